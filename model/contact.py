@@ -1,0 +1,72 @@
+"""Roll and soil: slips, forces, the linear law and the exponential one.
+
+Slips divide by v_n = sqrt((R_c w)^2 + v_eps^2). The paper's (17) divides by R_c w: that changes sign in reverse, where
+the soil would push instead of resist, and is singular at rest. With v_n driving backward mirrors driving forward.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from model.machine import Contact
+
+# Gauss-Legendre points across the roll: exact for the linear law (a quadratic in y), 1e-6 for the exponential one.
+_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(7)
+
+
+@dataclass(frozen=True)
+class Wrench:
+    """Forces [N] along and across the roll at its centre, and moment T_z [N m]: the soil turns the roll by -T_z."""
+
+    Sx: ca.SX
+    Sy: ca.SX
+    Tz: ca.SX
+
+
+@dataclass(frozen=True)
+class Slip:
+    """Slips at the middle of the roll, longitudinal and lateral [-], and v_n [m/s]."""
+
+    gx: ca.SX
+    gy: ca.SX
+    vn: ca.SX
+
+
+def slip(contact: Contact, Vx: ca.SX, Vy: ca.SX, spin: ca.SX) -> Slip:
+    """Slips of a roll whose centre moves at Vx, Vy [m/s] in its chassis' axes and which spins at `spin` [rad/s]."""
+    rim = float(contact.radius) * spin
+    vn = ca.sqrt(rim**2 + float(contact.v_eps) ** 2)
+    return Slip((Vx - rim) / vn, Vy / vn, vn)
+
+
+def wrench(contact: Contact, s: Slip, yaw_rate: ca.SX, Kx: ca.SX, Ky: ca.SX, saturation: ca.SX | None = None) -> Wrench:
+    """What the soil does to the roll; yaw_rate [rad/s] of its chassis; Kx, Ky [N] < 0.
+
+    Linear (24, 25), or with `saturation` = K / xi_s the exponential law (18) integrated over the patch.
+    """
+    if saturation is None:
+        Tz = Kx * (float(contact.width) ** 2 / 12) * (-yaw_rate) / s.vn
+        return Wrench(Kx * s.gx, Ky * s.gy, Tz)
+    Sx, Sy, Tz = ca.SX(0), ca.SX(0), ca.SX(0)
+    for point, weight in zip(_POINTS, _WEIGHTS / 2, strict=True):
+        y = point * float(contact.width) / 2
+        gx = s.gx - y * yaw_rate / s.vn
+        share = mobilised(ca.sqrt(gx**2 + s.gy**2 + 1e-12) / saturation)
+        Sx += weight * Kx * gx * share
+        Sy += weight * Ky * s.gy * share
+        Tz += weight * Kx * gx * y * share
+    return Wrench(Sx, Sy, Tz)
+
+
+def mobilised(x: ca.SX) -> ca.SX:
+    """Force of the exponential law over that of its linear limit, for x = |g| xi_s / K: 2 (x - 1 + e^-x) / x^2.
+
+    The mean over the patch of (1 - exp(-j/K)), j = |g| xi, against j/K (18). Below x = 0.05 the series
+    1 - x/3 + x^2/12 - x^3/60 + x^4/360 replaces it, where the closed form cancels.
+    """
+    series = 1 - x / 3 + x**2 / 12 - x**3 / 60 + x**4 / 360
+    safe = ca.fmax(x, 0.05)
+    return ca.if_else(x < 0.05, series, 2 * (safe - 1 + ca.exp(-safe)) / safe**2)

@@ -1,0 +1,486 @@
+"""The machine file (TOML) as frozen, checked records.
+
+A machine is a tree of bodies given by its modified Denavit-Hartenberg table (Khalil and Kleinfinger, 1986), with
+inertias, joint friction, roll-soil contacts, sensors, limits and the design problems that it is used for.
+Every number carries where it comes from. All values are SI.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
+
+MACHINES = Path(__file__).parent / "machines"
+Source = Literal["paper", "data sheet", "measured", "published", "identified", "assumed", "definition"]
+
+_PI = re.compile(r"^\s*([+-]?)\s*(?:(\d+(?:\.\d+)?)\s*\*\s*)?pi\s*(?:/\s*(\d+(?:\.\d+)?))?\s*$")
+
+
+class MachineError(ValueError):
+    """A machine file that can't be used: the message is one line with file, key, what is wrong and what is allowed."""
+
+
+def _number(value: Any) -> Any:
+    """Angles may be written as a multiple of pi, "-pi/2": the exact table entry, not a rounded one."""
+    if isinstance(value, bool):
+        raise ValueError("must be a number, not true/false")
+    if isinstance(value, str):
+        match = _PI.match(value)
+        if not match:
+            raise ValueError('must be a number, or a multiple of pi such as "-pi/2"')
+        sign, factor, divisor = match.groups()
+        return (-1.0 if sign == "-" else 1.0) * float(factor or 1) * math.pi / float(divisor or 1)
+    return value
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError("must be a finite number")
+    return value
+
+
+def _positive(q: Quantity) -> Quantity:
+    if not q.value > 0:
+        raise ValueError(f"must be > 0 (got {q.value:g})")
+    return q
+
+
+def _not_negative(q: Quantity) -> Quantity:
+    if q.value < 0:
+        raise ValueError(f"must be >= 0 (got {q.value:g})")
+    return q
+
+
+def _negative(q: Quantity) -> Quantity:
+    if not q.value < 0:
+        raise ValueError(f"must be < 0 (got {q.value:g}): the soil resists slip")
+    return q
+
+
+class Record(BaseModel):
+    """Frozen, and refuses keys that it doesn't know: a misspelt key must not be silently ignored."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+Number = Annotated[float, BeforeValidator(_number), AfterValidator(_finite)]
+
+
+class Quantity(Record):
+    """A value [SI] and where it comes from."""
+
+    value: Number
+    source: Source
+    note: str = ""
+
+    def __float__(self) -> float:
+        return self.value
+
+
+def _zero() -> Quantity:
+    return Quantity(value=0.0, source="definition")
+
+
+Positive = Annotated[Quantity, AfterValidator(_positive)]
+NotNegative = Annotated[Quantity, AfterValidator(_not_negative)]
+Negative = Annotated[Quantity, AfterValidator(_negative)]
+Vector3 = tuple[Number, Number, Number]
+
+
+class Point(Record):
+    """A point [m] in the body's frame."""
+
+    value: Vector3
+    source: Source
+    note: str = ""
+
+
+class Inertia(Record):
+    """Mass [kg], centre of mass [m] in the body's frame and inertia [kg m2] about the centre of mass.
+
+    `axisymmetric`: a roll or wheel, balanced about its joint axis z with its centre of mass at the frame's origin;
+    its standard parameters are then M, XX (= YY) and ZZ only.
+    """
+
+    mass: Positive
+    com: Point = Point(value=(0.0, 0.0, 0.0), source="definition")
+    XX: NotNegative = Field(default_factory=_zero)
+    XY: Quantity = Field(default_factory=_zero)
+    XZ: Quantity = Field(default_factory=_zero)
+    YY: NotNegative = Field(default_factory=_zero)
+    YZ: Quantity = Field(default_factory=_zero)
+    ZZ: NotNegative = Field(default_factory=_zero)
+    axisymmetric: bool = False
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Inertia:
+        if self.axisymmetric:
+            if any(self.com.value):
+                raise ValueError("axisymmetric: the centre of mass must be at the frame's origin (com 0, 0, 0)")
+            for key in ("XY", "XZ", "YZ"):
+                if getattr(self, key).value:
+                    raise ValueError(f"axisymmetric: {key} must be 0")
+            if self.YY.value not in (0.0, self.XX.value):
+                raise ValueError("axisymmetric: leave YY out, it equals XX")
+        return self
+
+
+class Friction(Record):
+    """Joint friction U = ... + Fv q' + Fs tanh(q'/smoothing), and the torque sensor's offset u0 (28).
+
+    Units of a revolute joint [N m s], [N m], [N m], smoothing [rad/s]; of a prismatic one [N s/m], [N], [N], [m/s].
+    """
+
+    Fv: NotNegative
+    Fs: NotNegative
+    u0: Quantity
+    smoothing: Positive
+
+
+class Contact(Record):
+    """A roll or wheel on the soil (11, 17, 24, 25). Frame: the chassis that carries the roll, at the roll's centre.
+
+    `law = "exponential"` is (18) integrated over the patch; it needs `saturation_slip` = K / xi_s, the slip at which
+    the shear displacement reaches K at the rear of the patch.
+    """
+
+    radius: Positive
+    width: NotNegative
+    Kx: Negative
+    Ky: Negative
+    v_eps: Positive
+    law: Literal["linear", "exponential"] = "linear"
+    saturation_slip: Positive | None = None
+    slip_limit: Positive | None = None
+
+    @model_validator(mode="after")
+    def _law(self) -> Contact:
+        if self.law == "exponential" and self.saturation_slip is None:
+            raise ValueError('law "exponential" needs saturation_slip (K / xi_s)')
+        return self
+
+
+class JointLimit(Record):
+    """What the drive of a joint allows. `rim_speed` is |radius x rate| of a roll [m/s]."""
+
+    torque: Positive | None = None
+    torque_rate: Positive | None = None
+    position: Positive | None = None
+    rate: Positive | None = None
+    rim_speed: Positive | None = None
+
+
+class Body(Record):
+    """One row of the modified Denavit-Hartenberg table, and what hangs on it.
+
+    Transform from the antecedent: Rot(z, gamma) Trans(z, b) Rot(x, alpha) Trans(x, d) Rot(z, theta) Trans(z, r);
+    the joint's coordinate replaces theta (revolute) or r (prismatic).
+    """
+
+    index: Annotated[int, Field(ge=0, le=99)]
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+    antecedent: int | Literal["ground"]
+    joint: Literal["planar", "revolute", "prismatic", "fixed"]
+    actuated: bool = False
+    place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
+    gamma: Quantity = Field(default_factory=_zero)
+    b: Quantity = Field(default_factory=_zero)
+    alpha: Quantity = Field(default_factory=_zero)
+    d: Quantity = Field(default_factory=_zero)
+    theta: Quantity = Field(default_factory=_zero)
+    r: Quantity = Field(default_factory=_zero)
+    inertia: Inertia | None = None
+    friction: Friction | None = None
+    contact: Contact | None = None
+    limit: JointLimit = JointLimit()
+
+    @property
+    def where(self) -> str:
+        """The name of the joint or contact, as effects and reports call it."""
+        return self.place or self.name
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        i = self.index
+        return {
+            "planar": (f"x{i}", f"y{i}", f"theta{i}"),
+            "revolute": (f"theta{i}",),
+            "prismatic": (f"q{i}",),
+            "fixed": (),
+        }[self.joint]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Body:
+        if self.joint in ("fixed", "planar") and (self.actuated or self.friction):
+            raise ValueError(f"a {self.joint} joint can't be actuated or have friction")
+        if self.actuated and self.friction is None:
+            raise ValueError("an actuated joint needs a [body.friction] table (Fv, Fs, u0, smoothing)")
+        if self.joint == "planar" and self.antecedent != "ground":
+            raise ValueError("a planar joint must stand on the ground")
+        if self.contact and self.joint != "revolute":
+            raise ValueError("a contact belongs to a roll or wheel: a revolute joint")
+        return self
+
+
+class Sensor(Record):
+    """One column of a log. SI value = factor x (number in the column).
+
+    kind `angle`: encoder of a joint; `wheel`: measuring wheel of `radius` [m] at `lateral` [m] (+ left) on the axis
+    through the body's origin (32); `torque`: delivered torque or force + u0; `yaw_rate`, `lateral_speed`: of the
+    body, in its own frame; `x`, `y`: position of its origin on the ground.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+    kind: Literal["angle", "wheel", "torque", "yaw_rate", "lateral_speed", "x", "y"]
+    body: int
+    column: Annotated[str, Field(min_length=1)]
+    unit: str
+    factor: Quantity = Quantity(value=1.0, source="definition")
+    kits: tuple[Literal["paper", "full"], ...] = ("paper", "full")
+    place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
+    counts_per_turn: Positive | None = None
+    noise: NotNegative | None = None
+    lateral: Quantity | None = None
+    radius: Positive | None = None
+
+    @property
+    def resolution(self) -> float | None:
+        """One count [SI unit of the column], None for an analogue sensor."""
+        return None if self.counts_per_turn is None else 2 * math.pi / self.counts_per_turn.value
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Sensor:
+        if self.kind == "wheel" and (self.radius is None or self.lateral is None):
+            raise ValueError("a measuring wheel needs radius and lateral")
+        if self.kind != "wheel" and (self.radius is not None or self.lateral is not None):
+            raise ValueError("radius and lateral are for kind wheel only")
+        if self.factor.value == 0:
+            raise ValueError("factor must not be 0")
+        return self
+
+
+class Filter(Record):
+    """Default processing of a log before least squares: zero-phase Butterworth of positions, and decimation."""
+
+    cutoff_hz: Positive
+    order: Annotated[int, Field(ge=1, le=8)] = 4
+    decimation: Annotated[int, Field(ge=1, le=1000)] = 10
+    drop: Annotated[int, Field(ge=0)] = 0
+
+
+class Problem(Record):
+    """A design problem: how long, where, how fine."""
+
+    duration_s: Positive
+    knot_s: Positive
+    lane_m: tuple[Number, Number]
+    lane_points: tuple[int, ...]
+    rest: bool = True
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Problem:
+        if min(self.lane_m) <= 0:
+            raise ValueError("lane_m must be > 0 (length, width)")
+        if self.knot_s.value * 4 > self.duration_s.value:
+            raise ValueError("duration_s must be at least 4 knots long")
+        return self
+
+
+class Machine(Record):
+    """A machine as its file describes it. Frozen; `locked` coordinates are held at zero."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")]
+    title: str
+    reference: str = ""
+    sampling_hz: Positive
+    time_column: str = "t_s"
+    gravity: Vector3 = (0.0, 0.0, -9.81)
+    power_limit: Positive | None = None
+    locked: tuple[str, ...] = ()
+    body: tuple[Body, ...]
+    sensor: tuple[Sensor, ...]
+    filter: Filter
+    problem: str | None = None
+    problems: dict[str, Problem] = {}
+    parameter_names: dict[str, str] = {}
+    scale: dict[str, Positive] = {}
+
+    def find(self, index: int) -> Body:
+        """The body with this index. Raises KeyError."""
+        for body in self.body:
+            if body.index == index:
+                return body
+        raise KeyError(index)
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Names of the free coordinates, in the order of the table."""
+        return tuple(c for b in self.body for c in b.coordinates if c not in self.locked)
+
+    @property
+    def planar(self) -> bool:
+        """Whether the root moves on the plane (velocities are then written in the chassis' own axes)."""
+        return self.body[0].joint == "planar"
+
+    @property
+    def actuated(self) -> tuple[Body, ...]:
+        """Actuated bodies whose coordinate is free."""
+        return tuple(b for b in self.body if b.actuated and b.coordinates[0] not in self.locked)
+
+    @property
+    def contacts(self) -> tuple[Body, ...]:
+        return tuple(b for b in self.body if b.contact and b.coordinates[0] not in self.locked)
+
+    def sensors(self, kit: str) -> tuple[Sensor, ...]:
+        """The sensors of a kit that measure something which is free to move."""
+        return tuple(s for s in self.sensor if kit in s.kits and self._visible(s))
+
+    def _visible(self, sensor: Sensor) -> bool:
+        free = set(self.coordinates)
+        body = self.find(sensor.body)
+        if sensor.kind in ("angle", "torque"):
+            return body.coordinates[0] in free
+        if sensor.kind == "yaw_rate":
+            return f"theta{self.body[0].index}" in free
+        if sensor.kind in ("lateral_speed", "y"):
+            return f"y{self.body[0].index}" in free
+        return True
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Machine:
+        seen: set[int] = set()
+        names: set[str] = set()
+        for k, body in enumerate(self.body):
+            if body.index in seen:
+                raise ValueError(f"body[{k}].index: {body.index} is given twice, every body needs its own")
+            if k == 0 and body.antecedent != "ground":
+                raise ValueError("body[0].antecedent: the first body must stand on the ground")
+            if k > 0 and body.antecedent not in seen:
+                known = ", ".join(map(str, sorted(seen)))
+                raise ValueError(f"body[{k}].antecedent: {body.antecedent} is not a body above it, allowed: {known}")
+            if body.name in names:
+                raise ValueError(f"body[{k}].name: {body.name} is given twice")
+            if body.contact and (body.antecedent == "ground" or not self.planar):
+                raise ValueError(f"body[{k}].contact: needs a chassis on a planar root to carry the roll")
+            seen.add(body.index)
+            names.add(body.name)
+        every = [c for b in self.body for c in b.coordinates]
+        for c in self.locked:
+            if c not in every:
+                raise ValueError(f"locked: no coordinate {c}, allowed: {', '.join(every)}")
+        if not self.coordinates:
+            raise ValueError("locked: nothing is left to move")
+        if not self.actuated:
+            raise ValueError("body: no joint is actuated, so nothing can drive the machine")
+        columns: set[str] = {self.time_column}
+        for k, sensor in enumerate(self.sensor):
+            if sensor.body not in seen:
+                raise ValueError(f"sensor[{k}].body: no body {sensor.body}, allowed: {sorted(seen)}")
+            if sensor.kind in ("angle", "torque") and not self.find(sensor.body).coordinates:
+                raise ValueError(f"sensor[{k}].body: body {sensor.body} has no joint to measure")
+            if sensor.column in columns:
+                raise ValueError(f"sensor[{k}].column: {sensor.column} is used twice")
+            columns.add(sensor.column)
+        if self.problem is not None and self.problem not in self.problems:
+            allowed = ", ".join(self.problems) or "none is declared"
+            raise ValueError(f"problem: no problem {self.problem}, allowed: {allowed}")
+        for name, problem in self.problems.items():
+            for i in problem.lane_points:
+                if i not in seen:
+                    raise ValueError(f"problems.{name}.lane_points: no body {i}, allowed: {sorted(seen)}")
+        if self.filter.cutoff_hz.value >= self.sampling_hz.value / 2:
+            raise ValueError(
+                f"filter.cutoff_hz: must be below half the sampling rate, {self.sampling_hz.value / 2:g} Hz"
+                f" (got {self.filter.cutoff_hz.value:g})"
+            )
+        return self
+
+
+def shipped() -> tuple[str, ...]:
+    """Names of the machines that come with the package."""
+    return tuple(sorted(p.stem for p in MACHINES.glob("*.toml")))
+
+
+def load(name: str | Path) -> Machine:
+    """The machine of a shipped name, or of a path to a TOML file.
+
+    A file may say `extends = "va12"` and give only what differs (tables merge, values and lists replace).
+    Raises MachineError: one line with file, key, what is wrong, what is allowed.
+    """
+    path = _find(str(name))
+    raw = _read(path)
+    try:
+        return Machine.model_validate(raw)
+    except ValidationError as err:
+        raise MachineError(_one_line(path, err)) from None
+
+
+def _find(name: str) -> Path:
+    if name in shipped():
+        return MACHINES / f"{name}.toml"
+    path = Path(name)
+    if path.suffix != ".toml":
+        raise MachineError(f"{name}: no such machine, allowed: {', '.join(shipped())}, or a path to a .toml file")
+    if not path.is_file():
+        raise MachineError(f"{name}: no such file")
+    return path
+
+
+def _read(path: Path, depth: int = 0) -> dict[str, Any]:
+    if depth > 4:
+        raise MachineError(f"{path}: extends: more than 4 files deep, a loop?")
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
+        raise MachineError(f"{path}: not a TOML file: {err}") from None
+    except OSError as err:
+        raise MachineError(f"{path}: can't be read: {err.strerror}") from None
+    parent = raw.pop("extends", None)
+    if parent is None:
+        return raw
+    if not isinstance(parent, str):
+        raise MachineError(f"{path}: extends: must be a shipped name or a file name")
+    base = MACHINES / f"{parent}.toml" if parent in shipped() else path.parent / parent
+    if not base.is_file():
+        raise MachineError(
+            f"{path}: extends: no machine {parent}, allowed: {', '.join(shipped())}, or a file beside it"
+        )
+    return _merge(_read(base, depth + 1), raw)
+
+
+def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in change.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        merged[key] = _merge(merged[key], value) if both else value
+    return merged
+
+
+def _one_line(path: Path, err: ValidationError) -> str:
+    first = err.errors(include_url=False)[0]
+    key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in first["loc"]).lstrip(".")
+    kind, message = first["type"], first["msg"]
+    if kind == "extra_forbidden":
+        message = "no such key here, check its spelling"
+    elif kind == "missing":
+        message = "is missing"
+    elif kind == "value_error":
+        message = message.removeprefix("Value error, ")
+    elif "input" in first and not isinstance(first["input"], dict | list):
+        message = f"{message[0].lower()}{message[1:]} (got {first['input']!r})"
+    more = len(err.errors()) - 1
+    tail = f" (and {more} more)" if more else ""
+    return " ".join(f"{path}: {key + ': ' if key else ''}{message}{tail}".split())
