@@ -70,7 +70,7 @@ def _inertial_unit(name: str) -> str:
     return {1: "kg", 2: "kg m" if letters[0] == "M" else "kg m2"}[len(letters)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Model:
     """A machine's equations as CasADi functions; build it with `build`.
 
@@ -229,7 +229,8 @@ def _contact(
     machine: Machine, body: Body, frames: dict[int, tree.Frame], nu: ca.SX, p: dict[str, ca.SX]
 ) -> tuple[ca.SX, contact.Slip]:
     """Generalised contact force (n_q,) of a roll (11) and its slips, by virtual power."""
-    assert body.contact is not None and not isinstance(body.antecedent, str)
+    assert body.contact is not None
+    assert not isinstance(body.antecedent, str)
     carrier, roll = frames[body.antecedent], frames[body.index]
     R, _ = tree._place(body, {c: ca.SX(0) for c in body.coordinates})
     turn = carrier.rotation.T @ roll.rotation
@@ -262,7 +263,7 @@ def _kinematics(
     """(q, nu) -> dq, slips, wheel rates, lateral and longitudinal speed of each body's origin, its ground position."""
     dq = nu
     if machine.planar:
-        x, y, t = machine.body[0].coordinates
+        x, y, _ = machine.body[0].coordinates
         turned = dict(
             zip((x, y), ca.vertsplit((tree._rot_z(heading) @ ca.vertcat(rate[x], rate[y], 0))[:2]), strict=True)
         )
@@ -271,7 +272,8 @@ def _kinematics(
     for s in machine.sensor:
         if s.kind == "wheel":
             f = frames[s.body]
-            assert s.radius is not None and s.lateral is not None
+            assert s.radius is not None
+            assert s.lateral is not None
             wheels.append((f.velocity[0] - float(s.lateral) * f.omega[2]) / float(s.radius))
     R = tree._rot_z(heading)
     root = ca.vertcat(*[at[c] for c in machine.body[0].coordinates[:2]], 0) if machine.planar else ca.SX(3, 1)
