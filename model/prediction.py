@@ -151,14 +151,15 @@ class Model:
     def stacked(self, q: np.ndarray, nu: np.ndarray, a: np.ndarray) -> np.ndarray:
         """The regressor of N samples (n_q, N) as (N, n_rows, n_base)."""
         n = q.shape[1]
-        W = self.regressor(q, nu, a).full()
+        W: np.ndarray = self.regressor(q, nu, a).full()
         return W.reshape(W.shape[0], n, len(self.base.names)).transpose(1, 0, 2)
 
     def base_values(self, standard: Mapping[str, float] | None = None) -> np.ndarray:
         """Base parameter values (n_base,) of standard values by name, the nominal ones where not given."""
         nominal = {n: v for n, (v, _) in standard_parameters(self.machine).items()}
         values = nominal | dict(standard or {})
-        return self.base.matrix @ np.array([values[n] for n in self.base.standard])
+        X: np.ndarray = self.base.matrix @ np.array([values[n] for n in self.base.standard])
+        return X
 
 
 def build(machine: Machine) -> Model:
@@ -175,7 +176,7 @@ def build(machine: Machine) -> Model:
     accel = full | dict(zip(names, ca.vertsplit(a), strict=True))
 
     heading = at[machine.body[0].coordinates[2]] if machine.planar else ca.SX(0)
-    gravity = tree._rot_z(-heading) @ ca.DM(machine.gravity)
+    gravity = tree.rot_z(-heading) @ ca.DM(machine.gravity)
     frames = tree.motion(machine, at, rate, accel, gravity)
     rows = tree.generalised_forces(
         machine, at, frames, {b.index: tree.inertial_vector(b, by_name) for b in machine.body}
@@ -232,7 +233,7 @@ def _contact(
     assert body.contact is not None
     assert not isinstance(body.antecedent, str)
     carrier, roll = frames[body.antecedent], frames[body.index]
-    R, _ = tree._place(body, {c: ca.SX(0) for c in body.coordinates})
+    R, _ = tree.place(body, {c: ca.SX(0) for c in body.coordinates})
     turn = carrier.rotation.T @ roll.rotation
     centre = turn @ roll.velocity
     axle = R[:, 2]
@@ -265,7 +266,7 @@ def _kinematics(
     if machine.planar:
         x, y, _ = machine.body[0].coordinates
         turned = dict(
-            zip((x, y), ca.vertsplit((tree._rot_z(heading) @ ca.vertcat(rate[x], rate[y], 0))[:2]), strict=True)
+            zip((x, y), ca.vertsplit((tree.rot_z(heading) @ ca.vertcat(rate[x], rate[y], 0))[:2]), strict=True)
         )
         dq = ca.vertcat(*[turned.get(c, rate[c]) for c in machine.coordinates])
     wheels = []
@@ -275,7 +276,7 @@ def _kinematics(
             assert s.radius is not None
             assert s.lateral is not None
             wheels.append((f.velocity[0] - float(s.lateral) * f.omega[2]) / float(s.radius))
-    R = tree._rot_z(heading)
+    R = tree.rot_z(heading)
     root = ca.vertcat(*[at[c] for c in machine.body[0].coordinates[:2]], 0) if machine.planar else ca.SX(3, 1)
     places = ca.horzcat(*[root + R @ frames[b.index].position for b in machine.body])
     speeds = ca.horzcat(*[frames[b.index].velocity for b in machine.body])

@@ -47,22 +47,22 @@ def _rot_x(angle: float) -> ca.SX:
     return ca.sparsify(ca.SX([[1, 0, 0], [0, c, -s], [0, s, c]]))
 
 
-def _rot_z(angle: ca.SX | float) -> ca.SX:
-    if isinstance(angle, float):
-        c, s = _exact(math.cos(angle)), _exact(math.sin(angle))
-    else:
-        c, s = ca.cos(angle), ca.sin(angle)
+def rot_z(angle: ca.SX | float) -> ca.SX:
+    """Rotation (3, 3) about z by an angle [rad]."""
+    number = isinstance(angle, float)
+    c = ca.SX(_exact(math.cos(angle))) if number else ca.cos(angle)
+    s = ca.SX(_exact(math.sin(angle))) if number else ca.sin(angle)
     R = ca.SX.eye(3)
     R[0, 0], R[0, 1], R[1, 0], R[1, 1] = c, -s, s, c
     return ca.sparsify(R)
 
 
-def _place(body: Body, q: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
+def place(body: Body, q: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
     """Rotation (3, 3) and position (3,) [m] of the body's frame in its antecedent's."""
     c = body.coordinates[0] if body.coordinates else ""
     theta = q[c] if body.joint == "revolute" else float(body.theta)
     r = q[c] if body.joint == "prismatic" else float(body.r)
-    Rz, Rx, Rt = _rot_z(float(body.gamma)), _rot_x(float(body.alpha)), _rot_z(theta)
+    Rz, Rx, Rt = rot_z(float(body.gamma)), _rot_x(float(body.alpha)), rot_z(theta)
     along = ca.vertcat(float(body.d), 0, 0) + Rx @ (Z * r)
     return Rz @ Rx @ Rt, Rz @ along + Z * float(body.b)
 
@@ -77,7 +77,7 @@ def motion(
     """
     frames: dict[int, Frame] = {}
     for body in machine.body:
-        R, P = _place(body, q)
+        R, P = place(body, q)
         zero = ca.SX(3, 1)
         if body.antecedent == "ground":
             above = Frame(ca.SX.eye(3), zero, zero, zero, zero, -gravity)
@@ -141,7 +141,7 @@ def generalised_forces(
         elif body.joint == "prismatic":
             rows[body.coordinates[0]] = F[2]
         if body.antecedent != "ground":
-            R, P = _place(body, q)
+            R, P = place(body, q)
             force[body.antecedent] += R @ F
             moment[body.antecedent] += R @ N + ca.cross(P, R @ F)
     return rows
