@@ -11,7 +11,7 @@ import math
 import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import (
     AfterValidator,
@@ -20,6 +20,8 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
     model_validator,
 )
 
@@ -42,13 +44,15 @@ def _number(value: Any) -> Any:
         if not match:
             raise ValueError('must be a number, or a multiple of pi such as "-pi/2"')
         sign, factor, divisor = match.groups()
+        if divisor and float(divisor) == 0:
+            raise ValueError("must be a finite number, not pi/0")
         return (-1.0 if sign == "-" else 1.0) * float(factor or 1) * math.pi / float(divisor or 1)
     return value
 
 
 def _finite(value: float) -> float:
     if not math.isfinite(value):
-        raise ValueError("must be a finite number")
+        raise ValueError(f"must be a finite number (got {value})")
     return value
 
 
@@ -77,6 +81,8 @@ class Record(BaseModel):
 
 
 Number = Annotated[float, BeforeValidator(_number), AfterValidator(_finite)]
+Index = Annotated[int, Field(strict=True, ge=0, le=99)]
+Flag = Annotated[bool, Field(strict=True)]
 
 
 class Quantity(Record):
@@ -123,7 +129,7 @@ class Inertia(Record):
     YY: NotNegative = Field(default_factory=_zero)
     YZ: Quantity = Field(default_factory=_zero)
     ZZ: NotNegative = Field(default_factory=_zero)
-    axisymmetric: bool = False
+    axisymmetric: Flag = False
 
     @model_validator(mode="after")
     def _consistent(self) -> Inertia:
@@ -183,6 +189,13 @@ class JointLimit(Record):
     rim_speed: Positive | None = None
 
 
+def _antecedent(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
+    try:
+        return handler(value)
+    except ValidationError:
+        raise ValueError(f'must be "ground" or the index of a body above (got {value!r})') from None
+
+
 class Body(Record):
     """One row of the modified Denavit-Hartenberg table, and what hangs on it.
 
@@ -190,11 +203,11 @@ class Body(Record):
     the joint's coordinate replaces theta (revolute) or r (prismatic).
     """
 
-    index: Annotated[int, Field(ge=0, le=99)]
+    index: Index
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
-    antecedent: int | Literal["ground"]
+    antecedent: Annotated[Index | Literal["ground"], WrapValidator(_antecedent)]
     joint: Literal["planar", "revolute", "prismatic", "fixed"]
-    actuated: bool = False
+    actuated: Flag = False
     place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
     gamma: Quantity = Field(default_factory=_zero)
     b: Quantity = Field(default_factory=_zero)
@@ -224,6 +237,10 @@ class Body(Record):
 
     @model_validator(mode="after")
     def _consistent(self) -> Body:
+        replaced = {"planar": ("gamma", "b", "alpha", "d", "theta", "r"), "revolute": ("theta",), "prismatic": ("r",)}
+        for key in replaced.get(self.joint, ()):
+            if getattr(self, key).value:
+                raise ValueError(f"{key}: a {self.joint} joint's coordinate takes its place, leave it out")
         if self.joint in ("fixed", "planar") and (self.actuated or self.friction):
             raise ValueError(f"a {self.joint} joint can't be actuated or have friction")
         if self.actuated and self.friction is None:
@@ -245,7 +262,7 @@ class Sensor(Record):
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
     kind: Literal["angle", "wheel", "torque", "yaw_rate", "lateral_speed", "x", "y"]
-    body: int
+    body: Index
     column: Annotated[str, Field(min_length=1)]
     unit: str
     factor: Quantity = Quantity(value=1.0, source="definition")
@@ -268,7 +285,7 @@ class Sensor(Record):
         if self.kind != "wheel" and (self.radius is not None or self.lateral is not None):
             raise ValueError("radius and lateral are for kind wheel only")
         if self.factor.value == 0:
-            raise ValueError("factor must not be 0")
+            raise ValueError("factor: must not be 0")
         return self
 
 
@@ -276,9 +293,9 @@ class Filter(Record):
     """Default processing of a log before least squares: zero-phase Butterworth of positions, and decimation."""
 
     cutoff_hz: Positive
-    order: Annotated[int, Field(ge=1, le=8)] = 4
-    decimation: Annotated[int, Field(ge=1, le=1000)] = 10
-    drop: Annotated[int, Field(ge=0)] = 0
+    order: Annotated[int, Field(strict=True, ge=1, le=8)] = 4
+    decimation: Annotated[int, Field(strict=True, ge=1, le=1000)] = 10
+    drop: Annotated[int, Field(strict=True, ge=0)] = 0
 
 
 class Problem(Record):
@@ -287,15 +304,16 @@ class Problem(Record):
     duration_s: Positive
     knot_s: Positive
     lane_m: tuple[Number, Number]
-    lane_points: tuple[int, ...]
-    rest: bool = True
+    lane_points: tuple[Index, ...]
+    rest: Flag = True
 
     @model_validator(mode="after")
     def _consistent(self) -> Problem:
         if min(self.lane_m) <= 0:
-            raise ValueError("lane_m must be > 0 (length, width)")
+            raise ValueError(f"lane_m: must be > 0, length and width (got {min(self.lane_m):g})")
         if self.knot_s.value * 4 > self.duration_s.value:
-            raise ValueError("duration_s must be at least 4 knots long")
+            least = 4 * self.knot_s.value
+            raise ValueError(f"duration_s: must be at least 4 knots long, {least:g} s (got {self.duration_s.value:g})")
         return self
 
 
@@ -310,7 +328,7 @@ class Machine(Record):
     gravity: Vector3 = (0.0, 0.0, -9.81)
     power_limit: Positive | None = None
     locked: tuple[str, ...] = ()
-    body: tuple[Body, ...]
+    body: Annotated[tuple[Body, ...], Field(min_length=1)]
     sensor: tuple[Sensor, ...]
     filter: Filter
     problem: str | None = None
@@ -342,7 +360,7 @@ class Machine(Record):
 
     @property
     def contacts(self) -> tuple[Body, ...]:
-        return tuple(b for b in self.body if b.contact and b.coordinates[0] not in self.locked)
+        return tuple(b for b in self.body if b.contact)
 
     def sensors(self, kit: str) -> tuple[Sensor, ...]:
         """The sensors of a kit that measure something which is free to move."""
@@ -361,6 +379,25 @@ class Machine(Record):
 
     @model_validator(mode="after")
     def _consistent(self) -> Machine:
+        self._check_tree()
+        self._check_locked()
+        self._check_sensors()
+        if self.problem is not None and self.problem not in self.problems:
+            allowed = ", ".join(self.problems) or "none is declared"
+            raise ValueError(f"problem: no problem {self.problem}, allowed: {allowed}")
+        indices = [b.index for b in self.body]
+        for name, problem in self.problems.items():
+            for i in problem.lane_points:
+                if i not in indices:
+                    raise ValueError(f"problems.{name}.lane_points: no body {i}, allowed: {sorted(indices)}")
+        if self.filter.cutoff_hz.value >= self.sampling_hz.value / 2:
+            raise ValueError(
+                f"filter.cutoff_hz: must be below half the sampling rate, {self.sampling_hz.value / 2:g} Hz"
+                f" (got {self.filter.cutoff_hz.value:g})"
+            )
+        return self
+
+    def _check_tree(self) -> None:
         seen: set[int] = set()
         names: set[str] = set()
         for k, body in enumerate(self.body):
@@ -371,42 +408,51 @@ class Machine(Record):
             if k > 0 and body.antecedent not in seen:
                 known = ", ".join(map(str, sorted(seen)))
                 raise ValueError(f"body[{k}].antecedent: {body.antecedent} is not a body above it, allowed: {known}")
-            if body.name in names:
-                raise ValueError(f"body[{k}].name: {body.name} is given twice")
+            if names & {body.name, body.where}:
+                raise ValueError(f"body[{k}].name: {body.where} is given twice, every body and place needs its own")
             if body.contact and (body.antecedent == "ground" or not self.planar):
                 raise ValueError(f"body[{k}].contact: needs a chassis on a planar root to carry the roll")
             seen.add(body.index)
-            names.add(body.name)
+            names |= {body.name, body.where}
+
+    def _check_locked(self) -> None:
         every = [c for b in self.body for c in b.coordinates]
         for c in self.locked:
             if c not in every:
                 raise ValueError(f"locked: no coordinate {c}, allowed: {', '.join(every)}")
+        if self.planar:
+            x, y, heading = self.body[0].coordinates
+            if {x, y} & set(self.locked) and heading not in self.locked:
+                raise ValueError(f"locked: {x} and {y} can only be held where {heading} is held too")
+        for body in self.contacts:
+            if body.coordinates[0] in self.locked:
+                raise ValueError(f"locked: {body.coordinates[0]} turns a roll on the soil, take its contact out first")
         if not self.coordinates:
             raise ValueError("locked: nothing is left to move")
         if not self.actuated:
             raise ValueError("body: no joint is actuated, so nothing can drive the machine")
+
+    def _check_sensors(self) -> None:
+        known = {b.index: b for b in self.body}
+        jointed = [i for i, b in known.items() if b.joint in ("revolute", "prismatic")]
+        driven = [i for i, b in known.items() if b.actuated]
+        names: set[str] = set()
         columns: set[str] = {self.time_column}
         for k, sensor in enumerate(self.sensor):
-            if sensor.body not in seen:
-                raise ValueError(f"sensor[{k}].body: no body {sensor.body}, allowed: {sorted(seen)}")
-            if sensor.kind in ("angle", "torque") and not self.find(sensor.body).coordinates:
-                raise ValueError(f"sensor[{k}].body: body {sensor.body} has no joint to measure")
+            if sensor.body not in known:
+                raise ValueError(f"sensor[{k}].body: no body {sensor.body}, allowed: {sorted(known)}")
+            if sensor.kind == "angle" and sensor.body not in jointed:
+                raise ValueError(f"sensor[{k}].body: body {sensor.body} has no joint to measure, allowed: {jointed}")
+            if sensor.kind == "torque" and sensor.body not in driven:
+                raise ValueError(f"sensor[{k}].body: joint {sensor.body} isn't actuated, allowed: {driven}")
+            if sensor.kind not in ("angle", "torque") and not self.planar:
+                raise ValueError(f"sensor[{k}].kind: {sensor.kind} needs a planar root, allowed here: angle, torque")
+            if sensor.name in names:
+                raise ValueError(f"sensor[{k}].name: {sensor.name} is used twice")
             if sensor.column in columns:
                 raise ValueError(f"sensor[{k}].column: {sensor.column} is used twice")
+            names.add(sensor.name)
             columns.add(sensor.column)
-        if self.problem is not None and self.problem not in self.problems:
-            allowed = ", ".join(self.problems) or "none is declared"
-            raise ValueError(f"problem: no problem {self.problem}, allowed: {allowed}")
-        for name, problem in self.problems.items():
-            for i in problem.lane_points:
-                if i not in seen:
-                    raise ValueError(f"problems.{name}.lane_points: no body {i}, allowed: {sorted(seen)}")
-        if self.filter.cutoff_hz.value >= self.sampling_hz.value / 2:
-            raise ValueError(
-                f"filter.cutoff_hz: must be below half the sampling rate, {self.sampling_hz.value / 2:g} Hz"
-                f" (got {self.filter.cutoff_hz.value:g})"
-            )
-        return self
 
 
 def shipped() -> tuple[str, ...]:
@@ -472,15 +518,40 @@ def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
 def _one_line(path: Path, err: ValidationError) -> str:
     first = err.errors(include_url=False)[0]
     key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in first["loc"]).lstrip(".")
-    kind, message = first["type"], first["msg"]
+    kind, message, got = first["type"], first["msg"], first.get("input")
     if kind == "extra_forbidden":
-        message = "no such key here, check its spelling"
+        message = f"no such key here, allowed: {', '.join(_record(first['loc'][:-1]).model_fields)}"
     elif kind == "missing":
         message = "is missing"
+    elif kind == "model_type":
+        record = _record(first["loc"])
+        number = record in (Quantity, Point)
+        table = '{ value = ..., source = "..." }' if number else f"with keys {', '.join(record.model_fields)}"
+        message = f"must be a table {table} (got {got!r})"
     elif kind == "value_error":
         message = message.removeprefix("Value error, ")
-    elif "input" in first and not isinstance(first["input"], dict | list):
-        message = f"{message[0].lower()}{message[1:]} (got {first['input']!r})"
+        inner, _, rest = message.partition(": ")
+        if inner in _record(first["loc"]).model_fields:
+            key, message = f"{key}.{inner}".lstrip("."), rest
+    elif not isinstance(got, dict | list | tuple):
+        message = f"{message[0].lower()}{message[1:]} (got {got!r})"
     more = len(err.errors()) - 1
     tail = f" (and {more} more)" if more else ""
     return " ".join(f"{path}: {key + ': ' if key else ''}{message}{tail}".split())
+
+
+def _record(where: tuple[int | str, ...]) -> type[Record]:
+    """The record that the file holds at this key."""
+    record: type[Record] = Machine
+    for step in where:
+        field = record.model_fields.get(str(step))
+        if field is not None:
+            inside = _record_in(field.annotation)
+            record = inside or record
+    return record
+
+
+def _record_in(annotation: Any) -> type[Record] | None:
+    if isinstance(annotation, type) and issubclass(annotation, Record):
+        return annotation
+    return next((r for a in get_args(annotation) if (r := _record_in(a)) is not None), None)

@@ -168,6 +168,7 @@ def build(machine: Machine) -> Model:
     n = len(names)
     q, nu, a = ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
     table = standard_parameters(machine)
+    _check_names(machine, tuple(table))
     p = ca.SX.sym("p", len(table))
     by_name = dict(zip(table, ca.vertsplit(p), strict=True))
     full = {c: ca.SX(0) for b in machine.body for c in b.coordinates}
@@ -224,6 +225,21 @@ def build(machine: Machine) -> Model:
         _kinematics(machine, q, nu, at, rate, frames, slips, heading),
         tuple(s for s, bent in zip(table, curved, strict=True) if bent),
     )
+
+
+def _check_names(machine: Machine, standard: tuple[str, ...]) -> None:
+    """Names that the file gives to parameters or scales must exist, or a misspelt one would change nothing."""
+    for name in machine.parameter_names:
+        if name not in standard:
+            raise ValueError(
+                f"{machine.name}: parameter_names.{name}: no such parameter, allowed: {', '.join(standard)}"
+            )
+    groups = {s + "R" for s in standard} | set(machine.parameter_names.values())
+    for name in machine.scale:
+        if name not in standard and name not in groups:
+            raise ValueError(
+                f"{machine.name}: scale.{name}: no such parameter, allowed: {', '.join(standard)}, with R for a group"
+            )
 
 
 def _contact(
@@ -330,8 +346,9 @@ def base_parameters(machine: Machine, W: ca.Function, p: np.ndarray, units: dict
         machine.parameter_names.get(standard[j], standard[j] + ("R" if np.count_nonzero(row) > 1 else ""))
         for j, row in zip(independent, chosen, strict=True)
     )
-    if len(set(names)) < len(names):
-        raise ValueError(f"{machine.name}: parameter_names: two base parameters get the same name: {sorted(names)}")
+    twice = sorted({s for s in names if names.count(s) > 1})
+    if twice:
+        raise ValueError(f"{machine.name}: parameter_names: two base parameters get the same name: {', '.join(twice)}")
     return BaseParameters(
         names, tuple(units[standard[j]] for j in independent), tuple(independent), chosen, tuple(invisible), standard
     )
