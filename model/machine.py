@@ -290,12 +290,13 @@ class Sensor(Record):
 
 
 class Filter(Record):
-    """Default processing of a log before least squares: zero-phase Butterworth of positions, and decimation."""
+    """Default processing of a log before least squares: zero-phase Butterworth of positions, then `drop` samples at
+    the start and at the end are left out, and one row in `decimation` is kept."""
 
     cutoff_hz: Positive
     order: Annotated[int, Field(strict=True, ge=1, le=8)] = 4
     decimation: Annotated[int, Field(strict=True, ge=1, le=1000)] = 10
-    drop: Annotated[int, Field(strict=True, ge=0)] = 0
+    drop: tuple[Annotated[int, Field(strict=True, ge=0)], Annotated[int, Field(strict=True, ge=0)]] = (0, 0)
 
 
 class Problem(Record):

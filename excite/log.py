@@ -1,0 +1,284 @@
+"""Logs and profiles: reading, checking, naming what is wrong in one line."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import scipy.io
+
+from excite.simulate import Motion
+from model import machine as machines
+from model.machine import Machine, Sensor
+from model.prediction import Model
+
+SHORTEST = 100  # samples: below this no filter and no estimate makes sense
+
+
+class LogError(ValueError):
+    """A log or profile that can't be used: one line with file, place, what is wrong and what to do."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """Checked measurements: t (N,) [s] evenly spaced, values (N,) by sensor name [SI]."""
+
+    source: str
+    t: np.ndarray
+    values: dict[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+def read(path: str | Path, machine: Machine, needs: Sequence[str] = ()) -> Log:
+    """A log (.csv, .parquet, .mat) as the machine file names its columns, checked.
+
+    `needs`: names of sensors that must be there. Raises LogError: a missing column, a NaN, time that goes back, a
+    gap, a wrong rate, another machine's log, an empty file.
+    """
+    table = read_table(path)
+    return check(table, machine, needs, str(path))
+
+
+def check(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> Log:
+    """A table of columns as a Log. Raises LogError."""
+    wanted = machine.sensors("full")
+    known = [s for s in wanted if s.column in table.columns]
+    if machine.time_column not in table.columns:
+        raise LogError(f"{source}: no column {machine.time_column} (time), {_columns(table)}{_other(table, machine)}")
+    missing = [s for s in wanted if s.name in needs and s not in known]
+    if missing:
+        names = ", ".join(f"{s.column} ({_what(s, machine)})" for s in missing)
+        raise LogError(f"{source}: no column {names}, {_columns(table)}{_other(table, machine)}")
+    t = _numbers(table, machine.time_column, source)
+    if len(t) < SHORTEST:
+        raise LogError(f"{source}: only {len(t)} rows, at least {SHORTEST} are needed: is the file complete?")
+    values = {s.name: float(s.factor) * _numbers(table, s.column, source) for s in known}
+    rate = float(machine.sampling_hz)
+    _check_time(t, rate, machine.time_column, source)
+    for s in known:
+        _check_values(s, values[s.name], rate, machine, source)
+    return Log(source, np.arange(len(t)) / rate, values)
+
+
+def read_table(path: str | Path) -> pd.DataFrame:
+    """The columns of a .csv, .parquet or .mat file as they are. Raises LogError."""
+    path = Path(path)
+    if not path.is_file():
+        raise LogError(f"{path}: no such file" if not path.is_dir() else f"{path}: is a folder, give a file")
+    if path.stat().st_size == 0:
+        raise LogError(f"{path}: the file is empty")
+    readers = {".csv": _read_csv, ".parquet": _read_parquet, ".mat": _read_mat}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise LogError(f"{path}: unknown kind of file {path.suffix!r}, allowed: {', '.join(readers)}")
+    table = reader(path)
+    if table.empty:
+        raise LogError(f"{path}: no rows of data")
+    return table
+
+
+def _read_csv(path: Path) -> pd.DataFrame:
+    try:
+        first = pd.read_csv(path, header=None, nrows=1, dtype=str).iloc[0]
+        twice = first[first.duplicated()]
+        if len(twice):
+            raise LogError(f"{path}: line 1: column {twice.iloc[0]} is there twice, keep one")
+        table = pd.read_csv(path, skipinitialspace=True, low_memory=False)
+    except UnicodeDecodeError:
+        raise LogError(f"{path}: not a text file, is it really CSV?") from None
+    except pd.errors.EmptyDataError:
+        raise LogError(f"{path}: the file is empty") from None
+    except pd.errors.ParserError as err:
+        raise LogError(f"{path}: not a table: {' '.join(str(err).split())}") from None
+    except OSError as err:
+        raise LogError(f"{path}: can't be read: {err.strerror}") from None
+    table.columns = table.columns.astype(str).str.strip()
+    return table
+
+
+def _read_parquet(path: Path) -> pd.DataFrame:
+    try:
+        return pd.read_parquet(path)
+    except (pa.ArrowInvalid, OSError) as err:
+        raise LogError(f"{path}: not a Parquet file: {' '.join(str(err).split())[:120]}") from None
+
+
+def _read_mat(path: Path) -> pd.DataFrame:
+    try:
+        raw = scipy.io.loadmat(path)
+    except (ValueError, TypeError, OSError, NotImplementedError, zipfile.BadZipFile, IndexError, KeyError) as err:
+        raise LogError(f"{path}: not a MATLAB file that can be read (v5 to v7): {' '.join(str(err).split())[:120]}") from None
+    columns = {
+        k: np.ravel(v)
+        for k, v in raw.items()
+        if not k.startswith("__") and isinstance(v, np.ndarray) and v.dtype.kind in "fiub" and 1 in v.shape and v.size > 1
+    }
+    if not columns:
+        raise LogError(f"{path}: holds no columns of numbers")
+    lengths = {k: len(v) for k, v in columns.items()}
+    if len(set(lengths.values())) > 1:
+        listed = ", ".join(f"{k} {n}" for k, n in lengths.items())
+        raise LogError(f"{path}: the variables have different lengths ({listed}), they must be one table")
+    return pd.DataFrame(columns)
+
+
+def _numbers(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
+    raw = table[column]
+    if raw.dtype.kind == "c":
+        raise LogError(f"{source}: column {column}: complex numbers, a measurement is real")
+    values = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float)
+    bad = ~np.isfinite(values)
+    if bad.any():
+        k = int(np.argmax(bad))
+        cell = raw.iloc[k]
+        what = "is empty or not a number (NaN)" if pd.isna(cell) else f"is {str(cell)[:30]!r}, not a finite number"
+        count = int(bad.sum())
+        more = f"; {count} such cells in this column" if count > 1 else ""
+        raise LogError(
+            f"{source}: row {k + 1}, column {column}: {what}{more}; cut the log there or repair the value"
+        )
+    return values
+
+
+def _check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
+    dt = np.diff(t)
+    if (dt <= 0).any():
+        k = int(np.argmax(dt <= 0))
+        what = "goes back" if dt[k] < 0 else "stands still"
+        raise LogError(
+            f"{source}: row {k + 2}, column {column}: time {what} ({t[k]:g} s, then {t[k + 1]:g} s); sort or cut the log"
+        )
+    typical = float(np.median(dt))
+    if abs(typical * rate - 1) > 0.02:
+        raise LogError(
+            f"{source}: column {column}: sampled at {1 / typical:.4g} Hz, the machine file says {rate:g} Hz;"
+            " resample the log or correct sampling_hz"
+        )
+    jump = np.abs(dt * rate - 1) > 0.5
+    if jump.any():
+        k = int(np.argmax(jump))
+        raise LogError(
+            f"{source}: row {k + 2}, column {column}: a gap of {dt[k]:.4g} s (from {t[k]:g} s to {t[k + 1]:g} s) where"
+            f" {1 / rate:g} s is expected; give the stretches before and after as two logs"
+        )
+    drift = (t[-1] - t[0]) * rate / (len(t) - 1)
+    if abs(drift - 1) > 0.01:
+        raise LogError(f"{source}: column {column}: the clock is {100 * (drift - 1):+.1f} % off {rate:g} Hz on average")
+
+
+def _check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Machine, source: str) -> None:
+    """Units and wrapping: what no such machine can do is a wrong log, not a measurement."""
+    body = machine.find(sensor.body)
+    if sensor.kind in ("angle", "wheel") and sensor.unit == "rad":
+        step = np.abs(np.diff(values))
+        k = int(np.argmax(step))
+        if step[k] > 2.0:
+            raise LogError(
+                f"{source}: row {k + 2}, column {sensor.column}: the angle jumps by {step[k]:.3g} rad in one sample;"
+                " unwrap it (encoder angles are counted on) or cut the log there"
+            )
+        limit = body.limit.position
+        if sensor.kind == "angle" and limit is not None and np.abs(values).max() > 3 * float(limit):
+            raise LogError(
+                f"{source}: column {sensor.column}: up to {np.abs(values).max():.3g} rad, the machine allows"
+                f" {float(limit):g} rad; is the column in degrees?"
+            )
+    if sensor.kind == "torque" and body.limit.torque is not None:
+        top, limit = float(np.abs(values).max()), float(body.limit.torque)
+        if top > 10 * limit:
+            raise LogError(
+                f"{source}: column {sensor.column}: up to {top:.3g}, more than ten times the drive's limit {limit:g};"
+                " is the unit right?"
+            )
+
+
+def _what(sensor: Sensor, machine: Machine) -> str:
+    where = sensor.place or machine.find(sensor.body).where
+    kind = {"angle": "angle", "wheel": "angle", "torque": "torque"}.get(sensor.kind, sensor.kind.replace("_", " "))
+    return f"{kind} of {where.replace('_', ' ')}"
+
+
+def _columns(table: pd.DataFrame) -> str:
+    names = [str(c) for c in table.columns]
+    shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+    return f"the file has {shown}"
+
+
+def _other(table: pd.DataFrame, machine: Machine) -> str:
+    """A shipped machine whose log this looks like."""
+    for name in machines.shipped():
+        if name == machine.name:
+            continue
+        other = machines.load(name)
+        columns = {other.time_column, *(s.column for s in other.sensors("paper"))}
+        if columns <= {str(c) for c in table.columns}:
+            return f"; this looks like a log of {name}"
+    return f"; is this a log of {machine.name}? The machine file names each sensor's column"
+
+
+def profile(model: Model, motion: Motion) -> pd.DataFrame:
+    """A drive as a table: the torques to deliver, then the motion that is expected (contract, section 2)."""
+    columns: dict[str, np.ndarray] = {"t_s": motion.t}
+    for k, name in enumerate(model.inputs):
+        columns[torque_column(model, name)] = motion.u[:, k]
+    names = motion_columns(model)
+    columns |= {place: motion.q[:, k] for k, (place, _) in enumerate(names)}
+    columns |= {rate: motion.nu[:, k] for k, (_, rate) in enumerate(names)}
+    return pd.DataFrame(columns)
+
+
+def torque_column(model: Model, name: str) -> str:
+    """Column of an input in a profile: u1_Nm, of a prismatic joint u1_N."""
+    body = model.machine.find(int(name[1:]))
+    return f"{name}_{'Nm' if body.joint == 'revolute' else 'N'}"
+
+
+def motion_columns(model: Model) -> list[tuple[str, str]]:
+    """Columns of each coordinate and its velocity in a profile; a planar root's are along its own axes."""
+    own = dict(zip(model.machine.body[0].coordinates, ("v_m_s", "vy_m_s"), strict=False)) if model.machine.planar else {}
+    names = []
+    for c in model.coordinates:
+        unit = "rad" if c.startswith("theta") else "m"
+        names.append((f"{c}_{unit}", own.get(c, f"d{c}_{unit}_s")))
+    return names
+
+
+def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Torques (N, n_u) [N m] of a profile and the state (n_q,), (n_q,) it starts from, zero where it gives none.
+
+    Raises LogError as for a log.
+    """
+    table = read_table(path)
+    source = str(path)
+    needed = ["t_s", *(torque_column(model, n) for n in model.inputs)]
+    missing = [c for c in needed if c not in table.columns]
+    if missing:
+        raise LogError(f"{source}: no column {', '.join(missing)}, {_columns(table)}; is this a profile of {model.machine.name}?")
+    t = _numbers(table, "t_s", source)
+    if len(t) < 2:
+        raise LogError(f"{source}: only {len(t)} row, a profile needs at least 2")
+    rate = float(model.machine.sampling_hz)
+    _check_time(t, rate, "t_s", source)
+    torque = np.column_stack([_numbers(table, c, source) for c in needed[1:]])
+    for k, name in enumerate(model.inputs):
+        limit = model.machine.find(int(name[1:])).limit.torque
+        top = float(np.abs(torque[:, k]).max())
+        if limit is not None and top > 10 * float(limit):
+            raise LogError(
+                f"{source}: column {needed[k + 1]}: up to {top:.3g}, more than ten times the drive's limit"
+                f" {float(limit):g}; is the unit right?"
+            )
+    start, speed = np.zeros(len(model.coordinates)), np.zeros(len(model.coordinates))
+    for k, (place, rate_column) in enumerate(motion_columns(model)):
+        if place in table.columns:
+            start[k] = _numbers(table, place, source)[0]
+        if rate_column in table.columns:
+            speed[k] = _numbers(table, rate_column, source)[0]
+    return torque, start, speed

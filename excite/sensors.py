@@ -1,0 +1,71 @@
+"""What sensors make of a motion: counts, noise, offsets; and the profile of what is expected."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from excite.simulate import Motion
+from model.machine import Sensor
+from model.prediction import Model
+
+KITS = ("paper", "full")
+
+
+def measure(
+    model: Model, motion: Motion, X: np.ndarray | None = None, kit: str = "full", seed: int = 0, noise: bool = True
+) -> pd.DataFrame:
+    """The log (N rows) that a kit's sensors would write, in their own units and columns.
+
+    X (n_base,) gives the torque offsets u0, which are parameters and stay without noise. An encoder counts whole
+    steps from where it was switched on, at a random place between two edges; noise is white and normal.
+    Raises ValueError for an unknown kit.
+    """
+    if kit not in KITS:
+        raise ValueError(f"kit: {kit} is unknown, allowed: {', '.join(KITS)}")
+    exact = signals(model, motion, X)
+    rng = np.random.default_rng(seed)
+    columns = {model.machine.time_column: motion.t}
+    for sensor in model.machine.sensors(kit):
+        columns[sensor.column] = (_flawed(sensor, exact[sensor.name], rng) if noise else exact[sensor.name]) / float(
+            sensor.factor
+        )
+    return pd.DataFrame(columns)
+
+
+def signals(model: Model, motion: Motion, X: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """What ideal sensors would read, (N,) each by sensor name [SI]; torques include the offset u0."""
+    machine = model.machine
+    X = model.nominal if X is None else X
+    standard = dict(zip(model.base.standard, model.expand @ X, strict=True))
+    speeds = model.kinematics(motion.q.T, motion.nu.T)[4].full().reshape(3, len(motion.t), len(machine.body))
+    wheels = [s.name for s in machine.sensor if s.kind == "wheel"]
+    root = machine.body[0]
+    values: dict[str, np.ndarray] = {}
+    for sensor in machine.sensors("full"):
+        body = machine.find(sensor.body)
+        if sensor.kind == "angle":
+            values[sensor.name] = motion.q[:, model.coordinates.index(body.coordinates[0])]
+        elif sensor.kind == "wheel":
+            values[sensor.name] = motion.wheels[:, wheels.index(sensor.name)]
+        elif sensor.kind == "torque":
+            k = model.inputs.index(f"u{body.index}")
+            values[sensor.name] = motion.u[:, k] + standard[f"u{body.index}0"]
+        elif sensor.kind == "yaw_rate":
+            values[sensor.name] = motion.nu[:, model.coordinates.index(root.coordinates[2])]
+        elif sensor.kind == "lateral_speed":
+            values[sensor.name] = speeds[1, :, machine.body.index(body)]
+        else:
+            values[sensor.name] = motion.q[:, model.coordinates.index(root.coordinates["xy".index(sensor.kind)])]
+    return values
+
+
+def _flawed(sensor: Sensor, exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    step = sensor.resolution
+    if step is not None:
+        phase = rng.uniform()
+        counts = np.floor(exact / step + phase)
+        return (counts - counts[0]) * step + np.round(exact[0] / step) * step
+    if sensor.noise is not None:
+        return exact + float(sensor.noise) * rng.standard_normal(len(exact))
+    return exact
