@@ -6,6 +6,7 @@ the soil would push instead of resist, and is singular at rest. With v_n driving
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import casadi as ca
@@ -13,8 +14,9 @@ import numpy as np
 
 from model.machine import Contact
 
-# Gauss-Legendre points across the roll: exact for the linear law (a quadratic in y), 1e-6 for the exponential one.
-_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(7)
+# Gauss-Legendre points on 0..1, for the exponential law on either side of the point where the roll doesn't slip.
+_GAUSS, _WEIGHTS = (v / 2 for v in np.polynomial.legendre.leggauss(6))
+_POINTS = _GAUSS + 0.5
 
 
 @dataclass(frozen=True)
@@ -51,14 +53,28 @@ def wrench(contact: Contact, s: Slip, yaw_rate: ca.SX, Kx: ca.SX, Ky: ca.SX, sat
         Tz = Kx * (float(contact.width) ** 2 / 12) * (-yaw_rate) / s.vn
         return Wrench(Kx * s.gx, Ky * s.gy, Tz)
     Sx, Sy, Tz = ca.SX(0), ca.SX(0), ca.SX(0)
-    for point, weight in zip(_POINTS, _WEIGHTS / 2, strict=True):
-        y = point * float(contact.width) / 2
+    for y, dy in _across(contact, s, yaw_rate):
         gx = s.gx - y * yaw_rate / s.vn
-        share = mobilised(ca.sqrt(gx**2 + s.gy**2 + 1e-12) / saturation)
-        Sx += weight * Kx * gx * share
-        Sy += weight * Ky * s.gy * share
-        Tz += weight * Kx * gx * y * share
+        share = mobilised(ca.sqrt(gx**2 + s.gy**2 + 1e-12) / saturation) * dy
+        Sx += Kx * gx * share
+        Sy += Ky * s.gy * share
+        Tz += Kx * gx * y * share
     return Wrench(Sx, Sy, Tz)
+
+
+def _across(contact: Contact, s: Slip, yaw_rate: ca.SX) -> Iterator[tuple[ca.SX, ca.SX]]:
+    """Points y [m] across the roll and their shares of its width (they add up to 1).
+
+    |g| has a kink where g_x(y) = 0, when the roll turns on the spot: the points meet there, denser towards it
+    (y - y0 = h p^2). Relative error of the force below 1e-5 for |g| <= 0.15, K / xi_s >= 0.15; 5e-5 for 0.05.
+    """
+    edge = float(contact.width) / 2
+    turn = edge * yaw_rate / s.vn
+    still = ca.fmin(1, ca.fmax(-1, s.gx * turn / (turn**2 + 1e-12)))
+    for end in (-1, 1):
+        h = end - still
+        for point, weight in zip(_POINTS, _WEIGHTS, strict=True):
+            yield edge * (still + h * point**2), ca.fabs(h) * point * weight
 
 
 def mobilised(x: ca.SX) -> ca.SX:
