@@ -237,6 +237,15 @@ def _independent(W: np.ndarray, names: Sequence[str]) -> tuple[list[int], dict[s
     return keep, reasons
 
 
+def torques(model: Model, log: Log, estimate: Estimate, filter: Filter | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Measured and predicted torque (n_u, N) of a log, both low-passed alike; unknown parameters count as zero."""
+    filter = filter or model.machine.filter
+    s = samples(model, log, filter)
+    predicted = np.einsum("nrp,p->rn", model.stacked(s.q, s.nu, s.a), np.nan_to_num(estimate.value))
+    rows, rate = list(model.actuated), float(model.machine.sampling_hz)
+    return lowpass(s.Y[rows], rate, filter), lowpass(predicted[rows], rate, filter)
+
+
 def noted(estimate: Estimate, *notes: str) -> Estimate:
     """The estimate with remarks for the report added."""
     return replace(estimate, notes=estimate.notes + notes)
@@ -244,3 +253,4 @@ def noted(estimate: Estimate, *notes: str) -> Estimate:
 
 Method = Callable[[Model, Sequence[Log], Filter], Estimate]
 METHODS: dict[str, Method] = {"ols": ols}
+RECOMMENDED = "ols"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -90,11 +91,15 @@ def _read_csv(path: Path) -> pd.DataFrame:
         twice = first[first.duplicated()]
         if len(twice):
             raise LogError(f"{path}: line 1: column {twice.iloc[0]} is there twice, keep one")
-        table = pd.read_csv(path, skipinitialspace=True, low_memory=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            table = pd.read_csv(path, skipinitialspace=True, low_memory=False, index_col=False)
     except UnicodeDecodeError:
         raise LogError(f"{path}: not a text file, is it really CSV?") from None
     except pd.errors.EmptyDataError:
         raise LogError(f"{path}: the file is empty") from None
+    except pd.errors.ParserWarning:
+        raise LogError(f"{path}: not a table: lines have more cells than the header has names") from None
     except pd.errors.ParserError as err:
         raise LogError(f"{path}: not a table: {' '.join(str(err).split())}") from None
     except OSError as err:

@@ -127,6 +127,14 @@ class Model:
         u, X = ca.SX.sym("u", len(self.inputs)), ca.SX.sym("X", len(self.base.names))
         return ca.Function("acceleration", [q, nu, u, X], [self.accelerate(q, nu, u, X)], ["q", "nu", "u", "X"], ["a"])
 
+    @cached_property
+    def pivots(self) -> ca.Function:
+        """(q, X) -> (n_q,) pivots of the mass matrix: all > 0 exactly where it is positive definite."""
+        q, nu, _ = self.symbols()
+        X = ca.SX.sym("X", len(self.base.names))
+        D, _, _ = ca.ldl(self.equations(q, nu, X)[0])
+        return ca.Function("pivots", [q, X], [D], ["q", "X"], ["D"])
+
     def accelerate(self, q: ca.SX, nu: ca.SX, u: ca.SX, X: ca.SX | ca.DM) -> ca.SX:
         """Forward dynamics as an expression; with numbers for X the graph is smaller and faster."""
         M, bias = self.equations(q, nu, X)

@@ -1,0 +1,586 @@
+"""The command line. Heavy imports happen inside the commands, so that --help is there at once."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+# One BLAS thread: our matrices are small, and threads turn a 0.3 ms eigenproblem into 100 ms.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import typer
+
+if TYPE_CHECKING:
+    from excite.design import Design
+    from excite.identify import Estimate
+    from excite.verify import Verification
+    from model.machine import Machine, Problem
+    from model.prediction import Model
+
+app = typer.Typer(
+    name="excite",
+    help="Designs test drives that make a machine tell you its parameters, verifies them, and identifies from a log.",
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+MachineArgument = Annotated[str, typer.Argument(metavar="MACHINE", help="a shipped name or a machine file (.toml)")]
+OutOption = Annotated[Path | None, typer.Option("--out", help="folder to write [results/<command>-<machine>]")]
+JsonOption = Annotated[bool, typer.Option("--json", help="print the summary as JSON and nothing else")]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="same seed, same result")]
+KitOption = Annotated[str, typer.Option("--kit", help="sensors: paper or full")]
+MethodOption = Annotated[str | None, typer.Option("--method", help="estimator; the recommended one by default")]
+ProblemOption = Annotated[str | None, typer.Option("--problem", help="design problem; the machine's own by default")]
+DurationOption = Annotated[float | None, typer.Option("--duration", help="length of the drive [s]")]
+ObjectiveOption = Annotated[str, typer.Option("--objective", help="what the drive is best for")]
+StartsOption = Annotated[int, typer.Option("--starts", min=1, help="number of starting guesses")]
+BudgetOption = Annotated[float | None, typer.Option("--budget", help="stop improving after this many seconds")]
+RunsOption = Annotated[int, typer.Option("--runs", min=1, help="simulated test days")]
+
+
+class UsageError(ValueError):
+    """Something asked for on the command line that can't be had: exit 2."""
+
+
+@app.command()
+def machines(json: JsonOption = False) -> None:
+    """Lists the machines that come with excite."""
+    from model import machine, prediction
+
+    rows = []
+    for name in machine.shipped():
+        loaded = machine.load(name)
+        model = prediction.build(loaded)
+        rows.append(
+            {
+                "machine": name,
+                "title": loaded.title,
+                "problem": loaded.problem,
+                "inputs": list(model.inputs),
+                "parameters": list(model.base.names),
+                "groupings": {n: g for n in model.base.names if len(g := model.base.grouping(n)) > 1},
+                "invisible": list(model.base.invisible),
+            }
+        )
+    if json:
+        _show_json({"machines": rows})
+        return
+    table = _table("machine", "what it is", "problem", "parameters")
+    for row in rows:
+        table.add_row(row["machine"], row["title"], row["problem"] or "-", str(len(row["parameters"])))
+    _print(table)
+
+
+@app.command()
+def design(
+    machine: MachineArgument,
+    problem: ProblemOption = None,
+    duration: DurationOption = None,
+    objective: ObjectiveOption = "cond",
+    starts: StartsOption = 2,
+    seed: SeedOption = 0,
+    budget: BudgetOption = None,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Designs a test drive."""
+    from excite import folder
+
+    out = out or Path(f"results/design-{_stem(machine)}")
+    folder.claim(out)
+    with folder.writing(out) as place:
+        summary = _design(place, machine, problem, duration, objective, starts, seed, budget)
+    _finish(summary, out, json, _design_table)
+
+
+@app.command()
+def verify(
+    design_dir: Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="what `excite design` wrote")],
+    runs: RunsOption = 50,
+    method: MethodOption = None,
+    kit: KitOption = "full",
+    seed: SeedOption = 0,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Simulates a designed drive and identifies from it, many times: how true and how sure is each parameter."""
+    from excite import folder
+
+    name = _design_summary(design_dir)["machine"]
+    out = out or Path(f"results/verify-{name}")
+    folder.claim(out)
+    with folder.writing(out) as place:
+        summary = _verify(place, design_dir, runs, method, kit, seed)
+    _finish(summary, out, json, _verify_table)
+
+
+@app.command()
+def run(
+    machine: MachineArgument,
+    problem: ProblemOption = None,
+    duration: DurationOption = None,
+    objective: ObjectiveOption = "cond",
+    starts: StartsOption = 2,
+    seed: SeedOption = 0,
+    budget: BudgetOption = None,
+    runs: RunsOption = 20,
+    method: MethodOption = None,
+    kit: KitOption = "full",
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Designs a test drive and verifies it, in one go."""
+    from excite import folder
+
+    out = out or Path(f"results/run-{_stem(machine)}")
+    folder.claim(out)
+    with folder.writing(out) as place:
+        designed = place / "design"
+        designed.mkdir()
+        first = _design(designed, machine, problem, duration, objective, starts, seed, budget)
+        checked = place / "verify"
+        checked.mkdir()
+        second = _verify(checked, designed, runs, method, kit, seed)
+        summary = {"design": first, "verify": second}
+        (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+
+    def show(both: dict[str, Any]) -> None:
+        _design_table(both["design"])
+        _verify_table(both["verify"])
+
+    _finish(summary, out, json, show)
+
+
+@app.command()
+def simulate(
+    machine: MachineArgument,
+    profile: Annotated[Path, typer.Argument(metavar="PROFILE.csv", help="torques to drive")],
+    out: Annotated[Path, typer.Option("--out", help="log to write (.csv or .parquet)")],
+    seed: SeedOption = 0,
+    noise: Annotated[str, typer.Option("--noise", help="on, or off for exact signals")] = "on",
+    kit: KitOption = "full",
+    json: JsonOption = False,
+) -> None:
+    """Drives a profile in simulation and writes the log that the sensors would write."""
+    from excite import folder, log, sensors
+    from excite.simulate import simulate as drive
+
+    if noise not in ("on", "off"):
+        raise UsageError(f"--noise: {noise} is unknown, allowed: on, off")
+    _known("--kit", kit, sensors.KITS)
+    writers = {".csv": lambda t, p: t.to_csv(p, index=False), ".parquet": lambda t, p: t.to_parquet(p, index=False)}
+    _known("--out: ending", out.suffix, tuple(writers))
+    model = _model(machine)
+    torque, q0, nu0 = log.read_profile(profile, model)
+    with folder.writing_file(out) as path:
+        motion = drive(model, torque, q0=q0, nu0=nu0)
+        table = sensors.measure(model, motion, kit=kit, seed=seed, noise=noise == "on")
+        writers[out.suffix](table, path)
+    summary = {
+        "machine": model.machine.name,
+        "profile": str(profile),
+        "log": str(out),
+        "rows": len(table),
+        "columns": list(table.columns),
+        "duration_s": float(motion.t[-1]),
+        "kit": kit,
+        "noise": noise,
+        "seed": seed,
+    }
+    if json:
+        _show_json(summary)
+    else:
+        _print(f"{out}: {len(table)} rows, {motion.t[-1]:g} s, columns {', '.join(table.columns)}")
+
+
+@app.command()
+def identify(
+    machine: MachineArgument,
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="one log or several (.csv, .parquet, .mat)")],
+    method: MethodOption = None,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Estimates the parameters, with uncertainty, from logs."""
+    from excite import folder, identify, log
+
+    model = _model(machine)
+    out = out or Path(f"results/identify-{model.machine.name}")
+    folder.claim(out)
+    method = _method(method, model)
+    needs = identify.needed_sensors(model, method)
+    read = [log.read(path, model.machine, needs) for path in logs]
+    with _busy("identifying"):
+        estimate = identify.identify(model, read, method)
+    with folder.writing(out) as place:
+        from excite import report
+
+        summary = {
+            "machine": model.machine.name,
+            "logs": [str(p) for p in logs],
+            "method": estimate.method,
+            "parameters": {
+                n: {"unit": u, "value": v, "std": s, "std_percent": r}
+                for n, u, v, s, r in zip(
+                    estimate.names, estimate.units, estimate.value, estimate.std, estimate.std_percent, strict=True
+                )
+            },
+            "cond_w": estimate.cond_w,
+            "cond_phi": estimate.cond_phi,
+            "relative_error_percent": estimate.relative_error_percent,
+            "unidentifiable": list(estimate.unidentifiable),
+            "reasons": dict(estimate.unidentifiable),
+            "notes": list(estimate.notes),
+            "versions": _versions(),
+        }
+        for k, one in enumerate(read):
+            measured, predicted = identify.torques(model, one, estimate)
+            figure = report.identify_figure(model, one, measured, predicted, f"{model.machine.title}: {one.source}")
+            report.save(figure, place / (f"fit-{k + 1}.png" if len(read) > 1 else "fit.png"))
+        (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    _finish(summary, out, json, _identify_table)
+
+
+# ------------------------------------------------------------------------------------------------ the work
+
+
+def _design(
+    place: Path,
+    machine: str,
+    problem: str | None,
+    duration: float | None,
+    objective: str,
+    starts: int,
+    seed: int,
+    budget: float | None,
+) -> dict[str, Any]:
+    import time
+
+    from excite import design, folder, log, objective as objectives, report
+
+    model = _model(machine)
+    name, chosen = _problem(model.machine, problem, duration)
+    _known("--objective", objective, tuple(objectives.OBJECTIVES))
+    if budget is not None and not budget > 0:
+        raise UsageError(f"--budget: must be > 0 s (got {budget:g})")
+    begin = time.perf_counter()
+    with _bar("designing") as advance:
+        result = design.design(model, chosen, objective, starts, seed, budget, advance)
+    wall = time.perf_counter() - begin
+    log.profile(model, result.motion).to_csv(place / "profile.csv", index=False)
+    (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    summary = {
+        "machine": model.machine.name,
+        "problem": name,
+        "duration_s": float(chosen.duration_s),
+        "objective": objective,
+        "cond_phi": result.cond_phi,
+        "cond_w": result.cond_w,
+        "cond_phi_start": result.cond_phi_start,
+        "sigma_percent": _sigma(model, result),
+        "max_violation": result.max_violation,
+        "violations": dict(result.violations),
+        "starts": starts,
+        "seed": seed,
+        "wall_s": wall,
+        "versions": _versions(),
+    }
+    title = f"{model.machine.title}: {name}, cond(Phi) = {result.cond_phi:.2f}"
+    report.save(report.design_figure(model, chosen, result.motion, title), place / "design.png")
+    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    return summary
+
+
+def _sigma(model: Model, result: Design) -> dict[str, float]:
+    from excite import smoothing
+
+    covariance = smoothing.cramer_rao(model, result.motion, "full")
+    spread = 100 * covariance.diagonal() ** 0.5 / abs(model.nominal)
+    return dict(zip(model.base.names, spread.tolist(), strict=True))
+
+
+def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: str, seed: int) -> dict[str, Any]:
+    from excite import folder, identify, log, report, sensors
+    from excite.simulate import simulate as drive
+    from excite.verify import summary as table
+    from excite.verify import verify
+    from model.machine import Machine
+    from model.prediction import build
+
+    before = _design_summary(design_dir)
+    _known("--kit", kit, sensors.KITS)
+    stored = design_dir / "machine.json"
+    try:
+        model = build(Machine.model_validate_json(stored.read_bytes()))
+    except (OSError, ValueError):
+        raise UsageError(f"{stored}: missing or damaged, design again") from None
+    method = _method(method, model)
+    motion = drive(model, *_profile(log.read_profile(design_dir / "profile.csv", model)))
+    _check_needs(model, method, kit)
+    with _bar("verifying") as advance:
+        result = verify(model, motion, method, kit, runs, seed, progress=lambda done, total: advance(done, total, None))
+    if len(result.failures) == runs:
+        raise identify.NotIdentifiable(f"all {runs} runs failed, the first one: {result.failures[0]}")
+    summary = {
+        "machine": model.machine.name,
+        "problem": before.get("problem"),
+        "design": str(design_dir),
+        "runs": runs,
+        "method": method,
+        "kit": kit,
+        "seed": seed,
+        "failed": len(result.failures),
+        "failures": result.failures,
+        "parameters": table(result),
+        "biased": _biased(result),
+        "versions": _versions(),
+    }
+    title = f"{model.machine.title}: {runs} simulated runs, {method}, kit {kit}"
+    report.save(report.verify_figure(result, title), place / "verify.png")
+    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    return summary
+
+
+def _profile(read: tuple[Any, Any, Any]) -> tuple[Any, None, Any, Any]:
+    torque, q0, nu0 = read
+    return torque, None, q0, nu0
+
+
+def _biased(v: Verification) -> list[str]:
+    """Parameters whose mean error is more than half of what one run's interval admits and more than chance."""
+    from excite.verify import summary
+
+    return [
+        name
+        for name, row in summary(v).items()
+        if abs(float(row["bias_percent"])) > max(float(row["predicted_std_percent"]), 4 * float(row["bias_std_percent"]))
+    ]
+
+
+def _check_needs(model: Model, method: str, kit: str) -> None:
+    from excite import identify
+
+    have = {s.name for s in model.machine.sensors(kit)}
+    missing = [s.column for s in model.machine.sensors("full") if s.name in identify.needed_sensors(model, method) and s.name not in have]
+    if missing:
+        raise UsageError(f"--method {method} needs {', '.join(missing)}, which kit {kit} does not measure; try --kit full")
+
+
+def _model(name: str) -> Model:
+    from model import machine, prediction
+
+    return prediction.build(machine.load(name))
+
+
+def _problem(machine: Machine, name: str | None, duration: float | None) -> tuple[str, Problem]:
+    name = name or machine.problem
+    if name is None:
+        raise UsageError(f"{machine.name} has no design problem of its own, give its machine file one ([problems.NAME])")
+    _known("--problem", name, tuple(machine.problems))
+    problem = machine.problems[name]
+    if duration is not None:
+        if not 4 * float(problem.knot_s) <= duration <= 3600:
+            raise UsageError(f"--duration: must be between {4 * float(problem.knot_s):g} and 3600 s (got {duration:g})")
+        steps = round(duration / float(problem.knot_s))
+        longer = problem.duration_s.model_copy(update={"value": steps * float(problem.knot_s)})
+        problem = problem.model_copy(update={"duration_s": longer})
+    return name, problem
+
+
+def _method(method: str | None, model: Model) -> str:
+    from excite import identify
+
+    method = method or identify.RECOMMENDED
+    _known("--method", method, tuple(identify.METHODS))
+    return method
+
+
+def _known(option: str, value: str, allowed: Sequence[str]) -> None:
+    if value not in allowed:
+        raise UsageError(f"{option}: {value} is unknown, allowed: {', '.join(allowed)}")
+
+
+def _stem(machine: str) -> str:
+    return Path(machine).stem if machine.endswith(".toml") else machine
+
+
+def _design_summary(design_dir: Path) -> dict[str, Any]:
+    import json
+
+    from excite import folder
+
+    path = design_dir / folder.SUMMARY
+    if not path.is_file():
+        raise UsageError(f"{design_dir}: not a design (no {folder.SUMMARY} in it), make one with `excite design MACHINE`")
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        raise UsageError(f"{path}: damaged, design again") from None
+    if not isinstance(summary, dict) or "machine" not in summary or not (design_dir / "profile.csv").is_file():
+        raise UsageError(f"{design_dir}: not a design, make one with `excite design MACHINE`")
+    return summary
+
+
+def _versions() -> dict[str, str]:
+    from importlib.metadata import version
+
+    return {name: version(name) for name in ("excite", "casadi", "numpy", "scipy")}
+
+
+# ------------------------------------------------------------------------------------------------ what people see
+
+
+def _print(thing: object) -> None:
+    from rich.console import Console
+
+    Console(highlight=False, soft_wrap=True).print(thing)
+
+
+def _show_json(summary: dict[str, Any]) -> None:
+    from excite import folder
+
+    sys.stdout.write(folder.dump(summary))
+
+
+def _finish(summary: dict[str, Any], out: Path, json: bool, show: Callable[[dict[str, Any]], None]) -> None:
+    if json:
+        _show_json(summary)
+        return
+    show(summary)
+    _print(f"written to {out}/")
+
+
+def _table(*names: str) -> Any:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD)
+    for k, name in enumerate(names):
+        table.add_column(name, justify="left" if k == 0 or name == "what it is" else "right")
+    return table
+
+
+def _figure(value: object, digits: int = 4) -> str:
+    if value is None or (isinstance(value, float) and value != value):
+        return "-"
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+
+
+def _design_table(summary: dict[str, Any]) -> None:
+    kept = "all limits kept" if summary["max_violation"] <= 1e-3 else f"limits exceeded by {100 * summary['max_violation']:.2f} %"
+    _print(
+        f"{summary['machine']} {summary['problem']}: cond(Phi) = {summary['cond_phi']:.2f} (best start"
+        f" {summary['cond_phi_start']:.0f}), {summary['duration_s']:g} s, {kept}, designed in {summary['wall_s']:.1f} s"
+    )
+
+
+def _verify_table(summary: dict[str, Any]) -> None:
+    table = _table("parameter", "unit", "true", "mean", "bias %", "spread %", "predicted %", "coverage %")
+    for name, row in summary["parameters"].items():
+        table.add_row(
+            name,
+            row["unit"],
+            _figure(row["true"], 6),
+            _figure(row["mean"], 6),
+            _figure(row["bias_percent"], 3),
+            _figure(row["std_percent"], 3),
+            _figure(row["predicted_std_percent"], 3),
+            _figure(100 * row["coverage95"], 3),
+        )
+    _print(f"{summary['runs']} simulated runs, method {summary['method']}, kit {summary['kit']}")
+    _print(table)
+    if summary["biased"]:
+        _print(f"biased, the intervals do not hold: {', '.join(summary['biased'])}")
+    if summary["failed"]:
+        _print(f"{summary['failed']} runs gave no estimate")
+
+
+def _identify_table(summary: dict[str, Any]) -> None:
+    table = _table("parameter", "unit", "value", "std", "std %")
+    for name, row in summary["parameters"].items():
+        table.add_row(name, row["unit"], *(_figure(row[k], d) for k, d in (("value", 6), ("std", 3), ("std_percent", 3))))
+    _print(table)
+    _print(
+        f"method {summary['method']}: relative error {summary['relative_error_percent']:.2f} %,"
+        f" cond(W) = {summary['cond_w']:.2f}, cond(Phi) = {summary['cond_phi']:.2f}"
+    )
+    for name, reason in summary["reasons"].items():
+        _print(f"{name} can't be identified: {reason}")
+    for note in summary["notes"]:
+        _print(note)
+
+
+Advance = Callable[[int, int, float | None], None]
+
+
+@contextmanager
+def _bar(label: str) -> Iterator[Advance]:
+    """A progress bar on stderr, silent where that is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        task = progress.add_task(label, total=None)
+
+        def advance(done: int, total: int, best: float | None) -> None:
+            text = label if best is None else f"{label}, best so far {best:.2f}"
+            progress.update(task, completed=done, total=total, description=text)
+
+        yield advance
+
+
+@contextmanager
+def _busy(label: str) -> Iterator[None]:
+    with _bar(label):
+        yield
+
+
+# ------------------------------------------------------------------------------------------------ errors
+
+
+def main() -> None:
+    """Runs a command: exit 0 done, 1 could not be done, 2 bad input or usage; one clear line on stderr."""
+    try:
+        result = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+    except typer.TyperException as err:
+        _fail(" ".join(err.format_message().split()), 2)
+    except (KeyboardInterrupt, typer.Abort):
+        _fail("interrupted, nothing was written", 130)
+    except Exception as err:
+        code = _exit_code(err)
+        if code is None:
+            raise
+        _fail(" ".join(str(err).split()), code)
+    sys.exit(result if isinstance(result, int) else 0)
+
+
+def _exit_code(err: Exception) -> int | None:
+    """What an error means for the person who must act; None for a defect of ours, which shows its traceback."""
+    from excite.folder import FolderError
+    from excite.identify import NotIdentifiable
+    from excite.limit import InfeasibleError
+    from excite.log import LogError
+    from excite.simulate import SimulationError
+    from model.machine import MachineError
+
+    if isinstance(err, UsageError | MachineError | LogError | FolderError):
+        return 2
+    if isinstance(err, NotIdentifiable | InfeasibleError | SimulationError):
+        return 1
+    return None
+
+
+def _fail(message: str, code: int) -> None:
+    sys.stderr.write(f"excite: {message}\n")
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

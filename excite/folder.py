@@ -1,0 +1,116 @@
+"""Result folders and files that are whole or not there at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+SUMMARY = "summary.json"
+
+
+class FolderError(ValueError):
+    """An output place that can't be used: the message says why and what to do."""
+
+
+def claim(out: Path) -> None:
+    """Checks before the work that `out` can be written at its end. Raises FolderError.
+
+    A folder of ours (it has a summary.json) or an empty one may be replaced; anything else is left alone.
+    """
+    if out.is_file():
+        raise FolderError(f"{out}: is a file, --out needs a folder")
+    if out.is_dir() and any(out.iterdir()) and not (out / SUMMARY).is_file():
+        raise FolderError(f"{out}: exists and holds something else, choose another --out")
+    _writable(out)
+
+
+def _writable(out: Path) -> None:
+    parent = out.absolute().parent
+    while not parent.exists():
+        parent = parent.parent
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise FolderError(f"{out}: can't be written, {parent} is not a folder that you may write to")
+
+
+@contextmanager
+def writing(out: Path) -> Iterator[Path]:
+    """A folder to fill that becomes `out` when the block ends well, and vanishes otherwise.
+
+    A killed run leaves only a hidden folder beside it. Raises FolderError.
+    """
+    claim(out)
+    made = _make_parents(out)
+    partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
+    try:
+        yield partial
+        partial.chmod(0o755)
+        if out.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".old", dir=out.parent))
+            out.replace(old / out.name)
+            partial.replace(out)
+            shutil.rmtree(old)
+        else:
+            partial.replace(out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+        _remove_empty(made)
+
+
+@contextmanager
+def writing_file(out: Path) -> Iterator[Path]:
+    """A file to write that becomes `out` when the block ends well. Raises FolderError."""
+    if out.is_dir():
+        raise FolderError(f"{out}: is a folder, --out needs a file name")
+    _writable(out)
+    made = _make_parents(out)
+    handle, name = tempfile.mkstemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent)
+    os.close(handle)
+    try:
+        yield Path(name)
+        Path(name).chmod(0o644)
+        Path(name).replace(out)
+    finally:
+        Path(name).unlink(missing_ok=True)
+        _remove_empty(made)
+
+
+def _make_parents(out: Path) -> list[Path]:
+    """Makes the folders that `out` needs and returns those that were not there, the deepest first."""
+    missing = [p for p in out.absolute().parents if not p.exists()]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    return missing
+
+
+def _remove_empty(made: list[Path]) -> None:
+    """What failed leaves nothing behind, not even an empty folder."""
+    for path in made:
+        if any(path.iterdir()):
+            return
+        path.rmdir()
+
+
+def dump(summary: Mapping[str, Any]) -> str:
+    """Strict JSON: a number that is not finite is null, never NaN."""
+    return json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value

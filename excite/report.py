@@ -1,0 +1,174 @@
+"""Figures that answer at a glance: labelled, with units, readable in black and white."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from excite import limit
+from excite.log import Log
+from excite.simulate import Motion
+from excite.verify import Verification
+from model.machine import Problem
+from model.prediction import Model
+
+# Okabe-Ito, told apart by the colour-blind; line styles tell them apart in black and white.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes a figure at print resolution, without the clock in it: the same data give the same bytes."""
+    figure.savefig(path, dpi=160, metadata={"Software": None} if path.suffix == ".png" else None)
+
+
+def _lines(ax: Axes, t: np.ndarray, curves: Mapping[str, np.ndarray], label: str, legend: bool = True) -> None:
+    for k, (name, values) in enumerate(curves.items()):
+        ax.plot(t, values, color=COLOURS[k % 6], linestyle=STYLES[k % 6], linewidth=1.2, label=name)
+    ax.set_ylabel(label)
+    ax.grid(alpha=0.3)
+    if legend:
+        ax.legend(loc="upper right", fontsize=8, ncols=max(1, len(curves)), framealpha=0.85)
+
+
+def _bound(ax: Axes, value: float) -> None:
+    for y in (-value, value):
+        ax.axhline(y, color="black", linewidth=0.8, linestyle=(0, (2, 3)))
+
+
+def design_figure(model: Model, problem: Problem, motion: Motion, title: str) -> Figure:
+    """A drive: torques, speeds, joint angles and slips over time, the path, and how much of each limit is used."""
+    machine, t = model.machine, motion.t
+    moving = [b for b in machine.actuated if b.limit.position is not None]
+    slips = model.kinematics(motion.q.T, motion.nu.T)[1].full()
+    panels = 2 + bool(moving) + bool(len(slips))
+    figure = Figure(figsize=(11.5, 2.3 * max(panels, 3) + 0.6), layout="constrained")
+    left, right = figure.subfigures(1, 2, width_ratios=(1.7, 1))
+    axes = left.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
+    figure.suptitle(title)
+
+    # torques in per cent of their limit where the joints differ in size, so that one panel shows all
+    named = {f"{name} {b.where.replace('_', ' ')}": k for k, (name, b) in enumerate(zip(model.inputs, machine.actuated, strict=True))}
+    tops = [float(b.limit.torque or np.abs(motion.u[:, k]).max() or 1.0) for k, b in enumerate(machine.actuated)]
+    unit = "N m" if all(b.joint == "revolute" for b in machine.actuated) else "N"
+    curves = {
+        f"{n} (100 % = {tops[k]:g} {unit})": 100 * motion.u[:, k] / tops[k] for n, k in named.items()
+    }
+    _lines(axes[0], t, curves, "torque [% of limit]")
+    _bound(axes[0], 100)
+    axes[0].set_ylim(-115, 150)
+
+    speeds: dict[str, np.ndarray] = {}
+    if machine.planar:
+        speeds["forward speed"] = motion.nu[:, 0]
+    for b in machine.contacts:
+        assert b.contact is not None
+        rim = float(b.contact.radius) * motion.nu[:, model.coordinates.index(b.coordinates[0])]
+        speeds[f"rim of {b.name.replace('_', ' ')}"] = rim
+    if not speeds:
+        speeds = {c: motion.nu[:, k] for k, c in enumerate(model.coordinates)}
+    _lines(axes[1], t, speeds, "speed [m/s]" if machine.planar else "speed [m/s or rad/s]")
+    rims = [float(b.limit.rim_speed) for b in machine.contacts if b.limit.rim_speed is not None]
+    if rims:
+        _bound(axes[1], max(rims))
+    row = 2
+    if moving:
+        angles = {b.where.replace("_", " "): motion.q[:, model.coordinates.index(b.coordinates[0])] for b in moving}
+        _lines(axes[row], t, angles, "angle [rad]")
+        _bound(axes[row], max(float(b.limit.position) for b in moving if b.limit.position is not None))
+        row += 1
+    if len(slips):
+        _lines(axes[row], t, dict(zip(model.slips, slips, strict=True)), "slip [-]")
+        allowed = [float(b.contact.slip_limit) for b in machine.contacts if b.contact and b.contact.slip_limit]
+        if allowed:
+            _bound(axes[row], max(allowed))
+    axes[-1].set_xlabel("time [s]")
+
+    use = limit_use(model, problem, motion)
+    lane = machine.planar and f"y{machine.body[0].index}" in model.coordinates
+    if lane:
+        path, bars = right.subplots(2, 1, height_ratios=(1, 1.5))
+        _path(path, model, problem, motion)
+    else:
+        bars = right.subplots(1, 1)
+    names = list(use)[::-1]
+    bars.barh(names, [100 * use[n] for n in names], color=COLOURS[0], height=0.6)
+    bars.axvline(100, color="black", linewidth=0.8, linestyle=(0, (2, 3)))
+    bars.set_xlim(0, 115)
+    bars.set_xlabel("most used [% of the limit]")
+    bars.tick_params(axis="y", labelsize=8)
+    return figure
+
+
+def _path(ax: Axes, model: Model, problem: Problem, motion: Motion) -> None:
+    places = model.kinematics(motion.q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), len(model.machine.body))
+    for k, i in enumerate(problem.lane_points):
+        body = model.machine.find(i)
+        x, y, _ = places[:, :, model.machine.body.index(body)]
+        ax.plot(x, y, color=COLOURS[k], linestyle=STYLES[k], linewidth=1.2, label=body.name.replace("_", " "))
+        ax.plot(x[0], y[0], "o", color=COLOURS[k], markersize=5)
+    length, width = problem.lane_m
+    ax.plot(*np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]).T * [[length / 2], [width / 2]], "k:", linewidth=0.8)
+    ax.set_aspect("equal")
+    ax.set_xlabel("x on the lane [m]")
+    ax.set_ylabel("y [m]")
+    ax.legend(fontsize=8)
+    ax.grid(alpha=0.3)
+
+
+def limit_use(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
+    """How much of each limit the motion uses at most: 1 is the limit itself."""
+    du = np.gradient(motion.u, motion.t, axis=0)
+    use: dict[str, float] = {}
+    for bound in limit.limits(model, problem):
+        values = bound.expression(motion.q.T, motion.nu.T, motion.u.T, du.T).full()
+        low = values.min() / bound.low if bound.low < 0 else 0.0
+        use[bound.name] = float(max(values.max() / bound.high, low))
+    return use
+
+
+def verify_figure(v: Verification, title: str) -> Figure:
+    """Every run's error of every parameter against the spread that was predicted, and the coverage of 95 % intervals."""
+    n = len(v.names)
+    figure = Figure(figsize=(10, 1.6 + 0.34 * n), layout="constrained")
+    errors, cover = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
+    figure.suptitle(title)
+    places = np.arange(n)[::-1]
+    e, s = v.error_percent, np.nanmean(v.std_percent, axis=0)
+    for k, y in enumerate(places):
+        half = 1.96 * s[k]
+        errors.plot([-half, half], [y, y], color="0.75", linewidth=9, solid_capstyle="butt", zorder=1)
+        errors.plot(e[:, k], y + np.linspace(-0.25, 0.25, len(e)), ".", color=COLOURS[0], markersize=3, zorder=2)
+        errors.plot(np.nanmean(e[:, k]), y, "D", color=COLOURS[1], markeredgecolor="black", markersize=6, zorder=3)
+    errors.axvline(0, color="black", linewidth=0.8)
+    errors.set_xscale("symlog", linthresh=1.0, linscale=1.2)
+    errors.set_yticks(places, v.names)
+    errors.set_xlabel("error [% of the true value]")
+    errors.grid(axis="x", alpha=0.3)
+    errors.plot([], [], color="0.75", linewidth=9, label="95 % interval as predicted")
+    errors.plot([], [], ".", color=COLOURS[0], label="one run")
+    errors.plot([], [], "D", color=COLOURS[1], markeredgecolor="black", label="mean of the runs")
+    errors.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize=8, frameon=False)
+    cover.barh(places, 100 * np.nanmean(v.covered, axis=0), color=COLOURS[2], height=0.6)
+    cover.axvline(95, color="black", linewidth=0.8, linestyle="--")
+    cover.set_xlim(0, 100)
+    cover.set_xlabel("truth within the\n95 % interval [% of runs]")
+    return figure
+
+
+def identify_figure(model: Model, log: Log, measured: np.ndarray, prediction: np.ndarray, title: str) -> Figure:
+    """Measured and predicted torque of every driven joint, with the residual; (n_u, N) each."""
+    n = len(model.inputs)
+    figure = Figure(figsize=(10, 1.0 + 2.6 * n), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(n, 1, sharex=True, squeeze=False)[:, 0]
+    for k, body in enumerate(model.machine.actuated):
+        unit = "N m" if body.joint == "revolute" else "N"
+        curves = {"measured": measured[k], "predicted": prediction[k], "residual": measured[k] - prediction[k]}
+        _lines(axes[k], log.t, curves, f"{model.inputs[k]} {body.where.replace('_', ' ')} [{unit}]")
+    axes[-1].set_xlabel("time [s]")
+    return figure

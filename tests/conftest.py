@@ -1,0 +1,84 @@
+"""Machines and drives that many tests share."""
+
+from __future__ import annotations
+
+import os
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import pytest
+
+from excite.simulate import Motion, simulate
+from model import machine, prediction
+from model.prediction import Model
+
+SHARED = Path(__file__).parents[2] / "shared" / "data"
+
+
+def drive(model: Model, duration: float, seed: int, amplitude: dict[str, float]) -> np.ndarray:
+    """A lively drive (N, n_u) [N m] from rest to about rest: a few sines of each torque, faded in and out."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(duration * float(model.machine.sampling_hz)) + 1) / float(model.machine.sampling_hz)
+    torque = np.zeros((len(t), len(model.inputs)))
+    for k, name in enumerate(model.inputs):
+        for frequency in (0.05, 0.08, 0.13, 0.2, 0.3):
+            torque[:, k] += amplitude[name] * np.sin(2 * np.pi * frequency * t + rng.uniform(0, 2 * np.pi))
+    return torque * np.minimum(1, np.minimum(t, duration - t) / 2)[:, None]
+
+
+@pytest.fixture(scope="session")
+def va12() -> Model:
+    return prediction.build(machine.load("va12"))
+
+
+@pytest.fixture(scope="session")
+def straight() -> Model:
+    return prediction.build(machine.load("va12_straight"))
+
+
+@pytest.fixture(scope="session")
+def emps() -> Model:
+    return prediction.build(machine.load("emps"))
+
+
+@pytest.fixture(scope="session")
+def va12_motion(va12: Model) -> Motion:
+    return simulate(va12, drive(va12, 60, 0, {"u1": 1200, "u2": 4500, "u4": 1200}))
+
+
+@pytest.fixture(scope="session")
+def straight_motion(straight: Model) -> Motion:
+    return simulate(straight, drive(straight, 40, 1, {"u1": 1200, "u4": 1200}))
+
+
+@pytest.fixture(scope="session")
+def emps_data() -> Path:
+    path = SHARED / "emps" / "DATA_EMPS.mat"
+    if not path.is_file():
+        pytest.skip(f"the real EMPS measurements are not here ({path})")
+    return path
+
+
+class Excite(Protocol):
+    """Runs a command in this process: exit code, stdout, stderr."""
+
+    def __call__(self, *args: object) -> tuple[int, str, str]: ...
+
+
+@pytest.fixture
+def excite(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Excite:
+    from excite.__main__ import main
+
+    def run(*args: object) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["excite", *map(str, args)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        shown = capsys.readouterr()
+        return int(end.value.code or 0), shown.out, shown.err
+
+    return run
