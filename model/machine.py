@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+import reprlib
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -53,6 +54,8 @@ def _number(value: Any) -> Any:
 def _finite(value: float) -> float:
     if not math.isfinite(value):
         raise ValueError(f"must be a finite number (got {value})")
+    if value and not 1e-12 <= abs(value) <= 1e12:
+        raise ValueError(f"must be 0 or of a size between 1e-12 and 1e12, in SI units (got {value:g})")
     return value
 
 
@@ -135,12 +138,12 @@ class Inertia(Record):
     def _consistent(self) -> Inertia:
         if self.axisymmetric:
             if any(self.com.value):
-                raise ValueError("axisymmetric: the centre of mass must be at the frame's origin (com 0, 0, 0)")
+                raise ValueError("com: of an axisymmetric body is at its frame's origin, leave it out")
             for key in ("XY", "XZ", "YZ"):
                 if getattr(self, key).value:
-                    raise ValueError(f"axisymmetric: {key} must be 0")
+                    raise ValueError(f"{key}: of an axisymmetric body is 0, leave it out")
             if self.YY.value not in (0.0, self.XX.value):
-                raise ValueError("axisymmetric: leave YY out, it equals XX")
+                raise ValueError("YY: of an axisymmetric body equals XX, leave it out")
         return self
 
 
@@ -175,7 +178,7 @@ class Contact(Record):
     @model_validator(mode="after")
     def _law(self) -> Contact:
         if self.law == "exponential" and self.saturation_slip is None:
-            raise ValueError('law "exponential" needs saturation_slip (K / xi_s)')
+            raise ValueError('saturation_slip: law "exponential" needs it (K / xi_s)')
         return self
 
 
@@ -242,13 +245,14 @@ class Body(Record):
             if getattr(self, key).value:
                 raise ValueError(f"{key}: a {self.joint} joint's coordinate takes its place, leave it out")
         if self.joint in ("fixed", "planar") and (self.actuated or self.friction):
-            raise ValueError(f"a {self.joint} joint can't be actuated or have friction")
+            key = "actuated" if self.actuated else "friction"
+            raise ValueError(f"{key}: a {self.joint} joint can't be actuated or have friction")
         if self.actuated and self.friction is None:
-            raise ValueError("an actuated joint needs a [body.friction] table (Fv, Fs, u0, smoothing)")
+            raise ValueError("friction: an actuated joint needs a [body.friction] table (Fv, Fs, u0, smoothing)")
         if self.joint == "planar" and self.antecedent != "ground":
-            raise ValueError("a planar joint must stand on the ground")
+            raise ValueError(f'antecedent: a planar joint must stand on "ground" (got {self.antecedent})')
         if self.contact and self.joint != "revolute":
-            raise ValueError("a contact belongs to a roll or wheel: a revolute joint")
+            raise ValueError(f"contact: belongs to a roll or wheel, a revolute joint (got {self.joint})")
         return self
 
 
@@ -281,9 +285,9 @@ class Sensor(Record):
     @model_validator(mode="after")
     def _consistent(self) -> Sensor:
         if self.kind == "wheel" and (self.radius is None or self.lateral is None):
-            raise ValueError("a measuring wheel needs radius and lateral")
+            raise ValueError(f"{'lateral' if self.radius else 'radius'}: a measuring wheel needs radius and lateral")
         if self.kind != "wheel" and (self.radius is not None or self.lateral is not None):
-            raise ValueError("radius and lateral are for kind wheel only")
+            raise ValueError(f"{'radius' if self.radius else 'lateral'}: is for kind wheel only")
         if self.factor.value == 0:
             raise ValueError("factor: must not be 0")
         return self
@@ -405,7 +409,7 @@ class Machine(Record):
             if body.index in seen:
                 raise ValueError(f"body[{k}].index: {body.index} is given twice, every body needs its own")
             if k == 0 and body.antecedent != "ground":
-                raise ValueError("body[0].antecedent: the first body must stand on the ground")
+                raise ValueError(f'body[0].antecedent: the first body must stand on "ground" (got {body.antecedent})')
             if k > 0 and body.antecedent not in seen:
                 known = ", ".join(map(str, sorted(seen)))
                 raise ValueError(f"body[{k}].antecedent: {body.antecedent} is not a body above it, allowed: {known}")
@@ -528,14 +532,19 @@ def _one_line(path: Path, err: ValidationError) -> str:
         record = _record(first["loc"])
         number = record in (Quantity, Point)
         table = '{ value = ..., source = "..." }' if number else f"with keys {', '.join(record.model_fields)}"
-        message = f"must be a table {table} (got {got!r})"
+        message = f"must be a table {table} (got {reprlib.repr(got)})"
     elif kind == "value_error":
         message = message.removeprefix("Value error, ")
         inner, _, rest = message.partition(": ")
         if inner in _record(first["loc"]).model_fields:
             key, message = f"{key}.{inner}".lstrip("."), rest
-    elif not isinstance(got, dict | list | tuple):
-        message = f"{message[0].lower()}{message[1:]} (got {got!r})"
+    elif kind == "too_short":
+        message = f"must have at least {first['ctx']['min_length']} (got {first['ctx']['actual_length']})"
+    elif kind == "too_long":
+        message = f"must have at most {first['ctx']['max_length']} (got {first['ctx']['actual_length']})"
+    else:
+        message = message.replace("Input should be", "must be").replace("String should", "must")
+        message = message.replace("a valid tuple", "a list in brackets") + f" (got {reprlib.repr(got)})"
     more = len(err.errors()) - 1
     tail = f" (and {more} more)" if more else ""
     return " ".join(f"{path}: {key + ': ' if key else ''}{message}{tail}".split())
