@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import typer
+import typer  # noqa: E402
 
 if TYPE_CHECKING:
     from excite.design import Design
-    from excite.identify import Estimate
     from excite.verify import Verification
     from model.machine import Machine, Problem
     from model.prediction import Model
@@ -52,7 +51,7 @@ def machines(json: JsonOption = False) -> None:
     """Lists the machines that come with excite."""
     from model import machine, prediction
 
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name in machine.shipped():
         loaded = machine.load(name)
         model = prediction.build(loaded)
@@ -254,23 +253,23 @@ def _design(
     machine: str,
     problem: str | None,
     duration: float | None,
-    objective: str,
+    aim: str,
     starts: int,
     seed: int,
     budget: float | None,
 ) -> dict[str, Any]:
     import time
 
-    from excite import design, folder, log, objective as objectives, report
+    from excite import design, folder, log, objective, report
 
     model = _model(machine)
     name, chosen = _problem(model.machine, problem, duration)
-    _known("--objective", objective, tuple(objectives.OBJECTIVES))
+    _known("--objective", aim, tuple(objective.OBJECTIVES))
     if budget is not None and not budget > 0:
         raise UsageError(f"--budget: must be > 0 s (got {budget:g})")
     begin = time.perf_counter()
     with _bar("designing") as advance:
-        result = design.design(model, chosen, objective, starts, seed, budget, advance)
+        result = design.design(model, chosen, aim, starts, seed, budget, advance)
     wall = time.perf_counter() - begin
     log.profile(model, result.motion).to_csv(place / "profile.csv", index=False)
     (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
@@ -278,7 +277,7 @@ def _design(
         "machine": model.machine.name,
         "problem": name,
         "duration_s": float(chosen.duration_s),
-        "objective": objective,
+        "objective": aim,
         "cond_phi": result.cond_phi,
         "cond_w": result.cond_w,
         "cond_phi_start": result.cond_phi_start,
@@ -358,7 +357,8 @@ def _biased(v: Verification) -> list[str]:
     return [
         name
         for name, row in summary(v).items()
-        if abs(float(row["bias_percent"])) > max(float(row["predicted_std_percent"]), 4 * float(row["bias_std_percent"]))
+        if abs(float(row["bias_percent"]))
+        > max(float(row["predicted_std_percent"]), 4 * float(row["bias_std_percent"]))
     ]
 
 
@@ -366,9 +366,15 @@ def _check_needs(model: Model, method: str, kit: str) -> None:
     from excite import identify
 
     have = {s.name for s in model.machine.sensors(kit)}
-    missing = [s.column for s in model.machine.sensors("full") if s.name in identify.needed_sensors(model, method) and s.name not in have]
+    missing = [
+        s.column
+        for s in model.machine.sensors("full")
+        if s.name in identify.needed_sensors(model, method) and s.name not in have
+    ]
     if missing:
-        raise UsageError(f"--method {method} needs {', '.join(missing)}, which kit {kit} does not measure; try --kit full")
+        raise UsageError(
+            f"--method {method} needs {', '.join(missing)}, which kit {kit} does not measure; try --kit full"
+        )
 
 
 def _model(name: str) -> Model:
@@ -380,7 +386,9 @@ def _model(name: str) -> Model:
 def _problem(machine: Machine, name: str | None, duration: float | None) -> tuple[str, Problem]:
     name = name or machine.problem
     if name is None:
-        raise UsageError(f"{machine.name} has no design problem of its own, give its machine file one ([problems.NAME])")
+        raise UsageError(
+            f"{machine.name} has no design problem of its own, give its machine file one ([problems.NAME])"
+        )
     _known("--problem", name, tuple(machine.problems))
     problem = machine.problems[name]
     if duration is not None:
@@ -416,7 +424,9 @@ def _design_summary(design_dir: Path) -> dict[str, Any]:
 
     path = design_dir / folder.SUMMARY
     if not path.is_file():
-        raise UsageError(f"{design_dir}: not a design (no {folder.SUMMARY} in it), make one with `excite design MACHINE`")
+        raise UsageError(
+            f"{design_dir}: not a design (no {folder.SUMMARY} in it), make one with `excite design MACHINE`"
+        )
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
     except ValueError:
@@ -472,7 +482,11 @@ def _figure(value: object, digits: int = 4) -> str:
 
 
 def _design_table(summary: dict[str, Any]) -> None:
-    kept = "all limits kept" if summary["max_violation"] <= 1e-3 else f"limits exceeded by {100 * summary['max_violation']:.2f} %"
+    kept = (
+        "all limits kept"
+        if summary["max_violation"] <= 1e-3
+        else f"limits exceeded by {100 * summary['max_violation']:.2f} %"
+    )
     _print(
         f"{summary['machine']} {summary['problem']}: cond(Phi) = {summary['cond_phi']:.2f} (best start"
         f" {summary['cond_phi_start']:.0f}), {summary['duration_s']:g} s, {kept}, designed in {summary['wall_s']:.1f} s"
@@ -503,7 +517,9 @@ def _verify_table(summary: dict[str, Any]) -> None:
 def _identify_table(summary: dict[str, Any]) -> None:
     table = _table("parameter", "unit", "value", "std", "std %")
     for name, row in summary["parameters"].items():
-        table.add_row(name, row["unit"], *(_figure(row[k], d) for k, d in (("value", 6), ("std", 3), ("std_percent", 3))))
+        table.add_row(
+            name, row["unit"], *(_figure(row[k], d) for k, d in (("value", 6), ("std", 3), ("std_percent", 3)))
+        )
     _print(table)
     _print(
         f"method {summary['method']}: relative error {summary['relative_error_percent']:.2f} %,"

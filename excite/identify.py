@@ -69,9 +69,7 @@ class Samples:
     Y: np.ndarray
 
 
-def identify(
-    model: Model, logs: Sequence[Log], method: str = "ols", filter: Filter | None = None
-) -> Estimate:
+def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Filter | None = None) -> Estimate:
     """Base parameters from one log or several. Raises ValueError for an unknown method, NotIdentifiable."""
     if method not in METHODS:
         raise ValueError(f"method: {method} is unknown, allowed: {', '.join(METHODS)}")

@@ -119,11 +119,17 @@ def _read_mat(path: Path) -> pd.DataFrame:
     try:
         raw = scipy.io.loadmat(path)
     except (ValueError, TypeError, OSError, NotImplementedError, zipfile.BadZipFile, IndexError, KeyError) as err:
-        raise LogError(f"{path}: not a MATLAB file that can be read (v5 to v7): {' '.join(str(err).split())[:120]}") from None
+        raise LogError(
+            f"{path}: not a MATLAB file that can be read (v5 to v7): {' '.join(str(err).split())[:120]}"
+        ) from None
     columns = {
         k: np.ravel(v)
         for k, v in raw.items()
-        if not k.startswith("__") and isinstance(v, np.ndarray) and v.dtype.kind in "fiub" and 1 in v.shape and v.size > 1
+        if not k.startswith("__")
+        and isinstance(v, np.ndarray)
+        and v.dtype.kind in "fiub"
+        and 1 in v.shape
+        and v.size > 1
     }
     if not columns:
         raise LogError(f"{path}: holds no columns of numbers")
@@ -146,9 +152,7 @@ def _numbers(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
         what = "is empty or not a number (NaN)" if pd.isna(cell) else f"is {str(cell)[:30]!r}, not a finite number"
         count = int(bad.sum())
         more = f"; {count} such cells in this column" if count > 1 else ""
-        raise LogError(
-            f"{source}: row {k + 1}, column {column}: {what}{more}; cut the log there or repair the value"
-        )
+        raise LogError(f"{source}: row {k + 1}, column {column}: {what}{more}; cut the log there or repair the value")
     return values
 
 
@@ -158,7 +162,8 @@ def _check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
         k = int(np.argmax(dt <= 0))
         what = "goes back" if dt[k] < 0 else "stands still"
         raise LogError(
-            f"{source}: row {k + 2}, column {column}: time {what} ({t[k]:g} s, then {t[k + 1]:g} s); sort or cut the log"
+            f"{source}: row {k + 2}, column {column}: time {what} ({t[k]:g} s, then {t[k + 1]:g} s);"
+            " sort or cut the log"
         )
     typical = float(np.median(dt))
     if abs(typical * rate - 1) > 0.02:
@@ -196,10 +201,10 @@ def _check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Mach
                 f" {float(limit):g} rad; is the column in degrees?"
             )
     if sensor.kind == "torque" and body.limit.torque is not None:
-        top, limit = float(np.abs(values).max()), float(body.limit.torque)
-        if top > 10 * limit:
+        top, most = float(np.abs(values).max()), float(body.limit.torque)
+        if top > 10 * most:
             raise LogError(
-                f"{source}: column {sensor.column}: up to {top:.3g}, more than ten times the drive's limit {limit:g};"
+                f"{source}: column {sensor.column}: up to {top:.3g}, more than ten times the drive's limit {most:g};"
                 " is the unit right?"
             )
 
@@ -247,7 +252,9 @@ def torque_column(model: Model, name: str) -> str:
 
 def motion_columns(model: Model) -> list[tuple[str, str]]:
     """Columns of each coordinate and its velocity in a profile; a planar root's are along its own axes."""
-    own = dict(zip(model.machine.body[0].coordinates, ("v_m_s", "vy_m_s"), strict=False)) if model.machine.planar else {}
+    own = (
+        dict(zip(model.machine.body[0].coordinates, ("v_m_s", "vy_m_s"), strict=False)) if model.machine.planar else {}
+    )
     names = []
     for c in model.coordinates:
         unit = "rad" if c.startswith("theta") else "m"
@@ -265,7 +272,9 @@ def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray
     needed = ["t_s", *(torque_column(model, n) for n in model.inputs)]
     missing = [c for c in needed if c not in table.columns]
     if missing:
-        raise LogError(f"{source}: no column {', '.join(missing)}, {_columns(table)}; is this a profile of {model.machine.name}?")
+        raise LogError(
+            f"{source}: no column {', '.join(missing)}, {_columns(table)}; is this a profile of {model.machine.name}?"
+        )
     t = _numbers(table, "t_s", source)
     if len(t) < 2:
         raise LogError(f"{source}: only {len(t)} row, a profile needs at least 2")

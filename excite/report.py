@@ -47,17 +47,20 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
     slips = model.kinematics(motion.q.T, motion.nu.T)[1].full()
     panels = 2 + bool(moving) + bool(len(slips))
     figure = Figure(figsize=(11.5, 2.3 * max(panels, 3) + 0.6), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=(1.7, 1))
+    halves = figure.subfigures(1, 2, width_ratios=(1.7, 1))
+    assert isinstance(halves, np.ndarray)
+    left, right = halves
     axes = left.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
     figure.suptitle(title)
 
     # torques in per cent of their limit where the joints differ in size, so that one panel shows all
-    named = {f"{name} {b.where.replace('_', ' ')}": k for k, (name, b) in enumerate(zip(model.inputs, machine.actuated, strict=True))}
+    named = {
+        f"{name} {b.where.replace('_', ' ')}": k
+        for k, (name, b) in enumerate(zip(model.inputs, machine.actuated, strict=True))
+    }
     tops = [float(b.limit.torque or np.abs(motion.u[:, k]).max() or 1.0) for k, b in enumerate(machine.actuated)]
     unit = "N m" if all(b.joint == "revolute" for b in machine.actuated) else "N"
-    curves = {
-        f"{n} (100 % = {tops[k]:g} {unit})": 100 * motion.u[:, k] / tops[k] for n, k in named.items()
-    }
+    curves = {f"{n} (100 % = {tops[k]:g} {unit})": 100 * motion.u[:, k] / tops[k] for n, k in named.items()}
     _lines(axes[0], t, curves, "torque [% of limit]")
     _bound(axes[0], 100)
     axes[0].set_ylim(-115, 150)
@@ -112,7 +115,9 @@ def _path(ax: Axes, model: Model, problem: Problem, motion: Motion) -> None:
         ax.plot(x, y, color=COLOURS[k], linestyle=STYLES[k], linewidth=1.2, label=body.name.replace("_", " "))
         ax.plot(x[0], y[0], "o", color=COLOURS[k], markersize=5)
     length, width = problem.lane_m
-    ax.plot(*np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]).T * [[length / 2], [width / 2]], "k:", linewidth=0.8)
+    ax.plot(
+        *np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]).T * [[length / 2], [width / 2]], "k:", linewidth=0.8
+    )
     ax.set_aspect("equal")
     ax.set_xlabel("x on the lane [m]")
     ax.set_ylabel("y [m]")
@@ -132,7 +137,7 @@ def limit_use(model: Model, problem: Problem, motion: Motion) -> dict[str, float
 
 
 def verify_figure(v: Verification, title: str) -> Figure:
-    """Every run's error of every parameter against the spread that was predicted, and the coverage of 95 % intervals."""
+    """Every run's error of every parameter against the predicted spread, and the coverage of 95 % intervals."""
     n = len(v.names)
     figure = Figure(figsize=(10, 1.6 + 0.34 * n), layout="constrained")
     errors, cover = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))

@@ -103,9 +103,9 @@ def _integrate(step: ca.Function, state: np.ndarray, torque: np.ndarray, X: np.n
     left, slope, length = torque[0].copy(), torque[0].copy(), np.zeros(1)
     buffer, advance = step.buffer()
     for k, array in enumerate((start, left, slope, length, np.ascontiguousarray(X, float))):
-        buffer.set_arg(k, memoryview(array))
-    buffer.set_res(0, memoryview(end))
-    buffer.set_res(1, memoryview(error))
+        buffer.set_arg(k, array.data)
+    buffer.set_res(0, end.data)
+    buffer.set_res(1, error.data)
     history = np.empty((len(torque), len(state)))
     history[0] = state
     share = 1.0
@@ -126,7 +126,8 @@ def _integrate(step: ca.Function, state: np.ndarray, torque: np.ndarray, X: np.n
                 start[:] = end
             elif share < SMALLEST or not (np.isfinite(e) or share > 1e-3):
                 raise SimulationError(
-                    f"the motion diverges at t = {(k + done) * sample:.3f} s, state {np.array2string(start, precision=3)}:"
+                    f"the motion diverges at t = {(k + done) * sample:.3f} s,"
+                    f" state {np.array2string(start, precision=3)}:"
                     " check the torques and that the masses and inertias are positive"
                 )
             share *= min(4.0, max(0.1, 0.9 * (e + 1e-12) ** -0.25)) if np.isfinite(e) else 0.1

@@ -42,7 +42,9 @@ def test_exact_signals_give_exact_parameters(va12: Model, va12_motion: Motion) -
     """W X = Y on the simulated motion itself."""
     W = va12.stacked(va12_motion.q.T, va12_motion.nu.T, va12_motion.a.T).transpose(1, 0, 2)
     Y = np.zeros(W.shape[:2])
-    Y[list(va12.actuated)] = va12_motion.u.T + va12.nominal[[va12.base.names.index(f"{u}0") for u in va12.inputs]][:, None]
+    Y[list(va12.actuated)] = (
+        va12_motion.u.T + va12.nominal[[va12.base.names.index(f"{u}0") for u in va12.inputs]][:, None]
+    )
     assert np.abs(np.einsum("rnp,p->rn", W, va12.nominal) - Y).max() < 1e-9 * np.abs(Y).max()
     estimate = identify.least_squares(va12, W, Y, "ols")
     assert np.abs(estimate.value / va12.nominal - 1).max() < 1e-9

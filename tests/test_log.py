@@ -119,9 +119,7 @@ def table(va12: Model, va12_motion: Motion) -> pd.DataFrame:
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_broken_log_is_one_clear_line(
-    name: str, table: pd.DataFrame, tmp_path: Path, excite: Excite
-) -> None:
+def test_broken_log_is_one_clear_line(name: str, table: pd.DataFrame, tmp_path: Path, excite: Excite) -> None:
     make, words = BROKEN[name]
     (tmp_path / "in").mkdir()
     path = make(table.copy(), tmp_path / "in")
@@ -138,9 +136,7 @@ def test_broken_log_is_one_clear_line(
 
 
 @pytest.mark.parametrize("ending", [".csv", ".parquet", ".mat"])
-def test_every_format_carries_the_same_log(
-    ending: str, va12: Model, table: pd.DataFrame, tmp_path: Path
-) -> None:
+def test_every_format_carries_the_same_log(ending: str, va12: Model, table: pd.DataFrame, tmp_path: Path) -> None:
     path = tmp_path / f"log{ending}"
     if ending == ".csv":
         table.to_csv(path, index=False)
@@ -174,10 +170,13 @@ def test_profile_goes_round(va12: Model, va12_motion: Motion, tmp_path: Path) ->
 def test_profile_has_the_contracts_columns(
     va12: Model, va12_motion: Motion, straight: Model, straight_motion: Motion
 ) -> None:
-    assert list(log.profile(va12, va12_motion)) == (
-        "t_s u1_Nm u2_Nm u4_Nm x0_m y0_m theta0_rad theta1_rad theta2_rad theta4_rad v_m_s vy_m_s dtheta0_rad_s"
-        " dtheta1_rad_s dtheta2_rad_s dtheta4_rad_s"
-    ).split()
+    assert (
+        list(log.profile(va12, va12_motion))
+        == (
+            "t_s u1_Nm u2_Nm u4_Nm x0_m y0_m theta0_rad theta1_rad theta2_rad theta4_rad v_m_s vy_m_s dtheta0_rad_s"
+            " dtheta1_rad_s dtheta2_rad_s dtheta4_rad_s"
+        ).split()
+    )
     assert list(log.profile(straight, straight_motion)) == (
         "t_s u1_Nm u4_Nm x0_m theta1_rad theta4_rad v_m_s dtheta1_rad_s dtheta4_rad_s".split()
     )

@@ -182,9 +182,7 @@ def test_same_seed_same_log(va12: Model, va12_motion: Motion) -> None:
         ("straight", "full", "t_s theta1_rad theta4_rad thetal_rad thetar_rad u1_Nm u4_Nm"),
     ],
 )
-def test_kits_have_the_contracts_columns(
-    request: pytest.FixtureRequest, fixture: str, kit: str, columns: str
-) -> None:
+def test_kits_have_the_contracts_columns(request: pytest.FixtureRequest, fixture: str, kit: str, columns: str) -> None:
     model = request.getfixturevalue(fixture)
     motion = simulate(model, np.zeros((10, len(model.inputs))))
     assert list(sensors.measure(model, motion, kit=kit)) == columns.split()

@@ -1,0 +1,66 @@
+"""Verification: honest bookkeeping, the same whatever the number of workers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from excite.simulate import Motion
+from excite.verify import Verification, summary, verify
+from model.prediction import Model
+
+
+@pytest.fixture(scope="module")
+def four(straight: Model, straight_motion: Motion) -> Verification:
+    return verify(straight, straight_motion, "ols", "paper", runs=4, seed=7, jobs=1)
+
+
+def test_same_seed_same_numbers_on_any_number_of_workers(
+    straight: Model, straight_motion: Motion, four: Verification
+) -> None:
+    side_by_side = verify(straight, straight_motion, "ols", "paper", runs=4, seed=7, jobs=2)
+    assert np.array_equal(four.value, side_by_side.value)
+    assert np.array_equal(four.std, side_by_side.std)
+
+
+def test_runs_differ_and_more_runs_keep_the_first_ones(
+    straight: Model, straight_motion: Motion, four: Verification
+) -> None:
+    assert len(np.unique(four.value[:, 0])) == 4
+    two = verify(straight, straight_motion, "ols", "paper", runs=2, seed=7, jobs=1)
+    assert np.array_equal(two.value, four.value[:2])
+
+
+def test_progress_is_told(straight: Model, straight_motion: Motion) -> None:
+    told: list[tuple[int, int]] = []
+    verify(
+        straight, straight_motion, "ols", "paper", 3, jobs=1, progress=lambda done, total: told.append((done, total))
+    )
+    assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_summary_is_what_its_names_say() -> None:
+    """Three estimates of a parameter whose truth is -100, one failed run."""
+    v = Verification(
+        "m",
+        "full",
+        ("K",),
+        ("N",),
+        np.array([-100.0]),
+        np.array([100.0]),
+        np.array([[-90.0], [-100.0], [-104.0], [np.nan]]),
+        np.array([[2.0], [2.0], [2.0], [np.nan]]),
+        np.full(4, 1.96),
+        {3: "no"},
+    )
+    row = summary(v)["K"]
+    assert row["mean"] == pytest.approx(-98)
+    assert row["bias_percent"] == pytest.approx(-2)  # too small in size
+    assert row["std_percent"] == pytest.approx(np.std([-10, 0, 4], ddof=1))
+    assert row["predicted_std_percent"] == pytest.approx(2)
+    assert row["coverage95"] == pytest.approx(1 / 3)
+
+
+def test_no_runs_is_refused(straight: Model, straight_motion: Motion) -> None:
+    with pytest.raises(ValueError, match="at least 1"):
+        verify(straight, straight_motion, "ols", runs=0)
