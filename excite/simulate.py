@@ -15,7 +15,8 @@ import numpy as np
 
 from model.prediction import Model
 
-TOLERANCE = 3e-8  # of one step, relative to each state's typical size
+TOLERANCE = 3e-7  # of one step, relative to each state's typical size
+FLOOR = 0.1
 SMALLEST = 1e-7  # share of a sample below which a step is not split further
 
 # RODAS: (I/(gamma h) - J) U_i = f(y + sum a_ij U_j) + sum c_ij U_j / h + d_i h df/dt, y1 = y + sum a_6j U_j + U_6
@@ -109,15 +110,17 @@ def _integrate(step: ca.Function, state: np.ndarray, torque: np.ndarray, X: np.n
     history = np.empty((len(torque), len(state)))
     history[0] = state
     share = 1.0
+    slopes = np.diff(torque, axis=0) / sample
     for k in range(len(torque) - 1):
-        slope[:] = (torque[k + 1] - torque[k]) / sample
-        start[:] = history[k]
+        slope[:] = slopes[k]
+        left[:] = torque[k]
         done = 0.0
         while done < 1.0:
             share = min(share, 1.0 - done)
             if 1.0 - done - share < 1e-9:
                 share = 1.0 - done
-            left[:] = torque[k] + slope * (sample * done)
+            if done > 0.0:
+                left[:] = torque[k] + slope * (sample * done)
             length[0] = share * sample
             advance()
             e = float(error[0])
@@ -175,7 +178,7 @@ def _step(model: Model) -> tuple[ca.Function, int]:
         stages.append(_solve(lower, upper, known))
     end = ca.SX(y)
     end[core] = at + stages[-1]
-    error = ca.norm_inf(stages[-1] / (1.0 + ca.fabs(y[core]))) / TOLERANCE
+    error = ca.norm_inf(stages[-1] / (FLOOR + ca.fabs(y[core]))) / TOLERANCE
 
     # The heading must be at its end before the position that turns with it: the order of the table does that
     # when taken backwards, since (x, y) come before theta.

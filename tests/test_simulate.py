@@ -38,10 +38,10 @@ def worst(a: np.ndarray, b: np.ndarray) -> float:
     return float((np.abs(a - b).max(axis=0) / np.abs(b).max(axis=0)).max())
 
 
-@pytest.mark.parametrize(("name", "duration"), [("va12", 5), ("va12_straight", 5)])
+@pytest.mark.parametrize(("name", "duration"), [("va12", 8), ("va12_straight", 8)])
 def test_motion_agrees_with_a_tight_integration(name: str, duration: float) -> None:
     model = prediction.build(machine.load(name))
-    torque = drive(model, duration, 3, {"u1": 1500, "u2": 5000, "u4": 1500})
+    torque = drive(model, duration, 3, {"u1": 2500, "u2": 8000, "u4": 2500})
     motion = simulate(model, torque)
     q, nu = tight(model, torque, motion.q[0])
     assert worst(motion.q, q) < 1e-6
