@@ -7,6 +7,7 @@ Jacobian and splits it where its error estimate asks for that: at reversals, whe
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -80,47 +81,73 @@ def simulate(
         raise ValueError(f"torque: needs shape (N >= 2, {n_u}) for {', '.join(model.inputs)}, got {torque.shape}")
     if not np.isfinite(torque).all():
         raise ValueError(f"torque: not a finite number in row {int(np.argmin(np.isfinite(torque).all(axis=1)))}")
-    X = model.nominal if X is None else np.asarray(X, float)
+    return respond(model, len(torque), lambda k, state: torque[k], X, q0, nu0)
+
+
+def respond(
+    model: Model,
+    samples: int,
+    torque: Callable[[int, np.ndarray], np.ndarray],
+    X: np.ndarray | None = None,
+    q0: np.ndarray | None = None,
+    nu0: np.ndarray | None = None,
+) -> Motion:
+    """The motion under torques that answer to it: torque(k, state) gives (n_u,) [N m] at sample k.
+
+    For sample 0 and k >= 1 the state is that of samples 0 and k - 1: q, nu, angles of the measuring wheels. Arguments
+    and errors otherwise as in `simulate`.
+    """
+    parameters = np.ascontiguousarray(model.nominal if X is None else X, float)
+    n_u, n_q = len(model.inputs), len(model.coordinates)
     rate = float(model.machine.sampling_hz)
     step, n_w = _step(model)
     state = np.zeros(2 * n_q + n_w)
     state[:n_q] = 0.0 if q0 is None else q0
     state[n_q : 2 * n_q] = 0.0 if nu0 is None else nu0
-    history = _integrate(step, state, torque, X, 1.0 / rate)
+    driven = np.empty((samples, n_u))
+    history = _integrate(step, state, driven, torque, parameters, 1.0 / rate)
     q, nu, wheels = np.split(history, [n_q, 2 * n_q], axis=1)
     # an L-stable step damps even what must blow up, so a mass matrix that isn't one has to be looked for
-    solid = (model.pivots(q.T, X).full() > 0).all(axis=0)
+    solid = (model.pivots(q.T, parameters).full() > 0).all(axis=0)
     if not solid.all():
         raise SimulationError(
             f"the mass matrix is not positive definite at t = {int(np.argmin(solid)) / rate:g} s: masses and inertias"
             " must be physically possible, check the parameters"
         )
-    a = model.acceleration(q.T, nu.T, torque.T, X).full().T
-    return Motion(np.arange(len(torque)) / rate, q, nu, a, torque, wheels)
+    a = model.acceleration(q.T, nu.T, driven.T, parameters).full().T
+    return Motion(np.arange(samples) / rate, q, nu, a, driven, wheels)
 
 
-def _integrate(step: ca.Function, state: np.ndarray, torque: np.ndarray, X: np.ndarray, sample: float) -> np.ndarray:
+def _integrate(
+    step: ca.Function,
+    state: np.ndarray,
+    driven: np.ndarray,
+    torque: Callable[[int, np.ndarray], np.ndarray],
+    parameters: np.ndarray,
+    sample: float,
+) -> np.ndarray:
     start, end, error = state.copy(), np.zeros_like(state), np.zeros(1)
-    left, slope, length = torque[0].copy(), torque[0].copy(), np.zeros(1)
+    left, slope, length = np.zeros(driven.shape[1]), np.zeros(driven.shape[1]), np.zeros(1)
     buffer, advance = step.buffer()
-    for k, array in enumerate((start, left, slope, length, np.ascontiguousarray(X, float))):
+    for k, array in enumerate((start, left, slope, length, parameters)):
         buffer.set_arg(k, array.data)
     buffer.set_res(0, end.data)
     buffer.set_res(1, error.data)
-    history = np.empty((len(torque), len(state)))
+    history = np.empty((len(driven), len(state)))
     history[0] = state
+    driven[0] = torque(0, state)
     share = 1.0
-    slopes = np.diff(torque, axis=0) / sample
-    for k in range(len(torque) - 1):
-        slope[:] = slopes[k]
-        left[:] = torque[k]
+    for k in range(len(driven) - 1):
+        driven[k + 1] = torque(k + 1, history[k])
+        left[:] = driven[k]
+        slope[:] = (driven[k + 1] - driven[k]) / sample
         done = 0.0
         while done < 1.0:
             share = min(share, 1.0 - done)
             if 1.0 - done - share < 1e-9:
                 share = 1.0 - done
             if done > 0.0:
-                left[:] = torque[k] + slope * (sample * done)
+                left[:] = driven[k] + slope * (sample * done)
             length[0] = share * sample
             advance()
             e = float(error[0])
