@@ -249,6 +249,13 @@ def noted(estimate: Estimate, *notes: str) -> Estimate:
     return replace(estimate, notes=estimate.notes + notes)
 
 
+def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
+    """The recommended method, joint smoothing; in a room of its own, which builds on this one."""
+    from excite import smoothing
+
+    return smoothing.joint(model, logs, filter)
+
+
 Method = Callable[[Model, Sequence[Log], Filter], Estimate]
-METHODS: dict[str, Method] = {"ols": ols}
+METHODS: dict[str, Method] = {"ols": ols, "joint": joint}
 RECOMMENDED = "ols"

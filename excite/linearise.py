@@ -1,0 +1,296 @@
+"""A machine along a trajectory: where each sample leads, how that moves with state, torques and parameters.
+
+All samples of a log in batched calls. Where a sample leads is integrated by `simulate`'s own step; how it moves needs
+three digits only (it weighs residuals, it doesn't make them), so the variational equation is solved by one step of
+Radau IIA of order 3 (Hairer and Wanner, "Solving Ordinary Differential Equations II", IV.5): L-stable, as the stiff
+contact at standstill demands, and exact in the steady state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+
+from excite.simulate import _step
+from model.machine import Sensor
+from model.prediction import Model
+
+ACCURACY = 30.0  # of an interval, in units of simulate's tolerance: 1e-6, far below what a sample's torque noise does
+CHUNKS = (500, 25)  # samples in one call of a mapped function
+SPLITS = 10  # an interval is halved at most this often
+
+
+class Batch:
+    """A CasADi function on N samples at once; inputs named in `shared` are the same for all of them.
+
+    Called with (N, size) arrays, or (size,) where shared; gives (N, rows, columns) arrays.
+    """
+
+    def __init__(self, function: ca.Function, shared: Sequence[int] = ()) -> None:
+        outputs = [ca.densify(e) for e in function.call(function.sx_in())]
+        self.function = ca.Function(function.name(), function.sx_in(), outputs, {"cse": True})
+        self.shared = tuple(shared)
+        self.shapes = [self.function.size_out(k) for k in range(self.function.n_out())]
+        name = self.function.name()
+        self.mapped = {n: self.function.map(name, "serial", n, list(self.shared), []) for n in CHUNKS}
+
+    def __call__(self, *arguments: np.ndarray) -> list[np.ndarray]:
+        N = next(len(a) for k, a in enumerate(arguments) if k not in self.shared)
+        results = [np.empty((N, columns, rows)) for rows, columns in self.shapes]
+        held = [np.ascontiguousarray(a, float) for a in arguments]
+        done = 0
+        for size in CHUNKS:
+            while N - done >= size or (size == CHUNKS[-1] and done < N):
+                self._chunk(held, results, done, min(size, N - done), size)
+                done += min(size, N - done)
+        return [r.transpose(0, 2, 1) for r in results]
+
+    def _chunk(self, held: list[np.ndarray], results: list[np.ndarray], at: int, count: int, size: int) -> None:
+        """Samples at .. at + count by the function mapped to `size` samples; the last one fills up what is missing."""
+        buffer, evaluate = self.mapped[size].buffer()
+        keep = []
+        for k, a in enumerate(held):
+            if k not in self.shared:
+                a = a[at : at + count]
+                if count < size:
+                    a = np.concatenate([a, np.repeat(a[-1:], size - count, axis=0)])
+            keep.append(a)
+            buffer.set_arg(k, _memory(a))
+        whole = [r[at : at + count] if count == size else np.empty((size, *r.shape[1:])) for r in results]
+        for k, r in enumerate(whole):
+            if r.size:
+                buffer.set_res(k, _memory(r))
+        evaluate()
+        if count < size:
+            for r, w in zip(results, whole, strict=True):
+                r[at : at + count] = w[:count]
+
+
+def _memory(a: np.ndarray) -> memoryview:
+    return a.reshape(-1).data
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """The states of a machine that a set of sensors and its forces depend on.
+
+    State s (n,): first the `core`, the coordinates that forces depend on and the velocities, then measured angles that
+    are integrals of these. `index` (n,): their places in simulate's state (q, nu, wheels), whose size is `full`.
+    `sensors`: those with a reading h(s), in order; `angle`: the state that each encoder reads, -1 for another sensor.
+    `offsets` (n_u, n_base) takes the torque offsets u0 out of X. `pushed`: rows of the unactuated coordinates.
+    """
+
+    model: Model
+    sensors: tuple[Sensor, ...]
+    core: int
+    index: np.ndarray
+    full: int
+    angle: tuple[int, ...]
+    offsets: np.ndarray
+    pushed: tuple[int, ...]
+    slopes: Batch
+    readings: Batch
+    step: Batch
+    pivots: Batch
+
+    @property
+    def n(self) -> int:
+        return len(self.index)
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """Derivatives of the end of each of K intervals: by its start A (K, n, n), the torques at its two ends B0, B1
+    (K, n, n_u), base parameters at fixed delivered torque X (K, n, n_base), a constant force on each pushed row
+    F (K, n, n_pushed)."""
+
+    A: np.ndarray
+    B0: np.ndarray
+    B1: np.ndarray
+    X: np.ndarray
+    F: np.ndarray
+
+
+@lru_cache(maxsize=16)
+def chart(model: Model, names: tuple[str, ...]) -> Chart:
+    """The chart of a model and the sensors of these names; torques and positions on the ground are not states."""
+    machine = model.machine
+    n_q, n_u = len(model.coordinates), len(model.inputs)
+    q, nu, _ = model.symbols()
+    u, X = ca.SX.sym("u", n_u), ca.SX.sym("X", len(model.base.names))
+    dq, _, wheel_rates, _, speeds, _ = model.kinematics(q, nu)
+    wheel_names = [s.name for s in machine.sensor if s.kind == "wheel"]
+    wheels = ca.SX.sym("w", len(wheel_names))
+    full = ca.vertcat(q, nu, wheels)
+
+    M, bias = model.equations(q, nu, X)
+    pushed = tuple(k for k in range(n_q) if k not in model.actuated)
+    force = ca.SX.sym("F", len(pushed))
+    load = ca.SX(n_q, 1)
+    for k, row in enumerate(model.actuated):
+        load[row] += u[k]
+    for k, row in enumerate(pushed):
+        load[row] += force[k]
+    D, L, order = ca.ldl(M)
+    a = ca.ldl_solve(load - bias, D, L, order)
+    rates = ca.vertcat(dq, a, wheel_rates)
+    core = _felt(model) + list(range(n_q, 2 * n_q))
+
+    sensors = tuple(s for s in machine.sensors("full") if s.name in names and s.kind not in ("torque", "x", "y"))
+    index, angle, h = list(core), [], []
+    for s in sensors:
+        if s.kind in ("angle", "wheel"):
+            at = (
+                model.coordinates.index(machine.find(s.body).coordinates[0])
+                if s.kind == "angle"
+                else 2 * n_q + wheel_names.index(s.name)
+            )
+            if at not in index:
+                index.append(at)
+            angle.append(index.index(at))
+            h.append(full[at])
+        else:
+            angle.append(-1)
+            body = machine.body.index(machine.find(s.body))
+            turn = machine.body[0].coordinates[2]
+            h.append(speeds[1, body] if s.kind == "lateral_speed" else nu[model.coordinates.index(turn)])
+    state = ca.SX.sym("s", len(index))
+    where = ca.SX.zeros(full.numel(), 1)
+    for k, at in enumerate(index):
+        where[at] = state[k]
+
+    def along(e: ca.SX) -> ca.SX:
+        """An expression of the full state, in terms of the chart's."""
+        return ca.substitute([e], [full], [where])[0]
+
+    zero = ca.SX.zeros(len(pushed), 1)
+    own = [
+        ca.substitute([e], [force], [zero])[0]
+        for e in (
+            ca.jacobian(rates[core], full[core]),
+            ca.jacobian(rates[core], u),
+            ca.jacobian(rates[core], X),
+            ca.jacobian(rates[core], force),
+            ca.jacobian(rates[index[len(core) :]], full[core]),
+        )
+    ]
+    speed = ca.vertcat(*[rates[index[k]] if k >= 0 else ca.SX(0) for k in angle])
+    seen = ca.vertcat(*h)
+    slopes = ca.Function("slopes", [state, u, X], [along(e) for e in own])
+    readings = ca.Function(
+        "readings",
+        [state],
+        [along(seen), along(ca.jacobian(seen, full[index])), along(speed), along(ca.jacobian(speed, full[index]))],
+    )
+    step, _ = _step(model)
+    table = np.array([model.base.standard.index(f"u{b.index}0") for b in machine.actuated])
+    return Chart(
+        model,
+        sensors,
+        len(core),
+        np.array(index),
+        full.numel(),
+        tuple(angle),
+        model.expand[table],
+        pushed,
+        Batch(slopes, (2,)),
+        Batch(readings),
+        Batch(step, (3, 4)),
+        Batch(ca.Function("pivots", [state, X], [along(ca.vec(D))]), (1,)),
+    )
+
+
+def _felt(model: Model) -> list[int]:
+    """Coordinates that the forces depend on. By numbers: a roll's own angle drops out only as cos^2 + sin^2 = 1."""
+    q, nu, a = model.symbols()
+    p = ca.DM(model.expand @ model.nominal)
+    slope = ca.Function("slope", [q, nu, a], [ca.jacobian(model.predict(q, nu, a, p), q)])
+    rng = np.random.default_rng(0)
+    size, change = np.zeros(len(model.coordinates)), np.zeros(len(model.coordinates))
+    for _ in range(4):
+        at = [rng.uniform(-1, 1, len(model.coordinates)) for _ in range(3)]
+        change = np.maximum(change, np.abs(slope(*at).full()).max(axis=0))
+        size = np.maximum(size, np.abs(model.predict(*at, p).full()).max())
+    return [k for k in range(len(size)) if change[k] > 1e-9 * size[k]]
+
+
+def advance(chart: Chart, s: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """Where N states s (N, n) under torques u (N, n_u) [N m], linear between samples, lead: (N - 1, n).
+
+    Not finite where an interval can't be integrated.
+    """
+    sample = 1 / float(chart.model.machine.sampling_hz)
+    start = np.zeros((len(s) - 1, chart.full))
+    start[:, chart.index] = s[:-1]
+    with np.errstate(all="ignore"):
+        end = _intervals(chart, start, u[:-1], np.diff(u, axis=0) / sample, sample, X, SPLITS)
+    return end[:, chart.index]
+
+
+def _intervals(
+    chart: Chart, start: np.ndarray, u: np.ndarray, rate: np.ndarray, h: float, X: np.ndarray, splits: int
+) -> np.ndarray:
+    """One step over h; intervals with too large an error in two halves."""
+    end, error = chart.step(start, u, rate, np.array([h]), X)
+    end = end[:, :, 0]
+    bad = np.flatnonzero(~(error[:, 0, 0] < ACCURACY))
+    if len(bad) and splits:
+        middle = _intervals(chart, start[bad], u[bad], rate[bad], h / 2, X, splits - 1)
+        end[bad] = _intervals(chart, middle, u[bad] + rate[bad] * (h / 2), rate[bad], h / 2, X, splits - 1)
+    return end
+
+
+def differentiate(chart: Chart, s: np.ndarray, u: np.ndarray, X: np.ndarray, force: bool = False) -> Slopes:
+    """How the ends of the N - 1 intervals between states s (N, n) under torques u (N, n_u) move, to about 1e-3.
+
+    F is filled with `force` only.
+    """
+    h = 1 / float(chart.model.machine.sampling_hz)
+    n, c, n_u, n_p = chart.n, chart.core, u.shape[1], len(X)
+    J, B, JX, JF, R = chart.slopes(s, u, X)
+    n_f = JF.shape[2] if force else 0
+    K = len(s) - 1
+
+    def between(e: np.ndarray) -> np.ndarray:
+        """One third into the interval, by linear interpolation."""
+        return e[:-1] * (2 / 3) + e[1:] * (1 / 3)
+
+    J1, J2 = between(J), J[1:]
+    system = np.empty((K, 2 * c, 2 * c))
+    system[:, :c, :c], system[:, :c, c:] = J1 * (-h * 5 / 12), J2 * (h / 12)
+    system[:, c:, :c], system[:, c:, c:] = J1 * (-h * 3 / 4), J2 * (-h / 4)
+    system[:, range(2 * c), range(2 * c)] += 1.0
+    # Columns: start, torque at the start (a hat that falls), at the end (a hat that rises), parameters, forces.
+    width = c + 2 * n_u + n_p + n_f
+    first, second = np.zeros((K, c, width)), np.zeros((K, c, width))
+    B1 = between(B)
+    first[:, :, c : c + n_u], first[:, :, c + n_u : c + 2 * n_u] = B1 * (2 / 3), B1 * (1 / 3)
+    second[:, :, c + n_u : c + 2 * n_u] = B[1:]
+    rest = c + 2 * n_u
+    first[:, :, rest : rest + n_p], second[:, :, rest : rest + n_p] = between(JX), JX[1:]
+    if force:
+        first[:, :, rest + n_p :], second[:, :, rest + n_p :] = between(JF), JF[1:]
+    known = np.empty((K, 2 * c, width))
+    known[:, :c] = first * (h * 5 / 12) - second * (h / 12)
+    known[:, c:] = first * (h * 3 / 4) + second * (h / 4)
+    eye = np.arange(c)
+    known[:, eye, eye] += 1.0
+    known[:, c + eye, eye] += 1.0
+    Y = np.linalg.inv(system) @ known
+    moved = np.zeros((K, n, width))
+    moved[:, :c] = Y[:, c:]
+    moved[:, c:] = h * (0.75 * between(R) @ Y[:, :c] + 0.25 * R[1:] @ Y[:, c:])
+    A = np.zeros((K, n, n))
+    A[:, :, :c] = moved[:, :, :c]
+    A[:, range(c, n), range(c, n)] = 1.0
+    return Slopes(
+        A,
+        moved[:, :, c : c + n_u],
+        moved[:, :, c + n_u : rest],
+        moved[:, :, rest : rest + n_p],
+        moved[:, :, rest + n_p :],
+    )

@@ -1,0 +1,586 @@
+"""Joint smoothing: states, true torques and parameters of a log estimated together (errors in variables).
+
+Maximum likelihood of everything at once: the machine's dynamics hold exactly between samples, the delivered torques are
+linear between samples and differ from the measured ones by white noise and an offset, and every sensor has a noise of
+its own. Gauss-Newton by multiple shooting: the chain of linearised samples is integrated out (`chain`), which leaves a
+small quadratic form in the parameters; its inverse is their covariance, and with no measurement at all, along a motion
+alone, the Cramer-Rao bound. Sources: Bryson and Ho, "Applied Optimal Control", ch. 13 (smoothing as a two-point
+problem); Bock, "Recent advances in parameter identification techniques for O.D.E.", 1983 (multiple shooting).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from excite import chain
+from excite.identify import Estimate, NotIdentifiable, decimate, samples
+from excite.linearise import Chart, advance, chart, differentiate
+from excite.log import Log
+from excite.simulate import Motion
+from model.machine import Filter, Sensor
+from model.prediction import Model
+
+PRIOR = 3.0  # standard deviation of a parameter before any data, in its scale
+PASSES = 20  # at most
+CONVERGED = 0.01  # a step this small against the standard deviation ends the iteration
+LARGEST_STEP = 0.5  # of a parameter in one pass, relative to its size
+EDGE = 0.29  # least standard deviation of an encoder edge [counts]
+FORCE, MOMENT = 500.0, 1000.0  # disturbance per sample where the model is not trusted [N], [N m]
+SUSPECT = 1.5  # mean square of innovations, all or slow ones, that the model can't explain
+BLOCK = 25  # readings whose mean counts as slow
+SHORTER = 8  # times that a step is halved
+DOUBT = (
+    "the machine does something that the model doesn't know: intervals of the exact model do not hold, these are of a"
+    " model with disturbing forces; run `excite diagnose`"
+)
+SPREAD_SPEED, SPREAD_ANGLE = 1.0, 0.1  # of the first state about its guess: says next to nothing
+
+
+class NotConverged(RuntimeError):
+    """Joint smoothing found no estimate; the message says how far it came and what to do."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the sensors' noise is taken to be: `torque` (n_u,) [N m]; `sensor` (m,) [SI] of those of a chart, for an
+    encoder that counts its step."""
+
+    torque: np.ndarray
+    sensor: np.ndarray
+
+
+@dataclass(frozen=True)
+class Record:
+    """A log as the smoother sees it: torque (N, n_u) as measured, reading (N, m) of the chart's sensors.
+
+    used (N, m): which samples tell something; counts (m,): encoders read at their edges. origin (m_o,): sensors
+    whose absolute value matters and whose count starts anywhere.
+    """
+
+    torque: np.ndarray
+    reading: np.ndarray
+    used: np.ndarray
+    counts: np.ndarray
+    origin: tuple[int, ...]
+    noise: Noise
+
+
+@dataclass(frozen=True)
+class Point:
+    """Where an iteration stands: states (N, n), torque errors (N, n_u), offsets (m_o,) of one log."""
+
+    s: np.ndarray
+    w: np.ndarray
+    offset: np.ndarray
+
+
+@dataclass(frozen=True)
+class Linear:
+    """One log linearised about a point: its chain and what it reduces to.
+
+    Z: twice the negative log-likelihood is [1 p]' Z [1 p] for steps p of parameters and offsets, scaled. scale
+    (n + n_u,) leads from the chain's states to SI. H (N, m, n) in the chain's scale, weight, residual (N, m).
+    """
+
+    stages: chain.Stages
+    solved: chain.Solved
+    Z: np.ndarray
+    scale: np.ndarray
+    H: np.ndarray
+    weight: np.ndarray
+    residual: np.ndarray
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Base parameters X (n_base,), their covariance, and the trajectories of the logs."""
+
+    X: np.ndarray
+    covariance: np.ndarray
+    points: tuple[Point, ...]
+    linear: tuple[Linear, ...]
+
+    @property
+    def std(self) -> np.ndarray:
+        return np.sqrt(np.diag(self.covariance))
+
+
+def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
+    """Base parameters by joint smoothing of all logs, from the machine file's values.
+
+    Where the innovations say that the machine does something the model doesn't know, or the exact dynamics find no
+    estimate, the answer is that of a model with white disturbing forces, with a note. Raises NotConverged where that
+    fails too, NotIdentifiable where a torque is missing.
+    """
+    c = chart(model, _names(model, logs))
+    records = [record(c, log) for log in logs]
+    starts = [_start(c, r, log, filter) for r, log in zip(records, logs, strict=True)]
+    notes = _noise_notes(c, records)
+    try:
+        fit = _iterate(c, records, starts, model.nominal, starts, False)
+    except NotConverged as failed:
+        loose = _iterate(c, records, starts, model.nominal, starts, True)
+        try:
+            fit = _iterate(c, records, loose.points, loose.X, starts, False)
+        except NotConverged:
+            return _estimate(c, records, loose, filter, (*notes, f"{failed}: {DOUBT}"))
+    suspects = [_suspects(c, linear) for linear in fit.linear]
+    found = [f"{log.source}: {text}" for log, texts in zip(logs, suspects, strict=True) for text in texts]
+    if found:
+        loose = _iterate(c, records, fit.points, fit.X, starts, True)
+        return _estimate(c, records, loose, filter, (*notes, *found, DOUBT))
+    return _estimate(c, records, fit, filter, notes)
+
+
+def _estimate(c: Chart, records: Sequence[Record], fit: Fit, filter: Filter, notes: tuple[str, ...]) -> Estimate:
+    """The answer as `identify` gives it: regressor along the smoothed states, residual of the torques."""
+    model = c.model
+    weak = fit.std > PRIOR / 2 * model.scale
+    reasons = {
+        name: "this log hardly moves with it: what is known of it is the machine file's value"
+        for name, yes in zip(model.base.names, weak, strict=True)
+        if yes
+    }
+    W, Y, errors = [], [], []
+    for r, p in zip(records, fit.points, strict=True):
+        q, nu, u = *_motion(c, p.s), r.torque - fit.X @ c.offsets.T + p.w
+        a = model.acceleration(q.T, nu.T, u.T, fit.X).full()
+        W.append(model.stacked(q.T, nu.T, a).reshape(-1, len(fit.X)))
+        measured, error = np.zeros((2, len(model.rows), len(u)))
+        measured[list(model.actuated)], error[list(model.actuated)] = r.torque.T, -p.w.T
+        Y.append(decimate(measured, filter.decimation))
+        errors.append(decimate(error, filter.decimation))
+    R = np.linalg.qr(np.concatenate(W), mode="r")
+    residual = np.concatenate(errors, axis=1)
+    covariance = fit.covariance.copy()
+    covariance[weak], covariance[:, weak] = np.nan, np.nan
+    return Estimate(
+        "joint",
+        model.base.names,
+        model.base.units,
+        np.where(weak, np.nan, fit.X),
+        covariance,
+        float(np.linalg.cond(R)),
+        float(
+            np.linalg.cond(
+                R * np.maximum(np.abs(fit.X), [float(model.machine.scale.get(n, 0.0)) for n in model.base.names])
+            )
+        ),
+        100 * float(np.linalg.norm(residual) / np.linalg.norm(np.concatenate(Y, axis=1))),
+        residual,
+        int(sum(r.used.sum() for r in records)) - len(fit.X),
+        reasons,
+        notes,
+    )
+
+
+def _motion(c: Chart, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates and velocities (N, n_q) of states; coordinates that nothing depends on are zero."""
+    n_q = len(c.model.coordinates)
+    full = np.zeros((len(s), c.full))
+    full[:, c.index] = s
+    return full[:, :n_q], full[:, n_q : 2 * n_q]
+
+
+def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | None = None) -> np.ndarray:
+    """The least covariance (n_base, n_base) that a kit's sensors allow along a motion, whatever the method.
+
+    The machine file's noise; an encoder tells something as often as it counts. A weak prior (300 % of each scale) stays
+    in, so that a parameter which the drive doesn't show has a large deviation and not an infinite one.
+    Raises ValueError where a sensor has neither noise nor counts.
+    """
+    X = model.nominal if X is None else np.asarray(X, float)
+    sensors = [s for s in model.machine.sensors(kit) if s.kind not in ("x", "y")]
+    for s in sensors:
+        if s.noise is None and s.counts_per_turn is None:
+            raise ValueError(
+                f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file"
+            )
+    c = chart(model, tuple(s.name for s in model.machine.sensors("full") if s in sensors))
+    state = np.hstack([motion.q, motion.nu, motion.wheels])[:, c.index]
+    counts = np.array([s.resolution is not None for s in c.sensors])
+    noise = Noise(
+        np.array([float(_torque_sensor(model, b.index).noise or 0) for b in model.machine.actuated]),
+        np.array([s.resolution or float(s.noise or 0) for s in c.sensors]),
+    )
+    none = np.zeros((len(state), len(c.sensors)))
+    r = Record(motion.u + X @ c.offsets.T, none, none, counts, _origin(c, counts), noise)
+    p = Point(state, np.zeros_like(motion.u), np.zeros(len(r.origin)))
+    linear = _linearise(c, _expected(c, r, p), p, state[0], X, False, exact=True)
+    assert linear is not None
+    information = linear.Z[1:, 1:].copy()
+    information[np.diag_indices(len(information))] += np.concatenate(
+        [np.full(len(X), PRIOR**-2), np.ones(len(r.origin))]
+    )
+    return np.asarray(np.linalg.inv(information)[: len(X), : len(X)] * np.outer(model.scale, model.scale))
+
+
+def _expected(c: Chart, r: Record, p: Point) -> Record:
+    """The record with how often each encoder counts, on average, in place of when."""
+    travel = np.abs(c.readings(p.s)[2][:, :, 0]) / float(c.model.machine.sampling_hz)
+    return replace(r, used=np.where(r.counts, np.minimum(travel / r.noise.sensor, 1.0), 1.0))
+
+
+def _names(model: Model, logs: Sequence[Log]) -> tuple[str, ...]:
+    """Sensors that every log has."""
+    common = set.intersection(*(set(log.values) for log in logs))
+    for body in model.machine.actuated:
+        if not any(s.kind == "torque" and s.body == body.index and s.name in common for s in model.machine.sensor):
+            raise NotIdentifiable(f"joint smoothing needs the torque of every driven joint, {body.where} has none")
+    return tuple(s.name for s in model.machine.sensors("full") if s.name in common)
+
+
+def record(c: Chart, log: Log) -> Record:
+    """A log prepared: encoder edges found, noise of the others estimated from the log itself."""
+    model = c.model
+    torques = [_torque_sensor(model, body.index) for body in model.machine.actuated]
+    torque = np.column_stack([log.values[s.name] for s in torques])
+    N, m = len(log), len(c.sensors)
+    reading, used = np.empty((N, m)), np.ones((N, m), bool)
+    counts = np.zeros(m, bool)
+    sigma = np.empty(m)
+    for j, sensor in enumerate(c.sensors):
+        value = log.values[sensor.name]
+        step = sensor.resolution
+        reading[:, j] = value
+        if step is None:
+            sigma[j] = max(white_noise(value), 1e-9 + 1e-3 * float(sensor.noise or 0))
+            continue
+        sigma[j] = step
+        n = np.round(value / step)
+        if np.abs(value - n * step).max() > 0.01 * step:
+            sigma[j] = step / np.sqrt(12)
+            continue
+        counts[j] = True
+        change = np.diff(n, prepend=n[0])
+        reading[:, j] = (n + (change < 0)) * step
+        used[:, j] = change != 0
+    level = np.array([max(white_noise(u), 1e-3 * float(s.noise or 1)) for u, s in zip(torque.T, torques, strict=True)])
+    return Record(torque, reading, used.astype(float), counts, _origin(c, counts), Noise(level, sigma))
+
+
+def _origin(c: Chart, counts: np.ndarray) -> tuple[int, ...]:
+    """Encoders whose count starts anywhere while forces depend on the angle itself."""
+    return tuple(j for j in range(len(counts)) if counts[j] and c.angle[j] < c.core)
+
+
+def _torque_sensor(model: Model, body: int) -> Sensor:
+    return next(s for s in model.machine.sensor if s.kind == "torque" and s.body == body)
+
+
+def white_noise(x: np.ndarray) -> float:
+    """Standard deviation of the white part of a signal, from its third differences.
+
+    Their median size, so that the corners of a signal that is linear in pieces do not count.
+    """
+    return float(np.median(np.abs(np.diff(x, 3)))) / (0.6744897501960817 * np.sqrt(20))
+
+
+def _start(c: Chart, r: Record, log: Log, filter: Filter) -> Point:
+    """States from the filtered log."""
+    guess = samples(c.model, log, filter)
+    full = np.zeros((len(log), c.full))
+    n_q = len(c.model.coordinates)
+    full[:, :n_q], full[:, n_q : 2 * n_q] = guess.q.T, guess.nu.T
+    s = full[:, c.index]
+    rate = float(c.model.machine.sampling_hz)
+    for j, k in enumerate(c.angle):
+        if c.index[k] >= 2 * n_q and k >= 0:
+            speed = c.readings(s)[2][:, j, 0]
+            s[:, k] = log.values[c.sensors[j].name][0] + np.concatenate(
+                [[0], np.cumsum(speed[1:] + speed[:-1]) / (2 * rate)]
+            )
+    return Point(s, np.zeros_like(r.torque), np.zeros(len(r.origin)))
+
+
+def _linearise(
+    c: Chart, r: Record, p: Point, first: np.ndarray, X: np.ndarray, disturbed: bool, exact: bool = False
+) -> Linear | None:
+    """The chain of a log about a point; None where the motion can't be integrated. first (n,): guess of s[0].
+
+    `exact`: the point is a motion of the machine, which needs no integration.
+    """
+    u = r.torque - X @ c.offsets.T + p.w
+    end = p.s[1:] if exact else advance(c, p.s, u, X)
+    if not np.isfinite(end).all():
+        return None
+    h, H, weight, D = _readings(c, r, p)
+    data = np.zeros((*h.shape, 1 + len(X) + len(r.origin)))
+    if not exact:
+        data[:, :, 0] = np.where(r.used > 0, r.reading - h, 0.0)
+    data[:, :, 1 + len(X) :] = -D * _one_count(c, r)
+    stages, scale = _stages(c, r, p, first, X, end - p.s[1:], u, H, weight, data, disturbed)
+    solved = chain.solve(stages)
+    # What the readings say of data and offsets directly; the base parameters act through the states alone.
+    flat = (data * np.sqrt(weight)[:, :, None]).reshape(-1, data.shape[2])
+    return Linear(stages, solved, solved.Z + flat.T @ flat, scale, H * scale[: c.n], weight, data[:, :, 0])
+
+
+def _one_count(c: Chart, r: Record) -> np.ndarray:
+    """Scale of the offsets (m_o,): a count starts at a random place between two edges, half a count on average."""
+    return np.array([float(c.sensors[j].resolution or 0) for j in r.origin])
+
+
+def _readings(c: Chart, r: Record, p: Point) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Expected readings (N, m), their slopes (N, m, n), weights (N, m) = 1 / variance and offset columns (m, m_o).
+
+    Right after a count the angle is past the edge by half of what it travels in a sample, at most half a step.
+    """
+    sample = 1 / float(c.model.machine.sampling_hz)
+    h, H, rate, Hrate = c.readings(p.s)
+    h, H, travel = h[:, :, 0].copy(), H.copy(), rate[:, :, 0] * sample
+    step = r.noise.sensor
+    slow = (np.abs(travel) < step) & r.counts
+    h -= np.where(r.counts, np.clip(travel, -step, step) / 2, 0.0)
+    H[slow] -= Hrate[slow] * (sample / 2)
+    width = np.where(r.counts, np.maximum(np.minimum(np.abs(travel), step) / np.sqrt(12), EDGE * step), step)
+    D = np.zeros((len(c.sensors), len(r.origin)))
+    for k, j in enumerate(r.origin):
+        D[j, k] = 1.0
+    return h + D @ p.offset, H, r.used / width**2, D
+
+
+def _stages(
+    c: Chart,
+    r: Record,
+    p: Point,
+    first: np.ndarray,
+    X: np.ndarray,
+    defect: np.ndarray,
+    u: np.ndarray,
+    H: np.ndarray,
+    weight: np.ndarray,
+    data: np.ndarray,
+    disturbed: bool,
+) -> tuple[chain.Stages, np.ndarray]:
+    """The chain in scaled unknowns: state, torque error; K = N + 1 stages, the first for what is known beforehand."""
+    N, n = p.s.shape
+    n_u, n_p, columns = u.shape[1], len(X), data.shape[2]
+    by = differentiate(c, p.s, u, X, disturbed)
+    scale = _scales(c, r)
+    sigma = r.noise.torque
+    S, Si = scale, 1 / scale
+    total = n + n_u
+    A, C, J = (np.zeros((N + 1, total, total)) for _ in range(3))
+    b, eta = np.zeros((N + 1, total, columns)), np.zeros((N + 1, total, columns))
+    B1 = by.B1 * (Si[:, None] * sigma)
+    A[1:N, :n, :n] = by.A * (Si[:, None] * S)
+    A[1:N, :n, n:] = by.B0 * (Si[:, None] * sigma)
+    C[1:N, :n, :n] = B1 @ B1.transpose(0, 2, 1)
+    C[1:N, :n, n:], C[1:N, n:, :n] = B1, B1.transpose(0, 2, 1)
+    C[1:N, range(n, total), range(n, total)] = 1.0
+    if disturbed:
+        F = by.F * (Si[:, None] * _forces(c))
+        C[1:N, :n, :n] += F @ F.transpose(0, 2, 1)
+    w = p.w / sigma
+    b[1:N, :n, 0] = defect * Si - (B1 @ w[1:, :, None])[:, :, 0]
+    b[1:N, n:, 0] = -w[1:]
+    b[1:N, :n, 1 : 1 + n_p] = (by.X - (by.B0 + by.B1) @ c.offsets) * Si[:, None] * c.model.scale
+    C[0, range(total), range(total)] = np.concatenate([(_spread(c) * Si) ** 2, np.ones(n_u)])
+    b[0, :, 0] = np.concatenate([(first - p.s[0]) * Si, -w[0]])
+    Hs = H * S
+    weighted = (Hs * weight[:, :, None]).transpose(0, 2, 1)
+    J[1:, :n, :n] = weighted @ Hs
+    eta[1:, :n] = weighted @ data
+    return chain.Stages(A, b, C, eta, J), np.concatenate([scale, sigma])
+
+
+def _scales(c: Chart, r: Record) -> np.ndarray:
+    """Typical size of an error of each state: a step for an angle, what a sensor tells for a speed."""
+    n_q = len(c.model.coordinates)
+    return np.array([1e-2 if n_q <= k < 2 * n_q else 1e-3 for k in c.index])
+
+
+def _spread(c: Chart) -> np.ndarray:
+    n_q = len(c.model.coordinates)
+    return np.array([SPREAD_SPEED if n_q <= k < 2 * n_q else SPREAD_ANGLE for k in c.index])
+
+
+def _forces(c: Chart) -> np.ndarray:
+    return np.array([MOMENT if c.model.coordinates[k].startswith("theta") else FORCE for k in c.pushed])
+
+
+def _iterate(
+    c: Chart,
+    records: Sequence[Record],
+    points: Sequence[Point],
+    X: np.ndarray,
+    starts: Sequence[Point],
+    disturbed: bool,
+) -> Fit:
+    """Gauss-Newton from points and X; the prior stands about the machine file's values and the states of `starts`.
+
+    Raises NotConverged.
+    """
+    model = c.model
+    step, before = np.inf, np.inf
+    shorter, here = 0, (list(points), X)
+    there = here
+    for _ in range(PASSES):
+        linear = _all_linear(c, records, there[0], starts, there[1], disturbed)
+        if linear is None:
+            # Too far: the mass matrix is not positive or a motion can't be integrated.
+            shorter += 1
+            if shorter > SHORTER or here is there:
+                break
+            there = _between(here, there, 0.5)
+            continue
+        here, shorter = there, 0
+        points, X = here
+        covariance, move = _parameters(c, records, linear, points, X)
+        sigma = np.sqrt(np.diag(covariance))[: len(X)]
+        before, step = step, float(np.abs(move[0][: len(X)] / sigma).max())
+        limit = LARGEST_STEP * np.maximum(np.abs(X) / model.scale, 1.0)
+        for m in move:
+            m[: len(X)] = np.clip(m[: len(X)], -limit, limit)
+        there = (
+            [_moved(c, r, p, f, m) for r, p, f, m in zip(records, points, linear, move, strict=True)],
+            X + move[0][: len(X)] * model.scale,
+        )
+        if step < CONVERGED or (step < before < np.inf and step * step / before < CONVERGED / 10):
+            base = covariance[: len(X), : len(X)] * np.outer(model.scale, model.scale)
+            return Fit(there[1], base, tuple(there[0]), tuple(linear))
+    raise NotConverged(
+        f"joint smoothing found no estimate in {PASSES} passes (last step {step:.3g} standard deviations): check the"
+        " log with `excite diagnose`, or start from better values in the machine file"
+    )
+
+
+def _all_linear(
+    c: Chart,
+    records: Sequence[Record],
+    points: Sequence[Point],
+    starts: Sequence[Point],
+    X: np.ndarray,
+    disturbed: bool,
+) -> list[Linear] | None:
+    """Every log linearised; None where the mass matrix isn't positive or a motion can't be integrated."""
+    linear: list[Linear] = []
+    for r, p, start in zip(records, points, starts, strict=True):
+        if not (c.pivots(p.s[::10], X)[0] > 0).all():
+            return None
+        found = _linearise(c, r, p, start.s[0], X, disturbed)
+        if found is None:
+            return None
+        linear.append(found)
+    return linear
+
+
+def _parameters(
+    c: Chart, records: Sequence[Record], linear: Sequence[Linear], points: Sequence[Point], X: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Covariance of all parameters and offsets (scaled), and the step of those of each log."""
+    n = len(X)
+    places, size = [], n
+    for r in records:
+        places.append(np.concatenate([np.arange(n), np.arange(size, size + len(r.origin))]))
+        size += len(r.origin)
+    information, slope = np.zeros((size, size)), np.zeros(size)
+    information[range(n), range(n)] = PRIOR**-2
+    slope[:n] = PRIOR**-2 * (X - c.model.nominal) / c.model.scale
+    for found, r, p, place in zip(linear, records, points, places, strict=True):
+        information[np.ix_(place, place)] += found.Z[1:, 1:]
+        slope[place] += found.Z[1:, 0]
+        own = place[n:]
+        information[own, own] += 1.0
+        slope[own] += p.offset / _one_count(c, r) - 0.5
+    covariance = np.linalg.inv(information)
+    if not (np.diag(covariance) > 0).all():
+        raise NotConverged("joint smoothing lost its numbers: check the log with `excite diagnose`")
+    step = -covariance @ slope
+    return covariance, [step[place] for place in places]
+
+
+def _moved(c: Chart, r: Record, p: Point, linear: Linear, move: np.ndarray) -> Point:
+    """The point after a step of parameters and offsets, with the states that go with it."""
+    x = linear.solved.states(move) * linear.scale
+    offset = move[len(move) - len(r.origin) :]
+    return Point(p.s + x[:, : c.n], p.w + x[:, c.n :], p.offset + offset * _one_count(c, r))
+
+
+def _between(
+    here: tuple[list[Point], np.ndarray], there: tuple[list[Point], np.ndarray], share: float
+) -> tuple[list[Point], np.ndarray]:
+    def mixed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return a + share * (b - a)
+
+    points = [
+        Point(mixed(a.s, b.s), mixed(a.w, b.w), mixed(a.offset, b.offset))
+        for a, b in zip(here[0], there[0], strict=True)
+    ]
+    return points, mixed(here[1], there[1])
+
+
+def _suspects(c: Chart, linear: Linear) -> list[str]:
+    """Sensors whose innovations are not what the model and their noise say, each as a line for the report."""
+    texts = []
+    for sensor, (size, slow) in zip(c.sensors, innovation_sizes(linear), strict=True):
+        if max(size, slow) > SUSPECT:
+            texts.append(
+                f"{sensor.name}: innovations {np.sqrt(size):.2f} times, slow ones {np.sqrt(slow):.2f} times what noise"
+                " gives"
+            )
+    return texts
+
+
+def innovation_sizes(linear: Linear) -> np.ndarray:
+    """Mean square of the normalised innovations of every sensor, and of their means over blocks, times the block:
+    (m, 2), both 1 where model and noise are right, 0 for a sensor with too few readings."""
+    z = innovations(linear)
+    sizes = np.zeros((z.shape[1], 2))
+    for j, column in enumerate(z.T):
+        own = column[np.isfinite(column)]
+        if len(own) < 8 * BLOCK:
+            continue
+        blocks = own[: len(own) // BLOCK * BLOCK].reshape(-1, BLOCK).sum(axis=1)
+        sizes[j] = np.mean(own**2), np.mean(blocks**2) / BLOCK
+    return sizes
+
+
+def innovations(linear: Linear) -> np.ndarray:
+    """Each reading less its prediction from all before it, over its standard deviation (N, m); NaN where unused.
+
+    A Kalman filter along the last linearisation, at the parameters found.
+    """
+    stages, H, weight, residual = linear.stages, linear.H, linear.weight, linear.residual
+    N, m = residual.shape
+    z = np.full((N, m), np.nan)
+    x, P = stages.b[0, :, 0], stages.C[0]
+    n = H.shape[2]
+    for k in range(N):
+        rows = np.flatnonzero(weight[k])
+        if len(rows):
+            h = H[k, rows]
+            PH = P[:, :n] @ h.T
+            S = h @ PH[:n]
+            S[range(len(rows)), range(len(rows))] += 1 / weight[k, rows]
+            e = residual[k, rows] - h @ x[:n]
+            z[k, rows] = e / np.sqrt(np.diag(S))
+            K = np.linalg.solve(S, PH.T).T
+            x = x + K @ e
+            P = P - K @ PH.T
+        if k < N - 1:
+            A = stages.A[k + 1]
+            x = A @ x + stages.b[k + 1, :, 0]
+            P = A @ P @ A.T + stages.C[k + 1]
+    return z
+
+
+def _noise_notes(c: Chart, records: Sequence[Record]) -> tuple[str, ...]:
+    """The noise found in the logs beside the machine file's."""
+    model = c.model
+    found: list[tuple[Sensor, float]] = []
+    for k, body in enumerate(model.machine.actuated):
+        level = float(np.sqrt(np.mean([r.noise.torque[k] ** 2 for r in records])))
+        found.append((_torque_sensor(model, body.index), level))
+    for j, sensor in enumerate(c.sensors):
+        if sensor.resolution is None:
+            found.append((sensor, float(np.sqrt(np.mean([r.noise.sensor[j] ** 2 for r in records])))))
+    texts = []
+    for sensor, level in found:
+        sheet = f"data sheet {float(sensor.noise):.3g}" if sensor.noise is not None else "no data sheet"
+        texts.append(f"{sensor.name} {level:.3g} ({sheet})")
+    return (f"noise per sample found in the log, SI: {', '.join(texts)}",)
