@@ -448,7 +448,11 @@ def _versions() -> dict[str, str]:
 def _print(thing: object) -> None:
     from rich.console import Console
 
-    Console(highlight=False, soft_wrap=True).print(thing)
+    console = Console(highlight=False)
+    if console.is_terminal:
+        console.print(thing)
+    else:  # a pipe or file has no width: whole lines, whole tables
+        Console(highlight=False, width=200).print(thing, soft_wrap=True)
 
 
 def _show_json(summary: dict[str, Any]) -> None:

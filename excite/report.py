@@ -151,6 +151,7 @@ def verify_figure(v: Verification, title: str) -> Figure:
         errors.plot(np.nanmean(e[:, k]), y, "D", color=COLOURS[1], markeredgecolor="black", markersize=6, zorder=3)
     errors.axvline(0, color="black", linewidth=0.8)
     errors.set_xscale("symlog", linthresh=1.0, linscale=1.2)
+    errors.xaxis.set_major_formatter("{x:g}")
     errors.set_yticks(places, v.names)
     errors.set_xlabel("error [% of the true value]")
     errors.grid(axis="x", alpha=0.3)

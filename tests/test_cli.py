@@ -87,7 +87,7 @@ def test_same_seed_same_bytes(profile: Path, tmp_path: Path, excite: Excite) -> 
         (["design", "va12", "--duration", "-3"], ["--duration", "-3"]),
         (["design", "va12", "--duration", "nan"], ["--duration", "nan"]),
         (["design", "va12", "--starts", "0"], ["--starts"]),
-        (["design", "va12", "--starts", "many"], ["--starts", "many"]),
+        (["design", "va12", "--starts", "many"], ["--starts", "integer"]),
         (["design", "va12", "--budget", "0"], ["--budget"]),
         (["design", "emps"], ["emps", "problem"]),
         (["design", "va12", "--speed", "3"], ["--speed"]),
