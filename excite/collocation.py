@@ -1,0 +1,298 @@
+"""A drive as numbers: piecewise linear torques, states at collocation points, and all their derivatives.
+
+Radau IIA collocation (degree 3) on every interval between two torque knots: stiffly accurate, made for the contact's
+1500 1/s near standstill. Physics, limits and information are CasADi expressions of one sample, mapped over all nodes;
+their exact first and second derivatives come out as plain arrays. Every variable is scaled to O(1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from excite.limit import REST_POSITION, Limit, Symbols, felt, limits, rest_tolerances, resting, symbols
+from model.machine import Problem
+from model.prediction import Model
+
+DEGREE = 3
+STILL = 0.25  # of the tolerance for rest at the end is used
+FAR = 1e3  # stands for no bound, in half ranges
+
+
+class UnsettledError(RuntimeError):
+    """The collocation equations of an interval have no solution that Newton's method finds."""
+
+
+def _view(array: Any) -> memoryview:
+    return memoryview(array)
+
+
+class Mapped:
+    """A CasADi function of one sample, evaluated over N samples: arrays (N, n) in, (N, rows...) out."""
+
+    def __init__(self, function: ca.Function, samples: int, shapes: Sequence[tuple[int, ...]]) -> None:
+        self._function = function.map(samples)
+        self._buffer, self._run = self._function.buffer()
+        self._results = [np.zeros((samples, *shape)) for shape in shapes]
+        for k, result in enumerate(self._results):
+            self._buffer.set_res(k, _view(result))
+
+    def __call__(self, *arguments: np.ndarray) -> list[np.ndarray]:
+        held = [np.ascontiguousarray(a, float) for a in arguments]
+        for k, a in enumerate(held):
+            self._buffer.set_arg(k, _view(a))
+        self._run()
+        return [r.copy() for r in self._results]
+
+
+@dataclass(frozen=True)
+class Transcription:
+    """The nonlinear program's data. K intervals, J nodes in each, states z (n_z,), torques u (n_u,).
+
+    A node's sample is s = (z, dz/dt, u), all scaled. Functions of it: residual (n_z,) of the equations of motion,
+    limits (n_g,) scaled to -1..1, entries (n_a,) of the information matrix on and above its diagonal.
+    """
+
+    intervals: int
+    nodes: int
+    knot: float
+    state_names: tuple[str, ...]
+    state_scale: np.ndarray
+    torque_scale: np.ndarray
+    derivative: np.ndarray
+    place: np.ndarray
+    weight: np.ndarray
+    limit_names: tuple[str, ...]
+    floor: np.ndarray
+    control_names: tuple[str, ...]
+    control: np.ndarray
+    control_centre: np.ndarray
+    rows: np.ndarray
+    columns: np.ndarray
+    size: int
+    at_rest: np.ndarray
+    band: np.ndarray
+    values: Mapped = field(repr=False)
+    first: Mapped = field(repr=False)
+    second: Mapped = field(repr=False)
+    step: Mapped = field(repr=False)
+
+    @property
+    def n_z(self) -> int:
+        return len(self.state_names)
+
+    @property
+    def n_u(self) -> int:
+        return len(self.torque_scale)
+
+    @property
+    def n_s(self) -> int:
+        return 2 * self.n_z + self.n_u
+
+    def samples(self, start: np.ndarray, Z: np.ndarray, U: np.ndarray) -> np.ndarray:
+        """(K J, n_s): what every node sees of states Z (K, J, n_z), torques U (K + 1, n_u) and the start (n_z,)."""
+        left = np.concatenate([start[None], Z[:-1, -1]])[:, None]
+        along = np.concatenate([left, Z], axis=1)
+        rate = np.einsum("ji,kin->kjn", self.derivative, along)
+        u = U[:-1, None] * (1 - self.place)[:, None] + U[1:, None] * self.place[:, None]
+        return np.concatenate([Z, rate, u], axis=2).reshape(-1, self.n_s)
+
+    def spread(self) -> np.ndarray:
+        """(J, n_s, n_z + J n_z + 2 n_u): samples of the nodes from (left state, node states, left and right torque)."""
+        J, n_z, n_u = self.nodes, self.n_z, self.n_u
+        L = np.zeros((J, self.n_s, n_z + J * n_z + 2 * n_u))
+        eye = np.eye(n_z)
+        for j in range(J):
+            L[j, :n_z, n_z * (j + 1) : n_z * (j + 2)] = eye
+            for i in range(J + 1):
+                L[j, n_z : 2 * n_z, n_z * i : n_z * (i + 1)] = self.derivative[j, i] * eye
+            L[j, 2 * n_z :, n_z * (J + 1) : n_z * (J + 1) + n_u] = (1 - self.place[j]) * np.eye(n_u)
+            L[j, 2 * n_z :, n_z * (J + 1) + n_u :] = self.place[j] * np.eye(n_u)
+        return L
+
+    def matrix(self, entries: np.ndarray) -> np.ndarray:
+        """The information matrix (n, n) of its entries (n_a,)."""
+        A = np.zeros((self.size, self.size))
+        A[self.rows, self.columns] = entries
+        A[self.columns, self.rows] = entries
+        return A
+
+
+def settle(tr: Transcription, start: np.ndarray, U: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """Node states (K, J, n_z) that the torques U (K + 1, n_u) lead to: Newton's method interval by interval."""
+    K, J, n_z = tr.intervals, tr.nodes, tr.n_z
+    L = tr.spread()
+    inner = slice(n_z, n_z * (J + 1))
+    Z = guess.copy()
+    left = start
+    for k in range(K):
+        x = guess[k].ravel()
+        best = np.inf
+        for attempt in range(3):
+            if attempt:
+                x = np.tile(left, J)
+            for _ in range(25):
+                s = L @ np.concatenate([left, x, U[k], U[k + 1]])
+                c, slope = tr.step(s)
+                size = float(np.abs(c).max())
+                if size < 1e-9:
+                    break
+                C = np.matmul(slope, L[:, :, inner]).reshape(J * n_z, -1)
+                dx = np.linalg.solve(C, -c.ravel())
+                share = 1.0
+                for _ in range(8):
+                    trial, _s = tr.step(L @ np.concatenate([left, x + share * dx, U[k], U[k + 1]]))
+                    if float(np.abs(trial).max()) < size:
+                        break
+                    share *= 0.5
+                x = x + share * dx
+            if size < 1e-7:
+                break
+        best = min(best, size)
+        if best > 1e-6:
+            raise UnsettledError(f"no motion follows these torques in interval {k} (residual {best:.1e})")
+        Z[k] = x.reshape(J, n_z)
+        left = Z[k, -1]
+    return Z
+
+
+def radau(elements: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes (J,) in 0..1, differentiation matrix (J, J + 1) on (left end, nodes) and weights (J,), J = 3 elements."""
+    tau = np.array([0.0, *ca.collocation_points(DEGREE, "radau")])
+    polynomials = [
+        np.poly1d(np.poly(np.delete(tau, i)) / np.prod(tau[i] - np.delete(tau, i))) for i in range(DEGREE + 1)
+    ]
+    D = np.array([[p.deriv()(x) for p in polynomials] for x in tau[1:]])
+    V = np.vander(tau[1:], increasing=True).T
+    b = np.linalg.solve(V, 1 / np.arange(1, DEGREE + 1))
+    J = DEGREE * elements
+    derivative = np.zeros((J, J + 1))
+    for e in range(elements):
+        derivative[e * DEGREE : (e + 1) * DEGREE, e * DEGREE : (e + 1) * DEGREE + 1] = D * elements
+    place = np.concatenate([(e + tau[1:]) / elements for e in range(elements)])
+    return place, derivative, np.tile(b / elements, elements)
+
+
+def transcribe(
+    model: Model,
+    problem: Problem,
+    state_size: dict[str, float],
+    intervals: int,
+    elements: int = 1,
+    with_pose: bool = False,
+) -> Transcription:
+    """The nonlinear program of a problem on `intervals` equal intervals, each of `elements` collocation elements.
+
+    state_size: the typical size of every coordinate and velocity (named c and c'). The pose is a state only where
+    `with_pose`: nothing but the lane depends on it.
+    """
+    every = limits(model, problem)
+    s = symbols(model)
+    moved = _depends(every, s, ca.vertcat(s.q, s.nu))
+    deferred = set() if with_pose else {g.name for g in every if g.name.startswith("lane")}
+    staged = [g for g in every if g.name in moved and g.name not in deferred]
+    steered = [g for g in every if g.name not in moved and g.name not in deferred]
+    if with_pose:
+        used = [c for c in model.coordinates if c in model.machine.body[0].coordinates or c in felt(model)]
+        used += [model.coordinates[k] for k in resting(model) if model.coordinates[k] not in used]
+    else:
+        used = [c for k, c in enumerate(model.coordinates) if c in felt(model) or k in resting(model)]
+    names = (*used, *[c + "'" for c in model.coordinates])
+    z_size = np.array([state_size[c] for c in names])
+    u_size = np.array([float(b.limit.torque) if b.limit.torque is not None else 1.0 for b in model.machine.actuated])
+    knot = float(problem.duration_s) / intervals
+    place, derivative, weight = radau(elements)
+
+    n_z, n_q, n_u = len(names), len(model.coordinates), len(u_size)
+    sample = ca.SX.sym("s", 2 * n_z + n_u)
+    z = sample[:n_z] * ca.DM(z_size)
+    rate = sample[n_z : 2 * n_z] * ca.DM(z_size) / knot
+    u = sample[2 * n_z :] * ca.DM(u_size)
+    q = ca.SX(n_q, 1)
+    for k, c in enumerate(used):
+        q[model.coordinates.index(c)] = z[k]
+    nu, a = z[len(used) :], rate[len(used) :]
+    p = model.expand @ model.nominal
+    for body in model.machine.actuated:
+        p[model.base.standard.index(f"u{body.index}0")] = 0.0
+    drive = ca.SX(n_q, 1)
+    for k, row in enumerate(model.actuated):
+        drive[row] = u[k]
+    dq = model.kinematics(q, nu)[0]
+    kept = [model.coordinates.index(c) for c in used]
+    residual = ca.vertcat(
+        (rate[: len(used)] - dq[kept]) * knot / ca.DM(z_size[: len(used)]),
+        (model.predict(q, nu, a, p) - drive) / float(u_size.max()),
+    )
+    g = ca.vertcat(*[(g.expression(q, nu, u, 0) - g.centre) * (2 / g.range) for g in staged], ca.SX(0, 1))
+    W = model.regressor(q, nu, a)
+    Phi = ca.mtimes(W, ca.diag(ca.DM(model.scale))) / float(u_size.max())
+    A = ca.triu(ca.mtimes(Phi.T, Phi))
+    rows, columns = (np.array(x) for x in A.sparsity().get_triplet())
+    entries = ca.vertcat(*A.nonzeros())
+
+    n_s, n_g, n_a = 2 * n_z + n_u, g.numel(), entries.numel()
+    weights = ca.SX.sym("w", n_z + n_g + n_a)
+    lagrangian = ca.dot(weights, ca.vertcat(residual, g, entries))
+    H, _ = ca.hessian(lagrangian, sample)
+    N = intervals * len(place)
+    options = {"cse": True}
+    values = ca.Function("values", [sample], [residual, g, entries], options)
+    slopes = [ca.densify(ca.jacobian(x, sample).T) for x in (residual, g, entries)]
+    first = ca.Function("first", [sample], [residual, g, entries, *slopes], options)
+    second = ca.Function("second", [sample, weights], [ca.densify(H)], options)
+
+    control, centre = _control(steered, s, u_size, knot)
+    rest = [names.index(model.coordinates[k]) for k in resting(model)] + [
+        names.index(c + "'") for c in model.coordinates
+    ]
+    still = np.concatenate([np.full(len(resting(model)), REST_POSITION), rest_tolerances(model)])
+    at_rest = np.array(rest if problem.rest else [], int)
+    band = (STILL * still / z_size[rest])[: len(at_rest)]
+    return Transcription(
+        intervals,
+        len(place),
+        knot,
+        names,
+        z_size,
+        u_size,
+        derivative,
+        place,
+        np.tile(weight, intervals) / intervals,
+        tuple(x.name for x in staged),
+        np.array([-1.0 if np.isfinite(x.low) else -FAR for x in staged]),
+        tuple(x.name for x in steered),
+        control,
+        centre,
+        rows,
+        columns,
+        len(model.scale),
+        at_rest,
+        band,
+        Mapped(values, N, [(n_z,), (n_g,), (n_a,)]),
+        Mapped(first, N, [(n_z,), (n_g,), (n_a,), (n_z, n_s), (n_g, n_s), (n_a, n_s)]),
+        Mapped(second, N, [(n_s, n_s)]),
+        Mapped(ca.Function("step", [sample], [residual, slopes[0]], options), len(place), [(n_z,), (n_z, n_s)]),
+    )
+
+
+def _depends(every: Sequence[Limit], s: Symbols, on: ca.SX) -> set[str]:
+    """Names of the limits whose expression depends on any of these symbols."""
+    return {g.name for g in every if any(ca.which_depends(g.expression(s.q, s.nu, s.u, s.du), on, 1, True))}
+
+
+def _control(steered: Sequence[Limit], s: Symbols, u_size: np.ndarray, knot: float) -> tuple[np.ndarray, np.ndarray]:
+    """Limits on torques alone as rows (n_c, 2 n_u) on the scaled torques of both ends, scaled to -1..1."""
+    n_u = len(u_size)
+    rows, centres = [], []
+    for g in steered:
+        e = g.expression(s.q, s.nu, s.u, s.du)
+        slope = ca.Function("slope", [s.u, s.du], [ca.jacobian(e, s.u), ca.jacobian(e, s.du)])
+        by_u, by_du = (x.full().ravel() for x in slope(0, 0))
+        rows.append(np.concatenate([-by_du / knot, by_u + by_du / knot]) * np.tile(u_size, 2) * 2 / g.range)
+        centres.append(-2 * g.centre / g.range)
+    return np.array(rows).reshape(-1, 2 * n_u), np.array(centres)

@@ -1,0 +1,267 @@
+"""What the machine and the lane allow: every limit is a named expression between two bounds.
+
+One plain function per kind of limit, in the table KINDS; each yields the limits of its kind that the machine file and
+the problem state. Their scale comes from their bounds: an excess is a fraction of the range, high - low.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from excite.simulate import Motion
+from model.machine import Problem
+from model.prediction import Model
+
+# What counts as at rest at the ends (contract, R60): speeds [m/s], rates [rad/s] and positions [rad, m].
+REST_SPEED, REST_RATE, REST_POSITION = 0.02, 0.01, 0.01
+
+
+class InfeasibleError(ValueError):
+    """No drive keeps every limit; `limit` names the one that can't be met, `excess` is a fraction of its range."""
+
+    def __init__(self, message: str, limit: str, excess: float) -> None:
+        super().__init__(message)
+        self.limit, self.excess = limit, excess
+
+    def __reduce__(self) -> tuple[type[InfeasibleError], tuple[str, str, float]]:
+        return type(self), (str(self), self.limit, self.excess)
+
+
+@dataclass(frozen=True)
+class Limit:
+    """low <= expression(q, nu, u, du) <= high, one number per sample; low may be -inf.
+
+    q, nu (n_q,) coordinates and velocities, u, du (n_u,) torques [N m] and their rates [N m/s].
+    """
+
+    name: str
+    expression: ca.Function
+    low: float
+    high: float
+    unit: str
+
+    @property
+    def range(self) -> float:
+        """high - low; of a limit that has no lower bound, high."""
+        return self.high - self.low if np.isfinite(self.low) else abs(self.high)
+
+    @property
+    def centre(self) -> float:
+        """The middle of the range."""
+        return self.high - self.range / 2
+
+
+@dataclass(frozen=True)
+class Symbols:
+    """One sample: q, nu (n_q,), u, du (n_u,)."""
+
+    q: ca.SX
+    nu: ca.SX
+    u: ca.SX
+    du: ca.SX
+
+
+Bounded = tuple[str, ca.SX, float, float, str]
+Kind = Callable[[Model, Problem, Symbols], Iterator[Bounded]]
+
+
+def _torque(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    for k, body in enumerate(model.machine.actuated):
+        if body.limit.torque is not None:
+            high = float(body.limit.torque)
+            yield f"torque {model.inputs[k]}", s.u[k], -high, high, "N m" if body.joint == "revolute" else "N"
+
+
+def _torque_rate(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    for k, body in enumerate(model.machine.actuated):
+        if body.limit.torque_rate is not None:
+            high = float(body.limit.torque_rate)
+            yield f"torque rate {model.inputs[k]}", s.du[k], -high, high, "N m/s" if body.joint == "revolute" else "N/s"
+
+
+def _position(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    for body in model.machine.body:
+        if body.limit.position is not None and body.coordinates[0] in model.coordinates:
+            high = float(body.limit.position)
+            k = model.coordinates.index(body.coordinates[0])
+            yield f"position {body.where}", s.q[k], -high, high, "rad" if body.joint == "revolute" else "m"
+
+
+def _rate(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    for body in model.machine.body:
+        if body.limit.rate is not None and body.coordinates[0] in model.coordinates:
+            high = float(body.limit.rate)
+            k = model.coordinates.index(body.coordinates[0])
+            yield f"rate {body.where}", s.nu[k], -high, high, "rad/s" if body.joint == "revolute" else "m/s"
+
+
+def _rim_speed(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    for body in model.machine.contacts:
+        if body.limit.rim_speed is not None and body.contact is not None:
+            high = float(body.limit.rim_speed)
+            k = model.coordinates.index(body.coordinates[0])
+            yield f"rim speed {body.where}", float(body.contact.radius) * s.nu[k], -high, high, "m/s"
+
+
+def _slip(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    slips = model.kinematics(s.q, s.nu)[1]
+    bodies = {str(b.index): b for b in model.machine.contacts}
+    for k, name in enumerate(model.slips):
+        body = bodies[name[2:]]
+        if body.contact is not None and body.contact.slip_limit is not None:
+            high = float(body.contact.slip_limit)
+            yield f"slip {name[:2]} {body.where}", slips[k], -high, high, "-"
+
+
+def _power(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    """Sum of |u_i q_i'| with |x| as sqrt(x^2 + e^2), e = 1/1000 of the limit: never less, and at the limit no more."""
+    if model.machine.power_limit is not None:
+        high = float(model.machine.power_limit)
+        parts = [ca.sqrt((s.u[k] * s.nu[row]) ** 2 + (1e-3 * high) ** 2) for k, row in enumerate(model.actuated)]
+        yield "power", sum(parts, ca.SX(0)), -np.inf, high, "W"
+
+
+def _lane(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    if not model.machine.planar:
+        return
+    places = model.kinematics(s.q, s.nu)[3]
+    bodies = [b.index for b in model.machine.body]
+    for index in problem.lane_points:
+        point = places[:, bodies.index(index)]
+        for axis, letter in enumerate("xy"):
+            if any(ca.which_depends(point[axis], s.q, 1, False)):
+                high = problem.lane_m[axis] / 2
+                yield f"lane {letter} {model.machine.find(index).where}", point[axis], -high, high, "m"
+
+
+KINDS: dict[str, Kind] = {
+    "torque": _torque,
+    "torque rate": _torque_rate,
+    "position": _position,
+    "rate": _rate,
+    "rim speed": _rim_speed,
+    "slip": _slip,
+    "power": _power,
+    "lane": _lane,
+}
+
+
+def symbols(model: Model) -> Symbols:
+    n_q, n_u = len(model.coordinates), len(model.inputs)
+    return Symbols(ca.SX.sym("q", n_q), ca.SX.sym("nu", n_q), ca.SX.sym("u", n_u), ca.SX.sym("du", n_u))
+
+
+def limits(model: Model, problem: Problem) -> tuple[Limit, ...]:
+    """Every limit that the machine and the problem state, in the order of KINDS."""
+    s = symbols(model)
+    return tuple(
+        Limit(name, ca.Function("limit", [s.q, s.nu, s.u, s.du], [e], ["q", "nu", "u", "du"], ["g"]), low, high, unit)
+        for kind in KINDS.values()
+        for name, e, low, high, unit in kind(model, problem, s)
+    )
+
+
+def resting(model: Model) -> tuple[int, ...]:
+    """Coordinates that are zero at both ends: those with a position limit or whose value the forces depend on."""
+    limited = {
+        body.coordinates[0]
+        for body in model.machine.body
+        if body.coordinates and (body.limit.position is not None or body.coordinates[0] in felt(model))
+    }
+    return tuple(k for k, c in enumerate(model.coordinates) if c in limited)
+
+
+def felt(model: Model) -> tuple[str, ...]:
+    """Names of the coordinates that the equations of motion depend on (a balanced roll's angle is none of them)."""
+    q, nu, a = model.symbols()
+    p = ca.DM(model.expand @ model.nominal)
+    slope = ca.Function("slope", [q, nu, a], [ca.jacobian(model.predict(q, nu, a, p), q)])
+    rng = np.random.default_rng(0)
+    n, typical = len(model.coordinates), np.zeros(len(model.coordinates))
+    for _ in range(5):
+        at = slope(*(rng.uniform(-1, 1, n) for _ in range(3))).full()
+        typical = np.maximum(typical, np.abs(at).max(axis=0))
+    floor = 1e-9 * np.abs(model.nominal).max()
+    return tuple(c for c, size in zip(model.coordinates, typical, strict=True) if size > floor)
+
+
+def rest_tolerances(model: Model) -> np.ndarray:
+    """(n_q,) what counts as standing still: 0.02 m/s (of a roll, at its rim), 0.01 rad/s."""
+    tolerance = np.empty(len(model.coordinates))
+    for body in model.machine.body:
+        for c in body.coordinates:
+            if c not in model.coordinates:
+                continue
+            k = model.coordinates.index(c)
+            straight = body.joint == "prismatic" or (body.joint == "planar" and not c.startswith("theta"))
+            tolerance[k] = REST_SPEED if straight else REST_RATE
+            if body.contact is not None:
+                tolerance[k] = REST_SPEED / float(body.contact.radius)
+    return tolerance
+
+
+def check(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
+    """By name, the largest excess of every limit over the motion's samples, as a fraction of the limit's range.
+
+    0 where it is kept. Rest at the ends counts as a limit whose range is its tolerance.
+    """
+    every = limits(model, problem)
+    du = np.diff(motion.u, axis=0) / np.diff(motion.t)[:, None]
+    du = np.vstack([du, du[-1:]])
+    s = symbols(model)
+    stacked = ca.Function(
+        "limits", [s.q, s.nu, s.u, s.du], [ca.vertcat(*[g.expression(s.q, s.nu, s.u, s.du) for g in every])]
+    )
+    values = stacked(motion.q.T, motion.nu.T, motion.u.T, du.T).full()
+    excess = {
+        g.name: max(0.0, float(v.max() - g.high), float(g.low - v.min())) / g.range
+        for g, v in zip(every, values, strict=True)
+    }
+    return excess | (_rest(model, motion) if problem.rest else {})
+
+
+def _rest(model: Model, motion: Motion) -> dict[str, float]:
+    tolerance = rest_tolerances(model)
+    still = {
+        f"rest {c}'": max(0.0, float(np.abs(motion.nu[[0, -1], k]).max() / tolerance[k]) - 1)
+        for k, c in enumerate(model.coordinates)
+    }
+    centred = {
+        f"rest {model.coordinates[k]}": max(0.0, float(np.abs(motion.q[[0, -1], k]).max() / REST_POSITION) - 1)
+        for k in resting(model)
+    }
+    return still | centred
+
+
+def placed(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
+    """Start coordinates (n_q,) that put the drive into the lane area as well as turning and shifting it can."""
+    start = motion.q[0].copy()
+    if not model.machine.planar or not problem.lane_points:
+        return start
+    axes = {c: model.coordinates.index(c) for c in model.machine.body[0].coordinates if c in model.coordinates}
+    x, y, heading = model.machine.body[0].coordinates
+    places = model.kinematics(motion.q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), -1)
+    bodies = [b.index for b in model.machine.body]
+    path = places[:2][:, :, [bodies.index(i) for i in problem.lane_points]].reshape(2, -1)
+    best, chosen = np.inf, (0.0, np.zeros(2))
+    for turn in np.linspace(0, np.pi, 361)[:-1] if heading in axes else (0.0,):
+        c, s = np.cos(turn), np.sin(turn)
+        turned = np.array([[c, -s], [s, c]]) @ path
+        low, high = turned.min(axis=1), turned.max(axis=1)
+        used = float(((high - low) / np.array(problem.lane_m)).max())
+        if used < best - 1e-9:
+            best, chosen = used, (float(turn), -(low + high) / 2)
+    turn, shift = chosen
+    at = np.array([start[axes[c]] if c in axes else 0.0 for c in (x, y)])
+    c, s = np.cos(turn), np.sin(turn)
+    moved = np.array([[c, -s], [s, c]]) @ at + shift
+    for k, name in enumerate((x, y)):
+        if name in axes:
+            start[axes[name]] = moved[k]
+    if heading in axes:
+        start[axes[heading]] += turn
+    return start
