@@ -295,8 +295,10 @@ class Sensor(Record):
 
 class Filter(Record):
     """Default processing of a log before least squares: zero-phase Butterworth of positions, then `drop` samples at
-    the start and at the end are left out, and one row in `decimation` is kept."""
+    the start and at the end are left out, and one row in `decimation` is kept. `source` is that of the whole numbers.
+    """
 
+    source: Source
     cutoff_hz: Positive
     order: Annotated[int, Field(strict=True, ge=1, le=8)] = 4
     decimation: Annotated[int, Field(strict=True, ge=1, le=1000)] = 10
@@ -304,8 +306,9 @@ class Filter(Record):
 
 
 class Problem(Record):
-    """A design problem: how long, where, how fine."""
+    """A design problem: how long, where, how fine. `source` is that of the lane."""
 
+    source: Source
     duration_s: Positive
     knot_s: Positive
     lane_m: tuple[Number, Number]

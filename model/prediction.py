@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from model import contact, tree
-from model.machine import Body, Machine
+from model.machine import Body, Machine, MachineError
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class Model:
 
 
 def build(machine: Machine) -> Model:
-    """The equations of a machine, with its base parameters found numerically. Raises ValueError if none is left."""
+    """The equations of a machine, with its base parameters found numerically. Raises MachineError if none is left."""
     names = machine.coordinates
     n = len(names)
     q, nu, a = ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
@@ -219,7 +219,7 @@ def build(machine: Machine) -> Model:
     )
     for s, x in zip(base.names, scale, strict=True):
         if x == 0:
-            raise ValueError(f"{machine.name}: scale.{s}: the nominal value is 0, give a scale > 0 in the machine file")
+            raise MachineError(f"{machine.name}: scale.{s}: the nominal value is 0, give a scale > 0 in the machine file")
     return Model(
         machine,
         names,
@@ -239,13 +239,13 @@ def _check_names(machine: Machine, standard: tuple[str, ...]) -> None:
     """Names that the file gives to parameters or scales must exist, or a misspelt one would change nothing."""
     for name in machine.parameter_names:
         if name not in standard:
-            raise ValueError(
+            raise MachineError(
                 f"{machine.name}: parameter_names.{name}: no such parameter, allowed: {', '.join(standard)}"
             )
     groups = {s + "R" for s in standard} | set(machine.parameter_names.values())
     for name in machine.scale:
         if name not in standard and name not in groups:
-            raise ValueError(
+            raise MachineError(
                 f"{machine.name}: scale.{name}: no such parameter, allowed: {', '.join(standard)}, with R for a group"
             )
 
@@ -318,7 +318,7 @@ def base_parameters(machine: Machine, W: ca.Function, p: np.ndarray, units: dict
     """Base parameters by QR of the standard regressor over random motions (Gautier, 1991).
 
     A column that depends on columns before it is grouped into them; coefficients are cleaned of rounding.
-    Raises ValueError when no parameter can be seen.
+    Raises MachineError when no parameter can be seen.
     """
     standard = tuple(units)
     n = len(machine.coordinates)
@@ -348,7 +348,7 @@ def base_parameters(machine: Machine, W: ca.Function, p: np.ndarray, units: dict
         coefficients = np.where(np.abs(coefficients) < 1e-9, 0.0, np.round(coefficients, 12))
         matrix[independent, j] = coefficients
     if not independent:
-        raise ValueError(f"{machine.name}: no parameter can be seen in any motion, check the table and what is locked")
+        raise MachineError(f"{machine.name}: no parameter can be seen in any motion, check the table and what is locked")
     chosen = matrix[independent]
     names = tuple(
         machine.parameter_names.get(standard[j], standard[j] + ("R" if np.count_nonzero(row) > 1 else ""))
@@ -356,7 +356,7 @@ def base_parameters(machine: Machine, W: ca.Function, p: np.ndarray, units: dict
     )
     twice = sorted({s for s in names if names.count(s) > 1})
     if twice:
-        raise ValueError(f"{machine.name}: parameter_names: two base parameters get the same name: {', '.join(twice)}")
+        raise MachineError(f"{machine.name}: parameter_names: two base parameters get the same name: {', '.join(twice)}")
     return BaseParameters(
         names, tuple(units[standard[j]] for j in independent), tuple(independent), chosen, tuple(invisible), standard
     )

@@ -256,7 +256,7 @@ BROKEN: dict[str, tuple[str | bytes, str, str]] = {
     "one key too many in a problem": (
         edit("lane_m", "pace = 3\nlane_m"),
         "problems.R60.pace",
-        "allowed: duration_s, knot_s",
+        "allowed: source, duration_s, knot_s",
     ),
     # numbers
     "negative mass": (edit("value = 2600", "value = -2600"), "body[0].inertia.mass", "must be > 0 .got -2600"),
