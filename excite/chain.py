@@ -14,9 +14,12 @@ care. b and eta have columns: the first is the data, the others how they move wi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+FIELDS = ("A", "b", "C", "eta", "J")
 
 
 @dataclass(frozen=True)
@@ -47,42 +50,71 @@ class _Level:
 
 
 @dataclass(frozen=True)
+class Section:
+    """Stages joined to one (`whole`), and the quadratic form Z (c, c) of what was integrated out."""
+
+    Z: np.ndarray
+    whole: Stages
+    levels: tuple[_Level, ...]
+
+    def between(self, weights: np.ndarray, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States and slopes (K - 1, n) between the stages, for the state (n,) before the first and the slope (n,)
+        behind the last."""
+        n = len(left)
+        ins, outs = left.reshape(1, n, 1), right.reshape(1, n, 1)
+        for level in reversed(self.levels):
+            pairs = len(level.G)
+            i, j = level.first, level.second
+            ahead = j.A.transpose(0, 2, 1) @ outs[:pairs] + (j.eta @ weights)[:, :, None]
+            x = level.G @ (i.A @ ins[:pairs] + (i.b @ weights)[:, :, None] + i.C @ ahead)
+            before, behind = np.empty((2, level.count, n, 1))
+            before[0 : 2 * pairs : 2], before[1 : 2 * pairs : 2] = ins[:pairs], x
+            behind[0 : 2 * pairs : 2], behind[1 : 2 * pairs : 2] = ahead - j.J @ x, outs[:pairs]
+            if level.count % 2:
+                before[-1], behind[-1] = ins[-1], outs[-1]
+            ins, outs = before, behind
+        return ins[1:, :, 0], outs[:-1, :, 0]
+
+
+@dataclass(frozen=True)
 class Solved:
     """A chain reduced to one quadratic form.
 
-    Z (c, c): the negative log-likelihood of all states integrated out is [1 p]' Z [1 p] / 2 plus what doesn't depend
+    Z (c, c): twice the negative log-likelihood of all states integrated out is [1 p]' Z [1 p] plus what doesn't depend
     on p, for parameter steps p (c - 1,).
     """
 
     Z: np.ndarray
-    levels: tuple[_Level, ...]
+    top: Section
+    parts: tuple[Section, ...]
 
-    def states(self, p: np.ndarray) -> np.ndarray:
-        """The most likely states (K - 1, n) between the stages for parameter steps p (c - 1,)."""
+    def states(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The most likely states and slopes (K - 1, n) between the stages for parameter steps p (c - 1,).
+
+        The random part e of a stage is C times the slope behind it.
+        """
         weights = np.concatenate([[1.0], p])
-        n = self.levels[0].G.shape[1]
-        left, right = np.zeros((1, n, 1)), np.zeros((1, n, 1))
-        between = np.zeros((0, n, 1))
-        for level in reversed(self.levels):
-            pairs = len(level.G)
-            i, j = level.first, level.second
-            ahead = j.A.transpose(0, 2, 1) @ right[:pairs] + (j.eta @ weights)[:, :, None]
-            x = level.G @ (i.A @ left[:pairs] + (i.b @ weights)[:, :, None] + i.C @ ahead)
-            slope = ahead - j.J @ x
-            wider, behind, joined = (np.empty((level.count, n, 1)) for _ in range(3))
-            wider[0 : 2 * pairs : 2], wider[1 : 2 * pairs : 2] = left[:pairs], x
-            behind[0 : 2 * pairs : 2], behind[1 : 2 * pairs : 2] = slope, right[:pairs]
-            if level.count % 2:
-                wider[-1], behind[-1] = left[-1], right[-1]
-            joined = joined[: level.count - 1]
-            joined[0 : 2 * pairs : 2] = x
-            joined[1::2] = between
-            left, right, between = wider, behind, joined
-        return between[:, :, 0]
+        zero = np.zeros(self.top.whole.A.shape[1])
+        inner = self.top.between(weights, zero, zero)
+        before, behind = np.vstack([zero, inner[0]]), np.vstack([inner[1], zero])
+        states: list[np.ndarray] = []
+        slopes: list[np.ndarray] = []
+        for part, left, right in zip(self.parts, before, behind, strict=True):
+            x, slope = part.between(weights, left, right)
+            states += [left[None], x]
+            slopes += [slope, right[None]]
+        return np.concatenate(states[1:]), np.concatenate(slopes[:-1])
 
 
-def solve(stages: Stages) -> Solved:
-    """Join all stages (at least two) pair by pair: about log2(K) batched levels, memory of order K."""
+def solve(parts: Sequence[Section]) -> Solved:
+    """A chain given as sections in a row. The first begins with what is known of the first state (A zero), the last
+    ends with a stage without transition."""
+    top = section(Stages(*(np.concatenate([getattr(p.whole, f) for p in parts]) for f in FIELDS)))
+    return Solved(sum((p.Z for p in parts), top.Z), top, tuple(parts))
+
+
+def section(stages: Stages) -> Section:
+    """Stages joined pair by pair: about log2(K) batched levels. Some 100 at a time stay in the processor's cache."""
     n, c = stages.b.shape[1:]
     Z = np.zeros((c, c))
     levels: list[_Level] = []
@@ -110,11 +142,9 @@ def solve(stages: Stages) -> Solved:
         levels.append(_Level(G, i, j, len(stages)))
         if len(stages) % 2:
             rest = stages.part(slice(-1, None))
-            joined = Stages(
-                *(np.concatenate([getattr(joined, f), getattr(rest, f)]) for f in ("A", "b", "C", "eta", "J"))
-            )
+            joined = Stages(*(np.concatenate([getattr(joined, f), getattr(rest, f)]) for f in FIELDS))
         stages = joined
-    return Solved((Z + Z.T) / 2, tuple(levels))
+    return Section((Z + Z.T) / 2, stages, tuple(levels))
 
 
 def _sum_of_products(a: np.ndarray, b: np.ndarray) -> np.ndarray:

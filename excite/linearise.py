@@ -15,13 +15,13 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
-from excite.simulate import _step
+from excite.simulate import _A, _C, _GAMMA, _SLOPES, _TIMES, _lu, _solve
 from model.machine import Sensor
 from model.prediction import Model
 
-ACCURACY = 30.0  # of an interval, in units of simulate's tolerance: 1e-6, far below what a sample's torque noise does
+ACCURACY = 1e-5  # of a speed over an interval [rad/s, m/s]: what a sample's torque noise does is far more
 CHUNKS = (500, 25)  # samples in one call of a mapped function
-SPLITS = 10  # an interval is halved at most this often
+SPLITS = 6  # an interval is halved at most this often
 
 
 class Batch:
@@ -104,13 +104,12 @@ class Chart:
 
 @dataclass(frozen=True)
 class Slopes:
-    """Derivatives of the end of each of K intervals: by its start A (K, n, n), the torques at its two ends B0, B1
-    (K, n, n_u), base parameters at fixed delivered torque X (K, n, n_base), a constant force on each pushed row
-    F (K, n, n_pushed)."""
+    """Derivatives of the end of each of K intervals: by its start A (K, n, n), by a torque that is constant in it
+    B (K, n, n_u), by base parameters at fixed delivered torque X (K, n, n_base), by a constant force on each pushed
+    row F (K, n, n_pushed)."""
 
     A: np.ndarray
-    B0: np.ndarray
-    B1: np.ndarray
+    B: np.ndarray
     X: np.ndarray
     F: np.ndarray
 
@@ -129,14 +128,11 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
 
     M, bias = model.equations(q, nu, X)
     pushed = tuple(k for k in range(n_q) if k not in model.actuated)
-    force = ca.SX.sym("F", len(pushed))
     load = ca.SX(n_q, 1)
     for k, row in enumerate(model.actuated):
         load[row] += u[k]
-    for k, row in enumerate(pushed):
-        load[row] += force[k]
-    D, L, order = ca.ldl(M)
-    a = ca.ldl_solve(load - bias, D, L, order)
+    factors = ca.ldl(M)
+    a = ca.ldl_solve(load - bias, *factors)
     rates = ca.vertcat(dq, a, wheel_rates)
     core = _felt(model) + list(range(n_q, 2 * n_q))
 
@@ -167,26 +163,30 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
         """An expression of the full state, in terms of the chart's."""
         return ca.substitute([e], [full], [where])[0]
 
-    zero = ca.SX.zeros(len(pushed), 1)
-    own = [
-        ca.substitute([e], [force], [zero])[0]
-        for e in (
-            ca.jacobian(rates[core], full[core]),
-            ca.jacobian(rates[core], u),
-            ca.jacobian(rates[core], X),
-            ca.jacobian(rates[core], force),
-            ca.jacobian(rates[index[len(core) :]], full[core]),
-        )
+    def moved(x: ca.SX) -> ca.SX:
+        """How the rates of the core move with x: of the velocities by the balance M da = -d(M a + bias)/dx."""
+        held = ca.SX.sym("a", n_q)
+        balance = ca.jacobian(M @ held + bias - load, x)
+        da = -ca.ldl_solve(ca.substitute([balance], [held], [a])[0], *factors)
+        return ca.vertcat(ca.jacobian(dq, x), da)[core, :]
+
+    push = ca.SX.eye(n_q)[:, list(pushed)]
+    local = [
+        along(moved(full[core])),
+        along(moved(u)),
+        along(moved(X)),
+        along(ca.vertcat(ca.SX(n_q, len(pushed)), ca.ldl_solve(push, *factors))[core, :]),
+        along(ca.jacobian(rates[index[len(core) :]], full[core])),
     ]
     speed = ca.vertcat(*[rates[index[k]] if k >= 0 else ca.SX(0) for k in angle])
     seen = ca.vertcat(*h)
-    slopes = ca.Function("slopes", [state, u, X], [along(e) for e in own])
+    slopes = ca.Function("slopes", [state, u, X], local)
+    step = _step(state, u, X, len(core), along(rates[index]), local[0], local[1], local[4])
     readings = ca.Function(
         "readings",
         [state],
         [along(seen), along(ca.jacobian(seen, full[index])), along(speed), along(ca.jacobian(speed, full[index]))],
     )
-    step, _ = _step(model)
     table = np.array([model.base.standard.index(f"u{b.index}0") for b in machine.actuated])
     return Chart(
         model,
@@ -200,8 +200,32 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
         Batch(slopes, (2,)),
         Batch(readings),
         Batch(step, (3, 4)),
-        Batch(ca.Function("pivots", [state, X], [along(ca.vec(D))]), (1,)),
+        Batch(ca.Function("pivots", [state, X], [along(ca.vec(factors[0]))]), (1,)),
     )
+
+
+def _step(
+    state: ca.SX, u: ca.SX, X: ca.SX, core: int, rates: ca.SX, J: ca.SX, B: ca.SX, R: ca.SX
+) -> ca.Function:
+    """(state, u, du/dt, h, X) -> state after h, its error [SI]: simulate's Rosenbrock method, on a chart's states.
+
+    The angles that nothing depends on take part in the method as they are: below the core's block in the Jacobian.
+    """
+    n = state.numel()
+    rate = ca.Function("rate", [state, u, X], [rates], {"cse": True})
+    y, left, slope, h = ca.SX.sym("y", n), ca.SX.sym("l", u.numel()), ca.SX.sym("s", u.numel()), ca.SX.sym("h")
+    Jy, By, Ry = ca.Function("jacobian", [state, u, X], [J, B, R], {"cse": True})(y, left, X)
+    lower, upper = _lu(ca.SX.eye(core) / (_GAMMA * h) - Jy)
+    dt = ca.vertcat(By @ slope, ca.SX.zeros(n - core, 1))
+    stages: list[ca.SX] = []
+    for time, gain, weights, c in zip(_TIMES, _SLOPES, _A, _C, strict=True):
+        at = y + sum((w * U for w, U in zip(weights, stages, strict=True)), ca.SX(n, 1))
+        known = rate(at, left + slope * (time * h), X) + gain * h * dt
+        known += sum((w * U for w, U in zip(c, stages, strict=True)), ca.SX(n, 1)) / h
+        inner = _solve(lower, upper, known[:core])
+        stages.append(ca.vertcat(inner, _GAMMA * h * (Ry @ inner + known[core:])))
+    error = ca.norm_inf(stages[-1])
+    return ca.Function("step", [y, left, slope, h, X], [at + stages[-1], error], {"cse": True})
 
 
 def _felt(model: Model) -> list[int]:
@@ -218,17 +242,14 @@ def _felt(model: Model) -> list[int]:
     return [k for k in range(len(size)) if change[k] > 1e-9 * size[k]]
 
 
-def advance(chart: Chart, s: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """Where N states s (N, n) under torques u (N, n_u) [N m], linear between samples, lead: (N - 1, n).
+def advance(chart: Chart, s: np.ndarray, left: np.ndarray, right: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """Where K states s (K, n) lead in one sample (K, n) under torques from left to right (K, n_u) [N m].
 
     Not finite where an interval can't be integrated.
     """
     sample = 1 / float(chart.model.machine.sampling_hz)
-    start = np.zeros((len(s) - 1, chart.full))
-    start[:, chart.index] = s[:-1]
     with np.errstate(all="ignore"):
-        end = _intervals(chart, start, u[:-1], np.diff(u, axis=0) / sample, sample, X, SPLITS)
-    return end[:, chart.index]
+        return _intervals(chart, s, left, (right - left) / sample, sample, X, SPLITS)
 
 
 def _intervals(
@@ -245,14 +266,14 @@ def _intervals(
 
 
 def differentiate(chart: Chart, s: np.ndarray, u: np.ndarray, X: np.ndarray, force: bool = False) -> Slopes:
-    """How the ends of the N - 1 intervals between states s (N, n) under torques u (N, n_u) move, to about 1e-3.
+    """How the ends of the K intervals between states s (K + 1, n) under torques u (K + 1, n_u) move, to about 1 %.
 
     F is filled with `force` only.
     """
     h = 1 / float(chart.model.machine.sampling_hz)
     n, c, n_u, n_p = chart.n, chart.core, u.shape[1], len(X)
     J, B, JX, JF, R = chart.slopes(s, u, X)
-    n_f = JF.shape[2] if force else 0
+    direct = np.concatenate([B, JX, JF] if force else [B, JX], axis=2)
     K = len(s) - 1
 
     def between(e: np.ndarray) -> np.ndarray:
@@ -264,33 +285,16 @@ def differentiate(chart: Chart, s: np.ndarray, u: np.ndarray, X: np.ndarray, for
     system[:, :c, :c], system[:, :c, c:] = J1 * (-h * 5 / 12), J2 * (h / 12)
     system[:, c:, :c], system[:, c:, c:] = J1 * (-h * 3 / 4), J2 * (-h / 4)
     system[:, range(2 * c), range(2 * c)] += 1.0
-    # Columns: start, torque at the start (a hat that falls), at the end (a hat that rises), parameters, forces.
-    width = c + 2 * n_u + n_p + n_f
-    first, second = np.zeros((K, c, width)), np.zeros((K, c, width))
-    B1 = between(B)
-    first[:, :, c : c + n_u], first[:, :, c + n_u : c + 2 * n_u] = B1 * (2 / 3), B1 * (1 / 3)
-    second[:, :, c + n_u : c + 2 * n_u] = B[1:]
-    rest = c + 2 * n_u
-    first[:, :, rest : rest + n_p], second[:, :, rest : rest + n_p] = between(JX), JX[1:]
-    if force:
-        first[:, :, rest + n_p :], second[:, :, rest + n_p :] = between(JF), JF[1:]
-    known = np.empty((K, 2 * c, width))
-    known[:, :c] = first * (h * 5 / 12) - second * (h / 12)
-    known[:, c:] = first * (h * 3 / 4) + second * (h / 4)
+    first, second = between(direct), direct[1:]
+    known = np.zeros((K, 2 * c, c + direct.shape[2]))
+    known[:, :c, c:] = first * (h * 5 / 12) - second * (h / 12)
+    known[:, c:, c:] = first * (h * 3 / 4) + second * (h / 4)
     eye = np.arange(c)
-    known[:, eye, eye] += 1.0
-    known[:, c + eye, eye] += 1.0
+    known[:, eye, eye] = 1.0
+    known[:, c + eye, eye] = 1.0
     Y = np.linalg.inv(system) @ known
-    moved = np.zeros((K, n, width))
-    moved[:, :c] = Y[:, c:]
-    moved[:, c:] = h * (0.75 * between(R) @ Y[:, :c] + 0.25 * R[1:] @ Y[:, c:])
+    moved = np.concatenate([Y[:, c:], h * (0.75 * between(R) @ Y[:, :c] + 0.25 * R[1:] @ Y[:, c:])], axis=1)
     A = np.zeros((K, n, n))
     A[:, :, :c] = moved[:, :, :c]
     A[:, range(c, n), range(c, n)] = 1.0
-    return Slopes(
-        A,
-        moved[:, :, c : c + n_u],
-        moved[:, :, c + n_u : rest],
-        moved[:, :, rest : rest + n_p],
-        moved[:, :, rest + n_p :],
-    )
+    return Slopes(A, moved[:, :, c : c + n_u], moved[:, :, c + n_u : c + n_u + n_p], moved[:, :, c + n_u + n_p :])

@@ -36,6 +36,7 @@ DOUBT = (
     "the machine does something that the model doesn't know: intervals of the exact model do not hold, these are of a"
     " model with disturbing forces; run `excite diagnose`"
 )
+PART = 100  # samples at a time: their chain stays in the processor's cache
 SPREAD_SPEED, SPREAD_ANGLE = 1.0, 0.1  # of the first state about its guess: says next to nothing
 
 
@@ -70,7 +71,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Point:
-    """Where an iteration stands: states (N, n), torque errors (N, n_u), offsets (m_o,) of one log."""
+    """Where an iteration stands: states (N, n), torque errors (N - 1, n_u), offsets (m_o,) of one log."""
 
     s: np.ndarray
     w: np.ndarray
@@ -79,16 +80,17 @@ class Point:
 
 @dataclass(frozen=True)
 class Linear:
-    """One log linearised about a point: its chain and what it reduces to.
+    """One log linearised about a point: its chain in scaled states, and what it reduces to.
 
-    Z: twice the negative log-likelihood is [1 p]' Z [1 p] for steps p of parameters and offsets, scaled. scale
-    (n + n_u,) leads from the chain's states to SI. H (N, m, n) in the chain's scale, weight, residual (N, m).
+    Z: twice the negative log-likelihood is [1 p]' Z [1 p] for steps p of parameters and offsets, scaled. gain
+    (N - 1, n, n_u): what a torque error of one standard deviation does to the scaled state. stages: by part of the
+    log. H (N, m, n), weight, residual (N, m): the readings.
     """
 
-    stages: chain.Stages
     solved: chain.Solved
     Z: np.ndarray
-    scale: np.ndarray
+    gain: np.ndarray
+    stages: tuple[chain.Stages, ...]
     H: np.ndarray
     weight: np.ndarray
     residual: np.ndarray
@@ -146,11 +148,12 @@ def _estimate(c: Chart, records: Sequence[Record], fit: Fit, filter: Filter, not
     }
     W, Y, errors = [], [], []
     for r, p in zip(records, fit.points, strict=True):
-        q, nu, u = *_motion(c, p.s), r.torque - fit.X @ c.offsets.T + p.w
+        w = np.concatenate([p.w, p.w[-1:]])
+        q, nu, u = *_motion(c, p.s), r.torque - fit.X @ c.offsets.T + w
         a = model.acceleration(q.T, nu.T, u.T, fit.X).full()
         W.append(model.stacked(q.T, nu.T, a).reshape(-1, len(fit.X)))
         measured, error = np.zeros((2, len(model.rows), len(u)))
-        measured[list(model.actuated)], error[list(model.actuated)] = r.torque.T, -p.w.T
+        measured[list(model.actuated)], error[list(model.actuated)] = r.torque.T, -w.T
         Y.append(decimate(measured, filter.decimation))
         errors.append(decimate(error, filter.decimation))
     R = np.linalg.qr(np.concatenate(W), mode="r")
@@ -208,7 +211,7 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
     )
     none = np.zeros((len(state), len(c.sensors)))
     r = Record(motion.u + X @ c.offsets.T, none, none, counts, _origin(c, counts), noise)
-    p = Point(state, np.zeros_like(motion.u), np.zeros(len(r.origin)))
+    p = Point(state, np.zeros_like(motion.u[1:]), np.zeros(len(r.origin)))
     linear = _linearise(c, _expected(c, r, p), p, state[0], X, False, exact=True)
     assert linear is not None
     information = linear.Z[1:, 1:].copy()
@@ -293,7 +296,7 @@ def _start(c: Chart, r: Record, log: Log, filter: Filter) -> Point:
             s[:, k] = log.values[c.sensors[j].name][0] + np.concatenate(
                 [[0], np.cumsum(speed[1:] + speed[:-1]) / (2 * rate)]
             )
-    return Point(s, np.zeros_like(r.torque), np.zeros(len(r.origin)))
+    return Point(s, np.zeros_like(r.torque[1:]), np.zeros(len(r.origin)))
 
 
 def _linearise(
@@ -303,20 +306,69 @@ def _linearise(
 
     `exact`: the point is a motion of the machine, which needs no integration.
     """
-    u = r.torque - X @ c.offsets.T + p.w
-    end = p.s[1:] if exact else advance(c, p.s, u, X)
-    if not np.isfinite(end).all():
-        return None
+    delivered = r.torque - X @ c.offsets.T
+    if exact:
+        defect = np.zeros_like(p.s[1:])
+    else:
+        defect = advance(c, p.s[:-1], delivered[:-1] + p.w, delivered[1:] + p.w, X) - p.s[1:]
+        if not np.isfinite(defect).all():
+            return None
     h, H, weight, D = _readings(c, r, p)
-    data = np.zeros((*h.shape, 1 + len(X) + len(r.origin)))
-    if not exact:
-        data[:, :, 0] = np.where(r.used > 0, r.reading - h, 0.0)
-    data[:, :, 1 + len(X) :] = -D * _one_count(c, r)
-    stages, scale = _stages(c, r, p, first, X, end - p.s[1:], u, H, weight, data, disturbed)
-    solved = chain.solve(stages)
-    # What the readings say of data and offsets directly; the base parameters act through the states alone.
-    flat = (data * np.sqrt(weight)[:, :, None]).reshape(-1, data.shape[2])
-    return Linear(stages, solved, solved.Z + flat.T @ flat, scale, H * scale[: c.n], weight, data[:, :, 0])
+    residual = np.zeros_like(h) if exact else np.where(r.used > 0, r.reading - h, 0.0)
+    u = delivered + np.concatenate([p.w, p.w[-1:]])
+    scale, n_p, n_o = _scale(c), len(X), len(r.origin)
+    S, unit = H * scale, _one_count(c, r)
+    parts, stages, gains = [_known_before(c, p, first, 1 + n_p + n_o)], [], []
+    N = len(p.s)
+    for k in range(0, N - 1, PART):
+        end = min(k + PART, N - 1)
+        # The last part ends with the last sample, from which nothing leads on.
+        own = slice(k, end if end < N - 1 else N)
+        J, eta = _seen(S[own], weight[own], residual[own], D * unit, n_p)
+        A, C = np.zeros((2, *J.shape))
+        b = np.zeros_like(eta)
+        by = differentiate(c, p.s[k : end + 1], u[k : end + 1], X, disturbed)
+        gain = by.B * r.noise.torque / scale[:, None]
+        on = slice(0, end - k)
+        A[on] = by.A * scale / scale[:, None]
+        C[on] = gain @ gain.transpose(0, 2, 1)
+        if disturbed:
+            push = by.F * _forces(c) / scale[:, None]
+            C[on] += push @ push.transpose(0, 2, 1)
+        b[on, :, 0] = defect[k:end] / scale - (gain @ (p.w[k:end] / r.noise.torque)[:, :, None])[:, :, 0]
+        b[on, :, 1 : 1 + n_p] = (by.X - by.B @ c.offsets) * (c.model.scale / scale[:, None])
+        gains.append(gain)
+        stages.append(chain.Stages(A, b, C, eta, J))
+        parts.append(chain.section(stages[-1]))
+    solved = chain.solve(parts)
+    # What the readings say of the offsets directly; base parameters act through the states alone.
+    flat = np.concatenate([residual[:, :, None], np.broadcast_to(-D * unit, (*residual.shape, n_o))], axis=2)
+    flat = (flat * np.sqrt(weight)[:, :, None]).reshape(-1, 1 + n_o)
+    Z = solved.Z.copy()
+    at = np.concatenate([[0], np.arange(1 + n_p, 1 + n_p + n_o)])
+    Z[np.ix_(at, at)] += flat.T @ flat
+    return Linear(solved, Z, np.concatenate(gains), tuple(stages), S, weight, residual)
+
+
+def _known_before(c: Chart, p: Point, first: np.ndarray, columns: int) -> chain.Section:
+    """A stage that leads to the first state, from nothing: a guess and how far it may be off."""
+    n, scale = c.n, _scale(c)
+    none = np.zeros((1, n, n))
+    b = np.zeros((1, n, columns))
+    b[0, :, 0] = (first - p.s[0]) / scale
+    spread = np.where(_speeds(c), SPREAD_SPEED, SPREAD_ANGLE)
+    return chain.section(chain.Stages(none, b, np.diag((spread / scale) ** 2)[None], np.zeros_like(b), none))
+
+
+def _seen(
+    H: np.ndarray, weight: np.ndarray, residual: np.ndarray, D: np.ndarray, n_p: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """What readings tell of the states: J (K, n, n), eta (K, n, 1 + n_p + n_o)."""
+    weighted = (H * weight[:, :, None]).transpose(0, 2, 1)
+    eta = np.zeros((len(H), H.shape[2], 1 + n_p + D.shape[1]))
+    eta[:, :, :1] = weighted @ residual[:, :, None]
+    eta[:, :, 1 + n_p :] = -(weighted @ D)
+    return weighted @ H, eta
 
 
 def _one_count(c: Chart, r: Record) -> np.ndarray:
@@ -343,60 +395,14 @@ def _readings(c: Chart, r: Record, p: Point) -> tuple[np.ndarray, np.ndarray, np
     return h + D @ p.offset, H, r.used / width**2, D
 
 
-def _stages(
-    c: Chart,
-    r: Record,
-    p: Point,
-    first: np.ndarray,
-    X: np.ndarray,
-    defect: np.ndarray,
-    u: np.ndarray,
-    H: np.ndarray,
-    weight: np.ndarray,
-    data: np.ndarray,
-    disturbed: bool,
-) -> tuple[chain.Stages, np.ndarray]:
-    """The chain in scaled unknowns: state, torque error; K = N + 1 stages, the first for what is known beforehand."""
-    N, n = p.s.shape
-    n_u, n_p, columns = u.shape[1], len(X), data.shape[2]
-    by = differentiate(c, p.s, u, X, disturbed)
-    scale = _scales(c, r)
-    sigma = r.noise.torque
-    S, Si = scale, 1 / scale
-    total = n + n_u
-    A, C, J = (np.zeros((N + 1, total, total)) for _ in range(3))
-    b, eta = np.zeros((N + 1, total, columns)), np.zeros((N + 1, total, columns))
-    B1 = by.B1 * (Si[:, None] * sigma)
-    A[1:N, :n, :n] = by.A * (Si[:, None] * S)
-    A[1:N, :n, n:] = by.B0 * (Si[:, None] * sigma)
-    C[1:N, :n, :n] = B1 @ B1.transpose(0, 2, 1)
-    C[1:N, :n, n:], C[1:N, n:, :n] = B1, B1.transpose(0, 2, 1)
-    C[1:N, range(n, total), range(n, total)] = 1.0
-    if disturbed:
-        F = by.F * (Si[:, None] * _forces(c))
-        C[1:N, :n, :n] += F @ F.transpose(0, 2, 1)
-    w = p.w / sigma
-    b[1:N, :n, 0] = defect * Si - (B1 @ w[1:, :, None])[:, :, 0]
-    b[1:N, n:, 0] = -w[1:]
-    b[1:N, :n, 1 : 1 + n_p] = (by.X - (by.B0 + by.B1) @ c.offsets) * Si[:, None] * c.model.scale
-    C[0, range(total), range(total)] = np.concatenate([(_spread(c) * Si) ** 2, np.ones(n_u)])
-    b[0, :, 0] = np.concatenate([(first - p.s[0]) * Si, -w[0]])
-    Hs = H * S
-    weighted = (Hs * weight[:, :, None]).transpose(0, 2, 1)
-    J[1:, :n, :n] = weighted @ Hs
-    eta[1:, :n] = weighted @ data
-    return chain.Stages(A, b, C, eta, J), np.concatenate([scale, sigma])
-
-
-def _scales(c: Chart, r: Record) -> np.ndarray:
-    """Typical size of an error of each state: a step for an angle, what a sensor tells for a speed."""
+def _speeds(c: Chart) -> np.ndarray:
     n_q = len(c.model.coordinates)
-    return np.array([1e-2 if n_q <= k < 2 * n_q else 1e-3 for k in c.index])
+    return (c.index >= n_q) & (c.index < 2 * n_q)
 
 
-def _spread(c: Chart) -> np.ndarray:
-    n_q = len(c.model.coordinates)
-    return np.array([SPREAD_SPEED if n_q <= k < 2 * n_q else SPREAD_ANGLE for k in c.index])
+def _scale(c: Chart) -> np.ndarray:
+    """Typical size of an error of each state (n,)."""
+    return np.where(_speeds(c), 1e-2, 1e-3)
 
 
 def _forces(c: Chart) -> np.ndarray:
@@ -496,9 +502,10 @@ def _parameters(
 
 def _moved(c: Chart, r: Record, p: Point, linear: Linear, move: np.ndarray) -> Point:
     """The point after a step of parameters and offsets, with the states that go with it."""
-    x = linear.solved.states(move) * linear.scale
+    x, slope = linear.solved.states(move)
+    w = (linear.gain.transpose(0, 2, 1) @ slope[1:, :, None])[:, :, 0] * r.noise.torque
     offset = move[len(move) - len(r.origin) :]
-    return Point(p.s + x[:, : c.n], p.w + x[:, c.n :], p.offset + offset * _one_count(c, r))
+    return Point(p.s + x * _scale(c), w, p.offset + offset * _one_count(c, r))
 
 
 def _between(
@@ -543,29 +550,37 @@ def innovation_sizes(linear: Linear) -> np.ndarray:
 def innovations(linear: Linear) -> np.ndarray:
     """Each reading less its prediction from all before it, over its standard deviation (N, m); NaN where unused.
 
-    A Kalman filter along the last linearisation, at the parameters found.
+    A Kalman filter along the last linearisation, at the parameters found. The joined parts give what is known where
+    each begins; then all parts are filtered side by side.
     """
-    stages, H, weight, residual = linear.stages, linear.H, linear.weight, linear.residual
-    N, m = residual.shape
-    z = np.full((N, m), np.nan)
-    x, P = stages.b[0, :, 0], stages.C[0]
-    n = H.shape[2]
-    for k in range(N):
-        rows = np.flatnonzero(weight[k])
-        if len(rows):
-            h = H[k, rows]
-            PH = P[:, :n] @ h.T
-            S = h @ PH[:n]
-            S[range(len(rows)), range(len(rows))] += 1 / weight[k, rows]
-            e = residual[k, rows] - h @ x[:n]
-            z[k, rows] = e / np.sqrt(np.diag(S))
-            K = np.linalg.solve(S, PH.T).T
-            x = x + K @ e
-            P = P - K @ PH.T
-        if k < N - 1:
-            A = stages.A[k + 1]
-            x = A @ x + stages.b[k + 1, :, 0]
-            P = A @ P @ A.T + stages.C[k + 1]
+    parts, n = linear.solved.parts, linear.H.shape[2]
+    starts = np.cumsum([0, *(len(s) for s in linear.stages)])
+    x, P = np.empty((len(linear.stages), n)), np.empty((len(linear.stages), n, n))
+    x[0], P[0] = parts[0].whole.b[0, :, 0], parts[0].whole.C[0]
+    for k, part in enumerate(parts[1:-1]):
+        w = part.whole
+        seen = np.linalg.inv(np.eye(n) + P[k] @ w.J[0])
+        x[k + 1] = w.A[0] @ (seen @ (x[k] + P[k] @ w.eta[0, :, 0])) + w.b[0, :, 0]
+        P[k + 1] = w.A[0] @ seen @ P[k] @ w.A[0].T + w.C[0]
+    z = np.full(linear.residual.shape, np.nan)
+    for j in range(max(len(s) for s in linear.stages)):
+        going = [i for i, s in enumerate(linear.stages) if j < len(s)]
+        x, P = x[: len(going)], P[: len(going)]
+        at = starts[going] + j
+        h, weight = linear.H[at], linear.weight[at]
+        PH = P @ h.transpose(0, 2, 1)
+        # A reading that isn't used counts as one with a huge variance.
+        variance = 1 / np.maximum(weight, 1e-12 * linear.weight.max(axis=0))
+        S = h @ PH
+        S[:, range(h.shape[1]), range(h.shape[1])] += variance
+        e = linear.residual[at] - (h @ x[:, :, None])[:, :, 0]
+        z[at] = np.where(weight > 0, e / np.sqrt(np.diagonal(S, axis1=1, axis2=2)), np.nan)
+        K = np.linalg.solve(S, PH.transpose(0, 2, 1)).transpose(0, 2, 1)
+        x = x + (K @ e[:, :, None])[:, :, 0]
+        P = P - K @ PH.transpose(0, 2, 1)
+        A, b, C = (np.stack([getattr(linear.stages[i], f)[j] for i in going]) for f in ("A", "b", "C"))
+        x = (A @ x[:, :, None])[:, :, 0] + b[:, :, 0]
+        P = A @ P @ A.transpose(0, 2, 1) + C
     return z
 
 
