@@ -20,6 +20,7 @@ from model.prediction import Model
 
 DEGREE = 3
 STILL = 0.25  # of the tolerance for rest at the end is used
+SETTLED = 1e-7  # residual of the equations of motion, scaled
 FAR = 1e3  # stands for no bound, in half ranges
 
 
@@ -53,7 +54,8 @@ class Mapped:
 class Transcription:
     """The nonlinear program's data. K intervals, J nodes in each, states z (n_z,), torques u (n_u,).
 
-    A node's sample is s = (z, dz/dt, u), all scaled. Functions of it: residual (n_z,) of the equations of motion,
+    A node's sample is s = (z, dz/dt, u), all scaled; `spread` (J, n_s, n_z + J n_z + 2 n_u) makes it from an interval's
+    left state, node states, left and right torque. Functions of it: residual (n_z,) of the equations of motion,
     limits (n_g,) scaled to -1..1, entries (n_a,) of the information matrix on and above its diagonal.
     """
 
@@ -76,6 +78,8 @@ class Transcription:
     size: int
     at_rest: np.ndarray
     band: np.ndarray
+    loose: np.ndarray
+    spread: np.ndarray
     values: Mapped = field(repr=False)
     first: Mapped = field(repr=False)
     second: Mapped = field(repr=False)
@@ -101,19 +105,6 @@ class Transcription:
         u = U[:-1, None] * (1 - self.place)[:, None] + U[1:, None] * self.place[:, None]
         return np.concatenate([Z, rate, u], axis=2).reshape(-1, self.n_s)
 
-    def spread(self) -> np.ndarray:
-        """(J, n_s, n_z + J n_z + 2 n_u): samples of the nodes from (left state, node states, left and right torque)."""
-        J, n_z, n_u = self.nodes, self.n_z, self.n_u
-        L = np.zeros((J, self.n_s, n_z + J * n_z + 2 * n_u))
-        eye = np.eye(n_z)
-        for j in range(J):
-            L[j, :n_z, n_z * (j + 1) : n_z * (j + 2)] = eye
-            for i in range(J + 1):
-                L[j, n_z : 2 * n_z, n_z * i : n_z * (i + 1)] = self.derivative[j, i] * eye
-            L[j, 2 * n_z :, n_z * (J + 1) : n_z * (J + 1) + n_u] = (1 - self.place[j]) * np.eye(n_u)
-            L[j, 2 * n_z :, n_z * (J + 1) + n_u :] = self.place[j] * np.eye(n_u)
-        return L
-
     def matrix(self, entries: np.ndarray) -> np.ndarray:
         """The information matrix (n, n) of its entries (n_a,)."""
         A = np.zeros((self.size, self.size))
@@ -122,42 +113,58 @@ class Transcription:
         return A
 
 
+def _spread(place: np.ndarray, derivative: np.ndarray, n_z: int, n_u: int) -> np.ndarray:
+    """(J, n_s, n_z + J n_z + 2 n_u): samples of the nodes from (left state, node states, left and right torque)."""
+    J = len(place)
+    L = np.zeros((J, 2 * n_z + n_u, n_z + J * n_z + 2 * n_u))
+    for j in range(J):
+        L[j, :n_z, n_z * (j + 1) : n_z * (j + 2)] = np.eye(n_z)
+        L[j, n_z : 2 * n_z, : n_z * (J + 1)] = np.kron(derivative[j], np.eye(n_z))
+        L[j, 2 * n_z :, n_z * (J + 1) :] = np.kron([1 - place[j], place[j]], np.eye(n_u))
+    return L
+
+
 def settle(tr: Transcription, start: np.ndarray, U: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Node states (K, J, n_z) that the torques U (K + 1, n_u) lead to: Newton's method interval by interval."""
-    K, J, n_z = tr.intervals, tr.nodes, tr.n_z
-    L = tr.spread()
-    inner = slice(n_z, n_z * (J + 1))
-    Z = guess.copy()
+    """Node states (K, J, n_z) that the torques U (K + 1, n_u) lead to: Newton's method interval by interval.
+
+    Raises UnsettledError where it fails from the guess and from rest on the left state.
+    """
+    Z = np.empty_like(guess)
     left = start
-    for k in range(K):
-        x = guess[k].ravel()
-        best = np.inf
-        for attempt in range(3):
-            if attempt:
-                x = np.tile(left, J)
-            for _ in range(25):
-                s = L @ np.concatenate([left, x, U[k], U[k + 1]])
-                c, slope = tr.step(s)
-                size = float(np.abs(c).max())
-                if size < 1e-9:
-                    break
-                C = np.matmul(slope, L[:, :, inner]).reshape(J * n_z, -1)
-                dx = np.linalg.solve(C, -c.ravel())
-                share = 1.0
-                for _ in range(8):
-                    trial, _s = tr.step(L @ np.concatenate([left, x + share * dx, U[k], U[k + 1]]))
-                    if float(np.abs(trial).max()) < size:
-                        break
-                    share *= 0.5
-                x = x + share * dx
-            if size < 1e-7:
-                break
-        best = min(best, size)
-        if best > 1e-6:
-            raise UnsettledError(f"no motion follows these torques in interval {k} (residual {best:.1e})")
-        Z[k] = x.reshape(J, n_z)
+    for k in range(tr.intervals):
+        u = U[k : k + 2].ravel()
+        x, size = _follow(tr, left, guess[k].ravel(), u)
+        if size > SETTLED:
+            x, size = _follow(tr, left, np.tile(left, tr.nodes), u)
+        if size > SETTLED:
+            raise UnsettledError(f"no motion follows these torques in interval {k} (residual {size:.1e})")
+        Z[k] = x.reshape(tr.nodes, tr.n_z)
         left = Z[k, -1]
     return Z
+
+
+def _follow(tr: Transcription, left: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, float]:
+    """Node states (J n_z,) of one interval and the largest residual, by Newton's method with step halving."""
+    n_z, J = tr.n_z, tr.nodes
+    L, inner = tr.spread, tr.spread[:, :, n_z : n_z * (J + 1)]
+    known = L @ np.concatenate([left, np.zeros(J * n_z), u])
+    c, slope = tr.step(known + inner @ x)
+    size = float(np.abs(c).max())
+    for _ in range(25):
+        if size < 1e-9:
+            break
+        dx = np.linalg.solve(np.matmul(slope, inner).reshape(J * n_z, -1), -c.ravel())
+        share = 1.0
+        for _ in range(8):
+            c, slope = tr.step(known + inner @ (x + share * dx))
+            trial = float(np.abs(c).max())
+            if trial < size:
+                break
+            share *= 0.5
+        x, size = x + share * dx, trial
+        if not np.isfinite(size):
+            return x, np.inf
+    return x, size
 
 
 def radau(elements: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -196,11 +203,9 @@ def transcribe(
     deferred = set() if with_pose else {g.name for g in every if g.name.startswith("lane")}
     staged = [g for g in every if g.name in moved and g.name not in deferred]
     steered = [g for g in every if g.name not in moved and g.name not in deferred]
-    if with_pose:
-        used = [c for c in model.coordinates if c in model.machine.body[0].coordinates or c in felt(model)]
-        used += [model.coordinates[k] for k in resting(model) if model.coordinates[k] not in used]
-    else:
-        used = [c for k, c in enumerate(model.coordinates) if c in felt(model) or k in resting(model)]
+    pose = model.machine.body[0].coordinates if with_pose else ()
+    needed = {*pose, *felt(model), *(model.coordinates[k] for k in resting(model))}
+    used = [c for c in model.coordinates if c in needed]
     names = (*used, *[c + "'" for c in model.coordinates])
     z_size = np.array([state_size[c] for c in names])
     u_size = np.array([float(b.limit.torque) if b.limit.torque is not None else 1.0 for b in model.machine.actuated])
@@ -273,6 +278,8 @@ def transcribe(
         len(model.scale),
         at_rest,
         band,
+        np.array([k for k, c in enumerate(names) if c in pose and k not in rest], int),
+        _spread(place, derivative, n_z, n_u),
         Mapped(values, N, [(n_z,), (n_g,), (n_a,)]),
         Mapped(first, N, [(n_z,), (n_g,), (n_a,), (n_z, n_s), (n_g, n_s), (n_a, n_s)]),
         Mapped(second, N, [(n_s, n_s)]),

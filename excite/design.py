@@ -246,14 +246,14 @@ def search(model: Model, problem: Problem, name: str, seed: int, over: Callable[
             return best
         task = interior.Task(
             name,
-            start,
             np.full((intervals, tr.nodes, len(tr.limit_names)), MARGIN),
             np.full((intervals, len(tr.control_names)), 1e-4),
+            np.array([name.startswith("lane") for name in tr.limit_names], bool),
         )
         watch = _watch(over)
         if number == 0:
-            Z, U = _project(tr, task, Z, U, watch)
-        point = interior.begin(tr, task, Z, U, stage.barrier, 0.05 if number == 0 else 1e-3)
+            Z, U = _project(tr, task, start, Z, U, watch)
+        point = interior.begin(tr, task, start, Z, U, stage.barrier, 0.05 if number == 0 else 1e-3)
         levels = tuple(
             interior.Level(stage.sharp * 2**i, stage.barrier / 3**i, 0.2 / (stage.sharp * 2**i), stage.iterations)
             for i in range(stage.levels)
@@ -270,7 +270,7 @@ def search(model: Model, problem: Problem, name: str, seed: int, over: Callable[
         if over():
             return best
         lane = max((v for limit, v in found.violations.items() if limit.startswith("lane")), default=0.0)
-        if stage.friction <= 2 and lane > 0:
+        if pose is not None or (stage.friction <= 4 and lane > 0):
             pose = found.start
     return best
 
@@ -289,16 +289,16 @@ def _verdict(
 
 
 def _project(
-    tr: Transcription, task: interior.Task, Z: np.ndarray, U: np.ndarray, watch: Callable[..., bool]
+    tr: Transcription, task: interior.Task, start: np.ndarray, Z: np.ndarray, U: np.ndarray, watch: interior.Watch
 ) -> tuple[np.ndarray, np.ndarray]:
     """The nearest torques that keep every limit and come to rest."""
     near = replace(task, objective=None, pull=1.0, goal=U)
-    point = interior.begin(tr, near, Z, U, 1e-3)
+    point = interior.begin(tr, near, start, Z, U, 1e-3, 0.05)
     point, _ = interior.minimise(tr, near, point, (interior.Level(1.0, 1e-3, 1e-3, 40),), watch)
     return point.Z, point.U
 
 
-def _watch(over: Callable[[], bool]) -> Callable[[interior.Progress, interior.Point, interior.State], bool]:
+def _watch(over: Callable[[], bool]) -> interior.Watch:
     def watch(progress: interior.Progress, point: interior.Point, state: interior.State) -> bool:
         return over()
 
