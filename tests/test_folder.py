@@ -1,0 +1,68 @@
+"""Result folders are whole or not there at all."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from excite import folder
+
+
+def test_a_folder_appears_whole(tmp_path: Path) -> None:
+    out = tmp_path / "a" / "b"
+    with folder.writing(out) as place:
+        (place / "x").write_text("1")
+        assert not out.exists()
+    assert [p.name for p in out.iterdir()] == ["x"]
+    assert [p.name for p in out.parent.iterdir()] == ["b"]
+
+
+def test_what_fails_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), folder.writing(tmp_path / "a" / "b") as place:
+        (place / "x").write_text("1")
+        _ = 1 / 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_fails_keeps_the_old_one(tmp_path: Path) -> None:
+    out = tmp_path / "o"
+    with folder.writing(out) as place:
+        (place / folder.SUMMARY).write_text("old")
+    with pytest.raises(ZeroDivisionError), folder.writing(out):
+        _ = 1 / 0
+    assert (out / folder.SUMMARY).read_text() == "old"
+    with folder.writing(out) as place:
+        (place / folder.SUMMARY).write_text("new")
+    assert (out / folder.SUMMARY).read_text() == "new"
+    assert [p.name for p in tmp_path.iterdir()] == ["o"]
+
+
+def test_a_file_appears_whole(tmp_path: Path) -> None:
+    out = tmp_path / "a" / "log.csv"
+    with pytest.raises(ZeroDivisionError), folder.writing_file(out):
+        _ = 1 / 0
+    assert list(tmp_path.iterdir()) == []
+    with folder.writing_file(out) as path:
+        path.write_text("1")
+    assert out.read_text() == "1"
+    assert [p.name for p in out.parent.iterdir()] == ["log.csv"]
+
+
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(folder.FolderError):
+            folder.claim(out)
+
+
+def test_json_is_strict() -> None:
+    text = folder.dump({"a": np.float64("nan"), "b": np.array([1, np.inf]), "c": {1: np.int64(3)}, "d": "x"})
+    assert json.loads(text, parse_constant=lambda name: pytest.fail(name)) == {
+        "a": None,
+        "b": [1.0, None],
+        "c": {"1": 3},
+        "d": "x",
+    }
