@@ -42,6 +42,9 @@ BudgetOption = Annotated[float | None, typer.Option("--budget", help="stop impro
 RunsOption = Annotated[int, typer.Option("--runs", min=1, help="simulated test days")]
 
 
+POOR = 5.0  # standard deviation [%] that a condition number should not hide
+
+
 class UsageError(ValueError):
     """Something asked for on the command line that can't be had: exit 2."""
 
@@ -491,10 +494,19 @@ def _design_table(summary: dict[str, Any]) -> None:
         if summary["max_violation"] <= 1e-3
         else f"limits exceeded by {100 * summary['max_violation']:.2f} %"
     )
+    sigma = summary["sigma_percent"]
+    worst = max(sigma, key=lambda name: sigma[name])
+    middle = sorted(sigma.values())[len(sigma) // 2]
     _print(
         f"{summary['machine']} {summary['problem']}: cond(Phi) = {summary['cond_phi']:.2f} (best start"
         f" {summary['cond_phi_start']:.0f}), {summary['duration_s']:g} s, {kept}, designed in {summary['wall_s']:.1f} s"
     )
+    _print(
+        f"attainable accuracy (Cramer-Rao, one standard deviation): worst {worst} {sigma[worst]:.2g} %,"
+        f" median {middle:.2g} %"
+    )
+    if summary["objective"] == "cond" and sigma[worst] > POOR:
+        _print(f"a low cond(Phi) hides poor accuracy here: {worst} can't be found better than {sigma[worst]:.2g} %")
 
 
 def _verify_table(summary: dict[str, Any]) -> None:
@@ -550,7 +562,7 @@ def _bar(label: str) -> Iterator[Advance]:
         task = progress.add_task(label, total=None)
 
         def advance(done: int, total: int, best: float | None) -> None:
-            text = label if best is None else f"{label}, best so far {best:.2f}"
+            text = label if best is None or best == float("inf") else f"{label}, best so far {best:.2f}"
             progress.update(task, completed=done, total=total, description=text)
 
         yield advance
@@ -583,16 +595,18 @@ def main() -> None:
 
 def _exit_code(err: Exception) -> int | None:
     """What an error means for the person who must act; None for a defect of ours, which shows its traceback."""
+    from excite.design import Stopped
     from excite.folder import FolderError
     from excite.identify import NotIdentifiable
     from excite.limit import InfeasibleError
     from excite.log import LogError
     from excite.simulate import SimulationError
+    from excite.smoothing import NotConverged
     from model.machine import MachineError
 
     if isinstance(err, UsageError | MachineError | LogError | FolderError):
         return 2
-    if isinstance(err, NotIdentifiable | InfeasibleError | SimulationError):
+    if isinstance(err, NotIdentifiable | NotConverged | InfeasibleError | SimulationError | Stopped):
         return 1
     return None
 
