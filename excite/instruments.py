@@ -1,0 +1,118 @@
+"""Instrumental variables: regressors along a simulated motion, which know nothing of the sensors' noise.
+
+The current estimate drives the log's torques; an observer pulls its speeds towards the measured ones, slowly enough to
+leave their noise behind. Iterated: better parameters, better motion, better instruments (Janot, Vandanjon and Gautier,
+"A generic instrumental variable approach for industrial robot identification", IEEE TCST 22, 2014, with the observer
+in place of their controller).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.linalg
+
+from excite.estimate import Estimate, NotIdentifiable
+from excite.log import Log
+from excite.noise import spread, whitener
+from excite.processing import Samples, lowpass, regression, samples
+from excite.regression import Block, assembled, effective, scatter, solved, whitened
+from excite.simulate import SimulationError, simulate
+from model.machine import Filter
+from model.prediction import Model
+
+PULL = 4.0  # time constant of the observer [s]
+PASSES = 30  # of the iteration, at most
+CONVERGED = 0.02  # a step this small against the standard deviation ends it
+STRETCH = 0.1  # between two corrections by the observer [s]
+SHORTER = 6  # times that a step is halved where the machine it leads to can't be simulated
+
+
+def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
+    """Instrumental variables, from the machine file's values.
+
+    Z'(Y - W X) = 0 with Z the regressor along the observed motion: consistent where W's noise has nothing to do with
+    Z's. Rows are made white at the current estimate, along the observed motion (see `whitener`). Deviations account for
+    autocorrelation. Raises NotIdentifiable where the iteration finds no machine that can be simulated, or none that
+    reproduces itself.
+    """
+    measured = [samples(model, log, filter) for log in logs]
+    blocks = [regression(model, s, filter) for s in measured]
+    noise = [spread(model, log, filter) for log in logs]
+    first = solved(blocks)
+    kept = list(first.kept)
+    x, step = model.nominal.copy(), np.full(len(model.nominal), np.nan)
+    for _ in range(PASSES):
+        seen, x = _observed(model, measured, x, step, filter)
+        turned = [whitener(model, s, x, n, filter) for s, n in zip(seen, noise, strict=True)]
+        Z = [whitened(regression(model, s, filter), L)[0] for s, L in zip(seen, turned, strict=True)]
+        own = [whitened(b, L) for b, L in zip(blocks, turned, strict=True)]
+        found, covariance = _square(own, Z, kept, x)
+        step = found - x
+        x = found
+        ratio = np.abs(step[kept]) / np.sqrt(np.diag(covariance))
+        if ratio.max() < CONVERGED:
+            return assembled(model, blocks, first, "iv", x, covariance, effective(solved(own), covariance), ())
+    worst = kept[int(np.argmax(ratio))]
+    raise NotIdentifiable(
+        f"iv: no estimate reproduces itself after {PASSES} passes, {model.base.names[worst]} still moves by"
+        f" {abs(step[worst]):.3g}: start from better values in the machine file, or drive more lively"
+    )
+
+
+def _observed(
+    model: Model, logs: Sequence[Samples], x: np.ndarray, step: np.ndarray, filter: Filter
+) -> tuple[list[Samples], np.ndarray]:
+    """The observed motion of each log and the parameters behind it: x, or short of it where x is no machine."""
+    for _ in range(SHORTER):
+        try:
+            return [observe(model, s, x, filter) for s in logs], x
+        except SimulationError:
+            if np.isnan(step).any():
+                break
+            step = step / 2
+            x = x - step
+    raise NotIdentifiable(
+        "iv: the machine that it leads to can't be simulated; start from better values in the machine file"
+    )
+
+
+def _square(
+    blocks: Sequence[Block], Z: Sequence[np.ndarray], kept: list[int], x: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """x (n_base,) of Z'(Y - W x) = 0, and the covariance (k, k) of the kept parameters."""
+    tall = np.concatenate([z[:, :, kept].reshape(-1, len(kept)) for z in Z])
+    W = np.concatenate([w[:, :, kept].reshape(-1, len(kept)) for w, _ in blocks])
+    y = np.concatenate([v.reshape(-1) for _, v in blocks])
+    size = np.linalg.norm(tall, axis=0)
+    if not (size > 0).all():
+        raise NotIdentifiable("iv: along the simulated motion nothing depends on one of the parameters")
+    Q, R = np.linalg.qr(tall / size)
+    A = Q.T @ W
+    found = x.copy()
+    found[kept] = np.linalg.solve(A, Q.T @ y)
+    half = np.linalg.solve(A, scipy.linalg.solve_triangular(R, np.diag(1 / size), trans="T"))
+    return found, half @ scatter(blocks, found, kept, Z) @ half.T
+
+
+def observe(model: Model, s: Samples, x: np.ndarray, filter: Filter, pull: float = PULL) -> Samples:
+    """The motion of the machine x (n_base,) under a log's low-passed torques, drawn towards the log's speeds and joint
+    angles with time constant `pull` [s]. Raises SimulationError."""
+    rate = float(model.machine.sampling_hz)
+    stretch = max(1, round(STRETCH * rate))
+    gain = 1 - np.exp(-stretch / rate / pull)
+    standard = dict(zip(model.base.standard, model.expand @ x, strict=True))
+    offset = np.array([standard[f"u{b.index}0"] for b in model.machine.actuated])
+    torque = lowpass(s.Y[list(model.actuated)], rate, filter).T - offset
+    q, nu = s.q[:, 0].copy(), s.nu[:, 0].copy()
+    N = s.q.shape[1]
+    places, speeds, slopes = np.empty((3, *s.q.shape))
+    for at in range(0, N - 1, stretch):
+        end = min(at + stretch, N - 1)
+        motion = simulate(model, torque[at : end + 1], x, q, nu)
+        places[:, at : end + 1], speeds[:, at : end + 1] = motion.q.T, motion.nu.T
+        slopes[:, at : end + 1] = motion.a.T
+        q = motion.q[-1] + gain * (s.q[:, end] - motion.q[-1])
+        nu = motion.nu[-1] + gain * (s.nu[:, end] - motion.nu[-1])
+    return Samples(places, speeds, slopes, s.Y)

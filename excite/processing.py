@@ -1,0 +1,129 @@
+"""From a log to the rows of a regression: filtering, derivatives, decimation, the model's regressor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.signal
+
+from excite.log import Log
+from model.machine import Filter, Sensor
+from model.prediction import Model
+
+BLOCK = 20_000  # samples whose regressor is in memory at once
+REACH = 200  # decimated rows after which the decimation filter has forgotten the edge of a block (1e-15)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A log as the regressor needs it: q, nu, a (n_q, N) and Y (n_rows, N), all at the log's rate."""
+
+    q: np.ndarray
+    nu: np.ndarray
+    a: np.ndarray
+    Y: np.ndarray
+
+
+def filtered_regression(model: Model, log: Log, filter: Filter, block: int = BLOCK) -> tuple[np.ndarray, np.ndarray]:
+    """W (n_rows, n, n_base) and Y (n_rows, n) of a log: prediction's regressor, filtered in parallel and decimated."""
+    return regression(model, samples(model, log, filter), filter, block)
+
+
+def regression(model: Model, s: Samples, filter: Filter, block: int = BLOCK) -> tuple[np.ndarray, np.ndarray]:
+    """The same from samples. The regressor at the log's rate is never in memory as a whole: it is made, filtered and
+    decimated in blocks that overlap as far as the filter reaches."""
+    first, last = filter.drop[0], s.q.shape[1] - filter.drop[1]
+    W = np.concatenate(list(_blocks(model, s, first, last, filter.decimation, block)), axis=1)
+    return W, decimate(s.Y[:, first:last], filter.decimation)
+
+
+def _blocks(model: Model, s: Samples, first: int, last: int, factor: int, block: int) -> Iterator[np.ndarray]:
+    """Decimated rows W (n_rows, n, n_base) of samples first .. last, one stretch after another."""
+    kept = kept_samples(first, last, factor)
+    reach = REACH * factor if factor > 1 else 0
+    count = max(1, block // factor)
+    for at in range(0, len(kept), count):
+        mine = kept[at : at + count]
+        low, high = max(first, mine[0] - reach), min(last, mine[-1] + 1 + reach)
+        W = model.stacked(s.q[:, low:high], s.nu[:, low:high], s.a[:, low:high]).transpose(1, 0, 2)
+        yield (W if factor == 1 else smooth(W, factor))[:, mine - low]
+
+
+def kept_samples(first: int, last: int, factor: int) -> np.ndarray:
+    """Which of the samples first .. last a decimation keeps: the last one and every factor-th before it."""
+    return np.arange(first + (last - first - 1) % factor, last, factor)
+
+
+def samples(model: Model, log: Log, filter: Filter) -> Samples:
+    """Coordinates, velocities and accelerations of a log: zero-phase Butterworth of what is measured, then central
+    differences. V_x and yaw rate come from the measuring wheels (32), V_y from its sensor.
+    """
+    machine = model.machine
+    rate = float(machine.sampling_hz)
+    n_q, N = len(model.coordinates), len(log)
+    q, nu = np.zeros((n_q, N)), np.zeros((n_q, N))
+    filtered = {
+        s.name: lowpass(log.values[s.name], rate, filter) for s in machine.sensors("full") if s.name in log.values
+    }
+    wheels: list[tuple[Sensor, np.ndarray]] = []
+    for sensor in machine.sensors("full"):
+        if sensor.name not in filtered:
+            continue
+        if sensor.kind == "angle":
+            k = model.coordinates.index(machine.find(sensor.body).coordinates[0])
+            q[k], nu[k] = filtered[sensor.name], derivative(filtered[sensor.name], rate)
+        elif sensor.kind == "wheel":
+            wheels.append((sensor, derivative(filtered[sensor.name], rate)))
+        elif sensor.kind == "lateral_speed":
+            nu[model.coordinates.index(machine.body[0].coordinates[1])] = filtered[sensor.name]
+    if wheels:
+        _planar_speed(model, wheels, nu)
+    a = np.array([derivative(v, rate) for v in nu])
+    Y = np.zeros((n_q, N))
+    for sensor in machine.sensors("full"):
+        if sensor.kind == "torque":
+            Y[model.coordinates.index(machine.find(sensor.body).coordinates[0])] = log.values[sensor.name]
+    return Samples(q, nu, a, Y)
+
+
+def _planar_speed(model: Model, wheels: list[tuple[Sensor, np.ndarray]], nu: np.ndarray) -> None:
+    """V_x and yaw rate of the root from its measuring wheels: R rate = V_x - lateral yaw (32), by least squares."""
+    x, _, turn = model.machine.body[0].coordinates
+    rows = [k for k in (x, turn) if k in model.coordinates]
+    A = np.array([[1.0, -float(s.lateral or 0)][: len(rows)] for s, _ in wheels])
+    speeds = np.array([float(s.radius or 0) * rate for s, rate in wheels])
+    found = np.linalg.lstsq(A, speeds, rcond=None)[0]
+    for name, value in zip(rows, found, strict=True):
+        nu[model.coordinates.index(name)] = value
+
+
+def lowpass(x: np.ndarray, rate: float, filter: Filter) -> np.ndarray:
+    """Zero-phase low-pass Butterworth (forward and backward), the ends continued by 3 x order reflected samples."""
+    b, a = scipy.signal.butter(filter.order, float(filter.cutoff_hz) / (rate / 2))
+    return np.asarray(scipy.signal.filtfilt(b, a, x, padlen=3 * filter.order))
+
+
+def derivative(x: np.ndarray, rate: float) -> np.ndarray:
+    """Central difference; one-sided at the two ends."""
+    return np.gradient(x, 1 / rate)
+
+
+def decimate(x: np.ndarray, factor: int) -> np.ndarray:
+    """Every column (axis 1) through one zero-phase low-pass (Chebyshev I, order 8), then every factor-th row.
+
+    The rows kept end with the last one.
+    """
+    return x if factor == 1 else smooth(x, factor)[:, (x.shape[1] - 1) % factor :: factor]
+
+
+def smooth(x: np.ndarray, factor: int) -> np.ndarray:
+    """The low-pass before a decimation along axis 1."""
+    b, a = scipy.signal.cheby1(8, 0.05, 0.8 / factor)
+    return np.asarray(scipy.signal.filtfilt(b, a, x, axis=1, padlen=24))
+
+
+def white_noise(x: np.ndarray) -> float:
+    """Standard deviation of the white part of a signal, from the median size of its third differences."""
+    return float(np.median(np.abs(np.diff(x, 3)))) / (0.6744897501960817 * np.sqrt(20))
