@@ -32,7 +32,9 @@ def _lines(ax: Axes, t: np.ndarray, curves: Mapping[str, np.ndarray], label: str
     ax.set_ylabel(label)
     ax.grid(alpha=0.3)
     if legend:
-        ax.legend(loc="upper right", fontsize=8, ncols=max(1, len(curves)), framealpha=0.85)
+        ax.legend(
+            loc="lower right", bbox_to_anchor=(1, 0.98), fontsize=8, ncols=max(1, len(curves)), frameon=False, borderpad=0
+        )
 
 
 def _bound(ax: Axes, value: float) -> None:
@@ -60,10 +62,10 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
     }
     tops = [float(b.limit.torque or np.abs(motion.u[:, k]).max() or 1.0) for k, b in enumerate(machine.actuated)]
     unit = "N m" if all(b.joint == "revolute" for b in machine.actuated) else "N"
-    curves = {f"{n} (100 % = {tops[k]:g} {unit})": 100 * motion.u[:, k] / tops[k] for n, k in named.items()}
+    curves = {f"{n} ({tops[k]:g} {unit})": 100 * motion.u[:, k] / tops[k] for n, k in named.items()}
     _lines(axes[0], t, curves, "torque [% of limit]")
     _bound(axes[0], 100)
-    axes[0].set_ylim(-115, 150)
+    axes[0].set_ylim(-115, 115)
 
     speeds: dict[str, np.ndarray] = {}
     if machine.planar:
