@@ -1,0 +1,183 @@
+"""A log as joint smoothing sees it: what each sensor tells, when, and how well.
+
+Encoders count. A count between edges says little, and its error follows the motion; the moment of an edge says where
+the angle was, so only samples right after a count are used. Noise of the other sensors and of the torques is found in
+the log; the data sheet is for comparison.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from excite.identify import NotIdentifiable, samples
+from excite.linearise import Chart
+from excite.log import Log
+from model.machine import Filter, Sensor
+from model.prediction import Model
+
+EDGE = 0.29  # least standard deviation of an encoder edge [counts]
+QUIET = 1e-3  # noise that a log without any is taken to have, in the data sheet's
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the sensors' noise is taken to be: `torque` (n_u,) [N m]; `sensor` (m,) [SI] of those of a chart, for an
+    encoder that counts its step."""
+
+    torque: np.ndarray
+    sensor: np.ndarray
+
+
+@dataclass(frozen=True)
+class Record:
+    """A log as the smoother sees it: torque (N, n_u) as measured, reading (N, m) of the chart's sensors.
+
+    used (N, m): which samples tell something; counts (m,): encoders read at their edges. origin (m_o,): sensors
+    whose absolute value matters and whose count starts anywhere.
+    """
+
+    torque: np.ndarray
+    reading: np.ndarray
+    used: np.ndarray
+    counts: np.ndarray
+    origin: tuple[int, ...]
+    noise: Noise
+
+
+@dataclass(frozen=True)
+class Point:
+    """Where an iteration stands: states (N, n), torque errors (N - 1, n_u), offsets (m_o,) of one log."""
+
+    s: np.ndarray
+    w: np.ndarray
+    offset: np.ndarray
+
+
+def common_sensors(model: Model, logs: Sequence[Log]) -> tuple[str, ...]:
+    """Sensors that every log has."""
+    common = set.intersection(*(set(log.values) for log in logs))
+    for body in model.machine.actuated:
+        if not any(s.kind == "torque" and s.body == body.index and s.name in common for s in model.machine.sensor):
+            raise NotIdentifiable(f"joint smoothing needs the torque of every driven joint, {body.where} has none")
+    return tuple(s.name for s in model.machine.sensors("full") if s.name in common)
+
+
+def record(c: Chart, log: Log) -> Record:
+    """A log prepared: encoder edges found, noise of the others estimated from the log itself."""
+    model = c.model
+    torques = [torque_sensor(model, body.index) for body in model.machine.actuated]
+    torque = np.column_stack([log.values[s.name] for s in torques])
+    N, m = len(log), len(c.sensors)
+    reading, used = np.empty((N, m)), np.ones((N, m), bool)
+    counts = np.zeros(m, bool)
+    sigma = np.empty(m)
+    for j, sensor in enumerate(c.sensors):
+        value = log.values[sensor.name]
+        step = sensor.resolution
+        reading[:, j] = value
+        if step is None:
+            sigma[j] = max(white_noise(value), 1e-9 + 1e-3 * float(sensor.noise or 0))
+            continue
+        sigma[j] = step
+        n = np.round(value / step)
+        if np.abs(value - n * step).max() > 0.01 * step:
+            sigma[j] = step / np.sqrt(12)
+            continue
+        counts[j] = True
+        change = np.diff(n, prepend=n[0])
+        reading[:, j] = (n + (change < 0)) * step
+        used[:, j] = change != 0
+    level = np.array([max(white_noise(u), 1e-3 * float(s.noise or 1)) for u, s in zip(torque.T, torques, strict=True)])
+    return Record(torque, reading, used.astype(float), counts, origins(c, counts), Noise(level, sigma))
+
+
+def origins(c: Chart, counts: np.ndarray) -> tuple[int, ...]:
+    """Encoders whose count starts anywhere while forces depend on the angle itself."""
+    return tuple(j for j in range(len(counts)) if counts[j] and c.angle[j] < c.core)
+
+
+def torque_sensor(model: Model, body: int) -> Sensor:
+    return next(s for s in model.machine.sensor if s.kind == "torque" and s.body == body)
+
+
+def white_noise(x: np.ndarray) -> float:
+    """Standard deviation of the white part of a signal, from its third differences.
+
+    Their median size, so that the corners of a signal that is linear in pieces do not count.
+    """
+    return float(np.median(np.abs(np.diff(x, 3)))) / (0.6744897501960817 * np.sqrt(20))
+
+
+def first_point(c: Chart, r: Record, log: Log, filter: Filter) -> Point:
+    """States from the filtered log."""
+    guess = samples(c.model, log, filter)
+    full = np.zeros((len(log), c.full))
+    n_q = len(c.model.coordinates)
+    full[:, :n_q], full[:, n_q : 2 * n_q] = guess.q.T, guess.nu.T
+    s = full[:, c.index]
+    rate = float(c.model.machine.sampling_hz)
+    for j, k in enumerate(c.angle):
+        if c.index[k] >= 2 * n_q and k >= 0:
+            speed = c.readings(s)[2][:, j, 0]
+            s[:, k] = log.values[c.sensors[j].name][0] + np.concatenate(
+                [[0], np.cumsum(speed[1:] + speed[:-1]) / (2 * rate)]
+            )
+    return Point(s, np.zeros_like(r.torque[1:]), np.zeros(len(r.origin)))
+
+
+def one_count(c: Chart, r: Record) -> np.ndarray:
+    """Scale of the offsets (m_o,): a count starts at a random place between two edges, half a count on average."""
+    return np.array([float(c.sensors[j].resolution or 0) for j in r.origin])
+
+
+def readings(c: Chart, r: Record, p: Point) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Expected readings (N, m), their slopes (N, m, n), weights (N, m) = 1 / variance and offset columns (m, m_o).
+
+    Right after a count the angle is past the edge by half of what it travels in a sample, at most half a step.
+    """
+    sample = 1 / float(c.model.machine.sampling_hz)
+    h, H, rate, Hrate = c.readings(p.s)
+    h, H, travel = h[:, :, 0].copy(), H.copy(), rate[:, :, 0] * sample
+    step = r.noise.sensor
+    slow = (np.abs(travel) < step) & r.counts
+    h -= np.where(r.counts, np.clip(travel, -step, step) / 2, 0.0)
+    H[slow] -= Hrate[slow] * (sample / 2)
+    width = np.where(r.counts, np.maximum(np.minimum(np.abs(travel), step) / np.sqrt(12), EDGE * step), step)
+    D = np.zeros((len(c.sensors), len(r.origin)))
+    for k, j in enumerate(r.origin):
+        D[j, k] = 1.0
+    return h + D @ p.offset, H, r.used / width**2, D
+
+
+def expected(c: Chart, r: Record, p: Point) -> Record:
+    """The record with how often each encoder counts, on average, in place of when."""
+    travel = np.abs(c.readings(p.s)[2][:, :, 0]) / float(c.model.machine.sampling_hz)
+    return replace(r, used=np.where(r.counts, np.minimum(travel / r.noise.sensor, 1.0), 1.0))
+
+
+def motion(c: Chart, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates and velocities (N, n_q) of states; coordinates that nothing depends on are zero."""
+    n_q = len(c.model.coordinates)
+    full = np.zeros((len(s), c.full))
+    full[:, c.index] = s
+    return full[:, :n_q], full[:, n_q : 2 * n_q]
+
+
+def noise_notes(c: Chart, records: Sequence[Record]) -> tuple[str, ...]:
+    """The noise found in the logs beside the machine file's."""
+    model = c.model
+    found: list[tuple[Sensor, float]] = []
+    for k, body in enumerate(model.machine.actuated):
+        level = float(np.sqrt(np.mean([r.noise.torque[k] ** 2 for r in records])))
+        found.append((torque_sensor(model, body.index), level))
+    for j, sensor in enumerate(c.sensors):
+        if sensor.resolution is None:
+            found.append((sensor, float(np.sqrt(np.mean([r.noise.sensor[j] ** 2 for r in records])))))
+    texts = []
+    for sensor, level in found:
+        sheet = f"data sheet {float(sensor.noise):.3g}" if sensor.noise is not None else "no data sheet"
+        texts.append(f"{sensor.name} {level:.3g} ({sheet})")
+    return (f"noise per sample found in the log, SI: {', '.join(texts)}",)
