@@ -7,7 +7,7 @@ their exact first and second derivatives come out as plain arrays. Every variabl
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -187,15 +187,18 @@ def radau(elements: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def transcribe(
     model: Model,
     problem: Problem,
-    state_size: dict[str, float],
+    state_size: Mapping[str, float],
     intervals: int,
     elements: int = 1,
     with_pose: bool = False,
+    rest: float = 1.0,
+    weights: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Transcription:
     """The nonlinear program of a problem on `intervals` equal intervals, each of `elements` collocation elements.
 
     state_size: the typical size of every coordinate and velocity (named c and c'). The pose is a state only where
-    `with_pose`: nothing but the lane depends on it.
+    `with_pose`: nothing but the lane depends on it. weights (n_rows,), (n_base,): of the
+    regressor's rows and columns, by default 1 and the scale.
     """
     every = limits(model, problem)
     s = symbols(model)
@@ -235,7 +238,9 @@ def transcribe(
     )
     g = ca.vertcat(*[(g.expression(q, nu, u, 0) - g.centre) * (2 / g.range) for g in staged], ca.SX(0, 1))
     W = model.regressor(q, nu, a)
-    Phi = ca.mtimes(W, ca.diag(ca.DM(model.scale))) / float(u_size.max())
+    rows_by, columns_by = weights or (np.ones(n_q), model.scale)
+    W = ca.mtimes(ca.diag(ca.DM(rows_by / rows_by.max())), W)
+    Phi = ca.mtimes(W, ca.diag(ca.DM(columns_by))) / float(u_size.max())
     A = ca.triu(ca.mtimes(Phi.T, Phi))
     rows, columns = (np.array(x) for x in A.sparsity().get_triplet())
     entries = ca.vertcat(*A.nonzeros())
@@ -252,12 +257,12 @@ def transcribe(
     second = ca.Function("second", [sample, weights], [ca.densify(H)], options)
 
     control, centre = _control(steered, s, u_size, knot)
-    rest = [names.index(model.coordinates[k]) for k in resting(model)] + [
+    resting_states = [names.index(model.coordinates[k]) for k in resting(model)] + [
         names.index(c + "'") for c in model.coordinates
     ]
     still = np.concatenate([np.full(len(resting(model)), REST_POSITION), rest_tolerances(model)])
-    at_rest = np.array(rest if problem.rest else [], int)
-    band = (STILL * still / z_size[rest])[: len(at_rest)]
+    at_rest = np.array(resting_states if problem.rest else [], int)
+    band = (rest * STILL * still / z_size[resting_states])[: len(at_rest)]
     return Transcription(
         intervals,
         len(place),
@@ -278,7 +283,7 @@ def transcribe(
         len(model.scale),
         at_rest,
         band,
-        np.array([k for k, c in enumerate(names) if c in pose and k not in rest], int),
+        np.array([k for k, c in enumerate(names) if c in pose and k not in resting_states], int),
         _spread(place, derivative, n_z, n_u),
         Mapped(values, N, [(n_z,), (n_g,), (n_a,)]),
         Mapped(first, N, [(n_z,), (n_g,), (n_a,), (n_z, n_s), (n_g, n_s), (n_a, n_s)]),

@@ -12,7 +12,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,9 +22,10 @@ import numpy as np
 
 from excite import interior
 from excite import objective as _objective
-from excite.collocation import Transcription, UnsettledError, settle, transcribe
+from excite.collocation import UnsettledError, settle, transcribe
 from excite.limit import InfeasibleError, check, placed
 from excite.manoeuvre import Manoeuvre, multisine, scaled
+from excite.manoeuvre import knots as _knots
 from excite.objective import OBJECTIVES
 from excite.simulate import Motion, SimulationError, simulate
 from model import prediction
@@ -39,7 +40,11 @@ Report = Callable[[int, int, float], None]
 
 @dataclass(frozen=True)
 class Stage:
-    """One solve of the continuation: transitions and knots wider by these factors, and the levels that follow."""
+    """One solve of the continuation: transitions and knots wider by these factors, and the levels that follow.
+
+    Level i follows the objective with sharpness sharp 2^i at barrier / 3^i, and ends when the decrease that a Newton
+    step promises is below `patience` / sharpness.
+    """
 
     friction: float
     slip: float
@@ -48,16 +53,18 @@ class Stage:
     barrier: float
     levels: int
     iterations: int
+    patience: float
 
 
 PLAN = (
-    Stage(10, 3, 4, 8, 1e-3, 2, 20),
-    Stage(10, 3, 2, 16, 3e-4, 1, 15),
-    Stage(4, 1.7, 2, 20, 1e-4, 2, 20),
-    Stage(2, 1.2, 2, 40, 3e-5, 2, 20),
-    Stage(1, 1, 2, 80, 1e-5, 2, 20),
-    Stage(1, 1, 1, 100, 1e-5, 4, 20),
+    Stage(10, 3, 4, 8, 1e-3, 2, 40, 1.0),
+    Stage(4, 1.7, 2, 16, 1e-4, 2, 20, 1.0),
+    Stage(2, 1.2, 2, 40, 3e-5, 1, 20, 1.0),
+    Stage(1, 1, 2, 60, 1e-5, 1, 20, 1.0),
+    Stage(1, 1, 1, 100, 1e-5, 4, 30, 0.1),
 )
+SCOUTS = 3  # stages that every start goes through; the best third of the starts go on to the end
+REPAIR = Stage(1, 1, 1, 800, 1e-6, 1, 30, 0.1)
 
 
 @dataclass(frozen=True)
@@ -84,22 +91,40 @@ class Design:
 
 @dataclass(frozen=True)
 class Candidate:
-    """What one start came to: torques at the knots (K, n_u) [N m] and the fresh simulation's verdict."""
+    """A drive and the fresh simulation's verdict: torques at the knots, start coordinates (n_q,), score, violations."""
 
     manoeuvre: Manoeuvre
     start: np.ndarray
     score: float
     violations: Mapping[str, float]
-    guess: float
-    complete: bool
 
     @property
     def excess(self) -> float:
         return max(self.violations.values(), default=0.0)
 
+    @property
+    def feasible(self) -> bool:
+        return self.excess <= TOLERANCE
 
-class Stopped(Exception):
-    """The search was asked to stop before anything feasible was found."""
+
+@dataclass(frozen=True)
+class Track:
+    """How far one start has come, ready to be carried on.
+
+    times (N,) [s] and states (N, n_z), scaled by `sizes`, are the last program's nodes, or the guess's samples and
+    none yet. pose (n_q,): the start coordinates once the lane matters. best: the best candidate on the way.
+    """
+
+    number: int
+    guess: float
+    sizes: Mapping[str, float]
+    latest: Candidate
+    best: Candidate
+    motion: Motion
+    times: np.ndarray
+    states: np.ndarray | None = None
+    pose: np.ndarray | None = None
+    complete: bool = False
 
 
 def design(
@@ -113,80 +138,84 @@ def design(
 ) -> Design:
     """The best drive of several starts, each from its own random multisine, in parallel processes.
 
-    progress(done, total, best score so far) is called as starts finish. budget_s [s] ends the search early with the
-    best feasible drive so far, and so does Ctrl-C. The same seed gives the same design where neither cuts in.
-    Raises InfeasibleError with the limit that can't be met and by how much; KeyError for an unknown objective.
+    Every start goes through the first stages, the most promising third (two at least) to the end.
+    progress(done, total, best score so far) is called as these pieces of work finish. budget_s [s] ends the search
+    early with the best feasible drive so far, and so does Ctrl-C (KeyboardInterrupt where there is none yet). The same
+    seed gives the same design where neither cuts in.
+
+    Raises InfeasibleError with the limit that can't be met and by how much, KeyError for an unknown objective.
     """
     if objective not in OBJECTIVES:
         raise KeyError(f"no objective {objective}, allowed: {', '.join(OBJECTIVES)}")
     if starts < 1:
         raise ValueError(f"starts must be at least 1, got {starts}")
     deadline = None if budget_s is None else time.time() + budget_s
-    seeds = [int(s) for s in np.random.SeedSequence(seed).generate_state(starts)]
-    best: Candidate | None = None
-    scores = [float("inf")] * starts
-    guess = float("inf")
-    complete = True
-    with _interruptible() as stop:
-        workers = min(starts, os.cpu_count() or 1)
-        run = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")
-        tasks = (joblib.delayed(_start)(model, problem, objective, k, s, deadline, stop) for k, s in enumerate(seeds))
-        for done, (k, found) in enumerate(run(tasks), 1):
-            if found is not None:
-                if found.excess <= TOLERANCE:
-                    scores[k] = _objective.reported(objective, found.score)
-                guess = min(guess, found.guess)
-                complete &= found.complete
-                if best is None or _rank(found, k) < _rank(best, -1):
-                    best = found
-            else:
-                complete = False
-            if progress is not None:
-                progress(done, starts, min(scores))
+    seeds = np.random.SeedSequence(seed).generate_state(starts)
+    tracks: dict[int, Track] = {}
+    with _interruptible() as stop, joblib.parallel_config("loky", inner_max_num_threads=1):
+        # loky even for one start: only there can the number of threads of the linear algebra be set
+        run = joblib.Parallel(n_jobs=max(2, os.cpu_count() or 1), return_as="generator_unordered")
+        call = joblib.delayed(_carry)
+        work = (call(model, problem, objective, k, int(s), None, deadline, stop) for k, s in enumerate(seeds))
+        kept = min(starts, max(2, -(-starts // 3)))
+        total = starts + kept
+        for track in run(work):
+            tracks[track.number] = track
+            _tell(progress, objective, len(tracks), total, tracks)
+        chosen = sorted(tracks.values(), key=lambda t: (_promise(t.latest), t.number))[:kept]
+        rest = (call(model, problem, objective, t.number, 0, t, deadline, stop) for t in chosen)
+        for done, track in enumerate(run(rest), starts + 1):
+            tracks[track.number] = track
+            _tell(progress, objective, done, total, tracks)
         interrupted = stop.exists()
-    if best is None:
+    best = min(tracks.values(), key=lambda t: (*_rank(t.best), t.number))
+    complete = all(tracks[t.number].complete for t in chosen)
+    if not best.best.feasible:
         if interrupted:
             raise KeyboardInterrupt
-        raise Stopped("nothing feasible was found in the time given: give more time")
-    if best.excess > TOLERANCE:
-        worst = max(best.violations, key=lambda name: best.violations[name])
+        name = max(best.best.violations, key=lambda limit: best.best.violations[limit])
+        excess = best.best.excess
+        short = "" if complete else ", give more time"
         raise InfeasibleError(
-            f"no drive found that keeps every limit: {worst} is exceeded by {100 * best.excess:.2f} % of its range"
-            f" in the best attempt; widen it, or give another duration or more starts",
-            worst,
-            best.excess,
+            f"no drive found that keeps every limit: {name} is exceeded by {100 * excess:.2f} % of its range in the"
+            f" best attempt{short}; widen it, or give another duration or more starts",
+            name,
+            excess,
         )
-    return finish(model, problem, objective, best, guess, tuple(scores), complete)
-
-
-def finish(
-    model: Model,
-    problem: Problem,
-    objective: str,
-    best: Candidate,
-    guess: float,
-    scores: tuple[float, ...],
-    complete: bool,
-) -> Design:
-    """The design of a candidate: its motion simulated once more, scored and checked."""
-    motion = simulate(model, best.manoeuvre.sample(float(model.machine.sampling_hz)), q0=best.start)
+    drive = best.best
+    motion = simulate(model, drive.manoeuvre.sample(float(model.machine.sampling_hz)), q0=drive.start)
     violations = check(model, problem, motion)
     return Design(
         objective,
-        best.manoeuvre,
+        drive.manoeuvre,
         motion,
         _objective.cond_phi(model, motion),
         _objective.cond_w(model, motion),
-        guess,
+        min(t.guess for t in tracks.values()),
         violations,
         max(violations.values(), default=0.0),
-        scores,
+        tuple(_score(objective, tracks[k].best) for k in range(starts)),
         complete,
     )
 
 
-def _rank(c: Candidate, k: int) -> tuple[float, float]:
-    return (0.0, c.score) if c.excess <= TOLERANCE else (1.0, c.excess)
+def _tell(progress: Report | None, objective: str, done: int, total: int, tracks: Mapping[int, Track]) -> None:
+    if progress is not None:
+        progress(done, total, min(_score(objective, t.best) for t in tracks.values()))
+
+
+def _score(objective: str, c: Candidate) -> float:
+    return _objective.reported(objective, c.score) if c.feasible else float("inf")
+
+
+def _rank(c: Candidate) -> tuple[float, float]:
+    """Feasible before infeasible, then by score, or by excess."""
+    return (0.0, c.score) if c.feasible else (1.0, c.excess)
+
+
+def _promise(c: Candidate) -> float:
+    """What a start may come to: its score, dearer by what it exceeds."""
+    return c.score + min(1.0, c.excess)
 
 
 @contextmanager
@@ -204,125 +233,39 @@ def _interruptible() -> Iterator[Path]:
             signal.signal(signal.SIGINT, before)
 
 
-def _start(
-    model: Model, problem: Problem, name: str, number: int, seed: int, deadline: float | None, stop: Path
-) -> tuple[int, Candidate | None]:
-    if threading.current_thread() is threading.main_thread() and os.getpid() != os.getppid():
+def _carry(
+    model: Model,
+    problem: Problem,
+    objective: str,
+    number: int,
+    seed: int,
+    track: Track | None,
+    deadline: float | None,
+    stop: Path,
+) -> Track:
+    """In a worker: a start through the first stages, or one that was chosen through the others."""
+    if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, lambda *_: stop.touch() if stop.parent.exists() else None)
 
     def over() -> bool:
         return stop.exists() or (deadline is not None and time.time() > deadline)
 
-    return number, None if over() else search(model, problem, name, seed, over)
+    if track is None:
+        return search(model, problem, objective, depart(model, problem, objective, number, seed), PLAN[:SCOUTS], over)
+    track = search(model, problem, objective, track, PLAN[SCOUTS:], over)
+    return track if over() else replace(repair(model, problem, objective, track, over), complete=not over())
 
 
-def search(model: Model, problem: Problem, name: str, seed: int, over: Callable[[], bool]) -> Candidate | None:
-    """One start through the continuation; `over` tells when to stop. None where nothing could be simulated."""
-    guess, motion = _guess(model, problem, seed)
-    first = _objective.cond_phi(model, motion)
-    sizes = _sizes(model, problem, motion)
-    torque, times = guess.torque, guess.times
-    states: np.ndarray | None = None
-    nodes: np.ndarray | None = None
-    best: Candidate | None = None
-    pose: np.ndarray | None = None
-    full = len(guess.times) - 1
-    for number, stage in enumerate(PLAN):
-        softer = soften(model, stage.friction, stage.slip)
-        intervals = max(4, round(full / stage.coarse))
-        tr = transcribe(softer, problem, sizes, intervals, with_pose=pose is not None)
-        knots = np.linspace(0, float(problem.duration_s), intervals + 1)
-        at = (np.arange(intervals)[:, None] + tr.place) * tr.knot
-        U = Manoeuvre(times, torque).at(knots) / tr.torque_scale
-        U[0] = U[-1] = 0.0
-        start = _origin(tr, pose, model)
-        if states is None or nodes is None or states.shape[1] != tr.n_z:
-            Z = _read(tr, model, motion, at, start)
-        else:
-            Z = np.stack([np.interp(at, nodes, states[:, i]) for i in range(tr.n_z)], axis=-1)
+def depart(model: Model, problem: Problem, objective: str, number: int, seed: int) -> Track:
+    """A start: a random multisine, as large as the limits on the motion allow."""
+    wish = multisine(model, problem, seed, top=0.5)
+    for factor in 0.85 ** np.arange(60):
         try:
-            Z = settle(tr, start, U, Z)
-        except UnsettledError:
-            return best
-        task = interior.Task(
-            name,
-            np.full((intervals, tr.nodes, len(tr.limit_names)), MARGIN),
-            np.full((intervals, len(tr.control_names)), 1e-4),
-            np.array([name.startswith("lane") for name in tr.limit_names], bool),
-        )
-        watch = _watch(over)
-        if number == 0:
-            Z, U = _project(tr, task, start, Z, U, watch)
-        point = interior.begin(tr, task, start, Z, U, stage.barrier, 0.05 if number == 0 else 1e-3)
-        levels = tuple(
-            interior.Level(stage.sharp * 2**i, stage.barrier / 3**i, 0.2 / (stage.sharp * 2**i), stage.iterations)
-            for i in range(stage.levels)
-        )
-        point, _ = interior.minimise(tr, task, point, levels, watch)
-        torque, times = point.U * tr.torque_scale, knots
-        nodes, states = at.ravel(), point.Z.reshape(-1, tr.n_z)
-        try:
-            found, motion = _verdict(model, problem, name, Manoeuvre(times, torque), first, number + 1 == len(PLAN))
-        except SimulationError:
-            return best
-        if best is None or _rank(found, 0) <= _rank(best, 0) or found.complete:
-            best = found if best is None or found.excess <= max(TOLERANCE, best.excess) else best
-        if over():
-            return best
-        lane = max((v for limit, v in found.violations.items() if limit.startswith("lane")), default=0.0)
-        if pose is not None or (stage.friction <= 4 and lane > 0):
-            pose = found.start
-    return best
-
-
-def _verdict(
-    model: Model, problem: Problem, name: str, manoeuvre: Manoeuvre, guess: float, complete: bool
-) -> tuple[Candidate, Motion]:
-    """The fresh simulation of a manoeuvre, placed on the lane as well as can be."""
-    torque = manoeuvre.sample(float(model.machine.sampling_hz))
-    motion = simulate(model, torque)
-    start = placed(model, problem, motion)
-    motion = simulate(model, torque, q0=start)
-    P = _objective.phi(model, motion)
-    score = _objective.value(name, P.T @ P)
-    return Candidate(manoeuvre, start, score, check(model, problem, motion), guess, complete), motion
-
-
-def _project(
-    tr: Transcription, task: interior.Task, start: np.ndarray, Z: np.ndarray, U: np.ndarray, watch: interior.Watch
-) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest torques that keep every limit and come to rest."""
-    near = replace(task, objective=None, pull=1.0, goal=U)
-    point = interior.begin(tr, near, start, Z, U, 1e-3, 0.05)
-    point, _ = interior.minimise(tr, near, point, (interior.Level(1.0, 1e-3, 1e-3, 40),), watch)
-    return point.Z, point.U
-
-
-def _watch(over: Callable[[], bool]) -> interior.Watch:
-    def watch(progress: interior.Progress, point: interior.Point, state: interior.State) -> bool:
-        return over()
-
-    return watch
-
-
-def _guess(model: Model, problem: Problem, seed: int) -> tuple[Manoeuvre, Motion]:
-    """A random multisine, as large as the limits on the motion allow."""
-    wish = multisine(model, problem, seed)
-    rate = float(model.machine.sampling_hz)
-    for factor in 0.85 ** np.arange(30):
-        tried = scaled(wish, float(factor))
-        try:
-            motion = simulate(model, tried.sample(rate))
+            found, motion = _verdict(model, problem, objective, scaled(wish, float(factor)))
         except SimulationError:
             continue
-        excess = check(model, problem, motion)
-        if all(v == 0 for k, v in excess.items() if not k.startswith(("rest", "lane"))):
+        if all(v == 0 for k, v in found.violations.items() if not k.startswith(("rest", "lane"))):
             break
-    return tried, motion
-
-
-def _sizes(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
-    """Typical size of every coordinate and velocity (c and c') in a motion; of the pose, half the lane."""
     sizes = {}
     for k, c in enumerate(model.coordinates):
         sizes[c] = max(1e-3, 2 * float(np.sqrt((motion.q[:, k] ** 2).mean())))
@@ -330,24 +273,121 @@ def _sizes(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
     if model.machine.planar:
         x, y, heading = model.machine.body[0].coordinates
         sizes |= {x: problem.lane_m[0] / 2, y: problem.lane_m[1] / 2, heading: 1.0}
-    return sizes
+    return Track(number, _objective.cond_phi(model, motion), sizes, found, found, motion, motion.t)
 
 
-def _origin(tr: Transcription, pose: np.ndarray | None, model: Model) -> np.ndarray:
+def search(
+    model: Model, problem: Problem, objective: str, track: Track, plan: Sequence[Stage], over: Callable[[], bool]
+) -> Track:
+    """A track carried through the stages of a plan, until `over`."""
+    for stage in plan:
+        if over():
+            break
+        moved = _advance(model, problem, objective, track, stage, {}, over)
+        if moved is None:
+            break
+        track = moved
+        lane = max((v for limit, v in track.latest.violations.items() if limit.startswith("lane")), default=0.0)
+        if track.pose is not None or (stage.friction <= 4 and lane > 0):
+            track = replace(track, pose=track.latest.start)
+    return track
+
+
+def repair(model: Model, problem: Problem, objective: str, track: Track, over: Callable[[], bool]) -> Track:
+    """The same drive with what the fresh simulation exceeds moved in, three times at most."""
+    margins: dict[str, float] = {}
+    for _ in range(3):
+        if track.latest.feasible or over():
+            break
+        for name, excess in track.latest.violations.items():
+            if excess > 0.3 * TOLERANCE:
+                margins[name] = margins.get(name, 0.0) + 3 * excess
+        track = replace(track, pose=track.latest.start) if track.pose is not None else track
+        track = _advance(model, problem, objective, track, REPAIR, margins, over) or track
+    return track
+
+
+def _advance(
+    model: Model,
+    problem: Problem,
+    objective: str,
+    track: Track,
+    stage: Stage,
+    margins: Mapping[str, float],
+    over: Callable[[], bool],
+) -> Track | None:
+    """One stage from where the track stands. None where no motion follows its torques."""
+    knots = len(_knots(problem)) - 1
+    intervals = max(4, round(knots / stage.coarse))
+    softer = soften(model, stage.friction, stage.slip)
+    rest = 2 * stage.friction if stage.friction > 1 else 1.0
+    tr = transcribe(softer, problem, track.sizes, intervals, with_pose=track.pose is not None, rest=rest)
+    times = np.linspace(0, float(problem.duration_s), intervals + 1)
+    nodes = (np.arange(intervals)[:, None] + tr.place) * tr.knot
+    U = track.latest.manoeuvre.at(times) / tr.torque_scale
+    U[0] = U[-1] = 0.0
     start = np.zeros(tr.n_z)
-    if pose is not None:
+    if track.pose is not None:
         for k, c in enumerate(tr.state_names):
-            if c in model.coordinates:
-                start[k] = pose[model.coordinates.index(c)] / tr.state_scale[k]
-    return start
+            start[k] = track.pose[model.coordinates.index(c)] / tr.state_scale[k] if c in model.coordinates else 0.0
+    fresh = track.states is None
+    if track.states is None or track.states.shape[1] != tr.n_z:
+        names = [*model.coordinates, *[c + "'" for c in model.coordinates]]
+        every = np.hstack([track.motion.q, track.motion.nu])
+        columns = [every[:, names.index(c)] / size for c, size in zip(tr.state_names, tr.state_scale, strict=True)]
+        Z = np.stack([np.interp(nodes, track.motion.t, x) for x in columns], axis=-1)
+    else:
+        Z = np.stack([np.interp(nodes, track.times, x) for x in track.states.T], axis=-1)
+    moved_in = np.array([MARGIN + 2 * margins.get(name, 0.0) for name in tr.limit_names])
+    task = interior.Task(
+        objective,
+        np.tile(moved_in, (intervals, tr.nodes, 1)),
+        np.tile([1e-4 + 2 * margins.get(name, 0.0) for name in tr.control_names], (intervals, 1)),
+        np.array([name.startswith("lane") for name in tr.limit_names], bool),
+    )
+
+    def watch(*_: object) -> bool:
+        return over()
+
+    try:
+        Z = settle(tr, start, U, Z)
+    except UnsettledError:
+        return None
+    if fresh:  # the nearest torques that keep every limit and come to rest
+        near = replace(task, objective=None, pull=1.0, goal=U)
+        point = interior.begin(tr, near, start, Z, U, 1e-3, 0.05)
+        point, _ = interior.minimise(tr, near, point, (interior.Level(1.0, 1e-3, 1e-3, 40),), watch)
+        Z, U = point.Z, point.U
+    point = interior.begin(tr, task, start, Z, U, stage.barrier, 0.05 if fresh else 1e-3)
+    sharp = [stage.sharp * 2**i for i in range(stage.levels)]
+    levels = [
+        interior.Level(p, stage.barrier / 3**i, stage.patience / p, stage.iterations) for i, p in enumerate(sharp)
+    ]
+    point, _ = interior.minimise(tr, task, point, tuple(levels), watch)
+    try:
+        found, motion = _verdict(model, problem, objective, Manoeuvre(times, point.U * tr.torque_scale))
+    except SimulationError:
+        return None
+    return replace(
+        track,
+        latest=found,
+        best=min(track.best, found, key=_rank),
+        motion=motion,
+        times=nodes.ravel(),
+        states=point.Z.reshape(-1, tr.n_z),
+    )
 
 
-def _read(tr: Transcription, model: Model, motion: Motion, at: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Scaled node states (K, J, n_z) of a simulated motion."""
-    names = [*model.coordinates, *[c + "'" for c in model.coordinates]]
-    every = np.hstack([motion.q, motion.nu])
-    columns = [every[:, names.index(s)] for s in tr.state_names]
-    return np.stack([np.interp(at, motion.t, x) for x in columns], axis=-1) / tr.state_scale
+def _verdict(model: Model, problem: Problem, objective: str, drive: Manoeuvre) -> tuple[Candidate, Motion]:
+    """The fresh simulation of a drive, placed on the lane as well as can be."""
+    torque = drive.sample(float(model.machine.sampling_hz))
+    motion = simulate(model, torque)
+    start = placed(model, problem, motion)
+    if not np.array_equal(start, motion.q[0]):
+        motion = simulate(model, torque, q0=start)
+    P = _objective.phi(model, motion)
+    score = _objective.value(objective, P.T @ P)
+    return Candidate(drive, start, score, check(model, problem, motion)), motion
 
 
 def soften(model: Model, friction: float, slip: float) -> Model:

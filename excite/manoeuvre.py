@@ -72,11 +72,11 @@ def _amplitude(model: Model) -> np.ndarray:
     return np.where(np.isfinite(torque), torque, np.abs(model.scale).max())
 
 
-def multisine(model: Model, problem: Problem, seed: int) -> Manoeuvre:
-    """Random multisine: 12 sines per input between 0.05 and 1 Hz, random phases and amplitudes."""
+def multisine(model: Model, problem: Problem, seed: int, top: float = 1.0) -> Manoeuvre:
+    """Random multisine: 12 sines per input between 0.05 Hz and `top` [Hz], random phases and amplitudes."""
     rng = np.random.default_rng(seed)
     t = knots(problem)
-    frequency = np.exp(rng.uniform(np.log(0.05), np.log(1.0), (12, len(model.inputs))))
+    frequency = np.exp(rng.uniform(np.log(0.05), np.log(top), (12, len(model.inputs))))
     phase = rng.uniform(0, 2 * np.pi, frequency.shape)
     size = rng.uniform(0, 1, frequency.shape)
     wish = (size * np.sin(2 * np.pi * frequency * t[:, None, None] + phase)).sum(axis=1)

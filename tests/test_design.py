@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -89,13 +92,23 @@ def test_same_seed_same_design(straight: Model, quick: Design) -> None:
 
 
 @pytest.mark.slow
-def test_s40_reaches_the_target_from_every_start(straight: Model) -> None:
+@pytest.mark.parametrize("seed", range(8))
+def test_s40_reaches_the_target_from_every_start(straight: Model, seed: int) -> None:
     problem = straight.machine.problems["S40"]
-    d = design(straight, problem, starts=8, seed=0)
-    assert max(d.scores) <= 24.0
-    assert d.cond_phi <= 23.56
+    d = design(straight, problem, starts=1, seed=seed)
+    assert d.cond_phi <= 23.5
+    assert d.scores == (pytest.approx(d.cond_phi, rel=1e-4),)
     assert d.max_violation <= TOLERANCE
     fresh_check(straight, problem, d)
+
+
+@pytest.mark.slow
+def test_r60_reaches_the_target(roller: Model) -> None:
+    problem = roller.machine.problems["R60"]
+    d = design(roller, problem, starts=2, seed=0)
+    assert d.cond_phi <= 19.0
+    assert d.max_violation <= TOLERANCE
+    fresh_check(roller, problem, d)
 
 
 @pytest.mark.parametrize("name", ["D", "A", "E"])
@@ -127,8 +140,26 @@ def test_a_short_lane_is_kept(straight: Model) -> None:
 
 
 def test_without_a_budget_left_nothing_is_made_up(straight: Model) -> None:
-    with pytest.raises(Exception, match="more time"):
+    with pytest.raises(InfeasibleError, match="give more time"):
         design(straight, straight.machine.problems["S40"], starts=1, budget_s=0.0)
+
+
+def test_ctrl_c_keeps_the_best_so_far() -> None:
+    """A first interrupt after the scouts are back: the program still ends with a drive, and says it isn't complete."""
+    code = (
+        "import os, signal, threading\n"
+        "from excite.design import design\n"
+        "from model import machine, prediction\n"
+        "if __name__ == '__main__':\n"
+        "    model = prediction.build(machine.load('va12_straight'))\n"
+        "    def seen(done, total, best):\n"
+        "        if done == 1:\n"
+        "            os.kill(os.getpid(), signal.SIGINT)\n"
+        "    d = design(model, model.machine.problems['S40'], starts=6, progress=seen)\n"
+        "    print(d.complete, d.max_violation <= 1e-3, d.cond_phi < 60)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert run.stdout.split() == ["False", "True", "True"], run.stderr[-2000:]
 
 
 def test_limits_are_named_and_scaled(roller: Model) -> None:
