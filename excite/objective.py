@@ -1,8 +1,9 @@
 """How good is a drive: scores of the information matrix A = Phi' Phi, Phi = W diag(scale). Lower is better.
 
-An objective is a plain function of the eigenvalues of A, all with one signature, in the table OBJECTIVES. The same
-expression runs on numbers and on CasADi symbols. `sharp` tells how closely a largest or smallest eigenvalue is
-followed: max_i x_i is replaced by log(sum_i exp(p x_i)) / p, which is smooth and at most log(n)/p above it.
+An objective is a plain function in the table OBJECTIVES, of the eigenvalues of A or of the relative variances, the
+diagonal of its inverse; the table says which, and whether rows count by their noise. The same expression runs on
+numbers and on CasADi symbols. `sharp` tells how closely a largest or smallest value is followed: max_i x_i is replaced
+by log(sum_i exp(p x_i)) / p, which is smooth and at most log(n)/p above it.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import casadi as ca
 import numpy as np
@@ -17,7 +19,19 @@ import numpy as np
 from excite.simulate import Motion
 from model.prediction import Model
 
-Objective = Callable[[ca.SX, ca.SX], ca.SX]
+Function = Callable[[ca.SX, ca.SX], ca.SX]
+
+
+@dataclass(frozen=True)
+class Objective:
+    """A function(x, sharp) of `of`: the eigenvalues of A or the relative variances diag(A^-1), x (n,).
+
+    `weighted`: Phi's rows are divided by their noise (`row_noise`), so that variances are those of the estimate.
+    """
+
+    function: Function
+    of: Literal["eigenvalues", "variances"]
+    weighted: bool
 
 
 def _top(x: ca.SX, sharp: ca.SX) -> ca.SX:
@@ -45,7 +59,26 @@ def e_optimal(eigenvalues: ca.SX, sharp: ca.SX) -> ca.SX:
     return _top(-ca.log(eigenvalues), sharp)
 
 
-OBJECTIVES: dict[str, Objective] = {"cond": cond, "D": d_optimal, "A": a_optimal, "E": e_optimal}
+def worst_sigma(variances: ca.SX, sharp: ca.SX) -> ca.SX:
+    """log of the largest relative variance: the parameter that comes out worst."""
+    return _top(ca.log(variances), sharp)
+
+
+def accuracy(variances: ca.SX, sharp: ca.SX) -> ca.SX:
+    """log of the largest relative variance and of the mean relative standard deviation squared, half and half."""
+    logs = ca.log(variances)
+    return (_top(logs, sharp) + 2 * (ca.logsumexp(logs / 2) - float(np.log(logs.numel())))) / 2
+
+
+OBJECTIVES: dict[str, Objective] = {
+    "cond": Objective(cond, "eigenvalues", False),
+    "weighted-cond": Objective(cond, "eigenvalues", True),
+    "D": Objective(d_optimal, "eigenvalues", True),
+    "A": Objective(a_optimal, "eigenvalues", True),
+    "E": Objective(e_optimal, "eigenvalues", True),
+    "worst": Objective(worst_sigma, "variances", True),
+    "accuracy": Objective(accuracy, "variances", True),
+}
 
 EXACT = 1e6  # sharp enough for a score that is reported
 
@@ -65,9 +98,9 @@ class Local:
 @lru_cache(maxsize=32)
 def _derivatives(objective: str, n: int) -> ca.Function:
     x, sharp = ca.SX.sym("x", n), ca.SX.sym("p")
-    f = OBJECTIVES[objective](x, sharp)
+    f = OBJECTIVES[objective].function(x, sharp)
     H, g = ca.hessian(f, x)
-    return ca.Function(objective, [x, sharp], [f, g, ca.densify(H)])
+    return ca.Function("objective", [x, sharp], [f, g, ca.densify(H)])
 
 
 def value(objective: str, A: np.ndarray, sharp: float = EXACT) -> float:
@@ -75,12 +108,15 @@ def value(objective: str, A: np.ndarray, sharp: float = EXACT) -> float:
     eigenvalues = np.linalg.eigvalsh(A)
     if not np.isfinite(eigenvalues).all() or eigenvalues[0] <= 1e-14 * eigenvalues[-1]:
         return float("inf")
-    return float(_derivatives(objective, len(A))(eigenvalues, sharp)[0])
+    x = eigenvalues if OBJECTIVES[objective].of == "eigenvalues" else np.diag(np.linalg.inv(A))
+    return float(_derivatives(objective, len(A))(x, sharp)[0])
 
 
 def reported(objective: str, value: float) -> float:
-    """An objective as people read it: cond as the condition number of Phi, the others as they are."""
-    return float(np.exp(value / 2)) if objective == "cond" else value
+    """An objective as people read it: a condition number, a relative standard deviation [%], others as they are."""
+    if objective in ("cond", "weighted-cond"):
+        return float(np.exp(value / 2))
+    return 100 * float(np.exp(value / 2)) if objective == "worst" else value
 
 
 def local(objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, sharp: float) -> Local:
@@ -88,8 +124,11 @@ def local(objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, 
 
     For a function F of the eigenvalues with A = V diag(x) V' and H in the eigenvectors' axes (Lewis and Sendov,
     2001), d2F[H, H] = sum_ij F_ij H_ii H_jj + sum_{i != j} (F_i - F_j) / (x_i - x_j) H_ij^2. Negative parts are
-    dropped: the log of the largest eigenvalue is concave along A itself.
+    dropped: the log of the largest eigenvalue is concave along A itself. Of the variances v_i = c_i[i], C = A^-1,
+    d2F[H, H] = sum_i 2 F_i c_i' H C H c_i + sum_ij F_ij (c_i' H c_i) (c_j' H c_j); log max_i v_i is convex in A.
     """
+    if OBJECTIVES[objective].of == "variances":
+        return _local_variances(objective, A, rows, columns, sharp)
     n = len(A)
     x, V = np.linalg.eigh(A)
     out = _derivatives(objective, n)(x, sharp)
@@ -104,15 +143,74 @@ def local(objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, 
     close = gap < 1e-7 * x[j]
     ratio = np.where(close, H[j, j] - H[i, j], (g[j] - g[i]) / np.where(close, 1, gap))
     factor = np.vstack([root @ np.einsum("lii->il", E), np.sqrt(2 * np.maximum(ratio, 0))[:, None] * E[:, i, j].T])
-    e, U = np.linalg.eigh(factor.T @ factor)
+    return Local(float(out[0]), slope, _root(factor.T @ factor))
+
+
+def _local_variances(objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, sharp: float) -> Local:
+    C = np.linalg.inv(A)
+    out = _derivatives(objective, len(A))(np.diag(C), sharp)
+    g, H = out[1].full().ravel(), out[2].full()
+    twice = np.where(rows != columns, 2.0, 1.0)
+    through = twice[:, None] * C[rows] * C[columns]  # c_i' E_l c_i, E_l the unit matrix of entry l
+    curvature = through @ H @ through.T
+    for i, weight in enumerate(g):
+        moved = np.zeros((len(rows), len(A)))  # E_l c_i
+        np.add.at(moved, (np.arange(len(rows)), rows), C[columns, i])
+        off = rows != columns
+        np.add.at(moved, (np.flatnonzero(off), columns[off]), C[rows[off], i])
+        curvature += 2 * weight * moved @ C @ moved.T
+    return Local(float(out[0]), -through @ g, _root(curvature))
+
+
+def _root(matrix: np.ndarray) -> np.ndarray:
+    """F (n, r) with F F' the positive part of a symmetric matrix."""
+    e, U = np.linalg.eigh((matrix + matrix.T) / 2)
     keep = e > 1e-13 * e[-1]
-    return Local(float(out[0]), slope, U[:, keep] * np.sqrt(e[keep]))
+    return np.asarray(U[:, keep] * np.sqrt(e[keep]))
 
 
-def phi(model: Model, motion: Motion) -> np.ndarray:
-    """Phi = W diag(scale) (rows of all samples, n_base)."""
-    W = model.stacked(motion.q.T, motion.nu.T, motion.a.T)
-    return (W * model.scale).reshape(-1, len(model.scale))
+def row_noise(model: Model) -> np.ndarray:
+    """(n_rows,) noise of every equation per sample [N m, N]: of the torque sensor in an actuated row.
+
+    Rows of a root hold no torque; what disturbs them is the torque noise that the contacts pass on, u / R, and the
+    moment of it at the machine's radius of gyration. Drives then rank as by the Cramer-Rao bound of all sensors
+    together (rank correlation 0.95 over random drives, torque noise alone and equal rows do worse).
+    """
+    machine = model.machine
+    torque = {s.body: float(s.noise) for s in machine.sensor if s.kind == "torque" and s.noise is not None}
+    known = [torque[b.index] for b in machine.actuated if b.index in torque]
+    usual = float(np.mean(known)) if known else 1.0
+    pushes = [torque.get(b.index, usual) / float(b.contact.radius) for b in machine.contacts if b.contact is not None]
+    force = float(np.sqrt(np.mean(np.square(pushes)))) if pushes else usual
+    noise = np.full(len(model.coordinates), force)
+    for k, body in zip(model.actuated, machine.actuated, strict=True):
+        noise[k] = torque.get(body.index, usual)
+    if machine.planar and machine.body[0].coordinates[2] in model.coordinates:
+        q, nu, _ = model.symbols()
+        M = ca.Function("M", [q], [model.equations(q, nu, ca.DM(model.nominal))[0]])(0).full()
+        turn = model.coordinates.index(machine.body[0].coordinates[2])
+        noise[turn] = force * float(np.sqrt(M[turn, turn] / M[0, 0]))
+    return noise
+
+
+def weights(model: Model, objective: str) -> tuple[np.ndarray, np.ndarray]:
+    """(n_rows,), (n_base,): what an objective multiplies the rows and the columns of W with.
+
+    Columns count in `scale`; for relative variances in the nominal value itself, where it is not zero. Raises KeyError
+    for an unknown name.
+    """
+    chosen = OBJECTIVES[objective]
+    rows = 1 / row_noise(model) if chosen.weighted else np.ones(len(model.coordinates))
+    if chosen.of == "eigenvalues":
+        return rows, model.scale
+    return rows, np.where(model.nominal != 0, np.abs(model.nominal), model.scale)
+
+
+def phi(model: Model, motion: Motion, objective: str = "cond") -> np.ndarray:
+    """Phi = W diag(scale) (rows of all samples, n_base), rows and columns weighted as the objective asks."""
+    rows, columns = weights(model, objective)
+    W = model.stacked(motion.q.T, motion.nu.T, motion.a.T) * rows[:, None]
+    return (W * columns).reshape(-1, len(columns))
 
 
 def _cond(matrix: np.ndarray) -> float:
