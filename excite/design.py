@@ -321,7 +321,15 @@ def _advance(
     intervals = max(4, round(knots / stage.coarse))
     softer = soften(model, stage.friction, stage.slip)
     rest = 2 * stage.friction if stage.friction > 1 else 1.0
-    tr = transcribe(softer, problem, track.sizes, intervals, with_pose=track.pose is not None, rest=rest)
+    tr = transcribe(
+        softer,
+        problem,
+        track.sizes,
+        intervals,
+        with_pose=track.pose is not None,
+        rest=rest,
+        weights=_objective.weights(model, objective),
+    )
     times = np.linspace(0, float(problem.duration_s), intervals + 1)
     nodes = (np.arange(intervals)[:, None] + tr.place) * tr.knot
     U = track.latest.manoeuvre.at(times) / tr.torque_scale
@@ -385,7 +393,7 @@ def _verdict(model: Model, problem: Problem, objective: str, drive: Manoeuvre) -
     start = placed(model, problem, motion)
     if not np.array_equal(start, motion.q[0]):
         motion = simulate(model, torque, q0=start)
-    P = _objective.phi(model, motion)
+    P = _objective.phi(model, motion, objective)
     score = _objective.value(objective, P.T @ P)
     return Candidate(drive, start, score, check(model, problem, motion)), motion
 
