@@ -1,0 +1,260 @@
+"""Joint smoothing: exact where there is no noise, honest where there is, and aware of what it doesn't know."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from excite import chain, sensors, smoothing
+from excite.driver import follow
+from excite.identify import identify
+from excite.linearise import advance, chart, differentiate
+from excite.log import Log, check
+from excite.simulate import Motion, simulate
+from model import machine, prediction
+from model.prediction import Model
+
+
+@pytest.fixture(scope="module")
+def va12() -> Model:
+    return prediction.build(machine.load("va12"))
+
+
+@pytest.fixture(scope="module")
+def straight() -> Model:
+    return prediction.build(machine.load("va12_straight"))
+
+
+def energetic(seconds: float = 60.0, size: float = 1.0) -> np.ndarray:
+    """Torques (N, 3) that reverse every few seconds while the articulation sweeps to half its range and more."""
+    t = np.arange(round(seconds * 100) + 1) / 100
+    rise = size * np.clip(np.minimum(t, t[-1] - t) / 2, 0, 1)
+    front = 2600 * np.sin(2 * np.pi * t / 11) + 1400 * np.sin(2 * np.pi * t / 5.3 + 1)
+    rear = 2600 * np.sin(2 * np.pi * t / 11 + 0.2) + 1400 * np.sin(2 * np.pi * t / 6.1 + 2)
+    steer = 9000 * np.sin(2 * np.pi * t / 9) + 3500 * np.sin(2 * np.pi * t / 4.1)
+    return np.column_stack([front, steer, rear]) * rise[:, None]
+
+
+def human(model: Model, X: np.ndarray, seed: int) -> Motion:
+    """A minute of slow passes to and fro with bends and stops, driven by hand."""
+    rng = np.random.default_rng(1000 + seed)
+    speed, angle = np.zeros((2, 6001))
+    k = 100
+    while k < 5700:
+        length = min(int(rng.uniform(400, 1200)), 5800 - k)
+        speed[k : k + length] = rng.choice([-1, 1]) * rng.uniform(0.4, 1.2)
+        angle[k : k + length] = rng.uniform(-0.4, 0.4)
+        k += length + int(rng.uniform(0, 200))
+    window = np.hanning(151) / np.hanning(151).sum()
+    by_hand = follow(
+        model, np.convolve(speed, window, "same"), np.convolve(angle, window, "same")[:, None], X=X, seed=seed
+    )
+    # The driver's torques as a drive would deliver them: without what the control loop does within a few samples.
+    return simulate(model, scipy.signal.filtfilt(*scipy.signal.butter(2, 0.06), by_hand.u, axis=0), X)
+
+
+def perturbed(model: Model, seed: int, by: float = 0.2) -> np.ndarray:
+    """Base parameters of a machine whose bodies, frictions and contacts are each off by up to `by`."""
+    rng = np.random.default_rng(seed)
+
+    def off() -> float:
+        return float(rng.uniform(1 - by, 1 + by))
+
+    table = {n: v for n, (v, _) in prediction.standard_parameters(model.machine).items()}
+    found: dict[str, float] = {}
+    for body in model.machine.body:
+        k = body.index
+        if body.inertia is not None:
+            mass = float(body.inertia.mass) * off()
+            found[f"M{k}"] = mass
+            if body.inertia.axisymmetric:
+                found |= {f"XX{k}": float(body.inertia.XX) * off(), f"ZZ{k}": float(body.inertia.ZZ) * off()}
+            else:
+                x, y = body.inertia.com.value[0] * off(), body.inertia.com.value[1] * off()
+                turn = float(body.inertia.ZZ) * off() + mass * (x * x + y * y)
+                found |= {f"MX{k}": mass * x, f"MY{k}": mass * y, f"ZZ{k}": turn}
+        for name in (f"Fv{k}", f"Fs{k}", f"u{k}0", f"Kx{k}", f"Ky{k}"):
+            if name in table:
+                found[name] = table[name] * off()
+    return model.base_values({n: v for n, v in found.items() if n in table})
+
+
+def measured(model: Model, motion: Motion, X: np.ndarray, kit: str = "full", seed: int = 0, noise: bool = True) -> Log:
+    return check(sensors.measure(model, motion, X, kit, seed, noise), model.machine)
+
+
+def test_chain_agrees_with_dense_algebra() -> None:
+    rng = np.random.default_rng(0)
+    K, n, c = 13, 4, 3
+    A, b = rng.normal(size=(K, n, n)) / 2, rng.normal(size=(K, n, c))
+    root, H = rng.normal(size=(K, n, 2)), rng.normal(size=(K, 2, n))
+    C, J = root @ root.transpose(0, 2, 1), H.transpose(0, 2, 1) @ H
+    eta = H.transpose(0, 2, 1) @ rng.normal(size=(K, 2, c))
+    A[0], J[0], eta[0], C[0] = 0, 0, 0, np.eye(n)
+    A[-1], b[-1], C[-1] = 0, 0, 0
+    stages = chain.Stages(A, b, C, eta, J)
+    cuts = (slice(0, 5), slice(5, 6), slice(6, None))
+    solved = chain.solve([chain.section(stages.part(cut)) for cut in cuts])
+
+    N = K - 1
+    mean, P, info, pull = np.zeros((N, n, c)), np.zeros((N, n, N, n)), np.zeros((N, n, N, n)), np.zeros((N, n, c))
+    mean[0], P[0, :, 0] = b[0], C[0]
+    for k in range(1, N):
+        mean[k] = A[k] @ mean[k - 1] + b[k]
+        for j in range(k):
+            P[k, :, j] = A[k] @ P[k - 1, :, j]
+            P[j, :, k] = P[k, :, j].T
+        P[k, :, k] = A[k] @ P[k - 1, :, k - 1] @ A[k].T + C[k]
+    for k in range(N):
+        info[k, :, k], pull[k] = J[k + 1], eta[k + 1]
+    m, P, info, pull = mean.reshape(N * n, c), P.reshape(N * n, -1), info.reshape(N * n, -1), pull.reshape(N * n, c)
+    G = np.linalg.inv(np.eye(N * n) + P @ info)
+    Z = m.T @ info @ G @ m - pull.T @ G @ m - (pull.T @ G @ m).T - pull.T @ G @ P @ pull
+    np.testing.assert_allclose(solved.Z, (Z + Z.T) / 2, rtol=0, atol=1e-9 * np.abs(Z).max())
+    p = np.array([0.3, -0.7])
+    weights = np.array([1.0, *p])
+    x, slope = solved.states(p)
+    expected = (G @ (m @ weights + P @ pull @ weights)).reshape(N, n)
+    np.testing.assert_allclose(x, expected, atol=1e-9)
+    for k in range(1, N):
+        np.testing.assert_allclose(x[k], A[k] @ x[k - 1] + b[k] @ weights + C[k] @ slope[k], atol=1e-9)
+
+
+def test_where_samples_lead_and_how_that_moves(va12: Model) -> None:
+    X = perturbed(va12, 2)
+    motion = simulate(va12, energetic(20), X)
+    c = chart(va12, tuple(s.name for s in va12.machine.sensor))
+    assert c.core == 7  # theta2 and six velocities: no roll's own angle, though the expressions hold it
+    s = np.hstack([motion.q, motion.nu, motion.wheels])[:, c.index]
+    end = advance(c, s[:-1], motion.u[:-1], motion.u[1:], X)
+    assert np.abs(end - s[1:]).max() < 2e-6
+    by = differentiate(c, s, motion.u, X, force=True)
+    rng = np.random.default_rng(0)
+    ds, du, dX = rng.normal(size=c.n) * 1e-5, rng.normal(size=3) * 10, rng.normal(size=len(X)) * 1e-4 * va12.scale
+    for a, b, d, moved in (
+        (ds, 0 * du, 0 * dX, by.A @ ds),
+        (0 * ds, du, 0 * dX, by.B @ du),
+        (0 * ds, 0 * du, dX, by.X @ dX),
+    ):
+        up = advance(c, s[:-1] + a, motion.u[:-1] + b, motion.u[1:] + b, X + d)
+        down = advance(c, s[:-1] - a, motion.u[:-1] - b, motion.u[1:] - b, X - d)
+        error, size = (up - down) / 2 - moved, (up - down) / 2
+        # A roll's spin forgets within a sample near standstill, and how much of it is left may be off; it hardly
+        # counts. What lasts, the angles, is right.
+        rms, typical = np.sqrt(np.mean(error**2, axis=0)), np.sqrt(np.mean(size**2, axis=0))
+        angles = [0, 7, 8, 9, 10]
+        assert (rms[angles] < 0.03 * typical[angles]).all()
+        assert (rms < 0.2 * np.maximum(typical, np.abs(a).max())).all()
+
+
+@pytest.mark.parametrize("kit", ["full", "paper"])
+def test_exact_signals_give_exact_parameters(va12: Model, kit: str) -> None:
+    X = perturbed(va12, 1)
+    motion = simulate(va12, energetic(), X)
+    estimate = identify(va12, [measured(va12, motion, X, kit, noise=False)], "joint")
+    np.testing.assert_allclose(estimate.value, X, rtol=0, atol=1e-5 * va12.scale.max(), err_msg=str(estimate.names))
+    assert (np.abs(estimate.value - X) < 1e-4 * va12.scale).all()
+
+
+def errors(
+    model: Model, drive: str, kit: str, seeds: range, by: float = 0.2
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """True errors in standard deviations and in per cent (runs, n), and standard deviations over the bound."""
+    z, percent, over = [], [], []
+    for seed in seeds:
+        X = perturbed(model, seed, by)
+        motion = simulate(model, energetic(), X) if drive == "energetic" else human(model, X, seed)
+        estimate = identify(model, [measured(model, motion, X, kit, 50000 + seed)], "joint")
+        assert len(estimate.notes) == 1, estimate.notes
+        z.append((estimate.value - X) / estimate.std)
+        percent.append(100 * (estimate.value - X) / np.maximum(np.abs(X), model.scale))
+        over.append(estimate.std / np.sqrt(np.diag(smoothing.cramer_rao(model, motion, kit, X))))
+    return np.array(z), np.array(percent), np.array(over)
+
+
+@pytest.mark.parametrize(("drive", "kit"), [("energetic", "full"), ("human", "paper")])
+def test_errors_are_as_large_as_it_says(va12: Model, drive: str, kit: str) -> None:
+    z, percent, over = errors(va12, drive, kit, range(2))
+    assert 0.7 < np.sqrt(np.mean(z**2)) < 1.35
+    assert np.abs(z).max() < 4.5
+    assert np.median(np.sqrt(np.mean(percent**2, axis=0))) < 0.6
+    # The noise is estimated and the encoders' counts are random: the bound knows both on average.
+    assert np.abs(over - 1).max() < 0.15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kit", ["full", "paper"])
+@pytest.mark.parametrize(("drive", "worst", "middle"), [("energetic", 2.2, 0.25), ("human", 2.0, 0.4)])
+def test_coverage(va12: Model, drive: str, kit: str, worst: float, middle: float) -> None:
+    z, percent, _ = errors(va12, drive, kit, range(50))
+    rms = np.sqrt(np.mean(percent**2, axis=0))
+    inside = np.mean(np.abs(z) < 1.96, axis=0)
+    assert rms.max() < worst
+    assert np.median(rms) < middle
+    assert 0.9 < np.sqrt(np.mean(z**2)) < 1.15
+    assert 0.93 < inside.mean() < 0.97
+    assert inside.min() >= 0.84  # 50 runs: two standard deviations below 95 % is 0.89, and this is the least of 22
+
+
+def test_bound_is_what_linear_least_squares_gives(va12: Model) -> None:
+    """The bound of a motion, and of twice the same noise: four times the covariance of what noise alone limits."""
+    motion = simulate(va12, energetic(30))
+    names = ("theta1", "theta4", "theta2", "thetal", "thetar")
+    bound = smoothing.cramer_rao(va12, motion)
+    without = smoothing.cramer_rao(va12, motion, "paper")
+    assert set(names) <= {s.name for s in va12.machine.sensors("paper")}
+    assert (np.linalg.eigvalsh((without - bound) / np.outer(va12.scale, va12.scale)) > -1e-12).all()
+    longer = smoothing.cramer_rao(va12, simulate(va12, energetic(60)))
+    assert np.median(np.sqrt(np.diag(longer) / np.diag(bound))) < 1
+
+
+def test_a_straight_drive_names_what_it_does_not_show(straight: Model) -> None:
+    X = perturbed(straight, 3)
+    motion = simulate(straight, energetic(40)[:, [0, 2]], X)
+    estimate = identify(straight, [measured(straight, motion, X, "paper", 5)], "joint")
+    assert not estimate.unidentifiable
+    assert np.sqrt(np.mean(((estimate.value - X) / estimate.std) ** 2)) < 1.8
+    std = np.sqrt(np.diag(smoothing.cramer_rao(straight, motion, "paper", X)))
+    np.testing.assert_allclose(estimate.std, std, rtol=0.15)
+
+
+def test_two_logs_know_more_than_one(va12: Model) -> None:
+    X = perturbed(va12, 4)
+    logs = [measured(va12, simulate(va12, energetic(30, size), X), X, "full", k) for k, size in enumerate((1.0, 0.8))]
+    one, both = identify(va12, logs[:1], "joint"), identify(va12, logs, "joint")
+    assert (both.std < one.std).all()
+    assert np.sqrt(np.mean(((both.value - X) / both.std) ** 2)) < 1.6
+
+
+@pytest.mark.parametrize("slope", [0.0005, 0.002])
+def test_a_slope_is_seen_in_the_innovations(va12: Model, slope: float) -> None:
+    """The exact model is brittle: a slope that nobody would notice on site spoils it. It must say so."""
+    X = perturbed(va12, 1)
+    tilted = prediction.build(va12.machine.model_copy(update={"gravity": (9.81 * slope, 0.0, -9.81)}))
+    log = measured(va12, simulate(tilted, energetic(), X), X)
+    estimate = identify(va12, [log], "joint")
+    assert any("excite diagnose" in note for note in estimate.notes)
+    good = identify(va12, [measured(va12, simulate(va12, energetic(), X), X)], "joint")
+    assert (estimate.std > good.std).all()
+    assert np.sqrt(np.mean(((estimate.value - X) / estimate.std) ** 2)) < 3
+
+
+def test_a_log_of_something_else_gives_no_number(va12: Model) -> None:
+    """Signals that no machine of this kind makes: an error that says what to do, not an estimate."""
+    rng = np.random.default_rng(0)
+    good = measured(va12, simulate(va12, energetic(20)), va12.nominal)
+    values = {name: rng.permutation(value) for name, value in good.values.items()}
+    with pytest.raises(smoothing.NotConverged, match="excite diagnose"):
+        identify(va12, [Log("shuffled", good.t, values)], "joint")
+
+
+def test_noise_is_found_in_the_log_not_taken_on_trust(va12: Model) -> None:
+    motion = simulate(va12, energetic(), va12.nominal)
+    log = measured(va12, motion, va12.nominal)
+    rng = np.random.default_rng(0)
+    log.values["u1"][:] += 69.3 * rng.standard_normal(len(log))  # 80 N m in all, twice the data sheet
+    estimate = identify(va12, [log], "joint")
+    note = next(n for n in estimate.notes if "u1" in n)
+    assert 72 < float(note.split("u1 ")[1].split(" ")[0]) < 88
+    assert "data sheet 40" in note
