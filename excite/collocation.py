@@ -223,7 +223,7 @@ def transcribe(
     q = ca.SX(n_q, 1)
     for k, c in enumerate(used):
         q[model.coordinates.index(c)] = z[k]
-    nu, a = z[len(used) :], rate[len(used) :]
+    nu, a = (ca.vertcat(*ca.vertsplit(x)[len(used) :]) for x in (z, rate))
     p = model.expand @ model.nominal
     for body in model.machine.actuated:
         p[model.base.standard.index(f"u{body.index}0")] = 0.0
@@ -231,11 +231,8 @@ def transcribe(
     for k, row in enumerate(model.actuated):
         drive[row] = u[k]
     dq = model.kinematics(q, nu)[0]
-    kept = [model.coordinates.index(c) for c in used]
-    residual = ca.vertcat(
-        (rate[: len(used)] - dq[kept]) * knot / ca.DM(z_size[: len(used)]),
-        (model.predict(q, nu, a, p) - drive) / float(u_size.max()),
-    )
+    turns = [(rate[k] - dq[model.coordinates.index(c)]) * knot / z_size[k] for k, c in enumerate(used)]
+    residual = ca.vertcat(*turns, (model.predict(q, nu, a, p) - drive) / float(u_size.max()))
     g = ca.vertcat(*[(g.expression(q, nu, u, 0) - g.centre) * (2 / g.range) for g in staged], ca.SX(0, 1))
     W = model.regressor(q, nu, a)
     rows_by, columns_by = weights or (np.ones(n_q), model.scale)

@@ -194,7 +194,9 @@ def _state(
     if task.goal is not None:
         f += 0.5 * task.pull * float(((U - task.goal) ** 2).sum())
     gc = np.concatenate([U[:-1], U[1:]], axis=1) @ tr.control.T + tr.control_centre
-    return State(g.reshape(tr.intervals, tr.nodes, -1), gc, Z[-1, -1, tr.at_rest] / tr.band, entries, f)
+    return State(
+        g.reshape(tr.intervals, tr.nodes, len(tr.limit_names)), gc, Z[-1, -1, tr.at_rest] / tr.band, entries, f
+    )
 
 
 def _pressure(
@@ -234,14 +236,14 @@ def _linearise(tr: Transcription, task: Task, point: Point, level: Level) -> Qua
 
     # the Lagrangian's curvature, with the multipliers of the dynamics by the adjoint
     pulled = np.matmul(slope[None, None], as_)[:, 0] * tr.weight[:, None]
-    y = (point.high - point.low + hinge).reshape(-1, n_g)
+    y = (point.high - point.low + hinge).reshape(K * J, n_g)
     grad = pulled + np.matmul(y[:, None], gs)[:, 0]
     lam = _adjoint(tr, CZ, T, grad.reshape(K, J, -1), (point.highe - point.lowe) / tr.band)
     (H,) = tr.second(s, np.concatenate([lam.reshape(K * J, n_z), y, tr.weight[:, None] * slope], axis=1))
-    H += np.matmul(gs.transpose(0, 2, 1) * (sigma + bend).reshape(-1, 1, n_g), gs)
+    H += np.matmul(gs.transpose(0, 2, 1) * (sigma + bend).reshape(K * J, 1, n_g), gs)
 
     # all of it in the steps of the intervals
-    inside = (force + sigma * (state.g - point.t) + hinge).reshape(-1, 1, n_g)
+    inside = (force + sigma * (state.g - point.t) + hinge).reshape(K * J, 1, n_g)
     node = pulled + np.matmul(inside, gs)[:, 0]
     flat = LT.reshape(K, -1, n_r)
     back = flat.transpose(0, 2, 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from excite.limit import InfeasibleError, check, limits, placed
 from excite.manoeuvre import BASELINES, Manoeuvre
 from excite.simulate import simulate
 from model import machine, prediction
-from model.machine import Problem
+from model.machine import Problem, Quantity
 from model.prediction import Model
 
 
@@ -109,6 +110,18 @@ def test_r60_reaches_the_target(roller: Model) -> None:
     assert d.cond_phi <= 19.0
     assert d.max_violation <= TOLERANCE
     fresh_check(roller, problem, d)
+
+
+def test_another_machine_needs_no_other_code() -> None:
+    """One prismatic joint, no contact, no lane; its friction is a sharp sign function."""
+    model = prediction.build(machine.load("emps"))
+    number = partial(Quantity, source="assumed")
+    problem = Problem(
+        duration_s=number(value=10.0), knot_s=number(value=0.1), lane_m=(1, 1), lane_points=(), source="assumed"
+    )
+    d = design(model, problem, starts=1)
+    assert d.max_violation <= TOLERANCE
+    assert d.cond_phi < 5
 
 
 @pytest.mark.parametrize("name", ["D", "A", "E"])
