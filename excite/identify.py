@@ -9,6 +9,7 @@ import numpy as np
 from excite.estimate import Estimate, NotIdentifiable, noted
 from excite.instruments import iv
 from excite.log import Log
+from excite.outputerror import oe
 from excite.processing import Samples, decimate, filtered_regression, lowpass, samples
 from excite.regression import least_squares, ols, tls, wls
 from model.machine import Filter
@@ -43,11 +44,8 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
 
 def needed_sensors(model: Model, method: str) -> tuple[str, ...]:
     """Names of the sensors without which a method can't work on this machine."""
-    needs = []
-    for sensor in model.machine.sensors("full"):
-        if sensor.kind in ("angle", "torque", "wheel", "lateral_speed"):
-            needs.append(sensor.name)
-    return tuple(needs)
+    kinds = ("angle", "torque", "wheel") if method in SIMULATING else ("angle", "torque", "wheel", "lateral_speed")
+    return tuple(s.name for s in model.machine.sensors("full") if s.kind in kinds)
 
 
 def torques(model: Model, log: Log, estimate: Estimate, filter: Filter | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -67,5 +65,6 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
 
 
 Method = Callable[[Model, Sequence[Log], Filter], Estimate]
-METHODS: dict[str, Method] = {"ols": ols, "wls": wls, "iv": iv, "tls": tls, "joint": joint}
+METHODS: dict[str, Method] = {"ols": ols, "wls": wls, "iv": iv, "tls": tls, "oe": oe, "joint": joint}
 RECOMMENDED = "ols"
+SIMULATING = ("iv", "oe", "joint")  # find a speed that nothing measures from the dynamics

@@ -15,8 +15,8 @@ import scipy.linalg
 
 from excite.estimate import Estimate, NotIdentifiable
 from excite.log import Log
-from excite.noise import spread, whitener
-from excite.processing import Samples, lowpass, regression, samples
+from excite.noise import Spread, spread, whitener
+from excite.processing import Samples, lowpass, regression, samples, unmeasured
 from excite.regression import Block, assembled, effective, scatter, solved, whitened
 from excite.simulate import SimulationError, simulate
 from model.machine import Filter
@@ -26,6 +26,8 @@ PULL = 4.0  # time constant of the observer [s]
 PASSES = 30  # of the iteration, at most
 CONVERGED = 0.02  # a step this small against the standard deviation ends it
 STRETCH = 0.1  # between two corrections by the observer [s]
+OFF_SPEED = 0.01  # error of an observed speed that nothing measures [m/s, rad/s]
+OFF_SLOPE = 0.02  # and of its slope, per second
 SHORTER = 6  # times that a step is halved where the machine it leads to can't be simulated
 
 
@@ -33,18 +35,28 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     """Instrumental variables, from the machine file's values.
 
     Z'(Y - W X) = 0 with Z the regressor along the observed motion: consistent where W's noise has nothing to do with
-    Z's. Rows are made white at the current estimate, along the observed motion (see `whitener`). Deviations account for
-    autocorrelation. Raises NotIdentifiable where the iteration finds no machine that can be simulated, or none that
-    reproduces itself.
+    Z's. A speed that no sensor measures, V_y with kit `paper`, is the observed one in W too. Rows are made white at the
+    current estimate, along the observed motion (see `whitener`). Deviations account for autocorrelation. Raises
+    NotIdentifiable where the iteration finds no machine that can be simulated, or none that reproduces itself.
     """
     measured = [samples(model, log, filter) for log in logs]
+    unseen = [unmeasured(model, log) for log in logs]
     blocks = [regression(model, s, filter) for s in measured]
-    noise = [spread(model, log, filter) for log in logs]
+    noise = [_with_unseen(spread(model, log, filter), rows) for log, rows in zip(logs, unseen, strict=True)]
+    if any(unseen):
+        measured = [
+            _completed(s, observe(model, s, model.nominal, filter, rows), rows)
+            for s, rows in zip(measured, unseen, strict=True)
+        ]
+        blocks = [regression(model, s, filter) for s in measured]
     first = solved(blocks)
     kept = list(first.kept)
     x, step = model.nominal.copy(), np.full(len(model.nominal), np.nan)
     for _ in range(PASSES):
-        seen, x = _observed(model, measured, x, step, filter)
+        seen, x = _observed(model, measured, unseen, x, step, filter)
+        if any(unseen):
+            measured = [_completed(s, o, rows) for s, o, rows in zip(measured, seen, unseen, strict=True)]
+            blocks = [regression(model, s, filter) for s in measured]
         turned = [whitener(model, s, x, n, filter) for s, n in zip(seen, noise, strict=True)]
         Z = [whitened(regression(model, s, filter), L)[0] for s, L in zip(seen, turned, strict=True)]
         own = [whitened(b, L) for b, L in zip(blocks, turned, strict=True)]
@@ -62,12 +74,17 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
 
 
 def _observed(
-    model: Model, logs: Sequence[Samples], x: np.ndarray, step: np.ndarray, filter: Filter
+    model: Model,
+    logs: Sequence[Samples],
+    unseen: Sequence[Sequence[int]],
+    x: np.ndarray,
+    step: np.ndarray,
+    filter: Filter,
 ) -> tuple[list[Samples], np.ndarray]:
     """The observed motion of each log and the parameters behind it: x, or short of it where x is no machine."""
     for _ in range(SHORTER):
         try:
-            return [observe(model, s, x, filter) for s in logs], x
+            return [observe(model, s, x, filter, rows) for s, rows in zip(logs, unseen, strict=True)], x
         except SimulationError:
             if np.isnan(step).any():
                 break
@@ -76,6 +93,22 @@ def _observed(
     raise NotIdentifiable(
         "iv: the machine that it leads to can't be simulated; start from better values in the machine file"
     )
+
+
+def _with_unseen(noise: Spread, rows: Sequence[int]) -> Spread:
+    """The spread of a log, some of whose speeds are observed only."""
+    P, n = noise.motion.copy(), len(noise.rows)
+    for k in rows:
+        P[n + k, n + k] += OFF_SPEED**2
+        P[2 * n + k, 2 * n + k] += OFF_SLOPE**2
+    return Spread(P, noise.rows)
+
+
+def _completed(s: Samples, observed: Samples, rows: Sequence[int]) -> Samples:
+    """Samples with the speeds and accelerations of some coordinates taken from the observed motion."""
+    nu, a = s.nu.copy(), s.a.copy()
+    nu[list(rows)], a[list(rows)] = observed.nu[list(rows)], observed.a[list(rows)]
+    return Samples(s.q, nu, a, s.Y)
 
 
 def _square(
@@ -96,12 +129,15 @@ def _square(
     return found, half @ scatter(blocks, found, kept, Z) @ half.T
 
 
-def observe(model: Model, s: Samples, x: np.ndarray, filter: Filter, pull: float = PULL) -> Samples:
+def observe(
+    model: Model, s: Samples, x: np.ndarray, filter: Filter, unseen: Sequence[int] = (), pull: float = PULL
+) -> Samples:
     """The motion of the machine x (n_base,) under a log's low-passed torques, drawn towards the log's speeds and joint
-    angles with time constant `pull` [s]. Raises SimulationError."""
+    angles with time constant `pull` [s], but for coordinates `unseen`. Raises SimulationError."""
     rate = float(model.machine.sampling_hz)
     stretch = max(1, round(STRETCH * rate))
-    gain = 1 - np.exp(-stretch / rate / pull)
+    gain = np.full(len(s.q), 1 - np.exp(-stretch / rate / pull))
+    gain[list(unseen)] = 0.0
     standard = dict(zip(model.base.standard, model.expand @ x, strict=True))
     offset = np.array([standard[f"u{b.index}0"] for b in model.machine.actuated])
     torque = lowpass(s.Y[list(model.actuated)], rate, filter).T - offset

@@ -88,6 +88,22 @@ def samples(model: Model, log: Log, filter: Filter) -> Samples:
     return Samples(q, nu, a, Y)
 
 
+def unmeasured(model: Model, log: Log) -> tuple[int, ...]:
+    """Coordinates of which a log says nothing: `samples` leaves their speed at zero."""
+    machine = model.machine
+    seen: set[str] = set()
+    for sensor in machine.sensors("full"):
+        if sensor.name not in log.values:
+            continue
+        if sensor.kind == "angle":
+            seen.add(machine.find(sensor.body).coordinates[0])
+        elif sensor.kind == "wheel":
+            seen |= {machine.body[0].coordinates[0], machine.body[0].coordinates[2]}
+        elif sensor.kind == "lateral_speed":
+            seen.add(machine.body[0].coordinates[1])
+    return tuple(k for k, c in enumerate(model.coordinates) if c not in seen)
+
+
 def _planar_speed(model: Model, wheels: list[tuple[Sensor, np.ndarray]], nu: np.ndarray) -> None:
     """V_x and yaw rate of the root from its measuring wheels: R rate = V_x - lateral yaw (32), by least squares."""
     x, _, turn = model.machine.body[0].coordinates

@@ -19,7 +19,7 @@ Block = tuple[np.ndarray, np.ndarray]  # W (n_rows, n, n_base) and Y (n_rows, n)
 
 TURNS = 30  # of an iteration for weights, at most
 SETTLED = 1e-4  # relative change of weights that ends it
-NOTABLE = 1.1  # deviations too small by this factor are worth a remark
+NOTABLE = 1.2  # deviations too small by this factor are worth a remark
 
 
 def ols(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
@@ -223,7 +223,7 @@ def _too_small(blocks: Sequence[Block], solution: Solution, estimate: Estimate, 
     """What autocorrelated residuals do to deviations by (33), as a note."""
     kept = list(solution.kept)
     ratio = np.sqrt(np.diag(honest)) / estimate.std[kept]
-    if not np.median(ratio) > NOTABLE:
+    if not ratio.max() > NOTABLE:
         return ()
     first = max((float(np.abs(lag_one(residual(b, solution.x))).max()) for b in blocks), default=0.0)
     worst = int(np.argmax(ratio))
