@@ -54,6 +54,7 @@ class Stage:
     levels: int
     iterations: int
     patience: float
+    elements: int = 1
 
 
 PLAN = (
@@ -64,7 +65,7 @@ PLAN = (
     Stage(1, 1, 1, 100, 1e-5, 4, 30, 0.1),
 )
 SCOUTS = 3  # stages that every start goes through; the best third of the starts go on to the end
-REPAIR = Stage(1, 1, 1, 800, 1e-6, 1, 30, 0.1)
+REPAIR = Stage(1, 1, 1, 800, 1e-6, 1, 30, 0.1, elements=3)
 
 
 @dataclass(frozen=True)
@@ -139,9 +140,9 @@ def design(
     """The best drive of several starts, each from its own random multisine, in parallel processes.
 
     Every start goes through the first stages, the most promising third (two at least) to the end.
-    progress(done, total, best score so far) is called as these pieces of work finish. budget_s [s] ends the search
-    early with the best feasible drive so far, and so does Ctrl-C (KeyboardInterrupt where there is none yet). The same
-    seed gives the same design where neither cuts in.
+    progress(done, total, best score so far) is called as these pieces of work finish. budget_s [s], half of it for the
+    first stages, ends the search early with the best feasible drive so far, and so does Ctrl-C (KeyboardInterrupt
+    where there is none yet). The same seed gives the same design where neither cuts in.
 
     Raises InfeasibleError with the limit that can't be met and by how much, KeyError for an unknown objective.
     """
@@ -149,27 +150,29 @@ def design(
         raise KeyError(f"no objective {objective}, allowed: {', '.join(OBJECTIVES)}")
     if starts < 1:
         raise ValueError(f"starts must be at least 1, got {starts}")
-    deadline = None if budget_s is None else time.time() + budget_s
+    now = time.time()
+    half, deadline = (None, None) if budget_s is None else (now + budget_s / 2, now + budget_s)
     seeds = np.random.SeedSequence(seed).generate_state(starts)
     tracks: dict[int, Track] = {}
     with _interruptible() as stop, joblib.parallel_config("loky", inner_max_num_threads=1):
         # loky even for one start: only there can the number of threads of the linear algebra be set
         run = joblib.Parallel(n_jobs=max(2, os.cpu_count() or 1), return_as="generator_unordered")
         call = joblib.delayed(_carry)
-        work = (call(model, problem, objective, k, int(s), None, deadline, stop) for k, s in enumerate(seeds))
+        work = (call(model, problem, objective, k, int(s), None, half, stop) for k, s in enumerate(seeds))
         kept = min(starts, max(2, -(-starts // 3)))
         total = starts + kept
-        for track in run(work):
-            tracks[track.number] = track
-            _tell(progress, objective, len(tracks), total, tracks)
+        for done, track in enumerate(run(work), 1):
+            if track is not None:
+                tracks[track.number] = track
+            _tell(progress, objective, done, total, tracks)
         chosen = sorted(tracks.values(), key=lambda t: (_promise(t.latest), t.number))[:kept]
         rest = (call(model, problem, objective, t.number, 0, t, deadline, stop) for t in chosen)
         for done, track in enumerate(run(rest), starts + 1):
-            tracks[track.number] = track
+            tracks |= {track.number: track} if track is not None else {}
             _tell(progress, objective, done, total, tracks)
         interrupted = stop.exists()
     best = min(tracks.values(), key=lambda t: (*_rank(t.best), t.number))
-    complete = all(tracks[t.number].complete for t in chosen)
+    complete = len(tracks) == starts and all(tracks[t.number].complete for t in chosen)
     if not best.best.feasible:
         if interrupted:
             raise KeyboardInterrupt
@@ -194,14 +197,14 @@ def design(
         min(t.guess for t in tracks.values()),
         violations,
         max(violations.values(), default=0.0),
-        tuple(_score(objective, tracks[k].best) for k in range(starts)),
+        tuple(_score(objective, tracks[k].best) if k in tracks else float("inf") for k in range(starts)),
         complete,
     )
 
 
 def _tell(progress: Report | None, objective: str, done: int, total: int, tracks: Mapping[int, Track]) -> None:
     if progress is not None:
-        progress(done, total, min(_score(objective, t.best) for t in tracks.values()))
+        progress(done, total, min((_score(objective, t.best) for t in tracks.values()), default=float("inf")))
 
 
 def _score(objective: str, c: Candidate) -> float:
@@ -242,8 +245,11 @@ def _carry(
     track: Track | None,
     deadline: float | None,
     stop: Path,
-) -> Track:
-    """In a worker: a start through the first stages, or one that was chosen through the others."""
+) -> Track | None:
+    """In a worker: a start through the first stages, or one that was chosen through the others.
+
+    None for a start that comes too late; the first one never does.
+    """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, lambda *_: stop.touch() if stop.parent.exists() else None)
 
@@ -251,6 +257,8 @@ def _carry(
         return stop.exists() or (deadline is not None and time.time() > deadline)
 
     if track is None:
+        if number > 0 and over():
+            return None
         return search(model, problem, objective, depart(model, problem, objective, number, seed), PLAN[:SCOUTS], over)
     track = search(model, problem, objective, track, PLAN[SCOUTS:], over)
     return track if over() else replace(repair(model, problem, objective, track, over), complete=not over())
@@ -326,6 +334,7 @@ def _advance(
         problem,
         track.sizes,
         intervals,
+        elements=stage.elements,
         with_pose=track.pose is not None,
         rest=rest,
         weights=_objective.weights(model, objective),
@@ -361,7 +370,7 @@ def _advance(
         Z = settle(tr, start, U, Z)
     except UnsettledError:
         return None
-    if fresh:  # the nearest torques that keep every limit and come to rest
+    if fresh or track.latest.excess > 0.02:  # the nearest torques that keep every limit and come to rest
         near = replace(task, objective=None, pull=1.0, goal=U)
         point = interior.begin(tr, near, start, Z, U, 1e-3, 0.05)
         point, _ = interior.minimise(tr, near, point, (interior.Level(1.0, 1e-3, 1e-3, 40),), watch)

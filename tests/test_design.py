@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
 from excite import collocation, interior, objective
-from excite.design import TOLERANCE, Design, design, soften
+from excite.design import PLAN, TOLERANCE, Design, depart, design, repair, search, soften
 from excite.limit import InfeasibleError, check, limits, placed
 from excite.manoeuvre import BASELINES, Manoeuvre
 from excite.simulate import simulate
@@ -155,6 +156,17 @@ def test_a_short_lane_is_kept(straight: Model) -> None:
 def test_without_a_budget_left_nothing_is_made_up(straight: Model) -> None:
     with pytest.raises(InfeasibleError, match="give more time"):
         design(straight, straight.machine.problems["S40"], starts=1, budget_s=0.0)
+
+
+def test_what_the_fresh_simulation_exceeds_is_repaired(straight: Model) -> None:
+    """The first stage ends far from rest, with transitions ten times wider than the machine's."""
+    problem = shorter(straight, 12.0)
+    track = search(straight, problem, "cond", depart(straight, problem, "cond", 0, 1), PLAN[:1], lambda: False)
+    off = replace(track.latest, violations=track.latest.violations | {"rim speed front_roll": 0.01})
+    mended = repair(straight, problem, "cond", replace(track, latest=off, best=off), lambda: False)
+    assert mended.best.feasible
+    spin = mended.motion.nu[:, 1] * 0.65
+    assert np.abs(spin).max() <= 2.0 * (1 - 2 * 0.02)
 
 
 def test_ctrl_c_keeps_the_best_so_far() -> None:
