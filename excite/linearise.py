@@ -81,7 +81,9 @@ class Chart:
     State s (n,): first the `core`, the coordinates that forces depend on and the velocities, then measured angles that
     are integrals of these. `index` (n,): their places in simulate's state (q, nu, wheels), whose size is `full`.
     `sensors`: those with a reading h(s), in order; `angle`: the state that each encoder reads, -1 for another sensor.
-    `offsets` (n_u, n_base) takes the torque offsets u0 out of X. `pushed`: rows of the unactuated coordinates.
+    `offsets` (n_u, n_base) takes the torque offsets u0 out of X.
+    `pushed`: rows on which disturbing forces may act, the unactuated ones, or all where there are none; `inertia`:
+    theirs, nominal [kg, kg m2].
     """
 
     model: Model
@@ -92,6 +94,7 @@ class Chart:
     angle: tuple[int, ...]
     offsets: np.ndarray
     pushed: tuple[int, ...]
+    inertia: np.ndarray
     slopes: Batch
     readings: Batch
     step: Batch
@@ -127,7 +130,7 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     full = ca.vertcat(q, nu, wheels)
 
     M, bias = model.equations(q, nu, X)
-    pushed = tuple(k for k in range(n_q) if k not in model.actuated)
+    pushed = tuple(k for k in range(n_q) if k not in model.actuated) or tuple(range(n_q))
     load = ca.SX(n_q, 1)
     for k, row in enumerate(model.actuated):
         load[row] += u[k]
@@ -187,6 +190,7 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
         [state],
         [along(seen), along(ca.jacobian(seen, full[index])), along(speed), along(ca.jacobian(speed, full[index]))],
     )
+    mass = ca.Function("mass", [q, X], [ca.diag(M)])(np.zeros(n_q), model.nominal).full()[:, 0]
     table = np.array([model.base.standard.index(f"u{b.index}0") for b in machine.actuated])
     return Chart(
         model,
@@ -197,6 +201,7 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
         tuple(angle),
         model.expand[table],
         pushed,
+        mass[list(pushed)],
         Batch(slopes, (2,)),
         Batch(readings),
         Batch(step, (3, 4)),
@@ -204,9 +209,7 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     )
 
 
-def _step(
-    state: ca.SX, u: ca.SX, X: ca.SX, core: int, rates: ca.SX, J: ca.SX, B: ca.SX, R: ca.SX
-) -> ca.Function:
+def _step(state: ca.SX, u: ca.SX, X: ca.SX, core: int, rates: ca.SX, J: ca.SX, B: ca.SX, R: ca.SX) -> ca.Function:
     """(state, u, du/dt, h, X) -> state after h, its error [SI]: simulate's Rosenbrock method, on a chart's states.
 
     The angles that nothing depends on take part in the method as they are: below the core's block in the Jacobian.

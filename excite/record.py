@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from excite.identify import NotIdentifiable, samples
+from excite.estimate import NotIdentifiable
 from excite.linearise import Chart
 from excite.log import Log
+from excite.processing import samples, white_noise
 from model.machine import Filter, Sensor
 from model.prediction import Model
 
@@ -101,14 +102,6 @@ def origins(c: Chart, counts: np.ndarray) -> tuple[int, ...]:
 
 def torque_sensor(model: Model, body: int) -> Sensor:
     return next(s for s in model.machine.sensor if s.kind == "torque" and s.body == body)
-
-
-def white_noise(x: np.ndarray) -> float:
-    """Standard deviation of the white part of a signal, from its third differences.
-
-    Their median size, so that the corners of a signal that is linear in pieces do not count.
-    """
-    return float(np.median(np.abs(np.diff(x, 3)))) / (0.6744897501960817 * np.sqrt(20))
 
 
 def first_point(c: Chart, r: Record, log: Log, filter: Filter) -> Point:

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from excite import chain
-from excite.identify import Estimate, decimate
+from excite.estimate import Estimate
 from excite.linearise import Chart, advance, chart, differentiate
 from excite.log import Log
+from excite.processing import decimate
 from excite.record import (
     Noise,
     Point,
@@ -40,10 +41,14 @@ from model.prediction import Model
 
 PRIOR = 3.0  # standard deviation of a parameter before any data, in its scale
 PASSES = 15  # at most
-CONVERGED = 0.01  # a step this small against the standard deviation ends the iteration
+HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
+# A step this small against the standard deviations ends the iteration, with disturbing forces five times that.
+CONVERGED = 0.01
 LARGEST_STEP = 0.5  # of a parameter in one pass, relative to its size
-FORCE, MOMENT = 500.0, 1000.0  # disturbance per sample where the model is not trusted [N], [N m]
-DISTURBED = (1.0, 4.0, 16.0)  # times these, until the innovations are what they should be
+# Disturbing forces where the model is not trusted, white from sample to sample, as accelerations [m/s2, rad/s2]: on a
+# roller of 11 t they are 500 N. Four and sixteen times that until the innovations are what they should be.
+DISTURBANCE = 0.045
+DISTURBED = (1.0, 4.0, 16.0)
 SUSPECT = 2.5  # mean square of innovations, all or slow ones, that the model can't explain; null logs stay below 1.6
 BLOCK = 25  # readings whose mean counts as slow
 SHORTER = 8  # times that a step is halved
@@ -263,7 +268,7 @@ def _linearise(
         A[on] = by.A * scale / scale[:, None]
         C[on] = gain @ gain.transpose(0, 2, 1)
         if disturbed > 0:
-            push = by.F * (disturbed * _forces(c)) / scale[:, None]
+            push = by.F * (disturbed * DISTURBANCE * c.inertia) / scale[:, None]
             C[on] += push @ push.transpose(0, 2, 1)
         b[on, :, 0] = defect[k:end] / scale - (gain @ (p.w[k:end] / r.noise.torque)[:, :, None])[:, :, 0]
         b[on, :, 1 : 1 + n_p] = (by.X - by.B @ c.offsets) * (c.model.scale / scale[:, None])
@@ -311,10 +316,6 @@ def _scale(c: Chart) -> np.ndarray:
     return np.where(_speeds(c), 1e-2, 1e-3)
 
 
-def _forces(c: Chart) -> np.ndarray:
-    return np.array([MOMENT if c.model.coordinates[k].startswith("theta") else FORCE for k in c.pushed])
-
-
 def _iterate(
     c: Chart,
     records: Sequence[Record],
@@ -331,7 +332,7 @@ def _iterate(
     step, before = np.inf, np.inf
     shorter, here = 0, (list(points), X)
     there = here
-    for _ in range(PASSES):
+    for k in range(PASSES):
         linear = _all_linear(c, records, there[0], starts, there[1], disturbed)
         if linear is None:
             # Too far: the mass matrix is not positive or a motion can't be integrated.
@@ -345,6 +346,8 @@ def _iterate(
         covariance, move = _parameters(c, records, linear, points, X)
         sigma = np.sqrt(np.diag(covariance))[: len(X)]
         before, step = step, float(np.abs(move[0][: len(X)] / sigma).max())
+        if k >= HOPELESS[0] and step > HOPELESS[1]:
+            break
         limit = LARGEST_STEP * np.maximum(np.abs(X) / model.scale, 1.0)
         for m in move:
             m[: len(X)] = np.clip(m[: len(X)], -limit, limit)
@@ -352,11 +355,12 @@ def _iterate(
             [_moved(c, r, p, f, m) for r, p, f, m in zip(records, points, linear, move, strict=True)],
             X + move[0][: len(X)] * model.scale,
         )
-        if step < CONVERGED or (step < before < np.inf and step * step / before < CONVERGED / 10):
+        small = CONVERGED if disturbed == 0 else 5 * CONVERGED
+        if step < small or (step < before < np.inf and step * step / before < small / 10):
             base = covariance[: len(X), : len(X)] * np.outer(model.scale, model.scale)
             return Fit(there[1], base, tuple(there[0]), tuple(linear))
     raise NotConverged(
-        f"joint smoothing found no estimate in {PASSES} passes (last step {step:.3g} standard deviations): check the"
+        f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
         " log with `excite diagnose`, or start from better values in the machine file"
     )
 
