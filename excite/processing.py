@@ -12,7 +12,7 @@ from excite.log import Log
 from model.machine import Filter, Sensor
 from model.prediction import Model
 
-BLOCK = 20_000  # samples whose regressor is in memory at once
+BLOCK = 10_000  # samples whose regressor is in memory at once
 REACH = 200  # decimated rows after which the decimation filter has forgotten the edge of a block (1e-15)
 
 
