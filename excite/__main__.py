@@ -406,7 +406,7 @@ def _problem(machine: Machine, name: str | None, duration: float | None) -> tupl
 def _method(method: str | None, model: Model) -> str:
     from excite import identify
 
-    method = method or identify.RECOMMENDED
+    method = method or identify.recommended(model)
     _known("--method", method, tuple(identify.METHODS))
     return method
 

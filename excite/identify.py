@@ -17,7 +17,6 @@ from model.prediction import Model
 
 __all__ = [
     "METHODS",
-    "RECOMMENDED",
     "Estimate",
     "Method",
     "NotIdentifiable",
@@ -28,9 +27,12 @@ __all__ = [
     "least_squares",
     "needed_sensors",
     "noted",
+    "recommended",
     "samples",
     "torques",
 ]
+
+Method = Callable[[Model, Sequence[Log], Filter], Estimate]
 
 
 def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Filter | None = None) -> Estimate:
@@ -42,9 +44,20 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     return METHODS[method](model, logs, filter or model.machine.filter)
 
 
+def recommended(model: Model) -> str:
+    """The method that a machine calls for: joint smoothing where slips, which are measured with noise, make the
+    regressor; least squares where a joint's own motion makes it.
+    """
+    return "joint" if model.slips else "ols"
+
+
 def needed_sensors(model: Model, method: str) -> tuple[str, ...]:
     """Names of the sensors without which a method can't work on this machine."""
-    kinds = ("angle", "torque", "wheel") if method in SIMULATING else ("angle", "torque", "wheel", "lateral_speed")
+    kinds = (
+        ("angle", "torque", "wheel")
+        if method.partition("+")[0] in SIMULATING
+        else ("angle", "torque", "wheel", "lateral_speed")
+    )
     return tuple(s.name for s in model.machine.sensors("full") if s.kind in kinds)
 
 
@@ -64,7 +77,24 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     return smoothing.joint(model, logs, filter)
 
 
-Method = Callable[[Model, Sequence[Log], Filter], Estimate]
-METHODS: dict[str, Method] = {"ols": ols, "wls": wls, "iv": iv, "tls": tls, "oe": oe, "joint": joint}
+def possible(plain: Method) -> Method:
+    """A linear method held to physically possible machines; the convex program is in a room of its own."""
+
+    def method(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
+        from excite.consistent import constrained  # cvxpy takes a second to load
+
+        blocks = [filtered_regression(model, log, filter) for log in logs]
+        return constrained(model, plain(model, logs, filter), blocks)
+
+    return method
+
+
+LINEAR: dict[str, Method] = {"ols": ols, "wls": wls, "iv": iv, "tls": tls}
+METHODS: dict[str, Method] = {
+    **LINEAR,
+    "oe": oe,
+    "joint": joint,
+    **{f"{name}+consistent": possible(plain) for name, plain in LINEAR.items()},
+}
 RECOMMENDED = "ols"
 SIMULATING = ("iv", "oe", "joint")  # find a speed that nothing measures from the dynamics

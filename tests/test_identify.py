@@ -125,3 +125,7 @@ def test_condition_numbers_are_those_of_the_stacked_regressor(straight: Model, s
 def test_unknown_method_is_refused(straight: Model) -> None:
     with pytest.raises(ValueError, match="allowed: ols"):
         identify.identify(straight, [], "magic")
+
+
+def test_recommended_method_follows_the_machine(va12: Model, straight: Model, emps: Model) -> None:
+    assert [identify.recommended(m) for m in (va12, straight, emps)] == ["joint", "joint", "ols"]
