@@ -33,6 +33,7 @@ from model.machine import Machine, Problem
 from model.prediction import Model
 
 TOLERANCE = 1e-3  # of a limit's range: what the fresh simulation may exceed
+STUCK = 20.0  # half ranges in all that a program still exceeds: it is not going to keep its limits
 MARGIN = 2e-3  # of half a range: what the program keeps from every limit
 
 Report = Callable[[int, int, float], None]
@@ -59,9 +60,9 @@ class Stage:
 
 PLAN = (
     Stage(10, 3, 4, 8, 1e-3, 2, 40, 1.0),
-    Stage(4, 1.7, 2, 16, 1e-4, 2, 20, 1.0),
-    Stage(2, 1.2, 2, 40, 3e-5, 1, 20, 1.0),
-    Stage(1, 1, 2, 60, 1e-5, 1, 20, 1.0),
+    Stage(4, 1.7, 2, 16, 1e-4, 2, 30, 1.0),
+    Stage(2, 1.2, 2, 40, 3e-5, 1, 30, 1.0),
+    Stage(1, 1, 2, 60, 1e-5, 1, 30, 1.0),
     Stage(1, 1, 1, 100, 1e-5, 4, 30, 0.1),
 )
 SCOUTS = 3  # stages that every start goes through; the best third of the starts go on to the end
@@ -370,17 +371,21 @@ def _advance(
         Z = settle(tr, start, U, Z)
     except UnsettledError:
         return None
-    if fresh or track.latest.excess > 0.02:  # the nearest torques that keep every limit and come to rest
+    sharp = [stage.sharp * 2**i for i in range(stage.levels)]
+    levels = tuple(
+        interior.Level(p, stage.barrier / 3**i, stage.patience / p, stage.iterations) for i, p in enumerate(sharp)
+    )
+    kept = not fresh
+    if kept:
+        point = interior.begin(tr, task, start, Z, U, stage.barrier, 1e-3)
+        point, state = interior.minimise(tr, task, point, levels, watch)
+        kept = interior.infeasibility(state, point) < STUCK
+    if not kept:  # by way of the nearest torques that keep every limit and come to rest
         near = replace(task, objective=None, pull=1.0, goal=U)
         point = interior.begin(tr, near, start, Z, U, 1e-3, 0.05)
         point, _ = interior.minimise(tr, near, point, (interior.Level(1.0, 1e-3, 1e-3, 40),), watch)
-        Z, U = point.Z, point.U
-    point = interior.begin(tr, task, start, Z, U, stage.barrier, 0.05 if fresh else 1e-3)
-    sharp = [stage.sharp * 2**i for i in range(stage.levels)]
-    levels = [
-        interior.Level(p, stage.barrier / 3**i, stage.patience / p, stage.iterations) for i, p in enumerate(sharp)
-    ]
-    point, _ = interior.minimise(tr, task, point, tuple(levels), watch)
+        point = interior.begin(tr, task, point.start, point.Z, point.U, max(stage.barrier, 1e-4), 0.05)
+        point, _ = interior.minimise(tr, task, point, levels, watch)
     try:
         found, motion = _verdict(model, problem, objective, Manoeuvre(times, point.U * tr.torque_scale))
     except SimulationError:

@@ -17,7 +17,7 @@ import numpy as np
 from excite import objective as scores
 from excite.collocation import FAR, Transcription, UnsettledError, settle
 
-PRICE = 20.0  # of a soft limit, per half range and node
+PRICE = 4.0  # of a soft limit, per half range and node
 
 
 @dataclass(frozen=True)
