@@ -595,7 +595,6 @@ def main() -> None:
 
 def _exit_code(err: Exception) -> int | None:
     """What an error means for the person who must act; None for a defect of ours, which shows its traceback."""
-    from excite.design import Stopped
     from excite.folder import FolderError
     from excite.identify import NotIdentifiable
     from excite.limit import InfeasibleError
@@ -606,7 +605,7 @@ def _exit_code(err: Exception) -> int | None:
 
     if isinstance(err, UsageError | MachineError | LogError | FolderError):
         return 2
-    if isinstance(err, NotIdentifiable | NotConverged | InfeasibleError | SimulationError | Stopped):
+    if isinstance(err, NotIdentifiable | NotConverged | InfeasibleError | SimulationError):
         return 1
     return None
 
