@@ -276,7 +276,7 @@ def _design(
     wall = time.perf_counter() - begin
     log.profile(model, result.motion).to_csv(place / "profile.csv", index=False)
     (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
-    summary = {
+    summary: dict[str, Any] = {
         "machine": model.machine.name,
         "problem": name,
         "duration_s": float(chosen.duration_s),
@@ -294,6 +294,7 @@ def _design(
     }
     title = f"{model.machine.title}: {name}, cond(Phi) = {result.cond_phi:.2f}"
     report.save(report.design_figure(model, chosen, result.motion, title), place / "design.png")
+    report.save(report.sigma_figure(summary["sigma_percent"], title), place / "sigma.png")
     (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
     return summary
 

@@ -127,6 +127,24 @@ def _path(ax: Axes, model: Model, problem: Problem, motion: Motion) -> None:
     ax.grid(alpha=0.3)
 
 
+def sigma_figure(sigma: Mapping[str, float], title: str) -> Figure:
+    """What accuracy a drive makes attainable: the Cramer-Rao bound of every parameter, one standard deviation [%]."""
+    n = len(sigma)
+    figure = Figure(figsize=(7.5, 1.2 + 0.27 * n), layout="constrained")
+    ax = figure.subplots()
+    figure.suptitle(title, fontsize=11)
+    names = list(sigma)[::-1]
+    ax.barh(names, [sigma[s] for s in names], color=COLOURS[0], height=0.6)
+    for y, s in enumerate(names):
+        ax.annotate(f"{sigma[s]:.2g}", (sigma[s], y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8)
+    ax.set_xscale("log")
+    ax.margins(x=0.12)
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.set_xlabel("attainable standard deviation [% of the nominal value]")
+    ax.grid(axis="x", alpha=0.3)
+    return figure
+
+
 def limit_use(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
     """How much of each limit the motion uses at most: 1 is the limit itself."""
     du = np.gradient(motion.u, motion.t, axis=0)
