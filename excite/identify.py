@@ -96,5 +96,4 @@ METHODS: dict[str, Method] = {
     "joint": joint,
     **{f"{name}+consistent": possible(plain) for name, plain in LINEAR.items()},
 }
-RECOMMENDED = "ols"
 SIMULATING = ("iv", "oe", "joint")  # find a speed that nothing measures from the dynamics
