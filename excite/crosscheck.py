@@ -1,0 +1,143 @@
+"""Does it hold on other data? Predicted torques, simulated signals and closed loops against what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from excite.estimate import Estimate
+from excite.log import Log
+from excite.processing import lowpass, samples
+from excite.sensors import signals
+from excite.simulate import Motion, respond, simulate
+from model.machine import Filter
+from model.prediction import Model
+
+Control = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Measured beside predicted, (m, N) each, of m signals [units]; t (N,) [s].
+
+    percent (m,): 100 |measured - predicted| / |measured|; rms (m,) of the difference, in the signal's unit.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    t: np.ndarray
+    measured: np.ndarray
+    predicted: np.ndarray
+
+    @property
+    def residual(self) -> np.ndarray:
+        return self.measured - self.predicted
+
+    @property
+    def percent(self) -> np.ndarray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return 100 * np.linalg.norm(self.residual, axis=1) / np.linalg.norm(self.measured, axis=1)
+
+    @property
+    def rms(self) -> np.ndarray:
+        return np.sqrt(np.mean(self.residual**2, axis=1))
+
+
+def torques(model: Model, log: Log, estimate: Estimate, filter: Filter | None = None) -> Comparison:
+    """Torques of a log that the parameters predict from its motion, both low-passed alike; a parameter that is unknown
+    counts as zero. Slips measured with noise make this test noisy: `motions` is the sharper one."""
+    filter = filter or model.machine.filter
+    rate = float(model.machine.sampling_hz)
+    s = samples(model, log, filter)
+    p = model.expand @ np.nan_to_num(estimate.value)
+    rows = list(model.actuated)
+    predicted = model.predict(s.q, s.nu, s.a, p).full()[rows]
+    units = tuple(_torque_unit(model, k) for k in rows)
+    keep = slice(filter.drop[0], len(log) - filter.drop[1])
+    measured, predicted = lowpass(s.Y[rows], rate, filter), lowpass(predicted, rate, filter)
+    return Comparison(model.inputs, units, log.t[keep], measured[:, keep], predicted[:, keep])
+
+
+def _torque_unit(model: Model, row: int) -> str:
+    return "N m" if model.coordinates[row].startswith("theta") else "N"
+
+
+def motions(model: Model, log: Log, estimate: Estimate, filter: Filter | None = None) -> Comparison:
+    """Direct simulation: the log's torques less the offsets drive the machine, from the log's first state, open loop.
+
+    Every signal but the torques; angles count from their first reading. Errors of torques and parameters add up along
+    the log, as they do in the machine's use. Raises ValueError where a parameter is unknown, SimulationError where the
+    parameters are no machine.
+    """
+    filter = filter or model.machine.filter
+    unknown = [n for n, v in zip(estimate.names, estimate.value, strict=True) if not np.isfinite(v)]
+    if unknown:
+        raise ValueError(f"a simulation needs every parameter, unknown: {', '.join(unknown)}")
+    s = samples(model, log, filter)
+    X = estimate.value
+    torque = s.Y[list(model.actuated)].T - offsets(model, X)
+    motion = simulate(model, torque, X, s.q[:, 0], s.nu[:, 0])
+    exact = signals(model, motion, X)
+    chosen = [x for x in model.machine.sensors("full") if x.name in log.values and x.kind not in ("torque", "x", "y")]
+    turned = {x.name: x.kind in ("angle", "wheel") for x in chosen}
+
+    def counted(name: str, v: np.ndarray) -> np.ndarray:
+        return v - v[0] if turned[name] else v
+
+    return Comparison(
+        tuple(x.name for x in chosen),
+        tuple({"yaw_rate": "rad/s", "lateral_speed": "m/s"}.get(x.kind, _length(x.unit)) for x in chosen),
+        log.t,
+        np.array([counted(x.name, log.values[x.name]) for x in chosen]),
+        np.array([counted(x.name, exact[x.name]) for x in chosen]),
+    )
+
+
+def _length(unit: str) -> str:
+    return unit if unit in ("rad", "m") else "SI"
+
+
+def offsets(model: Model, X: np.ndarray) -> np.ndarray:
+    """Offsets (n_u,) of the torque channels."""
+    standard = dict(zip(model.base.standard, model.expand @ X, strict=True))
+    return np.array([standard[f"u{b.index}0"] for b in model.machine.actuated])
+
+
+def closed_loop(
+    model: Model, X: np.ndarray, samples: int, control: Control, q0: np.ndarray, nu0: np.ndarray | None = None
+) -> Motion:
+    """The machine X (n_base,) under its own controller: control(k, q, nu) commands the torques (n_u,) at sample k
+    from coordinates and velocities (n_q,) there. What is delivered is the command less the channel's offset.
+
+    Commands are joined by straight lines, and the state at k is the one before, carried on at its speed.
+    """
+    n_q, h = len(model.coordinates), 1 / float(model.machine.sampling_hz)
+    offset = offsets(model, X)
+
+    def torque(k: int, state: np.ndarray) -> np.ndarray:
+        q, nu = state[:n_q], state[n_q : 2 * n_q]
+        return control(k, q + h * nu if k else q, nu) - offset
+
+    return respond(model, samples, torque, X, q0, nu0)
+
+
+def cascade(reference: np.ndarray, kp: float, kv: float, gain: float, limit: float, rate: float) -> Control:
+    """A position loop around a speed loop on one coordinate: gain (kp kv (reference - q) - kv dq), the bracket held
+    within `limit`; dq is the backward difference of the mean of the last two positions, as in EMPS.
+
+    reference (N,) [m]; kp [1/s], kv [V s/m], gain [N/V], limit [V], rate [Hz]. A controller remembers: make a new one
+    for every run.
+    """
+    last: list[float] = []
+
+    def control(k: int, q: np.ndarray, nu: np.ndarray) -> np.ndarray:
+        now = float(q[0])
+        before = last[-1] if last else now
+        earlier = last[-2] if len(last) > 1 else before
+        last.append(now)
+        speed = (now - earlier) / 2 * rate
+        return np.array([gain * float(np.clip(kp * kv * (reference[k] - now) - kv * speed, -limit, limit))])
+
+    return control
