@@ -21,6 +21,7 @@ from model.prediction import Model
 
 ACCURACY = 1e-5  # of a speed over an interval [rad/s, m/s]: what a sample's torque noise does is far more
 CHUNKS = (500, 25)  # samples in one call of a mapped function
+FINE = 16  # steps for an interval in which friction turns
 SPLITS = 6  # an interval is halved at most this often
 
 
@@ -271,24 +272,73 @@ def _intervals(
 def differentiate(chart: Chart, s: np.ndarray, u: np.ndarray, X: np.ndarray, force: bool = False) -> Slopes:
     """How the ends of the K intervals between states s (K + 1, n) under torques u (K + 1, n_u) move, to about 1 %.
 
-    F is filled with `force` only.
+    F is filled with `force` only. Where a joint reverses, its friction turns within a sample and leaves a mark on
+    everything that came before: these intervals are taken in FINE steps along the straight line between their ends.
     """
     h = 1 / float(chart.model.machine.sampling_hz)
-    n, c, n_u, n_p = chart.n, chart.core, u.shape[1], len(X)
-    J, B, JX, JF, R = chart.slopes(s, u, X)
+    slopes = _radau(chart, chart.slopes(s, u, X), slice(0, -1), slice(1, None), h, force)
+    turning = np.flatnonzero(_reversals(chart, s))
+    if len(turning) == 0:
+        return slopes
+    share = np.linspace(0, 1, FINE + 1)[:, None]
+    path = s[turning, None] + share * (s[turning + 1] - s[turning])[:, None]
+    push = u[turning, None] + share * (u[turning + 1] - u[turning])[:, None]
+    nodes = np.arange(len(turning) * (FINE + 1)).reshape(len(turning), FINE + 1)
+    local = chart.slopes(path.reshape(-1, chart.n), push.reshape(-1, u.shape[1]), X)
+    fine = _radau(chart, local, nodes[:, :-1].ravel(), nodes[:, 1:].ravel(), h / FINE, force)
+    shape = (len(turning), FINE)
+    A, B, BX, F = (e.reshape(*shape, *e.shape[1:]) for e in (fine.A, fine.B, fine.X, fine.F))
+    for part, own in ((slopes.B, B), (slopes.X, BX), (slopes.F, F)):
+        total = own[:, 0]
+        for k in range(1, FINE):
+            total = A[:, k] @ total + own[:, k]
+        part[turning] = total
+    through = A[:, 0]
+    for k in range(1, FINE):
+        through = A[:, k] @ through
+    slopes.A[turning] = through
+    return slopes
+
+
+def _reversals(chart: Chart, s: np.ndarray) -> np.ndarray:
+    """Which of the intervals between states s (K + 1, n) friction turns in, (K,)."""
+    model = chart.model
+    found = np.zeros(len(s) - 1, bool)
+    first = chart.core - len(model.coordinates)
+    for body in model.machine.body:
+        if body.friction is None or body.coordinates[0] not in model.coordinates:
+            continue
+        w = s[:, first + model.coordinates.index(body.coordinates[0])] / float(body.friction.smoothing)
+        nearest = np.where(w[:-1] * w[1:] <= 0, 0.0, np.minimum(np.abs(w[:-1]), np.abs(w[1:])))
+        found |= (nearest < 4) & (np.abs(np.diff(w)) > 0.3)
+    return found
+
+
+def _radau(
+    chart: Chart,
+    local: list[np.ndarray],
+    left: slice | np.ndarray,
+    right: slice | np.ndarray,
+    h: float,
+    force: bool,
+) -> Slopes:
+    """One step of Radau IIA over each interval of length h, from slopes at its two ends, linear in between."""
+    J, B, JX, JF, R = local
+    n, c, n_u, n_p = chart.n, chart.core, B.shape[2], JX.shape[2]
     direct = np.concatenate([B, JX, JF] if force else [B, JX], axis=2)
-    K = len(s) - 1
 
     def between(e: np.ndarray) -> np.ndarray:
-        """One third into the interval, by linear interpolation."""
-        return e[:-1] * (2 / 3) + e[1:] * (1 / 3)
+        """One third into the interval."""
+        third: np.ndarray = e[left] * (2 / 3) + e[right] * (1 / 3)
+        return third
 
-    J1, J2 = between(J), J[1:]
+    J1, J2 = between(J), J[right]
+    K = len(J1)
     system = np.empty((K, 2 * c, 2 * c))
     system[:, :c, :c], system[:, :c, c:] = J1 * (-h * 5 / 12), J2 * (h / 12)
     system[:, c:, :c], system[:, c:, c:] = J1 * (-h * 3 / 4), J2 * (-h / 4)
     system[:, range(2 * c), range(2 * c)] += 1.0
-    first, second = between(direct), direct[1:]
+    first, second = between(direct), direct[right]
     known = np.zeros((K, 2 * c, c + direct.shape[2]))
     known[:, :c, c:] = first * (h * 5 / 12) - second * (h / 12)
     known[:, c:, c:] = first * (h * 3 / 4) + second * (h / 4)
@@ -296,7 +346,7 @@ def differentiate(chart: Chart, s: np.ndarray, u: np.ndarray, X: np.ndarray, for
     known[:, eye, eye] = 1.0
     known[:, c + eye, eye] = 1.0
     Y = np.linalg.inv(system) @ known
-    moved = np.concatenate([Y[:, c:], h * (0.75 * between(R) @ Y[:, :c] + 0.25 * R[1:] @ Y[:, c:])], axis=1)
+    moved = np.concatenate([Y[:, c:], h * (0.75 * between(R) @ Y[:, :c] + 0.25 * R[right] @ Y[:, c:])], axis=1)
     A = np.zeros((K, n, n))
     A[:, :, :c] = moved[:, :, :c]
     A[:, range(c, n), range(c, n)] = 1.0

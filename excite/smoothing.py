@@ -41,6 +41,10 @@ from model.prediction import Model
 
 PRIOR = 3.0  # standard deviation of a parameter before any data, in its scale
 PASSES = 15  # at most
+HELD = 1e-6  # standard deviation of such a parameter, in its scale
+SETTLED = 3  # passes until the states fit the dynamics well enough to tell which these are
+UNSEEN = 1.0  # a parameter that a log tells less than this well, in its scale, stays at the machine file's value
+DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's scale, and its share from pass to pass
 HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
 # A step this small against the standard deviations ends the iteration, with disturbing forces five times that.
 CONVERGED = 0.01
@@ -86,10 +90,12 @@ class Linear:
 
 @dataclass(frozen=True)
 class Fit:
-    """Base parameters X (n_base,), their covariance, and the trajectories of the logs."""
+    """Base parameters X (n_base,), their covariance, which were held because nothing shows them, and the trajectories
+    of the logs."""
 
     X: np.ndarray
     covariance: np.ndarray
+    unseen: np.ndarray
     points: tuple[Point, ...]
     linear: tuple[Linear, ...]
 
@@ -160,7 +166,7 @@ def _disturbed(
 def _estimate(c: Chart, records: Sequence[Record], fit: Fit, filter: Filter, notes: tuple[str, ...]) -> Estimate:
     """The answer as `identify` gives it: regressor along the smoothed states, residual of the torques."""
     model = c.model
-    weak = fit.std > PRIOR / 2 * model.scale
+    weak = fit.unseen | (fit.std > UNSEEN * model.scale)
     reasons = {
         name: "this log hardly moves with it: what is known of it is the machine file's value"
         for name, yes in zip(model.base.names, weak, strict=True)
@@ -332,6 +338,8 @@ def _iterate(
     step, before = np.inf, np.inf
     shorter, here = 0, (list(points), X)
     there = here
+    prior, damping = np.full(len(X), PRIOR**-2), DAMPING[0]
+    unseen = np.zeros(len(X), bool)
     for k in range(PASSES):
         linear = _all_linear(c, records, there[0], starts, there[1], disturbed)
         if linear is None:
@@ -343,9 +351,15 @@ def _iterate(
             continue
         here, shorter = there, 0
         points, X = here
-        covariance, move = _parameters(c, records, linear, points, X)
-        sigma = np.sqrt(np.diag(covariance))[: len(X)]
-        before, step = step, float(np.abs(move[0][: len(X)] / sigma).max())
+        covariance, move, left = _parameters(c, records, linear, points, X, prior, damping)
+        if k == SETTLED:
+            unseen = np.sqrt(np.diag(covariance))[: len(X)] > UNSEEN
+            if unseen.any():
+                # Left free they would go anywhere, and take the mass matrix and the slips with them.
+                prior[unseen] = HELD**-2
+                covariance, move, left = _parameters(c, records, linear, points, X, prior, damping)
+        damping *= DAMPING[1]
+        before, step = step, left
         if k >= HOPELESS[0] and step > HOPELESS[1]:
             break
         limit = LARGEST_STEP * np.maximum(np.abs(X) / model.scale, 1.0)
@@ -356,9 +370,9 @@ def _iterate(
             X + move[0][: len(X)] * model.scale,
         )
         small = CONVERGED if disturbed == 0 else 5 * CONVERGED
-        if step < small or (step < before < np.inf and step * step / before < small / 10):
+        if step < small or (step < 10 * small and step * step / before < small / 10):
             base = covariance[: len(X), : len(X)] * np.outer(model.scale, model.scale)
-            return Fit(there[1], base, tuple(there[0]), tuple(linear))
+            return Fit(there[1], base, unseen, tuple(there[0]), tuple(linear))
     raise NotConverged(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
         " log with `excite diagnose`, or start from better values in the machine file"
@@ -386,17 +400,25 @@ def _all_linear(
 
 
 def _parameters(
-    c: Chart, records: Sequence[Record], linear: Sequence[Linear], points: Sequence[Point], X: np.ndarray
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Covariance of all parameters and offsets (scaled), and the step of those of each log."""
+    c: Chart,
+    records: Sequence[Record],
+    linear: Sequence[Linear],
+    points: Sequence[Point],
+    X: np.ndarray,
+    prior: np.ndarray,
+    damping: float,
+) -> tuple[np.ndarray, list[np.ndarray], float]:
+    """Covariance of all parameters and offsets (scaled), the step of those of each log, and the largest of a parameter
+    in standard deviations as it would be undamped. Damping (Levenberg): what a log shows badly moves in small steps
+    while the rest is still wrong. prior (n_base,): information about nominal."""
     n = len(X)
     places, size = [], n
     for r in records:
         places.append(np.concatenate([np.arange(n), np.arange(size, size + len(r.origin))]))
         size += len(r.origin)
     information, slope = np.zeros((size, size)), np.zeros(size)
-    information[range(n), range(n)] = PRIOR**-2
-    slope[:n] = PRIOR**-2 * (X - c.model.nominal) / c.model.scale
+    information[range(n), range(n)] = prior
+    slope[:n] = prior * (X - c.model.nominal) / c.model.scale
     for found, r, p, place in zip(linear, records, points, places, strict=True):
         information[np.ix_(place, place)] += found.Z[1:, 1:]
         slope[place] += found.Z[1:, 0]
@@ -406,8 +428,11 @@ def _parameters(
     covariance = np.linalg.inv(information)
     if not (np.diag(covariance) > 0).all():
         raise NotConverged("joint smoothing lost its numbers: check the log with `excite diagnose`")
-    step = -covariance @ slope
-    return covariance, [step[place] for place in places]
+    sigma = np.sqrt(np.diag(covariance))[:n]
+    left = float(np.abs((covariance @ slope)[:n] / sigma).max())
+    information[range(n), range(n)] += damping
+    step = -np.linalg.solve(information, slope)
+    return covariance, [step[place] for place in places], left
 
 
 def _moved(c: Chart, r: Record, p: Point, linear: Linear, move: np.ndarray) -> Point:
