@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from excite.estimate import Estimate, NotIdentifiable, noted
+from excite.examine import examine
+from excite.hidden import explained
 from excite.instruments import iv
 from excite.log import Log
 from excite.outputerror import oe
@@ -36,12 +38,19 @@ Method = Callable[[Model, Sequence[Log], Filter], Estimate]
 
 
 def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Filter | None = None) -> Estimate:
-    """Base parameters from one log or several. Raises ValueError for an unknown method, NotIdentifiable."""
+    """Base parameters from one log or several; single spikes are repaired, with a note (see `examine`), and
+    a parameter that the logs don't show comes with the drive that would (see `hidden`).
+
+    Raises ValueError for an unknown method, NotIdentifiable, LogError for a log that can't be repaired.
+    """
     if method not in METHODS:
         raise ValueError(f"method: {method} is unknown, allowed: {', '.join(METHODS)}")
     if not logs:
         raise ValueError("identify: no log given")
-    return METHODS[method](model, logs, filter or model.machine.filter)
+    examined = [examine(model, log) for log in logs]
+    mended, filter = [e.log for e in examined], filter or model.machine.filter
+    estimate = explained(model, mended, METHODS[method](model, mended, filter), filter)
+    return noted(estimate, *(note for e in examined for note in e.notes))
 
 
 def recommended(model: Model) -> str:

@@ -1,0 +1,130 @@
+"""Parameters that a log doesn't show: why, and the drive that would."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from excite.estimate import Estimate, noted
+from excite.log import Log
+from excite.processing import Samples, samples
+from model.machine import Filter
+from model.prediction import Model
+
+SAMPLES = 400  # of the logs, that stand for them
+STILL = 0.01  # of a coordinate's speed at other times [rad/s, m/s]
+LIVELY = 0.5  # speeds and accelerations of a manoeuvre that is tried out [SI]
+ENOUGH = 0.3  # of what the best manoeuvre shows: the simplest with this much is advised
+POOR = 0.5  # standard deviation relative to the parameter's size that is no answer
+
+
+@dataclass(frozen=True)
+class Manoeuvre:
+    """What a driver could do besides: text, the coordinates that it moves, and how (move, accelerate, reverse)."""
+
+    text: str
+    coordinates: tuple[int, ...]
+    how: str
+
+
+def explained(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter) -> Estimate:
+    """The estimate with advice: reasons of unidentifiable parameters name the drive that would reveal them, and so does
+    a note for those whose deviation is no better than a guess."""
+    size = np.maximum(np.abs(np.nan_to_num(estimate.value)), model.scale)
+    poor = [n for n, s, x in zip(estimate.names, estimate.std, size, strict=True) if np.isfinite(s) and s > POOR * x]
+    if not estimate.unidentifiable and not poor:
+        return estimate
+    s = [samples(model, log, filter) for log in logs]
+    told = advice(model, s, [*estimate.unidentifiable, *poor])
+    reasons = {n: f"{reason}; {told[n]}" for n, reason in estimate.unidentifiable.items()}
+    notes = tuple(f"{n}: this log hardly shows it (deviation > {100 * POOR:g} %); {told[n]}" for n in poor)
+    return noted(replace(estimate, unidentifiable=reasons), *notes)
+
+
+def advice(model: Model, logs: Sequence[Samples], names: Sequence[str]) -> dict[str, str]:
+    """For each of these base parameters the simplest manoeuvre that would show it apart from all others."""
+    rng = np.random.default_rng(0)
+    q, nu, a = (np.concatenate([getattr(s, part) for s in logs], axis=1) for part in ("q", "nu", "a"))
+    chosen = rng.choice(q.shape[1], min(SAMPLES, q.shape[1]), replace=False)
+    q, nu, a = q[:, chosen], nu[:, chosen], a[:, chosen]
+    # Noise of a coordinate at rest would pass for motion.
+    still = np.abs(nu).max(axis=1) < STILL
+    nu, a = np.where(still[:, None], 0.0, nu), np.where(still[:, None], 0.0, a)
+    here = _rows(model, q, nu, a)
+    options = manoeuvres(model, still)
+    tried = [np.concatenate([here, _rows(model, *_changed(m, q, nu, a, rng))]) for m in options]
+    level = np.maximum(np.sqrt(np.mean([(t**2).mean(axis=0) for t in tried], axis=0)), 1e-300)
+    found: dict[str, str] = {}
+    for name in names:
+        k = model.base.names.index(name)
+        shown = np.array([_apart(t / level, k) for t in tried])
+        if not shown.max(initial=0.0) > 1e-6:
+            found[name] = "no drive that was tried shows it apart from the others"
+            continue
+        best = options[int(np.argmax(shown >= ENOUGH * shown.max()))]
+        rest = [c for k, c in enumerate(model.coordinates) if still[k] and k in best.coordinates]
+        why = f"{', '.join(rest)} never move{'s' if len(rest) == 1 else ''} in this log: " if rest else ""
+        found[name] = why + best.text
+    return found
+
+
+def manoeuvres(model: Model, still: np.ndarray) -> list[Manoeuvre]:
+    """What can be done with a machine, simple things first: driving, steering, moving each joint, all of it."""
+    machine, at = model.machine, model.coordinates.index
+    rolls = [at(b.coordinates[0]) for b in machine.contacts if b.coordinates[0] in model.coordinates]
+    joints = [b for b in machine.actuated if b.contact is None]
+    along = [at(c) for c in machine.body[0].coordinates[:1] if machine.planar and c in model.coordinates]
+    across = [at(c) for c in machine.body[0].coordinates[1:] if machine.planar and c in model.coordinates]
+    drive = tuple(along + rolls)
+    found: list[Manoeuvre] = []
+    if drive:
+        if still[list(drive)].all():
+            found.append(Manoeuvre("drive forward and backward with changing speed", drive, "move"))
+        else:
+            found.append(Manoeuvre("drive with changing speed", drive, "accelerate"))
+            found.append(Manoeuvre("drive both forward and backward", drive, "reverse"))
+    for body in joints:
+        where = body.where.replace("_", " ")
+        own = (at(body.coordinates[0]), *across)
+        if machine.planar:
+            found.append(Manoeuvre(f"steer (move the {where}) while driving", (*own, *drive), "move"))
+        elif still[own[0]]:
+            found.append(Manoeuvre(f"move the {where} both ways with changing speed", own, "move"))
+        else:
+            found.append(Manoeuvre(f"move the {where} with changing speed", own, "accelerate"))
+            found.append(Manoeuvre(f"move the {where} both ways", own, "reverse"))
+    if drive:
+        found.append(Manoeuvre("let one roll drive against the other", drive, "move"))
+    found.append(Manoeuvre("move everything at once", tuple(range(len(still))), "move"))
+    return found
+
+
+def _changed(
+    m: Manoeuvre, q: np.ndarray, nu: np.ndarray, a: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The samples with a manoeuvre added."""
+    q, nu, a = q.copy(), nu.copy(), a.copy()
+    for k in m.coordinates:
+        if m.how == "reverse":
+            nu[k] = -nu[k]
+            continue
+        a[k] = LIVELY * rng.standard_normal(a.shape[1])
+        if m.how == "move":
+            nu[k] = LIVELY * rng.standard_normal(a.shape[1])
+            q[k] = LIVELY * rng.standard_normal(a.shape[1])
+    return q, nu, a
+
+
+def _rows(model: Model, q: np.ndarray, nu: np.ndarray, a: np.ndarray) -> np.ndarray:
+    return model.stacked(q, nu, a).reshape(-1, len(model.base.names))
+
+
+def _apart(W: np.ndarray, k: int) -> float:
+    """Length of column k that no combination of the others makes, over the root of the rows."""
+    others = np.delete(W, k, axis=1)
+    size = np.linalg.norm(others, axis=0)
+    others = others[:, size > 0] / size[size > 0]
+    rest = W[:, k] - others @ np.linalg.lstsq(others, W[:, k], rcond=1e-12)[0] if others.size else W[:, k]
+    return float(np.linalg.norm(rest) / np.sqrt(len(W)))

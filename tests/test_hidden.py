@@ -1,0 +1,59 @@
+"""What a log doesn't show is named, with the drive that would."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from excite import identify, log, sensors
+from excite.simulate import Motion, simulate
+from model.prediction import Model
+
+
+def test_a_machine_at_rest_is_told_to_drive_and_steer(va12: Model) -> None:
+    motion = simulate(va12, np.zeros((1001, 3)))
+    table = sensors.measure(va12, motion, noise=False)
+    reasons = identify.identify(va12, [log.check(table, va12.machine)], "ols").unidentifiable
+    assert "drive" in reasons["Fv1"]
+    assert "never move" in reasons["M"]
+    assert "steer (move the articulation) while driving" in reasons["ZZ2"]
+    assert "theta2" in reasons["Fv2"]
+
+
+def test_a_straight_drive_hides_what_steering_shows(va12: Model, straight: Model, straight_motion: Motion) -> None:
+    """The straight line's own log, with an articulation that stays at zero."""
+    table = sensors.measure(straight, straight_motion, seed=1)
+    still = pd.DataFrame({c: np.zeros(len(table)) for c in ("theta2_rad", "u2_Nm", "vy_m_s", "yaw_rate_rad_s")})
+    estimate = identify.identify(va12, [log.check(table.join(still), va12.machine)], "ols")
+    for name in ("Fv2", "Fs2", "MX2", "ZZ2"):
+        told = estimate.unidentifiable.get(name, " ".join(n for n in estimate.notes if n.startswith(f"{name}:")))
+        assert "theta2 never moves" in told or "theta2" in told
+        assert "steer" in told
+    assert "M" not in estimate.unidentifiable
+
+
+def test_one_way_is_told_to_go_both(straight: Model) -> None:
+    """Driving forward only, dry friction and offset of a joint are one constant."""
+    t = np.arange(4001) / 100
+    push = 900 + 500 * np.sin(2 * np.pi * 0.2 * t)
+    motion = simulate(straight, np.column_stack([push, 0.8 * push]), nu0=np.array([0.65, 1.0, 1.0]))
+    table = sensors.measure(straight, motion, noise=False)
+    estimate = identify.identify(straight, [log.check(table, straight.machine)], "ols")
+    assert {"u10", "u40"} <= set(estimate.unidentifiable)
+    for name in ("u10", "u40"):
+        assert "both forward and backward" in estimate.unidentifiable[name]
+
+
+def test_what_is_shown_gets_no_advice(straight: Model, straight_motion: Motion) -> None:
+    one = log.check(sensors.measure(straight, straight_motion, seed=1), straight.machine)
+    estimate = identify.identify(straight, [one], "iv")
+    assert estimate.unidentifiable == {}
+    assert not any("hardly shows" in note for note in estimate.notes)
+
+
+def test_other_machines_are_told_in_their_own_words(emps: Model) -> None:
+    motion = simulate(emps, np.full((3001, 1), 200.0), nu0=np.array([0.1]))
+    table = sensors.measure(emps, motion, noise=False)
+    estimate = identify.identify(emps, [log.check(table, emps.machine)], "ols")
+    told = " ".join([*estimate.unidentifiable.values(), *estimate.notes])
+    assert "carriage" in told
