@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import numpy as np
 
+from excite import bootstrap
 from excite.estimate import Estimate, NotIdentifiable, noted
 from excite.examine import examine
 from excite.hidden import explained
@@ -32,6 +34,7 @@ __all__ = [
     "recommended",
     "samples",
     "torques",
+    "with_bias",
 ]
 
 Method = Callable[[Model, Sequence[Log], Filter], Estimate]
@@ -51,6 +54,22 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     mended, filter = [e.log for e in examined], filter or model.machine.filter
     estimate = explained(model, mended, METHODS[method](model, mended, filter), filter)
     return noted(estimate, *(note for e in examined for note in e.notes))
+
+
+def with_bias(
+    model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter | None = None, runs: int = bootstrap.RUNS
+) -> Estimate:
+    """The estimate with its method's bias on these logs, from simulated ones (see `bootstrap`).
+
+    Of the machine that instrumental variables find, where they find one: least squares can be so far off that its own
+    machine says nothing of its bias.
+    """
+    filter = filter or model.machine.filter
+    around: np.ndarray | None = None
+    if estimate.method.partition("+")[0] in ("ols", "wls"):
+        with suppress(NotIdentifiable):
+            around = iv(model, logs, filter).value
+    return bootstrap.with_bias(model, logs, estimate, METHODS[estimate.method], filter, around, runs)
 
 
 def recommended(model: Model) -> str:
