@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from excite.limit import REST_POSITION, Limit, Symbols, felt, limits, rest_tolerances, resting, symbols
+from excite.limit import REST_POSITION, Limit, Symbols, limits, rest_tolerances, resting, symbols
 from model.machine import Problem
 from model.prediction import Model
 
@@ -207,7 +207,7 @@ def transcribe(
     staged = [g for g in every if g.name in moved and g.name not in deferred]
     steered = [g for g in every if g.name not in moved and g.name not in deferred]
     pose = model.machine.body[0].coordinates if with_pose else ()
-    needed = {*pose, *felt(model), *(model.coordinates[k] for k in resting(model))}
+    needed = {*pose, *model.felt, *(model.coordinates[k] for k in resting(model))}
     used = [c for c in model.coordinates if c in needed]
     names = (*used, *[c + "'" for c in model.coordinates])
     z_size = np.array([state_size[c] for c in names])

@@ -15,6 +15,8 @@ import scipy.signal
 from excite.simulate import Motion, respond
 from model.prediction import Model
 
+DRIVER = 2  # stream of random numbers, apart from the sensors'
+
 
 @dataclass(frozen=True)
 class Driver:
@@ -52,7 +54,7 @@ def follow(
     n = len(speed)
     if angles.shape != (n, len(joints)):
         raise ValueError(f"angles: needs shape ({n}, {len(joints)}), got {angles.shape}")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng([seed, DRIVER])
     wanted_speed = _by_hand(speed, driver.speed_error_m_s, driver, rate, rng)
     wanted_angle = np.array(angles, float)
     for i in range(len(joints)):
@@ -94,7 +96,7 @@ def follow(
 
 
 def _by_hand(wanted: np.ndarray, error: float, driver: Driver, rate: float, rng: np.random.Generator) -> np.ndarray:
-    """What the lever is set to: late, smoothed by the hand, with a slow error (time constant 2 s) that fades at rest."""
+    """What the lever is set to: late, smoothed by the hand, with a slow error (2 s) that fades at rest."""
     late = round(driver.delay_s * rate)
     delayed = np.concatenate([np.full(late, wanted[0]), wanted[: len(wanted) - late]])
     b, a = scipy.signal.butter(2, driver.bandwidth_hz / (rate / 2))

@@ -170,23 +170,9 @@ def resting(model: Model) -> tuple[int, ...]:
     limited = {
         body.coordinates[0]
         for body in model.machine.body
-        if body.coordinates and (body.limit.position is not None or body.coordinates[0] in felt(model))
+        if body.coordinates and (body.limit.position is not None or body.coordinates[0] in model.felt)
     }
     return tuple(k for k, c in enumerate(model.coordinates) if c in limited)
-
-
-def felt(model: Model) -> tuple[str, ...]:
-    """Names of the coordinates that the equations of motion depend on (a balanced roll's angle is none of them)."""
-    q, nu, a = model.symbols()
-    p = ca.DM(model.expand @ model.nominal)
-    slope = ca.Function("slope", [q, nu, a], [ca.jacobian(model.predict(q, nu, a, p), q)])
-    rng = np.random.default_rng(0)
-    n, typical = len(model.coordinates), np.zeros(len(model.coordinates))
-    for _ in range(5):
-        at = slope(*(rng.uniform(-1, 1, n) for _ in range(3))).full()
-        typical = np.maximum(typical, np.abs(at).max(axis=0))
-    floor = 1e-9 * np.abs(model.nominal).max()
-    return tuple(c for c, size in zip(model.coordinates, typical, strict=True) if size > floor)
 
 
 def rest_tolerances(model: Model) -> np.ndarray:

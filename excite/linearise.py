@@ -138,7 +138,7 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     factors = ca.ldl(M)
     a = ca.ldl_solve(load - bias, *factors)
     rates = ca.vertcat(dq, a, wheel_rates)
-    core = _felt(model) + list(range(n_q, 2 * n_q))
+    core = [k for k, c in enumerate(model.coordinates) if c in model.felt] + list(range(n_q, 2 * n_q))
 
     sensors = tuple(s for s in machine.sensors("full") if s.name in names and s.kind not in ("torque", "x", "y"))
     index, angle, h = list(core), [], []
@@ -230,20 +230,6 @@ def _step(state: ca.SX, u: ca.SX, X: ca.SX, core: int, rates: ca.SX, J: ca.SX, B
         stages.append(ca.vertcat(inner, _GAMMA * h * (Ry @ inner + known[core:])))
     error = ca.norm_inf(stages[-1])
     return ca.Function("step", [y, left, slope, h, X], [at + stages[-1], error], {"cse": True})
-
-
-def _felt(model: Model) -> list[int]:
-    """Coordinates that the forces depend on. By numbers: a roll's own angle drops out only as cos^2 + sin^2 = 1."""
-    q, nu, a = model.symbols()
-    p = ca.DM(model.expand @ model.nominal)
-    slope = ca.Function("slope", [q, nu, a], [ca.jacobian(model.predict(q, nu, a, p), q)])
-    rng = np.random.default_rng(0)
-    size, change = np.zeros(len(model.coordinates)), np.zeros(len(model.coordinates))
-    for _ in range(4):
-        at = [rng.uniform(-1, 1, len(model.coordinates)) for _ in range(3)]
-        change = np.maximum(change, np.abs(slope(*at).full()).max(axis=0))
-        size = np.maximum(size, np.abs(model.predict(*at, p).full()).max())
-    return [k for k in range(len(size)) if change[k] > 1e-9 * size[k]]
 
 
 def advance(chart: Chart, s: np.ndarray, left: np.ndarray, right: np.ndarray, X: np.ndarray) -> np.ndarray:

@@ -33,7 +33,12 @@ def _lines(ax: Axes, t: np.ndarray, curves: Mapping[str, np.ndarray], label: str
     ax.grid(alpha=0.3)
     if legend:
         ax.legend(
-            loc="lower right", bbox_to_anchor=(1, 0.98), fontsize=8, ncols=max(1, len(curves)), frameon=False, borderpad=0
+            loc="lower right",
+            bbox_to_anchor=(1, 0.98),
+            fontsize=8,
+            ncols=max(1, len(curves)),
+            frameon=False,
+            borderpad=0,
         )
 
 
@@ -136,7 +141,9 @@ def sigma_figure(sigma: Mapping[str, float], title: str) -> Figure:
     names = list(sigma)[::-1]
     ax.barh(names, [sigma[s] for s in names], color=COLOURS[0], height=0.6)
     for y, s in enumerate(names):
-        ax.annotate(f"{sigma[s]:.2g}", (sigma[s], y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8)
+        ax.annotate(
+            f"{sigma[s]:.2g}", (sigma[s], y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8
+        )
     ax.set_xscale("log")
     ax.margins(x=0.12)
     ax.xaxis.set_major_formatter("{x:g}")

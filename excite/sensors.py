@@ -10,6 +10,7 @@ from model.machine import Sensor
 from model.prediction import Model
 
 KITS = ("paper", "full")
+SENSORS = 1  # stream of random numbers: one seed drives and measures, but not with the same numbers
 
 
 def measure(
@@ -24,7 +25,7 @@ def measure(
     if kit not in KITS:
         raise ValueError(f"kit: {kit} is unknown, allowed: {', '.join(KITS)}")
     exact = signals(model, motion, X)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng([seed, SENSORS])
     columns = {model.machine.time_column: motion.t}
     for sensor in model.machine.sensors(kit):
         columns[sensor.column] = (_flawed(sensor, exact[sensor.name], rng) if noise else exact[sensor.name]) / float(

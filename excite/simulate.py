@@ -76,7 +76,7 @@ def simulate(
     matrix is not positive definite, and ValueError for torques of the wrong shape.
     """
     torque = np.ascontiguousarray(torque, float)
-    n_u, n_q = len(model.inputs), len(model.coordinates)
+    n_u = len(model.inputs)
     if torque.ndim != 2 or torque.shape[1] != n_u or len(torque) < 2:
         raise ValueError(f"torque: needs shape (N >= 2, {n_u}) for {', '.join(model.inputs)}, got {torque.shape}")
     if not np.isfinite(torque).all():
@@ -181,8 +181,7 @@ def _step(model: Model) -> tuple[ca.Function, int]:
     state = ca.vertcat(q, nu, ca.SX.sym("w", n_w))
     a = model.accelerate(q, nu, u, X)
     rhs = ca.vertcat(dq, a, wheels)
-    felt = ca.which_depends(a, q, 1, False)
-    core = [k for k, yes in enumerate(felt) if yes] + list(range(n_q, 2 * n_q))
+    core = [k for k, c in enumerate(model.coordinates) if c in model.felt] + list(range(n_q, 2 * n_q))
     rest = [k for k in range(state.numel()) if k not in core]
     rate = ca.Function("rate", [state, u, X], [rhs[core]], {"cse": True})
     jacobian = ca.Function(

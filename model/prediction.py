@@ -128,6 +128,22 @@ class Model:
         return ca.Function("acceleration", [q, nu, u, X], [self.accelerate(q, nu, u, X)], ["q", "nu", "u", "X"], ["a"])
 
     @cached_property
+    def felt(self) -> tuple[str, ...]:
+        """Coordinates that the equations depend on, found by numbers: a balanced roll's angle drops out only as
+        cos^2 + sin^2 = 1, which no look at the expressions tells.
+        """
+        q, nu, a = self.symbols()
+        p = ca.DM(self.expand @ self.nominal)
+        slope = ca.Function("slope", [q, nu, a], [ca.jacobian(self.predict(q, nu, a, p), q)])
+        rng = np.random.default_rng(0)
+        change = np.zeros(len(self.coordinates))
+        for _ in range(5):
+            at = slope(*rng.uniform(-1, 1, (3, len(self.coordinates)))).full()
+            change = np.maximum(change, np.abs(at).max(axis=0))
+        floor = 1e-9 * float(np.abs(self.nominal).max())
+        return tuple(c for c, size in zip(self.coordinates, change, strict=True) if size > floor)
+
+    @cached_property
     def pivots(self) -> ca.Function:
         """(q, X) -> (n_q,) pivots of the mass matrix: all > 0 exactly where it is positive definite."""
         q, nu, _ = self.symbols()
@@ -219,7 +235,9 @@ def build(machine: Machine) -> Model:
     )
     for s, x in zip(base.names, scale, strict=True):
         if x == 0:
-            raise MachineError(f"{machine.name}: scale.{s}: the nominal value is 0, give a scale > 0 in the machine file")
+            raise MachineError(
+                f"{machine.name}: scale.{s}: the nominal value is 0, give a scale > 0 in the machine file"
+            )
     return Model(
         machine,
         names,
@@ -348,7 +366,9 @@ def base_parameters(machine: Machine, W: ca.Function, p: np.ndarray, units: dict
         coefficients = np.where(np.abs(coefficients) < 1e-9, 0.0, np.round(coefficients, 12))
         matrix[independent, j] = coefficients
     if not independent:
-        raise MachineError(f"{machine.name}: no parameter can be seen in any motion, check the table and what is locked")
+        raise MachineError(
+            f"{machine.name}: no parameter can be seen in any motion, check the table and what is locked"
+        )
     chosen = matrix[independent]
     names = tuple(
         machine.parameter_names.get(standard[j], standard[j] + ("R" if np.count_nonzero(row) > 1 else ""))
@@ -356,7 +376,9 @@ def base_parameters(machine: Machine, W: ca.Function, p: np.ndarray, units: dict
     )
     twice = sorted({s for s in names if names.count(s) > 1})
     if twice:
-        raise MachineError(f"{machine.name}: parameter_names: two base parameters get the same name: {', '.join(twice)}")
+        raise MachineError(
+            f"{machine.name}: parameter_names: two base parameters get the same name: {', '.join(twice)}"
+        )
     return BaseParameters(
         names, tuple(units[standard[j]] for j in independent), tuple(independent), chosen, tuple(invisible), standard
     )

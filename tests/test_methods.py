@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from excite import identify, log, processing, regression, sensors
+from excite import identify, log, noise, processing, regression, sensors
 from excite.estimate import Estimate
 from excite.leastsquares import autoregression, merge, reduce, solve
 from excite.log import Log
@@ -36,7 +36,7 @@ def covered(model: Model, estimates: Sequence[Estimate]) -> float:
 
 @pytest.fixture(scope="module")
 def runs(straight: Model, straight_motion: Motion) -> dict[str, list[Estimate]]:
-    """Eight logs of a straight drive, by every linear method."""
+    """Eight logs of the straight drive, by every linear method."""
     logs = [measured(straight, straight_motion, 100 + k) for k in range(8)]
     return {m: [identify.identify(straight, [one], m) for one in logs] for m in LINEAR}
 
@@ -64,6 +64,20 @@ def test_least_squares_is_biased_and_weighting_helps(straight: Model, runs: dict
         assert np.median(bias[m]) < 0.15 * np.median(bias["ols"])
     inertia = straight.base.names.index("ZZ1")
     assert bias["ols"][inertia] > 15
+
+
+def test_a_disturbed_row_counts_less(straight: Model, straight_motion: Motion) -> None:
+    """A torque that is 400 N m off now and then: its row's weight follows its residual, and reproduces itself."""
+    one = measured(straight, straight_motion, 100)
+    off = one.values["u4"] + 400 * np.sin(2 * np.pi * 0.8 * one.t)
+    disturbed = Log(one.source, one.t, one.values | {"u4": off})
+    found = identify.identify(straight, [disturbed], "wls")
+    blocks = [processing.filtered_regression(straight, disturbed, straight.machine.filter)]
+    least = noise.row_levels([noise.row_errors(straight, disturbed, straight.machine.filter, 1)], straight.nominal)
+    level = np.sqrt((found.residual**2).mean(axis=1))
+    assert level[2] > 2 * least[2]
+    again = regression.solved(regression.scaled(blocks, np.maximum(level, least)))
+    assert (np.abs(again.x - found.value) < 0.02 * found.std).all()
 
 
 def test_paper_deviations_come_with_a_warning(runs: dict[str, list[Estimate]]) -> None:
@@ -170,8 +184,8 @@ def test_deviations_hold_for_coloured_noise(straight: Model, straight_motion: Mo
     found = []
     for _ in range(60):
         white = rng.standard_normal((3, W.shape[1] + 200))
-        noise = scipy.signal.lfilter([1, -zero], [1, -pole], white, axis=1)[:, 200:]
-        blocks = [(W, Y + 20 * noise)]
+        coloured = scipy.signal.lfilter([1, -zero], [1, -pole], white, axis=1)[:, 200:]
+        blocks = [(W, Y + 20 * coloured)]
         solution = regression.solved(blocks)
         covariance = regression.sandwich(blocks, solution)
         degrees = regression.effective(solution, covariance)

@@ -69,7 +69,7 @@ def random_tree(seed: int, joints: str, parents: tuple[int, ...]) -> Machine:
             "gravity": rng.normal(0.0, 6.0, 3).tolist(),
             "body": bodies,
             "sensor": [],
-            "filter": {"cutoff_hz": quantity(5)},
+            "filter": {"source": "assumed", "cutoff_hz": quantity(5)},
         }
     )
 
