@@ -17,8 +17,10 @@ import typer  # noqa: E402
 
 if TYPE_CHECKING:
     from excite.design import Design
+    from excite.identify import Estimate
+    from excite.log import Log
     from excite.verify import Verification
-    from model.machine import Machine, Problem
+    from model.machine import Filter, Machine, Problem
     from model.prediction import Model
 
 app = typer.Typer(
@@ -122,6 +124,26 @@ def verify(
 
 
 @app.command()
+def compare(
+    machine: MachineArgument,
+    problem: ProblemOption = None,
+    samples: Annotated[int, typer.Option("--samples", "--runs", min=1, help="of every random kind of drive")] = 20,
+    seed: SeedOption = 0,
+    budget: BudgetOption = None,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Compares a designed drive with the usual ones on the same problem, limits and time."""
+    from excite import folder
+
+    out = out or Path(f"results/compare-{_stem(machine)}")
+    folder.claim(out)
+    with folder.writing(out) as place:
+        summary = _compare(place, machine, problem, samples, seed, budget)
+    _finish(summary, out, json, _compare_table)
+
+
+@app.command()
 def run(
     machine: MachineArgument,
     problem: ProblemOption = None,
@@ -205,45 +227,53 @@ def identify(
     machine: MachineArgument,
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="one log or several (.csv, .parquet, .mat)")],
     method: MethodOption = None,
+    filtering: Annotated[
+        str, typer.Option("--filter", help="machine: the machine file's, or auto: by evidence")
+    ] = "machine",
+    validate: Annotated[
+        list[Path] | None, typer.Option("--validate", help="another log: how well the result predicts it (repeatable)")
+    ] = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
     """Estimates the parameters, with uncertainty, from logs."""
-    from excite import folder, identify, log
+    from excite import crosscheck, examine, folder, identify, log, report
 
     model = _model(machine)
     out = out or Path(f"results/identify-{model.machine.name}")
     folder.claim(out)
     method = _method(method, model)
+    _known("--filter", filtering, ("machine", "auto"))
     needs = identify.needed_sensors(model, method)
     read = [log.read(path, model.machine, needs) for path in logs]
+    fresh = [log.read(path, model.machine, needs) for path in validate or []]
     with _busy("identifying"):
-        estimate = identify.identify(model, read, method)
+        chosen, reason = examine.choose(model, read) if filtering == "auto" else (model.machine.filter, "")
+        estimate = identify.identify(model, read, method, chosen)
+        if model.slips and method.partition("+")[0] in ("ols", "wls"):  # slips measured with noise bias these
+            estimate = identify.with_bias(model, read, estimate, chosen)
+        late = [remark for one in read for remark in examine.late_channels(model, one, chosen)]
+    checks = [_check(model, one, estimate, chosen) for one in fresh]
     with folder.writing(out) as place:
-        from excite import report
-
         summary = {
             "machine": model.machine.name,
             "logs": [str(p) for p in logs],
             "method": estimate.method,
-            "parameters": {
-                n: {"unit": u, "value": v, "std": s, "std_percent": r}
-                for n, u, v, s, r in zip(
-                    estimate.names, estimate.units, estimate.value, estimate.std, estimate.std_percent, strict=True
-                )
-            },
+            "parameters": _parameters(estimate),
             "cond_w": estimate.cond_w,
             "cond_phi": estimate.cond_phi,
             "relative_error_percent": estimate.relative_error_percent,
             "unidentifiable": list(estimate.unidentifiable),
             "reasons": dict(estimate.unidentifiable),
-            "notes": list(estimate.notes),
+            "notes": [*([reason] if reason else []), *estimate.notes, *late],
+            "validation": checks,
             "versions": _versions(),
         }
-        for k, one in enumerate(read):
-            measured, predicted = identify.torques(model, one, estimate)
-            figure = report.identify_figure(model, one, measured, predicted, f"{model.machine.title}: {one.source}")
-            report.save(figure, place / (f"fit-{k + 1}.png" if len(read) > 1 else "fit.png"))
+        for kind, several in (("fit", read), ("validation", fresh)):
+            for k, one in enumerate(several):
+                title = f"{model.machine.title}: {one.source}"
+                figure = report.comparison_figure(model, crosscheck.torques(model, one, estimate, chosen), title)
+                report.save(figure, place / (f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png"))
         (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
     _finish(summary, out, json, _identify_table)
 
@@ -347,6 +377,98 @@ def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: s
     report.save(report.verify_figure(result, title), place / "verify.png")
     (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
     return summary
+
+
+def _compare(
+    place: Path, machine: str, problem: str | None, samples: int, seed: int, budget: float | None
+) -> dict[str, Any]:
+    import pandas as pd
+
+    from excite import compare, folder, report
+
+    model = _model(machine)
+    name, chosen = _problem(model.machine, problem, None)
+    if budget is not None and not budget > 0:
+        raise UsageError(f"--budget: must be > 0 s (got {budget:g})")
+    with _bar("comparing") as advance:
+        result = compare.compare(model, chosen, samples, seed, budget, advance)
+    columns = ["t_s", *[f"{u}_{'Nm' if b.joint == 'revolute' else 'N'}" for u, b in _inputs(model)]]
+    (place / "drives").mkdir()
+    designs = []
+    for row in result.rows:
+        knots = f"drives/{row.name.replace(',', '').replace(' ', '-')}.csv"
+        table = pd.DataFrame([[t, *u] for t, u in zip(row.manoeuvre.times, row.manoeuvre.torque, strict=True)])
+        table.to_csv(place / knots, index=False, header=columns, float_format="%.12g")
+        designs.append(
+            {
+                "name": row.name,
+                "cond_phi": row.cond_phi,
+                "cond_w": row.cond_w,
+                "worst_std_percent": row.worst_std_percent,
+                "median_std_percent": row.median_std_percent,
+                "max_violation": row.max_violation,
+                "breaks": row.breaks,
+                "kept": row.kept,
+                "samples": row.samples,
+                "wall_s": row.wall_s,
+                "knots": knots,
+                "start": dict(zip(model.coordinates, row.start, strict=True)),
+            }
+        )
+    summary = {
+        "machine": model.machine.name,
+        "problem": name,
+        "objective": "cond",
+        "samples": samples,
+        "seed": seed,
+        "budget_s": budget,
+        "designs": designs,
+        "ratio_equal_time": result.ratio_equal_time,
+        "versions": _versions(),
+    }
+    title = f"{model.machine.title}: {name}, the designed drive and the usual ones"
+    report.save(report.compare_figure(result.rows, title), place / "compare.png")
+    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    return summary
+
+
+def _inputs(model: Model) -> list[tuple[str, Any]]:
+    return list(zip(model.inputs, model.machine.actuated, strict=True))
+
+
+def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:
+    rows: dict[str, dict[str, Any]] = {}
+    for k, (name, unit) in enumerate(zip(estimate.names, estimate.units, strict=True)):
+        rows[name] = {
+            "unit": unit,
+            "value": estimate.value[k],
+            "std": estimate.std[k],
+            "std_percent": estimate.std_percent[k],
+        }
+        if estimate.bias is not None and estimate.bias_std is not None:
+            rows[name] |= {"bias": estimate.bias[k], "bias_std": estimate.bias_std[k]}
+    return rows
+
+
+def _check(model: Model, one: Log, estimate: Estimate, chosen: Filter) -> dict[str, Any]:
+    """How well an estimate predicts a log that it was not fitted on: torques, and signals by direct simulation."""
+    from excite import crosscheck
+    from excite.simulate import SimulationError
+
+    torques = crosscheck.torques(model, one, estimate, chosen)
+    shown: dict[str, Any] = {
+        "log": one.source,
+        "torque_error_percent": dict(zip(torques.names, torques.percent, strict=True)),
+    }
+    try:
+        signals = crosscheck.motions(model, one, estimate, chosen)
+    except (ValueError, SimulationError) as err:
+        return shown | {"simulation": f"not possible: {err}"}
+    return shown | {
+        "simulation_rms": {
+            n: {"rms": r, "unit": u} for n, r, u in zip(signals.names, signals.rms, signals.units, strict=True)
+        }
+    }
 
 
 def _profile(read: tuple[Any, Any, Any]) -> tuple[Any, None, Any, Any]:
@@ -531,6 +653,25 @@ def _verify_table(summary: dict[str, Any]) -> None:
         _print(f"{summary['failed']} runs gave no estimate")
 
 
+def _compare_table(summary: dict[str, Any]) -> None:
+    table = _table("drive", "cond(Phi)", "cond(W)", "worst std %", "median std %", "kept", "limit broken", "time s")
+    for row in summary["designs"]:
+        table.add_row(
+            row["name"],
+            *(_figure(row[k], 4) for k in ("cond_phi", "cond_w", "worst_std_percent", "median_std_percent")),
+            f"{row['kept']}/{row['samples']}",
+            "-" if row["breaks"] is None else f"{row['breaks']} by {100 * row['max_violation']:.2g} %",
+            f"{row['wall_s']:.1f}",
+        )
+    _print(f"{summary['machine']} {summary['problem']}: the designed drive and the usual ones")
+    _print(table)
+    ratio = summary["ratio_equal_time"]
+    if ratio < float("inf"):
+        _print(f"the best usual drive found in the same time has {ratio:.2g} times the designed one's cond(Phi)")
+    else:
+        _print("no usual drive found in the same time keeps every limit")
+
+
 def _identify_table(summary: dict[str, Any]) -> None:
     table = _table("parameter", "unit", "value", "std", "std %")
     for name, row in summary["parameters"].items():
@@ -546,6 +687,9 @@ def _identify_table(summary: dict[str, Any]) -> None:
         _print(f"{name} can't be identified: {reason}")
     for note in summary["notes"]:
         _print(note)
+    for check in summary["validation"]:
+        errors = ", ".join(f"{n} {v:.1f} %" for n, v in check["torque_error_percent"].items())
+        _print(f"{check['log']}, not fitted on: torque error {errors}")
 
 
 Advance = Callable[[int, int, float | None], None]
@@ -596,17 +740,16 @@ def main() -> None:
 
 def _exit_code(err: Exception) -> int | None:
     """What an error means for the person who must act; None for a defect of ours, which shows its traceback."""
+    from excite.estimate import NoEstimate
     from excite.folder import FolderError
-    from excite.identify import NotIdentifiable
     from excite.limit import InfeasibleError
     from excite.log import LogError
     from excite.simulate import SimulationError
-    from excite.smoothing import NotConverged
     from model.machine import MachineError
 
     if isinstance(err, UsageError | MachineError | LogError | FolderError):
         return 2
-    if isinstance(err, NotIdentifiable | NotConverged | InfeasibleError | SimulationError):
+    if isinstance(err, NoEstimate | InfeasibleError | SimulationError):
         return 1
     return None
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 import cvxpy as cp
 import numpy as np
 
-from excite.estimate import Estimate, noted
+from excite.estimate import Estimate, NoEstimate, noted
 from excite.regression import Block, residual, size
 from model.prediction import Model, standard_parameters
 from model.tree import INERTIAL
@@ -24,7 +24,7 @@ MARGIN = 1e-6  # of a parameter's scale, kept from the edge: a mass matrix must 
 ACTIVE = 1e-3  # of a standard deviation: a shift larger than this is worth a remark
 
 
-class NotConsistent(RuntimeError):
+class NotConsistent(NoEstimate):
     """No possible machine was found; the message says why."""
 
 

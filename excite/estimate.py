@@ -9,7 +9,11 @@ import numpy as np
 import scipy.stats
 
 
-class NotIdentifiable(RuntimeError):
+class NoEstimate(RuntimeError):
+    """A method found no estimate, or none that it stands by; the message says why and what to do."""
+
+
+class NotIdentifiable(NoEstimate):
     """The log says nothing of any parameter, or less rows than parameters are left."""
 
 

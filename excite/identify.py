@@ -8,13 +8,13 @@ from contextlib import suppress
 import numpy as np
 
 from excite import bootstrap
-from excite.estimate import Estimate, NotIdentifiable, noted
+from excite.estimate import Estimate, NoEstimate, NotIdentifiable, noted
 from excite.examine import examine
 from excite.hidden import explained
 from excite.instruments import iv
 from excite.log import Log
 from excite.outputerror import oe
-from excite.processing import Samples, decimate, filtered_regression, lowpass, samples
+from excite.processing import Samples, decimate, filtered_regression, samples
 from excite.regression import least_squares, ols, tls, wls
 from model.machine import Filter
 from model.prediction import Model
@@ -23,6 +23,7 @@ __all__ = [
     "METHODS",
     "Estimate",
     "Method",
+    "NoEstimate",
     "NotIdentifiable",
     "Samples",
     "decimate",
@@ -33,7 +34,6 @@ __all__ = [
     "noted",
     "recommended",
     "samples",
-    "torques",
     "with_bias",
 ]
 
@@ -87,15 +87,6 @@ def needed_sensors(model: Model, method: str) -> tuple[str, ...]:
         else ("angle", "torque", "wheel", "lateral_speed")
     )
     return tuple(s.name for s in model.machine.sensors("full") if s.kind in kinds)
-
-
-def torques(model: Model, log: Log, estimate: Estimate, filter: Filter | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Measured and predicted torque (n_u, N) of a log, both low-passed alike; unknown parameters count as zero."""
-    filter = filter or model.machine.filter
-    s = samples(model, log, filter)
-    predicted = np.einsum("nrp,p->rn", model.stacked(s.q, s.nu, s.a), np.nan_to_num(estimate.value))
-    rows, rate = list(model.actuated), float(model.machine.sampling_hz)
-    return lowpass(s.Y[rows], rate, filter), lowpass(predicted[rows], rate, filter)
 
 
 def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:

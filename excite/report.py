@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from excite import limit
-from excite.log import Log
+from excite.compare import OURS, Row
+from excite.crosscheck import Comparison
 from excite.simulate import Motion
 from excite.verify import Verification
 from model.machine import Problem
@@ -193,15 +194,45 @@ def verify_figure(v: Verification, title: str) -> Figure:
     return figure
 
 
-def identify_figure(model: Model, log: Log, measured: np.ndarray, prediction: np.ndarray, title: str) -> Figure:
-    """Measured and predicted torque of every driven joint, with the residual; (n_u, N) each."""
-    n = len(model.inputs)
-    figure = Figure(figsize=(10, 1.0 + 2.6 * n), layout="constrained")
-    figure.suptitle(title)
-    axes = figure.subplots(n, 1, sharex=True, squeeze=False)[:, 0]
-    for k, body in enumerate(model.machine.actuated):
-        unit = "N m" if body.joint == "revolute" else "N"
-        curves = {"measured": measured[k], "predicted": prediction[k], "residual": measured[k] - prediction[k]}
-        _lines(axes[k], log.t, curves, f"{model.inputs[k]} {body.where.replace('_', ' ')} [{unit}]")
+def comparison_figure(model: Model, c: Comparison, title: str) -> Figure:
+    """Measured beside predicted, signal by signal, with the residual below each."""
+    n = len(c.names)
+    figure = Figure(figsize=(10, 0.8 + 3.0 * n), layout="constrained")
+    figure.suptitle(title, fontsize=11)
+    axes = figure.subplots(2 * n, 1, sharex=True, squeeze=False, height_ratios=(2, 1) * n)[:, 0]
+    places = {name: b.where.replace("_", " ") for name, b in zip(model.inputs, model.machine.actuated, strict=True)}
+    for k, (name, unit) in enumerate(zip(c.names, c.units, strict=True)):
+        label = f"{name} {places.get(name, '')}".strip()
+        _lines(axes[2 * k], c.t, {"measured": c.measured[k], "predicted": c.predicted[k]}, f"{label} [{unit}]")
+        _lines(axes[2 * k + 1], c.t, {"residual": c.residual[k]}, f"residual [{unit}]", legend=False)
     axes[-1].set_xlabel("time [s]")
+    return figure
+
+
+def compare_figure(rows: Sequence[Row], title: str) -> Figure:
+    """Drives side by side, the lowest cond(Phi) on top: cond(Phi), and the attainable accuracy of the worst parameter.
+
+    Hatched: a drive that breaks a limit, which its label names.
+    """
+    rows = sorted(rows, key=lambda r: r.cond_phi, reverse=True)
+    figure = Figure(figsize=(10.5, 1.5 + 0.36 * len(rows)), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    figure.suptitle(title, fontsize=11)
+    values = ([r.cond_phi for r in rows], [r.worst_std_percent for r in rows])
+    places = np.arange(len(rows))
+    for ax, x, label in zip(
+        axes, values, ("cond(Phi)", "worst parameter: attainable standard deviation [%]"), strict=True
+    ):
+        for y, (r, value) in enumerate(zip(rows, x, strict=True)):
+            ours, hatch = r.name == OURS, "" if r.breaks is None else "///"
+            ax.barh(y, value, height=0.65, color=COLOURS[1 if ours else 0], edgecolor="black", hatch=hatch)
+            ax.annotate(f"{value:.3g}", (value, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8)
+        ax.set_xscale("log")
+        ax.set_xlim(min(x) / 2, max(x) * 2)
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.set_xlabel(label)
+        ax.grid(axis="x", alpha=0.3)
+        ax.set_axisbelow(True)
+    names = [r.name if r.breaks is None else f"{r.name}\n(breaks {r.breaks})" for r in rows]
+    axes[0].set_yticks(places, names, fontsize=9)
     return figure

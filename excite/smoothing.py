@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from excite import chain
-from excite.estimate import Estimate
+from excite.estimate import Estimate, NoEstimate
 from excite.linearise import Chart, advance, chart, differentiate
 from excite.log import Log
 from excite.processing import decimate
@@ -66,7 +66,7 @@ PART = 100  # samples at a time: their chain stays in the processor's cache
 SPREAD_SPEED, SPREAD_ANGLE = 0.05, 0.1
 
 
-class NotConverged(RuntimeError):
+class NotConverged(NoEstimate):
     """Joint smoothing found no estimate; the message says how far it came and what to do."""
 
 

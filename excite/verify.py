@@ -115,7 +115,7 @@ def _run(
     measured = log.check(table, assumed.machine, identify.needed_sensors(assumed, method))
     try:
         estimate = identify.identify(assumed, [measured], method)
-    except identify.NotIdentifiable as err:
+    except identify.NoEstimate as err:
         return k, None, str(err)
     return k, (estimate.value, estimate.std, estimate.quantile95), ""
 
