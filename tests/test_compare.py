@@ -1,0 +1,117 @@
+"""Every drive of a comparison keeps the limits or says which it breaks, and scores what it drives."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from excite import objective
+from excite.compare import OURS, USUAL, Comparison, compare, judge, shrunk, within
+from excite.design import TOLERANCE
+from excite.limit import check
+from excite.manoeuvre import Manoeuvre, multisine
+from excite.simulate import simulate
+from model.machine import Problem
+from model.prediction import Model
+from tests.conftest import Excite
+
+KINDS = ("multisine", "hand-made", "Fourier, SLSQP")
+
+
+@pytest.fixture(scope="module")
+def problem(straight: Model) -> Problem:
+    whole = straight.machine.problems["S40"]
+    return whole.model_copy(update={"duration_s": whole.duration_s.model_copy(update={"value": 16.0})})
+
+
+@pytest.fixture(scope="module")
+def result(straight: Model, problem: Problem) -> Comparison:
+    return compare(straight, problem, samples=3, seed=1, budget_s=8.0, usual=KINDS)
+
+
+def test_every_kind_has_its_rows(result: Comparison) -> None:
+    assert [r.name for r in result.rows] == [
+        OURS,
+        "multisine, best of 3",
+        "multisine, median of 3",
+        "hand-made",
+        "Fourier, SLSQP",
+    ]
+
+
+def test_the_designed_drive_beats_the_usual_ones(result: Comparison) -> None:
+    ours, *others = result.rows
+    assert ours.breaks is None
+    assert all(ours.cond_phi < r.cond_phi for r in others)
+    assert result.ratio_equal_time > 1
+
+
+def test_every_score_is_that_of_a_fresh_simulation(straight: Model, problem: Problem, result: Comparison) -> None:
+    for r in result.rows:
+        motion = simulate(straight, r.manoeuvre.sample(100.0), q0=r.start)
+        assert objective.cond_phi(straight, motion) == pytest.approx(r.cond_phi, rel=1e-9)
+        over = check(straight, problem, motion)
+        assert max(over.values()) == pytest.approx(r.max_violation, abs=1e-9)
+        assert (r.breaks is None) == (r.max_violation <= TOLERANCE)
+        assert 0 < r.median_std_percent <= r.worst_std_percent
+
+
+def test_what_cannot_be_brought_inside_says_what_it_breaks(straight: Model, problem: Problem) -> None:
+    shorter = problem.duration_s.model_copy(update={"value": 8.0})
+    lane = (3.0, 20.0)  # the rolls alone are 3.2 m apart
+    short = problem.model_copy(update={"lane_m": lane, "duration_s": shorter})
+    found = within(straight, short, multisine(straight, short, 0))
+    assert not found.feasible
+    assert max(found.violations, key=lambda name: found.violations[name]).startswith("lane x")
+
+
+def test_scaling_down_keeps_shape_and_limits(straight: Model, problem: Problem) -> None:
+    wish = multisine(straight, problem, 2)
+    small = shrunk(straight, problem, wish)
+    ratio = small.torque[5:-5] / wish.torque[5:-5]
+    assert np.ptp(ratio) < 1e-9
+    found, _ = judge(straight, problem, small)
+    assert all(v == 0 for name, v in found.violations.items() if not name.startswith(("rest", "lane")))
+
+
+@pytest.mark.parametrize("kind", USUAL)
+def test_every_kind_makes_a_drive_for_every_machine(emps: Model, straight: Model, va12: Model, kind: str) -> None:
+    for model in (emps, straight, va12):
+        problem = next(iter(model.machine.problems.values()), None)
+        if problem is None:
+            continue
+        problem = problem.model_copy(update={"duration_s": problem.duration_s.model_copy(update={"value": 12.0})})
+        drive = USUAL[kind].make(model, problem, 0, 0.0)
+        assert drive.duration == pytest.approx(float(problem.duration_s))
+        assert np.isfinite(drive.torque).all()
+        assert np.abs(drive.torque[[0, -1]]).max() < 1e-9
+        assert np.diff(drive.times).min() >= float(problem.knot_s) - 1e-9
+
+
+def test_an_unknown_kind_is_refused(straight: Model, problem: Problem) -> None:
+    with pytest.raises(KeyError, match="no usual drive waltz"):
+        compare(straight, problem, usual=("waltz",))
+
+
+def test_the_command_writes_drives_that_score_what_it_says(
+    tmp_path: Path, excite: Excite, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from excite import compare as room
+
+    kept = {name: USUAL[name] for name in ("chirp", "hand-made")}
+    monkeypatch.setattr(room.compare, "__defaults__", (*room.compare.__defaults__[:-1], tuple(kept)))
+    out = tmp_path / "compared"
+    code, shown, err = excite("compare", "va12_straight", "--samples", 2, "--budget", 6, "--out", out, "--json")
+    assert code == 0, err
+    summary = json.loads(shown)
+    assert summary == json.loads((out / "summary.json").read_text())
+    assert (out / "compare.png").stat().st_size > 10_000
+    for row in summary["designs"]:
+        knots = pd.read_csv(out / row["knots"]).to_numpy()
+        start = [row["start"][c] for c in straight.coordinates]
+        motion = simulate(straight, Manoeuvre(knots[:, 0], knots[:, 1:]).sample(100.0), q0=np.array(start))
+        assert objective.cond_phi(straight, motion) == pytest.approx(row["cond_phi"], rel=1e-5)
