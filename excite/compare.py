@@ -405,7 +405,7 @@ def compare(
         progress(1, total, lowest)
     seeds = np.random.SeedSequence(seed).generate_state(max(samples, 1))
     with joblib.parallel_config("loky", inner_max_num_threads=1):
-        run = joblib.Parallel(n_jobs=max(2, os.cpu_count() or 1), return_as="generator_unordered")
+        run = joblib.Parallel(n_jobs=_processes(), return_as="generator_unordered")
         call = joblib.delayed(_sample)
         found: list[_Sample] = []
         for done, one in enumerate(run(call(model, problem, n, k, int(seeds[k]), wall) for n, k in jobs), 2):
@@ -422,6 +422,10 @@ def compare(
     return Comparison(tuple(rows), min(in_time) / ours.cond_phi)
 
 
+def _processes() -> int:
+    return max(2, os.cpu_count() or 1)  # as the design has
+
+
 def _sample(model: Model, problem: Problem, kind: str, number: int, seed: int, seconds: float) -> _Sample:
     begin = time.monotonic()
     found = within(model, problem, USUAL[kind].make(model, problem, seed, seconds))
@@ -434,7 +438,7 @@ def _order(s: _Sample) -> tuple[bool, float]:
 
 def _in_time(samples: Sequence[_Sample], seconds: float) -> list[float]:
     """cond(Phi) of those that keep every limit, of as many samples as are had in the given time; a search always is."""
-    used = np.cumsum([s.wall_s for s in samples])
+    used = np.cumsum([s.wall_s for s in samples]) / _processes()
     return [
         objective.reported("cond", s.found.score)
         for k, (s, t) in enumerate(zip(samples, used, strict=True))

@@ -230,6 +230,7 @@ def compare_figure(rows: Sequence[Row], title: str) -> Figure:
         ax.set_xscale("log")
         ax.set_xlim(min(x) / 2, max(x) * 2)
         ax.xaxis.set_major_formatter("{x:g}")
+        ax.xaxis.set_minor_formatter("")
         ax.set_xlabel(label)
         ax.grid(axis="x", alpha=0.3)
         ax.set_axisbelow(True)
