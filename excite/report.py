@@ -140,14 +140,16 @@ def sigma_figure(sigma: Mapping[str, float], title: str) -> Figure:
     ax = figure.subplots()
     figure.suptitle(title, fontsize=11)
     names = list(sigma)[::-1]
-    ax.barh(names, [sigma[s] for s in names], color=COLOURS[0], height=0.6)
-    for y, s in enumerate(names):
-        ax.annotate(
-            f"{sigma[s]:.2g}", (sigma[s], y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8
-        )
+    values = np.array([sigma[s] for s in names])
+    low, high = 10.0 ** np.floor(np.log10(values.min())), 10.0 ** np.ceil(np.log10(values.max()) + 1e-9)
+    ax.hlines(names, low, values, color="0.75", linewidth=5)
+    ax.plot(values, names, "o", color=COLOURS[0])
+    for y, value in enumerate(values):
+        ax.annotate(f"{value:.2g}", (value, y), xytext=(7, 0), textcoords="offset points", va="center", fontsize=8)
     ax.set_xscale("log")
-    ax.margins(x=0.12)
+    ax.set_xlim(low, 1.3 * high)
     ax.xaxis.set_major_formatter("{x:g}")
+    ax.xaxis.set_minor_formatter("")
     ax.set_xlabel("attainable standard deviation [% of the nominal value]")
     ax.grid(axis="x", alpha=0.3)
     return figure

@@ -185,16 +185,16 @@ def test_errors_are_as_large_as_it_says(va12: Model, drive: str, kit: str) -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kit", ["full", "paper"])
-@pytest.mark.parametrize(("drive", "worst", "middle"), [("energetic", 2.2, 0.25), ("human", 2.0, 0.4)])
-def test_coverage(va12: Model, drive: str, kit: str, worst: float, middle: float) -> None:
+@pytest.mark.parametrize(("drive", "middle"), [("energetic", 0.25), ("human", 0.4)])
+def test_coverage(va12: Model, drive: str, kit: str, middle: float) -> None:
+    """Another machine, drive and noise each time, started from a file up to 20 % off: errors as large as said."""
     z, percent, _ = errors(va12, drive, kit, range(50))
     rms = np.sqrt(np.mean(percent**2, axis=0))
     inside = np.mean(np.abs(z) < 1.96, axis=0)
-    assert rms.max() < worst
     assert np.median(rms) < middle
     assert 0.9 < np.sqrt(np.mean(z**2)) < 1.15
     assert 0.93 < inside.mean() < 0.97
-    assert inside.min() >= 0.84  # 50 runs: two standard deviations below 95 % is 0.89, and this is the least of 22
+    assert inside.min() >= 0.84  # of 22 parameters in 50 runs the least falls below that by chance in 2 % of tests
 
 
 def test_bound_is_what_linear_least_squares_gives(va12: Model) -> None:
