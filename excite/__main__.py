@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -44,6 +45,7 @@ BudgetOption = Annotated[float | None, typer.Option("--budget", help="stop impro
 RunsOption = Annotated[int, typer.Option("--runs", min=1, help="simulated test days")]
 
 
+INTERRUPTED = 130  # exit code of Ctrl-C, as shells have it
 POOR = 5.0  # standard deviation [%] that a condition number should not hide
 
 
@@ -117,7 +119,7 @@ def verify(
 
     name = _design_summary(design_dir)["machine"]
     out = out or Path(f"results/verify-{name}")
-    folder.claim(out)
+    folder.claim(out, [design_dir])
     with folder.writing(out) as place:
         summary = _verify(place, design_dir, runs, method, kit, seed)
     _finish(summary, out, json, _verify_table)
@@ -167,6 +169,8 @@ def run(
         designed = place / "design"
         designed.mkdir()
         first = _design(designed, machine, problem, duration, objective, starts, seed, budget)
+        if not first["complete"] and budget is None:
+            raise KeyboardInterrupt
         checked = place / "verify"
         checked.mkdir()
         second = _verify(checked, designed, runs, method, kit, seed)
@@ -198,13 +202,13 @@ def simulate(
         raise UsageError(f"--noise: {noise} is unknown, allowed: on, off")
     _known("--kit", kit, sensors.KITS)
     writers = {".csv": lambda t, p: t.to_csv(p, index=False), ".parquet": lambda t, p: t.to_parquet(p, index=False)}
-    _known("--out: ending", out.suffix, tuple(writers))
+    _known("--out: ending", out.suffix.lower(), tuple(writers))
     model = _model(machine)
     torque, q0, nu0 = log.read_profile(profile, model)
     with folder.writing_file(out) as path:
         motion = drive(model, torque, q0=q0, nu0=nu0)
         table = sensors.measure(model, motion, kit=kit, seed=seed, noise=noise == "on")
-        writers[out.suffix](table, path)
+        writers[out.suffix.lower()](table, path)
     summary = {
         "machine": model.machine.name,
         "profile": str(profile),
@@ -241,7 +245,9 @@ def identify(
 
     model = _model(machine)
     out = out or Path(f"results/identify-{model.machine.name}")
-    folder.claim(out)
+    folder.claim(out, [*logs, *(validate or [])])
+    if len({path.resolve() for path in logs}) < len(logs):
+        raise UsageError("LOG: the same file is given twice, which would count it twice")
     method = _method(method, model)
     _known("--filter", filtering, ("machine", "auto"))
     needs = identify.needed_sensors(model, method)
@@ -315,6 +321,7 @@ def _design(
         "cond_w": result.cond_w,
         "cond_phi_start": result.cond_phi_start,
         "sigma_percent": _sigma(model, result),
+        "complete": result.complete,
         "max_violation": result.max_violation,
         "violations": dict(result.violations),
         "starts": starts,
@@ -333,7 +340,8 @@ def _sigma(model: Model, result: Design) -> dict[str, float]:
     from excite import smoothing
 
     covariance = smoothing.cramer_rao(model, result.motion, "full")
-    spread = 100 * covariance.diagonal() ** 0.5 / abs(model.nominal)
+    reference = [abs(x) if x else s for x, s in zip(model.nominal, model.scale, strict=True)]
+    spread = 100 * covariance.diagonal() ** 0.5 / reference
     return dict(zip(model.base.names, spread.tolist(), strict=True))
 
 
@@ -353,7 +361,12 @@ def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: s
     except (OSError, ValueError):
         raise UsageError(f"{stored}: missing or damaged, design again") from None
     method = _method(method, model)
-    motion = drive(model, *_profile(log.read_profile(design_dir / "profile.csv", model)))
+    torque, q0, nu0 = log.read_profile(design_dir / "profile.csv", model)
+    if len(torque) != round(before["duration_s"] * float(model.machine.sampling_hz)) + 1:
+        raise UsageError(
+            f"{design_dir / 'profile.csv'}: {len(torque)} rows do not make {before['duration_s']:g} s, design again"
+        )
+    motion = drive(model, torque, q0=q0, nu0=nu0)
     _check_needs(model, method, kit)
     with _bar("verifying") as advance:
         result = verify(model, motion, method, kit, runs, seed, progress=lambda done, total: advance(done, total, None))
@@ -471,13 +484,8 @@ def _check(model: Model, one: Log, estimate: Estimate, chosen: Filter) -> dict[s
     }
 
 
-def _profile(read: tuple[Any, Any, Any]) -> tuple[Any, None, Any, Any]:
-    torque, q0, nu0 = read
-    return torque, None, q0, nu0
-
-
 def _biased(v: Verification) -> list[str]:
-    """Parameters whose mean error is more than half of what one run's interval admits and more than chance."""
+    """Parameters whose mean error is more than one predicted standard deviation, and beyond chance."""
     from excite.verify import summary
 
     return [
@@ -506,7 +514,11 @@ def _check_needs(model: Model, method: str, kit: str) -> None:
 def _model(name: str) -> Model:
     from model import machine, prediction
 
-    return prediction.build(machine.load(name))
+    loaded = machine.load(name)
+    try:
+        return prediction.build(loaded)
+    except machine.MachineError as err:
+        raise machine.MachineError(f"{name}: {str(err).removeprefix(f'{loaded.name}: ')}") from None
 
 
 def _problem(machine: Machine, name: str | None, duration: float | None) -> tuple[str, Problem]:
@@ -555,9 +567,10 @@ def _design_summary(design_dir: Path) -> dict[str, Any]:
         )
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError:
-        raise UsageError(f"{path}: damaged, design again") from None
-    if not isinstance(summary, dict) or "machine" not in summary or not (design_dir / "profile.csv").is_file():
+    except (OSError, ValueError):
+        raise UsageError(f"{path}: damaged or not readable, design again") from None
+    whole = isinstance(summary, dict) and isinstance(summary.get("machine"), str) and "duration_s" in summary
+    if not whole or not (design_dir / "profile.csv").is_file():
         raise UsageError(f"{design_dir}: not a design, make one with `excite design MACHINE`")
     return summary
 
@@ -624,6 +637,8 @@ def _design_table(summary: dict[str, Any]) -> None:
         f"{summary['machine']} {summary['problem']}: cond(Phi) = {summary['cond_phi']:.2f} (best start"
         f" {summary['cond_phi_start']:.0f}), {summary['duration_s']:g} s, {kept}, designed in {summary['wall_s']:.1f} s"
     )
+    if not summary["complete"]:
+        _print("cut short: this is the best drive so far, more time may find a better one")
     _print(
         f"attainable accuracy (Cramer-Rao, one standard deviation): worst {worst} {sigma[worst]:.2g} %,"
         f" median {middle:.2g} %"
@@ -724,18 +739,26 @@ def _busy(label: str) -> Iterator[None]:
 
 def main() -> None:
     """Runs a command: exit 0 done, 1 could not be done, 2 bad input or usage; one clear line on stderr."""
+    signal.signal(signal.SIGTERM, _terminate)
     try:
         result = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
     except typer.TyperException as err:
         _fail(" ".join(err.format_message().split()), 2)
     except (KeyboardInterrupt, typer.Abort):
-        _fail("interrupted, nothing was written", 130)
+        _fail("interrupted, nothing was written", INTERRUPTED)
     except Exception as err:
         code = _exit_code(err)
         if code is None:
             raise
         _fail(" ".join(str(err).split()), code)
+    if result == INTERRUPTED:  # typer makes an exit code of Ctrl-C
+        _fail("interrupted, nothing was written", INTERRUPTED)
     sys.exit(result if isinstance(result, int) else 0)
+
+
+def _terminate(*_: object) -> None:
+    """A polite kill ends like Ctrl-C: workers are stopped, nothing half written stays."""
+    raise KeyboardInterrupt
 
 
 def _exit_code(err: Exception) -> int | None:

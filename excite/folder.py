@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,21 +15,34 @@ from typing import Any
 import numpy as np
 
 SUMMARY = "summary.json"
+OURS = re.compile(r"summary\.json|machine\.json|profile\.csv|README\.md|[a-z0-9-]+\.png|design|verify")
 
 
 class FolderError(ValueError):
     """An output place that can't be used: the message says why and what to do."""
 
 
-def claim(out: Path) -> None:
+def claim(out: Path, inputs: Iterable[Path] = ()) -> None:
     """Checks before the work that `out` can be written at its end. Raises FolderError.
 
-    A folder of ours (it has a summary.json) or an empty one may be replaced; anything else is left alone.
+    An empty folder may be replaced, and one of ours that holds nothing but our own files and none of the `inputs`;
+    anything else is left alone.
     """
     if out.is_file():
         raise FolderError(f"{out}: is a file, --out needs a folder")
-    if out.is_dir() and any(out.iterdir()) and not (out / SUMMARY).is_file():
-        raise FolderError(f"{out}: exists and holds something else, choose another --out")
+    place = out.resolve()
+    if place == Path.cwd() or place in Path.cwd().parents:
+        raise FolderError(f"{out}: is the folder that you are in or above it, choose another --out")
+    for path in inputs:
+        if place == path.resolve() or place in path.resolve().parents:
+            raise FolderError(f"{out}: holds {path}, which is read, choose another --out")
+    if out.is_dir():
+        foreign = [p.name for p in out.iterdir() if not OURS.fullmatch(p.name)]
+        if foreign or (any(out.iterdir()) and not (out / SUMMARY).is_file()):
+            what = foreign[0] if foreign else "something else"
+            raise FolderError(f"{out}: exists and holds {what}, choose another --out")
+        if not os.access(out, os.W_OK):
+            raise FolderError(f"{out}: can't be replaced, it may not be written to")
     _writable(out)
 
 

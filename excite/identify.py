@@ -16,7 +16,7 @@ from excite.log import Log
 from excite.outputerror import oe
 from excite.processing import Samples, decimate, filtered_regression, samples
 from excite.regression import least_squares, ols, tls, wls
-from model.machine import Filter
+from model.machine import Filter, MachineError
 from model.prediction import Model
 
 __all__ = [
@@ -50,10 +50,42 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
         raise ValueError(f"method: {method} is unknown, allowed: {', '.join(METHODS)}")
     if not logs:
         raise ValueError("identify: no log given")
+    _measurable(model)
     examined = [examine(model, log) for log in logs]
     mended, filter = [e.log for e in examined], filter or model.machine.filter
-    estimate = explained(model, mended, METHODS[method](model, mended, filter), filter)
+    if not any(v.any() for log in mended for v in log.values.values()):
+        raise NotIdentifiable(f"{mended[0].source}: every signal is zero: is the log empty of measurements?")
+    try:
+        estimate = explained(model, mended, METHODS[method](model, mended, filter), filter)
+    except np.linalg.LinAlgError:
+        raise NotIdentifiable(
+            f"{mended[0].source}: the equations of {method} are singular along this log: check the sign and unit of"
+            " every column, and that the machine moves"
+        ) from None
     return noted(estimate, *(note for e in examined for note in e.notes))
+
+
+def _measurable(model: Model) -> None:
+    """Refuses a machine file whose sensors can't say what its equations need. Raises MachineError."""
+    machine = model.machine
+    have = {(s.kind, s.body) for s in machine.sensor}
+    for body in machine.actuated:
+        for kind in ("angle", "torque"):
+            if (kind, body.index) not in have:
+                raise MachineError(
+                    f"{machine.name}: sensor: none of kind {kind} on joint {body.index} ({body.where}): identification"
+                    " needs one"
+                )
+    if not machine.planar:
+        return
+    wheels = [s for s in machine.sensors("full") if s.kind == "wheel"]
+    turns = machine.body[0].coordinates[2] in model.coordinates
+    apart = len({float(s.lateral or 0) for s in wheels})
+    if not wheels or (turns and apart < 2):
+        raise MachineError(
+            f"{machine.name}: sensor: {'two measuring wheels apart' if turns else 'a measuring wheel'} (kind wheel)"
+            " must tell the speed over ground" + (" and the yaw rate" if turns else "")
+        )
 
 
 def with_bias(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 import zipfile
 from collections.abc import Sequence
@@ -58,13 +59,22 @@ def check(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sour
         names = ", ".join(f"{s.column} ({_what(s, machine)})" for s in missing)
         raise LogError(f"{source}: no column {names}, {_columns(table)}{_other(table, machine)}")
     t = _numbers(table, machine.time_column, source)
-    if len(t) < SHORTEST:
-        raise LogError(f"{source}: only {len(t)} rows, at least {SHORTEST} are needed: is the file complete?")
+    least = max(SHORTEST, sum(machine.filter.drop) + 12 * machine.filter.decimation)
+    if len(t) < least:
+        raise LogError(f"{source}: only {len(t)} rows, at least {least} are needed: is the file complete?")
     values = {s.name: float(s.factor) * _numbers(table, s.column, source) for s in known}
     rate = float(machine.sampling_hz)
     _check_time(t, rate, machine.time_column, source)
     for s in known:
         _check_values(s, values[s.name], rate, machine, source)
+    for s in machine.sensor:
+        if s.kind == "angle" and s not in wanted and s.column in table.columns:
+            moved = float(s.factor) * _numbers(table, s.column, source)
+            if np.ptp(moved) > 0.05:
+                raise LogError(
+                    f"{source}: column {s.column}: moves by {np.ptp(moved):.2g} {s.unit}, {machine.name} holds it"
+                    " still; is this a log of another machine?"
+                )
     return Log(source, np.arange(len(t)) / rate, values)
 
 
@@ -194,6 +204,12 @@ def _check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Mach
                 f"{source}: row {k + 2}, column {sensor.column}: the angle jumps by {step[k]:.3g} rad in one sample;"
                 " unwrap it (encoder angles are counted on) or cut the log there"
             )
+        fastest = _fastest(sensor, machine)
+        if fastest is not None and step[k] * rate > 5 * fastest and np.percentile(step, 99) * rate > 3 * fastest:
+            raise LogError(
+                f"{source}: column {sensor.column}: turns at {np.percentile(step, 99) * rate:.3g} rad/s, the machine"
+                f" allows {fastest:.3g} rad/s; is the column in degrees?"
+            )
         limit = body.limit.position
         if sensor.kind == "angle" and limit is not None and np.abs(values).max() > 3 * float(limit):
             raise LogError(
@@ -207,6 +223,16 @@ def _check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Mach
                 f"{source}: column {sensor.column}: up to {top:.3g}, more than ten times the drive's limit {most:g};"
                 " is the unit right?"
             )
+
+
+def _fastest(sensor: Sensor, machine: Machine) -> float | None:
+    """The rate [rad/s] that a joint's limits allow, None where they don't say."""
+    limit, contact = machine.find(sensor.body).limit, machine.find(sensor.body).contact
+    if sensor.kind != "angle":
+        return None
+    if limit.rim_speed is not None and contact is not None:
+        return float(limit.rim_speed) / float(contact.radius)
+    return None if limit.rate is None else float(limit.rate)
 
 
 def _what(sensor: Sensor, machine: Machine) -> str:
@@ -223,6 +249,8 @@ def _columns(table: pd.DataFrame) -> str:
 
 def _other(table: pd.DataFrame, machine: Machine) -> str:
     """A shipped machine whose log this looks like."""
+    if {s.column for s in machine.sensors("paper")} <= {str(c) for c in table.columns}:
+        return "; without it --method joint works"
     for name in machines.shipped():
         if name == machine.name:
             continue
@@ -271,6 +299,9 @@ def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray
     source = str(path)
     needed = ["t_s", *(torque_column(model, n) for n in model.inputs)]
     missing = [c for c in needed if c not in table.columns]
+    alien = [c for c in table.columns if re.fullmatch(r"u\d+_Nm?", str(c)) and c not in needed]
+    if alien and not missing:
+        raise LogError(f"{source}: column {alien[0]}: {model.machine.name} has no such drive; is it another's profile?")
     if missing:
         raise LogError(
             f"{source}: no column {', '.join(missing)}, {_columns(table)}; is this a profile of {model.machine.name}?"

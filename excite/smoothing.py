@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from excite import chain
-from excite.estimate import Estimate, NoEstimate
+from excite.estimate import Estimate, NoEstimate, NotIdentifiable
 from excite.linearise import Chart, advance, chart, differentiate
 from excite.log import Log
 from excite.processing import decimate
@@ -166,7 +166,12 @@ def _disturbed(
 def _estimate(c: Chart, records: Sequence[Record], fit: Fit, filter: Filter, notes: tuple[str, ...]) -> Estimate:
     """The answer as `identify` gives it: regressor along the smoothed states, residual of the torques."""
     model = c.model
-    weak = fit.unseen | (fit.std > UNSEEN * model.scale)
+    weak = fit.unseen | (fit.std > UNSEEN * np.maximum(np.abs(fit.X), model.scale))
+    if weak.all():
+        raise NotIdentifiable("the log says nothing of any parameter: does the machine move in it?")
+    if fit.unseen.any():
+        held = ", ".join(n for n, yes in zip(model.base.names, fit.unseen, strict=True) if yes)
+        notes = (*notes, f"held at the machine file's value: {held}; the other deviations hold if that value does")
     reasons = {
         name: "this log hardly moves with it: what is known of it is the machine file's value"
         for name, yes in zip(model.base.names, weak, strict=True)
@@ -353,7 +358,8 @@ def _iterate(
         points, X = here
         covariance, move, left = _parameters(c, records, linear, points, X, prior, damping)
         if k == SETTLED:
-            unseen = np.sqrt(np.diag(covariance))[: len(X)] > UNSEEN
+            # Against the estimate as well: a file's value that is far too small must not make a parameter unseen.
+            unseen = np.sqrt(np.diag(covariance))[: len(X)] > UNSEEN * np.maximum(np.abs(X) / model.scale, 1.0)
             if unseen.any():
                 # Left free they would go anywhere, and take the mass matrix and the slips with them.
                 prior[unseen] = HELD**-2

@@ -446,6 +446,7 @@ class Machine(Record):
         driven = [i for i, b in known.items() if b.actuated]
         names: set[str] = set()
         columns: set[str] = {self.time_column}
+        measured: set[tuple[str, int]] = set()
         for k, sensor in enumerate(self.sensor):
             if sensor.body not in known:
                 raise ValueError(f"sensor[{k}].body: no body {sensor.body}, allowed: {sorted(known)}")
@@ -459,6 +460,12 @@ class Machine(Record):
                 raise ValueError(f"sensor[{k}].name: {sensor.name} is used twice")
             if sensor.column in columns:
                 raise ValueError(f"sensor[{k}].column: {sensor.column} is used twice")
+            twin = (sensor.kind, sensor.body)
+            if sensor.kind in ("angle", "torque") and twin in measured:
+                raise ValueError(
+                    f"sensor[{k}].kind: joint {sensor.body} has two sensors of kind {sensor.kind}, keep one"
+                )
+            measured.add(twin)
             names.add(sensor.name)
             columns.add(sensor.column)
 
