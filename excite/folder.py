@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 SUMMARY = "summary.json"
-OURS = re.compile(r"summary\.json|machine\.json|profile\.csv|README\.md|[a-z0-9-]+\.png|design|verify")
+OURS = re.compile(r"summary\.json|machine\.json|profile\.csv|README\.md|[a-z0-9-]+\.png|design|verify|drives")
 
 
 class FolderError(ValueError):

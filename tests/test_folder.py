@@ -65,3 +65,23 @@ def test_json_is_strict() -> None:
         "c": {"1": 3},
         "d": "x",
     }
+
+
+@pytest.mark.parametrize("foreign", ["mydata.csv", "thesis.txt", "drive.toml"])
+def test_a_folder_with_anything_else_in_it_is_left_alone(tmp_path: Path, foreign: str) -> None:
+    (tmp_path / "o").mkdir()
+    (tmp_path / "o" / folder.SUMMARY).write_text("{}")
+    (tmp_path / "o" / foreign).write_text("precious")
+    with pytest.raises(folder.FolderError, match=foreign):
+        folder.claim(tmp_path / "o")
+
+
+def test_what_is_read_is_not_written_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with folder.writing(tmp_path / "o") as place:
+        (place / folder.SUMMARY).write_text("{}")
+    for given in (tmp_path / "o", tmp_path / "o" / "log.csv"):
+        with pytest.raises(folder.FolderError, match="which is read"):
+            folder.claim(tmp_path / "o", [given])
+    monkeypatch.chdir(tmp_path / "o")
+    with pytest.raises(folder.FolderError, match="the folder that you are in"):
+        folder.claim(Path())

@@ -11,6 +11,7 @@ from conftest import Excite
 
 from excite import identify, log, sensors
 from excite.simulate import Motion, simulate
+from model import machine, prediction
 from model.prediction import Model
 
 # Janot, Gautier, Brunot (2019): estimate, standard deviation
@@ -129,3 +130,40 @@ def test_unknown_method_is_refused(straight: Model) -> None:
 
 def test_recommended_method_follows_the_machine(va12: Model, straight: Model, emps: Model) -> None:
     assert [identify.recommended(m) for m in (va12, straight, emps)] == ["joint", "joint", "ols"]
+
+
+def test_sensors_that_are_missing_are_named(va12: Model, va12_motion: Motion) -> None:
+    """Without a torque or a wheel the equations would be fed zeros: refused, not answered."""
+    measured = log.check(sensors.measure(va12, va12_motion), va12.machine)
+    for gone, words in (("u2", "torque on joint 2"), ("theta4", "angle on joint 4"), ("thetal", "measuring wheels")):
+        kept = tuple(s for s in va12.machine.sensor if s.name != gone)
+        model = prediction.build(va12.machine.model_copy(update={"sensor": kept}))
+        with pytest.raises(machine.MachineError, match=words):
+            identify.identify(model, [measured], "ols")
+
+
+def test_an_empty_log_is_not_an_estimate(straight: Model, straight_motion: Motion) -> None:
+    table = sensors.measure(straight, straight_motion) * 0
+    table["t_s"] = straight_motion.t
+    for method in ("ols", "joint"):
+        with pytest.raises(identify.NotIdentifiable, match="every signal is zero"):
+            identify.identify(straight, [log.check(table, straight.machine)], method)
+
+
+def test_a_machine_file_far_off_in_one_value_does_not_mislead(straight: Model) -> None:
+    """The S40 design goes one way, so friction and offset are hard to tell apart; the file says Fs4 = 20, not 143."""
+    stored = Path(__file__).parents[1] / "results" / "S40" / "design" / "profile.csv"
+    torque, q0, nu0 = log.read_profile(stored, straight)
+    motion = simulate(straight, torque, q0=q0, nu0=nu0)
+    bodies = []
+    for body in straight.machine.body:
+        if body.index == 4 and body.friction is not None:
+            low = body.friction.Fs.model_copy(update={"value": 20.0})
+            body = body.model_copy(update={"friction": body.friction.model_copy(update={"Fs": low})})
+        bodies.append(body)
+    wrong = prediction.build(straight.machine.model_copy(update={"body": tuple(bodies)}))
+    measured = log.check(sensors.measure(straight, motion, seed=2), straight.machine)
+    estimate = identify.identify(wrong, [measured], "joint")
+    known = np.isfinite(estimate.value)
+    errors = (estimate.value - straight.nominal)[known] / estimate.std[known]
+    assert np.abs(errors).max() < 4
