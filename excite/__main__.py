@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +14,8 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import typer  # noqa: E402
+
+from excite import terminal  # noqa: E402
 
 if TYPE_CHECKING:
     from excite.design import Design
@@ -46,7 +47,6 @@ RunsOption = Annotated[int, typer.Option("--runs", min=1, help="simulated test d
 
 
 INTERRUPTED = 130  # exit code of Ctrl-C, as shells have it
-POOR = 5.0  # standard deviation [%] that a condition number should not hide
 
 
 class UsageError(ValueError):
@@ -74,12 +74,12 @@ def machines(json: JsonOption = False) -> None:
             }
         )
     if json:
-        _show_json({"machines": rows})
+        terminal.show_json({"machines": rows})
         return
-    table = _table("machine", "what it is", "problem", "parameters")
+    table = terminal.table("machine", "what it is", "problem", "parameters")
     for row in rows:
         table.add_row(row["machine"], row["title"], row["problem"] or "-", str(len(row["parameters"])))
-    _print(table)
+    terminal.say(table)
 
 
 @app.command()
@@ -101,7 +101,7 @@ def design(
     folder.claim(out)
     with folder.writing(out) as place:
         summary = _design(place, machine, problem, duration, objective, starts, seed, budget)
-    _finish(summary, out, json, _design_table)
+    terminal.finish(summary, out, json, terminal.design_table)
 
 
 @app.command()
@@ -122,7 +122,7 @@ def verify(
     folder.claim(out, [design_dir])
     with folder.writing(out) as place:
         summary = _verify(place, design_dir, runs, method, kit, seed)
-    _finish(summary, out, json, _verify_table)
+    terminal.finish(summary, out, json, terminal.verify_table)
 
 
 @app.command()
@@ -142,7 +142,7 @@ def compare(
     folder.claim(out)
     with folder.writing(out) as place:
         summary = _compare(place, machine, problem, samples, seed, budget)
-    _finish(summary, out, json, _compare_table)
+    terminal.finish(summary, out, json, terminal.compare_table)
 
 
 @app.command()
@@ -178,10 +178,10 @@ def run(
         (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
 
     def show(both: dict[str, Any]) -> None:
-        _design_table(both["design"])
-        _verify_table(both["verify"])
+        terminal.design_table(both["design"])
+        terminal.verify_table(both["verify"])
 
-    _finish(summary, out, json, show)
+    terminal.finish(summary, out, json, show)
 
 
 @app.command()
@@ -221,9 +221,9 @@ def simulate(
         "seed": seed,
     }
     if json:
-        _show_json(summary)
+        terminal.show_json(summary)
     else:
-        _print(f"{out}: {len(table)} rows, {motion.t[-1]:g} s, columns {', '.join(table.columns)}")
+        terminal.say(f"{out}: {len(table)} rows, {motion.t[-1]:g} s, columns {', '.join(table.columns)}")
 
 
 @app.command()
@@ -253,7 +253,7 @@ def identify(
     needs = identify.needed_sensors(model, method)
     read = [log.read(path, model.machine, needs) for path in logs]
     fresh = [log.read(path, model.machine, needs) for path in validate or []]
-    with _busy("identifying"):
+    with terminal.busy("identifying"):
         chosen, reason = examine.choose(model, read) if filtering == "auto" else (model.machine.filter, "")
         estimate = identify.identify(model, read, method, chosen)
         if model.slips and method.partition("+")[0] in ("ols", "wls"):  # slips measured with noise bias these
@@ -281,7 +281,7 @@ def identify(
                 figure = report.comparison_figure(model, crosscheck.torques(model, one, estimate, chosen), title)
                 report.save(figure, place / (f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png"))
         (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
-    _finish(summary, out, json, _identify_table)
+    terminal.finish(summary, out, json, terminal.identify_table)
 
 
 # ------------------------------------------------------------------------------------------------ the work
@@ -307,7 +307,7 @@ def _design(
     if budget is not None and not budget > 0:
         raise UsageError(f"--budget: must be > 0 s (got {budget:g})")
     begin = time.perf_counter()
-    with _bar("designing") as advance:
+    with terminal.bar("designing") as advance:
         result = design.design(model, chosen, aim, starts, seed, budget, advance)
     wall = time.perf_counter() - begin
     log.profile(model, result.motion).to_csv(place / "profile.csv", index=False)
@@ -368,7 +368,7 @@ def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: s
         )
     motion = drive(model, torque, q0=q0, nu0=nu0)
     _check_needs(model, method, kit)
-    with _bar("verifying") as advance:
+    with terminal.bar("verifying") as advance:
         result = verify(model, motion, method, kit, runs, seed, progress=lambda done, total: advance(done, total, None))
     if len(result.failures) == runs:
         raise identify.NotIdentifiable(f"all {runs} runs failed, the first one: {result.failures[0]}")
@@ -403,7 +403,7 @@ def _compare(
     name, chosen = _problem(model.machine, problem, None)
     if budget is not None and not budget > 0:
         raise UsageError(f"--budget: must be > 0 s (got {budget:g})")
-    with _bar("comparing") as advance:
+    with terminal.bar("comparing") as advance:
         result = compare.compare(model, chosen, samples, seed, budget, advance)
     columns = ["t_s", *[f"{u}_{'Nm' if b.joint == 'revolute' else 'N'}" for u, b in _inputs(model)]]
     (place / "drives").mkdir()
@@ -579,159 +579,6 @@ def _versions() -> dict[str, str]:
     from importlib.metadata import version
 
     return {name: version(name) for name in ("excite", "casadi", "numpy", "scipy")}
-
-
-# ------------------------------------------------------------------------------------------------ what people see
-
-
-def _print(thing: object) -> None:
-    from rich.console import Console
-
-    console = Console(highlight=False)
-    if console.is_terminal:
-        console.print(thing)
-    else:  # a pipe or file has no width: whole lines, whole tables
-        Console(highlight=False, width=200).print(thing, soft_wrap=True)
-
-
-def _show_json(summary: dict[str, Any]) -> None:
-    from excite import folder
-
-    sys.stdout.write(folder.dump(summary))
-
-
-def _finish(summary: dict[str, Any], out: Path, json: bool, show: Callable[[dict[str, Any]], None]) -> None:
-    if json:
-        _show_json(summary)
-        return
-    show(summary)
-    _print(f"written to {out}/")
-
-
-def _table(*names: str) -> Any:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD)
-    for k, name in enumerate(names):
-        table.add_column(name, justify="left" if k == 0 or name == "what it is" else "right")
-    return table
-
-
-def _figure(value: object, digits: int = 4) -> str:
-    if value is None or (isinstance(value, float) and value != value):
-        return "-"
-    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
-
-
-def _design_table(summary: dict[str, Any]) -> None:
-    kept = (
-        "all limits kept"
-        if summary["max_violation"] <= 1e-3
-        else f"limits exceeded by {100 * summary['max_violation']:.2f} %"
-    )
-    sigma = summary["sigma_percent"]
-    worst = max(sigma, key=lambda name: sigma[name])
-    middle = sorted(sigma.values())[len(sigma) // 2]
-    _print(
-        f"{summary['machine']} {summary['problem']}: cond(Phi) = {summary['cond_phi']:.2f} (best start"
-        f" {summary['cond_phi_start']:.0f}), {summary['duration_s']:g} s, {kept}, designed in {summary['wall_s']:.1f} s"
-    )
-    if not summary["complete"]:
-        _print("cut short: this is the best drive so far, more time may find a better one")
-    _print(
-        f"attainable accuracy (Cramer-Rao, one standard deviation): worst {worst} {sigma[worst]:.2g} %,"
-        f" median {middle:.2g} %"
-    )
-    if summary["objective"] == "cond" and sigma[worst] > POOR:
-        _print(f"a low cond(Phi) hides poor accuracy here: {worst} can't be found better than {sigma[worst]:.2g} %")
-
-
-def _verify_table(summary: dict[str, Any]) -> None:
-    table = _table("parameter", "unit", "true", "mean", "bias %", "spread %", "predicted %", "coverage %")
-    for name, row in summary["parameters"].items():
-        table.add_row(
-            name,
-            row["unit"],
-            _figure(row["true"], 6),
-            _figure(row["mean"], 6),
-            _figure(row["bias_percent"], 3),
-            _figure(row["std_percent"], 3),
-            _figure(row["predicted_std_percent"], 3),
-            _figure(100 * row["coverage95"], 3),
-        )
-    _print(f"{summary['runs']} simulated runs, method {summary['method']}, kit {summary['kit']}")
-    _print(table)
-    if summary["biased"]:
-        _print(f"biased, the intervals do not hold: {', '.join(summary['biased'])}")
-    if summary["failed"]:
-        _print(f"{summary['failed']} runs gave no estimate")
-
-
-def _compare_table(summary: dict[str, Any]) -> None:
-    table = _table("drive", "cond(Phi)", "cond(W)", "worst std %", "median std %", "kept", "limit broken", "time s")
-    for row in summary["designs"]:
-        table.add_row(
-            row["name"],
-            *(_figure(row[k], 4) for k in ("cond_phi", "cond_w", "worst_std_percent", "median_std_percent")),
-            f"{row['kept']}/{row['samples']}",
-            "-" if row["breaks"] is None else f"{row['breaks']} by {100 * row['max_violation']:.2g} %",
-            f"{row['wall_s']:.1f}",
-        )
-    _print(f"{summary['machine']} {summary['problem']}: the designed drive and the usual ones")
-    _print(table)
-    ratio = summary["ratio_equal_time"]
-    if ratio < float("inf"):
-        _print(f"the best usual drive found in the same time has {ratio:.2g} times the designed one's cond(Phi)")
-    else:
-        _print("no usual drive found in the same time keeps every limit")
-
-
-def _identify_table(summary: dict[str, Any]) -> None:
-    table = _table("parameter", "unit", "value", "std", "std %")
-    for name, row in summary["parameters"].items():
-        table.add_row(
-            name, row["unit"], *(_figure(row[k], d) for k, d in (("value", 6), ("std", 3), ("std_percent", 3)))
-        )
-    _print(table)
-    _print(
-        f"method {summary['method']}: relative error {summary['relative_error_percent']:.2f} %,"
-        f" cond(W) = {summary['cond_w']:.2f}, cond(Phi) = {summary['cond_phi']:.2f}"
-    )
-    for name, reason in summary["reasons"].items():
-        _print(f"{name} can't be identified: {reason}")
-    for note in summary["notes"]:
-        _print(note)
-    for check in summary["validation"]:
-        errors = ", ".join(f"{n} {v:.1f} %" for n, v in check["torque_error_percent"].items())
-        _print(f"{check['log']}, not fitted on: torque error {errors}")
-
-
-Advance = Callable[[int, int, float | None], None]
-
-
-@contextmanager
-def _bar(label: str) -> Iterator[Advance]:
-    """A progress bar on stderr, silent where that is no terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
-        task = progress.add_task(label, total=None)
-
-        def advance(done: int, total: int, best: float | None) -> None:
-            text = label if best is None or best == float("inf") else f"{label}, best so far {best:.2f}"
-            progress.update(task, completed=done, total=total, description=text)
-
-        yield advance
-
-
-@contextmanager
-def _busy(label: str) -> Iterator[None]:
-    with _bar(label):
-        yield
 
 
 # ------------------------------------------------------------------------------------------------ errors

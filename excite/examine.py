@@ -174,7 +174,7 @@ def _torque_name(model: Model, row: int) -> str:
 def late_channels(model: Model, log: Log, filter: Filter | None = None) -> tuple[str, ...]:
     """A remark for every torque channel that is late or early beyond doubt."""
     return tuple(
-        f"{log.source}: {d.name} is {abs(d.value) * 1e3:.1f} ms (+-{d.std * 1e3:.1f})"
+        f"{log.source}: {d.name} is {abs(d.value) * 1e3:.1f} ms (+-{d.std * 1e3:.1g})"
         f" {'late' if d.value > 0 else 'early'} against the motion: shift the channel, or run `excite diagnose`"
         for d in delays(model, log, filter)
         if d.significant

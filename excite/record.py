@@ -20,7 +20,6 @@ from model.machine import Filter, Sensor
 from model.prediction import Model
 
 EDGE = 0.29  # least standard deviation of an encoder edge [counts]
-QUIET = 1e-3  # noise that a log without any is taken to have, in the data sheet's
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,171 @@
+"""What people see in the terminal: tables, sentences, progress; nothing but JSON where JSON is asked for."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+POOR = 5.0  # standard deviation [%] that a condition number should not hide
+
+
+def say(thing: object) -> None:
+    """Prints a line or a table."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    if console.is_terminal:
+        console.print(thing)
+    else:  # a pipe or file has no width: whole lines, whole tables
+        Console(highlight=False, width=200).print(thing, soft_wrap=True)
+
+
+def show_json(summary: dict[str, Any]) -> None:
+    """The summary as JSON on stdout and nothing else."""
+    from excite import folder
+
+    sys.stdout.write(folder.dump(summary))
+
+
+def finish(summary: dict[str, Any], out: Path, json: bool, show: Callable[[dict[str, Any]], None]) -> None:
+    """The end of a command: its summary as JSON, or shown with the folder that was written."""
+    if json:
+        show_json(summary)
+        return
+    show(summary)
+    say(f"written to {out}/")
+
+
+def table(*names: str) -> Any:
+    """An empty table with these columns."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD)
+    for k, name in enumerate(names):
+        table.add_column(name, justify="left" if k == 0 or name == "what it is" else "right")
+    return table
+
+
+def rounded(value: object, digits: int = 4) -> str:
+    """A number to so many digits, a dash where there is none."""
+    if value is None or (isinstance(value, float) and value != value):
+        return "-"
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+
+
+def design_table(summary: dict[str, Any]) -> None:
+    """A design in sentences: score, limits, what accuracy it makes attainable."""
+    kept = (
+        "all limits kept"
+        if summary["max_violation"] <= 1e-3
+        else f"limits exceeded by {100 * summary['max_violation']:.2f} %"
+    )
+    sigma = summary["sigma_percent"]
+    worst = max(sigma, key=lambda name: sigma[name])
+    middle = sorted(sigma.values())[len(sigma) // 2]
+    say(
+        f"{summary['machine']} {summary['problem']}: cond(Phi) = {summary['cond_phi']:.2f} (best start"
+        f" {summary['cond_phi_start']:.0f}), {summary['duration_s']:g} s, {kept}, designed in {summary['wall_s']:.1f} s"
+    )
+    if not summary["complete"]:
+        say("cut short: this is the best drive so far, more time may find a better one")
+    say(
+        f"attainable accuracy (Cramer-Rao, one standard deviation): worst {worst} {sigma[worst]:.2g} %,"
+        f" median {middle:.2g} %"
+    )
+    if summary["objective"] == "cond" and sigma[worst] > POOR:
+        say(f"a low cond(Phi) hides poor accuracy here: {worst} can't be found better than {sigma[worst]:.2g} %")
+
+
+def verify_table(summary: dict[str, Any]) -> None:
+    """A verification, a parameter a line, and which ones are biased."""
+    rows = table("parameter", "unit", "true", "mean", "bias %", "spread %", "predicted %", "coverage %")
+    for name, row in summary["parameters"].items():
+        rows.add_row(
+            name,
+            row["unit"],
+            rounded(row["true"], 6),
+            rounded(row["mean"], 6),
+            rounded(row["bias_percent"], 3),
+            rounded(row["std_percent"], 3),
+            rounded(row["predicted_std_percent"], 3),
+            rounded(100 * row["coverage95"], 3),
+        )
+    say(f"{summary['runs']} simulated runs, method {summary['method']}, kit {summary['kit']}")
+    say(rows)
+    if summary["biased"]:
+        say(f"biased, the intervals do not hold: {', '.join(summary['biased'])}")
+    if summary["failed"]:
+        say(f"{summary['failed']} runs gave no estimate")
+
+
+def compare_table(summary: dict[str, Any]) -> None:
+    """A comparison, a drive a line."""
+    rows = table("drive", "cond(Phi)", "cond(W)", "worst std %", "median std %", "kept", "limit broken", "time s")
+    for row in summary["designs"]:
+        rows.add_row(
+            row["name"],
+            *(rounded(row[k], 4) for k in ("cond_phi", "cond_w", "worst_std_percent", "median_std_percent")),
+            f"{row['kept']}/{row['samples']}",
+            "-" if row["breaks"] is None else f"{row['breaks']} by {100 * row['max_violation']:.2g} %",
+            f"{row['wall_s']:.1f}",
+        )
+    say(f"{summary['machine']} {summary['problem']}: the designed drive and the usual ones")
+    say(rows)
+    ratio = summary["ratio_equal_time"]
+    if ratio < float("inf"):
+        say(f"the best usual drive found in the same time has {ratio:.2g} times the designed one's cond(Phi)")
+    else:
+        say("no usual drive found in the same time keeps every limit")
+
+
+def identify_table(summary: dict[str, Any]) -> None:
+    """An estimate, a parameter a line, with what there is to remark."""
+    rows = table("parameter", "unit", "value", "std", "std %")
+    for name, row in summary["parameters"].items():
+        rows.add_row(
+            name, row["unit"], *(rounded(row[k], d) for k, d in (("value", 6), ("std", 3), ("std_percent", 3)))
+        )
+    say(rows)
+    say(
+        f"method {summary['method']}: relative error {summary['relative_error_percent']:.2f} %,"
+        f" cond(W) = {summary['cond_w']:.2f}, cond(Phi) = {summary['cond_phi']:.2f}"
+    )
+    for name, reason in summary["reasons"].items():
+        say(f"{name} can't be identified: {reason}")
+    for note in summary["notes"]:
+        say(note)
+    for check in summary["validation"]:
+        errors = ", ".join(f"{n} {v:.1f} %" for n, v in check["torque_error_percent"].items())
+        say(f"{check['log']}, not fitted on: torque error {errors}")
+
+
+Advance = Callable[[int, int, float | None], None]
+
+
+@contextmanager
+def bar(label: str) -> Iterator[Advance]:
+    """A progress bar on stderr, silent where that is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        task = progress.add_task(label, total=None)
+
+        def advance(done: int, total: int, best: float | None) -> None:
+            text = label if best is None or best == float("inf") else f"{label}, best so far {best:.2f}"
+            progress.update(task, completed=done, total=total, description=text)
+
+        yield advance
+
+
+@contextmanager
+def busy(label: str) -> Iterator[None]:
+    """A bar for work that can't tell how far it is."""
+    with bar(label):
+        yield
