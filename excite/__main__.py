@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from excite.design import Design
     from excite.identify import Estimate
     from excite.log import Log
-    from excite.verify import Verification
     from model.machine import Filter, Machine, Problem
     from model.prediction import Model
 
@@ -348,8 +347,8 @@ def _sigma(model: Model, result: Design) -> dict[str, float]:
 def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: str, seed: int) -> dict[str, Any]:
     from excite import folder, identify, log, report, sensors
     from excite.simulate import simulate as drive
+    from excite.verify import biased, verify
     from excite.verify import summary as table
-    from excite.verify import verify
     from model.machine import Machine
     from model.prediction import build
 
@@ -372,6 +371,7 @@ def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: s
         result = verify(model, motion, method, kit, runs, seed, progress=lambda done, total: advance(done, total, None))
     if len(result.failures) == runs:
         raise identify.NotIdentifiable(f"all {runs} runs failed, the first one: {result.failures[0]}")
+    parameters = table(result)
     summary = {
         "machine": model.machine.name,
         "problem": before.get("problem"),
@@ -382,8 +382,8 @@ def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: s
         "seed": seed,
         "failed": len(result.failures),
         "failures": result.failures,
-        "parameters": table(result),
-        "biased": _biased(result),
+        "parameters": parameters,
+        "biased": biased(parameters),
         "versions": _versions(),
     }
     title = f"{model.machine.title}: {runs} simulated runs, {method}, kit {kit}"
@@ -482,18 +482,6 @@ def _check(model: Model, one: Log, estimate: Estimate, chosen: Filter) -> dict[s
             n: {"rms": r, "unit": u} for n, r, u in zip(signals.names, signals.rms, signals.units, strict=True)
         }
     }
-
-
-def _biased(v: Verification) -> list[str]:
-    """Parameters whose mean error is more than one predicted standard deviation, and beyond chance."""
-    from excite.verify import summary
-
-    return [
-        name
-        for name, row in summary(v).items()
-        if abs(float(row["bias_percent"]))
-        > max(float(row["predicted_std_percent"]), 4 * float(row["bias_std_percent"]))
-    ]
 
 
 def _check_needs(model: Model, method: str, kit: str) -> None:

@@ -28,9 +28,9 @@ import scipy.optimize
 
 from excite import interior, manoeuvre, objective, smoothing
 from excite.collocation import UnsettledError, settle, transcribe
-from excite.design import MARGIN, TOLERANCE, Candidate, Track, design, land
+from excite.design import MARGIN, TOLERANCE, Candidate, Track, design, land, typical_sizes, verdict
 from excite.driver import follow
-from excite.limit import check, limits, placed, symbols
+from excite.limit import check, limits, symbols
 from excite.manoeuvre import Manoeuvre, scaled
 from excite.simulate import Motion, SimulationError, simulate
 from model.machine import Problem
@@ -293,7 +293,7 @@ def within(model: Model, problem: Problem, wish: Manoeuvre) -> Candidate:
     """The drive of a wish that keeps every limit, as this module's docstring says; else the one that exceeds least."""
     small = shrunk(model, problem, wish)
     found, motion = judge(model, problem, small)
-    track = Track(0, found.score, _sizes(model, problem, motion), found, found, motion, motion.t)
+    track = Track(0, found.score, typical_sizes(model, problem, motion), found, found, motion, motion.t)
     margins: dict[str, float] = {}
     least = found
     for attempt in range(ATTEMPTS):
@@ -311,25 +311,8 @@ def within(model: Model, problem: Problem, wish: Manoeuvre) -> Candidate:
 
 
 def judge(model: Model, problem: Problem, drive: Manoeuvre) -> tuple[Candidate, Motion]:
-    """The fresh simulation of a drive, placed on the lane as well as can be."""
-    torque = drive.sample(float(model.machine.sampling_hz))
-    motion = simulate(model, torque)
-    start = placed(model, problem, motion)
-    if not np.array_equal(start, motion.q[0]):
-        motion = simulate(model, torque, q0=start)
-    P = objective.phi(model, motion)
-    return Candidate(drive, start, objective.value("cond", P.T @ P), check(model, problem, motion)), motion
-
-
-def _sizes(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
-    sizes = {}
-    for k, c in enumerate(model.coordinates):
-        sizes[c] = max(1e-3, 2 * float(np.sqrt((motion.q[:, k] ** 2).mean())))
-        sizes[c + "'"] = max(1e-3, 2 * float(np.sqrt((motion.nu[:, k] ** 2).mean())))
-    if model.machine.planar:
-        x, y, heading = model.machine.body[0].coordinates
-        sizes |= {x: problem.lane_m[0] / 2, y: problem.lane_m[1] / 2, heading: 1.0}
-    return sizes
+    """A design's own verdict on a drive: simulated afresh, placed on the lane as well as can be, scored by cond."""
+    return verdict(model, problem, "cond", drive)
 
 
 def _nearest(

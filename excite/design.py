@@ -270,11 +270,17 @@ def depart(model: Model, problem: Problem, objective: str, number: int, seed: in
     wish = multisine(model, problem, seed, top=0.5)
     for factor in 0.85 ** np.arange(60):
         try:
-            found, motion = _verdict(model, problem, objective, scaled(wish, float(factor)))
+            found, motion = verdict(model, problem, objective, scaled(wish, float(factor)))
         except SimulationError:
             continue
         if all(v == 0 for k, v in found.violations.items() if not k.startswith(("rest", "lane"))):
             break
+    sizes = typical_sizes(model, problem, motion)
+    return Track(number, _objective.cond_phi(model, motion), sizes, found, found, motion, motion.t)
+
+
+def typical_sizes(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
+    """Typical size of every coordinate and velocity (c and c') in a motion; of the pose, half the lane."""
     sizes = {}
     for k, c in enumerate(model.coordinates):
         sizes[c] = max(1e-3, 2 * float(np.sqrt((motion.q[:, k] ** 2).mean())))
@@ -282,7 +288,7 @@ def depart(model: Model, problem: Problem, objective: str, number: int, seed: in
     if model.machine.planar:
         x, y, heading = model.machine.body[0].coordinates
         sizes |= {x: problem.lane_m[0] / 2, y: problem.lane_m[1] / 2, heading: 1.0}
-    return Track(number, _objective.cond_phi(model, motion), sizes, found, found, motion, motion.t)
+    return sizes
 
 
 def search(
@@ -346,7 +352,7 @@ def land(model: Model, problem: Problem, objective: str, track: Track, over: Cal
             off = np.abs(x0) > 0.5  # what is at rest already needs no torque
             sizes = np.linalg.lstsq(J[off], -x0[off], rcond=1e-3)[0]
             added = sum((size * s for size, s in zip(sizes, shapes, strict=True)), np.zeros_like(drive.torque))
-            found, motion = _verdict(model, problem, objective, Manoeuvre(drive.times, drive.torque + added))
+            found, motion = verdict(model, problem, objective, Manoeuvre(drive.times, drive.torque + added))
         except SimulationError:
             break
         if _rank(found) >= _rank(track.latest):
@@ -440,7 +446,7 @@ def _advance(
         point = interior.begin(tr, task, point.start, point.Z, point.U, max(stage.barrier, 1e-4), 0.05)
         point, _ = interior.minimise(tr, task, point, levels, watch)
     try:
-        found, motion = _verdict(model, problem, objective, Manoeuvre(times, point.U * tr.torque_scale))
+        found, motion = verdict(model, problem, objective, Manoeuvre(times, point.U * tr.torque_scale))
     except SimulationError:
         return None
     return replace(
@@ -453,7 +459,7 @@ def _advance(
     )
 
 
-def _verdict(model: Model, problem: Problem, objective: str, drive: Manoeuvre) -> tuple[Candidate, Motion]:
+def verdict(model: Model, problem: Problem, objective: str, drive: Manoeuvre) -> tuple[Candidate, Motion]:
     """The fresh simulation of a drive, placed on the lane as well as can be."""
     torque = drive.sample(float(model.machine.sampling_hz))
     motion = simulate(model, torque)

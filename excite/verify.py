@@ -144,3 +144,13 @@ def summary(v: Verification) -> dict[str, dict[str, float | str]]:
             "coverage95": float(np.nanmean(v.covered[:, k])) if some else np.nan,
         }
     return table
+
+
+def biased(table: dict[str, dict[str, float | str]]) -> list[str]:
+    """Parameters of a `summary` whose mean error is more than one predicted standard deviation, and beyond chance."""
+    return [
+        name
+        for name, row in table.items()
+        if abs(float(row["bias_percent"]))
+        > max(float(row["predicted_std_percent"]), 4 * float(row["bias_std_percent"]))
+    ]
