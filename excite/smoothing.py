@@ -17,7 +17,7 @@ import numpy as np
 
 from excite import chain
 from excite.estimate import Estimate, NoEstimate, NotIdentifiable
-from excite.linearise import Chart, advance, chart, differentiate
+from excite.linearise import BATCH, Chart, advance, chart, differentiate
 from excite.log import Log
 from excite.processing import decimate
 from excite.record import (
@@ -46,8 +46,8 @@ SETTLED = 3  # passes until the states fit the dynamics well enough to tell whic
 UNSEEN = 1.0  # a parameter that a log tells less than this well, in its scale, stays at the machine file's value
 DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's scale, and its share from pass to pass
 HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
-# A step this small against the standard deviations ends the iteration, with disturbing forces five times that.
-CONVERGED = 0.01
+# Left undone at the end of the iteration, in standard deviations; with disturbing forces two and a half times that.
+CONVERGED = 0.02
 LARGEST_STEP = 0.5  # of a parameter in one pass, relative to its size
 # Disturbing forces where the model is not trusted, white from sample to sample, as accelerations [m/s2, rad/s2]: on a
 # roller of 11 t they are 500 N. Four and sixteen times that until the innovations are what they should be.
@@ -60,7 +60,7 @@ DOUBT = (
     "the log shows something that the model doesn't know, so the intervals do not hold: these values allow for"
     " disturbing forces, and are right as far as it is forces that disturb; run `excite diagnose`"
 )
-PART = 100  # samples at a time: their chain stays in the processor's cache
+PART = 200  # samples at a time: their chain stays in the processor's cache
 # Of the first state about the filtered log. Not wider: where the contact is stiff, at standstill, nothing is seen of
 # the first speeds, which are gone within milliseconds, and an iteration would play with them for ever.
 SPREAD_SPEED, SPREAD_ANGLE = 0.05, 0.1
@@ -266,33 +266,37 @@ def _linearise(
     S, unit = H * scale, one_count(c, r)
     parts, stages, gains = [_known_before(c, p, first, 1 + n_p + n_o)], [], []
     N = len(p.s)
-    for k in range(0, N - 1, PART):
-        end = min(k + PART, N - 1)
-        # The last part ends with the last sample, from which nothing leads on.
-        own = slice(k, end if end < N - 1 else N)
-        J, eta = _seen(S[own], weight[own], residual[own], D * unit, n_p)
-        A, C = np.zeros((2, *J.shape))
-        b = np.zeros_like(eta)
-        by = differentiate(c, p.s[k : end + 1], u[k : end + 1], X, disturbed > 0)
+    for at in range(0, N - 1, BATCH):
+        until = min(at + BATCH, N - 1)
+        by = differentiate(c, p.s[at : until + 1], u[at : until + 1], X, disturbed > 0)
         gain = by.B * r.noise.torque / scale[:, None]
-        on = slice(0, end - k)
-        A[on] = by.A * scale / scale[:, None]
-        C[on] = gain @ gain.transpose(0, 2, 1)
+        C = gain @ gain.transpose(0, 2, 1)
         if disturbed > 0:
             push = by.F * (disturbed * DISTURBANCE * c.inertia) / scale[:, None]
-            C[on] += push @ push.transpose(0, 2, 1)
-        b[on, :, 0] = defect[k:end] / scale - (gain @ (p.w[k:end] / r.noise.torque)[:, :, None])[:, :, 0]
-        b[on, :, 1 : 1 + n_p] = (by.X - by.B @ c.offsets) * (c.model.scale / scale[:, None])
+            C += push @ push.transpose(0, 2, 1)
+        A = by.A * (scale / scale[:, None])
+        b = np.zeros((until - at, c.n, 1 + n_p + n_o))
+        b[:, :, 0] = defect[at:until] / scale - (gain @ (p.w[at:until] / r.noise.torque)[:, :, None])[:, :, 0]
+        b[:, :, 1 : 1 + n_p] = (by.X - by.B @ c.offsets) * (c.model.scale / scale[:, None])
         gains.append(gain)
-        stages.append(chain.Stages(A, b, C, eta, J))
-        parts.append(chain.section(stages[-1]))
+        for k in range(at, until, PART):
+            end = min(k + PART, until)
+            J, eta = _seen(S[k:end], weight[k:end], residual[k:end], D * unit, n_p)
+            own = slice(k - at, end - at)
+            stages.append(chain.Stages(A[own], b[own], C[own], eta, J))
+            parts.append(chain.section(stages[-1]))
+    # From the last sample nothing leads on.
+    J, eta = _seen(S[-1:], weight[-1:], residual[-1:], D * unit, n_p)
+    none = np.zeros_like(J)
+    stages.append(chain.Stages(none, np.zeros_like(eta), none, eta, J))
+    parts.append(chain.section(stages[-1]))
     solved = chain.solve(parts)
     # What the readings say of the offsets directly; base parameters act through the states alone.
     flat = np.concatenate([residual[:, :, None], np.broadcast_to(-D * unit, (*residual.shape, n_o))], axis=2)
     flat = (flat * np.sqrt(weight)[:, :, None]).reshape(-1, 1 + n_o)
     Z = solved.Z.copy()
-    at = np.concatenate([[0], np.arange(1 + n_p, 1 + n_p + n_o)])
-    Z[np.ix_(at, at)] += flat.T @ flat
+    place = np.concatenate([[0], np.arange(1 + n_p, 1 + n_p + n_o)])
+    Z[np.ix_(place, place)] += flat.T @ flat
     return Linear(solved, Z, np.concatenate(gains), tuple(stages), S, weight, residual)
 
 
@@ -375,8 +379,10 @@ def _iterate(
             [_moved(c, r, p, f, m) for r, p, f, m in zip(records, points, linear, move, strict=True)],
             X + move[0][: len(X)] * model.scale,
         )
-        small = CONVERGED if disturbed == 0 else 5 * CONVERGED
-        if step < small or (step < 10 * small and step * step / before < small / 10):
+        # What this step will have left undone, if steps go on shrinking as they do.
+        ratio = min(step / before, 0.9)
+        small = CONVERGED if disturbed == 0 else 2.5 * CONVERGED
+        if step < 10 * small and step * ratio / (1 - ratio) < small:
             base = covariance[: len(X), : len(X)] * np.outer(model.scale, model.scale)
             return Fit(there[1], base, unseen, tuple(there[0]), tuple(linear))
     raise NotConverged(
