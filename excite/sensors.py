@@ -35,29 +35,19 @@ def measure(
 
 
 def signals(model: Model, motion: Motion, X: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """What ideal sensors would read, (N,) each by sensor name [SI]; torques include the offset u0."""
-    machine = model.machine
+    """What ideal sensors would read, (N,) each by sensor name [SI]; torques include the offset u0.
+
+    Effects that sit in a sensor are in its reading.
+    """
     X = model.nominal if X is None else X
-    standard = dict(zip(model.base.standard, model.expand @ X, strict=True))
-    speeds = model.kinematics(motion.q.T, motion.nu.T)[4].full().reshape(3, len(motion.t), len(machine.body))
-    wheels = [s.name for s in machine.sensor if s.kind == "wheel"]
-    root = machine.body[0]
-    values: dict[str, np.ndarray] = {}
-    for sensor in machine.sensors("full"):
-        body = machine.find(sensor.body)
-        if sensor.kind == "angle":
-            values[sensor.name] = motion.q[:, model.coordinates.index(body.coordinates[0])]
-        elif sensor.kind == "wheel":
-            values[sensor.name] = motion.wheels[:, wheels.index(sensor.name)]
-        elif sensor.kind == "torque":
-            k = model.inputs.index(f"u{body.index}")
-            values[sensor.name] = motion.u[:, k] + standard[f"u{body.index}0"]
-        elif sensor.kind == "yaw_rate":
-            values[sensor.name] = motion.nu[:, model.coordinates.index(root.coordinates[2])]
-        elif sensor.kind == "lateral_speed":
-            values[sensor.name] = speeds[1, :, machine.body.index(body)]
-        else:
-            values[sensor.name] = motion.q[:, model.coordinates.index(root.coordinates["xy".index(sensor.kind)])]
+    arrays = (motion.q, motion.nu, motion.wheels, motion.u, motion.memory)
+    values = dict(zip(model.readable, model.read(*(x.T for x in arrays), X).full(), strict=True))
+    gain, offset, delay = (x.full() for x in model.channels(motion.t[None], X))
+    for sensor in model.machine.sensors("full"):
+        if sensor.kind == "torque":
+            k = model.inputs.index(f"u{sensor.body}")
+            late = np.interp(motion.t - delay[k], motion.t, motion.u[:, k])
+            values[sensor.name] = gain[k] * late + offset[k]
     return values
 
 

@@ -51,7 +51,8 @@ class Motion:
     """A motion at the samples t (N,) [s].
 
     q (N, n_q) coordinates [rad, m], nu (N, n_q) velocities and a (N, n_q) their derivatives (a planar root's in its
-    own axes), u (N, n_u) delivered torques [N m], wheels (N, n_wheels) angles of the measuring wheels [rad].
+    own axes), u (N, n_u) delivered torques [N m], wheels (N, n_wheels) angles of the measuring wheels [rad]; memory
+    (N, n_z): what effects remember.
     """
 
     t: np.ndarray
@@ -60,6 +61,7 @@ class Motion:
     a: np.ndarray
     u: np.ndarray
     wheels: np.ndarray
+    memory: np.ndarray
 
 
 def simulate(
@@ -101,12 +103,13 @@ def respond(
     n_u, n_q = len(model.inputs), len(model.coordinates)
     rate = float(model.machine.sampling_hz)
     step, n_w = _step(model)
-    state = np.zeros(2 * n_q + n_w)
+    state = np.zeros(2 * n_q + n_w + len(model.memory))
     state[:n_q] = 0.0 if q0 is None else q0
     state[n_q : 2 * n_q] = 0.0 if nu0 is None else nu0
+    state[2 * n_q + n_w :] = model.fresh
     driven = np.empty((samples, n_u))
     history = _integrate(step, state, driven, torque, parameters, 1.0 / rate)
-    q, nu, wheels = np.split(history, [n_q, 2 * n_q], axis=1)
+    q, nu, wheels, memory = np.split(history, [n_q, 2 * n_q, 2 * n_q + n_w], axis=1)
     # an L-stable step damps even what must blow up, so a mass matrix that isn't one has to be looked for
     solid = (model.pivots(q.T, parameters).full() > 0).all(axis=0)
     if not solid.all():
@@ -114,8 +117,9 @@ def respond(
             f"the mass matrix is not positive definite at t = {int(np.argmin(solid)) / rate:g} s: masses and inertias"
             " must be physically possible, check the parameters"
         )
-    a = model.acceleration(q.T, nu.T, driven.T, parameters).full().T
-    return Motion(np.arange(samples) / rate, q, nu, a, driven, wheels)
+    beside = () if model.plain else (memory.T,)
+    a = model.acceleration(q.T, nu.T, driven.T, *beside, parameters).full().T
+    return Motion(np.arange(samples) / rate, q, nu, a, driven, wheels, memory)
 
 
 def _integrate(
@@ -170,18 +174,20 @@ def _integrate(
 def _step(model: Model) -> tuple[ca.Function, int]:
     """One step (state, u, du/dt, h, X) -> state after h, its error over the tolerance.
 
-    Rosenbrock for the speeds and the coordinates that the forces depend on. The others (pose, angles of rolls and
-    measuring wheels) are integrals of these, by the Hermite quadrature h/2 (f0 + f1) + h^2/12 (f0' - f1').
+    Rosenbrock for the speeds, what effects remember, and the coordinates that the forces depend on. The others (pose,
+    angles of rolls and measuring wheels) are integrals of these, by the Hermite quadrature
+    h/2 (f0 + f1) + h^2/12 (f0' - f1').
     """
     n_q, n_u = len(model.coordinates), len(model.inputs)
     q, nu, _ = model.symbols()
-    u, X = ca.SX.sym("u", n_u), ca.SX.sym("X", len(model.base.names))
+    u, X, z = ca.SX.sym("u", n_u), ca.SX.sym("X", len(model.base.names)), ca.SX.sym("z", len(model.memory))
     dq, _, wheels, *_ = model.kinematics(q, nu)
     n_w = wheels.numel()
-    state = ca.vertcat(q, nu, ca.SX.sym("w", n_w))
-    a = model.accelerate(q, nu, u, X)
-    rhs = ca.vertcat(dq, a, wheels)
+    state = ca.vertcat(q, nu, ca.SX.sym("w", n_w), z)
+    a = model.accelerate(q, nu, u, X, z)
+    rhs = ca.vertcat(dq, a, wheels, model.flow(q, nu, u, z, X))
     core = [k for k, c in enumerate(model.coordinates) if c in model.felt] + list(range(n_q, 2 * n_q))
+    core += range(2 * n_q + n_w, state.numel())
     rest = [k for k in range(state.numel()) if k not in core]
     rate = ca.Function("rate", [state, u, X], [rhs[core]], {"cse": True})
     jacobian = ca.Function(

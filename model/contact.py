@@ -44,11 +44,22 @@ def slip(contact: Contact, Vx: ca.SX, Vy: ca.SX, spin: ca.SX) -> Slip:
     return Slip((Vx - rim) / vn, Vy / vn, vn)
 
 
-def wrench(contact: Contact, s: Slip, yaw_rate: ca.SX, Kx: ca.SX, Ky: ca.SX, saturation: ca.SX | None = None) -> Wrench:
+def wrench(
+    contact: Contact,
+    s: Slip,
+    yaw_rate: ca.SX,
+    Kx: ca.SX,
+    Ky: ca.SX,
+    saturation: ca.SX | None = None,
+    lateral: ca.SX | None = None,
+) -> Wrench:
     """What the soil does to the roll; yaw_rate [rad/s] of its chassis; Kx, Ky [N] < 0.
 
-    Linear (24, 25), or with `saturation` = K / xi_s the exponential law (18) integrated over the patch.
+    Linear (24, 25), or with `saturation` = K / xi_s the exponential law (18) integrated over the patch. `lateral`: the
+    same for the lateral force alone, as a factor on it.
     """
+    if lateral is not None:
+        Ky = Ky * mobilised(ca.sqrt(s.gy**2 + 1e-12) / lateral)
     if saturation is None:
         Tz = Kx * (float(contact.width) ** 2 / 12) * (-yaw_rate) / s.vn
         return Wrench(Kx * s.gx, Ky * s.gy, Tz)

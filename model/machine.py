@@ -325,6 +325,16 @@ class Problem(Record):
         return self
 
 
+class EffectEntry(Record):
+    """An effect that the machine has beyond the plain model: its name in the catalogue, place, amount and shapes."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+    where: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
+    amount: Quantity
+    std: NotNegative | None = None
+    shape: dict[str, Quantity] = {}
+
+
 class Machine(Record):
     """A machine as its file describes it. Frozen; `locked` coordinates are held at zero."""
 
@@ -343,6 +353,7 @@ class Machine(Record):
     problems: dict[str, Problem] = {}
     parameter_names: dict[str, str] = {}
     scale: dict[str, Positive] = {}
+    effect: tuple[EffectEntry, ...] = ()
 
     def find(self, index: int) -> Body:
         """The body with this index. Raises KeyError."""

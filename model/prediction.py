@@ -2,19 +2,21 @@
 
 Rows are the equations of motion written as the paper identifies them: an actuated row predicts the measured torque
 (dynamics + friction - contact + offset u0), any other row predicts zero. The regressor is the exact Jacobian of that
-prediction; nothing in the project spells the physics a second time.
+prediction; nothing in the project spells the physics a second time. Effects of the machine file (`effects`) are part of
+the prediction, and their amounts are parameters like the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
 from model import contact, tree
+from model import effects as catalogue
 from model.machine import Body, Machine, MachineError
 
 
@@ -76,7 +78,12 @@ class Model:
 
     Samples: q (n_q,) coordinates [rad, m] with the pose on the ground; nu (n_q,) velocities and a (n_q,) their time
     derivatives, those of a planar root in its own axes; u (n_u,) torques that the motors deliver [N m]. Functions
-    take (n_q, N) batches as they are. `nominal`, `scale`: (n_base,), of the base parameters X.
+    take (n_q, N) batches as they are. `nominal`, `scale`: (n_base,), of the base parameters X, behind which come the
+    amounts of the machine's effects. With effects, functions of a sample take two more arguments, `beside`: u, and
+    what the effects remember, z (n_z,), whose rates are `flow` (q, nu, u, z, X) and which starts as `fresh`.
+
+    read: (q, nu, wheels, u, z, X) -> exact readings of the sensors that `readable` names. channels: (t, X) -> gain,
+    offset, delay (n_u,) of the torque sensors.
     """
 
     machine: Machine
@@ -90,6 +97,23 @@ class Model:
     standard_regressor: ca.Function
     kinematics: ca.Function
     nonlinear: tuple[str, ...]
+    balance: ca.Function
+    flow: ca.Function
+    read: ca.Function
+    channels: ca.Function
+    readable: tuple[str, ...]
+    memory: tuple[str, ...]
+    effects: tuple[catalogue.Placed, ...]
+
+    @property
+    def plain(self) -> bool:
+        """Whether the machine file names no effect."""
+        return not self.effects
+
+    @property
+    def fresh(self) -> np.ndarray:
+        """What effects remember at rest, before a log begins (n_z,)."""
+        return np.zeros(len(self.memory))
 
     @cached_property
     def rows(self) -> tuple[str, ...]:
@@ -115,17 +139,21 @@ class Model:
         With a batch of N samples the result is (n_rows, n_base N), sample after sample.
         """
         q, nu, a = self.symbols()
-        W = self.standard_regressor(q, nu, a, ca.DM(self.expand @ self.nominal))
+        beside = self.beside()
+        W = self.standard_regressor(q, nu, a, ca.DM(self.expand @ self.nominal), *beside)
+        names = ["q", "nu", "a", "u", "z"][: 3 + len(beside)]
         return ca.Function(
-            "regressor", [q, nu, a], [ca.mtimes(W, ca.sparsify(ca.DM(self.expand)))], ["q", "nu", "a"], ["W"]
+            "regressor", [q, nu, a, *beside], [ca.mtimes(W, ca.sparsify(ca.DM(self.expand)))], names, ["W"]
         )
 
     @cached_property
     def acceleration(self) -> ca.Function:
-        """(q, nu, u, X) -> a: forward dynamics, mass matrix solved by LDL'."""
+        """(q, nu, u, z, X) -> a, without z for a plain model: forward dynamics, mass matrix solved by LDL'."""
         q, nu, _ = self.symbols()
         u, X = ca.SX.sym("u", len(self.inputs)), ca.SX.sym("X", len(self.base.names))
-        return ca.Function("acceleration", [q, nu, u, X], [self.accelerate(q, nu, u, X)], ["q", "nu", "u", "X"], ["a"])
+        z = () if self.plain else (ca.SX.sym("z", len(self.memory)),)
+        names = ["q", "nu", "u", *["z" for _ in z], "X"]
+        return ca.Function("acceleration", [q, nu, u, *z, X], [self.accelerate(q, nu, u, X, *z)], names, ["a"])
 
     @cached_property
     def felt(self) -> tuple[str, ...]:
@@ -134,11 +162,13 @@ class Model:
         """
         q, nu, a = self.symbols()
         p = ca.DM(self.expand @ self.nominal)
-        slope = ca.Function("slope", [q, nu, a], [ca.jacobian(self.predict(q, nu, a, p), q)])
+        beside = self.beside()
+        slope = ca.Function("slope", [q, nu, a, *beside], [ca.jacobian(self.predict(q, nu, a, p, *beside), q)])
         rng = np.random.default_rng(0)
         change = np.zeros(len(self.coordinates))
         for _ in range(5):
-            at = slope(*rng.uniform(-1, 1, (3, len(self.coordinates)))).full()
+            outside = [rng.uniform(0.1, 1, x.numel()) for x in beside]
+            at = slope(*rng.uniform(-1, 1, (3, len(self.coordinates))), *outside).full()
             change = np.maximum(change, np.abs(at).max(axis=0))
         floor = 1e-9 * float(np.abs(self.nominal).max())
         return tuple(c for c, size in zip(self.coordinates, change, strict=True) if size > floor)
@@ -151,31 +181,40 @@ class Model:
         D, _, _ = ca.ldl(self.equations(q, nu, X)[0])
         return ca.Function("pivots", [q, X], [D], ["q", "X"], ["D"])
 
-    def accelerate(self, q: ca.SX, nu: ca.SX, u: ca.SX, X: ca.SX | ca.DM) -> ca.SX:
+    def accelerate(self, q: ca.SX, nu: ca.SX, u: ca.SX, X: ca.SX | ca.DM, z: ca.SX | None = None) -> ca.SX:
         """Forward dynamics as an expression; with numbers for X the graph is smaller and faster."""
-        M, bias = self.equations(q, nu, X)
+        M, bias = self.equations(q, nu, X, u, z)
         drive = ca.SX(len(self.coordinates), 1)
         for k, row in enumerate(self.actuated):
             drive[row] = u[k]
         D, L, order = ca.ldl(M)
         return ca.ldl_solve(drive - bias, D, L, order)
 
-    def equations(self, q: ca.SX, nu: ca.SX, X: ca.SX | ca.DM) -> tuple[ca.SX, ca.SX]:
-        """Mass matrix (n_q, n_q) and bias (n_q,) without the offsets u0: M a + bias = delivered torques."""
+    def equations(
+        self, q: ca.SX, nu: ca.SX, X: ca.SX | ca.DM, u: ca.SX | None = None, z: ca.SX | None = None
+    ) -> tuple[ca.SX, ca.SX]:
+        """Mass matrix (n_q, n_q) and bias (n_q,): M a + bias = the torques u that the sensors feel, flaws aside.
+
+        Of effects that answer to torques or remember, u and z are zero where not given.
+        """
         p = ca.mtimes(ca.sparsify(ca.DM(self.expand)), X)
-        for body in self.machine.actuated:
-            p[self.base.standard.index(f"u{body.index}0")] = 0
         a = ca.SX.sym("a", len(self.coordinates))
-        return ca.jacobian(self.predict(q, nu, a, p), a), self.predict(q, nu, 0, p)
+        none = (ca.SX.zeros(len(self.inputs)), ca.SX.zeros(len(self.memory)))
+        beside = () if self.plain else (none[0] if u is None else u, none[1] if z is None else z)
+        return ca.jacobian(self.balance(q, nu, a, p, *beside), a), self.balance(q, nu, 0, p, *beside)
+
+    def beside(self) -> tuple[ca.SX, ...]:
+        """Symbols of what functions of a sample take beside q, nu and a: u and z with effects, nothing without."""
+        return () if self.plain else (ca.SX.sym("u", len(self.inputs)), ca.SX.sym("z", len(self.memory)))
 
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         n = len(self.coordinates)
         return ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
 
-    def stacked(self, q: np.ndarray, nu: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """The regressor of N samples (n_q, N) as (N, n_rows, n_base)."""
+    def stacked(self, q: np.ndarray, nu: np.ndarray, a: np.ndarray, *beside: np.ndarray) -> np.ndarray:
+        """The regressor of N samples (n_q, N) as (N, n_rows, n_base); with effects also u (n_u, N), z (n_z, N)."""
         n = q.shape[1]
-        W: np.ndarray = self.regressor(q, nu, a).full()
+        W: np.ndarray = self.regressor(q, nu, a, *beside).full()
         return W.reshape(W.shape[0], n, len(self.base.names)).transpose(1, 0, 2)
 
     def base_values(self, standard: Mapping[str, float] | None = None) -> np.ndarray:
@@ -186,50 +225,77 @@ class Model:
         return X
 
 
-def build(machine: Machine) -> Model:
-    """The equations of a machine, with its base parameters found numerically. Raises MachineError if none is left."""
-    names = machine.coordinates
-    n = len(names)
-    q, nu, a = ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
+@dataclass(frozen=True)
+class _Sample:
+    """The symbols of one sample, and the machine's motion in it."""
+
+    machine: Machine
+    q: ca.SX
+    nu: ca.SX
+    a: ca.SX
+    u: ca.SX
+    p: ca.SX
+    wheels: ca.SX
+    at: dict[str, ca.SX]
+    rate: dict[str, ca.SX]
+    by_name: dict[str, ca.SX]
+    frames: dict[int, tree.Frame]
+    gravity: ca.SX
+    heading: ca.SX
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.machine.coordinates
+
+    def row(self, body: Body) -> int:
+        return self.names.index(body.coordinates[0])
+
+
+@dataclass(frozen=True)
+class _Acting:
+    """An effect in a sample: what it sees, and its amount and shapes."""
+
+    placed: catalogue.Placed
+    scene: catalogue.Scene
+    values: catalogue.Values
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """A machine's functions of one sample, with standard parameters p in place of base parameters."""
+
+    sample: _Sample
+    inputs: tuple[str, ...]
+    slips: Mapping[str, ca.SX]
+    predict: ca.Function
+    standard_regressor: ca.Function
+    balance: ca.Function
+    flow: ca.Function
+    read: ca.Function
+    channels: ca.Function
+    readable: tuple[str, ...]
+    memory: tuple[str, ...]
+    nonlinear: tuple[str, ...]
+
+
+def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
+    """The equations of a machine, with its base parameters found numerically.
+
+    The amounts of its effects are parameters behind the base parameters; without `flaws` those of effects that sit in
+    a sensor only, which no equation of motion shows, are constants; with `shapes` the shapes of effects are parameters
+    as well. Raises MachineError if no parameter is left, or for an effect that the machine can't have.
+    """
     table = standard_parameters(machine)
     _check_names(machine, tuple(table))
-    p = ca.SX.sym("p", len(table))
-    by_name = dict(zip(table, ca.vertsplit(p), strict=True))
-    full = {c: ca.SX(0) for b in machine.body for c in b.coordinates}
-    at = full | dict(zip(names, ca.vertsplit(q), strict=True))
-    rate = full | dict(zip(names, ca.vertsplit(nu), strict=True))
-    accel = full | dict(zip(names, ca.vertsplit(a), strict=True))
-
-    heading = at[machine.body[0].coordinates[2]] if machine.planar else ca.SX(0)
-    gravity = tree.rot_z(-heading) @ ca.DM(machine.gravity)
-    frames = tree.motion(machine, at, rate, accel, gravity)
-    rows = tree.generalised_forces(
-        machine, at, frames, {b.index: tree.inertial_vector(b, by_name) for b in machine.body}
-    )
-    force = ca.vertcat(*[rows[c] for c in names])
-    inputs: list[str] = []
-    for body in machine.body:
-        if body.friction is None or body.coordinates[0] not in names:
-            continue
-        row, w = names.index(body.coordinates[0]), rate[body.coordinates[0]]
-        k = body.index
-        force[row] += by_name[f"Fv{k}"] * w + by_name[f"Fs{k}"] * ca.tanh(w / float(body.friction.smoothing))
-        if body.actuated:
-            force[row] += by_name[f"u{k}0"]
-            inputs.append(f"u{k}")
-    slips: dict[str, ca.SX] = {}
-    for body in machine.contacts:
-        push, slip = _contact(machine, body, frames, nu, by_name)
-        force -= push
-        slips |= {f"gx{body.index}": slip.gx, f"gy{body.index}": slip.gy}
-    if machine.planar and machine.body[0].coordinates[1] in machine.locked:
-        slips = {s: e for s, e in slips.items() if not s.startswith("gy")}
-    predict = ca.Function("predict", [q, nu, a, p], [force], ["q", "nu", "a", "p"], ["Y"])
-    W = ca.Function("standard_regressor", [q, nu, a, p], [ca.jacobian(force, p)], ["q", "nu", "a", "p"], ["W"])
-    curved = ca.which_depends(force, p, 2, False)
-    nominal_p = np.array([v for v, _ in table.values()])
-    base = base_parameters(machine, W, nominal_p, {s: unit for s, (_, unit) in table.items()})
-    nominal = base.matrix @ nominal_p
+    placed = tuple(catalogue.placed(machine, entry) for entry in machine.effect)
+    twice = sorted({e.name for e in placed if [f.name for f in placed].count(e.name) > 1})
+    if twice:
+        raise MachineError(f"{machine.name}: effect: given twice at one place: {', '.join(twice)}")
+    equations = _equations(machine, tuple(table), ())
+    values = np.array([v for v, _ in table.values()])
+    units = {s: unit for s, (_, unit) in table.items()}
+    base = base_parameters(machine, equations.standard_regressor, values, units)
+    nominal = base.matrix @ values
     scale = np.array(
         [float(machine.scale[s]) if s in machine.scale else abs(x) for s, x in zip(base.names, nominal, strict=True)]
     )
@@ -238,19 +304,298 @@ def build(machine: Machine) -> Model:
             raise MachineError(
                 f"{machine.name}: scale.{s}: the nominal value is 0, give a scale > 0 in the machine file"
             )
+    if placed:
+        amounts = _amounts(machine, placed, flaws, shapes)
+        base = _beside_base(base, amounts)
+        nominal = np.concatenate([nominal, [v for v, _, _ in amounts.values()]])
+        scale = np.concatenate([scale, [size for _, _, size in amounts.values()]])
+        equations = _equations(machine, base.standard, placed)
     return Model(
         machine,
-        names,
-        tuple(inputs),
-        tuple(slips),
+        machine.coordinates,
+        equations.inputs,
+        tuple(equations.slips),
         base,
         nominal,
         scale,
-        predict,
-        W,
-        _kinematics(machine, q, nu, at, rate, frames, slips, heading),
-        tuple(s for s, bent in zip(table, curved, strict=True) if bent),
+        equations.predict,
+        equations.standard_regressor,
+        _kinematics(equations.sample, equations.slips),
+        equations.nonlinear,
+        equations.balance,
+        _of_base(equations.flow, base),
+        _of_base(equations.read, base),
+        _of_base(equations.channels, base),
+        equations.readable,
+        equations.memory,
+        placed,
     )
+
+
+def _amounts(
+    machine: Machine, placed: Sequence[catalogue.Placed], flaws: bool, shapes: bool
+) -> dict[str, tuple[float, str, float]]:
+    """Value, unit and typical size of every amount and shape that is a parameter, by name."""
+    found: dict[str, tuple[float, str, float]] = {}
+    for e in placed:
+        if e.effect.sensed and not flaws:
+            continue
+        site = catalogue.Site(machine, machine.find(e.bodies[0]), catalogue.DURATION)
+        for name, (key, unit) in e.parameters.items():
+            if key == "A":
+                size = abs(e.effect.amount(site))
+            elif shapes and not e.effect.shapes[key].whole:
+                shape = e.effect.shapes[key]
+                size = 1.0 if shape.circular else abs(shape.default * shape.size(site)) / 4
+            else:
+                continue
+            found[name] = e.values[key], unit, max(size, abs(e.values[key]) if key == "A" else 0.0)
+    return found
+
+
+def _beside_base(base: BaseParameters, amounts: Mapping[str, tuple[float, str, float]]) -> BaseParameters:
+    """Base parameters with amounts behind them, each standing for itself."""
+    n, k, m = len(base.names), len(base.standard), len(amounts)
+    matrix = np.zeros((n + m, k + m))
+    matrix[:n, :k], matrix[n:, k:] = base.matrix, np.eye(m)
+    return BaseParameters(
+        base.names + tuple(amounts),
+        base.units + tuple(unit for _, unit, _ in amounts.values()),
+        base.independent + tuple(range(k, k + m)),
+        matrix,
+        base.invisible,
+        base.standard + tuple(amounts),
+    )
+
+
+def _of_base(function: ca.Function, base: BaseParameters) -> ca.Function:
+    """A function whose last argument is standard parameters, of base parameters instead."""
+    arguments = function.sx_in()[:-1]
+    X = ca.SX.sym("X", len(base.names))
+    expand = np.zeros((len(base.standard), len(base.names)))
+    expand[list(base.independent), range(len(base.names))] = 1.0
+    results = function.call([*arguments, ca.mtimes(ca.sparsify(ca.DM(expand)), X)])
+    return ca.Function(function.name(), [*arguments, X], results)
+
+
+def _sample(machine: Machine, standard: tuple[str, ...]) -> _Sample:
+    names = machine.coordinates
+    n = len(names)
+    q, nu, a = ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
+    p = ca.SX.sym("p", len(standard))
+    full = {c: ca.SX(0) for b in machine.body for c in b.coordinates}
+    at = full | dict(zip(names, ca.vertsplit(q), strict=True))
+    rate = full | dict(zip(names, ca.vertsplit(nu), strict=True))
+    accel = full | dict(zip(names, ca.vertsplit(a), strict=True))
+    heading = at[machine.body[0].coordinates[2]] if machine.planar else ca.SX(0)
+    gravity = tree.rot_z(-heading) @ ca.DM(machine.gravity)
+    return _Sample(
+        machine,
+        q,
+        nu,
+        a,
+        ca.SX.sym("u", len(machine.actuated)),
+        p,
+        ca.SX.sym("wheels", sum(s.kind == "wheel" for s in machine.sensor)),
+        at,
+        rate,
+        dict(zip(standard, ca.vertsplit(p), strict=True)),
+        tree.motion(machine, at, rate, accel, gravity),
+        gravity,
+        heading,
+    )
+
+
+def _equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[catalogue.Placed]) -> _Equations:
+    """The functions of a machine with effects."""
+    s = _sample(machine, standard)
+    memory, z, acting = _acting(s, placed)
+    balance, slips = _balance(s, acting)
+    time = ca.SX.sym("t")
+    gain, offset, delay = _channels(s, acting, time)
+    now = z[memory.index("time")] if "time" in memory else ca.SX(0)
+    read, readable = _readings(s, acting)
+    predict = ca.SX(balance)
+    for k, body in enumerate(machine.actuated):
+        row = s.row(body)
+        predict[row] = ca.substitute(gain[k], time, now) * predict[row] + ca.substitute(offset[k], time, now)
+    rates = [ca.SX(1)] if "time" in memory else []
+    for e in acting:
+        rates += [rate(e.scene, e.placed.bodies[0], e.values) for rate in e.placed.effect.memory.values()]
+    beside = [s.u, z] if placed else []
+    labels = ["q", "nu", "a", "p", "u", "z"][: 4 + len(beside)]
+    sample = [s.q, s.nu, s.a, s.p, *beside]
+    curved = ca.which_depends(predict, s.p, 2, False)
+    return _Equations(
+        s,
+        tuple(f"u{b.index}" for b in machine.actuated),
+        slips,
+        ca.Function("predict", sample, [predict], labels, ["Y"]),
+        ca.Function("standard_regressor", sample, [ca.jacobian(predict, s.p)], labels, ["W"]),
+        ca.Function("balance", sample, [balance], labels, ["Y"]),
+        ca.Function("flow", [s.q, s.nu, s.u, z, s.p], [ca.vertcat(*rates, ca.SX(0, 1))]),
+        ca.Function("read", [s.q, s.nu, s.wheels, s.u, z, s.p], [read]),
+        ca.Function("channels", [time, s.p], [gain, offset, delay]),
+        readable,
+        memory,
+        tuple(name for name, bent in zip(standard, curved, strict=True) if bent),
+    )
+
+
+def _acting(s: _Sample, placed: Sequence[catalogue.Placed]) -> tuple[tuple[str, ...], ca.SX, list[_Acting]]:
+    """What effects remember, its symbols z, and the effects with what they see of a sample."""
+    memory = ["time"] if any(e.effect.timed for e in placed) else []
+    memory += [f"{e.name}.{m}" for e in placed for m in e.effect.memory]
+    z = ca.SX.sym("z", len(memory))
+    known = dict(zip(memory, ca.vertsplit(z), strict=True))
+    turning = [b for b in s.machine.body if b.coordinates and b.joint != "planar" and b.friction is not None]
+    scene = catalogue.Scene(
+        {b.index: s.at[b.coordinates[0]] for b in turning},
+        {b.index: s.rate[b.coordinates[0]] for b in turning},
+        dict(zip([b.index for b in s.machine.actuated], ca.vertsplit(s.u), strict=True)),
+        {b.index: _friction(s, b) for b in turning},
+        {b.index: float(b.friction.smoothing) for b in turning if b.friction is not None},
+        {b.index: _rolling(s, b)[0] for b in s.machine.contacts},
+        {b.index: s.frames[b.index].velocity[0] for b in s.machine.body},
+        known.get("time", ca.SX(0)),
+    )
+    acting = []
+    for e in placed:
+        own = {m: known[f"{e.name}.{m}"] for m in e.effect.memory}
+        values = {key: s.by_name.get(name, ca.SX(e.values[key])) for name, (key, _) in e.parameters.items()}
+        acting.append(_Acting(e, replace(scene, z=own), values))
+    return tuple(memory), z, acting
+
+
+def _friction(s: _Sample, body: Body) -> ca.SX:
+    assert body.friction is not None
+    w, k = s.rate[body.coordinates[0]], body.index
+    return s.by_name[f"Fv{k}"] * w + s.by_name[f"Fs{k}"] * ca.tanh(w / float(body.friction.smoothing))
+
+
+def _balance(s: _Sample, acting: Sequence[_Acting]) -> tuple[ca.SX, dict[str, ca.SX]]:
+    """The generalised forces (n_q,) that the motors must deliver, as their sensors feel them flaws aside; the slips."""
+    machine = s.machine
+    inertia = {b.index: tree.inertial_vector(b, s.by_name) for b in machine.body}
+    rows = tree.generalised_forces(machine, s.at, s.frames, inertia)
+    force = ca.vertcat(*[rows[c] for c in s.names])
+    for body in machine.body:
+        if body.friction is not None and body.coordinates[0] in s.names:
+            force[s.row(body)] += _friction(s, body)
+    for e in acting:
+        force -= _added(s, e, inertia)
+    slips: dict[str, ca.SX] = {}
+    for body in machine.contacts:
+        rolling, lever = _rolling(s, body)
+        soil = _soil(s, body, rolling)
+        slips |= {f"gx{body.index}": soil.slip.gx, f"gy{body.index}": soil.slip.gy}
+        for e in acting:
+            if e.placed.effect.soil is not None and body.index in e.placed.bodies:
+                soil = e.placed.effect.soil(e.scene, body.index, e.values, soil)
+        force -= _pushed(body, soil, lever)
+    if machine.planar and machine.body[0].coordinates[1] in machine.locked:
+        slips = {g: x for g, x in slips.items() if not g.startswith("gy")}
+    return force, slips
+
+
+def _added(s: _Sample, e: _Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
+    """Generalised force (n_q,) of an effect that isn't the soil's: torques, forces at rolls, gravity, inertia."""
+    effect, machine = e.placed.effect, s.machine
+    force = ca.SX.zeros(len(s.names))
+    for k in e.placed.bodies:
+        body = machine.find(k)
+        if effect.torque is not None:
+            force[s.row(body)] += effect.torque(e.scene, k, e.values)
+        if effect.push is not None:
+            lever = _rolling(s, body)[1]
+            force += lever[:2, :].T @ ca.vertcat(*effect.push(e.scene, k, e.values))
+    if effect.gravity is not None:
+        pull = tree.rot_z(-s.heading) @ ca.vertcat(*effect.gravity(e.scene, e.values), 0)
+        still = {c: ca.SX(0) for c in s.at}
+        frames = tree.motion(machine, s.at, still, still, pull)
+        rows = tree.generalised_forces(machine, s.at, frames, dict(inertia))
+        force -= ca.vertcat(*[rows[c] for c in s.names])
+    if effect.inertia is not None:
+        moved = {catalogue.shifted(machine): effect.inertia(e.scene, e.values)}
+        none = {n: ca.SX(0) for n in s.by_name}
+        change = {b.index: tree.inertial_vector(b, {**none, **moved}) for b in machine.body}
+        rows = tree.generalised_forces(machine, s.at, s.frames, change)
+        force -= ca.vertcat(*[rows[c] for c in s.names])
+    return force
+
+
+def _rolling(s: _Sample, body: Body) -> tuple[catalogue.Rolling, ca.SX]:
+    """How a roll moves, and how (Vx, Vy, spin, yaw) follow from the velocities (4, n_q)."""
+    assert body.contact is not None
+    assert not isinstance(body.antecedent, str)
+    carrier, roll = s.frames[body.antecedent], s.frames[body.index]
+    R, _ = tree.place(body, {c: ca.SX(0) for c in body.coordinates})
+    turn = carrier.rotation.T @ roll.rotation
+    centre = turn @ roll.velocity
+    spin = (R[:, 2].T @ turn) @ roll.omega
+    yaw = carrier.omega[2]
+    lever = ca.jacobian(ca.vertcat(centre[0], centre[1], spin, yaw), s.nu)
+    return catalogue.Rolling(body.contact, centre[0], centre[1], spin, yaw), lever
+
+
+def _soil(s: _Sample, body: Body, rolling: catalogue.Rolling) -> catalogue.Soil:
+    """The soil under a roll as the machine file has it."""
+    law = rolling.contact
+    saturation = None
+    if law.law == "exponential":
+        assert law.saturation_slip is not None
+        saturation = ca.SX(float(law.saturation_slip))
+    Kx, Ky = s.by_name[f"Kx{body.index}"], s.by_name[f"Ky{body.index}"]
+    return catalogue.Soil(rolling.slip, rolling.yaw, Kx, Ky, saturation)
+
+
+def _pushed(body: Body, soil: catalogue.Soil, lever: ca.SX) -> ca.SX:
+    """Generalised contact force (n_q,) of a roll (11), by virtual power."""
+    assert body.contact is not None
+    w = contact.wrench(body.contact, soil.slip, soil.yaw, soil.Kx, soil.Ky, soil.saturation, soil.lateral)
+    return lever.T @ ca.vertcat(w.Sx, w.Sy, -float(body.contact.radius) * w.Sx, -w.Tz)
+
+
+def _channels(s: _Sample, acting: Sequence[_Acting], time: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Gain, offset and delay (n_u,) of the torque sensors."""
+    gain, offset, delay = [], [], []
+    for body in s.machine.actuated:
+        g, o, d = ca.SX(1), s.by_name[f"u{body.index}0"], ca.SX(0)
+        for e in acting:
+            if e.placed.effect.channel is not None and body.index in e.placed.bodies:
+                own = e.placed.effect.channel(time, e.values)
+                g, o, d = g * own.gain, o + own.offset, d + own.delay
+        gain.append(g)
+        offset.append(o)
+        delay.append(d)
+    return ca.vertcat(*gain), ca.vertcat(*offset), ca.vertcat(*delay)
+
+
+def _readings(s: _Sample, acting: Sequence[_Acting]) -> tuple[ca.SX, tuple[str, ...]]:
+    """What sensors read, those of torque aside, and their names."""
+    machine, root = s.machine, s.machine.body[0]
+    wheels = [x.name for x in machine.sensor if x.kind == "wheel"]
+    readings: dict[str, ca.SX] = {}
+    for sensor in machine.sensors("full"):
+        body = machine.find(sensor.body)
+        if sensor.kind == "torque":
+            continue
+        if sensor.kind == "angle":
+            value = s.at[body.coordinates[0]]
+        elif sensor.kind == "wheel":
+            value = s.wheels[wheels.index(sensor.name)]
+        elif sensor.kind == "yaw_rate":
+            value = s.rate[root.coordinates[2]]
+        elif sensor.kind == "lateral_speed":
+            value = s.frames[body.index].velocity[1]
+        else:
+            value = s.at[root.coordinates["xy".index(sensor.kind)]]
+        exact = value
+        for e in acting:
+            if e.placed.effect.reading is not None and e.placed.sensor == sensor.name:
+                value = value + e.placed.effect.reading(e.scene, exact, body.index, e.values)
+        readings[sensor.name] = value
+    return ca.vertcat(*readings.values(), ca.SX(0, 1)), tuple(readings)
 
 
 def _check_names(machine: Machine, standard: tuple[str, ...]) -> None:
@@ -268,64 +613,31 @@ def _check_names(machine: Machine, standard: tuple[str, ...]) -> None:
             )
 
 
-def _contact(
-    machine: Machine, body: Body, frames: dict[int, tree.Frame], nu: ca.SX, p: dict[str, ca.SX]
-) -> tuple[ca.SX, contact.Slip]:
-    """Generalised contact force (n_q,) of a roll (11) and its slips, by virtual power."""
-    assert body.contact is not None
-    assert not isinstance(body.antecedent, str)
-    carrier, roll = frames[body.antecedent], frames[body.index]
-    R, _ = tree.place(body, {c: ca.SX(0) for c in body.coordinates})
-    turn = carrier.rotation.T @ roll.rotation
-    centre = turn @ roll.velocity
-    axle = R[:, 2]
-    spin = (axle.T @ turn) @ roll.omega
-    yaw = carrier.omega[2]
-    s = contact.slip(body.contact, centre[0], centre[1], spin)
-    Kx, Ky = p[f"Kx{body.index}"], p[f"Ky{body.index}"]
-    saturation = None
-    if body.contact.law == "exponential":
-        assert body.contact.saturation_slip is not None
-        saturation = ca.SX(float(body.contact.saturation_slip))
-    w = contact.wrench(body.contact, s, yaw, Kx, Ky, saturation)
-    velocities = ca.vertcat(centre[0], centre[1], spin, yaw)
-    wrench = ca.vertcat(w.Sx, w.Sy, -float(body.contact.radius) * w.Sx, -w.Tz)
-    return ca.jacobian(velocities, nu).T @ wrench, s
-
-
-def _kinematics(
-    machine: Machine,
-    q: ca.SX,
-    nu: ca.SX,
-    at: dict[str, ca.SX],
-    rate: dict[str, ca.SX],
-    frames: dict[int, tree.Frame],
-    slips: dict[str, ca.SX],
-    heading: ca.SX,
-) -> ca.Function:
+def _kinematics(s: _Sample, slips: Mapping[str, ca.SX]) -> ca.Function:
     """(q, nu) -> dq, slips, wheel rates, lateral and longitudinal speed of each body's origin, its ground position."""
+    machine, at, rate, frames, nu = s.machine, s.at, s.rate, s.frames, s.nu
     dq = nu
     if machine.planar:
         x, y, _ = machine.body[0].coordinates
         turned = dict(
-            zip((x, y), ca.vertsplit((tree.rot_z(heading) @ ca.vertcat(rate[x], rate[y], 0))[:2]), strict=True)
+            zip((x, y), ca.vertsplit((tree.rot_z(s.heading) @ ca.vertcat(rate[x], rate[y], 0))[:2]), strict=True)
         )
         dq = ca.vertcat(*[turned.get(c, rate[c]) for c in machine.coordinates])
     wheels = []
-    for s in machine.sensor:
-        if s.kind == "wheel":
-            f = frames[s.body]
-            assert s.radius is not None
-            assert s.lateral is not None
-            wheels.append((f.velocity[0] - float(s.lateral) * f.omega[2]) / float(s.radius))
-    R = tree.rot_z(heading)
+    for sensor in machine.sensor:
+        if sensor.kind == "wheel":
+            f = frames[sensor.body]
+            assert sensor.radius is not None
+            assert sensor.lateral is not None
+            wheels.append((f.velocity[0] - float(sensor.lateral) * f.omega[2]) / float(sensor.radius))
+    R = tree.rot_z(s.heading)
     root = ca.vertcat(*[at[c] for c in machine.body[0].coordinates[:2]], 0) if machine.planar else ca.SX(3, 1)
     places = ca.horzcat(*[root + R @ frames[b.index].position for b in machine.body])
     speeds = ca.horzcat(*[frames[b.index].velocity for b in machine.body])
     turns = ca.horzcat(*[frames[b.index].omega for b in machine.body])
     return ca.Function(
         "kinematics",
-        [q, nu],
+        [s.q, nu],
         [dq, ca.vertcat(*slips.values()), ca.vertcat(*wheels), places, speeds, turns],
         ["q", "nu"],
         ["dq", "slips", "wheels", "places", "speeds", "turns"],

@@ -1,0 +1,793 @@
+"""The catalogue of effects: what real machines do beyond the model, each declared once.
+
+An effect says where it may sit, what its amount and shapes mean [unit], and what it does to one sample: to the torque
+that a joint gets, to the soil under a roll, to gravity, inertia, a sensor's reading or a torque channel. Simulation,
+regressor, smoothing, diagnosis, the documentation and the tests are made from that declaration; adding an effect is
+adding one entry to `CATALOGUE`. Amounts and names are those of the project's contract; where it leaves a shape open (a
+decay speed, a phase), the shape has a default for simulation and a grid on which diagnosis looks for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import pi
+
+import casadi as ca
+
+from model import contact as law
+from model.machine import Body, Contact, EffectEntry, Machine, MachineError, Quantity, Sensor
+
+GRAVITY = 9.81
+DURATION = 60.0  # [s] of a log, where nobody says
+SMOOTH_SLIP = 0.005  # slip over which driving turns into braking
+SMOOTH_SPEED = 0.02  # [m/s] over which a force against the motion turns
+Values = Mapping[str, ca.SX]  # the amount "A" and the shapes by name
+
+
+@dataclass(frozen=True)
+class Rolling:
+    """How a roll moves: its centre's velocity along and across its chassis [m/s], spin and yaw rate [rad/s]."""
+
+    contact: Contact
+    Vx: ca.SX
+    Vy: ca.SX
+    spin: ca.SX
+    yaw: ca.SX
+
+    @property
+    def slip(self) -> law.Slip:
+        return law.slip(self.contact, self.Vx, self.Vy, self.spin)
+
+
+@dataclass(frozen=True)
+class Soil:
+    """What a roll's wrench is made from: slips, yaw rate, stiffnesses Kx, Ky [N], saturations (None: linear)."""
+
+    slip: law.Slip
+    yaw: ca.SX
+    Kx: ca.SX
+    Ky: ca.SX
+    saturation: ca.SX | None = None
+    lateral: ca.SX | None = None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One sample as an effect sees it.
+
+    q, w: angle and rate of a joint [rad, rad/s] by body; u: torque that its sensor feels, flaws aside [N m]; friction:
+    Fv w + Fs sgn w [N m]; smooth: the rate over which sgn turns; rolling: of rolls; ahead: V_x of each body's origin in
+    its own axes [m/s]; time [s] since the log began; z: what this effect remembers, by name.
+    """
+
+    q: Mapping[int, ca.SX]
+    w: Mapping[int, ca.SX]
+    u: Mapping[int, ca.SX]
+    friction: Mapping[int, ca.SX]
+    smooth: Mapping[int, float]
+    rolling: Mapping[int, Rolling]
+    ahead: Mapping[int, ca.SX]
+    time: ca.SX
+    z: Mapping[str, ca.SX] = field(default_factory=dict)
+
+    def sign(self, k: int) -> ca.SX:
+        """sgn of a joint's rate, smoothed as its friction is."""
+        return ca.tanh(self.w[k] / self.smooth[k])
+
+    def others(self, k: int) -> list[int]:
+        return [j for j in self.rolling if j != k]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A torque sensor: u_measured(t) = gain u(t - delay) + offset."""
+
+    gain: ca.SX | float = 1.0
+    offset: ca.SX | float = 0.0
+    delay: ca.SX | float = 0.0
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where an effect is looked for: a body (the joint or the first of several), the log's length [s]."""
+
+    machine: Machine
+    body: Body
+    duration: float
+
+
+def _one(site: Site) -> float:
+    return 1.0
+
+
+def _smooth(site: Site) -> float:
+    return float(site.body.friction.smoothing) if site.body.friction is not None else 1.0
+
+
+def _duration(site: Site) -> float:
+    return site.duration
+
+
+def _stop(site: Site) -> float:
+    return float(site.body.limit.position) if site.body.limit.position is not None else 0.6
+
+
+def _full_torque(site: Site) -> float:
+    return float(site.body.limit.torque) if site.body.limit.torque is not None else 5000.0
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What an effect's amount leaves open: default and grid in units of `size`, which belongs to the site.
+
+    `circular`: a phase, found by its sine and cosine; `whole`: an integer, not refined.
+    """
+
+    unit: str
+    default: float
+    grid: tuple[float, ...]
+    size: Callable[[Site], float] = _one
+    circular: bool = False
+    whole: bool = False
+
+
+PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One entry of the catalogue.
+
+    `places`: joints, rolls, drive, articulation, wheels, yaw_rate, lateral_speed, machine. `amount`: a typical one
+    [unit] at a site, `grid`: shares of it that are tried where the signature isn't proportional to the amount.
+    `positive`: a negative amount makes no sense. Hooks take the scene, the body they act on, and the values.
+    """
+
+    name: str
+    places: tuple[str, ...]
+    unit: str
+    meaning: str
+    signature: str
+    source: str
+    amount: Callable[[Site], float]
+    shapes: Mapping[str, Shape] = field(default_factory=dict)
+    grid: tuple[float, ...] = (1.0,)
+    positive: bool = False
+    torque: Callable[[Scene, int, Values], ca.SX] | None = None
+    soil: Callable[[Scene, int, Values, Soil], Soil] | None = None
+    push: Callable[[Scene, int, Values], tuple[ca.SX, ca.SX]] | None = None
+    gravity: Callable[[Scene, Values], tuple[ca.SX, ca.SX]] | None = None
+    inertia: Callable[[Scene, Values], ca.SX] | None = None
+    reading: Callable[[Scene, ca.SX, int, Values], ca.SX] | None = None
+    channel: Callable[[ca.SX, Values], Channel] | None = None
+    memory: Mapping[str, Callable[[Scene, int, Values], ca.SX]] = field(default_factory=dict)
+    timed: bool = False
+
+    @property
+    def sensed(self) -> bool:
+        """Whether it sits in a sensor only, so that no equation of motion shows it."""
+        return not (self.torque or self.soil or self.push or self.gravity or self.inertia or self.channel)
+
+
+# ------------------------------------------------------------------------------------------------ the hooks
+
+
+def _softplus(x: ca.SX, width: float | ca.SX) -> ca.SX:
+    """max(x, 0), rounded over `width`."""
+    return (x + ca.sqrt(x**2 + width**2)) / 2
+
+
+def _deadband(s: Scene, k: int, p: Values) -> ca.SX:
+    u, A, width = s.u[k], p["A"], 20.0
+    return _softplus(u - A, width) - _softplus(-u - A, width) - u + 0 * A
+
+
+def _coupling(s: Scene, k: int, p: Values) -> ca.SX:
+    return p["A"] * sum((s.u[j] for j in s.others(k)), ca.SX(0))
+
+
+def _relaxed(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
+    """The forces' slips lag the geometric ones over the distance A."""
+    slip = law.Slip(s.z["gx"], s.z["gy"], soil.slip.vn)
+    return replace(soil, slip=slip, yaw=s.z["turn"] * soil.slip.vn)
+
+
+def _relaxation(slip: Callable[[Rolling], ca.SX], name: str) -> Callable[[Scene, int, Values], ca.SX]:
+    def rate(s: Scene, k: int, p: Values) -> ca.SX:
+        r = s.rolling[k]
+        return (slip(r) - s.z[name]) * r.slip.vn / p["A"]
+
+    return rate
+
+
+def _braking(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
+    r = s.rolling[k]
+    rim = float(r.contact.radius) * r.spin
+    excess = (ca.sqrt(r.Vx**2 + 1e-6) - ca.sqrt(rim**2 + 1e-6)) / soil.slip.vn
+    return replace(soil, Kx=soil.Kx * (1 + p["A"] * (1 + ca.tanh(excess / SMOOTH_SLIP)) / 2))
+
+
+def _scaled(soil: Soil, factor: ca.SX) -> Soil:
+    return replace(soil, Kx=soil.Kx * factor, Ky=soil.Ky * factor)
+
+
+def _between(t: ca.SX, begin: ca.SX, end: ca.SX, width: float) -> ca.SX:
+    return (ca.tanh((t - begin) / width) - ca.tanh((t - end) / width)) / 2
+
+
+def _window(t: ca.SX, p: Values) -> ca.SX:
+    return _between(t, p["begin"], p["begin"] + p["length"], 0.2)
+
+
+def _resistance(s: Scene, k: int, p: Values) -> tuple[ca.SX, ca.SX]:
+    r = s.rolling[k]
+    return -p["A"] * ca.tanh(r.Vx / SMOOTH_SPEED), ca.SX(0)
+
+
+def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
+    q = s.q[k]
+    return -p["A"] * (_softplus(q - p["stop"], 0.01) - _softplus(-q - p["stop"], 0.01))
+
+
+def _clipped(s: Scene, k: int, p: Values) -> ca.SX:
+    """A relief valve: what is above its torque is lost, to the share A."""
+    over = _softplus(s.u[k] - p["valve"], 50.0) - _softplus(-s.u[k] - p["valve"], 50.0)
+    return -p["A"] * over
+
+
+def _constant(value: float) -> Callable[[Site], float]:
+    return lambda site: value
+
+
+def _of(size: Callable[[Site], float], share: float) -> Callable[[Site], float]:
+    return lambda site: share * size(site)
+
+
+def _coulomb(share: float) -> Callable[[Site], float]:
+    return lambda site: share * max(float(site.body.friction.Fs), 1e-6) if site.body.friction is not None else share
+
+
+def _viscous(share: float, power: float = 0.0) -> Callable[[Site], float]:
+    """A share of Fv over a rate of 1 m/s at the rim, or half the rate limit, to a power."""
+
+    def size(site: Site) -> float:
+        body = site.body
+        assert body.friction is not None
+        rate = 1.0
+        if body.contact is not None:
+            rate = 1.0 / float(body.contact.radius)
+        elif body.limit.rate is not None:
+            rate = float(body.limit.rate) / 2
+        return share * max(float(body.friction.Fv), 1e-6) / rate**power
+
+    return size
+
+
+def _rear_moment(site: Site) -> float:
+    total = sum(float(b.inertia.mass) for b in site.machine.body if b.inertia is not None)
+    return 0.05 * total
+
+
+def _one_over_torque(site: Site) -> float:
+    return 0.002 / _full_torque(site) * 3
+
+
+CATALOGUE: dict[str, Effect] = {}
+
+
+def _declare(*effects: Effect) -> None:
+    for e in effects:
+        if e.name in CATALOGUE:
+            raise ValueError(f"{e.name}: two effects have this name")
+        CATALOGUE[e.name] = e
+
+
+_declare(
+    # ---------------------------------------------------------------- friction
+    Effect(
+        "stribeck_friction",
+        ("joints",),
+        "N m",
+        "friction above Fs near standstill, fading with speed: A sgn(w) exp(-(w/decay)^2)",
+        "torque missing just after every start and reversal",
+        "Stribeck 1902; Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30 (1994), eq. (4)",
+        _coulomb(0.5),
+        {"decay": Shape("rad/s", 15.0, (4.0, 12.0, 36.0), _smooth)},
+        torque=lambda s, k, p: -p["A"] * s.sign(k) * ca.exp(-((s.w[k] / p["decay"]) ** 2)),
+    ),
+    Effect(
+        "load_dependent_friction",
+        ("joints",),
+        "-",
+        "friction grows by A times the delivered torque's size",
+        "friction larger where the torque is large, at the same speed",
+        "Dohring et al. 1993; Linderoth et al. 2013, load-dependent Coulomb friction",
+        _constant(0.05),
+        torque=lambda s, k, p: -p["A"] * ca.sqrt(s.u[k] ** 2 + 20.0**2) * s.sign(k),
+    ),
+    Effect(
+        "asymmetric_coulomb",
+        ("joints",),
+        "N m",
+        "Coulomb friction Fs + A forward, Fs - A backward",
+        "an offset of the torque while the joint moves that is gone at rest",
+        "Armstrong-Helouvry 1991, ch. 4",
+        _coulomb(0.3),
+        torque=lambda s, k, p: -p["A"] * s.sign(k) ** 2,
+    ),
+    Effect(
+        "asymmetric_viscous",
+        ("joints",),
+        "N m s",
+        "friction grows by A abs(w): viscous friction Fv + A forward, Fv - A backward",
+        "an error even in speed and proportional to it",
+        "Janot, Gautier, Brunot 2019 (EMPS: direction-dependent friction)",
+        _viscous(0.3),
+        torque=lambda s, k, p: -p["A"] * s.w[k] * s.sign(k),
+    ),
+    Effect(
+        "quadratic_drag",
+        ("joints",),
+        "N m s2",
+        "friction grows by A w abs(w)",
+        "an error odd in speed, growing with its square",
+        "turbulent losses of hydraulic motors, Merritt, Hydraulic Control Systems, 1967",
+        _viscous(0.5, 1.0),
+        torque=lambda s, k, p: -p["A"] * s.w[k] * ca.sqrt(s.w[k] ** 2 + s.smooth[k] ** 2),
+    ),
+    Effect(
+        "friction_warm_up",
+        ("joints",),
+        "-",
+        "Fv and Fs larger by the factor 1 + A at the start, fading with time: A exp(-t/fade)",
+        "friction that falls over minutes as oil warms",
+        "Bittencourt, Axelsson, J. Dyn. Sys. 136 (2014): friction and temperature",
+        _constant(0.5),
+        {"fade": Shape("s", 30.0, (8.0, 25.0, 80.0))},
+        torque=lambda s, k, p: -p["A"] * ca.exp(-s.time / p["fade"]) * s.friction[k],
+        timed=True,
+    ),
+    # ---------------------------------------------------------------- drives and torque channels
+    Effect(
+        "actuator_lag",
+        ("joints",),
+        "s",
+        "the delivered torque follows the measured one with a first-order lag of time constant A",
+        "torque errors proportional to the torque's rate of change",
+        "Merritt, Hydraulic Control Systems, 1967, ch. 4",
+        _constant(0.05),
+        grid=(0.3, 1.0, 4.0),
+        positive=True,
+        torque=lambda s, k, p: s.z["u"] - s.u[k],
+        memory={"u": lambda s, k, p: (s.u[k] - s.z["u"]) / p["A"]},
+    ),
+    Effect(
+        "channel_delay",
+        ("joints",),
+        "s",
+        "the torque channel is late by A: u_measured(t) = u(t - A) + u0",
+        "torque errors proportional to the torque's rate of change, with the sign of a torque that comes early",
+        "Ljung, System Identification, 2nd ed., 10.3",
+        _constant(0.03),
+        channel=lambda t, p: Channel(delay=p["A"]),
+    ),
+    Effect(
+        "torque_gain",
+        ("joints",),
+        "-",
+        "u_measured = (1 + A) u + u0",
+        "one joint's parameters scaled against the rest of the machine",
+        "Gautier, Briot, J. Dyn. Sys. 136 (2014): global identification of drive gains",
+        _constant(0.05),
+        channel=lambda t, p: Channel(gain=1 + p["A"]),
+    ),
+    Effect(
+        "torque_offset_drift",
+        ("joints",),
+        "N m/s",
+        "the torque sensor's offset drifts by A a second",
+        "a torque error that grows steadily with time",
+        "strain-gauge and pressure sensors' zero drift, Doebelin, Measurement Systems, ch. 5",
+        _of(_full_torque, 2e-4),
+        channel=lambda t, p: Channel(offset=p["A"] * t),
+        timed=True,
+    ),
+    Effect(
+        "torque_deadband",
+        ("rolls",),
+        "N m",
+        "delivered sgn(u) max(abs(u) - A, 0), u measured",
+        "a loss of torque with the sign of the torque, also at standstill",
+        "overlap of proportional valves, Merritt, Hydraulic Control Systems, 1967, ch. 5",
+        _constant(100.0),
+        grid=(1.0, 4.0),
+        positive=True,
+        torque=_deadband,
+    ),
+    Effect(
+        "pump_coupling",
+        ("drive",),
+        "-",
+        "each roll's delivered torque grows by A times the other's measured one",
+        "one roll answers to the other's torque",
+        "two motors on one hydraulic pump",
+        _constant(0.05),
+        torque=_coupling,
+    ),
+    Effect(
+        "relief_valve",
+        ("joints",),
+        "-",
+        "of the torque beyond a valve's opening the share A is not delivered",
+        "torque missing at the largest torques alone",
+        "pressure relief valves, Merritt, Hydraulic Control Systems, 1967, ch. 5",
+        _constant(0.5),
+        {"valve": Shape("N m", 0.6, (0.3, 0.5, 0.7, 0.85), _full_torque)},
+        torque=_clipped,
+    ),
+    # ---------------------------------------------------------------- once or several times per turn
+    Effect(
+        "roll_unbalance",
+        ("rolls",),
+        "N m",
+        "a torque once per turn of the roll: A sin(theta + phase)",
+        "a torque error periodic in the roll's angle",
+        "eccentric mass or bearing of a roll",
+        _constant(100.0),
+        {"phase": PHASE},
+        torque=lambda s, k, p: p["A"] * ca.sin(s.q[k] + p["phase"]),
+    ),
+    Effect(
+        "encoder_eccentricity",
+        ("rolls", "wheels"),
+        "rad",
+        "the encoder reads A sin(theta + phase) too much",
+        "an angle error periodic in the angle itself",
+        "eccentric encoder discs, Dunster; error once per turn",
+        _constant(0.005),
+        {"phase": PHASE},
+        reading=lambda s, exact, k, p: p["A"] * (ca.sin(exact + p["phase"]) - ca.sin(p["phase"])),
+    ),
+    Effect(
+        "torque_ripple",
+        ("rolls",),
+        "N m",
+        "the delivered torque ripples several times per turn: A sin(order theta + phase)",
+        "a torque error periodic in the roll's angle, several times per turn",
+        "piston motors, Ivantysyn, Hydrostatic Pumps and Motors, 2001",
+        _constant(100.0),
+        {
+            "order": Shape("1/turn", 5.0, tuple(float(n) for n in range(2, 13)), whole=True),
+            "phase": PHASE,
+        },
+        torque=lambda s, k, p: p["A"] * ca.sin(p["order"] * s.q[k] + p["phase"]),
+    ),
+    # ---------------------------------------------------------------- soil
+    Effect(
+        "shear_saturation",
+        ("rolls",),
+        "-",
+        "law (18) instead of the linear one; A = K / xi_s, the slip at which j = K at the rear of the patch",
+        "contact forces fall behind the linear law at large slips",
+        "paper (18), (20); Janosi, Hanamoto 1961",
+        _constant(0.3),
+        grid=(0.5, 1.0, 3.0),
+        positive=True,
+        soil=lambda s, k, p, soil: replace(soil, saturation=p["A"]),
+    ),
+    Effect(
+        "lateral_saturation",
+        ("rolls",),
+        "-",
+        "law (18) for the lateral force alone",
+        "lateral forces fall behind the linear law at large lateral slips",
+        "paper (18); Wong, Theory of Ground Vehicles, ch. 2",
+        _constant(0.3),
+        grid=(0.5, 1.0, 3.0),
+        positive=True,
+        soil=lambda s, k, p, soil: replace(soil, lateral=p["A"]),
+    ),
+    Effect(
+        "drive_brake_asymmetry",
+        ("rolls",),
+        "-",
+        "Kx larger by the factor 1 + A when braking (abs(V_x) > abs(R_c w))",
+        "slip of another size when braking than when driving at the same force",
+        "Wong, Theory of Ground Vehicles, ch. 2; driven and towed wheels on sand",
+        _constant(0.3),
+        soil=_braking,
+    ),
+    Effect(
+        "compaction_per_pass",
+        ("drive",),
+        "-",
+        "Kx, Ky grow with the passes towards the factor 1 + A: A (1 - exp(-distance / pass))",
+        "less slip at the same force, the longer the drive on the same lane",
+        "soil compaction by passes, Forssblad, Vibratory Soil and Rock Fill Compaction, 1981",
+        _constant(0.3),
+        {"pass": Shape("m", 15.0, (5.0, 15.0, 50.0))},
+        soil=lambda s, k, p, soil: _scaled(soil, 1 + p["A"] * (1 - ca.exp(-s.z["distance"] / p["pass"]))),
+        memory={"distance": lambda s, k, p: ca.sqrt(s.rolling[k].Vx ** 2 + 1e-4)},
+    ),
+    Effect(
+        "slip_relaxation",
+        ("rolls",),
+        "m",
+        "contact forces build up over the distance A",
+        "contact forces late against slip, by a distance",
+        "relaxation length, Pacejka, Tire and Vehicle Dynamics, ch. 5",
+        _constant(0.05),
+        grid=(0.2, 1.0, 4.0),
+        positive=True,
+        soil=_relaxed,
+        memory={
+            "gx": _relaxation(lambda r: r.slip.gx, "gx"),
+            "gy": _relaxation(lambda r: r.slip.gy, "gy"),
+            "turn": _relaxation(lambda r: r.yaw / r.slip.vn, "turn"),
+        },
+    ),
+    Effect(
+        "vibration_on",
+        ("rolls",),
+        "-",
+        "for a while Kx and Ky are smaller by the factor 1 - A, the roll vibrates",
+        "more slip at the same force between two instants",
+        "vibratory rollers, Forssblad 1981",
+        _constant(0.3),
+        {
+            "begin": Shape("s", 0.4, (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), _duration),
+            "length": Shape("s", 0.25, (0.125, 0.25, 0.5), _duration),
+            "shake": Shape("N m", 100.0, (0.0,), whole=True),
+            "frequency": Shape("Hz", 27.0, (27.0,), whole=True),
+        },
+        soil=lambda s, k, p, soil: _scaled(soil, 1 - p["A"] * _window(s.time, p)),
+        channel=lambda t, p: Channel(offset=p["shake"] * _window(t, p) * ca.sin(2 * pi * p["frequency"] * t)),
+        timed=True,
+    ),
+    # ---------------------------------------------------------------- forces
+    Effect(
+        "rolling_resistance",
+        ("rolls",),
+        "N",
+        "a force against the motion at the roll's centre",
+        "a force that turns with the direction of travel",
+        "Bekker, Introduction to Terrain-Vehicle Systems, 1969",
+        _constant(200.0),
+        push=_resistance,
+    ),
+    Effect(
+        "ground_slope",
+        ("machine",),
+        "rad",
+        "gravity along a fixed direction of the ground; `direction` points downhill, from the first heading",
+        "a force that keeps its direction on the ground while the machine turns and reverses",
+        "statics of an inclined plane",
+        _constant(0.005),
+        {"direction": PHASE},
+        gravity=lambda s, p: (
+            GRAVITY * p["A"] * ca.cos(p["direction"]),
+            GRAVITY * p["A"] * ca.sin(p["direction"]),
+        ),
+    ),
+    Effect(
+        "payload_shift",
+        ("machine",),
+        "kg m",
+        "at one instant the first moment of the rear chassis along its axis changes by A",
+        "inertial and yaw forces that change at an instant",
+        "a water tank or a load that moves",
+        _rear_moment,
+        {"instant": Shape("s", 0.5, (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), _duration)},
+        inertia=lambda s, p: p["A"] * (1 + ca.tanh((s.time - p["instant"]) / 0.2)) / 2,
+        timed=True,
+    ),
+    # ---------------------------------------------------------------- articulation
+    Effect(
+        "articulation_backlash",
+        ("articulation",),
+        "rad",
+        "play A between the actuator, with its encoder, and the joint",
+        "the angle jumps where the torque changes its sign",
+        "Nordin, Gutman, Automatica 38 (2002)",
+        _constant(0.005),
+        {"turn": Shape("N m", 0.02, (0.01, 0.05), _full_torque)},
+        positive=True,
+        reading=lambda s, exact, k, p: p["A"] / 2 * ca.tanh(s.u[k] / p["turn"]),
+    ),
+    Effect(
+        "articulation_compliance",
+        ("articulation",),
+        "rad/(N m)",
+        "a spring between the actuator, with its encoder, and the joint: it winds up by A times the torque",
+        "the angle leads by an amount proportional to the torque",
+        "Spong 1987, flexible joints",
+        _one_over_torque,
+        positive=True,
+        reading=lambda s, exact, k, p: p["A"] * s.u[k],
+    ),
+    Effect(
+        "articulation_stop_spring",
+        ("articulation",),
+        "N m/rad",
+        "a spring beyond some angle to both sides",
+        "a torque that grows with the angle beyond a limit",
+        "rubber stops of articulated frames",
+        lambda site: _full_torque(site),
+        {"stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), _stop)},
+        torque=_stopped,
+    ),
+    # ---------------------------------------------------------------- sensors
+    Effect(
+        "measuring_wheel_radius",
+        ("wheels",),
+        "-",
+        "the true radius is R (1 + A)",
+        "slip where there is none, proportional to speed, and the same forward and backward",
+        "Borenstein, Feng, IEEE Trans. Robotics and Automation 12 (1996): odometry",
+        _constant(0.002),
+        reading=lambda s, exact, k, p: exact / (1 + p["A"]) - exact,
+    ),
+    Effect(
+        "yaw_rate_bias",
+        ("yaw_rate",),
+        "rad/s",
+        "the gyro reads A too much",
+        "a constant difference between gyro and measuring wheels",
+        "IEEE Std 952, gyro bias",
+        _constant(0.001),
+        reading=lambda s, exact, k, p: p["A"] + 0 * exact,
+    ),
+    Effect(
+        "yaw_rate_gain",
+        ("yaw_rate",),
+        "-",
+        "the gyro reads 1 + A times the rate",
+        "a difference between gyro and measuring wheels proportional to the rate",
+        "IEEE Std 952, scale factor",
+        _constant(0.02),
+        reading=lambda s, exact, k, p: p["A"] * exact,
+    ),
+    Effect(
+        "lateral_speed_bias",
+        ("lateral_speed",),
+        "m/s",
+        "the lateral speed sensor reads A too much",
+        "a lateral speed that stays at rest",
+        "optical speed sensors' zero",
+        _constant(0.005),
+        reading=lambda s, exact, k, p: p["A"] + 0 * exact,
+    ),
+    Effect(
+        "lateral_speed_misalignment",
+        ("lateral_speed",),
+        "rad",
+        "the lateral speed sensor is turned by A and reads a share of the forward speed",
+        "a lateral speed proportional to the forward speed",
+        "mounting angle of optical speed sensors",
+        _constant(0.01),
+        reading=lambda s, exact, k, p: p["A"] * s.ahead[k],
+    ),
+)
+
+
+# ------------------------------------------------------------------------------------------------ places
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An effect at a place: `bodies` it acts on, the sensor it sits in, values of amount and shapes."""
+
+    effect: Effect
+    where: str
+    bodies: tuple[int, ...]
+    sensor: str | None
+    values: Mapping[str, float]
+
+    @property
+    def name(self) -> str:
+        return f"{self.effect.name}@{self.where}"
+
+    @property
+    def parameters(self) -> dict[str, tuple[str, str]]:
+        """Names as parameters of the model -> (value's key, unit): the amount first, then the shapes."""
+        named = {self.name: ("A", self.effect.unit)}
+        return named | {f"{self.name}.{s}": (s, shape.unit) for s, shape in self.effect.shapes.items()}
+
+
+def places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...], str | None]]:
+    """Where an effect may sit on a machine: name of the place -> bodies, sensor."""
+    free = list(machine.actuated)
+    rolls = [b for b in free if b.contact is not None]
+    plain = [b for b in free if b.contact is None]
+    sensors = machine.sensors("full")
+    root = machine.body[0].index
+    found: dict[str, tuple[tuple[int, ...], str | None]] = {}
+    for place in effect.places:
+        if place == "joints":
+            found |= {b.where: ((b.index,), _angle(sensors, b)) for b in free}
+        elif place == "rolls":
+            found |= {b.where: ((b.index,), _angle(sensors, b)) for b in rolls}
+        elif place == "drive" and len(rolls) > 1:
+            found["drive"] = tuple(b.index for b in rolls), None
+        elif place == "articulation" and machine.planar:
+            found |= {b.where: ((b.index,), _angle(sensors, b)) for b in plain}
+        elif place == "wheels":
+            found |= {s.place or s.name: ((s.body,), s.name) for s in sensors if s.kind == "wheel"}
+        elif place in ("yaw_rate", "lateral_speed"):
+            found |= {s.place or place: ((s.body,), s.name) for s in sensors if s.kind == place}
+        elif place == "machine" and machine.planar and (effect.gravity or _shifting(machine) is not None):
+            found["machine"] = (root,), None
+    if effect.soil or effect.push:
+        found = {w: at for w, at in found.items() if all(machine.find(k).contact for k in at[0])}
+    return found
+
+
+def _angle(sensors: Sequence[Sensor], body: Body) -> str | None:
+    return next((s.name for s in sensors if s.kind == "angle" and s.body == body.index), None)
+
+
+def _shifting(machine: Machine) -> int | None:
+    """The body whose load may move: the last chassis behind an articulation."""
+    hung = [b.index for b in machine.body[1:] if b.inertia is not None and not b.inertia.axisymmetric and b.coordinates]
+    free = [k for k in hung if machine.find(k).coordinates[0] in machine.coordinates]
+    return free[-1] if free else None
+
+
+def shifted(machine: Machine) -> str:
+    """The standard parameter that `inertia` hooks change."""
+    return f"MX{_shifting(machine)}"
+
+
+def parse(text: str, machine: Machine, duration: float) -> EffectEntry:
+    """`NAME[@WHERE]=AMOUNT` as an entry of a machine file, shapes at their defaults for a log of duration [s].
+
+    Raises MachineError.
+    """
+    name, _, amount = text.partition("=")
+    name, _, where = name.partition("@")
+    try:
+        value = Quantity(value=float(amount), source="assumed")
+    except ValueError:
+        raise MachineError(f"effect {text}: must be NAME[@WHERE]=AMOUNT with a number behind the =") from None
+    if not name or not name.replace("_", "").isalnum() or (where and not where.replace("_", "").isalnum()):
+        raise MachineError(f"effect {text}: must be NAME[@WHERE]=AMOUNT")
+    entry = EffectEntry.model_construct(name=name, where=where or None, amount=value, std=None, shape={})
+    found = placed(machine, entry, duration)
+    shapes = {s: Quantity(value=found.values[s], source="assumed") for s in found.effect.shapes}
+    return EffectEntry(name=name, where=found.where, amount=value, shape=shapes)
+
+
+def extended(machine: Machine, *entries: EffectEntry) -> Machine:
+    """The machine with these effects beside those that it has."""
+    return machine.model_copy(update={"effect": (*machine.effect, *entries)})
+
+
+def placed(machine: Machine, entry: EffectEntry, duration: float = DURATION) -> Placed:
+    """An effect of a machine file, checked. Raises MachineError for an unknown name, place or shape.
+
+    duration [s]: of the log, which the defaults of some shapes are shares of.
+    """
+    effect = CATALOGUE.get(entry.name)
+    if effect is None:
+        raise MachineError(f"{machine.name}: effect {entry.name}: unknown, allowed: {', '.join(CATALOGUE)}")
+    allowed = places(machine, effect)
+    where = entry.where or (next(iter(allowed)) if len(allowed) == 1 else "")
+    if where not in allowed:
+        options = ", ".join(allowed) or "none on this machine"
+        raise MachineError(f"{machine.name}: effect {entry.name}: where must be one of {options} (got {where or '-'})")
+    for name in entry.shape:
+        if name not in effect.shapes:
+            options = ", ".join(effect.shapes) or "none"
+            raise MachineError(f"{machine.name}: effect {entry.name}: no shape {name}, allowed: {options}")
+    if effect.positive and not float(entry.amount) > 0:
+        raise MachineError(f"{machine.name}: effect {entry.name}: amount must be > 0 (got {float(entry.amount):g})")
+    bodies, sensor = allowed[where]
+    if effect.sensed and sensor is None:
+        raise MachineError(f"{machine.name}: effect {entry.name}: {where} has no sensor that it could sit in")
+    site = Site(machine, machine.find(bodies[0]), duration)
+    values = {"A": float(entry.amount)}
+    for name, shape in effect.shapes.items():
+        given = entry.shape.get(name)
+        values[name] = float(given) if given is not None else shape.default * shape.size(site)
+    return Placed(effect, where, bodies, sensor, values)
