@@ -32,6 +32,7 @@ app = typer.Typer(
 )
 
 MachineArgument = Annotated[str, typer.Argument(metavar="MACHINE", help="a shipped name or a machine file (.toml)")]
+DesignArgument = Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="what `excite design` wrote")]
 OutOption = Annotated[Path | None, typer.Option("--out", help="folder to write [results/<command>-<machine>]")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the summary as JSON and nothing else")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="same seed, same result")]
@@ -105,7 +106,7 @@ def design(
 
 @app.command()
 def verify(
-    design_dir: Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="what `excite design` wrote")],
+    design_dir: DesignArgument,
     runs: RunsOption = 50,
     method: MethodOption = None,
     kit: KitOption = "full",
@@ -114,9 +115,9 @@ def verify(
     json: JsonOption = False,
 ) -> None:
     """Simulates a designed drive and identifies from it, many times: how true and how sure is each parameter."""
-    from excite import folder
+    from excite import folder, stored
 
-    name = _design_summary(design_dir)["machine"]
+    name = stored.summary(design_dir)["machine"]
     out = out or Path(f"results/verify-{name}")
     folder.claim(out, [design_dir])
     with folder.writing(out) as place:
@@ -181,6 +182,32 @@ def run(
         terminal.verify_table(both["verify"])
 
     terminal.finish(summary, out, json, show)
+
+
+@app.command()
+def drive(
+    design_dir: DesignArgument,
+    phases: Annotated[
+        int | None, typer.Option("--phases", min=2, help="at most so many phases; one in three seconds by default")
+    ] = None,
+    shortest: Annotated[float, typer.Option("--shortest", help="of a phase [s]")] = 2.0,
+    seed: SeedOption = 0,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Turns a design into a drive that a person can follow: the driver's sheet (PDF)."""
+    from excite import cab, folder, stored
+
+    name = stored.summary(design_dir)["machine"]
+    out = out or Path(f"results/drive-{name}")
+    folder.claim(out, [design_dir])
+    with folder.writing(out) as place:
+        with terminal.bar("driving") as advance:
+            made = cab.prepare(stored.read(design_dir), phases, shortest, seed, advance)
+        summary = {"machine": name, "design": str(design_dir), "seed": seed, **cab.write(made, place)}
+        summary["versions"] = _versions()
+        (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    terminal.finish(summary, out, json, terminal.drive_table)
 
 
 @app.command()
@@ -345,27 +372,14 @@ def _sigma(model: Model, result: Design) -> dict[str, float]:
 
 
 def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: str, seed: int) -> dict[str, Any]:
-    from excite import folder, identify, log, report, sensors
-    from excite.simulate import simulate as drive
+    from excite import folder, identify, report, sensors, stored
     from excite.verify import biased, verify
     from excite.verify import summary as table
-    from model.machine import Machine
-    from model.prediction import build
 
-    before = _design_summary(design_dir)
     _known("--kit", kit, sensors.KITS)
-    stored = design_dir / "machine.json"
-    try:
-        model = build(Machine.model_validate_json(stored.read_bytes()))
-    except (OSError, ValueError):
-        raise UsageError(f"{stored}: missing or damaged, design again") from None
+    design = stored.read(design_dir)
+    model, motion = design.model, design.motion
     method = _method(method, model)
-    torque, q0, nu0 = log.read_profile(design_dir / "profile.csv", model)
-    if len(torque) != round(before["duration_s"] * float(model.machine.sampling_hz)) + 1:
-        raise UsageError(
-            f"{design_dir / 'profile.csv'}: {len(torque)} rows do not make {before['duration_s']:g} s, design again"
-        )
-    motion = drive(model, torque, q0=q0, nu0=nu0)
     _check_needs(model, method, kit)
     with terminal.bar("verifying") as advance:
         result = verify(model, motion, method, kit, runs, seed, progress=lambda done, total: advance(done, total, None))
@@ -374,7 +388,7 @@ def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: s
     parameters = table(result)
     summary = {
         "machine": model.machine.name,
-        "problem": before.get("problem"),
+        "problem": design.summary.get("problem"),
         "design": str(design_dir),
         "runs": runs,
         "method": method,
@@ -543,26 +557,6 @@ def _stem(machine: str) -> str:
     return Path(machine).stem if machine.endswith(".toml") else machine
 
 
-def _design_summary(design_dir: Path) -> dict[str, Any]:
-    import json
-
-    from excite import folder
-
-    path = design_dir / folder.SUMMARY
-    if not path.is_file():
-        raise UsageError(
-            f"{design_dir}: not a design (no {folder.SUMMARY} in it), make one with `excite design MACHINE`"
-        )
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise UsageError(f"{path}: damaged or not readable, design again") from None
-    whole = isinstance(summary, dict) and isinstance(summary.get("machine"), str) and "duration_s" in summary
-    if not whole or not (design_dir / "profile.csv").is_file():
-        raise UsageError(f"{design_dir}: not a design, make one with `excite design MACHINE`")
-    return summary
-
-
 def _versions() -> dict[str, str]:
     from importlib.metadata import version
 
@@ -598,14 +592,16 @@ def _terminate(*_: object) -> None:
 
 def _exit_code(err: Exception) -> int | None:
     """What an error means for the person who must act; None for a defect of ours, which shows its traceback."""
+    from excite.drive import DriveError
     from excite.estimate import NoEstimate
     from excite.folder import FolderError
     from excite.limit import InfeasibleError
     from excite.log import LogError
     from excite.simulate import SimulationError
+    from excite.stored import StoredError
     from model.machine import MachineError
 
-    if isinstance(err, UsageError | MachineError | LogError | FolderError):
+    if isinstance(err, UsageError | MachineError | LogError | FolderError | StoredError | DriveError):
         return 2
     if isinstance(err, NoEstimate | InfeasibleError | SimulationError):
         return 1

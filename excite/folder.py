@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 
 SUMMARY = "summary.json"
-OURS = re.compile(r"summary\.json|machine\.json|profile\.csv|README\.md|[a-z0-9-]+\.png|design|verify|drives")
+OURS = re.compile(
+    r"summary\.json|machine\.json|(profile|phases)\.csv|README\.md|[a-z0-9-]+\.(png|pdf|html)|design|verify|drives"
+)
 
 
 class FolderError(ValueError):

@@ -143,6 +143,18 @@ def identify_table(summary: dict[str, Any]) -> None:
         say(f"{check['log']}, not fitted on: torque error {errors}")
 
 
+def drive_table(summary: dict[str, Any]) -> None:
+    """A drive for a person: its phases, what it keeps of the design, what to mind."""
+    rows = table("at", "what it is")
+    for phase in summary["phases"]:
+        seconds = phase["start_s"]
+        rows.add_row(f"{int(seconds // 60)}:{seconds % 60:04.1f}", phase["do"])
+    say(rows)
+    say(summary["verdict"])
+    for warning in summary["warnings"]:
+        say(warning)
+
+
 Advance = Callable[[int, int, float | None], None]
 
 

@@ -1,0 +1,162 @@
+"""What goes into the cab: from a designed motion to the driver's sheet, the driver's page and their numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from excite import drive, sheet
+from excite.drive import DriveError, Score, Trace
+from excite.sheet import Sheet
+from excite.simulate import Motion, SimulationError
+from excite.stored import Stored
+from model.machine import Problem
+from model.prediction import Model
+
+PEOPLE = 3  # drives by different people, in simulation
+NEAR = 0.8  # of the articulation's stop
+Progress = Callable[[int, int, float | None], None]
+
+PLAYED, TRACED, PHASED = "torques played back", "a person on the design's own trace", "a person on these phases"
+
+
+def prepare(
+    design: Stored, most: int | None = None, shortest: float = 2.0, seed: int = 0, progress: Progress | None = None
+) -> Sheet:
+    """Everything that the sheet and the page show of a design: phases, paths, room, warnings, what a person keeps.
+
+    Raises DriveError and SimulationError as `drive.phases` and `drive.driven`.
+    """
+    model, motion, problem = design.model, design.motion, design.problem
+    if problem is None:
+        raise DriveError(f"{model.machine.name}: has no problem {design.summary.get('problem')}, design again")
+    trace, own = drive.phases(model, motion, shortest, most), drive.as_designed(model, motion)
+    done = 0
+
+    def people(way: Trace) -> tuple[Motion, ...]:
+        nonlocal done
+        motions = []
+        for k in range(PEOPLE):
+            motions.append(drive.driven(model, way, None, seed + k, motion.q[0]))
+            done += 1
+            if progress is not None:
+                progress(done, 2 * PEOPLE, None)
+        return tuple(motions)
+
+    scores: list[tuple[str, Score]] = [(PLAYED, drive.score(model, motion))]
+    try:
+        scores.append((TRACED, drive.middle([drive.score(model, m) for m in people(own)])))
+    except SimulationError:  # a trace that no one can follow need not stop the phases
+        done = PEOPLE
+    motions = drive.placed(model, problem, people(trace))
+    scores.append((PHASED, drive.middle([drive.score(model, m) for m in motions])))
+    room = drive.room(model, motions)
+    lane = (float(problem.lane_m[0]), float(problem.lane_m[1]))
+    return Sheet(
+        design.title,
+        model,
+        trace,
+        motions,
+        room,
+        lane,
+        tuple(_warnings(model, problem, trace, motions, room)),
+        tuple(scores),
+        verdict(scores[0][1], scores[-1][1]),
+    )
+
+
+def verdict(played: Score, person: Score) -> str:
+    """What a person keeps of a design, in a sentence."""
+    worst, median = person.worst_percent / played.worst_percent, person.median_percent / played.median_percent
+    ratio = max(worst, median)
+    begin = (
+        f"A person on these phases attains {median:.2g} times the median error and {worst:.2g} times the worst error of"
+        " torques played back exactly"
+    )
+    if ratio <= 1.1:
+        return f"{begin}: nothing that counts is lost."
+    if ratio <= drive.LOST:
+        return f"{begin}: good enough to drive."
+    return f"{begin}: too much is lost; design again with --objective accuracy, or play back the torques."
+
+
+def _warnings(model: Model, problem: Problem, trace: Trace, motions: tuple[Motion, ...], room: drive.Room) -> list[str]:
+    free = (np.ceil(room.length + 2 * sheet.AHEAD), np.ceil(room.width + 2 * sheet.AHEAD))
+    lines = [
+        f"Keep everybody off {free[0]:.0f} m x {free[1]:.0f} m: the rolls touch {room.length:.1f} m x"
+        f" {room.width:.1f} m, {sheet.AHEAD:g} m are left all around for overhangs and for stopping. Stop at once if"
+        " anybody comes near.",
+        "Vibration off, engine speed and drive settings the same all along, ground level and firm.",
+    ]
+    turns = len(drive.reversals(trace))
+    if turns:
+        times = "once" if turns == 1 else f"{turns} times"
+        lines.append(f"The machine changes direction {times}: somebody must see the ground behind it.")
+    ends = np.array([drive.edges(model, m)[0].mean(axis=0)[-1] for m in motions])
+    spread = float(np.hypot(*(ends.max(axis=0) - ends.min(axis=0))))
+    lines.append(
+        f"People drift: between {len(motions)} simulated drives the ends lie {spread:.1f} m apart. Follow speed and"
+        " articulation, not the place; don't correct the place before the end."
+    )
+    wheel = drive.steered(model)
+    if wheel is not None and wheel.limit.position is not None:
+        top = float(np.abs(trace.angle).max()) / float(wheel.limit.position)
+        if top > NEAR:
+            lines.append(f"The articulation goes to {100 * top:.0f} % of its stop: hands and feet away from the joint.")
+    over: dict[str, float] = {}
+    for m in motions:
+        for name, value in drive.broken(model, problem, m).items():
+            over[name] = max(over.get(name, 0.0), value)
+    if over:
+        named = ", ".join(f"{n.replace('_', ' ')} by {100 * v:.0f} %" for n, v in over.items())
+        lines.append(f"In a person's hands these limits are exceeded: {named} of their range.")
+    return lines
+
+
+def summary(made: Sheet) -> dict[str, Any]:
+    """The numbers of a sheet: phases, room, scores by way of driving, warnings."""
+    trace = made.trace
+    return {
+        "duration_s": trace.duration,
+        "phases": [
+            {
+                "start_s": float(trace.times[k]),
+                "end_s": float(trace.times[k + 1]),
+                "speed_m_s": [float(trace.speed[k]), float(trace.speed[k + 1])],
+                "angle_rad": [float(trace.angle[k]), float(trace.angle[k + 1])],
+                "do": drive.words(trace, k),
+            }
+            for k in range(len(trace))
+        ],
+        "direction_changes_s": drive.reversals(trace),
+        "room_m": [made.room.length, made.room.width],
+        "tolerance": {
+            "speed_m_s": drive.BAND_SPEED,
+            "angle_rad": float(drive.BAND_ANGLE),
+            "time_s": drive.BAND_S,
+        },
+        "scores": {
+            name: {
+                "cond_phi": s.cond_phi,
+                "worst_percent": s.worst_percent,
+                "worst": s.worst,
+                "median_percent": s.median_percent,
+            }
+            for name, s in made.scores
+        },
+        "verdict": made.verdict,
+        "warnings": list(made.warnings),
+    }
+
+
+def write(made: Sheet, place: Path) -> dict[str, Any]:
+    """sheet.pdf and phases.csv into a folder; returns the numbers."""
+    sheet.save(made, place / "sheet.pdf")
+    t = made.trace.times
+    knots = pd.DataFrame({"t_s": t, "v_m_s": made.trace.speed, "angle_rad": made.trace.angle})
+    knots.to_csv(place / "phases.csv", index=False)
+    return summary(made)

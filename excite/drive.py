@@ -1,0 +1,390 @@
+"""From a designed motion to a drive that a person can follow: phases of some seconds, their words, room and score.
+
+People follow a trace of speed and articulation, as in drive-cycle testing, not torques. A design is smoothed into few
+straight pieces of at least some seconds (piecewise linear least squares; the knots by dynamic programming, Bellman and
+Roth, 1969), rounded to what a dial shows, and driven in simulation by `driver`: what is left of the attainable
+accuracy is what a person can keep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from excite import driver, limit, objective, smoothing
+from excite.simulate import Motion
+from model.machine import Body, Problem
+from model.prediction import Model
+
+GRID = 0.5  # s between places where a phase may begin
+SPEED_STEP, ANGLE_STEP = 0.1, np.deg2rad(2)  # what is read from a dial and steered to
+RESERVE = 0.93  # of speed and rate limits that a trace asks for: a person overshoots
+# Tolerance of the trace, in proportion to the 2 km/h of 130 km/h and 1 s of drive-cycle testing (WLTP, UN GTR 15),
+# but no narrower than a practised person's slow errors (`driver.Driver`).
+BAND_S = 1.0
+BAND_SPEED, BAND_ANGLE = 0.1, np.deg2rad(2)
+LOST = 2.0  # times the attainable error: a drive that loses more in a person's hands is not worth the day
+
+
+class DriveError(ValueError):
+    """A design that no person can be asked to follow: the message says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a driver follows, linear between knots: times (K,) [s], speed (K,) [m/s] forward, angle (K,) [rad].
+
+    `angle` is that of the steered joint in the machine's own sign; `left` is +1 or -1, the sign that turns the machine
+    to the left when it goes forward, 0 where nothing is steered.
+    """
+
+    times: np.ndarray
+    speed: np.ndarray
+    angle: np.ndarray
+    left: int
+
+    @property
+    def duration(self) -> float:
+        return float(self.times[-1])
+
+    def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Speed (N,) [m/s] and angle (N,) [rad] at times (N,) [s], held at the ends."""
+        return np.interp(t, self.times, self.speed), np.interp(t, self.times, self.angle)
+
+    def __len__(self) -> int:
+        return len(self.times) - 1
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a drive gives: cond(Phi), and the attainable standard deviation [%], worst and median parameter."""
+
+    cond_phi: float
+    worst_percent: float
+    worst: str
+    median_percent: float
+
+
+@dataclass(frozen=True)
+class Room:
+    """The ground that the rolls' edges touch, along the lane's axes [m]: length, width, corner (x, y) of the box."""
+
+    length: float
+    width: float
+    corner: tuple[float, float]
+
+
+def steered(model: Model) -> Body | None:
+    """The joint that a person steers, None on a straight lane. Raises DriveError: no wheels, or several such joints."""
+    if not model.machine.planar or not model.machine.contacts:
+        raise DriveError(f"{model.machine.name}: has no rolls on the ground, so there is nobody to drive it")
+    joints = [b for b in model.machine.actuated if b.contact is None]
+    if len(joints) > 1:
+        names = ", ".join(b.where for b in joints)
+        raise DriveError(f"{model.machine.name}: {names} are steered at once, a person follows one; lock the others")
+    return joints[0] if joints else None
+
+
+def turns_left(model: Model) -> int:
+    """The sign of the steered joint's angle that turns the machine left when rolling forward, 0 without steering.
+
+    From pure rolling: the lateral speeds of both rolls vanish, which is linear in the chassis' speeds.
+    """
+    body = steered(model)
+    if body is None:
+        return 0
+    names = model.coordinates
+    q = np.zeros(len(names))
+    q[names.index(body.coordinates[0])] = 0.1
+    rows = [k for k, s in enumerate(model.slips) if s.startswith("gy")]
+
+    def lateral(k: int) -> np.ndarray:
+        nu = np.zeros(len(names))
+        nu[k] = 1e-3
+        return np.asarray(model.kinematics(q, nu)[1].full())[rows, 0]
+
+    forward, sideways, yaw = (lateral(k) for k in range(3))
+    turn = np.linalg.lstsq(np.column_stack([sideways, yaw]), -forward, rcond=None)[0][1]
+    return 1 if turn > 0 else -1
+
+
+def phases(model: Model, motion: Motion, shortest: float = 2.0, most: int | None = None) -> Trace:
+    """A motion as a trace of at most `most` straight pieces, one in three seconds by default, `shortest` [s] or longer.
+
+    Starts and ends at rest; speed and steering rate keep the machine's limits with a reserve. Raises DriveError for a
+    machine that nobody steers, and for arguments out of range.
+    """
+    duration = float(motion.t[-1])
+    most = max(2, round(duration / 3)) if most is None else most
+    if most < 2:
+        raise DriveError(f"phases: at least 2 are needed, to go and to stop (got {most})")
+    if not GRID <= shortest <= duration / 2:
+        raise DriveError(f"shortest phase: must be between {GRID:g} and {duration / 2:g} s (got {shortest:g})")
+    wheel, left = steered(model), turns_left(model)
+    speed = motion.nu[:, 0]
+    angle = motion.q[:, model.coordinates.index(wheel.coordinates[0])] if wheel else np.zeros(len(motion.t))
+    fastest, widest, swing = _bounds(model, wheel)
+    signal = np.column_stack([speed / (SPEED_STEP * 5), angle / (ANGLE_STEP * 5)])
+    knots = _segments(motion.t, signal, shortest, most)
+    fit = _refit(motion.t, np.column_stack([speed, angle]), knots)
+    v = np.clip(np.round(fit[:, 0] / SPEED_STEP) * SPEED_STEP, -fastest, fastest)
+    a = np.clip(np.round(fit[:, 1] / ANGLE_STEP) * ANGLE_STEP, -widest, widest)
+    for k in range(1, len(a)):  # from the start, then from the end, so that both ends stay where they are
+        a[k] = np.clip(a[k], a[k - 1] - swing * np.diff(knots)[k - 1], a[k - 1] + swing * np.diff(knots)[k - 1])
+    for k in range(len(a) - 2, -1, -1):
+        a[k] = np.clip(a[k], a[k + 1] - swing * np.diff(knots)[k], a[k + 1] + swing * np.diff(knots)[k])
+    return _merge(Trace(knots, v + 0.0, a + 0.0, left))
+
+
+def as_designed(model: Model, motion: Motion) -> Trace:
+    """A motion's own speed and articulation as a trace, sample by sample: what the phases are compared with."""
+    wheel = steered(model)
+    angle = motion.q[:, model.coordinates.index(wheel.coordinates[0])] if wheel else np.zeros(len(motion.t))
+    return Trace(motion.t, motion.nu[:, 0], angle, turns_left(model))
+
+
+def _bounds(model: Model, wheel: Body | None) -> tuple[float, float, float]:
+    """Speed [m/s], angle [rad] and rate [rad/s] that a trace may ask for; speed and angle on the dial's grid."""
+    rims = [float(b.limit.rim_speed) for b in model.machine.contacts if b.limit.rim_speed is not None]
+    fastest = np.floor(RESERVE * min(rims) / SPEED_STEP + 1e-9) * SPEED_STEP if rims else np.inf
+    if wheel is None:
+        return float(fastest), np.inf, np.inf
+    top, rate = wheel.limit.position, wheel.limit.rate
+    widest = np.floor(RESERVE * float(top) / ANGLE_STEP) * ANGLE_STEP if top is not None else np.inf
+    return float(fastest), float(widest), RESERVE * float(rate) if rate is not None else np.inf
+
+
+def _segments(t: np.ndarray, signal: np.ndarray, shortest: float, most: int) -> np.ndarray:
+    """Knot times (K + 1,) of the best chords: the fewest whose squared misfit is close to the best with `most`."""
+    count = max(round(t[-1] / GRID), 2)
+    grid = np.round(np.linspace(0, len(t) - 1, count + 1)).astype(int)
+    least = max(1, int(np.ceil(shortest * count / t[-1] - 1e-9)))
+    cost = np.full((count + 1, count + 1), np.inf)
+    # a chord between two samples: its misfit is a sum of squares that cumulative sums give at once
+    n = np.arange(len(t), dtype=float)
+    sums = [np.vstack([np.zeros((1, signal.shape[1])), np.cumsum(x, axis=0)]) for x in (signal, signal**2)]
+    moment = np.vstack([np.zeros((1, signal.shape[1])), np.cumsum(n[:, None] * signal, axis=0)])
+    for i in range(count + 1):
+        for j in range(i + least, count + 1):
+            p, q = grid[i], grid[j]
+            m = q - p
+            slope = (signal[q] - signal[p]) / m
+            s, ss, ns = (x[q] - x[p] for x in (sums[0], sums[1], moment))
+            k1, k2 = m * (m - 1) / 2, (m - 1) * m * (2 * m - 1) / 6
+            chord = m * signal[p] ** 2 + 2 * signal[p] * slope * k1 + slope**2 * k2
+            cost[i, j] = float((ss - 2 * (signal[p] * s + slope * (ns - p * s)) + chord).sum())
+    best = np.full((most + 1, count + 1), np.inf)
+    came = np.zeros((most + 1, count + 1), int)
+    best[0, 0] = 0.0
+    for k in range(1, most + 1):
+        total = best[k - 1][:, None] + cost
+        came[k], best[k] = np.argmin(total, axis=0), np.min(total, axis=0)
+    ends = best[1:, count]
+    chosen = 1 + int(np.argmax(ends <= 1.1 * np.min(ends) + 1e-6 * len(t)))
+    path = [count]
+    for k in range(chosen, 0, -1):
+        path.append(int(came[k, path[-1]]))
+    return np.asarray(t[grid[path[::-1]]])
+
+
+def _refit(t: np.ndarray, signal: np.ndarray, knots: np.ndarray) -> np.ndarray:
+    """Knot values (K + 1, n) of the continuous piecewise linear function nearest to the signal, zero at both ends."""
+    hats = np.column_stack([np.interp(t, knots, row) for row in np.eye(len(knots))])[:, 1:-1]
+    values = np.zeros((len(knots), signal.shape[1]))
+    if hats.shape[1]:
+        values[1:-1] = np.linalg.lstsq(hats, signal, rcond=None)[0]
+    return values
+
+
+def _merge(trace: Trace) -> Trace:
+    """Neighbours that are one straight line become one phase."""
+    keep = [0]
+    for k in range(1, len(trace.times) - 1):
+        before, after = keep[-1], k + 1
+        share = (trace.times[k] - trace.times[before]) / (trace.times[after] - trace.times[before])
+        bend_v = trace.speed[k] - (trace.speed[before] + share * (trace.speed[after] - trace.speed[before]))
+        bend_a = trace.angle[k] - (trace.angle[before] + share * (trace.angle[after] - trace.angle[before]))
+        if abs(bend_v) > SPEED_STEP / 10 or abs(bend_a) > ANGLE_STEP / 10:
+            keep.append(k)
+    keep.append(len(trace.times) - 1)
+    return replace(trace, times=trace.times[keep], speed=trace.speed[keep], angle=trace.angle[keep])
+
+
+# ------------------------------------------------------------------------------------------------ words
+
+
+def clock(t: float) -> str:
+    """Seconds as a person reads them: 0:12, 1:04.5."""
+    tenths = round(10 * t)
+    minutes, rest = divmod(tenths, 600)
+    return f"{minutes}:{rest // 10:02d}" + (f".{rest % 10}" if rest % 10 else "")
+
+
+def letter(k: int) -> str:
+    """The name of the k-th change of direction on the map: A, B, ... Z, A1, B1, ..."""
+    return chr(ord("A") + k % 26) + (str(k // 26) if k >= 26 else "")
+
+
+def words(trace: Trace, k: int, letters: bool = False) -> str:
+    """What to do in phase k: "accelerate to 1.5 m/s in 4 s, straight".
+
+    `letters`: with the names that changes of direction have on the map.
+    """
+    start, end = float(trace.times[k]), float(trace.times[k + 1])
+    took = end - start
+    v0, v1 = float(trace.speed[k]), float(trace.speed[k + 1])
+    names = [letter(n) for n, t in enumerate(reversals(trace)) if letters and start < t < end]
+    go = _speed_words(v0, v1, took, start, names[0] if names else "")
+    if trace.left == 0:
+        return go
+    steer = _steer_words(trace.left * float(trace.angle[k]), trace.left * float(trace.angle[k + 1]), took)
+    return f"{go}, {steer}"
+
+
+def _speed_words(v0: float, v1: float, took: float, start: float, name: str) -> str:
+    seconds = f"in {took:.3g} s"
+    way = " backward" if min(v0, v1) < 0 else ""
+    if v0 == v1:
+        return f"hold {abs(v1):.1f} m/s{way} for {took:.3g} s" if v1 else f"stand still for {took:.3g} s"
+    if v0 * v1 < 0:
+        turn, way = clock(start + took * v0 / (v0 - v1)), "backward" if v1 < 0 else "forward"
+        return f"through a stop {name + ' ' if name else ''}at {turn} to {abs(v1):.1f} m/s {way} {seconds}"
+    if v1 == 0:
+        return f"brake to a stop {seconds}"
+    verb = "accelerate" if abs(v1) > abs(v0) else "slow down"
+    return f"{verb}{way} to {abs(v1):.1f} m/s {seconds}"
+
+
+def _steer_words(a0: float, a1: float, took: float) -> str:
+    """Angles positive to the left."""
+    degrees = round(abs(np.rad2deg(a1)))
+    side = "left" if a1 > 0 else "right"
+    if abs(a0 - a1) < ANGLE_STEP / 10:
+        return f"keep {degrees}° {side}" if degrees else "straight"
+    return f"steer to {degrees}° {side}" if degrees else "straighten up"
+
+
+def reversals(trace: Trace) -> list[float]:
+    """Times [s] at which the direction of travel changes."""
+    t = np.arange(0, trace.duration, 0.01)
+    v = trace.at(t)[0]
+    moving = np.flatnonzero(np.abs(v) > SPEED_STEP / 4)
+    turns = moving[1:][np.sign(v[moving[1:]]) != np.sign(v[moving[:-1]])]
+    return [float(t[k]) for k in turns]
+
+
+# ------------------------------------------------------------------------------------------------ driven by a person
+
+
+def driven(model: Model, trace: Trace, who: driver.Driver | None, seed: int, q0: np.ndarray | None = None) -> Motion:
+    """A person follows the trace, in simulation. Raises SimulationError."""
+    rate = float(model.machine.sampling_hz)
+    t = np.arange(round(trace.duration * rate) + 1) / rate
+    speed, angle = trace.at(t)
+    angles = angle[:, None] if trace.left else np.zeros((len(t), 0))
+    return driver.follow(model, speed, angles, who, seed=seed, q0=q0)
+
+
+def score(model: Model, motion: Motion) -> Score:
+    """cond(Phi) and what accuracy a motion makes attainable (Cramer-Rao, kit full), whoever drives it."""
+    covariance = smoothing.cramer_rao(model, motion, "full")
+    reference = np.where(model.nominal != 0, np.abs(model.nominal), model.scale)
+    sigma = 100 * np.sqrt(np.diag(covariance)) / reference
+    worst = int(np.argmax(sigma))
+    return Score(
+        objective.cond_phi(model, motion), float(sigma[worst]), model.base.names[worst], float(np.median(sigma))
+    )
+
+
+def middle(scores: Sequence[Score]) -> Score:
+    """The score in the middle of several, by the worst parameter."""
+    return sorted(scores, key=lambda s: s.worst_percent)[(len(scores) - 1) // 2]
+
+
+def broken(model: Model, problem: Problem, motion: Motion, least: float = 0.02) -> dict[str, float]:
+    """Limits of machine and lane that a motion exceeds by more than `least` of their range, with the excess."""
+    over = limit.check(model, problem, motion)
+    return {name: value for name, value in over.items() if value > least and not name.startswith("rest")}
+
+
+# ------------------------------------------------------------------------------------------------ room
+
+
+def edges(model: Model, motion: Motion) -> np.ndarray:
+    """Ground tracks of the edges of every roll (n_rolls, 2, N, 2) [m]: right and left end of its line of contact."""
+    machine = model.machine
+    places = model.kinematics(motion.q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), len(machine.body))
+    heading = _headings(model, motion)
+    tracks = []
+    for b in machine.contacts:
+        assert b.contact is not None
+        k = machine.body.index(b)
+        turn = heading[k]
+        half = float(b.contact.width) / 2
+        across = np.column_stack([-np.sin(turn), np.cos(turn)])
+        tracks.append([places[:2, :, k].T - half * across, places[:2, :, k].T + half * across])
+    return np.array(tracks)
+
+
+def _headings(model: Model, motion: Motion) -> np.ndarray:
+    """(n_bodies, N) heading [rad] of every body: the root's and the vertical joints' between."""
+    machine = model.machine
+    at = {c: motion.q[:, k] for k, c in enumerate(model.coordinates)}
+    still = np.zeros(len(motion.t))
+    heading: dict[int, np.ndarray] = {}
+    for b in machine.body:
+        own = at.get(f"theta{b.index}", still)
+        if isinstance(b.antecedent, str):
+            heading[b.index] = own
+        else:  # a roll spins about its axle, not about the vertical
+            spins = b.contact is not None or b.joint != "revolute"
+            heading[b.index] = heading[b.antecedent] + (0.0 if spins else own)
+    return np.array([heading[b.index] for b in machine.body])
+
+
+def room(model: Model, motions: Sequence[Motion]) -> Room:
+    """The ground that the rolls' edges touch in any of the drives."""
+    points = np.concatenate([edges(model, m).reshape(-1, 2) for m in motions])
+    low, high = points.min(axis=0), points.max(axis=0)
+    return Room(float(high[0] - low[0]), float(high[1] - low[1]), (float(low[0]), float(low[1])))
+
+
+def placed(model: Model, problem: Problem, motions: Sequence[Motion]) -> tuple[Motion, ...]:
+    """The drives, all from one start, moved there where the first of them lies best in the lane.
+
+    What a machine does on flat ground doesn't depend on where it starts. A drive that keeps the lane stays.
+    """
+    first = motions[0]
+    if not any(name.startswith("lane") for name in broken(model, problem, first, 0.0)):
+        return tuple(motions)
+    return tuple(moved(model, m, limit.placed(model, problem, first)) for m in motions)
+
+
+def moved(model: Model, motion: Motion, start: np.ndarray) -> Motion:
+    """The same motion from another place and heading, start (n_q,): turned and shifted over the ground."""
+    names = model.machine.body[0].coordinates
+    x, y, head = (model.coordinates.index(c) if c in model.coordinates else None for c in names)
+    q = motion.q.copy()
+    turn = 0.0 if head is None else float(start[head] - q[0, head])
+    c, s = np.cos(turn), np.sin(turn)
+    flat = np.column_stack([q[:, k] if k is not None else np.zeros(len(q)) for k in (x, y)])
+    flat = (flat - flat[0]) @ np.array([[c, s], [-s, c]])
+    for k, values in ((x, flat[:, 0]), (y, flat[:, 1])):
+        if k is not None:
+            q[:, k] = values + start[k]
+    if head is not None:
+        q[:, head] += turn
+    return replace(motion, q=q)
+
+
+def band(t: np.ndarray, value: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper edge (N,) of the tolerance around a reference (N,) at even times (N,) [s].
+
+    As in drive-cycle testing: within `tolerance` of any value that the reference has less than BAND_S away.
+    """
+    reach = round(BAND_S / (t[1] - t[0]))
+    padded = np.pad(value, reach, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
+    return windows.min(axis=1) - tolerance, windows.max(axis=1) + tolerance

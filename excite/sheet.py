@@ -1,0 +1,281 @@
+"""The driver's sheet: two pages A4 in print, what to drive where and when, what to set up, what to mind."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from excite import drive
+from excite.drive import Room, Score, Trace
+from excite.report import COLOURS
+from excite.simulate import Motion
+from model.machine import Machine, Sensor
+from model.prediction import Model
+
+A4 = (8.27, 11.69)
+LEFT, RIGHT = 0.08, 0.95
+SI = {"torque": "N m", "yaw_rate": "rad/s", "lateral_speed": "m/s", "x": "m", "y": "m", "angle": "rad", "wheel": "rad"}
+AHEAD = 3.0  # m of free ground around what the rolls touch: overhangs, and a person who has to stop
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What the sheet shows. motions: the trace driven by several people, the first one's path is drawn; scores: what
+    each way of driving makes attainable, by name."""
+
+    title: str
+    model: Model
+    trace: Trace
+    motions: tuple[Motion, ...]
+    room: Room
+    lane: tuple[float, float]
+    warnings: tuple[str, ...]
+    scores: tuple[tuple[str, Score], ...]
+    verdict: str
+
+
+def save(sheet: Sheet, path: Path) -> None:
+    """Writes the PDF, without the clock in it: the same drive gives the same bytes."""
+    with PdfPages(path, metadata={"CreationDate": None, "Title": f"Driver's sheet: {sheet.title}"}) as pdf:
+        for page in (_first(sheet), _second(sheet)):
+            pdf.savefig(page)
+
+
+def facts(sheet: Sheet) -> list[tuple[str, str]]:
+    """The drive in numbers, name and value."""
+    trace = sheet.trace
+    top = float(np.abs(trace.speed).max())
+    length = float(np.abs(trace.at(np.arange(0, trace.duration, 0.01))[0]).sum() * 0.01)
+    rows = [
+        ("time", f"{drive.clock(trace.duration)} min"),
+        ("phases", str(len(trace))),
+        ("direction changes", str(len(drive.reversals(trace)))),
+        ("distance", f"{length:.0f} m"),
+        ("top speed", f"{top:.1f} m/s, {3.6 * top:.1f} km/h"),
+    ]
+    if trace.left:
+        rows.append(("articulation up to", f"{np.rad2deg(np.abs(trace.angle).max()):.0f}°"))
+    rows.append(
+        ("free ground", f"{np.ceil(sheet.room.length + 2 * AHEAD):.0f} x {np.ceil(sheet.room.width + 2 * AHEAD):.0f} m")
+    )
+    return rows
+
+
+def _first(sheet: Sheet) -> Figure:
+    figure = Figure(figsize=A4)
+    _head(figure, sheet, 1)
+    rows = facts(sheet)
+    widths = np.array([max(len(value) * 1.35, len(name)) + 3 for name, value in rows], float)
+    starts = LEFT + (RIGHT - LEFT) * np.concatenate([[0.0], np.cumsum(widths)[:-1]]) / widths.sum()
+    for x, (name, value) in zip(starts, rows, strict=True):
+        figure.text(x, 0.908, value, fontsize=9, weight="bold")
+        figure.text(x, 0.895, name, fontsize=7, color="0.25")
+    lane = figure.add_axes((LEFT, 0.555, RIGHT - LEFT, 0.31))
+    _lane(lane, sheet)
+    steers = sheet.trace.left != 0
+    height = 0.19 if steers else 0.38
+    speed = figure.add_axes((LEFT, 0.29 if steers else 0.1, RIGHT - LEFT, height))
+    _trace(speed, sheet, "speed [m/s]\nbackward  |  forward", sheet.trace.speed, drive.BAND_SPEED, 1.0)
+    _numbers(speed, sheet.trace)
+    bottom = speed
+    if steers:
+        bottom = figure.add_axes((LEFT, 0.075, RIGHT - LEFT, height), sharex=speed)
+        angle = np.rad2deg(sheet.trace.left * sheet.trace.angle)
+        _trace(bottom, sheet, "articulation [°]\nright  |  left", angle, np.rad2deg(drive.BAND_ANGLE), 5.0)
+        speed.tick_params(labelbottom=False)
+    bottom.set_xlabel("time [s]; the grey band is the tolerance", fontsize=8)
+    return figure
+
+
+def _head(figure: Figure, sheet: Sheet, page: int) -> None:
+    figure.text(LEFT, 0.955, "Driver's sheet", fontsize=18, weight="bold")
+    figure.text(LEFT, 0.937, sheet.title, fontsize=9.5)
+    figure.text(RIGHT, 0.955, f"{page} / 2", fontsize=9, ha="right")
+
+
+def _lane(ax: Axes, sheet: Sheet) -> None:
+    """The lane from above: what the rolls touch, the way of the first roll, start, turning points, end."""
+    motion, model = sheet.motions[0], sheet.model
+    edges = drive.edges(model, motion)
+    for right, left in edges:
+        step = max(1, len(right) // 400)
+        for k in range(0, len(right) - step, step):
+            quad = [right[k], right[k + step], left[k + step], left[k]]
+            ax.add_patch(Polygon(quad, closed=True, facecolor="0.88", edgecolor="none", zorder=1))
+    centre = edges[0].mean(axis=0)
+    v = sheet.trace.at(motion.t)[0]
+    forward = v >= 0
+    for ahead, colour, style, name in ((True, COLOURS[0], "-", "forward"), (False, COLOURS[1], "--", "backward")):
+        part = np.where((forward == ahead)[:, None], centre, np.nan)
+        ax.plot(*part.T, color=colour, linestyle=style, linewidth=1.8, label=name, zorder=3)
+    for b, roll in zip(model.machine.contacts, edges, strict=True):  # the machine as it stands at the start
+        right, left = roll[:, 0]
+        assert b.contact is not None
+        across = left - right
+        along = np.array([across[1], -across[0]]) / float(b.contact.width) * float(b.contact.radius)
+        outline = [right - along, right + along, left + along, left - along]
+        ax.add_patch(Polygon(outline, closed=True, facecolor="white", edgecolor="black", zorder=4))
+    ax.plot(*edges.mean(axis=1)[:, 0].T, color="black", linewidth=1.5, zorder=4)
+    _mark(ax, centre[0], "o", "START", (6, 8))
+    _mark(ax, centre[-1], "s", "END", (6, -13))
+    for k, t in enumerate(drive.reversals(sheet.trace)):
+        at = centre[min(round(t * float(model.machine.sampling_hz)), len(centre) - 1)]
+        _mark(ax, at, "D", drive.letter(k), (7, 6) if k % 2 else (-13, 6))
+    for t in np.arange(3.0, sheet.trace.duration, 6.0):  # which way along the path
+        k = min(round(t * float(model.machine.sampling_hz)), len(centre) - 11)
+        step = centre[k + 10] - centre[k]
+        if np.hypot(*step) > 0.05:
+            tip = centre[k] + step / np.hypot(*step) * 0.4
+            ax.annotate("", tip, centre[k], arrowprops={"arrowstyle": "-|>", "color": "black"}, zorder=5)
+    half, lane = np.array(sheet.lane) / 2, f"lane {sheet.lane[0]:g} x {sheet.lane[1]:g} m"
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * half
+    ax.plot(*corners.T, color="black", linestyle=":", linewidth=1, label=lane)
+    ax.plot([], [], "D", color="white", markeredgecolor="black", markersize=5, label="change of direction A, B, ...")
+    ax.plot([], [], color="0.8", linewidth=6, label="ground under the rolls")
+    (x, y), margin = sheet.room.corner, 0.7 * AHEAD
+    half_x, half_y = sheet.room.length / 2, sheet.room.width / 2
+    width, height = ax.get_position().width * A4[0], ax.get_position().height * A4[1]
+    scale = max((half_x + margin) / width, (half_y + margin) / height)
+    ax.set_xlim(x + half_x - scale * width, x + half_x + scale * width)
+    ax.set_ylim(y + half_y - scale * height, y + half_y + scale * height)
+    ax.set_aspect("equal")
+    ax.set_xlabel("along the lane [m]", fontsize=8)
+    ax.set_ylabel("across [m]", fontsize=8)
+    ax.tick_params(labelsize=7)
+    ax.grid(alpha=0.25)
+    ax.legend(fontsize=7, ncols=5, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False, borderpad=0)
+
+
+def _mark(ax: Axes, at: np.ndarray, marker: str, text: str, offset: tuple[float, float]) -> None:
+    filled = "white" if marker == "D" else "black"
+    ax.plot(*at, marker, color=filled, markeredgecolor="black", markersize=6, zorder=6)
+    ax.annotate(text, (at[0], at[1]), xytext=offset, textcoords="offset points", fontsize=8, weight="bold", zorder=7)
+
+
+def _trace(ax: Axes, sheet: Sheet, label: str, value: np.ndarray, band: float, least: float) -> None:
+    trace = sheet.trace
+    t = np.arange(0, trace.duration + 0.005, 0.05)
+    low, high = drive.band(t, np.interp(t, trace.times, value), band)
+    ax.fill_between(t, low, high, color="0.85", linewidth=0)
+    ax.plot(trace.times, value, color="black", linewidth=1.8)
+    for k in range(len(trace)):
+        if k % 2:
+            ax.axvspan(trace.times[k], trace.times[k + 1], color=COLOURS[4], alpha=0.13, linewidth=0)
+        ax.axvline(trace.times[k], color="0.5", linewidth=0.5)
+    ax.axhline(0, color="black", linewidth=0.6)
+    top = 1.25 * max(least, float(np.abs(value).max()))
+    ax.set_ylim(-top, top)
+    ax.set_xlim(0, trace.duration)
+    ax.set_ylabel(label, fontsize=8)
+    ax.tick_params(labelsize=7)
+    ax.grid(axis="y", alpha=0.3)
+
+
+def _numbers(ax: Axes, trace: Trace) -> None:
+    """The phases' numbers above the trace."""
+    for k in range(len(trace)):
+        middle = (trace.times[k] + trace.times[k + 1]) / 2
+        ax.annotate(
+            str(k + 1),
+            (middle, 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(0, 2),
+            textcoords="offset points",
+            ha="center",
+            fontsize=7,
+            weight="bold",
+        )
+
+
+def _second(sheet: Sheet) -> Figure:
+    figure = Figure(figsize=A4)
+    _head(figure, sheet, 2)
+    trace = sheet.trace
+    y = _title(figure, 0.91, "What to drive")
+    space = min(0.0165, 0.40 / max(len(trace), 1))
+    size = min(9.0, 8.5 * space / 0.0145)
+    columns = (LEFT, LEFT + 0.04, LEFT + 0.12, LEFT + 0.69, LEFT + 0.79)
+    titles = ("no.", "at", "do", "then speed", "then angle" if trace.left else "")
+    for x, text in zip(columns, titles, strict=True):
+        figure.text(x, y, text, fontsize=7, color="0.25")
+    y -= space
+    for k in range(len(trace)):
+        degrees = trace.left * np.rad2deg(trace.angle[k + 1])
+        side = "" if abs(degrees) < 0.5 else " left" if degrees > 0 else " right"
+        cells = (
+            str(k + 1),
+            drive.clock(trace.times[k]),
+            drive.words(trace, k, letters=True),
+            f"{trace.speed[k + 1]:+.1f} m/s".replace("+0.0", "0"),
+            f"{abs(degrees):.0f}°{side}" if trace.left else "",
+        )
+        for x, text in zip(columns, cells, strict=True):
+            figure.text(x, y, text, fontsize=size, weight="bold" if x == columns[1] else "normal")
+        y -= space
+    y = _title(figure, y - 0.008, "Mind")
+    y = _list(figure, y, sheet.warnings)
+    y = _title(figure, y - 0.008, "Set up")
+    y = _list(figure, y, set_up(sheet.model.machine))
+    y = _title(figure, y - 0.008, "What this drive gives in a person's hands")
+    y = _list(figure, y, [sheet.verdict, *(_score_line(name, score) for name, score in sheet.scores)])
+    return figure
+
+
+def _score_line(name: str, score: Score) -> str:
+    return (
+        f"{name}: attainable error {score.median_percent:.2g} % (median parameter), {score.worst_percent:.2g} %"
+        f" (worst, {score.worst}); cond(Phi) {score.cond_phi:.3g}"
+    )
+
+
+def _title(figure: Figure, y: float, text: str) -> float:
+    figure.text(LEFT, y, text, fontsize=11, weight="bold")
+    return y - 0.018
+
+
+def _list(figure: Figure, y: float, lines: Sequence[str]) -> float:
+    for line in lines:
+        for k, part in enumerate(textwrap.wrap(line, 122)):
+            figure.text(LEFT, y, ("•  " if k == 0 else "    ") + part, fontsize=7.8)
+            y -= 0.0128
+    return y
+
+
+def set_up(machine: Machine) -> list[str]:
+    """The list of sensors to mount and to check before the drive, a line each."""
+    rate = float(machine.sampling_hz)
+    lines = [f"Log all columns at {rate:g} Hz, from 5 s before the drive to 5 s after it, the machine at rest."]
+    return lines + [sensor_line(machine, s) for s in machine.sensors("full")]
+
+
+def sensor_line(machine: Machine, sensor: Sensor) -> str:
+    """One sensor: what it reads, where, its column and how fine it must be."""
+    body = machine.find(sensor.body)
+    where = (sensor.place or body.where).replace("_", " ")
+    what = {
+        "angle": f"angle of the {where}, counted on over turns",
+        "wheel": f"angle of the {where}",
+        "torque": f"torque at the {where}",
+        "yaw_rate": f"yaw rate of the {where}",
+        "lateral_speed": f"lateral speed of the {where}",
+        "x": f"position along x of the {where}",
+        "y": f"position along y of the {where}",
+    }[sensor.kind]
+    extra = []
+    if sensor.radius is not None and sensor.lateral is not None:
+        side = "left" if float(sensor.lateral) > 0 else "right"
+        extra.append(f"radius {float(sensor.radius):g} m, {abs(float(sensor.lateral)):g} m to the {side}: measure both")
+    if sensor.counts_per_turn is not None:
+        extra.append(f"{float(sensor.counts_per_turn):g} counts per turn")
+    if sensor.noise is not None:
+        extra.append(f"noise below {float(sensor.noise):g} {SI[sensor.kind]}")
+    kit = "" if "paper" in sensor.kits else "; optional"
+    return f"{sensor.column} [{sensor.unit}]: {what}" + (f"; {', '.join(extra)}" if extra else "") + kit

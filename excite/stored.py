@@ -1,0 +1,65 @@
+"""A design folder read back: what `excite design` wrote, as a model and a motion again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from excite import folder, log
+from excite.simulate import Motion, simulate
+from model.machine import Machine, Problem
+from model.prediction import Model, build
+
+
+class StoredError(ValueError):
+    """A folder that holds no design, or a damaged one: the message says what to do."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A design: its summary, model and problem, and the motion that its torques make."""
+
+    summary: dict[str, Any]
+    model: Model
+    problem: Problem | None
+    motion: Motion
+
+    @property
+    def title(self) -> str:
+        return f"{self.model.machine.title}: {self.summary.get('problem')}"
+
+
+def summary(design_dir: Path) -> dict[str, Any]:
+    """The summary of a design folder. Raises StoredError."""
+    path = design_dir / folder.SUMMARY
+    if not path.is_file():
+        raise StoredError(
+            f"{design_dir}: not a design (no {folder.SUMMARY} in it), make one with `excite design MACHINE`"
+        )
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise StoredError(f"{path}: damaged or not readable, design again") from None
+    whole = isinstance(found, dict) and isinstance(found.get("machine"), str) and "duration_s" in found
+    if not whole or not (design_dir / "profile.csv").is_file():
+        raise StoredError(f"{design_dir}: not a design, make one with `excite design MACHINE`")
+    return dict(found)
+
+
+def read(design_dir: Path) -> Stored:
+    """A design folder, its profile driven afresh. Raises StoredError, LogError, SimulationError."""
+    before = summary(design_dir)
+    path = design_dir / "machine.json"
+    try:
+        model = build(Machine.model_validate_json(path.read_bytes()))
+    except (OSError, ValueError):
+        raise StoredError(f"{path}: missing or damaged, design again") from None
+    torque, q0, nu0 = log.read_profile(design_dir / "profile.csv", model)
+    if len(torque) != round(before["duration_s"] * float(model.machine.sampling_hz)) + 1:
+        raise StoredError(
+            f"{design_dir / 'profile.csv'}: {len(torque)} rows do not make {before['duration_s']:g} s, design again"
+        )
+    problem = model.machine.problems.get(str(before.get("problem")))
+    return Stored(before, model, problem, simulate(model, torque, q0=q0, nu0=nu0))

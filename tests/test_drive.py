@@ -1,0 +1,183 @@
+"""A drive that people can follow: phases, words, sides, tolerance, room, and what a person keeps of a design."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Excite
+
+from excite import cab, drive, sheet, stored
+from excite.drive import DriveError, Trace
+from excite.simulate import Motion, simulate
+from model.prediction import Model
+
+RESULTS = Path(__file__).parents[1] / "results"
+KNOTS = np.array([0.0, 4, 9, 12, 15, 19, 23, 27])
+SPEED = np.array([0.0, 1.5, 1.5, 0, 0, -1.2, -1.2, 0])
+ANGLE = np.deg2rad([0.0, 0, 20, 20, 0, 0, -10, 0])
+
+
+def motion_of(model: Model, speed: np.ndarray, angle: np.ndarray) -> Motion:
+    """A motion with just the speed and articulation given."""
+    n, n_q = len(speed), len(model.coordinates)
+    still = simulate(model, np.zeros((2, len(model.inputs))))
+    q, nu = np.zeros((n, n_q)), np.zeros((n, n_q))
+    nu[:, 0] = speed
+    if "theta2" in model.coordinates:
+        q[:, model.coordinates.index("theta2")] = angle
+    return replace(still, t=np.arange(n) / 100, q=q, nu=nu)
+
+
+def test_phases_of_a_drive_made_of_phases_are_these(va12: Model) -> None:
+    t = np.arange(2701) / 100
+    motion = motion_of(va12, np.interp(t, KNOTS, SPEED), np.interp(t, KNOTS, ANGLE))
+    trace = drive.phases(va12, motion, most=9)
+    assert trace.times == pytest.approx(KNOTS)
+    assert trace.speed == pytest.approx(SPEED, abs=1e-9)
+    assert trace.angle == pytest.approx(ANGLE, abs=1e-9)
+
+
+@pytest.mark.parametrize(("most", "shortest"), [(4, 2.0), (12, 2.0), (20, 3.0)])
+def test_phases_are_few_and_long_enough_and_within_the_machine(
+    va12: Model, va12_motion: Motion, most: int, shortest: float
+) -> None:
+    trace = drive.phases(va12, va12_motion, shortest, most)
+    assert 2 <= len(trace) <= most
+    assert np.diff(trace.times).min() >= shortest - 1e-9
+    assert trace.times[-1] == va12_motion.t[-1]
+    assert [trace.speed[0], trace.speed[-1], trace.angle[0], trace.angle[-1]] == [0, 0, 0, 0]
+    assert np.abs(trace.speed).max() <= 2.0
+    assert np.abs(trace.angle).max() <= 0.6
+    assert np.abs(np.diff(trace.angle) / np.diff(trace.times)).max() <= 0.35
+
+
+def test_more_phases_are_nearer_to_the_design(va12: Model, va12_motion: Motion) -> None:
+    def misfit(most: int) -> float:
+        speed, _ = drive.phases(va12, va12_motion, most=most).at(va12_motion.t)
+        return float(np.mean((speed - va12_motion.nu[:, 0]) ** 2))
+
+    assert misfit(4) > misfit(8) > misfit(16)
+
+
+@pytest.mark.parametrize(
+    ("most", "shortest", "words"),
+    [(1, 2.0, "at least 2"), (9, 0.0, "shortest"), (9, 40.0, "between 0.5 and 30 s"), (9, np.nan, "nan")],
+)
+def test_what_makes_no_phases_is_refused(
+    va12: Model, va12_motion: Motion, most: int, shortest: float, words: str
+) -> None:
+    with pytest.raises(DriveError, match=words):
+        drive.phases(va12, va12_motion, shortest, most)
+
+
+def test_a_machine_without_wheels_has_no_driver(emps: Model) -> None:
+    with pytest.raises(DriveError, match="emps"):
+        drive.steered(emps)
+
+
+def test_words_say_what_to_do() -> None:
+    trace = Trace(KNOTS, SPEED, -ANGLE, left=-1)
+    assert [drive.words(trace, k) for k in range(len(trace))] == [
+        "accelerate to 1.5 m/s in 4 s, straight",
+        "hold 1.5 m/s for 5 s, steer to 20° left",
+        "brake to a stop in 3 s, keep 20° left",
+        "stand still for 3 s, straighten up",
+        "accelerate backward to 1.2 m/s in 4 s, straight",
+        "hold 1.2 m/s backward for 4 s, steer to 10° right",
+        "brake to a stop in 4 s, straighten up",
+    ]
+    through = Trace(np.array([0.0, 2, 5, 7]), np.array([0.0, 1, -0.5, 0]), np.zeros(4), left=0)
+    assert drive.words(through, 1) == "through a stop at 0:04 to 0.5 m/s backward in 3 s"
+    assert drive.words(through, 1, letters=True).startswith("through a stop A at 0:04")
+    assert drive.reversals(through) == pytest.approx([4.0], abs=0.2)
+    assert drive.reversals(trace) == pytest.approx([15.0], abs=0.2)
+
+
+def test_left_is_where_the_machine_goes(va12: Model, straight: Model) -> None:
+    """The sign from pure rolling is what simulation does: forward at an angle, the heading grows to the left."""
+    assert drive.turns_left(straight) == 0
+    left = drive.turns_left(va12)
+    t = np.arange(1201) / 100
+    trace = Trace(np.array([0.0, 4, 12]), np.array([0.0, 1, 1]), left * np.array([0.0, 0.3, 0.3]), left)
+    heading = drive.driven(va12, trace, None, 0).q[:, va12.coordinates.index("theta0")]
+    assert heading[-1] > 0.3
+    assert t[-1] == trace.duration
+
+
+def test_room_of_a_straight_pass_is_its_length_and_the_rolls_width(straight: Model) -> None:
+    """10 m forward: the axles are 3.2 m apart, the rolls 2.1 m wide."""
+    motion = motion_of(straight, np.zeros(101), np.zeros(101))
+    motion.q[:, 0] = np.linspace(0, 10, 101)
+    room = drive.room(straight, [motion])
+    assert room.length == pytest.approx(10 + 1.45 + 1.75)
+    assert room.width == pytest.approx(2.1)
+    assert room.corner == pytest.approx((-3.2, -1.05))
+
+
+def test_edges_turn_with_the_articulation(va12: Model) -> None:
+    motion = motion_of(va12, np.zeros(2), np.full(2, 0.5))
+    front, rear = drive.edges(va12, motion)[:, :, 0]
+    assert front[1] - front[0] == pytest.approx([0, 2.1])
+    assert rear[1] - rear[0] == pytest.approx([-2.1 * np.sin(0.5), 2.1 * np.cos(0.5)])
+    assert rear.mean(axis=0) == pytest.approx([-1.45 - 1.75 * np.cos(0.5), -1.75 * np.sin(0.5)])
+
+
+def test_moved_motion_is_the_same_motion_elsewhere(va12: Model, va12_motion: Motion) -> None:
+    """The equations don't know the place: driving the same torques from the new start gives the moved path."""
+    start = va12_motion.q[0].copy()
+    start[:3] = [3.0, -2.0, 0.7]
+    short = simulate(va12, va12_motion.u[:801], q0=start)
+    assert drive.moved(va12, va12_motion, start).q[:801] == pytest.approx(short.q, abs=1e-6)
+
+
+def test_band_is_the_reference_a_second_around() -> None:
+    t = np.arange(0, 10, 0.1)
+    step = np.where(t < 5, 0.0, 1.0)
+    low, high = drive.band(t, step, 0.1)
+    assert high[t < 3.9] == pytest.approx(0.1)
+    assert high[t > 4.05] == pytest.approx(1.1)
+    assert low[t < 5.9] == pytest.approx(-0.1)
+    assert low[t > 6.05] == pytest.approx(0.9)
+
+
+@pytest.mark.slow
+def test_what_a_person_keeps_of_the_accurate_drive() -> None:
+    """The claim of the sheet: sixteen phases by hand cost at most twice the error of torques played back."""
+    design = stored.read(RESULTS / "R60_accuracy" / "design")
+    made = cab.prepare(design)
+    scores = dict(made.scores)
+    played, person = scores[cab.PLAYED], scores[cab.PHASED]
+    assert played.worst_percent == pytest.approx(max(design.summary["sigma_percent"].values()), rel=0.02)
+    assert len(made.trace) <= 20
+    assert played.median_percent < person.median_percent < 2 * played.median_percent
+    assert person.worst_percent < 2 * played.worst_percent
+    assert "good enough" in made.verdict
+    assert any("8 times" in line for line in made.warnings)
+    lost = drive.Score(1, 3 * played.worst_percent, "M", played.median_percent)
+    assert "too much is lost" in cab.verdict(played, lost)
+    lines = sheet.set_up(design.model.machine)
+    assert all(any(line.startswith(f"{s.column} [") for line in lines) for s in design.model.machine.sensor)
+
+
+def test_drive_command_writes_two_pages(excite: Excite, tmp_path: Path) -> None:
+    out, design = tmp_path / "cab", RESULTS / "S40" / "design"
+    code, stdout, stderr = excite("drive", design, "--phases", 8, "--out", out, "--json")
+    assert (code, stderr) == (0, "")
+    shown = json.loads(stdout)
+    assert shown == json.loads((out / "summary.json").read_text())
+    assert len(shown["phases"]) <= 8
+    assert shown["phases"][-1]["speed_m_s"][1] == 0
+    pdf = (out / "sheet.pdf").read_bytes()
+    assert pdf.startswith(b"%PDF")
+    assert pdf.count(b"/Type /Page ") == 2
+    assert b"/MediaBox [ 0 0 595.44 841.68 ]" in pdf
+    code, _, stderr = excite("drive", design, "--shortest", 100)
+    assert code == 2
+    assert "between 0.5 and 20 s" in stderr
+    code, _, stderr = excite("drive", tmp_path)
+    assert code == 2
+    assert "excite design" in stderr
