@@ -135,6 +135,10 @@ _OPERATIONS: dict[int, np.ufunc] = {
     ca.OP_ATAN2: np.arctan2,
     ca.OP_POW: np.power,
     ca.OP_CONSTPOW: np.power,
+    ca.OP_LT: np.less,
+    ca.OP_LE: np.less_equal,
+    ca.OP_NOT: np.logical_not,
+    ca.OP_IF_ELSE_ZERO: np.multiply,
 }
 
 
@@ -146,10 +150,11 @@ def _memory(a: np.ndarray) -> memoryview:
 class Chart:
     """The states of a machine that a set of sensors and its forces depend on.
 
-    State s (n,): first the `core`, the coordinates that forces depend on and the velocities, then measured angles that
-    are integrals of these. `index` (n,): their places in simulate's state (q, nu, wheels), whose size is `full`.
-    `sensors`: those with a reading h(s), in order; `angle`: the state that each encoder reads, -1 for another sensor.
-    `offsets` (n_u, n_base) takes the torque offsets u0 out of X.
+    State s (n,): first the `core`, the coordinates that forces depend on, the velocities and what effects remember,
+    then measured angles that are integrals of these. `index` (n,): their places in simulate's state (q, nu, wheels, z),
+    whose size is `full`. `sensors`: those with a reading h(s), in order; `angle`: the state that each encoder reads, -1 for
+    another sensor. `offsets` (n_u, n_base) takes the torque offsets u0 out of X. `flawed`: parameters that readings
+    depend on directly. `known` (n,): states whose start is known, and how well; NaN for the others.
     `pushed`: rows on which disturbing forces may act, the unactuated ones, or all where there are none; `inertia`:
     theirs, nominal [kg, kg m2].
     """
@@ -163,14 +168,48 @@ class Chart:
     offsets: np.ndarray
     pushed: tuple[int, ...]
     inertia: np.ndarray
+    flawed: tuple[int, ...]
+    known: np.ndarray
     slopes: Batch
     readings: Batch
     step: Batch
     pivots: Batch
+    channels: ca.Function
 
     @property
     def n(self) -> int:
         return len(self.index)
+
+    def parts(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Coordinates, velocities (N, n_q) and memory (N, n_z) of states (N, n); what nothing depends on is zero."""
+        n_q, n_z = len(self.model.coordinates), len(self.model.memory)
+        full = np.zeros((len(s), self.full))
+        full[:, self.index] = s
+        return full[:, :n_q], full[:, n_q : 2 * n_q], full[:, self.full - n_z :]
+
+    def delivered(self, torque: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Torques (N, n_u) [N m] behind measured ones, and how they move with X (N, n_u, n_base)."""
+        if self.model.plain:
+            return torque - X @ self.offsets.T, np.broadcast_to(-self.offsets, (len(torque), *self.offsets.shape))
+        N, n_u = torque.shape
+        step = 1 / float(self.model.machine.sampling_hz)
+        t = np.arange(N) * step
+        out = [e.full() for e in self.channels(t[None], X)]
+        gain, offset, delay = (e.T for e in out[:3])
+        by = [e.reshape(n_u, N, len(X)).transpose(1, 0, 2) for e in out[3:]]
+        early = np.column_stack([np.interp(t + delay[:, k], t, torque[:, k]) for k in range(n_u)])
+        rise = np.gradient(early, step, axis=0)
+        u = (early - offset) / gain
+        slope = (rise[:, :, None] * by[2] - by[1] - u[:, :, None] * by[0]) / gain[:, :, None]
+        return u, slope
+
+    def measured(self, u: np.ndarray, X: np.ndarray) -> np.ndarray:
+        """What torque sensors read of delivered torques (N, n_u)."""
+        step = 1 / float(self.model.machine.sampling_hz)
+        t = np.arange(len(u)) * step
+        gain, offset, delay = (e.full().T for e in self.model.channels(t[None], X))
+        late = np.column_stack([np.interp(t - delay[:, k], t, u[:, k]) for k in range(u.shape[1])])
+        return np.asarray(gain * late + offset)
 
 
 @dataclass(frozen=True)
@@ -192,23 +231,26 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     n_q, n_u = len(model.coordinates), len(model.inputs)
     q, nu, _ = model.symbols()
     u, X = ca.SX.sym("u", n_u), ca.SX.sym("X", len(model.base.names))
-    dq, _, wheel_rates, _, speeds, _ = model.kinematics(q, nu)
+    z = ca.SX.sym("z", len(model.memory))
+    dq, _, wheel_rates, *_ = model.kinematics(q, nu)
     wheel_names = [s.name for s in machine.sensor if s.kind == "wheel"]
     wheels = ca.SX.sym("w", len(wheel_names))
-    full = ca.vertcat(q, nu, wheels)
+    full = ca.vertcat(q, nu, wheels, z)
 
-    M, bias = model.equations(q, nu, X)
+    M, bias = model.equations(q, nu, X, u, z)
     pushed = tuple(k for k in range(n_q) if k not in model.actuated) or tuple(range(n_q))
     load = ca.SX(n_q, 1)
     for k, row in enumerate(model.actuated):
         load[row] += u[k]
     factors = ca.ldl(M)
     a = ca.ldl_solve(load - bias, *factors)
-    rates = ca.vertcat(dq, a, wheel_rates)
+    flow = model.flow(q, nu, u, z, X)
+    rates = ca.vertcat(dq, a, wheel_rates, flow)
     core = [k for k, c in enumerate(model.coordinates) if c in model.felt] + list(range(n_q, 2 * n_q))
+    core += range(full.numel() - len(model.memory), full.numel())
 
     sensors = tuple(s for s in machine.sensors("full") if s.name in names and s.kind not in ("torque", "x", "y"))
-    index, angle, h = list(core), [], []
+    index, angle = list(core), []
     for s in sensors:
         if s.kind in ("angle", "wheel"):
             at = (
@@ -219,12 +261,8 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
             if at not in index:
                 index.append(at)
             angle.append(index.index(at))
-            h.append(full[at])
         else:
             angle.append(-1)
-            body = machine.body.index(machine.find(s.body))
-            turn = machine.body[0].coordinates[2]
-            h.append(speeds[1, body] if s.kind == "lateral_speed" else nu[model.coordinates.index(turn)])
     state = ca.SX.sym("s", len(index))
     where = ca.SX.zeros(full.numel(), 1)
     for k, at in enumerate(index):
@@ -239,25 +277,43 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
         held = ca.SX.sym("a", n_q)
         balance = ca.jacobian(M @ held + bias - load, x)
         da = -ca.ldl_solve(ca.substitute([balance], [held], [a])[0], *factors)
-        return ca.vertcat(ca.jacobian(dq, x), da)[core, :]
+        return ca.vertcat(ca.jacobian(dq, x), da, ca.jacobian(wheel_rates, x), ca.jacobian(flow, x))[core, :]
 
     push = ca.SX.eye(n_q)[:, list(pushed)]
     local = [
         along(moved(full[core])),
         along(moved(u)),
         along(moved(X)),
-        along(ca.vertcat(ca.SX(n_q, len(pushed)), ca.ldl_solve(push, *factors))[core, :]),
+        along(
+            ca.vertcat(
+                ca.SX(n_q, len(pushed)),
+                ca.ldl_solve(push, *factors),
+                ca.SX(full.numel() - 2 * n_q, len(pushed)),
+            )[core, :]
+        ),
         along(ca.jacobian(rates[index[len(core) :]], full[core])),
     ]
     speed = ca.vertcat(*[rates[index[k]] if k >= 0 else ca.SX(0) for k in angle])
-    seen = ca.vertcat(*h)
+    every = model.read(q, nu, wheels, u, z, X)
+    seen = ca.vertcat(*[every[model.readable.index(s.name)] for s in sensors])
+    flawed = tuple(k for k in range(X.numel()) if ca.depends_on(seen, X[k]))
     slopes = ca.Function("slopes", [state, u, X], local)
     step = _step(state, u, X, len(core), along(rates[index]), local[0], local[1], local[4])
     readings = ca.Function(
         "readings",
-        [state],
-        [along(seen), along(ca.jacobian(seen, full[index])), along(speed), along(ca.jacobian(speed, full[index]))],
+        [state, u, X],
+        [
+            along(seen),
+            along(ca.jacobian(seen, full[index])),
+            along(speed),
+            along(ca.jacobian(speed, full[index])),
+            *([along(ca.jacobian(seen, X)[:, list(flawed)])] if flawed else []),
+        ],
     )
+    t = ca.SX.sym("t")
+    channels = model.channels(t, X)
+    known = np.full(len(index), np.nan)
+    known[len(core) - len(model.memory) : len(core)] = model.remembered
     mass = ca.Function("mass", [q, X], [ca.diag(M)])(np.zeros(n_q), model.nominal).full()[:, 0]
     table = np.array([model.base.standard.index(f"u{b.index}0") for b in machine.actuated])
     return Chart(
@@ -270,10 +326,13 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
         model.expand[table],
         pushed,
         mass[list(pushed)],
+        flawed,
+        known,
         Batch(slopes, (2,)),
-        Batch(readings),
+        Batch(readings, (2,)),
         Batch(step, (3, 4)),
         Batch(ca.Function("pivots", [state, X], [along(ca.vec(factors[0]))]), (1,)),
+        ca.Function("channels", [t, X], [*channels, *[ca.densify(ca.jacobian(e, X)) for e in channels]]),
     )
 
 
@@ -357,7 +416,7 @@ def _reversals(chart: Chart, s: np.ndarray) -> np.ndarray:
     """Which of the intervals between states s (K + 1, n) friction turns in, (K,)."""
     model = chart.model
     found = np.zeros(len(s) - 1, bool)
-    first = chart.core - len(model.coordinates)
+    first = chart.core - len(model.coordinates) - len(model.memory)
     for body in model.machine.body:
         if body.friction is None or body.coordinates[0] not in model.coordinates:
             continue

@@ -148,7 +148,7 @@ def _run(c: Chart, p: Stretch, x: np.ndarray) -> Run:
     motion = simulate(c.model, u, x, full[:n_q], full[n_q : 2 * n_q])
     s = np.hstack([motion.q, motion.nu, motion.wheels + full[2 * n_q :]])[:, c.index]
     rate = np.hstack([motion.nu, motion.a, np.zeros_like(motion.wheels)])[:, c.index]
-    h, H, *_ = c.readings(s)
+    h, H, *_ = c.readings(s, u, x)
     A, B, X = _slopes(c, s, rate, u, x)
     forced = X - B @ c.offsets
     moved = np.zeros((len(s), n, n + n_p))

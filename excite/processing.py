@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.integrate
 import scipy.signal
 
 from excite.log import Log
@@ -58,7 +59,7 @@ def kept_samples(first: int, last: int, factor: int) -> np.ndarray:
 
 def samples(model: Model, log: Log, filter: Filter) -> Samples:
     """Coordinates, velocities and accelerations of a log: zero-phase Butterworth of what is measured, then central
-    differences. V_x and yaw rate come from the measuring wheels (32), V_y from its sensor.
+    differences. V_x and yaw rate come from the measuring wheels (32), V_y from its sensor; the heading begins at zero.
     """
     machine = model.machine
     rate = float(machine.sampling_hz)
@@ -80,6 +81,10 @@ def samples(model: Model, log: Log, filter: Filter) -> Samples:
             nu[model.coordinates.index(machine.body[0].coordinates[1])] = filtered[sensor.name]
     if wheels:
         _planar_speed(model, wheels, nu)
+        turn = machine.body[0].coordinates[2]
+        if turn in model.coordinates:
+            k = model.coordinates.index(turn)
+            q[k] = scipy.integrate.cumulative_trapezoid(nu[k], dx=1 / rate, initial=0)
     a = np.array([derivative(v, rate) for v in nu])
     Y = np.zeros((n_q, N))
     for sensor in machine.sensors("full"):

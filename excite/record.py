@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import casadi as ca
 import numpy as np
 
 from excite.estimate import NotIdentifiable
@@ -107,17 +108,35 @@ def first_point(c: Chart, r: Record, log: Log, filter: Filter) -> Point:
     """States from the filtered log."""
     guess = samples(c.model, log, filter)
     full = np.zeros((len(log), c.full))
-    n_q = len(c.model.coordinates)
+    n_q, n_z = len(c.model.coordinates), len(c.model.memory)
     full[:, :n_q], full[:, n_q : 2 * n_q] = guess.q.T, guess.nu.T
+    if n_z:
+        u, _ = c.delivered(r.torque, c.model.nominal)
+        full[:, c.full - n_z :] = remember(c.model, guess.q.T, guess.nu.T, u, c.model.nominal)
     s = full[:, c.index]
     rate = float(c.model.machine.sampling_hz)
     for j, k in enumerate(c.angle):
         if c.index[k] >= 2 * n_q and k >= 0:
-            speed = c.readings(s)[2][:, j, 0]
+            speed = c.readings(s, r.torque, c.model.nominal)[2][:, j, 0]
             s[:, k] = log.values[c.sensors[j].name][0] + np.concatenate(
                 [[0], np.cumsum(speed[1:] + speed[:-1]) / (2 * rate)]
             )
     return Point(s, np.zeros_like(r.torque[1:]), np.zeros(len(r.origin)))
+
+
+def remember(model: Model, q: np.ndarray, nu: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """What effects remember (N, n_z) along a motion, from rest: linearly implicit Euler, sample by sample."""
+    n_q, n_u, n_z = len(model.coordinates), len(model.inputs), len(model.memory)
+    at = ca.SX.sym("at", 2 * n_q + n_u)
+    z, p = ca.SX.sym("z", n_z), ca.SX.sym("X", len(X))
+    rate = model.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q :], z, p)
+    h = 1 / float(model.machine.sampling_hz)
+    ahead = z + ca.solve(ca.SX.eye(n_z) - h * ca.jacobian(rate, z), h * rate)
+    step = ca.Function("step", [z, at, p], [ahead])
+    path = step.mapaccum("path", len(q) - 1)(
+        model.fresh, np.hstack([q, nu, u])[:-1].T, ca.repmat(ca.DM(X), 1, len(q) - 1)
+    )
+    return np.vstack([model.fresh, path.full().T])
 
 
 def one_count(c: Chart, r: Record) -> np.ndarray:
@@ -125,13 +144,16 @@ def one_count(c: Chart, r: Record) -> np.ndarray:
     return np.array([float(c.sensors[j].resolution or 0) for j in r.origin])
 
 
-def readings(c: Chart, r: Record, p: Point) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Expected readings (N, m), their slopes (N, m, n), weights (N, m) = 1 / variance and offset columns (m, m_o).
+def readings(
+    c: Chart, r: Record, p: Point, u: np.ndarray, X: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Expected readings (N, m) under torques u (N, n_u), their slopes (N, m, n), weights (N, m) = 1 / variance, offset
+    columns (m, m_o), and how readings move with the chart's `flawed` parameters (N, m, n_f).
 
     Right after a count the angle is past the edge by half of what it travels in a sample, at most half a step.
     """
     sample = 1 / float(c.model.machine.sampling_hz)
-    h, H, rate, Hrate = c.readings(p.s)
+    h, H, rate, Hrate, *flaws = c.readings(p.s, u, X)
     h, H, travel = h[:, :, 0].copy(), H.copy(), rate[:, :, 0] * sample
     step = r.noise.sensor
     slow = (np.abs(travel) < step) & r.counts
@@ -141,21 +163,14 @@ def readings(c: Chart, r: Record, p: Point) -> tuple[np.ndarray, np.ndarray, np.
     D = np.zeros((len(c.sensors), len(r.origin)))
     for k, j in enumerate(r.origin):
         D[j, k] = 1.0
-    return h + D @ p.offset, H, r.used / width**2, D
+    by = flaws[0] if flaws else np.zeros((*h.shape, 0))
+    return h + D @ p.offset, H, r.used / width**2, D, by
 
 
-def expected(c: Chart, r: Record, p: Point) -> Record:
+def expected(c: Chart, r: Record, p: Point, u: np.ndarray, X: np.ndarray) -> Record:
     """The record with how often each encoder counts, on average, in place of when."""
-    travel = np.abs(c.readings(p.s)[2][:, :, 0]) / float(c.model.machine.sampling_hz)
+    travel = np.abs(c.readings(p.s, u, X)[2][:, :, 0]) / float(c.model.machine.sampling_hz)
     return replace(r, used=np.where(r.counts, np.minimum(travel / r.noise.sensor, 1.0), 1.0))
-
-
-def motion(c: Chart, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates and velocities (N, n_q) of states; coordinates that nothing depends on are zero."""
-    n_q = len(c.model.coordinates)
-    full = np.zeros((len(s), c.full))
-    full[:, c.index] = s
-    return full[:, :n_q], full[:, n_q : 2 * n_q]
 
 
 def noise_notes(c: Chart, records: Sequence[Record]) -> tuple[str, ...]:

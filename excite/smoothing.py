@@ -27,7 +27,6 @@ from excite.record import (
     common_sensors,
     expected,
     first_point,
-    motion,
     noise_notes,
     one_count,
     origins,
@@ -44,6 +43,7 @@ PASSES = 15  # at most
 HELD = 1e-6  # standard deviation of such a parameter, in its scale
 SETTLED = 3  # passes until the states fit the dynamics well enough to tell which these are
 UNSEEN = 1.0  # a parameter that a log tells less than this well, in its scale, stays at the machine file's value
+STILL_COUNTS, STILL = 2, 0.01  # counts of an encoder, and a speed [rad/s, m/s], within which a joint stands still
 DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's scale, and its share from pass to pass
 HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
 # Left undone at the end of the iteration, in standard deviations; with disturbing forces two and a half times that.
@@ -115,26 +115,75 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     records = [record(c, log) for log in logs]
     starts = [first_point(c, r, log, filter) for r, log in zip(records, logs, strict=True)]
     notes = noise_notes(c, records)
+    held = _not_shown(c, logs, records, starts, joints_only=True)
     points: Sequence[Point] = starts
     X, trouble = model.nominal, ""
-    for tries in range(2):
+    for tries in range(3):
         try:
-            fit = _iterate(c, records, points, X, starts, 0.0)
+            fit = _iterate(c, records, points, X, starts, 0.0, held)
         except NotConverged as failed:
             trouble = trouble or str(failed)
-            if tries:
+            if tries == 0:
+                still = _not_shown(c, logs, records, starts, joints_only=False)
+                if (still & ~held).any():
+                    held = held | still
+                    continue
+            if tries == 2 or X is not model.nominal:
                 break
             # The model with disturbing forces finds its way from further off.
-            loose = _disturbed(c, logs, records, starts, model.nominal, starts)
+            loose = _disturbed(c, logs, records, starts, model.nominal, starts, held)
             points, X = loose.points, loose.X
             continue
         found = _suspects(c, logs, fit)
         if not found:
             return _estimate(c, records, fit, filter, notes)
-        loose = _disturbed(c, logs, records, fit.points, fit.X, starts)
+        loose = _disturbed(c, logs, records, fit.points, fit.X, starts, held)
         trouble = "; ".join(found)
         break
     return _estimate(c, records, loose, filter, (*notes, trouble, DOUBT))
+
+
+def _not_shown(
+    c: Chart, logs: Sequence[Log], records: Sequence[Record], starts: Sequence[Point], joints_only: bool
+) -> np.ndarray:
+    """Parameters that a drive says nothing of while something on the machine stands still, (n_base,).
+
+    Along the log as it is, the noise of a joint at rest would pass for motion, and show what nothing shows. So the
+    information is that of a motion in which what stands still does so exactly: a joint whose encoder counts no further
+    than STILL_COUNTS in any log; or, without `joints_only`, whatever moves slower than STILL all along.
+    """
+    model = c.model
+    n_q = len(model.coordinates)
+    sensors = [s for s in c.sensors if s.kind == "angle" and s.resolution is not None]
+    resting = {
+        model.coordinates.index(model.machine.find(s.body).coordinates[0])
+        for s in sensors
+        if all(np.ptp(log.values[s.name]) <= STILL_COUNTS * float(s.resolution or 0) for log in logs)
+    }
+    none = np.zeros(len(model.base.names), bool)
+    if joints_only and not resting:
+        return none
+    speeds = np.max([np.abs(c.parts(p.s)[1]).max(axis=0) for p in starts], axis=0)
+    resting |= {k for k in range(n_q) if speeds[k] < STILL}
+    information = np.diag(np.full(len(none), PRIOR**-2))
+    for r, p in zip(records, starts, strict=True):
+        s = p.s.copy()
+        for k in np.flatnonzero(_speeds(c)):
+            if c.index[k] - n_q in resting:
+                s[:, k] = 0.0
+        for k in resting & set(c.index.tolist()):
+            own = c.index == k
+            s[:, own] = s[:, own].mean()
+        exact = Point(s, p.w, p.offset)
+        seen = expected(c, r, exact, c.delivered(r.torque, model.nominal)[0], model.nominal)
+        linear = _linearise(c, seen, exact, s[0], model.nominal, 0.0, exact=True)
+        assert linear is not None
+        Z = linear.Z[1:, 1:].copy()
+        Z[range(len(none), len(Z)), range(len(none), len(Z))] += 1.0
+        own, others = slice(0, len(none)), slice(len(none), len(Z))
+        information += Z[own, own] - Z[own, others] @ np.linalg.solve(Z[others, others], Z[others, own])
+    sigma = np.sqrt(np.diag(np.linalg.inv(information)))
+    return np.asarray(sigma > UNSEEN * np.maximum(np.abs(model.nominal) / model.scale, 1.0))
 
 
 def _disturbed(
@@ -144,13 +193,14 @@ def _disturbed(
     points: Sequence[Point],
     X: np.ndarray,
     starts: Sequence[Point],
+    held: np.ndarray,
 ) -> Fit:
     """The fit with disturbing forces as large as the innovations ask for. Raises NotConverged."""
     trouble: NotConverged | None = None
     fit: Fit | None = None
     for times in DISTURBED:
         try:
-            fit = _iterate(c, records, points, X, starts, times)
+            fit = _iterate(c, records, points, X, starts, times, held)
         except NotConverged as failed:
             trouble = failed
             continue
@@ -180,9 +230,12 @@ def _estimate(c: Chart, records: Sequence[Record], fit: Fit, filter: Filter, not
     W, Y, errors = [], [], []
     for r, p in zip(records, fit.points, strict=True):
         w = np.concatenate([p.w, p.w[-1:]])
-        q, nu, u = *motion(c, p.s), r.torque - fit.X @ c.offsets.T + w
-        a = model.acceleration(q.T, nu.T, u.T, fit.X).full()
-        W.append(model.stacked(q.T, nu.T, a).reshape(-1, len(fit.X)))
+        q, nu, z = c.parts(p.s)
+        u = c.delivered(r.torque, fit.X)[0] + w
+        remembered = () if model.plain else (z.T,)
+        a = model.acceleration(q.T, nu.T, u.T, *remembered, fit.X).full()
+        beside = () if model.plain else (u.T, z.T)
+        W.append(model.stacked(q.T, nu.T, a, *beside).reshape(-1, len(fit.X)))
         measured, error = np.zeros((2, len(model.rows), len(u)))
         measured[list(model.actuated)], error[list(model.actuated)] = r.torque.T, -w.T
         Y.append(decimate(measured, filter.decimation))
@@ -227,16 +280,16 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
                 f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file"
             )
     c = chart(model, tuple(s.name for s in model.machine.sensors("full") if s in sensors))
-    state = np.hstack([motion.q, motion.nu, motion.wheels])[:, c.index]
+    state = np.hstack([motion.q, motion.nu, motion.wheels, motion.memory])[:, c.index]
     counts = np.array([s.resolution is not None for s in c.sensors])
     noise = Noise(
         np.array([float(torque_sensor(model, b.index).noise or 0) for b in model.machine.actuated]),
         np.array([s.resolution or float(s.noise or 0) for s in c.sensors]),
     )
     none = np.zeros((len(state), len(c.sensors)))
-    r = Record(motion.u + X @ c.offsets.T, none, none, counts, origins(c, counts), noise)
+    r = Record(c.measured(motion.u, X), none, none, counts, origins(c, counts), noise)
     p = Point(state, np.zeros_like(motion.u[1:]), np.zeros(len(r.origin)))
-    linear = _linearise(c, expected(c, r, p), p, state[0], X, 0.0, exact=True)
+    linear = _linearise(c, expected(c, r, p, motion.u, X), p, state[0], X, 0.0, exact=True)
     assert linear is not None
     information = linear.Z[1:, 1:].copy()
     information[np.diag_indices(len(information))] += np.concatenate(
@@ -252,16 +305,17 @@ def _linearise(
 
     `exact`: the point is a motion of the machine, which needs no integration.
     """
-    delivered = r.torque - X @ c.offsets.T
+    delivered, behind = c.delivered(r.torque, X)
     if exact:
         defect = np.zeros_like(p.s[1:])
     else:
         defect = advance(c, p.s[:-1], delivered[:-1] + p.w, delivered[1:] + p.w, X) - p.s[1:]
         if not np.isfinite(defect).all():
             return None
-    h, H, weight, D = readings(c, r, p)
-    residual = np.zeros_like(h) if exact else np.where(r.used > 0, r.reading - h, 0.0)
     u = delivered + np.concatenate([p.w, p.w[-1:]])
+    h, H, weight, D, flaws = readings(c, r, p, u, X)
+    residual = np.zeros_like(h) if exact else np.where(r.used > 0, r.reading - h, 0.0)
+    flaws = flaws * c.model.scale[list(c.flawed)]
     scale, n_p, n_o = _scale(c), len(X), len(r.origin)
     S, unit = H * scale, one_count(c, r)
     parts, stages, gains = [_known_before(c, p, first, 1 + n_p + n_o)], [], []
@@ -277,25 +331,25 @@ def _linearise(
         A = by.A * (scale / scale[:, None])
         b = np.zeros((until - at, c.n, 1 + n_p + n_o))
         b[:, :, 0] = defect[at:until] / scale - (gain @ (p.w[at:until] / r.noise.torque)[:, :, None])[:, :, 0]
-        b[:, :, 1 : 1 + n_p] = (by.X - by.B @ c.offsets) * (c.model.scale / scale[:, None])
+        b[:, :, 1 : 1 + n_p] = (by.X + by.B @ behind[at:until]) * (c.model.scale / scale[:, None])
         gains.append(gain)
         for k in range(at, until, PART):
             end = min(k + PART, until)
-            J, eta = _seen(S[k:end], weight[k:end], residual[k:end], D * unit, n_p)
+            J, eta = _seen(c, S[k:end], weight[k:end], residual[k:end], D * unit, flaws[k:end])
             own = slice(k - at, end - at)
             stages.append(chain.Stages(A[own], b[own], C[own], eta, J))
             parts.append(chain.section(stages[-1]))
     # From the last sample nothing leads on.
-    J, eta = _seen(S[-1:], weight[-1:], residual[-1:], D * unit, n_p)
+    J, eta = _seen(c, S[-1:], weight[-1:], residual[-1:], D * unit, flaws[-1:])
     none = np.zeros_like(J)
     stages.append(chain.Stages(none, np.zeros_like(eta), none, eta, J))
     parts.append(chain.section(stages[-1]))
     solved = chain.solve(parts)
-    # What the readings say of the offsets directly; base parameters act through the states alone.
-    flat = np.concatenate([residual[:, :, None], np.broadcast_to(-D * unit, (*residual.shape, n_o))], axis=2)
-    flat = (flat * np.sqrt(weight)[:, :, None]).reshape(-1, 1 + n_o)
+    # What the readings say directly of offsets and of flaws of sensors; other parameters act through the states alone.
+    flat = np.concatenate([residual[:, :, None], -flaws, np.broadcast_to(-D * unit, (*residual.shape, n_o))], axis=2)
+    flat = (flat * np.sqrt(weight)[:, :, None]).reshape(-1, flat.shape[2])
     Z = solved.Z.copy()
-    place = np.concatenate([[0], np.arange(1 + n_p, 1 + n_p + n_o)])
+    place = np.concatenate([[0], 1 + np.array(c.flawed, int), np.arange(1 + n_p, 1 + n_p + n_o)])
     Z[np.ix_(place, place)] += flat.T @ flat
     return Linear(solved, Z, np.concatenate(gains), tuple(stages), S, weight, residual)
 
@@ -306,17 +360,20 @@ def _known_before(c: Chart, p: Point, first: np.ndarray, columns: int) -> chain.
     none = np.zeros((1, n, n))
     b = np.zeros((1, n, columns))
     b[0, :, 0] = (first - p.s[0]) / scale
-    spread = np.where(_speeds(c), SPREAD_SPEED, SPREAD_ANGLE)
+    spread = np.where(np.isfinite(c.known), c.known, np.where(_speeds(c), SPREAD_SPEED, SPREAD_ANGLE))
     return chain.section(chain.Stages(none, b, np.diag((spread / scale) ** 2)[None], np.zeros_like(b), none))
 
 
 def _seen(
-    H: np.ndarray, weight: np.ndarray, residual: np.ndarray, D: np.ndarray, n_p: int
+    c: Chart, H: np.ndarray, weight: np.ndarray, residual: np.ndarray, D: np.ndarray, flaws: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """What readings tell of the states: J (K, n, n), eta (K, n, 1 + n_p + n_o)."""
+    n_p = len(c.model.scale)
     weighted = (H * weight[:, :, None]).transpose(0, 2, 1)
     eta = np.zeros((len(H), H.shape[2], 1 + n_p + D.shape[1]))
     eta[:, :, :1] = weighted @ residual[:, :, None]
+    if c.flawed:
+        eta[:, :, 1 + np.array(c.flawed)] = -(weighted @ flaws)
     eta[:, :, 1 + n_p :] = -(weighted @ D)
     return weighted @ H, eta
 
@@ -338,8 +395,10 @@ def _iterate(
     X: np.ndarray,
     starts: Sequence[Point],
     disturbed: float,
+    held: np.ndarray,
 ) -> Fit:
     """Gauss-Newton from points and X; the prior stands about the machine file's values and the states of `starts`.
+    Parameters `held` (n_base,) stay at their values.
 
     Raises NotConverged.
     """
@@ -347,8 +406,8 @@ def _iterate(
     step, before = np.inf, np.inf
     shorter, here = 0, (list(points), X)
     there = here
-    prior, damping = np.full(len(X), PRIOR**-2), DAMPING[0]
-    unseen = np.zeros(len(X), bool)
+    prior, damping = np.where(held, HELD**-2, PRIOR**-2), DAMPING[0]
+    unseen = held.copy()
     for k in range(PASSES):
         linear = _all_linear(c, records, there[0], starts, there[1], disturbed)
         if linear is None:
@@ -363,7 +422,8 @@ def _iterate(
         covariance, move, left = _parameters(c, records, linear, points, X, prior, damping)
         if k == SETTLED:
             # Against the estimate as well: a file's value that is far too small must not make a parameter unseen.
-            unseen = np.sqrt(np.diag(covariance))[: len(X)] > UNSEEN * np.maximum(np.abs(X) / model.scale, 1.0)
+            sigma = np.sqrt(np.diag(covariance))[: len(X)]
+            unseen |= sigma > UNSEEN * np.maximum(np.abs(X) / model.scale, 1.0)
             if unseen.any():
                 # Left free they would go anywhere, and take the mass matrix and the slips with them.
                 prior[unseen] = HELD**-2

@@ -132,6 +132,14 @@ class Shape:
     whole: bool = False
 
 
+@dataclass(frozen=True)
+class Memory:
+    """A state of its own that an effect has: its rate of change, and how far it may be from zero when a log begins."""
+
+    rate: Callable[[Scene, int, Values], ca.SX]
+    spread: float
+
+
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
 
 
@@ -161,7 +169,7 @@ class Effect:
     inertia: Callable[[Scene, Values], ca.SX] | None = None
     reading: Callable[[Scene, ca.SX, int, Values], ca.SX] | None = None
     channel: Callable[[ca.SX, Values], Channel] | None = None
-    memory: Mapping[str, Callable[[Scene, int, Values], ca.SX]] = field(default_factory=dict)
+    memory: Mapping[str, Memory] = field(default_factory=dict)
     timed: bool = False
 
     @property
@@ -193,12 +201,12 @@ def _relaxed(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
     return replace(soil, slip=slip, yaw=s.z["turn"] * soil.slip.vn)
 
 
-def _relaxation(slip: Callable[[Rolling], ca.SX], name: str) -> Callable[[Scene, int, Values], ca.SX]:
+def _relaxation(slip: Callable[[Rolling], ca.SX], name: str) -> Memory:
     def rate(s: Scene, k: int, p: Values) -> ca.SX:
         r = s.rolling[k]
         return (slip(r) - s.z[name]) * r.slip.vn / p["A"]
 
-    return rate
+    return Memory(rate, 0.05)
 
 
 def _braking(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
@@ -360,7 +368,7 @@ _declare(
         grid=(0.3, 1.0, 4.0),
         positive=True,
         torque=lambda s, k, p: s.z["u"] - s.u[k],
-        memory={"u": lambda s, k, p: (s.u[k] - s.z["u"]) / p["A"]},
+        memory={"u": Memory(lambda s, k, p: (s.u[k] - s.z["u"]) / p["A"], 1000.0)},
     ),
     Effect(
         "channel_delay",
@@ -508,7 +516,7 @@ _declare(
         _constant(0.3),
         {"pass": Shape("m", 15.0, (5.0, 15.0, 50.0))},
         soil=lambda s, k, p, soil: _scaled(soil, 1 + p["A"] * (1 - ca.exp(-s.z["distance"] / p["pass"]))),
-        memory={"distance": lambda s, k, p: ca.sqrt(s.rolling[k].Vx ** 2 + 1e-4)},
+        memory={"distance": Memory(lambda s, k, p: ca.sqrt(s.rolling[k].Vx ** 2 + 1e-4), 1e-6)},
     ),
     Effect(
         "slip_relaxation",

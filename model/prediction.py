@@ -115,6 +115,12 @@ class Model:
         """What effects remember at rest, before a log begins (n_z,)."""
         return np.zeros(len(self.memory))
 
+    @property
+    def remembered(self) -> np.ndarray:
+        """How well `fresh` is known at the start of a log (n_z,)."""
+        own = [m.spread for e in self.effects for m in e.effect.memory.values()]
+        return np.array([1e-6] * ("time" in self.memory) + own)
+
     @cached_property
     def rows(self) -> tuple[str, ...]:
         """Names of the equations: one per coordinate."""
@@ -421,7 +427,7 @@ def _equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[cat
         predict[row] = ca.substitute(gain[k], time, now) * predict[row] + ca.substitute(offset[k], time, now)
     rates = [ca.SX(1)] if "time" in memory else []
     for e in acting:
-        rates += [rate(e.scene, e.placed.bodies[0], e.values) for rate in e.placed.effect.memory.values()]
+        rates += [m.rate(e.scene, e.placed.bodies[0], e.values) for m in e.placed.effect.memory.values()]
     beside = [s.u, z] if placed else []
     labels = ["q", "nu", "a", "p", "u", "z"][: 4 + len(beside)]
     sample = [s.q, s.nu, s.a, s.p, *beside]
