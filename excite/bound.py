@@ -22,7 +22,7 @@ the tolerances of rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 
@@ -35,10 +35,10 @@ from excite.simulate import Motion
 from model.machine import Problem
 from model.prediction import Model
 
-STRIDE = 40  # samples of the drive from one state to the next, at first
+STRIDE = 40  # samples of a drive from one state to the next, at first
 INSIDE = 1e-6  # of a limit's range: what a state may exceed
 SPREAD = 3e-3, 0.5  # of the population around the states that are known, log-uniform, in half ranges
-THOROUGH = 3  # times the search of a round, against the certificate that is reported
+THOROUGH = 3  # times the search of the first rounds, once these find little, and against what is reported
 NEAR = 0.5  # violation below the certificate's boundary by which a state is kept
 MOST = 500  # states that are kept
 # Of drift that is left over, in t. Samples of a drive hardly ever stand still exactly, so drift is allowed at this
@@ -46,8 +46,6 @@ MOST = 500  # states that are kept
 # et al., 1999); a certificate with bounded multipliers is as valid, and a mixture counts once nothing is left over.
 PRICE = 300.0
 STILL = 1e-5  # drift that is left over and counts as none, as a share of the largest
-
-Progress = Callable[[int, int, float], None]
 
 
 @dataclass(frozen=True)
@@ -65,6 +63,9 @@ class Bound:
     states: int
     rounds: int
     degree: int
+
+
+Progress = Callable[[Bound], bool | None]
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ class _States:
 def bound(
     model: Model,
     problem: Problem,
-    motion: Motion,
+    motions: Sequence[Motion],
     degree: int = 2,
     rounds: int = 60,
     population: int = 20_000,
@@ -125,28 +126,29 @@ def bound(
     gap: float = 0.02,
     progress: Progress | None = None,
 ) -> Bound:
-    """A lower bound on cond(Phi) of every drive of a problem, from the states of one drive within the limits.
+    """A lower bound on cond(Phi) of every drive of a problem, from the states of drives within the limits.
 
-    Ends when the certified bound is within `gap` of the mixture, or after so many rounds. degree: of the polynomials
-    phi (0: any mixture of states). population, polished: states that are tried in a round, and how many of them are
-    made worse locally. progress(round, rounds, certified bound). Raises ValueError where the motion leaves the limits
-    everywhere, RuntimeError where the semidefinite program fails.
+    Ends when the certified bound is within `gap` of the mixture for a thorough search, or after so many rounds. degree:
+    of the polynomials phi (0: any mixture of states). population, polished: states that are tried in a round, and how
+    many of them are made worse locally. progress(found so far) may say True to make this round the last one. Raises
+    ValueError where the motions leave the limits everywhere, RuntimeError where the semidefinite program fails.
     """
     states = _states(model, problem, degree)
     rng = np.random.default_rng(seed)
-    every = [motion.q[::STRIDE, list(states.core)], motion.nu[::STRIDE], motion.u[::STRIDE]]
-    Z = (np.hstack(every) / states.size).T
+    every = [np.hstack([m.q[::STRIDE, list(states.core)], m.nu[::STRIDE], m.u[::STRIDE]]) for m in motions]
+    Z = (np.vstack(every) / states.size).T
     Z = _kept_limits(states, np.hstack([Z, -Z]))
     if not Z.shape[1]:
         raise ValueError(
-            "the drive to start from keeps the limits nowhere: give one that was designed for this problem"
+            "the drives to start from keep the limits nowhere: give one that was designed for this problem"
         )
     found = Bound(np.inf, 0.0, np.inf, Z.shape[1], 0, degree)
     proofs: list[tuple[_Certificate, float]] = []
+    effort = 1
     for k in range(1, rounds + 1):
         Phi, drift, _ = states.columns(Z)
         t, w, certificate = _mixture(np.einsum("kri,krj->kij", Phi, Phi), drift)
-        fresh, worst = _price(states, certificate, Z, population, polished, rng)
+        fresh, worst = _price(states, certificate, Z, effort * population, effort * polished, rng)
         # what is found against one certificate counts against every one
         new_Phi, new_drift, _ = states.columns(fresh)
         proofs = [(x, float(_violation(new_Phi, new_drift, x).max(initial=e))) for x, e in proofs]
@@ -159,9 +161,11 @@ def bound(
             states=int((w > 1e-6 * w.max()).sum()),
             rounds=k,
         )
-        if progress is not None:
-            progress(k, rounds, found.certified)
+        enough = progress is not None and progress(found)
         if found.certified > (1 - gap) * found.mixture or not fresh.shape[1]:
+            enough = enough or effort > 1
+            effort = THOROUGH  # closed for a quick look: it has to close for a thorough one
+        if enough:
             break
         e = np.where(w > 1e-9 * w.max(), np.inf, _violation(Phi, drift, certificate))
         best = np.argsort(-e)[:MOST]
