@@ -18,7 +18,7 @@ import typer  # noqa: E402
 from excite import terminal  # noqa: E402
 
 if TYPE_CHECKING:
-    from excite.design import Design
+    from excite.brief import Brief
     from excite.identify import Estimate
     from excite.log import Log
     from model.machine import Filter, Machine, Problem
@@ -42,6 +42,15 @@ ProblemOption = Annotated[str | None, typer.Option("--problem", help="design pro
 DurationOption = Annotated[float | None, typer.Option("--duration", help="length of the drive [s]")]
 ObjectiveOption = Annotated[str, typer.Option("--objective", help="what the drive is best for")]
 StartsOption = Annotated[int, typer.Option("--starts", min=1, help="number of starting guesses")]
+SigmaMaxOption = Annotated[
+    float | None, typer.Option("--sigma-max", help="what the worst parameter's standard deviation may be [%]")
+]
+RobustOption = Annotated[
+    bool, typer.Option("--robust", help="for every machine within 20 %, not the nominal one alone")
+]
+AfterOption = Annotated[
+    list[Path] | None, typer.Option("--after", help="log of an earlier drive: design for what it leaves (repeatable)")
+]
 BudgetOption = Annotated[float | None, typer.Option("--budget", help="stop improving after this many seconds")]
 RunsOption = Annotated[int, typer.Option("--runs", min=1, help="simulated test days")]
 
@@ -88,6 +97,9 @@ def design(
     problem: ProblemOption = None,
     duration: DurationOption = None,
     objective: ObjectiveOption = "cond",
+    sigma_max: SigmaMaxOption = None,
+    robust: RobustOption = False,
+    after: AfterOption = None,
     starts: StartsOption = 2,
     seed: SeedOption = 0,
     budget: BudgetOption = None,
@@ -96,11 +108,13 @@ def design(
 ) -> None:
     """Designs a test drive."""
     from excite import folder
+    from excite.brief import Brief
 
     out = out or Path(f"results/design-{_stem(machine)}")
-    folder.claim(out)
+    folder.claim(out, after or [])
+    brief = Brief(objective, sigma_max, robust, tuple(after or ()), starts, seed, budget)
     with folder.writing(out) as place:
-        summary = _design(place, machine, problem, duration, objective, starts, seed, budget)
+        summary = _design(place, machine, problem, duration, brief)
     terminal.finish(summary, out, json, terminal.design_table)
 
 
@@ -151,6 +165,8 @@ def run(
     problem: ProblemOption = None,
     duration: DurationOption = None,
     objective: ObjectiveOption = "cond",
+    sigma_max: SigmaMaxOption = None,
+    robust: RobustOption = False,
     starts: StartsOption = 2,
     seed: SeedOption = 0,
     budget: BudgetOption = None,
@@ -162,13 +178,15 @@ def run(
 ) -> None:
     """Designs a test drive and verifies it, in one go."""
     from excite import folder
+    from excite.brief import Brief
 
     out = out or Path(f"results/run-{_stem(machine)}")
     folder.claim(out)
     with folder.writing(out) as place:
         designed = place / "design"
         designed.mkdir()
-        first = _design(designed, machine, problem, duration, objective, starts, seed, budget)
+        brief = Brief(objective, sigma_max, robust, (), starts, seed, budget)
+        first = _design(designed, machine, problem, duration, brief)
         if not first["complete"] and budget is None:
             raise KeyboardInterrupt
         checked = place / "verify"
@@ -313,62 +331,39 @@ def identify(
 # ------------------------------------------------------------------------------------------------ the work
 
 
-def _design(
-    place: Path,
-    machine: str,
-    problem: str | None,
-    duration: float | None,
-    aim: str,
-    starts: int,
-    seed: int,
-    budget: float | None,
-) -> dict[str, Any]:
+def _design(place: Path, machine: str, problem: str | None, duration: float | None, brief: Brief) -> dict[str, Any]:
     import time
 
-    from excite import design, folder, log, objective, report
+    from excite import folder, log, report
+    from excite.brief import answer
+    from excite.brief import summary as said
+    from excite.objective import OBJECTIVES
 
     model = _model(machine)
     name, chosen = _problem(model.machine, problem, duration)
-    _known("--objective", aim, tuple(objective.OBJECTIVES))
-    if budget is not None and not budget > 0:
-        raise UsageError(f"--budget: must be > 0 s (got {budget:g})")
+    _known("--objective", brief.objective, tuple(OBJECTIVES))
+    for option, value, unit in (("--budget", brief.budget_s, "s"), ("--sigma-max", brief.sigma_max, "%")):
+        if value is not None and not value > 0:
+            raise UsageError(f"{option}: must be > 0 {unit} (got {value:g})")
     begin = time.perf_counter()
     with terminal.bar("designing") as advance:
-        result = design.design(model, chosen, aim, starts, seed, budget, advance)
+        found = answer(model, chosen, brief, advance)
     wall = time.perf_counter() - begin
-    log.profile(model, result.motion).to_csv(place / "profile.csv", index=False)
+    log.profile(found.model, found.design.motion).to_csv(place / "profile.csv", index=False)
     (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
     summary: dict[str, Any] = {
         "machine": model.machine.name,
         "problem": name,
         "duration_s": float(chosen.duration_s),
-        "objective": aim,
-        "cond_phi": result.cond_phi,
-        "cond_w": result.cond_w,
-        "cond_phi_start": result.cond_phi_start,
-        "sigma_percent": _sigma(model, result),
-        "complete": result.complete,
-        "max_violation": result.max_violation,
-        "violations": dict(result.violations),
-        "starts": starts,
-        "seed": seed,
+        **said(brief, found),
         "wall_s": wall,
         "versions": _versions(),
     }
-    title = f"{model.machine.title}: {name}, cond(Phi) = {result.cond_phi:.2f}"
-    report.save(report.design_figure(model, chosen, result.motion, title), place / "design.png")
+    title = f"{model.machine.title}: {name}, cond(Phi) = {found.design.cond_phi:.2f}"
+    report.save(report.design_figure(found.model, chosen, found.design.motion, title), place / "design.png")
     report.save(report.sigma_figure(summary["sigma_percent"], title), place / "sigma.png")
     (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
     return summary
-
-
-def _sigma(model: Model, result: Design) -> dict[str, float]:
-    from excite import smoothing
-
-    covariance = smoothing.cramer_rao(model, result.motion, "full")
-    reference = [abs(x) if x else s for x, s in zip(model.nominal, model.scale, strict=True)]
-    spread = 100 * covariance.diagonal() ** 0.5 / reference
-    return dict(zip(model.base.names, spread.tolist(), strict=True))
 
 
 def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: str, seed: int) -> dict[str, Any]:
@@ -396,6 +391,11 @@ def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: s
         "seed": seed,
         "failed": len(result.failures),
         "failures": result.failures,
+    if design.summary.get("after"):
+        raise UsageError(
+            f"{design_dir}: was designed for the machine that {', '.join(design.summary['after'])} told of, not for the"
+            " machine file's; verify a design made without --after"
+        )
         "parameters": parameters,
         "biased": biased(parameters),
         "versions": _versions(),

@@ -56,7 +56,8 @@ class Transcription:
 
     A node's sample is s = (z, dz/dt, u), all scaled; `spread` (J, n_s, n_z + J n_z + 2 n_u) makes it from an interval's
     left state, node states, left and right torque. Functions of it: residual (n_z,) of the equations of motion,
-    limits (n_g,) scaled to -1..1, entries (n_a,) of the information matrix on and above its diagonal.
+    limits (n_g,) scaled to -1..1, entries (n_a,) of the information matrices on and above their diagonals, one matrix
+    after the other; `weight` (K J,) sums them as if over every sample of a motion.
     """
 
     intervals: int
@@ -76,6 +77,7 @@ class Transcription:
     rows: np.ndarray
     columns: np.ndarray
     size: int
+    blocks: int
     at_rest: np.ndarray
     band: np.ndarray
     loose: np.ndarray
@@ -105,11 +107,16 @@ class Transcription:
         u = U[:-1, None] * (1 - self.place)[:, None] + U[1:, None] * self.place[:, None]
         return np.concatenate([Z, rate, u], axis=2).reshape(-1, self.n_s)
 
-    def matrix(self, entries: np.ndarray) -> np.ndarray:
-        """The information matrix (n, n) of its entries (n_a,)."""
-        A = np.zeros((self.size, self.size))
-        A[self.rows, self.columns] = entries
-        A[self.columns, self.rows] = entries
+    @property
+    def n_a(self) -> int:
+        return len(self.rows) * self.blocks
+
+    def matrices(self, entries: np.ndarray) -> np.ndarray:
+        """The information matrices (n_blocks, n, n) of their entries (n_a,)."""
+        A = np.zeros((self.blocks, self.size, self.size))
+        each = entries.reshape(self.blocks, -1)
+        A[:, self.rows, self.columns] = each
+        A[:, self.columns, self.rows] = each
         return A
 
 
@@ -192,13 +199,13 @@ def transcribe(
     elements: int = 1,
     with_pose: bool = False,
     rest: float = 1.0,
-    weights: tuple[np.ndarray, np.ndarray] | None = None,
+    weights: np.ndarray | None = None,
 ) -> Transcription:
     """The nonlinear program of a problem on `intervals` equal intervals, each of `elements` collocation elements.
 
     state_size: the typical size of every coordinate and velocity (named c and c'). The pose is a state only where
-    `with_pose`: nothing but the lane depends on it. weights (n_rows,), (n_base,): of the
-    regressor's rows and columns, by default 1 and the scale.
+    `with_pose`: nothing but the lane depends on it. weights (n_blocks, n_rows): of the regressor's rows [1/SI], one
+    information matrix for each; all 1 by default.
     """
     every = limits(model, problem)
     s = symbols(model)
@@ -235,23 +242,23 @@ def transcribe(
     residual = ca.vertcat(*turns, (model.predict(q, nu, a, p) - drive) / float(u_size.max()))
     g = ca.vertcat(*[(g.expression(q, nu, u, 0) - g.centre) * (2 / g.range) for g in staged], ca.SX(0, 1))
     W = model.regressor(q, nu, a)
-    rows_by, columns_by = weights or (np.ones(n_q), model.scale)
-    W = ca.mtimes(ca.diag(ca.DM(rows_by / rows_by.max())), W)
-    Phi = ca.mtimes(W, ca.diag(ca.DM(columns_by))) / float(u_size.max())
-    A = ca.triu(ca.mtimes(Phi.T, Phi))
-    rows, columns = (np.array(x) for x in A.sparsity().get_triplet())
-    entries = ca.vertcat(*A.nonzeros())
+    Phi = ca.mtimes(W, ca.diag(ca.DM(model.scale)))
+    blocks = np.ones((1, n_q)) if weights is None else weights
+    every_A = [ca.triu(ca.mtimes(P.T, P)) for P in (ca.mtimes(ca.diag(ca.DM(w)), Phi) for w in blocks)]
+    rows, columns = (np.array(x) for x in every_A[0].sparsity().get_triplet())
+    entries = ca.vertcat(*[x for A in every_A for x in A.nonzeros()])
 
     n_s, n_g, n_a = 2 * n_z + n_u, g.numel(), entries.numel()
-    weights = ca.SX.sym("w", n_z + n_g + n_a)
-    lagrangian = ca.dot(weights, ca.vertcat(residual, g, entries))
+    multipliers = ca.SX.sym("m", n_z + n_g + n_a)
+    lagrangian = ca.dot(multipliers, ca.vertcat(residual, g, entries))
     H, _ = ca.hessian(lagrangian, sample)
     N = intervals * len(place)
+    samples = float(problem.duration_s) * float(model.machine.sampling_hz)
     options = {"cse": True}
     values = ca.Function("values", [sample], [residual, g, entries], options)
     slopes = [ca.densify(ca.jacobian(x, sample).T) for x in (residual, g, entries)]
     first = ca.Function("first", [sample], [residual, g, entries, *slopes], options)
-    second = ca.Function("second", [sample, weights], [ca.densify(H)], options)
+    second = ca.Function("second", [sample, multipliers], [ca.densify(H)], options)
 
     control, centre = _control(steered, s, u_size, knot)
     resting_states = [names.index(model.coordinates[k]) for k in resting(model)] + [
@@ -269,7 +276,7 @@ def transcribe(
         u_size,
         derivative,
         place,
-        np.tile(weight, intervals) / intervals,
+        np.tile(weight, intervals) / intervals * samples,
         tuple(x.name for x in staged),
         np.array([-1.0 if np.isfinite(x.low) else -FAR for x in staged]),
         tuple(x.name for x in steered),
@@ -278,6 +285,7 @@ def transcribe(
         rows,
         columns,
         len(model.scale),
+        len(blocks),
         at_rest,
         band,
         np.array([k for k, c in enumerate(names) if c in pose and k not in resting_states], int),

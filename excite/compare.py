@@ -2,10 +2,10 @@
 
 The usual drives know nothing of the limits on the motion, so each is brought inside them in the same way. It is scaled
 down until every limit but rest and lane holds, first the torques of the rolls alone, then the others with them. Rest at
-the end and the lane are then met by the nearest drive that keeps every limit (`interior`, no objective, least squares
-distance in the share of the torque limits), and small smooth torques land it (`design.land`). This moves a drive as
-little as can be and never looks at the score. A drive that still exceeds a limit by more than `design.TOLERANCE` of its
-range is reported with the limit that it breaks.
+the end and the lane are then met by the nearest drive that keeps every limit (`interior`, no aim, least squares
+distance in the share of the torque limits), and small smooth torques land it (`continuation.land`). This moves a drive
+as little as can be and never looks at the score. A drive that still exceeds a limit by more than
+`continuation.TOLERANCE` of its range is reported with the limit that it breaks.
 
 Fourier series (0.05 to 0.3 Hz; Swevers et al., 1997) are searched, from a random one scaled down like that, for the
 time that the design took, with rest and lane left to the same treatment afterwards. All work runs in as many processes
@@ -27,8 +27,10 @@ import numpy as np
 import scipy.optimize
 
 from excite import interior, manoeuvre, objective, smoothing
+from excite.aim import aim
 from excite.collocation import UnsettledError, settle, transcribe
-from excite.design import MARGIN, TOLERANCE, Candidate, Track, design, land, typical_sizes, verdict
+from excite.continuation import MARGIN, TOLERANCE, Candidate, Track, land, typical_sizes, verdict
+from excite.design import design
 from excite.driver import follow
 from excite.limit import check, limits, symbols
 from excite.manoeuvre import Manoeuvre, scaled
@@ -302,7 +304,7 @@ def within(model: Model, problem: Problem, wish: Manoeuvre) -> Candidate:
         moved = _nearest(model, problem, track, small, margins, elements=1 if attempt == 0 else 3)
         if moved is None:
             break
-        track = land(model, problem, "cond", moved, lambda: False)
+        track = land(model, problem, aim(model, "cond"), moved, lambda: False)
         least = min(least, track.latest, key=lambda c: c.excess)
         for name, excess in track.latest.violations.items():
             if excess > 0.3 * TOLERANCE:
@@ -312,7 +314,7 @@ def within(model: Model, problem: Problem, wish: Manoeuvre) -> Candidate:
 
 def judge(model: Model, problem: Problem, drive: Manoeuvre) -> tuple[Candidate, Motion]:
     """A design's own verdict on a drive: simulated afresh, placed on the lane as well as can be, scored by cond."""
-    return verdict(model, problem, "cond", drive)
+    return verdict(model, problem, aim(model, "cond"), drive)
 
 
 def _nearest(

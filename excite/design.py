@@ -1,18 +1,18 @@
-"""The nonlinear program of a test drive: torques that make every parameter speak, under every limit.
+"""The search for a test drive: torques that make every parameter speak, under every limit.
 
-Each start goes through a continuation: wide friction and slip transitions and far-apart torque knots first, where the
-problem is smooth, then ever closer to the machine as it is. The answer is simulated afresh by the accurate integrator
-at the machine's sampling rate; its score and its limits are those of that motion, never the optimiser's own.
+Many starts, each carried through the continuation (`continuation`) in a process of its own: all of them through the
+first stages, the most promising to the end.
 """
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,53 +20,18 @@ from pathlib import Path
 import joblib
 import numpy as np
 
-from excite import interior
-from excite import objective as _objective
-from excite.collocation import UnsettledError, settle, transcribe
-from excite.limit import REST_POSITION, InfeasibleError, check, placed, rest_tolerances, resting
-from excite.manoeuvre import Manoeuvre, multisine, scaled
-from excite.manoeuvre import knots as _knots
-from excite.objective import OBJECTIVES
-from excite.simulate import Motion, SimulationError, simulate
-from model import prediction
-from model.machine import Machine, Problem
+from excite import aim as aims
+from excite import objective as objectives
+from excite.aim import SIGMA_MAX, Aim
+from excite.continuation import PLAN, SCOUTS, Candidate, Track, depart, promise, rank, refine, repair, search
+from excite.limit import InfeasibleError
+from excite.manoeuvre import Manoeuvre
+from excite.simulate import Motion, simulate
+from model.machine import Problem
 from model.prediction import Model
 
-TOLERANCE = 1e-3  # of a limit's range: what the fresh simulation may exceed
-STUCK = 20.0  # half ranges in all that a program still exceeds: it is not going to keep its limits
-MARGIN = 2e-3  # of half a range: what the program keeps from every limit
-
 Report = Callable[[int, int, float], None]
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One solve of the continuation: transitions and knots wider by these factors, and the levels that follow.
-
-    Level i follows the objective with sharpness sharp 2^i at barrier / 3^i, and ends when the decrease that a Newton
-    step promises is below `patience` / sharpness.
-    """
-
-    friction: float
-    slip: float
-    coarse: int
-    sharp: float
-    barrier: float
-    levels: int
-    iterations: int
-    patience: float
-    elements: int = 1
-
-
-PLAN = (
-    Stage(10, 3, 4, 8, 1e-3, 2, 40, 1.0),
-    Stage(4, 1.7, 2, 16, 1e-4, 2, 30, 1.0),
-    Stage(2, 1.2, 2, 40, 3e-5, 1, 30, 1.0),
-    Stage(1, 1, 2, 60, 1e-5, 1, 30, 1.0),
-    Stage(1, 1, 1, 100, 1e-5, 4, 30, 0.1),
-)
-SCOUTS = 3  # stages that every start goes through; the best third of the starts go on to the end
-REPAIR = Stage(1, 1, 1, 800, 1e-6, 1, 30, 0.1, elements=3)
+LATER = len(PLAN) - SCOUTS + 1  # pieces of work of a start that is chosen, at least
 
 
 @dataclass(frozen=True)
@@ -91,48 +56,10 @@ class Design:
     complete: bool
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A drive and the fresh simulation's verdict: torques at the knots, start coordinates (n_q,), score, violations."""
-
-    manoeuvre: Manoeuvre
-    start: np.ndarray
-    score: float
-    violations: Mapping[str, float]
-
-    @property
-    def excess(self) -> float:
-        return max(self.violations.values(), default=0.0)
-
-    @property
-    def feasible(self) -> bool:
-        return self.excess <= TOLERANCE
-
-
-@dataclass(frozen=True)
-class Track:
-    """How far one start has come, ready to be carried on.
-
-    times (N,) [s] and states (N, n_z), scaled by `sizes`, are the last program's nodes, or the guess's samples and
-    none yet. pose (n_q,): the start coordinates once the lane matters. best: the best candidate on the way.
-    """
-
-    number: int
-    guess: float
-    sizes: Mapping[str, float]
-    latest: Candidate
-    best: Candidate
-    motion: Motion
-    times: np.ndarray
-    states: np.ndarray | None = None
-    pose: np.ndarray | None = None
-    complete: bool = False
-
-
 def design(
     model: Model,
     problem: Problem,
-    objective: str = "cond",
+    objective: str | Aim = "cond",
     starts: int = 2,
     seed: int = 0,
     budget_s: float | None = None,
@@ -140,86 +67,83 @@ def design(
 ) -> Design:
     """The best drive of several starts, each from its own random multisine, in parallel processes.
 
-    Every start goes through the first stages, the most promising third (two at least) to the end.
-    progress(done, total, best score so far) is called as these pieces of work finish. budget_s [s], half of it for the
+    Every start goes through the first stages, the most promising third (two at least) to the end. objective: a name, or
+    an `aim` that puts it together with an accuracy to keep, what is known before, or other machines.
+    progress(done, total, best score so far) is called as stages finish. budget_s [s], half of it for the
     first stages, ends the search early with the best feasible drive so far, and so does Ctrl-C (KeyboardInterrupt
     where there is none yet). The same seed gives the same design where neither cuts in.
 
     Raises InfeasibleError with the limit that can't be met and by how much, KeyError for an unknown objective.
     """
-    if objective not in OBJECTIVES:
-        raise KeyError(f"no objective {objective}, allowed: {', '.join(OBJECTIVES)}")
+    aim = aims.aim(model, objective) if isinstance(objective, str) else objective
     if starts < 1:
         raise ValueError(f"starts must be at least 1, got {starts}")
     now = time.time()
     half, deadline = (None, None) if budget_s is None else (now + budget_s / 2, now + budget_s)
     seeds = np.random.SeedSequence(seed).generate_state(starts)
+    kept = min(starts, max(2, -(-starts // 3)))
     tracks: dict[int, Track] = {}
-    with _interruptible() as stop, joblib.parallel_config("loky", inner_max_num_threads=1):
+    with (
+        _interruptible() as stop,
+        _watching(stop.parent, progress, starts * SCOUTS + kept * LATER),
+        joblib.parallel_config("loky", inner_max_num_threads=1),
+    ):
         # loky even for one start: only there can the number of threads of the linear algebra be set
         run = joblib.Parallel(n_jobs=max(2, os.cpu_count() or 1), return_as="generator_unordered")
         call = joblib.delayed(_carry)
-        work = (call(model, problem, objective, k, int(s), None, half, stop) for k, s in enumerate(seeds))
-        kept = min(starts, max(2, -(-starts // 3)))
-        total = starts + kept
-        for done, track in enumerate(run(work), 1):
+        for track in run(call(model, problem, aim, k, int(s), None, half, stop) for k, s in enumerate(seeds)):
             if track is not None:
                 tracks[track.number] = track
-            _tell(progress, objective, done, total, tracks)
-        chosen = sorted(tracks.values(), key=lambda t: (_promise(t.latest), t.number))[:kept]
-        rest = (call(model, problem, objective, t.number, 0, t, deadline, stop) for t in chosen)
-        for done, track in enumerate(run(rest), starts + 1):
-            tracks |= {track.number: track} if track is not None else {}
-            _tell(progress, objective, done, total, tracks)
+        chosen = sorted(tracks.values(), key=lambda t: (promise(t.latest), t.number))[:kept]
+        for track in run(call(model, problem, aim, t.number, 0, t, deadline, stop) for t in chosen):
+            if track is not None:
+                tracks[track.number] = track
         interrupted = stop.exists()
-    best = min(tracks.values(), key=lambda t: (*_rank(t.best), t.number))
+    best = min(tracks.values(), key=lambda t: (*rank(t.best), t.number))
     complete = len(tracks) == starts and all(tracks[t.number].complete for t in chosen)
     if not best.best.feasible:
         if interrupted:
             raise KeyboardInterrupt
-        name = max(best.best.violations, key=lambda limit: best.best.violations[limit])
-        excess = best.best.excess
-        short = "" if complete else ", give more time"
-        raise InfeasibleError(
-            f"no drive found that keeps every limit: {name} is exceeded by {100 * excess:.2f} % of its range in the"
-            f" best attempt{short}; widen it, or give another duration or more starts",
-            name,
-            excess,
-        )
+        raise _infeasible(aim, best.best, complete)
     drive = best.best
     motion = simulate(model, drive.manoeuvre.sample(float(model.machine.sampling_hz)), q0=drive.start)
-    violations = check(model, problem, motion)
     return Design(
-        objective,
+        aim.name,
         drive.manoeuvre,
         motion,
-        _objective.cond_phi(model, motion),
-        _objective.cond_w(model, motion),
+        objectives.cond_phi(model, motion),
+        objectives.cond_w(model, motion),
         min(t.guess for t in tracks.values()),
-        violations,
-        max(violations.values(), default=0.0),
-        tuple(_score(objective, tracks[k].best) if k in tracks else float("inf") for k in range(starts)),
+        dict(drive.violations),
+        drive.excess,
+        tuple(_score(aim, tracks[k].best) if k in tracks else float("inf") for k in range(starts)),
         complete,
     )
 
 
-def _tell(progress: Report | None, objective: str, done: int, total: int, tracks: Mapping[int, Track]) -> None:
-    if progress is not None:
-        progress(done, total, min((_score(objective, t.best) for t in tracks.values()), default=float("inf")))
+def _infeasible(aim: Aim, best: Candidate, complete: bool) -> InfeasibleError:
+    """What to say where no start ended inside the limits: which one can't be met, and by how much."""
+    name = max(best.violations, key=lambda limit: best.violations[limit])
+    excess = best.excess
+    short = "" if complete else ", give more time"
+    if name == SIGMA_MAX and aim.sigma_max is not None:
+        return InfeasibleError(
+            f"no drive found that is accurate enough: {name} {aim.sigma_max:g} % is exceeded by {100 * excess:.2g} %,"
+            f" the worst parameter comes out at {aim.sigma_max * (1 + excess):.3g} % in the best attempt{short}; allow"
+            " more, or give a longer duration or more starts",
+            name,
+            excess,
+        )
+    return InfeasibleError(
+        f"no drive found that keeps every limit: {name} is exceeded by {100 * excess:.2f} % of its range in the"
+        f" best attempt{short}; widen it, or give another duration or more starts",
+        name,
+        excess,
+    )
 
 
-def _score(objective: str, c: Candidate) -> float:
-    return _objective.reported(objective, c.score) if c.feasible else float("inf")
-
-
-def _rank(c: Candidate) -> tuple[float, float]:
-    """Feasible before infeasible, then by score, or by excess."""
-    return (0.0, c.score) if c.feasible else (1.0, c.excess)
-
-
-def _promise(c: Candidate) -> float:
-    """What a start may come to: its score, dearer by what it exceeds."""
-    return c.score + min(1.0, c.excess)
+def _score(aim: Aim, c: Candidate) -> float:
+    return objectives.reported(aim.name, c.score) if c.feasible else float("inf")
 
 
 @contextmanager
@@ -237,10 +161,39 @@ def _interruptible() -> Iterator[Path]:
             signal.signal(signal.SIGINT, before)
 
 
+@contextmanager
+def _watching(folder: Path, progress: Report | None, total: int) -> Iterator[None]:
+    """Reports as the searches leave word of a stage that is done: a file START-STAGE with the best score so far."""
+    if progress is None:
+        yield
+        return
+    ended = threading.Event()
+    scores: dict[str, float] = {}
+
+    def look() -> None:
+        for path in folder.glob("*-*"):
+            if path.name not in scores:
+                scores[path.name] = float(path.read_text(encoding="ascii"))
+                progress(min(len(scores), total), total, min(scores.values()))
+
+    def watch() -> None:
+        while not ended.wait(0.2):
+            look()
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        look()
+
+
 def _carry(
     model: Model,
     problem: Problem,
-    objective: str,
+    aim: Aim,
     number: int,
     seed: int,
     track: Track | None,
@@ -253,237 +206,24 @@ def _carry(
     """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, lambda *_: stop.touch() if stop.parent.exists() else None)
+    stages = itertools.count(0 if track is None else SCOUTS)
 
     def over() -> bool:
         return stop.exists() or (deadline is not None and time.time() > deadline)
 
+    def tell(track: Track) -> None:
+        fresh = stop.parent / f".{number}"
+        fresh.write_text(repr(_score(aim, track.best)), encoding="ascii")
+        fresh.replace(stop.parent / f"{number}-{next(stages)}")
+
     if track is None:
         if number > 0 and over():
             return None
-        return search(model, problem, objective, depart(model, problem, objective, number, seed), PLAN[:SCOUTS], over)
-    track = search(model, problem, objective, track, PLAN[SCOUTS:], over)
-    return track if over() else replace(repair(model, problem, objective, track, over), complete=not over())
-
-
-def depart(model: Model, problem: Problem, objective: str, number: int, seed: int) -> Track:
-    """A start: a random multisine, as large as the limits on the motion allow."""
-    wish = multisine(model, problem, seed, top=0.5)
-    for factor in 0.85 ** np.arange(60):
-        try:
-            found, motion = verdict(model, problem, objective, scaled(wish, float(factor)))
-        except SimulationError:
-            continue
-        if all(v == 0 for k, v in found.violations.items() if not k.startswith(("rest", "lane"))):
-            break
-    sizes = typical_sizes(model, problem, motion)
-    return Track(number, _objective.cond_phi(model, motion), sizes, found, found, motion, motion.t)
-
-
-def typical_sizes(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
-    """Typical size of every coordinate and velocity (c and c') in a motion; of the pose, half the lane."""
-    sizes = {}
-    for k, c in enumerate(model.coordinates):
-        sizes[c] = max(1e-3, 2 * float(np.sqrt((motion.q[:, k] ** 2).mean())))
-        sizes[c + "'"] = max(1e-3, 2 * float(np.sqrt((motion.nu[:, k] ** 2).mean())))
-    if model.machine.planar:
-        x, y, heading = model.machine.body[0].coordinates
-        sizes |= {x: problem.lane_m[0] / 2, y: problem.lane_m[1] / 2, heading: 1.0}
-    return sizes
-
-
-def search(
-    model: Model, problem: Problem, objective: str, track: Track, plan: Sequence[Stage], over: Callable[[], bool]
-) -> Track:
-    """A track carried through the stages of a plan, until `over`."""
-    for stage in plan:
-        if over():
-            break
-        moved = _advance(model, problem, objective, track, stage, {}, over)
-        if moved is None:
-            break
-        track = moved
-        lane = max((v for limit, v in track.latest.violations.items() if limit.startswith("lane")), default=0.0)
-        if track.pose is not None or (stage.friction <= 4 and lane > 0):
-            track = replace(track, pose=track.latest.start)
+        return search(model, problem, aim, depart(model, problem, aim, number, seed), PLAN[:SCOUTS], over, tell)
+    track = search(model, problem, aim, track, PLAN[SCOUTS:], over, tell)
+    if not over():
+        track = refine(model, problem, aim, track, over, tell)
+    if not over():
+        track = replace(repair(model, problem, aim, track, over), complete=not over())
+    tell(track)
     return track
-
-
-def repair(model: Model, problem: Problem, objective: str, track: Track, over: Callable[[], bool]) -> Track:
-    """The same drive with what the fresh simulation exceeds moved in, three times at most."""
-    margins: dict[str, float] = {}
-    track = land(model, problem, objective, track, over)
-    for _ in range(3):
-        if track.latest.feasible or over():
-            break
-        for name, excess in track.latest.violations.items():
-            if excess > 0.3 * TOLERANCE:
-                margins[name] = margins.get(name, 0.0) + 3 * excess
-        track = replace(track, pose=track.latest.start) if track.pose is not None else track
-        track = _advance(model, problem, objective, track, REPAIR, margins, over) or track
-        track = land(model, problem, objective, track, over)
-    return track
-
-
-def land(model: Model, problem: Problem, objective: str, track: Track, over: Callable[[], bool]) -> Track:
-    """The same drive with small smooth torques added that bring the fresh simulation to rest where it should end.
-
-    What the forces integrate, an articulation say, drifts in open loop by what the collocation neglects; Newton's
-    method on the end of the motion, least in the share of the torque limits, takes that out. Kept where it helps.
-    """
-    rate = float(model.machine.sampling_hz)
-    scale = np.array([float(b.limit.torque) if b.limit.torque is not None else 1.0 for b in model.machine.actuated])
-    for _ in range(4):
-        late = [name for name, v in track.latest.violations.items() if v > 0 and name.startswith("rest")]
-        if not late or over():
-            break
-        drive, x0 = track.latest.manoeuvre, _end(model, track.motion)
-        shapes = [
-            shape[:, None] * scale * np.eye(len(scale))[k]
-            for shape in _bumps(drive.times / drive.duration)
-            for k in range(len(scale))
-        ]
-        step = 1e-3
-        try:
-            moved = [
-                simulate(model, Manoeuvre(drive.times, drive.torque + step * s).sample(rate), q0=track.motion.q[0])
-                for s in shapes
-            ]
-            J = np.column_stack([(_end(model, m) - x0) / step for m in moved])
-            off = np.abs(x0) > 0.5  # what is at rest already needs no torque
-            sizes = np.linalg.lstsq(J[off], -x0[off], rcond=1e-3)[0]
-            added = sum((size * s for size, s in zip(sizes, shapes, strict=True)), np.zeros_like(drive.torque))
-            found, motion = verdict(model, problem, objective, Manoeuvre(drive.times, drive.torque + added))
-        except SimulationError:
-            break
-        if _rank(found) >= _rank(track.latest):
-            break
-        track = replace(track, latest=found, best=min(track.best, found, key=_rank), motion=motion)
-    return track
-
-
-def _bumps(share: np.ndarray) -> list[np.ndarray]:
-    """Smooth bumps (K,) in the second half of a drive, share (K,) of its duration."""
-    return [
-        np.where(np.abs(share - middle) < 0.1, np.cos(5 * np.pi * (share - middle)) ** 2, 0.0)
-        for middle in (0.6, 0.75, 0.88)
-    ]
-
-
-def _end(model: Model, motion: Motion) -> np.ndarray:
-    """What must be zero at the end of a motion, in its tolerances: coordinates that rest and velocities."""
-    still = motion.q[-1, list(resting(model))] / REST_POSITION
-    return np.concatenate([still, motion.nu[-1] / rest_tolerances(model)])
-
-
-def _advance(
-    model: Model,
-    problem: Problem,
-    objective: str,
-    track: Track,
-    stage: Stage,
-    margins: Mapping[str, float],
-    over: Callable[[], bool],
-) -> Track | None:
-    """One stage from where the track stands. None where no motion follows its torques."""
-    knots = len(_knots(problem)) - 1
-    intervals = max(4, round(knots / stage.coarse))
-    softer = soften(model, stage.friction, stage.slip)
-    rest = 2 * stage.friction if stage.friction > 1 else 1.0
-    tr = transcribe(
-        softer,
-        problem,
-        track.sizes,
-        intervals,
-        elements=stage.elements,
-        with_pose=track.pose is not None,
-        rest=rest,
-        weights=_objective.weights(model, objective),
-    )
-    times = np.linspace(0, float(problem.duration_s), intervals + 1)
-    nodes = (np.arange(intervals)[:, None] + tr.place) * tr.knot
-    U = track.latest.manoeuvre.at(times) / tr.torque_scale
-    U[0] = U[-1] = 0.0
-    start = np.zeros(tr.n_z)
-    if track.pose is not None:
-        for k, c in enumerate(tr.state_names):
-            start[k] = track.pose[model.coordinates.index(c)] / tr.state_scale[k] if c in model.coordinates else 0.0
-    fresh = track.states is None
-    if track.states is None or track.states.shape[1] != tr.n_z:
-        names = [*model.coordinates, *[c + "'" for c in model.coordinates]]
-        every = np.hstack([track.motion.q, track.motion.nu])
-        columns = [every[:, names.index(c)] / size for c, size in zip(tr.state_names, tr.state_scale, strict=True)]
-        Z = np.stack([np.interp(nodes, track.motion.t, x) for x in columns], axis=-1)
-    else:
-        Z = np.stack([np.interp(nodes, track.times, x) for x in track.states.T], axis=-1)
-    moved_in = np.array([MARGIN + 2 * margins.get(name, 0.0) for name in tr.limit_names])
-    task = interior.Task(
-        objective,
-        np.tile(moved_in, (intervals, tr.nodes, 1)),
-        np.tile([1e-4 + 2 * margins.get(name, 0.0) for name in tr.control_names], (intervals, 1)),
-        np.array([name.startswith("lane") for name in tr.limit_names], bool),
-    )
-
-    def watch(*_: object) -> bool:
-        return over()
-
-    try:
-        Z = settle(tr, start, U, Z)
-    except UnsettledError:
-        return None
-    sharp = [stage.sharp * 2**i for i in range(stage.levels)]
-    levels = tuple(
-        interior.Level(p, stage.barrier / 3**i, stage.patience / p, stage.iterations) for i, p in enumerate(sharp)
-    )
-    kept = not fresh
-    if kept:
-        point = interior.begin(tr, task, start, Z, U, stage.barrier, 1e-3)
-        point, state = interior.minimise(tr, task, point, levels, watch)
-        kept = interior.infeasibility(state, point) < STUCK
-    if not kept:  # by way of the nearest torques that keep every limit and come to rest
-        near = replace(task, objective=None, pull=1.0, goal=U)
-        point = interior.begin(tr, near, start, Z, U, 1e-3, 0.05)
-        point, _ = interior.minimise(tr, near, point, (interior.Level(1.0, 1e-3, 1e-3, 40),), watch)
-        point = interior.begin(tr, task, point.start, point.Z, point.U, max(stage.barrier, 1e-4), 0.05)
-        point, _ = interior.minimise(tr, task, point, levels, watch)
-    try:
-        found, motion = verdict(model, problem, objective, Manoeuvre(times, point.U * tr.torque_scale))
-    except SimulationError:
-        return None
-    return replace(
-        track,
-        latest=found,
-        best=min(track.best, found, key=_rank),
-        motion=motion,
-        times=nodes.ravel(),
-        states=point.Z.reshape(-1, tr.n_z),
-    )
-
-
-def verdict(model: Model, problem: Problem, objective: str, drive: Manoeuvre) -> tuple[Candidate, Motion]:
-    """The fresh simulation of a drive, placed on the lane as well as can be."""
-    torque = drive.sample(float(model.machine.sampling_hz))
-    motion = simulate(model, torque)
-    start = placed(model, problem, motion)
-    if not np.array_equal(start, motion.q[0]):
-        motion = simulate(model, torque, q0=start)
-    P = _objective.phi(model, motion, objective)
-    score = _objective.value(objective, P.T @ P)
-    return Candidate(drive, start, score, check(model, problem, motion)), motion
-
-
-def soften(model: Model, friction: float, slip: float) -> Model:
-    """The same model with transitions of friction and slip at standstill wider by these factors."""
-    if friction == 1 and slip == 1:
-        return model
-    bodies = []
-    for body in model.machine.body:
-        changed: dict[str, object] = {}
-        if body.friction is not None:
-            wider = body.friction.smoothing.model_copy(update={"value": friction * float(body.friction.smoothing)})
-            changed["friction"] = body.friction.model_copy(update={"smoothing": wider})
-        if body.contact is not None:
-            wider = body.contact.v_eps.model_copy(update={"value": slip * float(body.contact.v_eps)})
-            changed["contact"] = body.contact.model_copy(update={"v_eps": wider})
-        bodies.append(body.model_copy(update=changed))
-    machine: Machine = model.machine.model_copy(update={"body": tuple(bodies)})
-    return replace(prediction.build(machine), nominal=model.nominal, scale=model.scale)

@@ -64,7 +64,7 @@ def follow(
     n_q = len(model.coordinates)
     rows = list(model.actuated)
     radius = [float(b.contact.radius) if b.contact is not None else 0.0 for b in machine.actuated]
-    gain = _gains(model, rolls, joints)
+    gain = gains(model)
     top = np.array([float(b.limit.torque) if b.limit.torque is not None else np.inf for b in machine.actuated])
     climb = np.array(
         [float(b.limit.torque_rate) if b.limit.torque_rate is not None else np.inf for b in machine.actuated]
@@ -107,17 +107,14 @@ def _by_hand(wanted: np.ndarray, error: float, driver: Driver, rate: float, rng:
     return np.asarray(smooth + error * noise * fade)
 
 
-def _gains(model: Model, rolls: list[int], joints: list[int]) -> np.ndarray:
-    """Torque per speed error [N m s/rad] of each drive: its reflected inertia brought to speed in about 0.3 s."""
+def gains(model: Model) -> np.ndarray:
+    """(n_u,) torque per speed error [N m s/rad] of each drive: its reflected inertia to speed in about 0.3 s."""
     q, nu, _ = model.symbols()
     mass = ca.Function("mass", [q], [model.equations(q, nu, ca.DM(model.nominal))[0]])
     M = mass(np.zeros(len(model.coordinates))).full()
+    rolls = sum(b.contact is not None for b in model.machine.actuated)
     gain = np.zeros(len(model.inputs))
-    for j in rolls:
-        body = model.machine.actuated[j]
-        assert body.contact is not None
-        share = M[0, 0] * float(body.contact.radius) ** 2 / len(rolls)
-        gain[j] = (share + M[model.actuated[j], model.actuated[j]]) / 0.3
-    for j in joints:
-        gain[j] = M[model.actuated[j], model.actuated[j]] / 0.3
+    for j, (row, body) in enumerate(zip(model.actuated, model.machine.actuated, strict=True)):
+        share = M[0, 0] * float(body.contact.radius) ** 2 / rolls if body.contact is not None else 0.0
+        gain[j] = (share + M[row, row]) / 0.3
     return gain

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from excite import objective as scores
+from excite import aim as aims
+from excite.aim import Aim
 from excite.collocation import FAR, Transcription, UnsettledError, settle
 
 PRICE = 4.0  # of a soft limit, per half range and node
@@ -54,13 +55,13 @@ class Level:
 
 @dataclass(frozen=True)
 class Task:
-    """What is minimised: an objective of A (or None) plus pull / 2 |U - goal|^2, limits moved in by `margin`.
+    """What is minimised: an aim (or None) plus pull / 2 |U - goal|^2, limits moved in by `margin`.
 
     margin (K, J, n_g) and marginc (K, n_c), in half ranges. Limits marked `soft` (n_g,) may be exceeded on the way,
     at a price of PRICE per half range: a smooth hinge.
     """
 
-    objective: str | None
+    aim: Aim | None
     margin: np.ndarray
     marginc: np.ndarray
     soft: np.ndarray
@@ -190,7 +191,7 @@ def _evaluate(tr: Transcription, task: Task, start: np.ndarray, Z: np.ndarray, U
 def _state(
     tr: Transcription, task: Task, Z: np.ndarray, U: np.ndarray, g: np.ndarray, entries: np.ndarray, sharp: float
 ) -> State:
-    f = 0.0 if task.objective is None else scores.value(task.objective, tr.matrix(entries), sharp)
+    f = 0.0 if task.aim is None else aims.value(task.aim, tr.matrices(entries), sharp)
     if task.goal is not None:
         f += 0.5 * task.pull * float(((U - task.goal) ** 2).sum())
     gc = np.concatenate([U[:-1], U[1:]], axis=1) @ tr.control.T + tr.control_centre
@@ -207,7 +208,7 @@ def _pressure(
 
 
 def _linearise(tr: Transcription, task: Task, point: Point, level: Level) -> Quadratic:
-    K, J, n_z, n_u, n_a, mu = tr.intervals, tr.nodes, tr.n_z, tr.n_u, len(tr.rows), level.barrier
+    K, J, n_z, n_u, n_a, mu = tr.intervals, tr.nodes, tr.n_z, tr.n_u, tr.n_a, level.barrier
     n_g = point.t.shape[2]
     n_y, n_r = n_z + n_u, n_z + 2 * n_u
     L = tr.spread
@@ -216,8 +217,8 @@ def _linearise(tr: Transcription, task: Task, point: Point, level: Level) -> Qua
     _, g, a, cs, gs, as_ = tr.first(s)
     state = _state(tr, task, point.Z, point.U, g, tr.weight @ a, level.sharp)
     slope, F = np.zeros(n_a), np.zeros((n_a, 0))
-    if task.objective is not None:
-        local = scores.local(task.objective, tr.matrix(state.entries), tr.rows, tr.columns, level.sharp)
+    if task.aim is not None:
+        local = aims.local(task.aim, tr.matrices(state.entries), tr.rows, tr.columns, level.sharp)
         slope, F = local.slope, local.factor
 
     # node states from the interval's ends

@@ -112,6 +112,11 @@ def value(objective: str, A: np.ndarray, sharp: float = EXACT) -> float:
     return float(_derivatives(objective, len(A))(x, sharp)[0])
 
 
+def of_values(objective: str, x: np.ndarray) -> float:
+    """The score of eigenvalues or relative variances (n,) as they are, whichever the objective looks at."""
+    return float(_derivatives(objective, len(x))(x, EXACT)[0])
+
+
 def reported(objective: str, value: float) -> float:
     """An objective as people read it: a condition number, a relative standard deviation [%], others as they are."""
     if objective in ("cond", "weighted-cond"):
@@ -143,7 +148,7 @@ def local(objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, 
     close = gap < 1e-7 * x[j]
     ratio = np.where(close, H[j, j] - H[i, j], (g[j] - g[i]) / np.where(close, 1, gap))
     factor = np.vstack([root @ np.einsum("lii->il", E), np.sqrt(2 * np.maximum(ratio, 0))[:, None] * E[:, i, j].T])
-    return Local(float(out[0]), slope, _root(factor.T @ factor))
+    return Local(float(out[0]), slope, factored(factor.T @ factor))
 
 
 def _local_variances(objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, sharp: float) -> Local:
@@ -159,10 +164,10 @@ def _local_variances(objective: str, A: np.ndarray, rows: np.ndarray, columns: n
         off = rows != columns
         np.add.at(moved, (np.flatnonzero(off), columns[off]), C[rows[off], i])
         curvature += 2 * weight * moved @ C @ moved.T
-    return Local(float(out[0]), -through @ g, _root(curvature))
+    return Local(float(out[0]), -through @ g, factored(curvature))
 
 
-def _root(matrix: np.ndarray) -> np.ndarray:
+def factored(matrix: np.ndarray) -> np.ndarray:
     """F (n, r) with F F' the positive part of a symmetric matrix."""
     e, U = np.linalg.eigh((matrix + matrix.T) / 2)
     keep = e > 1e-13 * e[-1]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from excite import folder, log
 from excite.simulate import Motion, simulate
@@ -56,6 +58,9 @@ def read(design_dir: Path) -> Stored:
         model = build(Machine.model_validate_json(path.read_bytes()))
     except (OSError, ValueError):
         raise StoredError(f"{path}: missing or damaged, design again") from None
+    if "nominal" in before:  # designed for what logs told of the machine, not for the machine file's values
+        nominal = np.array([float(before["nominal"][n]) for n in model.base.names])
+        model = replace(model, nominal=nominal)
     torque, q0, nu0 = log.read_profile(design_dir / "profile.csv", model)
     if len(torque) != round(before["duration_s"] * float(model.machine.sampling_hz)) + 1:
         raise StoredError(

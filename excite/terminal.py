@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-POOR = 5.0  # standard deviation [%] that a condition number should not hide
-
 
 def say(thing: object) -> None:
     """Prints a line or a table."""
@@ -76,8 +74,8 @@ def design_table(summary: dict[str, Any]) -> None:
         f"attainable accuracy (Cramer-Rao, one standard deviation): worst {worst} {sigma[worst]:.2g} %,"
         f" median {middle:.2g} %"
     )
-    if summary["objective"] == "cond" and sigma[worst] > POOR:
-        say(f"a low cond(Phi) hides poor accuracy here: {worst} can't be found better than {sigma[worst]:.2g} %")
+    if summary["advice"] is not None:
+        say(summary["advice"])
 
 
 def verify_table(summary: dict[str, Any]) -> None:

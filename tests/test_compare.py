@@ -11,7 +11,7 @@ import pytest
 
 from excite import objective
 from excite.compare import OURS, USUAL, Comparison, compare, judge, shrunk, within
-from excite.design import TOLERANCE
+from excite.continuation import TOLERANCE
 from excite.limit import check
 from excite.manoeuvre import Manoeuvre, multisine
 from excite.simulate import simulate

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from excite import collocation, interior, objective
-from excite.design import PLAN, TOLERANCE, Design, depart, design, repair, search, soften
+from excite.aim import aim
+from excite.continuation import PLAN, TOLERANCE, depart, repair, search, soften
+from excite.design import Design, design
 from excite.limit import InfeasibleError, check, limits, placed
 from excite.manoeuvre import BASELINES, Manoeuvre
 from excite.simulate import simulate
@@ -161,16 +163,17 @@ def test_without_a_budget_left_nothing_is_made_up(straight: Model) -> None:
 def test_what_the_fresh_simulation_exceeds_is_repaired(straight: Model) -> None:
     """The first stage ends far from rest, with transitions ten times wider than the machine's."""
     problem = shorter(straight, 12.0)
-    track = search(straight, problem, "cond", depart(straight, problem, "cond", 0, 1), PLAN[:1], lambda: False)
+    cond = aim(straight, "cond")
+    track = search(straight, problem, cond, depart(straight, problem, cond, 0, 1), PLAN[:1], lambda: False)
     off = replace(track.latest, violations=track.latest.violations | {"rim speed front_roll": 0.01})
-    mended = repair(straight, problem, "cond", replace(track, latest=off, best=off), lambda: False)
+    mended = repair(straight, problem, cond, replace(track, latest=off, best=off), lambda: False)
     assert mended.best.feasible
     spin = mended.motion.nu[:, 1] * 0.65
     assert np.abs(spin).max() <= 2.0 * (1 - 2 * 0.02)
 
 
 def test_ctrl_c_keeps_the_best_so_far() -> None:
-    """A first interrupt after the scouts are back: the program still ends with a drive, and says it isn't complete."""
+    """A first interrupt once there is a drive within the limits: it ends with a drive, and says it isn't complete."""
     code = (
         "import os, signal, threading\n"
         "from excite.design import design\n"
@@ -178,7 +181,7 @@ def test_ctrl_c_keeps_the_best_so_far() -> None:
         "if __name__ == '__main__':\n"
         "    model = prediction.build(machine.load('va12_straight'))\n"
         "    def seen(done, total, best):\n"
-        "        if done == 1:\n"
+        "        if best < 1e9:\n"
         "            os.kill(os.getpid(), signal.SIGINT)\n"
         "    d = design(model, model.machine.problems['S40'], starts=6, progress=seen)\n"
         "    print(d.complete, d.max_violation <= 1e-3, d.cond_phi < 60)\n"

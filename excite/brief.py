@@ -1,0 +1,108 @@
+"""What is asked of a design, and what is said of the answer.
+
+A brief puts an objective together with an accuracy to keep (`sigma_max`), the machines that it could be (`robust`) and
+what earlier logs tell (`after`). The answer states its condition number and the accuracy that it makes attainable side
+by side, and says so where the one hides the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from excite import aim as aims
+from excite import identify, log, scenario, sequential
+from excite.aim import Aim
+from excite.design import Design, design
+from model.machine import Problem
+from model.prediction import Model
+
+POOR = 5.0  # attainable standard deviation [%] that a low condition number should not hide
+SCENARIOS, SPREAD = 5, 0.2  # machines of a robust design, and how far their values are from the nominal ones
+
+
+@dataclass(frozen=True)
+class Brief:
+    """objective: a name of the table. sigma_max [%]. robust: for every machine within SPREAD. after: logs."""
+
+    objective: str = "cond"
+    sigma_max: float | None = None
+    robust: bool = False
+    after: tuple[Path, ...] = ()
+    starts: int = 2
+    seed: int = 0
+    budget_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A design, the model that it was made for (with `after`, the estimate is its nominal) and the aim."""
+
+    model: Model
+    aim: Aim
+    design: Design
+
+
+def answer(
+    model: Model, problem: Problem, brief: Brief, progress: Callable[[int, int, float], None] | None = None
+) -> Answer:
+    """The design that a brief asks for. Raises what `design`, `log.read` and `identify` raise."""
+    prior = None
+    if brief.after:
+        needs = identify.needed_sensors(model, "joint")
+        known = sequential.known(model, [log.read(path, model.machine, needs) for path in brief.after])
+        model, prior = known.model, known.information
+    machines = scenario.scenarios(model, SCENARIOS, SPREAD, brief.seed) if brief.robust else ()
+    aim = aims.aim(model, brief.objective, brief.sigma_max, prior, machines)
+    return Answer(model, aim, design(model, problem, aim, brief.starts, brief.seed, brief.budget_s, progress))
+
+
+def summary(brief: Brief, a: Answer) -> dict[str, Any]:
+    """What there is to say of an answer: the brief, the scores, the accuracy, the limits."""
+    names, d = a.model.base.names, a.design
+    sigma = dict(zip(names, aims.sigma_percent(a.aim, a.model, d.motion).tolist(), strict=True))
+    worst = max(sigma, key=lambda n: sigma[n])
+    said: dict[str, Any] = {
+        "objective": brief.objective,
+        "cond_phi": d.cond_phi,
+        "cond_w": d.cond_w,
+        "cond_phi_start": d.cond_phi_start,
+        "sigma_percent": sigma,
+        "worst_parameter": worst,
+        "worst_percent": sigma[worst],
+        "median_percent": float(np.median(list(sigma.values()))),
+        "hides_poor_accuracy": sigma[worst] > POOR,
+        "advice": advice(brief, worst, sigma[worst]),
+        "complete": d.complete,
+        "max_violation": d.max_violation,
+        "violations": dict(d.violations),
+        "scores": list(d.scores),
+        "starts": brief.starts,
+        "seed": brief.seed,
+    }
+    if brief.sigma_max is not None:
+        said["sigma_max"] = brief.sigma_max
+    if brief.robust:
+        said["robust"] = {"machines": SCENARIOS, "spread": SPREAD}
+    if brief.after:
+        said["after"] = [str(p) for p in brief.after]
+        said["nominal"] = dict(zip(names, a.model.nominal.tolist(), strict=True))
+    return said
+
+
+def advice(brief: Brief, worst: str, percent: float) -> str | None:
+    """What to do where a design lets one know some parameter poorly, None where all is well."""
+    if percent <= POOR:
+        return None
+    blind = brief.objective in ("cond", "weighted-cond") and brief.sigma_max is None
+    text = f"a low cond(Phi) hides poor accuracy: {worst} can't be found better than {percent:.2g} %"
+    if not blind:
+        return f"poor accuracy: {worst} can't be found better than {percent:.2g} %; drive longer, or on more room"
+    return (
+        f"{text}; --objective accuracy designs for small errors (run it to see how small),"
+        f" --sigma-max PERCENT for the lowest cond(Phi) among drives that are accurate enough"
+    )
