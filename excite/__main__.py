@@ -373,6 +373,11 @@ def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: s
 
     _known("--kit", kit, sensors.KITS)
     design = stored.read(design_dir)
+    if design.summary.get("after"):
+        raise UsageError(
+            f"{design_dir}: was designed for the machine that {', '.join(design.summary['after'])} told of, not for the"
+            " machine file's; verify a design made without --after"
+        )
     model, motion = design.model, design.motion
     method = _method(method, model)
     _check_needs(model, method, kit)
@@ -391,11 +396,6 @@ def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: s
         "seed": seed,
         "failed": len(result.failures),
         "failures": result.failures,
-    if design.summary.get("after"):
-        raise UsageError(
-            f"{design_dir}: was designed for the machine that {', '.join(design.summary['after'])} told of, not for the"
-            " machine file's; verify a design made without --after"
-        )
         "parameters": parameters,
         "biased": biased(parameters),
         "versions": _versions(),
@@ -603,7 +603,7 @@ def _exit_code(err: Exception) -> int | None:
 
     if isinstance(err, UsageError | MachineError | LogError | FolderError | StoredError | DriveError):
         return 2
-    if isinstance(err, NoEstimate | InfeasibleError | SimulationError):
+    if isinstance(err, NoEstimate | InfeasibleError | SimulationError | ServeError):
         return 1
     return None
 
