@@ -603,7 +603,7 @@ def _exit_code(err: Exception) -> int | None:
 
     if isinstance(err, UsageError | MachineError | LogError | FolderError | StoredError | DriveError):
         return 2
-    if isinstance(err, NoEstimate | InfeasibleError | SimulationError | ServeError):
+    if isinstance(err, NoEstimate | InfeasibleError | SimulationError):
         return 1
     return None
 
