@@ -6,22 +6,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from excite.estimate import Estimate, noted
 from excite.log import Log
-from excite.processing import Samples, samples
+from excite.processing import BLOCK, Samples, samples
 from model.machine import Filter
 from model.prediction import Model
 
 SAMPLES = 400  # of the logs, that stand for them
 STILL = 0.01  # of a coordinate's speed at other times [rad/s, m/s]
+COUNTS = 2  # of an encoder within which a joint stands still
+NOTHING = 1e-6  # of the largest column of a regressor
 LIVELY = 0.5  # speeds and accelerations of a manoeuvre that is tried out [SI]
 ENOUGH = 0.3  # of what the best manoeuvre shows: the simplest with this much is advised
 POOR = 0.5  # standard deviation relative to the parameter's size that is no answer
 
 
 @dataclass(frozen=True)
-class Manoeuvre:
+class Change:
     """What a driver could do besides: text, the coordinates that it moves, and how (move, accelerate, reverse)."""
 
     text: str
@@ -43,6 +46,46 @@ def explained(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Fil
     return noted(replace(estimate, unidentifiable=reasons), *notes)
 
 
+def unmoved(model: Model, logs: Sequence[Log], filter: Filter, slow: bool) -> np.ndarray:
+    """Parameters (n_base,) that logs say nothing of because something on the machine stands still in all of them.
+
+    Along the logs as they are the noise of a joint at rest would pass for motion. Here what stands still does so
+    exactly: a joint whose encoder counts no further than COUNTS, and with it whatever moves slower than STILL on
+    average over a second; with `slow` that alone is enough.
+    """
+    none = np.zeros(len(model.base.names), bool)
+    if not model.plain:
+        return none
+    machine = model.machine
+    at_rest = {
+        model.coordinates.index(machine.find(s.body).coordinates[0])
+        for s in machine.sensors("full")
+        if s.kind == "angle"
+        and s.resolution is not None
+        and all(s.name in log.values and np.ptp(log.values[s.name]) <= COUNTS * s.resolution for log in logs)
+    }
+    if not at_rest and not slow:
+        return none
+    motions = [samples(model, log, filter) for log in logs]
+    second = round(float(machine.sampling_hz))
+    speed = np.max([np.abs(uniform_filter1d(s.nu, second, axis=1)).max(axis=1) for s in motions], axis=0)
+    still = speed < STILL
+    still[list(at_rest)] = True
+    if not still.any():
+        return none
+    R = np.zeros((0, len(none)))
+    for s in motions:
+        q = np.where(still[:, None], s.q.mean(axis=1, keepdims=True), s.q)
+        nu, a = np.where(still[:, None], 0.0, s.nu), np.where(still[:, None], 0.0, s.a)
+        for k in range(0, q.shape[1], BLOCK):
+            own = slice(k, k + BLOCK)
+            rows = _rows(model, q[:, own], nu[:, own], a[:, own])
+            R = np.asarray(np.linalg.qr(np.concatenate([R, rows]), mode="r"))
+    R = R * model.scale
+    largest = np.linalg.norm(R, axis=0).max()
+    return np.array([_apart(R, k) * np.sqrt(len(R)) <= NOTHING * largest for k in range(len(none))])
+
+
 def advice(model: Model, logs: Sequence[Samples], names: Sequence[str]) -> dict[str, str]:
     """For each of these base parameters the simplest manoeuvre that would show it apart from all others."""
     rng = np.random.default_rng(0)
@@ -53,7 +96,7 @@ def advice(model: Model, logs: Sequence[Samples], names: Sequence[str]) -> dict[
     still = np.abs(nu).max(axis=1) < STILL
     nu, a = np.where(still[:, None], 0.0, nu), np.where(still[:, None], 0.0, a)
     here = _rows(model, q, nu, a)
-    options = manoeuvres(model, still)
+    options = changes(model, still)
     tried = [np.concatenate([here, _rows(model, *_changed(m, q, nu, a, rng))]) for m in options]
     level = np.maximum(np.sqrt(np.mean([(t**2).mean(axis=0) for t in tried], axis=0)), 1e-300)
     found: dict[str, str] = {}
@@ -70,7 +113,7 @@ def advice(model: Model, logs: Sequence[Samples], names: Sequence[str]) -> dict[
     return found
 
 
-def manoeuvres(model: Model, still: np.ndarray) -> list[Manoeuvre]:
+def changes(model: Model, still: np.ndarray) -> list[Change]:
     """What can be done with a machine, simple things first: driving, steering, moving each joint, all of it."""
     machine, at = model.machine, model.coordinates.index
     rolls = [at(b.coordinates[0]) for b in machine.contacts if b.coordinates[0] in model.coordinates]
@@ -78,31 +121,31 @@ def manoeuvres(model: Model, still: np.ndarray) -> list[Manoeuvre]:
     along = [at(c) for c in machine.body[0].coordinates[:1] if machine.planar and c in model.coordinates]
     across = [at(c) for c in machine.body[0].coordinates[1:] if machine.planar and c in model.coordinates]
     drive = tuple(along + rolls)
-    found: list[Manoeuvre] = []
+    found: list[Change] = []
     if drive:
         if still[list(drive)].all():
-            found.append(Manoeuvre("drive forward and backward with changing speed", drive, "move"))
+            found.append(Change("drive forward and backward with changing speed", drive, "move"))
         else:
-            found.append(Manoeuvre("drive with changing speed", drive, "accelerate"))
-            found.append(Manoeuvre("drive both forward and backward", drive, "reverse"))
+            found.append(Change("drive with changing speed", drive, "accelerate"))
+            found.append(Change("drive both forward and backward", drive, "reverse"))
     for body in joints:
         where = body.where.replace("_", " ")
         own = (at(body.coordinates[0]), *across)
         if machine.planar:
-            found.append(Manoeuvre(f"steer (move the {where}) while driving", (*own, *drive), "move"))
+            found.append(Change(f"steer (move the {where}) while driving", (*own, *drive), "move"))
         elif still[own[0]]:
-            found.append(Manoeuvre(f"move the {where} both ways with changing speed", own, "move"))
+            found.append(Change(f"move the {where} both ways with changing speed", own, "move"))
         else:
-            found.append(Manoeuvre(f"move the {where} with changing speed", own, "accelerate"))
-            found.append(Manoeuvre(f"move the {where} both ways", own, "reverse"))
+            found.append(Change(f"move the {where} with changing speed", own, "accelerate"))
+            found.append(Change(f"move the {where} both ways", own, "reverse"))
     if drive:
-        found.append(Manoeuvre("let one roll drive against the other", drive, "move"))
-    found.append(Manoeuvre("move everything at once", tuple(range(len(still))), "move"))
+        found.append(Change("let one roll drive against the other", drive, "move"))
+    found.append(Change("move everything at once", tuple(range(len(still))), "move"))
     return found
 
 
 def _changed(
-    m: Manoeuvre, q: np.ndarray, nu: np.ndarray, a: np.ndarray, rng: np.random.Generator
+    m: Change, q: np.ndarray, nu: np.ndarray, a: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The samples with a manoeuvre added."""
     q, nu, a = q.copy(), nu.copy(), a.copy()

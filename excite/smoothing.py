@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from excite import chain
+from excite import chain, hidden
 from excite.estimate import Estimate, NoEstimate, NotIdentifiable
 from excite.linearise import BATCH, Chart, advance, chart, differentiate
 from excite.log import Log
@@ -43,7 +43,6 @@ PASSES = 15  # at most
 HELD = 1e-6  # standard deviation of such a parameter, in its scale
 SETTLED = 3  # passes until the states fit the dynamics well enough to tell which these are
 UNSEEN = 1.0  # a parameter that a log tells less than this well, in its scale, stays at the machine file's value
-STILL_COUNTS, STILL = 2, 0.01  # counts of an encoder, and a speed [rad/s, m/s], within which a joint stands still
 DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's scale, and its share from pass to pass
 HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
 # Left undone at the end of the iteration, in standard deviations; with disturbing forces two and a half times that.
@@ -115,7 +114,7 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     records = [record(c, log) for log in logs]
     starts = [first_point(c, r, log, filter) for r, log in zip(records, logs, strict=True)]
     notes = noise_notes(c, records)
-    held = _not_shown(c, logs, records, starts, joints_only=True)
+    held = hidden.unmoved(model, logs, filter, slow=False)
     points: Sequence[Point] = starts
     X, trouble = model.nominal, ""
     for tries in range(3):
@@ -124,7 +123,7 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         except NotConverged as failed:
             trouble = trouble or str(failed)
             if tries == 0:
-                still = _not_shown(c, logs, records, starts, joints_only=False)
+                still = hidden.unmoved(model, logs, filter, slow=True)
                 if (still & ~held).any():
                     held = held | still
                     continue
@@ -141,49 +140,6 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         trouble = "; ".join(found)
         break
     return _estimate(c, records, loose, filter, (*notes, trouble, DOUBT))
-
-
-def _not_shown(
-    c: Chart, logs: Sequence[Log], records: Sequence[Record], starts: Sequence[Point], joints_only: bool
-) -> np.ndarray:
-    """Parameters that a drive says nothing of while something on the machine stands still, (n_base,).
-
-    Along the log as it is, the noise of a joint at rest would pass for motion, and show what nothing shows. So the
-    information is that of a motion in which what stands still does so exactly: a joint whose encoder counts no further
-    than STILL_COUNTS in any log; or, without `joints_only`, whatever moves slower than STILL all along.
-    """
-    model = c.model
-    n_q = len(model.coordinates)
-    sensors = [s for s in c.sensors if s.kind == "angle" and s.resolution is not None]
-    resting = {
-        model.coordinates.index(model.machine.find(s.body).coordinates[0])
-        for s in sensors
-        if all(np.ptp(log.values[s.name]) <= STILL_COUNTS * float(s.resolution or 0) for log in logs)
-    }
-    none = np.zeros(len(model.base.names), bool)
-    if joints_only and not resting:
-        return none
-    speeds = np.max([np.abs(c.parts(p.s)[1]).max(axis=0) for p in starts], axis=0)
-    resting |= {k for k in range(n_q) if speeds[k] < STILL}
-    information = np.diag(np.full(len(none), PRIOR**-2))
-    for r, p in zip(records, starts, strict=True):
-        s = p.s.copy()
-        for k in np.flatnonzero(_speeds(c)):
-            if c.index[k] - n_q in resting:
-                s[:, k] = 0.0
-        for k in resting & set(c.index.tolist()):
-            own = c.index == k
-            s[:, own] = s[:, own].mean()
-        exact = Point(s, p.w, p.offset)
-        seen = expected(c, r, exact, c.delivered(r.torque, model.nominal)[0], model.nominal)
-        linear = _linearise(c, seen, exact, s[0], model.nominal, 0.0, exact=True)
-        assert linear is not None
-        Z = linear.Z[1:, 1:].copy()
-        Z[range(len(none), len(Z)), range(len(none), len(Z))] += 1.0
-        own, others = slice(0, len(none)), slice(len(none), len(Z))
-        information += Z[own, own] - Z[own, others] @ np.linalg.solve(Z[others, others], Z[others, own])
-    sigma = np.sqrt(np.diag(np.linalg.inv(information)))
-    return np.asarray(sigma > UNSEEN * np.maximum(np.abs(model.nominal) / model.scale, 1.0))
 
 
 def _disturbed(
@@ -569,14 +525,14 @@ def innovations(linear: Linear) -> np.ndarray:
         seen = np.linalg.inv(np.eye(n) + P[k] @ w.J[0])
         x[k + 1] = w.A[0] @ (seen @ (x[k] + P[k] @ w.eta[0, :, 0])) + w.b[0, :, 0]
         P[k + 1] = w.A[0] @ seen @ P[k] @ w.A[0].T + w.C[0]
-    z = np.full(linear.residual.shape, np.nan)
+    z, most = np.full(linear.residual.shape, np.nan), linear.weight.max(axis=0)
     for j in range(max(len(s) for s in linear.stages)):
         going = [i for i, s in enumerate(linear.stages) if j < len(s)]
         at = starts[going] + j
         h, weight = linear.H[at], linear.weight[at]
         PH = P[going] @ h.transpose(0, 2, 1)
         # A reading that isn't used counts as one with a huge variance.
-        variance = 1 / np.maximum(weight, 1e-12 * linear.weight.max(axis=0))
+        variance = 1 / np.maximum(weight, 1e-12 * np.where(most > 0, most, 1.0))
         S = h @ PH
         S[:, range(h.shape[1]), range(h.shape[1])] += variance
         e = linear.residual[at, :, None] - h @ x[going, :, None]

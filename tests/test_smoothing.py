@@ -219,6 +219,22 @@ def test_a_straight_drive_names_what_it_does_not_show(straight: Model) -> None:
     np.testing.assert_allclose(estimate.std, std, rtol=0.15)
 
 
+@pytest.mark.parametrize("kit", ["full", "paper"])
+def test_without_steering_the_hidden_parameters_are_named(va12: Model, kit: str) -> None:
+    """The whole machine driven straight: what only turning shows has no number, the rest has an honest one."""
+    X = perturbed(va12, 3)
+    X[[va12.base.names.index("MY0"), va12.base.names.index("MY2")]] = 0.0  # or it would not go straight
+    torque = energetic()
+    torque[:, 1] = 0.0
+    estimate = identify(va12, [measured(va12, simulate(va12, torque, X), X, kit, 5)], "joint")
+    hidden = {"MX0R", "ZZ0R", "MX2", "ZZ2", "Ky1", "Ky4", "Fv2", "Fs2"}
+    assert set(estimate.unidentifiable) == hidden
+    assert all("steer" in reason and "theta2" in reason for reason in estimate.unidentifiable.values())
+    seen = ~np.isin(estimate.names, list(hidden))
+    assert np.isnan(estimate.value[~seen]).all()
+    assert np.sqrt(np.mean(((estimate.value - X) / estimate.std)[seen] ** 2)) < 1.6
+
+
 def test_two_logs_know_more_than_one(va12: Model) -> None:
     X = perturbed(va12, 4)
     logs = [measured(va12, simulate(va12, energetic(30, size), X), X, "full", k) for k, size in enumerate((1.0, 0.8))]
