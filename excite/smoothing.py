@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from excite import chain, hidden
 from excite.estimate import Estimate, NoEstimate, NotIdentifiable
-from excite.linearise import BATCH, Chart, advance, chart, differentiate
+from excite.linearise import BATCH, Chart, Slopes, advance, chart, differentiate
 from excite.log import Log
 from excite.processing import decimate
 from excite.record import (
@@ -87,16 +88,27 @@ class Linear:
     residual: np.ndarray
 
 
+class Beyond(Protocol):
+    """What C effects that are not in the model would add along a log, at samples first .. last: generalised forces
+    (K, n_q, C), delivered torques (K, n_u, C) and readings (K, m, C)."""
+
+    columns: int
+
+    def __call__(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
+
+
 @dataclass(frozen=True)
 class Fit:
     """Base parameters X (n_base,), their covariance, which were held because nothing shows them, and the trajectories
-    of the logs."""
+    of the logs; twice the negative log-likelihood `cost`, and the disturbing forces in units of DISTURBANCE."""
 
     X: np.ndarray
     covariance: np.ndarray
     unseen: np.ndarray
     points: tuple[Point, ...]
     linear: tuple[Linear, ...]
+    cost: float
+    disturbed: float
 
     @property
     def std(self) -> np.ndarray:
@@ -255,11 +267,19 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
 
 
 def _linearise(
-    c: Chart, r: Record, p: Point, first: np.ndarray, X: np.ndarray, disturbed: float, exact: bool = False
+    c: Chart,
+    r: Record,
+    p: Point,
+    first: np.ndarray,
+    X: np.ndarray,
+    disturbed: float,
+    exact: bool = False,
+    beyond: Beyond | None = None,
 ) -> Linear | None:
     """The chain of a log about a point; None where the motion can't be integrated. first (n,): guess of s[0].
 
-    `exact`: the point is a motion of the machine, which needs no integration.
+    `exact`: the point is a motion of the machine, which needs no integration. With `beyond` its effects are columns
+    behind parameters and offsets, and the chain is reduced to Z only.
     """
     delivered, behind = c.delivered(r.torque, X)
     if exact:
@@ -273,41 +293,80 @@ def _linearise(
     residual = np.zeros_like(h) if exact else np.where(r.used > 0, r.reading - h, 0.0)
     flaws = flaws * c.model.scale[list(c.flawed)]
     scale, n_p, n_o = _scale(c), len(X), len(r.origin)
+    n_e = 0 if beyond is None else beyond.columns
     S, unit = H * scale, one_count(c, r)
-    parts, stages, gains = [_known_before(c, p, first, 1 + n_p + n_o)], [], []
+    parts, stages, gains = [_known_before(c, p, first, 1 + n_p + n_o + n_e)], [], []
+    direct: list[np.ndarray] = []
     N = len(p.s)
     for at in range(0, N - 1, BATCH):
         until = min(at + BATCH, N - 1)
-        by = differentiate(c, p.s[at : until + 1], u[at : until + 1], X, disturbed > 0)
+        by = differentiate(c, p.s[at : until + 1], u[at : until + 1], X, disturbed > 0 or n_e > 0)
         gain = by.B * r.noise.torque / scale[:, None]
         C = gain @ gain.transpose(0, 2, 1)
         if disturbed > 0:
             push = by.F * (disturbed * DISTURBANCE * c.inertia) / scale[:, None]
             C += push @ push.transpose(0, 2, 1)
         A = by.A * (scale / scale[:, None])
-        b = np.zeros((until - at, c.n, 1 + n_p + n_o))
+        b = np.zeros((until - at, c.n, 1 + n_p + n_o + n_e))
         b[:, :, 0] = defect[at:until] / scale - (gain @ (p.w[at:until] / r.noise.torque)[:, :, None])[:, :, 0]
         b[:, :, 1 : 1 + n_p] = (by.X + by.B @ behind[at:until]) * (c.model.scale / scale[:, None])
+        if beyond is not None:
+            force, torque, reading = beyond(at, until + 1)
+            b[:, :, 1 + n_p + n_o :] = _pushed(c, by, force, torque) / scale[:, None]
+            direct.append(_direct(residual, flaws, D * unit, weight, reading[:-1], at))
         gains.append(gain)
         for k in range(at, until, PART):
             end = min(k + PART, until)
             J, eta = _seen(c, S[k:end], weight[k:end], residual[k:end], D * unit, flaws[k:end])
+            if beyond is not None:
+                eta = np.concatenate([eta, _read(S[k:end], weight[k:end], reading[k - at : end - at])], axis=2)
             own = slice(k - at, end - at)
             stages.append(chain.Stages(A[own], b[own], C[own], eta, J))
-            parts.append(chain.section(stages[-1]))
+            parts.append(chain.section(stages[-1], keep=beyond is None))
     # From the last sample nothing leads on.
     J, eta = _seen(c, S[-1:], weight[-1:], residual[-1:], D * unit, flaws[-1:])
+    if beyond is not None:
+        eta = np.concatenate([eta, _read(S[-1:], weight[-1:], reading[-1:])], axis=2)
+        direct.append(_direct(residual, flaws, D * unit, weight, reading[-1:], N - 1))
     none = np.zeros_like(J)
     stages.append(chain.Stages(none, np.zeros_like(eta), none, eta, J))
     parts.append(chain.section(stages[-1]))
     solved = chain.solve(parts)
     # What the readings say directly of offsets and of flaws of sensors; other parameters act through the states alone.
-    flat = np.concatenate([residual[:, :, None], -flaws, np.broadcast_to(-D * unit, (*residual.shape, n_o))], axis=2)
-    flat = (flat * np.sqrt(weight)[:, :, None]).reshape(-1, flat.shape[2])
+    if beyond is None:
+        direct = [_direct(residual, flaws, D * unit, weight, np.zeros((*residual.shape, 0)), 0)]
     Z = solved.Z.copy()
-    place = np.concatenate([[0], 1 + np.array(c.flawed, int), np.arange(1 + n_p, 1 + n_p + n_o)])
-    Z[np.ix_(place, place)] += flat.T @ flat
+    place = np.concatenate([[0], 1 + np.array(c.flawed, int), np.arange(1 + n_p, 1 + n_p + n_o + n_e)])
+    Z[np.ix_(place, place)] += sum(direct)
     return Linear(solved, Z, np.concatenate(gains), tuple(stages), S, weight, residual)
+
+
+def _direct(
+    residual: np.ndarray, flaws: np.ndarray, D: np.ndarray, weight: np.ndarray, reading: np.ndarray, at: int
+) -> np.ndarray:
+    """The quadratic form of readings at .. at + K in what they show by themselves: data, flaws, offsets, effects."""
+    own = slice(at, at + len(reading))
+    offsets = np.broadcast_to(-D, (*reading.shape[:2], D.shape[1]))
+    flat = np.concatenate([residual[own, :, None], -flaws[own], offsets, -reading], axis=2)
+    flat = (flat * np.sqrt(weight[own])[:, :, None]).reshape(-1, flat.shape[2])
+    form: np.ndarray = flat.T @ flat
+    return form
+
+
+def _pushed(c: Chart, by: Slopes, force: np.ndarray, torque: np.ndarray) -> np.ndarray:
+    """What effects beyond the model do to the ends of K intervals (K, n, C) [SI]; force, torque of K + 1 samples."""
+    push, drive = (force[:-1] + force[1:]) / 2, (torque[:-1] + torque[1:]) / 2
+    moved: np.ndarray = by.B @ (push[:, list(c.model.actuated)] + drive)
+    for k, row in enumerate(c.pushed):
+        if row not in c.model.actuated:
+            moved += by.F[:, :, k : k + 1] @ push[:, row : row + 1]
+    return moved
+
+
+def _read(S: np.ndarray, weight: np.ndarray, reading: np.ndarray) -> np.ndarray:
+    """What readings tell of the states where effects beyond the model are in them, (K, n, C)."""
+    told: np.ndarray = -((S * weight[:, :, None]).transpose(0, 2, 1) @ reading)
+    return told
 
 
 def _known_before(c: Chart, p: Point, first: np.ndarray, columns: int) -> chain.Section:
@@ -352,9 +411,10 @@ def _iterate(
     starts: Sequence[Point],
     disturbed: float,
     held: np.ndarray,
+    damping: float = DAMPING[0],
 ) -> Fit:
     """Gauss-Newton from points and X; the prior stands about the machine file's values and the states of `starts`.
-    Parameters `held` (n_base,) stay at their values.
+    Parameters `held` (n_base,) stay at their values. damping: of the first step.
 
     Raises NotConverged.
     """
@@ -362,7 +422,7 @@ def _iterate(
     step, before = np.inf, np.inf
     shorter, here = 0, (list(points), X)
     there = here
-    prior, damping = np.where(held, HELD**-2, PRIOR**-2), DAMPING[0]
+    prior = np.where(held, HELD**-2, PRIOR**-2)
     unseen = held.copy()
     for k in range(PASSES):
         linear = _all_linear(c, records, there[0], starts, there[1], disturbed)
@@ -375,7 +435,7 @@ def _iterate(
             continue
         here, shorter = there, 0
         points, X = here
-        covariance, move, left = _parameters(c, records, linear, points, X, prior, damping)
+        covariance, move, left, cost = _parameters(c, records, linear, points, X, prior, damping)
         if k == SETTLED:
             # Against the estimate as well: a file's value that is far too small must not make a parameter unseen.
             sigma = np.sqrt(np.diag(covariance))[: len(X)]
@@ -383,7 +443,7 @@ def _iterate(
             if unseen.any():
                 # Left free they would go anywhere, and take the mass matrix and the slips with them.
                 prior[unseen] = HELD**-2
-                covariance, move, left = _parameters(c, records, linear, points, X, prior, damping)
+                covariance, move, left, cost = _parameters(c, records, linear, points, X, prior, damping)
         damping *= DAMPING[1]
         before, step = step, left
         if k >= HOPELESS[0] and step > HOPELESS[1]:
@@ -391,6 +451,10 @@ def _iterate(
         limit = LARGEST_STEP * np.maximum(np.abs(X) / model.scale, 1.0)
         for m in move:
             m[: len(X)] = np.clip(m[: len(X)], -limit, limit)
+        for m in move:
+            # Amounts that make sense above zero only stay there.
+            low = -0.8 * X[model.positive] / model.scale[model.positive]
+            m[: len(X)][model.positive] = np.maximum(m[: len(X)][model.positive], low)
         there = (
             [_moved(c, r, p, f, m) for r, p, f, m in zip(records, points, linear, move, strict=True)],
             X + move[0][: len(X)] * model.scale,
@@ -400,7 +464,7 @@ def _iterate(
         small = CONVERGED if disturbed == 0 else 2.5 * CONVERGED
         if step < 10 * small and step * ratio / (1 - ratio) < small:
             base = covariance[: len(X), : len(X)] * np.outer(model.scale, model.scale)
-            return Fit(there[1], base, unseen, tuple(there[0]), tuple(linear))
+            return Fit(there[1], base, unseen, tuple(there[0]), tuple(linear), cost, disturbed)
     raise NotConverged(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
         " log with `excite diagnose`, or start from better values in the machine file"
@@ -435,10 +499,10 @@ def _parameters(
     X: np.ndarray,
     prior: np.ndarray,
     damping: float,
-) -> tuple[np.ndarray, list[np.ndarray], float]:
-    """Covariance of all parameters and offsets (scaled), the step of those of each log, and the largest of a parameter
-    in standard deviations as it would be undamped. Damping (Levenberg): what a log shows badly moves in small steps
-    while the rest is still wrong. prior (n_base,): information about nominal."""
+) -> tuple[np.ndarray, list[np.ndarray], float, float]:
+    """Covariance of all parameters and offsets (scaled), the step of those of each log, the largest of a parameter in
+    standard deviations as it would be undamped, and the cost behind that step. Damping (Levenberg): what a log shows
+    badly moves in small steps while the rest is still wrong. prior (n_base,): information about nominal."""
     n = len(X)
     places, size = [], n
     for r in records:
@@ -446,21 +510,26 @@ def _parameters(
         size += len(r.origin)
     information, slope = np.zeros((size, size)), np.zeros(size)
     information[range(n), range(n)] = prior
-    slope[:n] = prior * (X - c.model.nominal) / c.model.scale
+    off = (X - c.model.nominal) / c.model.scale
+    slope[:n] = prior * off
+    cost = float(prior @ off**2)
     for found, r, p, place in zip(linear, records, points, places, strict=True):
         information[np.ix_(place, place)] += found.Z[1:, 1:]
         slope[place] += found.Z[1:, 0]
         own = place[n:]
         information[own, own] += 1.0
-        slope[own] += p.offset / one_count(c, r) - 0.5
+        away = p.offset / one_count(c, r) - 0.5
+        slope[own] += away
+        cost += float(found.Z[0, 0] + away @ away)
     covariance = np.linalg.inv(information)
     if not (np.diag(covariance) > 0).all():
         raise NotConverged("joint smoothing lost its numbers: check the log with `excite diagnose`")
     sigma = np.sqrt(np.diag(covariance))[:n]
     left = float(np.abs((covariance @ slope)[:n] / sigma).max())
+    cost -= float(slope @ covariance @ slope)
     information[range(n), range(n)] += damping
     step = -np.linalg.solve(information, slope)
-    return covariance, [step[place] for place in places], left
+    return covariance, [step[place] for place in places], left, cost
 
 
 def _moved(c: Chart, r: Record, p: Point, linear: Linear, move: np.ndarray) -> Point:

@@ -1,0 +1,367 @@
+"""The equations of motion of one sample, with standard parameters: rigid bodies, friction, soil and effects together.
+
+Everything that the machine file says becomes one balance: what the motors must deliver for a motion. Effects add to it
+what their declarations say; what one effect alone adds is its signature, which diagnosis looks for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+
+from model import contact, tree
+from model import effects as catalogue
+from model.machine import Body, Machine
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The symbols of one sample, and the machine's motion in it."""
+
+    machine: Machine
+    q: ca.SX
+    nu: ca.SX
+    a: ca.SX
+    u: ca.SX
+    p: ca.SX
+    wheels: ca.SX
+    at: dict[str, ca.SX]
+    rate: dict[str, ca.SX]
+    by_name: dict[str, ca.SX]
+    frames: dict[int, tree.Frame]
+    gravity: ca.SX
+    heading: ca.SX
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.machine.coordinates
+
+    def row(self, body: Body) -> int:
+        return self.names.index(body.coordinates[0])
+
+
+@dataclass(frozen=True)
+class Acting:
+    """An effect in a sample: what it sees, and its amount and shapes."""
+
+    placed: catalogue.Placed
+    scene: catalogue.Scene
+    values: catalogue.Values
+
+
+@dataclass(frozen=True)
+class Equations:
+    """A machine's functions of one sample, with standard parameters p in place of base parameters."""
+
+    sample: Sample
+    inputs: tuple[str, ...]
+    slips: Mapping[str, ca.SX]
+    predict: ca.Function
+    standard_regressor: ca.Function
+    balance: ca.Function
+    flow: ca.Function
+    read: ca.Function
+    channels: ca.Function
+    readable: tuple[str, ...]
+    memory: tuple[str, ...]
+    nonlinear: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Signatures:
+    """What C effects add, each alone, at samples (q, nu, a, u, t, z, exact readings, p): generalised forces (n_q, C)
+    and readings (n_readable, C); and the rates (q, nu, u, t, z, p) -> dz of all that they remember."""
+
+    force: ca.Function
+    reading: ca.Function
+    flow: ca.Function
+
+
+def sample_of(machine: Machine, standard: tuple[str, ...]) -> Sample:
+    names = machine.coordinates
+    n = len(names)
+    q, nu, a = ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
+    p = ca.SX.sym("p", len(standard))
+    full = {c: ca.SX(0) for b in machine.body for c in b.coordinates}
+    at = full | dict(zip(names, ca.vertsplit(q), strict=True))
+    rate = full | dict(zip(names, ca.vertsplit(nu), strict=True))
+    accel = full | dict(zip(names, ca.vertsplit(a), strict=True))
+    heading = at[machine.body[0].coordinates[2]] if machine.planar else ca.SX(0)
+    gravity = tree.rot_z(-heading) @ ca.DM(machine.gravity)
+    return Sample(
+        machine,
+        q,
+        nu,
+        a,
+        ca.SX.sym("u", len(machine.actuated)),
+        p,
+        ca.SX.sym("wheels", sum(s.kind == "wheel" for s in machine.sensor)),
+        at,
+        rate,
+        dict(zip(standard, ca.vertsplit(p), strict=True)),
+        tree.motion(machine, at, rate, accel, gravity),
+        gravity,
+        heading,
+    )
+
+
+def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[catalogue.Placed]) -> Equations:
+    """The functions of a machine with effects."""
+    s = sample_of(machine, standard)
+    memory, z, acting = _acting(s, placed)
+    balance, slips = _balance(s, acting)
+    time = ca.SX.sym("t")
+    gain, offset, delay = _channels(s, acting, time)
+    now = z[memory.index("time")] if "time" in memory else ca.SX(0)
+    read, readable = _readings(s, acting)
+    predict = ca.SX(balance)
+    for k, body in enumerate(machine.actuated):
+        row = s.row(body)
+        predict[row] = ca.substitute(gain[k], time, now) * predict[row] + ca.substitute(offset[k], time, now)
+    rates = [ca.SX(1)] if "time" in memory else []
+    for e in acting:
+        rates += [m.rate(e.scene, e.placed.bodies[0], e.values) for m in e.placed.effect.memory.values()]
+    beside = [s.u, z] if placed else []
+    labels = ["q", "nu", "a", "p", "u", "z"][: 4 + len(beside)]
+    sample = [s.q, s.nu, s.a, s.p, *beside]
+    curved = ca.which_depends(predict, s.p, 2, False)
+    return Equations(
+        s,
+        tuple(f"u{b.index}" for b in machine.actuated),
+        slips,
+        ca.Function("predict", sample, [predict], labels, ["Y"]),
+        ca.Function("standard_regressor", sample, [ca.jacobian(predict, s.p)], labels, ["W"]),
+        ca.Function("balance", sample, [balance], labels, ["Y"]),
+        ca.Function("flow", [s.q, s.nu, s.u, z, s.p], [ca.vertcat(*rates, ca.SX(0, 1))]),
+        ca.Function("read", [s.q, s.nu, s.wheels, s.u, z, s.p], [read]),
+        ca.Function("channels", [time, s.p], [gain, offset, delay]),
+        readable,
+        memory,
+        tuple(name for name, bent in zip(standard, curved, strict=True) if bent),
+    )
+
+
+def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[catalogue.Placed]) -> Signatures:
+    """What each of these effects alone adds to a machine with standard parameters of these names."""
+    s = sample_of(machine, standard)
+    inertia = {b.index: tree.inertial_vector(b, s.by_name) for b in machine.body}
+    time = ca.SX.sym("t")
+    exact = ca.SX.sym("exact", sum(x.kind != "torque" for x in machine.sensors("full")))
+    force, reading, states, rates = [], [], [], []
+    for e in placed:
+        memory, z, (own,) = _acting(s, [e])
+        own = Acting(e, replace(own.scene, time=time), own.values)
+        added = _added(s, own, inertia)
+        if e.effect.soil is not None:
+            for k in e.bodies:
+                body = machine.find(k)
+                rolling, lever = _rolling(s, body)
+                soil = _soil(s, body, rolling)
+                changed = e.effect.soil(own.scene, k, own.values, soil)
+                added += _pushed(body, changed, lever) - _pushed(body, soil, lever)
+        force.append(added)
+        read = ca.SX.zeros(exact.numel())
+        if e.effect.reading is not None:
+            sensors = [x for x in machine.sensors("full") if x.kind != "torque"]
+            at = next(i for i, x in enumerate(sensors) if x.name == e.sensor)
+            read[at] = e.effect.reading(own.scene, exact[at], sensors[at].body, own.values)
+        reading.append(read)
+        kept = [k for k, m in enumerate(memory) if m != "time"]
+        states.append(z[kept])
+        rates += [m.rate(own.scene, e.bodies[0], own.values) for m in e.effect.memory.values()]
+    z = ca.vertcat(*states, ca.SX(0, 1))
+    arguments = [s.q, s.nu, s.a, s.u, time, z, exact, s.p]
+    return Signatures(
+        ca.Function("force", arguments, [ca.horzcat(*force)]),
+        ca.Function("reading", arguments, [ca.horzcat(*reading)]),
+        ca.Function("flow", [s.q, s.nu, s.u, time, z, s.p], [ca.vertcat(*rates, ca.SX(0, 1))]),
+    )
+
+
+def _acting(s: Sample, placed: Sequence[catalogue.Placed]) -> tuple[tuple[str, ...], ca.SX, list[Acting]]:
+    """What effects remember, its symbols z, and the effects with what they see of a sample."""
+    memory = ["time"] if any(e.effect.timed for e in placed) else []
+    memory += [f"{e.name}.{m}" for e in placed for m in e.effect.memory]
+    z = ca.SX.sym("z", len(memory))
+    known = dict(zip(memory, ca.vertsplit(z), strict=True))
+    turning = [b for b in s.machine.body if b.coordinates and b.joint != "planar" and b.friction is not None]
+    scene = catalogue.Scene(
+        {b.index: s.at[b.coordinates[0]] for b in turning},
+        {b.index: s.rate[b.coordinates[0]] for b in turning},
+        dict(zip([b.index for b in s.machine.actuated], ca.vertsplit(s.u), strict=True)),
+        {b.index: _friction(s, b) for b in turning},
+        {b.index: float(b.friction.smoothing) for b in turning if b.friction is not None},
+        {b.index: _rolling(s, b)[0] for b in s.machine.contacts},
+        {b.index: s.frames[b.index].velocity[0] for b in s.machine.body},
+        known.get("time", ca.SX(0)),
+    )
+    acting = []
+    for e in placed:
+        own = {m: known[f"{e.name}.{m}"] for m in e.effect.memory}
+        values = {key: s.by_name.get(name, ca.SX(e.values[key])) for name, (key, _) in e.parameters.items()}
+        acting.append(Acting(e, replace(scene, z=own), values))
+    return tuple(memory), z, acting
+
+
+def _friction(s: Sample, body: Body) -> ca.SX:
+    assert body.friction is not None
+    w, k = s.rate[body.coordinates[0]], body.index
+    return s.by_name[f"Fv{k}"] * w + s.by_name[f"Fs{k}"] * ca.tanh(w / float(body.friction.smoothing))
+
+
+def _balance(s: Sample, acting: Sequence[Acting]) -> tuple[ca.SX, dict[str, ca.SX]]:
+    """The generalised forces (n_q,) that the motors must deliver, as their sensors feel them flaws aside; the slips."""
+    machine = s.machine
+    inertia = {b.index: tree.inertial_vector(b, s.by_name) for b in machine.body}
+    rows = tree.generalised_forces(machine, s.at, s.frames, inertia)
+    force = ca.vertcat(*[rows[c] for c in s.names])
+    for body in machine.body:
+        if body.friction is not None and body.coordinates[0] in s.names:
+            force[s.row(body)] += _friction(s, body)
+    for e in acting:
+        force -= _added(s, e, inertia)
+    slips: dict[str, ca.SX] = {}
+    for body in machine.contacts:
+        rolling, lever = _rolling(s, body)
+        soil = _soil(s, body, rolling)
+        slips |= {f"gx{body.index}": soil.slip.gx, f"gy{body.index}": soil.slip.gy}
+        for e in acting:
+            if e.placed.effect.soil is not None and body.index in e.placed.bodies:
+                soil = e.placed.effect.soil(e.scene, body.index, e.values, soil)
+        force -= _pushed(body, soil, lever)
+    if machine.planar and machine.body[0].coordinates[1] in machine.locked:
+        slips = {g: x for g, x in slips.items() if not g.startswith("gy")}
+    return force, slips
+
+
+def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
+    """Generalised force (n_q,) of an effect that isn't the soil's: torques, forces at rolls, gravity, inertia."""
+    effect, machine = e.placed.effect, s.machine
+    force = ca.SX.zeros(len(s.names))
+    for k in e.placed.bodies:
+        body = machine.find(k)
+        if effect.torque is not None:
+            force[s.row(body)] += effect.torque(e.scene, k, e.values)
+        if effect.push is not None:
+            lever = _rolling(s, body)[1]
+            force += lever[:2, :].T @ ca.vertcat(*effect.push(e.scene, k, e.values))
+    if effect.gravity is not None:
+        pull = tree.rot_z(-s.heading) @ ca.vertcat(*effect.gravity(e.scene, e.values), 0)
+        still = {c: ca.SX(0) for c in s.at}
+        frames = tree.motion(machine, s.at, still, still, pull)
+        rows = tree.generalised_forces(machine, s.at, frames, dict(inertia))
+        force -= ca.vertcat(*[rows[c] for c in s.names])
+    if effect.inertia is not None:
+        moved = {catalogue.shifted(machine): effect.inertia(e.scene, e.values)}
+        none = {n: ca.SX(0) for n in s.by_name}
+        change = {b.index: tree.inertial_vector(b, {**none, **moved}) for b in machine.body}
+        rows = tree.generalised_forces(machine, s.at, s.frames, change)
+        force -= ca.vertcat(*[rows[c] for c in s.names])
+    return force
+
+
+def _rolling(s: Sample, body: Body) -> tuple[catalogue.Rolling, ca.SX]:
+    """How a roll moves, and how (Vx, Vy, spin, yaw) follow from the velocities (4, n_q)."""
+    assert body.contact is not None
+    assert not isinstance(body.antecedent, str)
+    carrier, roll = s.frames[body.antecedent], s.frames[body.index]
+    R, _ = tree.place(body, {c: ca.SX(0) for c in body.coordinates})
+    turn = carrier.rotation.T @ roll.rotation
+    centre = turn @ roll.velocity
+    spin = (R[:, 2].T @ turn) @ roll.omega
+    yaw = carrier.omega[2]
+    lever = ca.jacobian(ca.vertcat(centre[0], centre[1], spin, yaw), s.nu)
+    return catalogue.Rolling(body.contact, centre[0], centre[1], spin, yaw), lever
+
+
+def _soil(s: Sample, body: Body, rolling: catalogue.Rolling) -> catalogue.Soil:
+    """The soil under a roll as the machine file has it."""
+    law = rolling.contact
+    saturation = None
+    if law.law == "exponential":
+        assert law.saturation_slip is not None
+        saturation = ca.SX(float(law.saturation_slip))
+    Kx, Ky = s.by_name[f"Kx{body.index}"], s.by_name[f"Ky{body.index}"]
+    return catalogue.Soil(rolling.slip, rolling.yaw, Kx, Ky, saturation)
+
+
+def _pushed(body: Body, soil: catalogue.Soil, lever: ca.SX) -> ca.SX:
+    """Generalised contact force (n_q,) of a roll (11), by virtual power."""
+    assert body.contact is not None
+    w = contact.wrench(body.contact, soil.slip, soil.yaw, soil.Kx, soil.Ky, soil.saturation, soil.lateral)
+    return lever.T @ ca.vertcat(w.Sx, w.Sy, -float(body.contact.radius) * w.Sx, -w.Tz)
+
+
+def _channels(s: Sample, acting: Sequence[Acting], time: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Gain, offset and delay (n_u,) of the torque sensors."""
+    gain, offset, delay = [], [], []
+    for body in s.machine.actuated:
+        g, o, d = ca.SX(1), s.by_name[f"u{body.index}0"], ca.SX(0)
+        for e in acting:
+            if e.placed.effect.channel is not None and body.index in e.placed.bodies:
+                own = e.placed.effect.channel(time, e.values)
+                g, o, d = g * own.gain, o + own.offset, d + own.delay
+        gain.append(g)
+        offset.append(o)
+        delay.append(d)
+    return ca.vertcat(*gain), ca.vertcat(*offset), ca.vertcat(*delay)
+
+
+def _readings(s: Sample, acting: Sequence[Acting]) -> tuple[ca.SX, tuple[str, ...]]:
+    """What sensors read, those of torque aside, and their names."""
+    machine, root = s.machine, s.machine.body[0]
+    wheels = [x.name for x in machine.sensor if x.kind == "wheel"]
+    readings: dict[str, ca.SX] = {}
+    for sensor in machine.sensors("full"):
+        body = machine.find(sensor.body)
+        if sensor.kind == "torque":
+            continue
+        if sensor.kind == "angle":
+            value = s.at[body.coordinates[0]]
+        elif sensor.kind == "wheel":
+            value = s.wheels[wheels.index(sensor.name)]
+        elif sensor.kind == "yaw_rate":
+            value = s.rate[root.coordinates[2]]
+        elif sensor.kind == "lateral_speed":
+            value = s.frames[body.index].velocity[1]
+        else:
+            value = s.at[root.coordinates["xy".index(sensor.kind)]]
+        exact = value
+        for e in acting:
+            if e.placed.effect.reading is not None and e.placed.sensor == sensor.name:
+                value = value + e.placed.effect.reading(e.scene, exact, body.index, e.values)
+        readings[sensor.name] = value
+    return ca.vertcat(*readings.values(), ca.SX(0, 1)), tuple(readings)
+
+
+def kinematics(s: Sample, slips: Mapping[str, ca.SX]) -> ca.Function:
+    """(q, nu) -> dq, slips, wheel rates, lateral and longitudinal speed of each body's origin, its ground position."""
+    machine, at, rate, frames, nu = s.machine, s.at, s.rate, s.frames, s.nu
+    dq = nu
+    if machine.planar:
+        x, y, _ = machine.body[0].coordinates
+        turned = dict(
+            zip((x, y), ca.vertsplit((tree.rot_z(s.heading) @ ca.vertcat(rate[x], rate[y], 0))[:2]), strict=True)
+        )
+        dq = ca.vertcat(*[turned.get(c, rate[c]) for c in machine.coordinates])
+    wheels = []
+    for sensor in machine.sensor:
+        if sensor.kind == "wheel":
+            f = frames[sensor.body]
+            assert sensor.radius is not None
+            assert sensor.lateral is not None
+            wheels.append((f.velocity[0] - float(sensor.lateral) * f.omega[2]) / float(sensor.radius))
+    R = tree.rot_z(s.heading)
+    root = ca.vertcat(*[at[c] for c in machine.body[0].coordinates[:2]], 0) if machine.planar else ca.SX(3, 1)
+    places = ca.horzcat(*[root + R @ frames[b.index].position for b in machine.body])
+    speeds = ca.horzcat(*[frames[b.index].velocity for b in machine.body])
+    turns = ca.horzcat(*[frames[b.index].omega for b in machine.body])
+    return ca.Function(
+        "kinematics",
+        [s.q, nu],
+        [dq, ca.vertcat(*slips.values()), ca.vertcat(*wheels), places, speeds, turns],
+        ["q", "nu"],
+        ["dq", "slips", "wheels", "places", "speeds", "turns"],
+    )
