@@ -223,20 +223,24 @@ def judge(aim: Aim, motions: Sequence[tuple[Model, Motion]]) -> Judged:
     return Judged(total, worst)
 
 
-def calibrated(aim: Aim, model: Model, motion: Motion) -> Aim:
-    """The aim with surrogates that give the Cramer-Rao bound along this motion of the nominal machine."""
-    if not any(t.of_variances for t in aim.terms):
-        return aim
-    A = information(aim, model, motion)
-    true = np.diag(covariance(aim, model, motion)) / aim.scale**2
-    terms = []
+def optimism(aim: Aim, model: Model, motion: Motion) -> np.ndarray | None:
+    """(n_base,) the Cramer-Rao bound's variances over the surrogate's along a motion of the nominal machine.
+
+    None where the aim has no objective of variances.
+    """
     for term in aim.terms:
         if term.of_variances:
-            J = _seen(term, A[term.block])
+            A = information(replace(aim, rows=aim.rows[[term.block]]), model, motion)[0]
+            J = _seen(term, A)
             thought = np.diag(np.linalg.inv(J)) * term.columns**2
-            term = replace(term, columns=term.columns * np.sqrt(thought / true))
-        terms.append(term)
-    return replace(aim, terms=tuple(terms))
+            return np.asarray(np.diag(covariance(aim, model, motion)) / aim.scale**2 / thought)
+    return None
+
+
+def calibrated(aim: Aim, optimism: np.ndarray) -> Aim:
+    """The aim with surrogates of variances that much larger: they give the bound where the optimism is that of."""
+    terms = tuple(replace(t, columns=t.columns / np.sqrt(optimism)) if t.of_variances else t for t in aim.terms)
+    return replace(aim, terms=terms)
 
 
 def lowered(aim: Aim, share: float) -> Aim:

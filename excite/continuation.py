@@ -16,8 +16,18 @@ from excite import aim as aims
 from excite import interior
 from excite import objective as _objective
 from excite.aim import SIGMA_MAX, Aim
-from excite.collocation import UnsettledError, settle, transcribe
-from excite.limit import REST_POSITION, check, placed, rest_tolerances, resting
+from excite.collocation import Transcription, UnsettledError, settle, transcribe
+from excite.limit import (
+    REST_POSITION,
+    REST_SPEED,
+    TRAVEL,
+    check,
+    directions,
+    limits,
+    placed,
+    rest_tolerances,
+    resting,
+)
 from excite.manoeuvre import Manoeuvre, multisine, scaled
 from excite.manoeuvre import knots as _knots
 from excite.scenario import followed
@@ -91,6 +101,8 @@ class Track:
 
     times (N,) [s] and states (N, n_z), scaled by `sizes`, are the last program's nodes, or the guess's samples and
     none yet. pose (n_q,): the start coordinates once the lane matters. best: the best candidate on the way.
+    going (N,): the direction of travel at the machine's samples, +-1, where reversals are counted. optimism (n_base,):
+    of the surrogates of variances, as the next stage corrects them.
     """
 
     number: int
@@ -102,6 +114,8 @@ class Track:
     times: np.ndarray
     states: np.ndarray | None = None
     pose: np.ndarray | None = None
+    going: np.ndarray | None = None
+    optimism: np.ndarray | None = None
     complete: bool = False
 
 
@@ -128,7 +142,8 @@ def depart(model: Model, problem: Problem, aim: Aim, number: int, seed: int) -> 
             break
     found, motion = verdict(model, problem, aim, drive)
     sizes = typical_sizes(model, problem, motion)
-    return Track(number, _objective.cond_phi(model, motion), sizes, found, found, motion, motion.t)
+    going = None if problem.reversals is None else directions(motion, problem.reversals)
+    return Track(number, _objective.cond_phi(model, motion), sizes, found, found, motion, motion.t, going=going)
 
 
 def typical_sizes(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
@@ -261,7 +276,14 @@ def _advance(
     over: Callable[[], bool],
 ) -> Track | None:
     """One stage from where the track stands. None where no motion follows its torques."""
-    wanted = aim if stage.friction > 1 else aims.calibrated(aim, model, track.motion)
+    wanted = aim
+    if stage.friction == 1:
+        seen = aims.optimism(aim, model, track.motion)
+        if seen is not None:
+            # what turned out too optimistic before is trusted again by half only, or drives go back and forth
+            careful = seen if track.optimism is None else np.maximum(seen, np.sqrt(seen * track.optimism))
+            track = replace(track, optimism=careful)
+            wanted = aims.calibrated(aim, careful)
     wanted = aims.lowered(wanted, margins.get(SIGMA_MAX, 0.0))
     knots = len(_knots(problem)) - 1
     intervals = max(4, round(knots / stage.coarse))
@@ -300,6 +322,9 @@ def _advance(
         np.tile([1e-4 + 2 * margins.get(name, 0.0) for name in tr.control_names], (intervals, 1)),
         np.array([name.startswith("lane") for name in tr.limit_names], bool),
     )
+    if track.going is not None and TRAVEL in tr.limit_names:
+        above, below = _one_way(tr, nodes, model, problem, track.going)
+        task = replace(task, above=above, below=below)
 
     def watch(*_: object) -> bool:
         return over()
@@ -335,6 +360,19 @@ def _advance(
         times=nodes.ravel(),
         states=point.Z.reshape(-1, tr.n_z),
     )
+
+
+def _one_way(
+    tr: Transcription, nodes: np.ndarray, model: Model, problem: Problem, going: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What moves the upper and the lower bound of the forward speed in (K, J, n_g), so that it keeps its direction."""
+    k = tr.limit_names.index(TRAVEL)
+    (travel,) = (g for g in limits(model, problem) if g.name == TRAVEL)
+    shut = 1 - REST_SPEED / travel.high  # what counts as at rest may go either way
+    above, below = np.zeros((2, *nodes.shape, len(tr.limit_names)))
+    ahead = going[np.clip(np.rint(nodes * float(model.machine.sampling_hz)).astype(int), 0, len(going) - 1)] > 0
+    above[..., k], below[..., k] = np.where(ahead, 0, shut), np.where(ahead, shut, 0)
+    return above, below
 
 
 def verdict(model: Model, problem: Problem, aim: Aim, drive: Manoeuvre) -> tuple[Candidate, Motion]:

@@ -58,7 +58,8 @@ class Task:
     """What is minimised: an aim (or None) plus pull / 2 |U - goal|^2, limits moved in by `margin`.
 
     margin (K, J, n_g) and marginc (K, n_c), in half ranges. Limits marked `soft` (n_g,) may be exceeded on the way,
-    at a price of PRICE per half range: a smooth hinge.
+    at a price of PRICE per half range: a smooth hinge. above, below (K, J, n_g): what the upper or the lower bound
+    alone is moved in by.
     """
 
     aim: Aim | None
@@ -67,15 +68,17 @@ class Task:
     soft: np.ndarray
     pull: float = 0.0
     goal: np.ndarray | None = None
+    above: np.ndarray | float = 0.0
+    below: np.ndarray | float = 0.0
 
     @property
     def wall(self) -> np.ndarray:
         """Distance (K, J, n_g) of the upper bounds from the middle; that of soft limits is far away."""
-        return np.where(self.soft, FAR, 1 - self.margin)
+        return np.where(self.soft, FAR, 1 - self.margin - self.above)
 
     def floor(self, tr: Transcription) -> np.ndarray:
         """The same of the lower bounds."""
-        return np.where(self.soft, FAR, -tr.floor - self.margin)
+        return np.where(self.soft, FAR, -tr.floor - self.margin - self.below)
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,12 @@ the problem state. Their scale comes from their bounds: an excess is a fraction 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+import scipy.optimize
 
 from excite.simulate import Motion
 from model.machine import Problem
@@ -18,6 +19,8 @@ from model.prediction import Model
 
 # What counts as at rest at the ends (contract, R60): speeds [m/s], rates [rad/s] and positions [rad, m].
 REST_SPEED, REST_RATE, REST_POSITION = 0.02, 0.01, 0.01
+TRAVEL, REVERSALS = "travel", "reversals"
+TURNS = 361  # headings at which a drive is tried on the lane
 
 
 class InfeasibleError(ValueError):
@@ -138,6 +141,39 @@ def _lane(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
                 yield f"lane {letter} {model.machine.find(index).where}", point[axis], -high, high, "m"
 
 
+def _polygon(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    """Every edge of a convex area: the distance across it, from the corner that is farthest to the edge itself."""
+    if not model.machine.planar:
+        return
+    places = model.kinematics(s.q, s.nu)[3]
+    bodies = [b.index for b in model.machine.body]
+    for k, (outward, low, high) in enumerate(edges(problem.lane_polygon_m), 1):
+        for index in problem.lane_points:
+            point = places[:, bodies.index(index)]
+            across = outward[0] * point[0] + outward[1] * point[1]
+            yield f"lane edge {k} {model.machine.find(index).where}", across, low, high, "m"
+
+
+def _travel(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    """The forward speed of a problem that counts reversals; the program narrows it to one direction at a time."""
+    if problem.reversals is not None and model.machine.planar:
+        fast = [float(b.limit.rim_speed) for b in model.machine.contacts if b.limit.rim_speed is not None]
+        high = 1.2 * max(fast, default=10.0)  # slip included
+        yield TRAVEL, s.nu[0], -high, high, "m/s"
+
+
+def edges(corners: Sequence[tuple[float, float]]) -> list[tuple[np.ndarray, float, float]]:
+    """Outward normal (2,), and distance of the farthest corner and of the edge along it [m], of a convex area."""
+    P = np.array(corners, float).reshape(-1, 2)
+    found = []
+    for a, b in zip(P, np.roll(P, -1, axis=0), strict=True):
+        normal = np.array([b[1] - a[1], a[0] - b[0]]) / np.linalg.norm(b - a)
+        if normal @ (P.mean(axis=0) - a) > 0:
+            normal = -normal
+        found.append((normal, float((P @ normal).min()), float(a @ normal)))
+    return found
+
+
 KINDS: dict[str, Kind] = {
     "torque": _torque,
     "torque rate": _torque_rate,
@@ -147,6 +183,8 @@ KINDS: dict[str, Kind] = {
     "slip": _slip,
     "power": _power,
     "lane": _lane,
+    "polygon": _polygon,
+    "travel": _travel,
 }
 
 
@@ -207,10 +245,14 @@ def check(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
         g.name: max(0.0, float(v.max() - g.high), float(g.low - v.min())) / g.range
         for g, v in zip(every, values, strict=True)
     }
-    return excess | (_rest(model, motion) if problem.rest else {})
+    for whole in WHOLE.values():
+        excess |= whole(model, problem, motion)
+    return excess
 
 
-def _rest(model: Model, motion: Motion) -> dict[str, float]:
+def _rest(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
+    if not problem.rest:
+        return {}
     tolerance = rest_tolerances(model)
     still = {
         f"rest {c}'": max(0.0, float(np.abs(motion.nu[[0, -1], k]).max() / tolerance[k]) - 1)
@@ -223,6 +265,50 @@ def _rest(model: Model, motion: Motion) -> dict[str, float]:
     return still | centred
 
 
+def _reversals(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
+    if problem.reversals is None or not model.machine.planar:
+        return {}
+    return {REVERSALS: max(0.0, (reversals(motion) - problem.reversals) / max(1, problem.reversals))}
+
+
+def reversals(motion: Motion) -> int:
+    """How often a machine changes its direction of travel; what counts as at rest is no direction."""
+    going = np.sign(motion.nu[np.abs(motion.nu[:, 0]) > REST_SPEED, 0])
+    return int((np.diff(going) != 0).sum())
+
+
+# Limits on a motion as a whole: excess by name, of the model, the problem and the motion.
+WHOLE: dict[str, Callable[[Model, Problem, Motion], dict[str, float]]] = {"rest": _rest, "reversals": _reversals}
+
+
+def directions(motion: Motion, most: int) -> np.ndarray:
+    """(N,) +-1: the direction of travel at every sample, with at most so many reversals, that fits a motion best.
+
+    Best: the least distance is driven the other way. By dynamic programming over the runs of one direction.
+    """
+    v = motion.nu[:, 0]
+    cuts = np.concatenate([[0], np.flatnonzero(np.diff(np.sign(v)) != 0) + 1, [len(v)]])
+    driven = np.add.reduceat(v, cuts[:-1])
+    gain = np.full((len(driven), most + 1, 2), -np.inf)
+    came = np.zeros((len(driven), most + 1, 2), int)  # direction of the run before
+    signs = np.array([1.0, -1.0])
+    gain[0, 0] = signs * driven[0]
+    for k in range(1, len(driven)):
+        for r in range(most + 1):
+            for d in range(2):
+                stay = gain[k - 1, r, d]
+                turn = gain[k - 1, r - 1, 1 - d] if r else -np.inf
+                came[k, r, d] = d if stay >= turn else 1 - d
+                gain[k, r, d] = max(stay, turn) + signs[d] * driven[k]
+    r, d = (int(i) for i in np.unravel_index(int(np.argmax(gain[-1])), gain[-1].shape))
+    found = np.empty(len(v))
+    for k in range(len(driven) - 1, -1, -1):
+        found[cuts[k] : cuts[k + 1]] = signs[d]
+        before = int(came[k, r, d])
+        r, d = (r - 1 if before != d else r), before
+    return found
+
+
 def placed(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
     """Start coordinates (n_q,) that put the drive into the lane area as well as turning and shifting it can."""
     start = motion.q[0].copy()
@@ -233,14 +319,14 @@ def placed(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
     places = model.kinematics(motion.q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), -1)
     bodies = [b.index for b in model.machine.body]
     path = places[:2][:, :, [bodies.index(i) for i in problem.lane_points]].reshape(2, -1)
+    fit = _fit_polygon if problem.lane_polygon_m else _fit_box
     best, chosen = np.inf, (0.0, np.zeros(2))
-    for turn in np.linspace(0, np.pi, 361)[:-1] if heading in axes else (0.0,):
+    whole = 2 * np.pi if problem.lane_polygon_m else np.pi  # a box is the same upside down
+    for turn in np.linspace(0, whole, TURNS)[:-1] if heading in axes else (0.0,):
         c, s = np.cos(turn), np.sin(turn)
-        turned = np.array([[c, -s], [s, c]]) @ path
-        low, high = turned.min(axis=1), turned.max(axis=1)
-        used = float(((high - low) / np.array(problem.lane_m)).max())
+        used, shift = fit(problem, np.array([[c, -s], [s, c]]) @ path)
         if used < best - 1e-9:
-            best, chosen = used, (float(turn), -(low + high) / 2)
+            best, chosen = used, (float(turn), shift)
     turn, shift = chosen
     at = np.array([start[axes[c]] if c in axes else 0.0 for c in (x, y)])
     c, s = np.cos(turn), np.sin(turn)
@@ -251,3 +337,21 @@ def placed(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
     if heading in axes:
         start[axes[heading]] += turn
     return start
+
+
+def _fit_box(problem: Problem, path: np.ndarray) -> tuple[float, np.ndarray]:
+    """The share of the lane's length or width that a path (2, K) needs, and the shift that centres it."""
+    low, high = path.min(axis=1), path.max(axis=1)
+    return float(((high - low) / np.array(problem.lane_m)).max()), -(low + high) / 2
+
+
+def _fit_polygon(problem: Problem, path: np.ndarray) -> tuple[float, np.ndarray]:
+    """The same for the edges of box and polygon: the shift that leaves the largest excess least, a linear program."""
+    length, width = problem.lane_m
+    box = [(length / 2, width / 2), (-length / 2, width / 2), (-length / 2, -width / 2), (length / 2, -width / 2)]
+    sides = edges(box) + edges(problem.lane_polygon_m)
+    rows = [[*outward / (high - low), -1.0] for outward, low, high in sides]
+    most = [(high - float((outward @ path).max())) / (high - low) for outward, low, high in sides]
+    found = scipy.optimize.linprog([0, 0, 1], A_ub=rows, b_ub=most, bounds=[(None, None)] * 3)
+    shift = np.asarray(found.x)
+    return float(shift[2]), shift[:2]

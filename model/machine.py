@@ -11,6 +11,7 @@ import math
 import re
 import reprlib
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -306,19 +307,27 @@ class Filter(Record):
 
 
 class Problem(Record):
-    """A design problem: how long, where, how fine. `source` is that of the lane."""
+    """A design problem: how long, where, how fine. `source` is that of the lane.
+
+    lane_m: length and width of the lane area, centred on 0, 0; lane_polygon_m: corners of a convex area in which the
+    `lane_points` stay as well. reversals: of the direction of travel, at most.
+    """
 
     source: Source
     duration_s: Positive
     knot_s: Positive
     lane_m: tuple[Number, Number]
     lane_points: tuple[Index, ...]
+    lane_polygon_m: tuple[tuple[Number, Number], ...] = ()
+    reversals: Annotated[int, Field(strict=True, ge=0)] | None = None
     rest: Flag = True
 
     @model_validator(mode="after")
     def _consistent(self) -> Problem:
         if min(self.lane_m) <= 0:
             raise ValueError(f"lane_m: must be > 0, length and width (got {min(self.lane_m):g})")
+        if self.lane_polygon_m and not _convex(self.lane_polygon_m):
+            raise ValueError("lane_polygon_m: must be three corners or more, in order, of a convex area")
         if self.knot_s.value * 4 > self.duration_s.value:
             least = 4 * self.knot_s.value
             raise ValueError(f"duration_s: must be at least 4 knots long, {least:g} s (got {self.duration_s.value:g})")
@@ -333,6 +342,19 @@ class EffectEntry(Record):
     amount: Quantity
     std: NotNegative | None = None
     shape: dict[str, Quantity] = {}
+
+
+def _convex(corners: Sequence[tuple[float, float]]) -> bool:
+    """Whether corners, in order, go once around a convex area, turning the same way at every one."""
+    n = len(corners)
+    turn, turns = 0.0, []
+    for k in range(n):
+        (ax, ay), (bx, by), (cx, cy) = (corners[(k + i) % n] for i in range(3))
+        cross = (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
+        turns.append(cross)
+        turn += math.atan2(cross, (bx - ax) * (cx - bx) + (by - ay) * (cy - by))
+    one_way = all(t > 0 for t in turns) or all(t < 0 for t in turns)
+    return n >= 3 and one_way and abs(abs(turn) - 2 * math.pi) < 1e-6
 
 
 class Machine(Record):

@@ -51,9 +51,9 @@ def test_accuracy_is_judged_by_the_bound(straight: Model, motion: Motion) -> Non
 
 def test_calibrated_surrogates_give_the_bound(straight: Model, motion: Motion) -> None:
     aim = aims.aim(straight, "worst")
-    off, on = (
-        aims.value(a, aims.information(a, straight, motion)) for a in (aim, aims.calibrated(aim, straight, motion))
-    )
+    optimism = aims.optimism(aim, straight, motion)
+    assert optimism is not None
+    off, on = (aims.value(a, aims.information(a, straight, motion)) for a in (aim, aims.calibrated(aim, optimism)))
     true = aims.judge(aim, [(straight, motion)]).score
     assert on == pytest.approx(true, abs=1e-6)
     assert abs(off - true) > 0.01

@@ -9,13 +9,14 @@ from functools import partial
 
 import numpy as np
 import pytest
+from matplotlib.path import Path as MplPath
 
 from excite import collocation, interior, objective
 from excite.aim import aim
 from excite.continuation import PLAN, TOLERANCE, depart, repair, search, soften
 from excite.design import Design, design
-from excite.limit import InfeasibleError, check, limits, placed
-from excite.manoeuvre import BASELINES, Manoeuvre
+from excite.limit import InfeasibleError, check, directions, limits, placed, reversals
+from excite.manoeuvre import BASELINES, Manoeuvre, multisine, scaled
 from excite.simulate import simulate
 from model import machine, prediction
 from model.machine import Problem, Quantity
@@ -313,3 +314,78 @@ def test_objective_slope_and_curvature() -> None:
         assert (up - down) / 2 == pytest.approx(here.slope @ d, rel=1e-5)
         assert ((here.factor.T @ d) ** 2).sum() >= 0.99 * (up + down - 2 * here.value)
     assert objective.value("cond", A) == pytest.approx(2 * np.log(np.linalg.cond(B)), rel=1e-5)
+
+
+@pytest.mark.parametrize("shape", ["triangle", "leaning"])
+def test_a_polygon_is_kept(straight: Model, shape: str) -> None:
+    """Corners of a convex area, in either order; the straight line has to lie along its long side."""
+    corners = {"triangle": ((0, 0), (14, 0), (0, 9)), "leaning": ((0, 0), (3, 9), (6, 9), (3, 0))}[shape]
+    problem = shorter(straight, 12.0, lane_polygon_m=corners)
+    drive = scaled(multisine(straight, problem, 3), 0.2)
+    motion = simulate(straight, drive.sample(100.0))
+    excess = {k: v for k, v in check(straight, problem, motion).items() if k.startswith("lane edge")}
+    x, y = motion.q[:, 0], np.zeros(len(motion.t))
+    area = MplPath(np.array(corners, float))
+    outside = [not area.contains_points(np.column_stack([x + s, y]), radius=1e-9).all() for s in (0.0, -3.2)]
+    assert any(outside) == (max(excess.values()) > 0)
+
+
+def test_placed_fits_a_path_into_a_polygon(roller: Model) -> None:
+    problem = roller.machine.problems["R60"].model_copy(update={"lane_polygon_m": ((-9, -9), (20, -9), (-9, 9))})
+    u = np.zeros((1501, 3))
+    u[20:900, [0, 2]] = 450.0
+    motion = simulate(roller, u, q0=np.array([5.0, 5.0, 2.0, 0, 0, 0]))
+    assert max(v for k, v in check(roller, problem, motion).items() if k.startswith("lane")) > 0.1
+    again = simulate(roller, u, q0=placed(roller, problem, motion))
+    assert max(v for k, v in check(roller, problem, again).items() if k.startswith("lane")) == 0
+
+
+def test_directions_fit_a_motion_best(straight: Model) -> None:
+    t = np.arange(1201) / 100
+    still = simulate(straight, np.zeros((1201, 2)))
+    speed = np.sin(t) + 0.3 * np.sin(5 * t)
+    motion = replace(still, nu=np.column_stack([speed, speed, speed]))
+    for most in (0, 1, 2, 3):
+        found = directions(motion, most)
+        assert set(np.unique(found)) <= {-1.0, 1.0}
+        turns = int((np.diff(found) != 0).sum())
+        assert turns <= most
+        rng = np.random.default_rng(most)
+        for _ in range(300):  # no other pattern does better
+            cuts = np.sort(rng.integers(0, 1201, most))
+            other = np.sign(rng.uniform(-1, 1)) * (-1.0) ** np.searchsorted(cuts, np.arange(1201), side="right")
+            assert other @ speed <= found @ speed + 1e-9
+
+
+def test_reversals_are_counted_where_it_moves(straight: Model) -> None:
+    t = np.arange(1001) / 100
+    still = simulate(straight, np.zeros((1001, 2)))
+    wave = np.where(t < 5, 0.5 * np.sin(t), 0.01 * np.sin(20 * t))
+    motion = replace(still, nu=np.column_stack([wave] * 3))
+    assert reversals(motion) == 1
+    over = check(straight, shorter(straight, 10.0, reversals=0), motion)
+    assert over["reversals"] == 1
+    assert "reversals" not in check(straight, shorter(straight, 10.0), motion)
+
+
+@pytest.mark.parametrize("most", [0, 1])
+def test_few_reversals_are_kept(straight: Model, most: int) -> None:
+    problem = shorter(straight, 12.0, reversals=most)
+    d = design(straight, problem, starts=1, seed=3)
+    assert reversals(d.motion) <= most
+    assert d.max_violation <= TOLERANCE
+    assert d.violations["reversals"] == 0
+
+
+@pytest.mark.slow
+def test_r60_within_a_triangle_and_with_two_reversals(roller: Model) -> None:
+    corners = ((-18.0, -9.0), (18.0, -9.0), (0.0, 14.0))
+    problem = roller.machine.problems["R60"].model_copy(update={"lane_polygon_m": corners, "reversals": 2})
+    d = design(roller, problem, starts=2, seed=0)
+    assert d.max_violation <= TOLERANCE
+    assert reversals(d.motion) <= 2
+    places = roller.kinematics(d.motion.q.T, d.motion.nu.T)[3].full().reshape(3, len(d.motion.t), -1)
+    bodies = [b.index for b in roller.machine.body]
+    area = MplPath(np.array(corners))
+    for i in (0, 4):
+        assert area.contains_points(places[:2, :, bodies.index(i)].T, radius=0.05).all()
