@@ -1,0 +1,127 @@
+"""Blind logs: that they are what they say, and that the diagnosis names what was hidden in them.
+
+The logs come from a second roller that shares no code with the program (`plant`, `causes`, `surprises`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import plant
+import pytest
+from blind import Blind, Case, Hidden, blind, case, score
+from causes import CAUSES
+from visibility import VISIBLE, visibility
+
+
+def slalom(*hidden: Hidden, kind: str = "cause", kit: str = "full", seed: int = 5, duration: float = 60) -> Case:
+    return Case(kind, 0, seed, "slalom", duration, kit, hidden)
+
+
+# ------------------------------------------------------------------------------------------------------ the logs
+def test_a_case_gives_the_same_log_again_and_another_number_another() -> None:
+    first, again = (replace(case("cause", "roll_unbalance", 1), duration=8.0) for _ in range(2))
+    assert first == again
+    assert blind(first).log.equals(blind(again).log)
+    assert case("cause", "roll_unbalance", 2).seed != first.seed
+
+
+def test_cases_cover_places_kits_manoeuvres_and_amounts() -> None:
+    many = [case("cause", name, k) for name in CAUSES for k in range(20)]
+    for name, cause in CAUSES.items():
+        hidden = [c.hidden[0] for c in many if c.hidden[0].name == name]
+        assert {h.place for h in hidden} == set(cause.places)
+        assert ({np.sign(h.amount) for h in hidden} == {-1, 1}) == cause.signed
+        for h in hidden:
+            low, high = sorted(cause.between(h.place))
+            assert low * 0.999 <= abs(h.amount) <= high * 1.001
+    assert {c.manoeuvre for c in many} == set(plant.MANOEUVRES)
+    assert {c.kit for c in many} == set(plant.KITS)
+    assert len({c.seed for c in many}) == len(many)
+
+
+# ------------------------------------------------------------------------------------------------- how visible
+def test_nothing_hidden_leaves_nothing_and_a_parameter_is_no_cause() -> None:
+    seen = blind(slalom(kind="nothing", duration=20))
+    assert visibility(seen) < 1e-6
+    other = replace(seen.machine, Fv1=seen.machine.Fv1 * 1.1, m2=seen.machine.m2 * 1.05, Ky4=seen.machine.Ky4 * 0.95)
+    moved = plant.drive(plant.bare(), other, plant.plan("slalom", 20, 5), 5)
+    wrong_machine = Blind(seen.case, seen.machine, plant.bare(), moved, seen.log)
+    assert visibility(wrong_machine) < 5  # the prior, and what is not linear
+
+
+def test_visibility_grows_with_the_square_of_the_amount() -> None:
+    chi2 = [
+        visibility(blind(slalom(Hidden("encoder_eccentricity", "rear_roll", A), duration=20))) for A in (1e-3, 2e-3)
+    ]
+    assert chi2[0] > VISIBLE
+    assert chi2[1] / chi2[0] == pytest.approx(4, rel=0.02)
+
+
+def test_paper_sees_less_than_full() -> None:
+    hidden = Hidden("lateral_saturation", "front_roll", 0.1)
+    full, paper = (visibility(blind(slalom(hidden, kit=kit, duration=20))) for kit in ("full", "paper"))
+    assert full > paper
+
+
+# -------------------------------------------------------------------------------------------------- the judging
+def said(
+    verdict: str, *names: str, tied: tuple[str, ...] = (), amount: float = 1.0, std: float = 0.1
+) -> dict[str, Any]:
+    findings = [
+        {
+            "effect": name.split("@")[0],
+            "where": name.split("@")[1],
+            "tied_with": list(tied),
+            "amount": amount,
+            "amount_std": 0.1,
+            "gain_percent": 12.0,
+            "gain_ci95": [8.0, 16.0],
+        }
+        for name in names
+    ]
+    return {"verdict": verdict, "findings": findings}
+
+
+TRUE = "torque_ripple@rear_roll"
+
+
+@pytest.mark.parametrize(
+    ("kind", "summary", "outcome"),
+    [
+        ("nothing", said("clean"), "clean"),
+        ("nothing", said("unexplained"), "wrong"),
+        ("nothing", said("named", TRUE), "wrong"),
+        ("cause", said("clean"), "clean"),
+        ("cause", said("unexplained"), "unexplained"),
+        ("cause", said("named", TRUE), "right"),
+        ("cause", said("tied", "roll_unbalance@rear_roll", tied=(TRUE,)), "tied"),
+        ("cause", said("tied", TRUE, tied=("roll_unbalance@rear_roll",)), "tied"),
+        ("cause", said("named", "torque_ripple@front_roll"), "place"),
+        ("cause", said("named", "ground_slope@machine"), "wrong"),
+        ("cause", said("named", TRUE, "ground_slope@machine"), "more"),
+        ("surprise", said("unexplained"), "unexplained"),
+        ("surprise", said("unexplained", TRUE), "wrong"),
+        ("surprise", said("clean"), "clean"),
+        ("pair", said("named", TRUE, "ground_slope@machine"), "right"),
+        ("pair", said("named", "ground_slope@machine"), "part"),
+        ("pair", said("named", TRUE, "pump_coupling@drive"), "more"),
+        ("pair", said("named", "pump_coupling@drive"), "wrong"),
+    ],
+)
+def test_judgement(kind: str, summary: dict[str, Any], outcome: str) -> None:
+    true, slope = Hidden("torque_ripple", "rear_roll", 1.1), Hidden("ground_slope", "machine", 0.01)
+    hidden = {"nothing": (), "cause": (true,), "surprise": (Hidden("sloshing", "", 1.0),), "pair": (true, slope)}
+    assert score(slalom(*hidden[kind], kind=kind), summary).outcome == outcome
+
+
+def test_amounts_and_gains_are_judged_by_their_intervals() -> None:
+    one = slalom(Hidden("torque_ripple", "rear_roll", 1.1))
+    assert score(one, said("named", TRUE)).amount_in
+    far = score(one, said("named", TRUE, amount=0.7))
+    assert not far.amount_in
+    assert far.amount_error == pytest.approx(-0.4 / 1.1)
+    assert far.gain_sure
+    assert score(one, said("clean")).amount_in is None
