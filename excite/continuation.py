@@ -59,6 +59,12 @@ class Stage:
     patience: float
     elements: int = 1
 
+    def apart(self) -> list[Stage]:
+        """Its levels as stages of their own: surrogates of variances are then calibrated before each."""
+        return [
+            replace(self, sharp=self.sharp * 2**i, barrier=self.barrier / 3**i, levels=1) for i in range(self.levels)
+        ]
+
 
 PLAN = (
     Stage(10, 3, 4, 8, 1e-3, 2, 40, 1.0),
@@ -146,6 +152,16 @@ def depart(model: Model, problem: Problem, aim: Aim, number: int, seed: int) -> 
     return Track(number, _objective.cond_phi(model, motion), sizes, found, found, motion, motion.t, going=going)
 
 
+def resume(model: Model, problem: Problem, aim: Aim, number: int, drive: Manoeuvre) -> Track:
+    """A start from a drive that is there already, for the last stages. Raises SimulationError."""
+    found, motion = verdict(model, problem, aim, drive)
+    sizes = typical_sizes(model, problem, motion)
+    going = None if problem.reversals is None else directions(motion, problem.reversals)
+    pose = found.start if model.machine.planar and problem.lane_points else None
+    score = _objective.cond_phi(model, motion)
+    return Track(number, score, sizes, found, found, motion, motion.t, pose=pose, going=going)
+
+
 def typical_sizes(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
     """Typical size of every coordinate and velocity (c and c') in a motion; of the pose, half the lane."""
     sizes = {}
@@ -168,6 +184,8 @@ def search(
     tell: Tell = lambda track: None,
 ) -> Track:
     """A track carried through the stages of a plan, until `over`; `tell` sees it after each."""
+    if aim.sigma_max is not None:
+        plan = [one for stage in plan for one in (stage.apart() if stage.friction == 1 else [stage])]
     for stage in plan:
         if over():
             break

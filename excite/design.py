@@ -12,7 +12,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ import numpy as np
 from excite import aim as aims
 from excite import objective as objectives
 from excite.aim import SIGMA_MAX, Aim
-from excite.continuation import PLAN, SCOUTS, Candidate, Track, depart, promise, rank, refine, repair, search
+from excite.continuation import PLAN, SCOUTS, Candidate, Track, depart, promise, rank, refine, repair, resume, search
 from excite.limit import InfeasibleError
 from excite.manoeuvre import Manoeuvre
 from excite.simulate import Motion, simulate
@@ -64,11 +64,13 @@ def design(
     seed: int = 0,
     budget_s: float | None = None,
     progress: Report | None = None,
+    warm: Sequence[Manoeuvre] = (),
 ) -> Design:
     """The best drive of several starts, each from its own random multisine, in parallel processes.
 
     Every start goes through the first stages, the most promising third (two at least) to the end. objective: a name, or
-    an `aim` that puts it together with an accuracy to keep, what is known before, or other machines.
+    an `aim` that puts it together with an accuracy to keep, what is known before, or other machines. warm: drives to
+    start from as well, which go straight to the last stages; starts may be 0 then.
     progress(done, total, best score so far) is called as stages finish. budget_s [s], half of it for the
     first stages, ends the search early with the best feasible drive so far, and so does Ctrl-C (KeyboardInterrupt
     where there is none yet). The same seed gives the same design where neither cuts in.
@@ -76,12 +78,13 @@ def design(
     Raises InfeasibleError with the limit that can't be met and by how much, KeyError for an unknown objective.
     """
     aim = aims.aim(model, objective) if isinstance(objective, str) else objective
-    if starts < 1:
+    if starts < (0 if warm else 1):
         raise ValueError(f"starts must be at least 1, got {starts}")
     now = time.time()
     half, deadline = (None, None) if budget_s is None else (now + budget_s / 2, now + budget_s)
     seeds = np.random.SeedSequence(seed).generate_state(starts)
-    kept = min(starts, max(2, -(-starts // 3)))
+    kept = min(starts, max(2, -(-starts // 3))) + len(warm)
+    guesses: list[int | Manoeuvre] = [*(int(s) for s in seeds), *warm]
     tracks: dict[int, Track] = {}
     with (
         _interruptible() as stop,
@@ -91,16 +94,17 @@ def design(
         # loky even for one start: only there can the number of threads of the linear algebra be set
         run = joblib.Parallel(n_jobs=max(2, os.cpu_count() or 1), return_as="generator_unordered")
         call = joblib.delayed(_carry)
-        for track in run(call(model, problem, aim, k, int(s), None, half, stop) for k, s in enumerate(seeds)):
+        for track in run(call(model, problem, aim, k, g, None, half, stop) for k, g in enumerate(guesses)):
             if track is not None:
                 tracks[track.number] = track
-        chosen = sorted(tracks.values(), key=lambda t: (promise(t.latest), t.number))[:kept]
+        ranked = sorted(tracks.values(), key=lambda t: (t.number < starts, promise(t.latest), t.number))
+        chosen = ranked[:kept]
         for track in run(call(model, problem, aim, t.number, 0, t, deadline, stop) for t in chosen):
             if track is not None:
                 tracks[track.number] = track
         interrupted = stop.exists()
     best = min(tracks.values(), key=lambda t: (*rank(t.best), t.number))
-    complete = len(tracks) == starts and all(tracks[t.number].complete for t in chosen)
+    complete = len(tracks) == len(guesses) and all(tracks[t.number].complete for t in chosen)
     if not best.best.feasible:
         if interrupted:
             raise KeyboardInterrupt
@@ -116,7 +120,7 @@ def design(
         min(t.guess for t in tracks.values()),
         dict(drive.violations),
         drive.excess,
-        tuple(_score(aim, tracks[k].best) if k in tracks else float("inf") for k in range(starts)),
+        tuple(_score(aim, tracks[k].best) if k in tracks else float("inf") for k in range(len(guesses))),
         complete,
     )
 
@@ -195,12 +199,12 @@ def _carry(
     problem: Problem,
     aim: Aim,
     number: int,
-    seed: int,
+    guess: int | Manoeuvre,
     track: Track | None,
     deadline: float | None,
     stop: Path,
 ) -> Track | None:
-    """In a worker: a start through the first stages, or one that was chosen through the others.
+    """In a worker: a start (a seed or a drive) through the first stages, or one that was chosen through the others.
 
     None for a start that comes too late; the first one never does.
     """
@@ -219,7 +223,9 @@ def _carry(
     if track is None:
         if number > 0 and over():
             return None
-        return search(model, problem, aim, depart(model, problem, aim, number, seed), PLAN[:SCOUTS], over, tell)
+        if isinstance(guess, Manoeuvre):
+            return resume(model, problem, aim, number, guess)
+        return search(model, problem, aim, depart(model, problem, aim, number, guess), PLAN[:SCOUTS], over, tell)
     track = search(model, problem, aim, track, PLAN[SCOUTS:], over, tell)
     if not over():
         track = refine(model, problem, aim, track, over, tell)

@@ -389,3 +389,12 @@ def test_r60_within_a_triangle_and_with_two_reversals(roller: Model) -> None:
     area = MplPath(np.array(corners))
     for i in (0, 4):
         assert area.contains_points(places[:2, :, bodies.index(i)].T, radius=0.05).all()
+
+
+def test_a_drive_to_start_from_is_not_made_worse(straight: Model, quick: Design) -> None:
+    problem = shorter(straight, 12.0)
+    again = design(straight, problem, starts=0, warm=[quick.manoeuvre])
+    assert again.cond_phi <= quick.cond_phi * (1 + 1e-9)
+    assert again.max_violation <= TOLERANCE
+    with pytest.raises(ValueError, match="at least 1"):
+        design(straight, problem, starts=0)
