@@ -210,11 +210,17 @@ def drive(
     ] = None,
     shortest: Annotated[float, typer.Option("--shortest", help="of a phase [s]")] = 2.0,
     seed: SeedOption = 0,
+    serve: Annotated[bool, typer.Option("--serve", help="show the page with live values until Ctrl-C")] = False,
+    live: Annotated[Path | None, typer.Option("--live", help="log (.csv) that grows, for --serve")] = None,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="for --serve; 0: any free one")] = 8765,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Turns a design into a drive that a person can follow: the driver's sheet (PDF)."""
+    """Turns a design into a drive that a person can follow: sheet (PDF) and page (HTML) for the driver."""
     from excite import cab, folder, stored
+
+    if (live is not None or port != 8765) and not serve:
+        raise UsageError("--live and --port are for --serve, give that too")
 
     name = stored.summary(design_dir)["machine"]
     out = out or Path(f"results/drive-{name}")
@@ -226,6 +232,8 @@ def drive(
         summary["versions"] = _versions()
         (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
     terminal.finish(summary, out, json, terminal.drive_table)
+    if serve:
+        cab.serve(out, made, port, live, lambda address: typer.echo(f"{address} (Ctrl-C ends)", err=True))
 
 
 @app.command()
@@ -597,13 +605,14 @@ def _exit_code(err: Exception) -> int | None:
     from excite.folder import FolderError
     from excite.limit import InfeasibleError
     from excite.log import LogError
+    from excite.serve import ServeError
     from excite.simulate import SimulationError
     from excite.stored import StoredError
     from model.machine import MachineError
 
     if isinstance(err, UsageError | MachineError | LogError | FolderError | StoredError | DriveError):
         return 2
-    if isinstance(err, NoEstimate | InfeasibleError | SimulationError):
+    if isinstance(err, NoEstimate | InfeasibleError | SimulationError | ServeError):
         return 1
     return None
 

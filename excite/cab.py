@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,8 +11,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from excite import drive, sheet
+from excite import drive, page, sheet
 from excite.drive import DriveError, Score, Trace
+from excite.serve import Tail, run
 from excite.sheet import Sheet
 from excite.simulate import Motion, SimulationError
 from excite.stored import Stored
@@ -18,6 +21,7 @@ from model.machine import Problem
 from model.prediction import Model
 
 PEOPLE = 3  # drives by different people, in simulation
+PAGE = "driver.html"
 NEAR = 0.8  # of the articulation's stop
 Progress = Callable[[int, int, float | None], None]
 
@@ -154,9 +158,18 @@ def summary(made: Sheet) -> dict[str, Any]:
 
 
 def write(made: Sheet, place: Path) -> dict[str, Any]:
-    """sheet.pdf and phases.csv into a folder; returns the numbers."""
+    """sheet.pdf, driver.html and phases.csv into a folder; returns the numbers."""
     sheet.save(made, place / "sheet.pdf")
+    (place / PAGE).write_text(page.driver_page(made.model, made.trace, made.title), encoding="utf-8")
     t = made.trace.times
     knots = pd.DataFrame({"t_s": t, "v_m_s": made.trace.speed, "angle_rad": made.trace.angle})
     knots.to_csv(place / "phases.csv", index=False)
     return summary(made)
+
+
+def serve(out: Path, made: Sheet, port: int, live: Path | None, ready: Callable[[str], None]) -> None:
+    """The page of a written folder with live values, until Ctrl-C; `ready` gets its address. Raises ServeError."""
+    text = (out / PAGE).read_text(encoding="utf-8")
+    tail = Tail(live, made.model.machine) if live is not None else None
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(run(text, port, tail, ready))

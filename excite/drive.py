@@ -232,15 +232,20 @@ def words(trace: Trace, k: int, letters: bool = False) -> str:
 
     `letters`: with the names that changes of direction have on the map.
     """
+    return ", ".join(part for part in parts(trace, k, letters) if part)
+
+
+def parts(trace: Trace, k: int, letters: bool = False) -> tuple[str, str]:
+    """What to do in phase k with the speed lever and with the wheel, the latter empty where nothing is steered."""
     start, end = float(trace.times[k]), float(trace.times[k + 1])
     took = end - start
     v0, v1 = float(trace.speed[k]), float(trace.speed[k + 1])
     names = [letter(n) for n, t in enumerate(reversals(trace)) if letters and start < t < end]
     go = _speed_words(v0, v1, took, start, names[0] if names else "")
     if trace.left == 0:
-        return go
+        return go, ""
     steer = _steer_words(trace.left * float(trace.angle[k]), trace.left * float(trace.angle[k + 1]), took)
-    return f"{go}, {steer}"
+    return go, steer
 
 
 def _speed_words(v0: float, v1: float, took: float, start: float, name: str) -> str:

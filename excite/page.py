@@ -1,0 +1,66 @@
+"""Self-contained web pages: the driver's aid and the reports. One file each, no network, from the templates."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from excite import drive
+from excite.drive import Trace
+from model.prediction import Model
+
+TIMES = re.compile(r" (in|for) [\d.]+ s| at \d+:[\d.]+")  # the page counts down, so its words need no times
+
+
+@lru_cache(maxsize=1)
+def _templates() -> jinja2.Environment:
+    loader = jinja2.PackageLoader("excite", "templates")
+    return jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+
+
+def driver_page(model: Model, trace: Trace, title: str) -> str:
+    """The driver's aid: a moving reference of speed and articulation, with the countdown to what comes next.
+
+    It shows what was driven beside it, from a log in the machine's own columns or from `serve`, and scores it.
+    """
+    return _templates().get_template("driver.html").render(data=driver_data(model, trace, title))
+
+
+def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
+    """What the page knows: the trace (angles in degrees, positive to the left), its phases in words, the columns."""
+    machine = model.machine
+    degrees = trace.left * 180 / np.pi
+    by_body = {s.body: s for s in machine.sensors("full") if s.kind == "angle"}
+    rolls = [
+        {"column": by_body[b.index].column, "gain": float(b.contact.radius) * float(by_body[b.index].factor)}
+        for b in machine.contacts
+        if b.contact is not None and b.index in by_body
+    ]
+    wheel = drive.steered(model)
+    sensor = by_body.get(wheel.index) if wheel is not None else None
+    angle = {
+        "column": sensor.column if sensor else "",
+        "gain": degrees * float(sensor.factor) if sensor else 0.0,
+        "degrees": degrees,
+    }
+    words = [drive.parts(trace, k) for k in range(len(trace))]
+    words = [(TIMES.sub("", go), steer) for go, steer in words]
+    return {
+        "title": title,
+        "times": trace.times.tolist(),
+        "speed": trace.speed.tolist(),
+        "angle": (degrees * trace.angle).tolist(),
+        "steers": trace.left != 0,
+        "phases": [
+            {"start": float(t), "go": go, "steer": steer}
+            for t, (go, steer) in zip(trace.times[:-1], words, strict=True)
+        ],
+        "band": {"speed": drive.BAND_SPEED, "angle": float(np.rad2deg(drive.BAND_ANGLE)), "time": drive.BAND_S},
+        "log": {"time": machine.time_column, "rolls": rolls, "angle": angle},
+    }

@@ -1,0 +1,394 @@
+"""The driver's page in a real browser, and the server behind it: timing, hands, score, size, who may connect."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from excite import drive, page, sensors, serve
+from excite.drive import Trace
+from model.prediction import Model
+
+TRACE = Trace(
+    np.array([0.0, 3, 6, 8.5, 11, 14]), np.array([0.0, 1.2, 1.2, 0, -0.8, 0]), -np.array([0.0, 0, 0.3, 0.3, 0, 0]), -1
+)
+STARTS = [0.0, 3, 6, 8.5, 11]
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("no Chromium on this machine (Debian: apt install chromium)")
+    with api.sync_playwright() as play:
+        chromium = play.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture(scope="module")
+def html(va12: Model) -> str:
+    return page.driver_page(va12, TRACE, "A drive")
+
+
+class Tab:
+    """The page open in a phone held sideways, with what its console said."""
+
+    def __init__(self, browser: Any, address: str, fake: bool, size: tuple[int, int] = (844, 390)) -> None:
+        self.context = browser.new_context(
+            viewport={"width": size[0], "height": size[1]}, has_touch=True, reduced_motion="reduce"
+        )
+        self.page = self.context.new_page()
+        self.said: list[str] = []
+        self.page.on("console", lambda message: self.said.append(message.text))
+        self.page.on("pageerror", lambda error: self.said.append(str(error)))
+        self.page.on("request", lambda r: self.said.append(r.url) if not r.url.startswith(("file:", "data:")) else None)
+        if fake:
+            self.page.clock.install(time=0)
+        self.page.goto(address)
+        if fake:
+            self.page.clock.pause_at(1000)
+
+    def shows(self, id: str, text: str) -> None:
+        self.page.locator(id, has_text=text).wait_for(state="attached", timeout=8000)
+
+    def text(self, id: str) -> str:
+        return str(self.page.inner_text(id))
+
+    def seconds(self) -> float:
+        return float(self.page.evaluate("aid.time()"))
+
+
+@pytest.fixture
+def open_page(browser: Any, html: str, tmp_path: Path) -> Iterator[Callable[..., Tab]]:
+    tabs: list[Tab] = []
+    path = tmp_path / "driver.html"
+    path.write_text(html, encoding="utf-8")
+
+    def open(fake: bool = True, size: tuple[int, int] = (844, 390)) -> Tab:
+        tabs.append(Tab(browser, path.as_uri(), fake, size))
+        return tabs[-1]
+
+    yield open
+    for tab in tabs:
+        tab.context.close()
+        assert tab.said == []  # no error, no warning, no network
+
+
+def test_page_is_one_file_without_network(html: str) -> None:
+    assert re.findall(r"https?://[\w.]+", html) == []
+    assert re.findall(r'(?:src|href)="(?!data:)[^"]*"', html) == []
+    assert "default-src 'none'" in html
+
+
+def test_title_cannot_break_out_of_the_page(va12: Model) -> None:
+    evil = "</script><script>alert(1)</script>"
+    assert evil not in page.driver_page(va12, TRACE, evil)
+
+
+def test_phases_come_on_time_over_a_drive(open_page: Callable[..., Tab]) -> None:
+    """Every phase appears within 50 ms of its time, whatever frames do; the clock never drifts."""
+    tab = open_page()
+    tab.page.tap("#start")
+    shown = []
+    for _ in range(19):
+        tab.page.clock.run_for(1000)
+        shown.append(tab.seconds())
+    assert np.abs(np.array(shown[:18]) - np.arange(-4, 14)).max() < 0.05
+    tab.page.clock.run_for(50)  # the frame that sees the end
+    events = tab.page.evaluate("aid.events")
+    assert [e["phase"] for e in events if e["phase"] >= 0] == [0, 1, 2, 3, 4]
+    begin = events[0]["clock"] / 1000 - events[0]["t"]
+    for event, due in zip([e for e in events if e["phase"] >= 0], STARTS, strict=True):
+        assert 0 <= event["clock"] / 1000 - begin - due < 0.05
+    assert tab.text("#action").startswith("Finished")
+    assert tab.text("#start") == "Again"
+
+
+def test_what_the_driver_reads(open_page: Callable[..., Tab]) -> None:
+    tab = open_page()
+    assert tab.text("#action") == "Get ready: accelerate to 1.2 m/s"
+    tab.page.tap("#start")
+    tab.page.clock.run_for(5000 + 4200)
+    assert tab.text("#action") == "hold 1.2 m/s, steer to 17° left"
+    assert tab.text("#next") == "then brake to a stop, keep 17° left"
+    assert tab.text("#count") == "2"
+    assert tab.page.get_attribute("#now", "class") == "soon"
+    assert tab.text("#speed .value") == "1.2 m/s"
+    assert tab.text("#angle .value") == "7° left"
+    assert tab.text("#clock") == "0:04 / 0:14"
+    tab.page.keyboard.press("u")
+    tab.page.clock.run_for(50)
+    assert tab.text("#speed .value") == "4.3 km/h"
+    assert tab.text("#action").startswith("hold 4.3 km/h")
+
+
+def test_start_pause_and_repeat_by_touch_and_key(open_page: Callable[..., Tab]) -> None:
+    tab = open_page()
+    tab.page.clock.run_for(3000)
+    assert tab.seconds() == -5
+    tab.page.keyboard.press("Space")
+    tab.page.clock.run_for(8000)
+    tab.page.tap("#start")
+    paused = tab.seconds()
+    assert paused == pytest.approx(3, abs=0.05)
+    assert tab.text("#start") == "Go on"
+    tab.page.clock.run_for(10_000)
+    assert tab.seconds() == paused
+    tab.page.tap("#start")
+    tab.page.clock.run_for(2000)
+    assert tab.seconds() == pytest.approx(paused + 2, abs=0.05)
+    tab.page.keyboard.press("r")
+    assert tab.seconds() == pytest.approx(-5, abs=0.05)
+    tab.page.clock.run_for(6000)
+    assert tab.seconds() == pytest.approx(1, abs=0.05)
+    tab.page.tap("#repeat")
+    assert tab.seconds() == pytest.approx(-5, abs=0.05)
+    tab.page.tap("#sound")
+    assert tab.page.get_attribute("#sound", "aria-pressed") == "false"
+
+
+def test_real_time_is_kept(open_page: Callable[..., Tab]) -> None:
+    """Against this process's own clock: what is painted is the time within 50 ms, after seconds as at the start."""
+    tab = open_page(fake=False)
+    tab.page.keyboard.press("s")
+    tab.page.tap("#start")
+    lags, drifts = [], []
+    for _ in range(10):
+        before = time.perf_counter()
+        now, painted = tab.page.evaluate("[aid.time(), Number(document.body.dataset.t)]")
+        after = time.perf_counter()
+        drifts.append(now - (before + after) / 2)
+        lags.append(now - painted)
+        time.sleep(0.35)
+    assert np.ptp(drifts) < 0.05
+    assert float(np.median(lags)) < 0.05
+
+
+@pytest.mark.parametrize("size", [(844, 390), (667, 375), (1280, 800), (390, 844)])
+def test_everything_fits_and_is_big(open_page: Callable[..., Tab], size: tuple[int, int]) -> None:
+    tab = open_page(size=size)
+    tab.page.tap("#start")
+    for wait in (100, 6000, 3500, 2500, 2500, 2500):
+        tab.page.clock.run_for(wait)
+        for id in ("#now", "#words", "#targets", "#bar", "body"):
+            high, room = tab.page.evaluate(f"(e => [e.scrollHeight, e.clientHeight])(document.querySelector('{id}'))")
+            assert high <= room + 1, (id, tab.text("#action"))
+    style = "e => parseFloat(getComputedStyle(e).fontSize)"
+    short = min(size)
+    assert tab.page.eval_on_selector("#count", style) >= 0.16 * short  # 10 mm and more on a phone: read at two metres
+    assert tab.page.eval_on_selector("#speed .value", style) >= 0.10 * short
+    for id in ("#start", "#repeat"):
+        assert tab.page.locator(id).bounding_box()["height"] >= 40
+    seen = tab.page.evaluate(
+        "(c => { const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
+        " let dark = 0; for (let k = 0; k < d.length; k += 4) dark += d[k + 3] > 200 && d[k] < 60; return dark; })"
+        "(document.getElementById('trace'))"
+    )
+    assert seen > 500
+
+
+@pytest.fixture(scope="module")
+def followed(va12: Model) -> pd.DataFrame:
+    return sensors.measure(va12, drive.driven(va12, TRACE, None, 4), seed=1)
+
+
+def test_a_log_is_replayed_and_scored(
+    open_page: Callable[..., Tab], va12: Model, followed: pd.DataFrame, tmp_path: Path
+) -> None:
+    """The page's score is that of the band, computed here from the same log."""
+    followed.to_csv(tmp_path / "log.csv", index=False)
+    t = followed["t_s"].to_numpy()
+    turned = 0.65 * (followed["theta1_rad"] + followed["theta4_rad"]).to_numpy() / 2
+    near, far = np.maximum(np.arange(len(t)) - 10, 0), np.minimum(np.arange(len(t)) + 10, len(t) - 1)
+    speed = (turned[far] - turned[near]) / (t[far] - t[near])
+    angle = followed["theta2_rad"].to_numpy()
+    wanted = TRACE.at(t)
+    inside = []
+    for value, reference, tolerance in zip((speed, angle), wanted, (drive.BAND_SPEED, drive.BAND_ANGLE), strict=True):
+        low, high = drive.band(t, reference, tolerance)
+        inside.append((value >= low) & (value <= high))
+    tab = open_page()
+    tab.page.set_input_files("#log", tmp_path / "log.csv")
+    tab.shows("#note", "begins")
+    assert "1401 rows, the drive begins at 0.0 s" in tab.text("#note")
+    tab.page.tap("#start")
+    tab.page.clock.run_for(5000 + 5000)
+    k = round(100 * tab.seconds())
+    assert tab.text("#speed .seen") == f"is {speed[k]:.1f} m/s"
+    assert tab.text("#angle .seen").endswith("left")
+    tab.page.clock.run_for(10_000)
+    score = tab.page.evaluate("aid.score()")
+    assert score["samples"] == 1401
+    assert score["speed_percent"] == pytest.approx(100 * inside[0].mean(), abs=0.3)
+    assert score["angle_percent"] == pytest.approx(100 * inside[1].mean(), abs=0.3)
+    assert score["in_band_percent"] == pytest.approx(100 * (inside[0] & inside[1]).mean(), abs=0.3)
+    assert score["speed_rms_m_s"] == pytest.approx(np.sqrt(np.mean((speed - wanted[0]) ** 2)), rel=0.01)
+    assert score["angle_rms_deg"] == pytest.approx(np.rad2deg(np.sqrt(np.mean((angle - wanted[1]) ** 2))), rel=0.01)
+    assert f"{score['in_band_percent']:.0f} % of the time" in tab.text("#next")
+
+
+def test_a_log_that_began_earlier_is_found_in_time(
+    open_page: Callable[..., Tab], followed: pd.DataFrame, tmp_path: Path
+) -> None:
+    """Five seconds at rest before the drive, decimal commas: the drive is found in it, as late as the driver was."""
+    early = followed.reindex(np.maximum(np.arange(-500, len(followed) + 300), 0), method="nearest")
+    early = early.iloc[:].reset_index(drop=True).assign(t_s=lambda x: np.arange(len(x)) / 100)
+    early.to_csv(tmp_path / "log.csv", index=False, sep=";", decimal=",")
+    tab = open_page()
+    tab.page.set_input_files("#log", tmp_path / "log.csv")
+    tab.shows("#note", "begins")
+    found = re.search(r"begins at ([\d.]+) s", tab.text("#note"))
+    assert found
+    assert 5.0 <= float(found[1]) <= 6.3
+    followed.drop(columns=["theta2_rad"]).to_csv(tmp_path / "other.csv", index=False)
+    tab.page.set_input_files("#log", tmp_path / "other.csv")
+    tab.shows("#note", "no column")
+    assert tab.text("#note") == "the log has no column theta2_rad"
+
+
+# ------------------------------------------------------------------------------------------------ the server
+
+
+@contextmanager
+def running(html: str) -> Iterator[tuple[str, Callable[[dict[str, float]], None]]]:
+    loop, ready = asyncio.new_event_loop(), threading.Event()
+    found: dict[str, Any] = {}
+
+    async def work() -> None:
+        found["end"] = asyncio.Event()
+        async with serve.serving(html) as (server, send):
+            found["address"] = f"127.0.0.1:{server.sockets[0].getsockname()[1]}"
+            found["send"] = send
+            ready.set()
+            await found["end"].wait()
+
+    thread = threading.Thread(target=loop.run_until_complete, args=(work(),), daemon=True)
+    thread.start()
+    assert ready.wait(10)
+    try:
+        yield found["address"], lambda said: loop.call_soon_threadsafe(found["send"], said)
+    finally:
+        loop.call_soon_threadsafe(found["end"].set)
+        thread.join(20)
+        loop.close()
+
+
+def test_live_values_are_shown(browser: Any, html: str) -> None:
+    with running(html) as (address, send):
+        tab = Tab(browser, f"http://{address}/", fake=False)
+        tab.shows("#note", "live values")
+        send({"v_m_s": 0.74, "angle_rad": -0.2})
+        tab.shows("#speed .seen", "is 0.7 m/s")
+        assert tab.text("#angle .seen") == "is 11° left"  # what is negative turns this machine to the left
+        with connect(f"ws://{address}/live") as logger:
+            logger.send(json.dumps({"t_s": 1, "v_m_s": -0.3, "angle_rad": 0.1}))
+            tab.shows("#speed .seen", "is -0.3 m/s")
+        assert [s for s in tab.said if "127.0.0.1" not in s] == []
+        tab.context.close()
+
+
+def test_pages_from_elsewhere_are_refused(html: str) -> None:
+    with running(html) as (address, _):
+        port = int(address.split(":")[1])
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(f"ws://{address}/live", origin="https://evil.example")
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(f"ws://{address}/live", origin="null")
+        with connect(f"ws://{address}/live", origin=f"http://{address}"):  # type: ignore[arg-type]
+            pass
+        for host, status in (
+            (f"evil.example:{port}", b"403"),
+            (address, b"200"),
+        ):  # a name that points here (rebinding)
+            with socket.create_connection(("127.0.0.1", port)) as plain:
+                plain.sendall(f"GET / HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+                answer = plain.recv(1000)
+            assert answer.split()[1] == status
+        assert socket.gethostbyname("localhost") == "127.0.0.1"
+        with pytest.raises(OSError, match=r"."):
+            socket.create_connection((_other_address(), port), timeout=2)
+
+
+def _other_address() -> str:
+    """An address of this machine that is not the loopback one the server listens on."""
+    return "127.0.0.2"
+
+
+@pytest.mark.parametrize(
+    ("message", "code"),
+    [
+        ("x" * 2000, 1009),
+        ("not json", 1007),
+        ('{"v_m_s": "fast"}', 1007),
+        ('{"v_m_s": NaN}', 1007),
+        ('{"v_m_s": 1, "evil": 2}', 1007),
+        ("[1, 2]", 1007),
+        ('{"angle_rad": 1}', 1007),
+    ],
+)
+def test_bad_messages_end_the_connection(html: str, message: str, code: int) -> None:
+    with running(html) as (address, _), connect(f"ws://{address}/live") as listener:
+        with connect(f"ws://{address}/live") as logger:
+            logger.send(message)
+            with pytest.raises(ConnectionClosed) as end:
+                logger.recv(timeout=5)
+            assert end.value.rcvd is not None
+            assert end.value.rcvd.code == code
+        with pytest.raises(TimeoutError):
+            listener.recv(timeout=0.1)
+
+
+def test_growing_log_becomes_values(va12: Model, followed: pd.DataFrame, tmp_path: Path) -> None:
+    """Written in pieces that end anywhere, even within a number: every row counts once, nothing is misread."""
+    path = tmp_path / "log.csv"
+    tail = serve.Tail(path, va12.machine)
+    assert tail.new() == []
+    text = followed.to_csv(index=False)
+    said = []
+    for a, b in zip([0, 333, 5000, 5001, 40_000], [333, 5000, 5001, 40_000, len(text)], strict=True):
+        with path.open("a", newline="") as file:
+            file.write(text[a:b])
+        said += tail.new()
+    assert len(said) == len(followed) - 1
+    turned = 0.65 * (followed["theta1_rad"] + followed["theta4_rad"]).to_numpy() / 2
+    assert said[499]["v_m_s"] == pytest.approx((turned[500] - turned[480]) / 0.2)
+    assert said[499]["angle_rad"] == pytest.approx(followed["theta2_rad"][500])
+    path.write_text("t_s,other\n")
+    assert tail.new() == []
+
+
+@pytest.mark.slow
+def test_serve_command_shows_the_page_until_it_is_stopped(tmp_path: Path) -> None:
+    design = Path(__file__).parents[1] / "results" / "S40" / "design"
+    command = [sys.executable, "-m", "excite", "drive", design, "--phases", "6", "--serve", "--port", "0"]
+    with subprocess.Popen(
+        [*command, "--out", tmp_path / "d"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as run:
+        assert run.stderr is not None
+        address = run.stderr.readline().split()[0]
+        port = int(address.rstrip("/").rpartition(":")[2])
+        with socket.create_connection(("127.0.0.1", port)) as plain:
+            plain.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode())
+            assert b"200" in plain.recv(100)
+        run.terminate()
+        assert run.wait(20) == 0
+    assert (tmp_path / "d" / "driver.html").is_file()
