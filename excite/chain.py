@@ -113,11 +113,8 @@ def solve(parts: Sequence[Section]) -> Solved:
     return Solved(sum((p.Z for p in parts), top.Z), top, tuple(parts))
 
 
-def section(stages: Stages, keep: bool = True) -> Section:
-    """Stages joined pair by pair: about log2(K) batched levels. Some 100 at a time stay in the processor's cache.
-
-    Without `keep` the states between the stages can't be found afterwards.
-    """
+def section(stages: Stages) -> Section:
+    """Stages joined pair by pair: about log2(K) batched levels. Some 100 at a time stay in the processor's cache."""
     n, c = stages.b.shape[1:]
     Z = np.zeros((c, c))
     levels: list[_Level] = []
@@ -142,8 +139,7 @@ def section(stages: Stages, keep: bool = True) -> Section:
             i.eta + back[:, :, n:],
             (J + J.transpose(0, 2, 1)) / 2,
         )
-        if keep:
-            levels.append(_Level(G, i, j, len(stages)))
+        levels.append(_Level(G, i, j, len(stages)))
         if len(stages) % 2:
             rest = stages.part(slice(-1, None))
             joined = Stages(*(np.concatenate([getattr(joined, f), getattr(rest, f)]) for f in FIELDS))

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from excite import chain, hidden
 from excite.estimate import Estimate, NoEstimate, NotIdentifiable
-from excite.linearise import BATCH, Chart, Slopes, advance, chart, differentiate
+from excite.innovations import innovation_sizes
+from excite.linearise import BATCH, Chart, advance, chart, differentiate
 from excite.log import Log
 from excite.processing import decimate
 from excite.record import (
@@ -54,7 +54,6 @@ LARGEST_STEP = 0.5  # of a parameter in one pass, relative to its size
 DISTURBANCE = 0.045
 DISTURBED = (1.0, 4.0, 16.0)
 SUSPECT = 2.5  # mean square of innovations, all or slow ones, that the model can't explain; null logs stay below 1.6
-BLOCK = 25  # readings whose mean counts as slow
 SHORTER = 8  # times that a step is halved
 DOUBT = (
     "the log shows something that the model doesn't know, so the intervals do not hold: these values allow for"
@@ -76,7 +75,8 @@ class Linear:
 
     Z: twice the negative log-likelihood is [1 p]' Z [1 p] for steps p of parameters and offsets, scaled. gain
     (N - 1, n, n_u): what a torque error of one standard deviation does to the scaled state. stages: by part of the
-    log. H (N, m, n), weight, residual (N, m): the readings.
+    log. H (N, m, n), weight, residual (N, m): the readings; direct (N, m, n_f + n_o): how they move with flaws of
+    sensors and offsets.
     """
 
     solved: chain.Solved
@@ -86,15 +86,7 @@ class Linear:
     H: np.ndarray
     weight: np.ndarray
     residual: np.ndarray
-
-
-class Beyond(Protocol):
-    """What C effects that are not in the model would add along a log, at samples first .. last: generalised forces
-    (K, n_q, C), delivered torques (K, n_u, C) and readings (K, m, C)."""
-
-    columns: int
-
-    def __call__(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
+    direct: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -257,7 +249,7 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
     none = np.zeros((len(state), len(c.sensors)))
     r = Record(c.measured(motion.u, X), none, none, counts, origins(c, counts), noise)
     p = Point(state, np.zeros_like(motion.u[1:]), np.zeros(len(r.origin)))
-    linear = _linearise(c, expected(c, r, p, motion.u, X), p, state[0], X, 0.0, exact=True)
+    linear = linearise(c, expected(c, r, p, motion.u, X), p, state[0], X, 0.0, exact=True)
     assert linear is not None
     information = linear.Z[1:, 1:].copy()
     information[np.diag_indices(len(information))] += np.concatenate(
@@ -266,7 +258,7 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
     return np.asarray(np.linalg.inv(information)[: len(X), : len(X)] * np.outer(model.scale, model.scale))
 
 
-def _linearise(
+def linearise(
     c: Chart,
     r: Record,
     p: Point,
@@ -274,12 +266,10 @@ def _linearise(
     X: np.ndarray,
     disturbed: float,
     exact: bool = False,
-    beyond: Beyond | None = None,
 ) -> Linear | None:
     """The chain of a log about a point; None where the motion can't be integrated. first (n,): guess of s[0].
 
-    `exact`: the point is a motion of the machine, which needs no integration. With `beyond` its effects are columns
-    behind parameters and offsets, and the chain is reduced to Z only.
+    `exact`: the point is a motion of the machine, which needs no integration.
     """
     delivered, behind = c.delivered(r.torque, X)
     if exact:
@@ -292,86 +282,48 @@ def _linearise(
     h, H, weight, D, flaws = readings(c, r, p, u, X)
     residual = np.zeros_like(h) if exact else np.where(r.used > 0, r.reading - h, 0.0)
     flaws = flaws * c.model.scale[list(c.flawed)]
-    scale, n_p, n_o = _scale(c), len(X), len(r.origin)
-    n_e = 0 if beyond is None else beyond.columns
+    scale, n_p, n_o = state_scale(c), len(X), len(r.origin)
     S, unit = H * scale, one_count(c, r)
-    parts, stages, gains = [_known_before(c, p, first, 1 + n_p + n_o + n_e)], [], []
-    direct: list[np.ndarray] = []
+    parts, stages, gains = [_known_before(c, p, first, 1 + n_p + n_o)], [], []
     N = len(p.s)
     for at in range(0, N - 1, BATCH):
         until = min(at + BATCH, N - 1)
-        by = differentiate(c, p.s[at : until + 1], u[at : until + 1], X, disturbed > 0 or n_e > 0)
+        by = differentiate(c, p.s[at : until + 1], u[at : until + 1], X, disturbed > 0)
         gain = by.B * r.noise.torque / scale[:, None]
         C = gain @ gain.transpose(0, 2, 1)
         if disturbed > 0:
             push = by.F * (disturbed * DISTURBANCE * c.inertia) / scale[:, None]
             C += push @ push.transpose(0, 2, 1)
         A = by.A * (scale / scale[:, None])
-        b = np.zeros((until - at, c.n, 1 + n_p + n_o + n_e))
+        b = np.zeros((until - at, c.n, 1 + n_p + n_o))
         b[:, :, 0] = defect[at:until] / scale - (gain @ (p.w[at:until] / r.noise.torque)[:, :, None])[:, :, 0]
         b[:, :, 1 : 1 + n_p] = (by.X + by.B @ behind[at:until]) * (c.model.scale / scale[:, None])
-        if beyond is not None:
-            force, torque, reading = beyond(at, until + 1)
-            b[:, :, 1 + n_p + n_o :] = _pushed(c, by, force, torque) / scale[:, None]
-            direct.append(_direct(residual, flaws, D * unit, weight, reading[:-1], at))
         gains.append(gain)
         for k in range(at, until, PART):
             end = min(k + PART, until)
             J, eta = _seen(c, S[k:end], weight[k:end], residual[k:end], D * unit, flaws[k:end])
-            if beyond is not None:
-                eta = np.concatenate([eta, _read(S[k:end], weight[k:end], reading[k - at : end - at])], axis=2)
             own = slice(k - at, end - at)
             stages.append(chain.Stages(A[own], b[own], C[own], eta, J))
-            parts.append(chain.section(stages[-1], keep=beyond is None))
+            parts.append(chain.section(stages[-1]))
     # From the last sample nothing leads on.
     J, eta = _seen(c, S[-1:], weight[-1:], residual[-1:], D * unit, flaws[-1:])
-    if beyond is not None:
-        eta = np.concatenate([eta, _read(S[-1:], weight[-1:], reading[-1:])], axis=2)
-        direct.append(_direct(residual, flaws, D * unit, weight, reading[-1:], N - 1))
     none = np.zeros_like(J)
     stages.append(chain.Stages(none, np.zeros_like(eta), none, eta, J))
     parts.append(chain.section(stages[-1]))
     solved = chain.solve(parts)
     # What the readings say directly of offsets and of flaws of sensors; other parameters act through the states alone.
-    if beyond is None:
-        direct = [_direct(residual, flaws, D * unit, weight, np.zeros((*residual.shape, 0)), 0)]
+    direct = np.concatenate([flaws, np.broadcast_to(D * unit, (*residual.shape, n_o))], axis=2)
+    flat = np.concatenate([residual[:, :, None], -direct], axis=2) * np.sqrt(weight)[:, :, None]
+    flat = flat.reshape(-1, flat.shape[2])
     Z = solved.Z.copy()
-    place = np.concatenate([[0], 1 + np.array(c.flawed, int), np.arange(1 + n_p, 1 + n_p + n_o + n_e)])
-    Z[np.ix_(place, place)] += sum(direct)
-    return Linear(solved, Z, np.concatenate(gains), tuple(stages), S, weight, residual)
-
-
-def _direct(
-    residual: np.ndarray, flaws: np.ndarray, D: np.ndarray, weight: np.ndarray, reading: np.ndarray, at: int
-) -> np.ndarray:
-    """The quadratic form of readings at .. at + K in what they show by themselves: data, flaws, offsets, effects."""
-    own = slice(at, at + len(reading))
-    offsets = np.broadcast_to(-D, (*reading.shape[:2], D.shape[1]))
-    flat = np.concatenate([residual[own, :, None], -flaws[own], offsets, -reading], axis=2)
-    flat = (flat * np.sqrt(weight[own])[:, :, None]).reshape(-1, flat.shape[2])
-    form: np.ndarray = flat.T @ flat
-    return form
-
-
-def _pushed(c: Chart, by: Slopes, force: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """What effects beyond the model do to the ends of K intervals (K, n, C) [SI]; force, torque of K + 1 samples."""
-    push, drive = (force[:-1] + force[1:]) / 2, (torque[:-1] + torque[1:]) / 2
-    moved: np.ndarray = by.B @ (push[:, list(c.model.actuated)] + drive)
-    for k, row in enumerate(c.pushed):
-        if row not in c.model.actuated:
-            moved += by.F[:, :, k : k + 1] @ push[:, row : row + 1]
-    return moved
-
-
-def _read(S: np.ndarray, weight: np.ndarray, reading: np.ndarray) -> np.ndarray:
-    """What readings tell of the states where effects beyond the model are in them, (K, n, C)."""
-    told: np.ndarray = -((S * weight[:, :, None]).transpose(0, 2, 1) @ reading)
-    return told
+    place = np.concatenate([[0], 1 + np.array(c.flawed, int), np.arange(1 + n_p, 1 + n_p + n_o)])
+    Z[np.ix_(place, place)] += flat.T @ flat
+    return Linear(solved, Z, np.concatenate(gains), tuple(stages), S, weight, residual, direct)
 
 
 def _known_before(c: Chart, p: Point, first: np.ndarray, columns: int) -> chain.Section:
     """A stage that leads to the first state, from nothing: a guess and how far it may be off."""
-    n, scale = c.n, _scale(c)
+    n, scale = c.n, state_scale(c)
     none = np.zeros((1, n, n))
     b = np.zeros((1, n, columns))
     b[0, :, 0] = (first - p.s[0]) / scale
@@ -398,7 +350,7 @@ def _speeds(c: Chart) -> np.ndarray:
     return (c.index >= n_q) & (c.index < 2 * n_q)
 
 
-def _scale(c: Chart) -> np.ndarray:
+def state_scale(c: Chart) -> np.ndarray:
     """Typical size of an error of each state (n,)."""
     return np.where(_speeds(c), 1e-2, 1e-3)
 
@@ -484,7 +436,7 @@ def _all_linear(
     for r, p, begin in zip(records, points, starts, strict=True):
         if not (c.pivots(p.s[::10], X)[0] > 0).all():
             return None
-        found = _linearise(c, r, p, begin.s[0], X, disturbed)
+        found = linearise(c, r, p, begin.s[0], X, disturbed)
         if found is None:
             return None
         linear.append(found)
@@ -537,7 +489,7 @@ def _moved(c: Chart, r: Record, p: Point, linear: Linear, move: np.ndarray) -> P
     x, slope = linear.solved.states(move)
     w = (linear.gain.transpose(0, 2, 1) @ slope[1:, :, None])[:, :, 0] * r.noise.torque
     offset = move[len(move) - len(r.origin) :]
-    return Point(p.s + x * _scale(c), w, p.offset + offset * one_count(c, r))
+    return Point(p.s + x * state_scale(c), w, p.offset + offset * one_count(c, r))
 
 
 def _between(
@@ -564,50 +516,3 @@ def _suspects(c: Chart, logs: Sequence[Log], fit: Fit) -> list[str]:
                     f" {np.sqrt(slow):.2f} times what noise gives"
                 )
     return texts
-
-
-def innovation_sizes(linear: Linear) -> np.ndarray:
-    """Mean square of the normalised innovations of every sensor, and of their means over blocks, times the block, both
-    1 where model and noise are right; and the number of blocks: (m, 3)."""
-    z = innovations(linear)
-    sizes = np.zeros((z.shape[1], 3))
-    for j, column in enumerate(z.T):
-        own = column[np.isfinite(column)]
-        if len(own) >= BLOCK:
-            sums = own[: len(own) // BLOCK * BLOCK].reshape(-1, BLOCK).sum(axis=1)
-            sizes[j] = np.mean(own**2), np.mean(sums**2) / BLOCK, len(sums)
-    return sizes
-
-
-def innovations(linear: Linear) -> np.ndarray:
-    """Each reading less its prediction from all before it, over its standard deviation (N, m); NaN where unused.
-
-    A Kalman filter along the last linearisation, at the parameters found. The joined parts give what is known where
-    each begins; then all parts are filtered side by side.
-    """
-    parts, n = linear.solved.parts, linear.H.shape[2]
-    starts = np.cumsum([0, *(len(s) for s in linear.stages)])
-    x, P = np.empty((len(linear.stages), n)), np.empty((len(linear.stages), n, n))
-    x[0], P[0] = parts[0].whole.b[0, :, 0], parts[0].whole.C[0]
-    for k, part in enumerate(parts[1:-1]):
-        w = part.whole
-        seen = np.linalg.inv(np.eye(n) + P[k] @ w.J[0])
-        x[k + 1] = w.A[0] @ (seen @ (x[k] + P[k] @ w.eta[0, :, 0])) + w.b[0, :, 0]
-        P[k + 1] = w.A[0] @ seen @ P[k] @ w.A[0].T + w.C[0]
-    z, most = np.full(linear.residual.shape, np.nan), linear.weight.max(axis=0)
-    for j in range(max(len(s) for s in linear.stages)):
-        going = [i for i, s in enumerate(linear.stages) if j < len(s)]
-        at = starts[going] + j
-        h, weight = linear.H[at], linear.weight[at]
-        PH = P[going] @ h.transpose(0, 2, 1)
-        # A reading that isn't used counts as one with a huge variance.
-        variance = 1 / np.maximum(weight, 1e-12 * np.where(most > 0, most, 1.0))
-        S = h @ PH
-        S[:, range(h.shape[1]), range(h.shape[1])] += variance
-        e = linear.residual[at, :, None] - h @ x[going, :, None]
-        z[at] = np.where(weight > 0, e[:, :, 0] / np.sqrt(np.diagonal(S, axis1=1, axis2=2)), np.nan)
-        K = np.linalg.solve(S, PH.transpose(0, 2, 1)).transpose(0, 2, 1)
-        A, b, C = (np.stack([getattr(linear.stages[i], f)[j] for i in going]) for f in ("A", "b", "C"))
-        x[going] = (A @ (x[going, :, None] + K @ e))[:, :, 0] + b[:, :, 0]
-        P[going] = A @ (P[going] - K @ PH.transpose(0, 2, 1)) @ A.transpose(0, 2, 1) + C
-    return z

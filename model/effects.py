@@ -149,7 +149,7 @@ class Effect:
 
     `places`: joints, rolls, drive, articulation, wheels, yaw_rate, lateral_speed, machine. `amount`: a typical one
     [unit] at a site, `grid`: shares of it that are tried where the signature isn't proportional to the amount.
-    `positive`: a negative amount makes no sense. Hooks take the scene, the body they act on, and the values.
+    `positive`: a negative amount makes no sense; `inverse`: the smaller the amount, the larger the effect. Hooks take the scene, the body they act on, and the values.
     """
 
     name: str
@@ -162,6 +162,7 @@ class Effect:
     shapes: Mapping[str, Shape] = field(default_factory=dict)
     grid: tuple[float, ...] = (1.0,)
     positive: bool = False
+    inverse: bool = False
     torque: Callable[[Scene, int, Values], ca.SX] | None = None
     soil: Callable[[Scene, int, Values, Soil], Soil] | None = None
     push: Callable[[Scene, int, Values], tuple[ca.SX, ca.SX]] | None = None
@@ -482,6 +483,7 @@ _declare(
         _constant(0.3),
         grid=(0.5, 1.0, 3.0),
         positive=True,
+        inverse=True,
         soil=lambda s, k, p, soil: replace(soil, saturation=p["A"]),
     ),
     Effect(
@@ -494,6 +496,7 @@ _declare(
         _constant(0.3),
         grid=(0.5, 1.0, 3.0),
         positive=True,
+        inverse=True,
         soil=lambda s, k, p, soil: replace(soil, lateral=p["A"]),
     ),
     Effect(

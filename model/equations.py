@@ -169,7 +169,7 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[cat
             read[at] = e.effect.reading(own.scene, exact[at], sensors[at].body, own.values)
         reading.append(read)
         kept = [k for k, m in enumerate(memory) if m != "time"]
-        states.append(z[kept])
+        states += [z[k] for k in kept]
         rates += [m.rate(own.scene, e.bodies[0], own.values) for m in e.effect.memory.values()]
     z = ca.vertcat(*states, ca.SX(0, 1))
     arguments = [s.q, s.nu, s.a, s.u, time, z, exact, s.p]

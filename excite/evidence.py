@@ -1,0 +1,240 @@
+"""Evidence of effects that a model doesn't have: score tests in the joint smoother.
+
+Along a fitted log every effect of the catalogue, at every place and on its grid of shapes, has a signature: the forces,
+torques and readings that it alone would add. Signatures go through the smoother's linearised chain as columns beside
+the parameters; what the parameters, the states and the torque noise can absorb is projected out, and what is left is
+tested against the innovations. Sensor noise in slips and speeds, which fills least-squares residuals with false
+structure, is accounted for. The test is Rao's score test (Rao, 1948) of each effect's amount at zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import casadi as ca
+import numpy as np
+
+from excite import smoothing
+from excite.innovations import whitened
+from excite.linearise import BATCH, Batch, Chart, Slopes, differentiate
+from excite.record import Point, Record
+from model import effects
+from model.effects import CATALOGUE, Effect, Placed
+from model.equations import signatures
+from model.machine import Machine
+
+CHUNK = 20_000  # innovations whose products are summed at once
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect at a place with shapes of the grid; `columns`: one, or the sine and the cosine of a phase."""
+
+    placed: Placed
+    columns: tuple[int, ...]
+
+    @property
+    def name(self) -> str:
+        return self.placed.name
+
+
+@dataclass(frozen=True)
+class Score:
+    """A candidate's evidence: `gain` is how much twice the log-likelihood would rise with it, to first order.
+
+    values: amount and shapes that it would get. direction (C,): its unit signature among the columns, what parameters
+    absorb projected out, whitened by nothing; `left`: the share of the signature that they don't absorb.
+    """
+
+    candidate: Candidate
+    gain: float
+    values: Mapping[str, float]
+    left: float
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Scores of all candidates, best first; covariances of their evidence (C, C) in `information`."""
+
+    scores: tuple[Score, ...]
+    information: np.ndarray
+
+
+def candidates(machine: Machine, sensors: Sequence[str], duration: float, known: Sequence[str] = ()) -> list[Candidate]:
+    """Every effect at every place on its grid, for a log of duration [s] with these sensors; without the `known`."""
+    found: list[Candidate] = []
+    columns = 0
+    for effect in CATALOGUE.values():
+        for where, (bodies, sensor) in effects.places(machine, effect).items():
+            if f"{effect.name}@{where}" in known or (effect.reading is not None and sensor not in sensors):
+                continue
+            site = effects.Site(machine, machine.find(bodies[0]), duration)
+            for values, width in _grid(effect, site):
+                placed = Placed(effect, where, bodies, sensor, values)
+                found.append(Candidate(placed, tuple(range(columns, columns + width))))
+                columns += width
+    return found
+
+
+def _grid(effect: Effect, site: effects.Site) -> list[tuple[dict[str, float], int]]:
+    """Amounts and shapes that are tried, each with its number of columns."""
+    names = [n for n, s in effect.shapes.items() if not s.circular]
+    sizes = [effect.shapes[n].size(site) for n in names]
+    grids = [[g * size for g in effect.shapes[n].grid] for n, size in zip(names, sizes, strict=True)]
+    circular = next((n for n, s in effect.shapes.items() if s.circular), None)
+    tried = []
+    for share in effect.grid:
+        for shapes in product(*grids):
+            values = {"A": share * effect.amount(site), **dict(zip(names, shapes, strict=True))}
+            if "begin" in values and values["begin"] + values["length"] > site.duration:
+                continue
+            tried.append((values | ({circular: 0.0} if circular else {}), 2 if circular else 1))
+    return tried
+
+
+class Signatures:
+    """The signatures of candidates along one fitted log."""
+
+    def __init__(self, c: Chart, r: Record, fit: smoothing.Fit, log: int, found: Sequence[Candidate]) -> None:
+        model, p = c.model, fit.points[log]
+        self.chart, self.columns = c, sum(len(x.columns) for x in found)
+        every: list[Placed] = []
+        for x in found:
+            circular = [n for n, s in x.placed.effect.shapes.items() if s.circular]
+            for turn in range(len(x.columns)):
+                shift = dict.fromkeys(circular, turn * np.pi / 2)
+                values = {**x.placed.values, **shift}
+                every.append(Placed(x.placed.effect, x.placed.where, x.placed.bodies, x.placed.sensor, values))
+        standard = tuple(n for n in model.base.standard if "@" not in n)
+        made = signatures(model.machine, standard, every)
+        self.force, self.reading = Batch(made.force, (7,)), Batch(made.reading, (7,))
+        self.rows = [model.readable.index(s.name) for s in c.sensors]
+        self.p = (model.expand @ fit.X)[: len(standard)]
+        u, _ = c.delivered(r.torque, fit.X)
+        u = u + np.concatenate([p.w, p.w[-1:]])
+        q, nu, z = c.parts(p.s)
+        known = () if model.plain else (z.T,)
+        a = model.acceleration(q.T, nu.T, u.T, *known, fit.X).full().T
+        t = np.arange(len(u)) / float(model.machine.sampling_hz)
+        wheels = np.zeros((len(u), sum(s.kind == "wheel" for s in model.machine.sensor)))
+        n_q = q.shape[1]
+        for k, at in enumerate(c.index):
+            if 2 * n_q <= at < 2 * n_q + wheels.shape[1]:
+                wheels[:, at - 2 * n_q] = p.s[:, k]
+        plain = np.zeros((len(u), len(model.memory)))
+        exact = model.read(q.T, nu.T, wheels.T, u.T, plain.T if model.plain else z.T, fit.X).full().T
+        memory = _remembered(made.flow, q, nu, u, t, self.p)
+        self.samples = (q, nu, a, u, t[:, None], memory, exact)
+        self.torque = np.zeros((*u.shape, self.columns))
+        for k, e in enumerate(every):
+            if e.effect.channel is not None:
+                self.torque[:, :, k] = _misread(c, e, r.torque, u, t)
+
+    def along(self, X: np.ndarray, r: Record, p: Point) -> tuple[np.ndarray, np.ndarray]:
+        """What signatures do to the scaled state behind each sample (N - 1, n, C), and to readings (N, m, C)."""
+        c, N = self.chart, len(p.s)
+        u, scale = self.samples[3], smoothing.state_scale(c)[:, None]
+        push = np.empty((N - 1, c.n, self.columns), np.float32)
+        reading = np.empty((N, len(c.sensors), self.columns), np.float32)
+        for at in range(0, N - 1, BATCH):
+            until = min(at + BATCH, N - 1)
+            by = differentiate(c, p.s[at : until + 1], u[at : until + 1], X, force=True)
+            held = tuple(x[at : until + 1] for x in self.samples)
+            force = self.force(*held, self.p)[0]
+            torque = self.torque[at : until + 1]
+            push[at:until] = _pushed(c, by, (force[:-1] + force[1:]) / 2, (torque[:-1] + torque[1:]) / 2) / scale
+            reading[at : until + 1] = self.reading(*held, self.p)[0][:, self.rows]
+        return push, reading
+
+
+def _pushed(c: Chart, by: Slopes, force: np.ndarray, torque: np.ndarray) -> np.ndarray:
+    """What forces (K, n_q, C) and delivered torques (K, n_u, C) do to the ends of K intervals (K, n, C) [SI]."""
+    moved: np.ndarray = by.B @ (force[:, list(c.model.actuated)] + torque)
+    for k, row in enumerate(c.pushed):
+        if row not in c.model.actuated:
+            moved += by.F[:, :, k : k + 1] @ force[:, row : row + 1]
+    return moved
+
+
+def _misread(c: Chart, e: Placed, measured: np.ndarray, u: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """How much more torque would be delivered (N, n_u) where a channel reads as the effect has it."""
+    assert e.effect.channel is not None
+    time = ca.SX.sym("t")
+    channel = e.effect.channel(time, {k: ca.SX(v) for k, v in e.values.items()})
+    read = ca.Function("channel", [time], [ca.SX(x) for x in (channel.gain, channel.offset, channel.delay)])
+    gain, offset, delay = (np.broadcast_to(x.full()[0], t.shape) for x in read(t[None]))
+    more = np.zeros_like(u)
+    for k, body in enumerate(c.model.machine.actuated):
+        if body.index in e.bodies:
+            early = np.interp(t + delay, t, measured[:, k]) - measured[:, k]
+            more[:, k] = (u[:, k] + early - offset) / gain - u[:, k]
+    return more
+
+
+def _remembered(
+    flow: ca.Function, q: np.ndarray, nu: np.ndarray, u: np.ndarray, t: np.ndarray, p: np.ndarray
+) -> np.ndarray:
+    """What candidates remember (N, n_z) along a motion: linearly implicit Euler, sample by sample."""
+    n_z = flow.size1_in(4)
+    if n_z == 0:
+        return np.zeros((len(t), 0))
+    n_q, n_u = q.shape[1], u.shape[1]
+    at, z = ca.SX.sym("at", 2 * n_q + n_u + 1), ca.SX.sym("z", n_z)
+    rate = flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q : -1], at[-1], z, p)
+    h = float(t[1] - t[0])
+    # Each remembers for itself: the Jacobian is diagonal.
+    slope = ca.diag(ca.jacobian(rate, z))
+    step = ca.Function("step", [z, at], [z + h * rate / (1 - h * slope)])
+    path = step.mapaccum("path", len(t) - 1)(np.zeros(n_z), np.hstack([q, nu, u, t[:, None]])[:-1].T)
+    return np.vstack([np.zeros(n_z), path.full().T])
+
+
+def scan(c: Chart, records: Sequence[Record], fit: smoothing.Fit, found: Sequence[Candidate]) -> Scan:
+    """The score of every candidate along fitted logs, best first."""
+    total, n = sum(len(x.columns) for x in found), len(fit.X)
+    prior = np.where(fit.unseen, smoothing.HELD**-2, smoothing.PRIOR**-2)
+    Z = np.zeros((1 + n + total, 1 + n + total))
+    for k, (r, linear) in enumerate(zip(records, fit.linear, strict=True)):
+        made = Signatures(c, r, fit, k, found)
+        push, reading = made.along(fit.X, r, fit.points[k])
+        E = whitened(linear, c.flawed, push, reading)
+        form = sum((_square(E[at : at + CHUNK]) for at in range(0, len(E), CHUNK)), np.zeros((E.shape[1],) * 2))
+        # Offsets of counts belong to one log: integrate them out.
+        n_o = len(r.origin)
+        o, keep = slice(1 + n, 1 + n + n_o), np.r_[0 : 1 + n, 1 + n + n_o : len(form)]
+        inner = form[o, o] + np.eye(n_o)
+        Z += form[np.ix_(keep, keep)] - form[keep, o] @ np.linalg.solve(inner, form[o, keep])
+    own, p = slice(1 + n, None), slice(1, 1 + n)
+    base, cross = Z[p, p] + np.diag(prior), Z[p, own]
+    g_base = Z[p, 0] + prior * (fit.X - c.model.nominal) / c.model.scale
+    solved = np.linalg.solve(base, np.column_stack([cross, g_base]))
+    S = Z[own, own] - cross.T @ solved[:, :-1]
+    g = Z[own, 0] - cross.T @ solved[:, -1]
+    scores = [_score(x, S, g, Z[own, own]) for x in found]
+    return Scan(tuple(sorted((s for s in scores if s is not None), key=lambda s: -s.gain)), S)
+
+
+def _square(E: np.ndarray) -> np.ndarray:
+    form: np.ndarray = (E.T @ E).astype(float)
+    return form
+
+
+def _score(x: Candidate, S: np.ndarray, g: np.ndarray, own: np.ndarray) -> Score | None:
+    """The evidence of one candidate; None where the parameters absorb all of it or nothing shows it."""
+    at = list(x.columns)
+    left = float(np.min(np.diag(S)[at] / np.maximum(np.diag(own)[at], 1e-30)))
+    if not left > 0 or np.diag(own)[at].max() < 1e-6:
+        return None
+    step = -np.linalg.solve(S[np.ix_(at, at)] + 1e-9 * np.diag(np.diag(own)[at]), g[at])
+    values, effect = dict(x.placed.values), x.placed.effect
+    if len(at) == 2:
+        circular = next(n for n, s in effect.shapes.items() if s.circular)
+        values[circular] = float(np.arctan2(step[1], step[0]))
+        values["A"] *= float(np.hypot(*step))
+    else:
+        values["A"] *= float(step[0])
+    if effect.positive and step[0] <= 0 and len(at) == 1:
+        return Score(x, 0.0, values, left)
+    return Score(x, float(-step @ g[at]), values, left)

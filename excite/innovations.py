@@ -1,0 +1,148 @@
+"""Innovations: what each reading of a log says that nothing before it did.
+
+A Kalman filter along the smoother's last linearisation. Where the model and its noise are right, the normalised
+innovations are white with variance one; and a signature that goes through the same filter is what an effect would add
+to them. The joined parts of the chain say what is known where each part begins, so all parts are filtered side by side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from excite.smoothing import Linear
+
+SLOW = 25  # readings whose mean counts as slow
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A filter's step j in all parts that are as long: samples `at`, which parts `going`, gain K, whitening root."""
+
+    at: np.ndarray
+    going: np.ndarray
+    gain: np.ndarray
+    root: np.ndarray
+    used: np.ndarray
+
+
+def innovations(linear: Linear) -> np.ndarray:
+    """Each reading less its prediction from all before it, over its standard deviation (N, m); NaN where unused."""
+    z = np.full(linear.residual.shape, np.nan)
+    x = _before(linear)
+    for step in _filter(linear):
+        e = linear.residual[step.at, :, None] - linear.H[step.at] @ x[step.going, :, None]
+        size = np.sqrt(np.diagonal(step.root @ step.root.transpose(0, 2, 1), axis1=1, axis2=2))
+        z[step.at] = np.where(step.used, e[:, :, 0] / size, np.nan)
+        A, b = _leading(linear, step)
+        x[step.going] = (A @ (x[step.going, :, None] + step.gain @ e))[:, :, 0] + b[:, :, 0]
+    return z
+
+
+def innovation_sizes(linear: Linear) -> np.ndarray:
+    """Mean square of the normalised innovations of every sensor, and of their means over blocks, times the block, both
+    1 where model and noise are right; and the number of blocks: (m, 3)."""
+    z = innovations(linear)
+    sizes = np.zeros((z.shape[1], 3))
+    for j, column in enumerate(z.T):
+        own = column[np.isfinite(column)]
+        if len(own) >= SLOW:
+            sums = own[: len(own) // SLOW * SLOW].reshape(-1, SLOW).sum(axis=1)
+            sizes[j] = np.mean(own**2), np.mean(sums**2) / SLOW, len(sums)
+    return sizes
+
+
+def whitened(linear: Linear, flawed: tuple[int, ...], push: np.ndarray, reading: np.ndarray) -> np.ndarray:
+    """Innovations of data, parameters, offsets and signatures, white and of variance one: (N m, 1 + n_p + n_o + C).
+
+    push (N - 1, n, C): what signatures do to the scaled state behind each sample; reading (N, m, C): to readings.
+    flawed: parameters that readings depend on directly. Where data = sum of columns times steps, the columns' products
+    are the information about the steps, all states integrated out. Single precision.
+    """
+    N, m, n = linear.H.shape
+    own = linear.solved.Z.shape[0]
+    n_f = len(flawed)
+    columns = own + push.shape[2]
+    E = np.zeros((N, m, columns), np.float32)
+    reach = np.zeros((N, m, n), np.float32)  # what an error of the state where the part begins does
+    parts = len(linear.stages)
+    x = np.zeros((parts, n, columns + n))
+    x[:, :, columns:] = np.eye(n)
+    told = np.concatenate([1 + np.array(flawed, int), np.arange(own - linear.direct.shape[2] + n_f, own)])
+    for step in _filter(linear):
+        y = np.zeros((len(step.going), m, columns + n))
+        y[:, :, 0] = linear.residual[step.at]
+        y[:, :, told] = -linear.direct[step.at]
+        y[:, :, own:columns] = -reading[step.at]
+        e = y - linear.H[step.at] @ x[step.going]
+        white = np.linalg.solve(step.root, e) * step.used[:, :, None]
+        E[step.at], reach[step.at] = white[:, :, :columns], white[:, :, columns:]
+        A, b = _leading(linear, step)
+        x[step.going] = A @ (x[step.going] + step.gain @ e)
+        x[step.going, :, :own] += b
+        last = step.at[-1] == N - 1
+        inner = step.going[:-1] if last else step.going
+        x[inner, :, own:columns] += push[step.at[: len(inner)]]
+    # Where each part really begins follows from the part before.
+    begin = np.zeros((n, columns))
+    begin[:, :own] = linear.solved.parts[0].whole.b[0]
+    at = 0
+    for k, stages in enumerate(linear.stages):
+        stretch = slice(at, at + len(stages))
+        E[stretch] += (reach[stretch].reshape(-1, n) @ begin.astype(np.float32)).reshape(-1, m, columns)
+        begin = x[k, :, :columns] + x[k, :, columns:] @ begin
+        at += len(stages)
+    return E.reshape(-1, columns)
+
+
+def _before(linear: Linear) -> np.ndarray:
+    """What is expected of the state where each part begins (parts, n)."""
+    return _known(linear)[0]
+
+
+def _known(linear: Linear) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the state where each part begins, from all before it."""
+    parts, n = linear.solved.parts, linear.H.shape[2]
+    x, P = np.empty((len(linear.stages), n)), np.empty((len(linear.stages), n, n))
+    x[0], P[0] = parts[0].whole.b[0, :, 0], parts[0].whole.C[0]
+    for k, part in enumerate(parts[1:-1]):
+        w = part.whole
+        seen = np.linalg.inv(np.eye(n) + P[k] @ w.J[0])
+        x[k + 1] = w.A[0] @ (seen @ (x[k] + P[k] @ w.eta[0, :, 0])) + w.b[0, :, 0]
+        P[k + 1] = w.A[0] @ seen @ P[k] @ w.A[0].T + w.C[0]
+    return x, P
+
+
+def _filter(linear: Linear) -> list[_Step]:
+    """The filter's gains, which don't depend on data, step by step in all parts."""
+    starts = np.cumsum([0, *(len(s) for s in linear.stages)])
+    P = _known(linear)[1]
+    most = linear.weight.max(axis=0)
+    steps = []
+    for j in range(max(len(s) for s in linear.stages)):
+        going = np.array([i for i, s in enumerate(linear.stages) if j < len(s)])
+        at = starts[going] + j
+        h, weight = linear.H[at], linear.weight[at]
+        PH = P[going] @ h.transpose(0, 2, 1)
+        # A reading that isn't used counts as one with a huge variance.
+        variance = 1 / np.maximum(weight, 1e-12 * np.where(most > 0, most, 1.0))
+        S = h @ PH
+        S[:, range(h.shape[1]), range(h.shape[1])] += variance
+        K = np.linalg.solve(S, PH.transpose(0, 2, 1)).transpose(0, 2, 1)
+        A, C = (np.stack([getattr(linear.stages[i], f)[j] for i in going]) for f in ("A", "C"))
+        P[going] = A @ (P[going] - K @ PH.transpose(0, 2, 1)) @ A.transpose(0, 2, 1) + C
+        steps.append(_Step(at, going, K, np.linalg.cholesky(S), weight > 0))
+    return steps
+
+
+def _leading(linear: Linear, step: _Step) -> tuple[np.ndarray, np.ndarray]:
+    """Transition and drift (n, 1 + n_p + n_o) behind a step, of the parts that go on."""
+    starts = np.cumsum([0, *(len(s) for s in linear.stages)])
+    j = int(step.at[0] - starts[step.going[0]])
+    return (
+        np.stack([linear.stages[i].A[j] for i in step.going]),
+        np.stack([linear.stages[i].b[j] for i in step.going]),
+    )
