@@ -293,7 +293,7 @@ def identify(
     json: JsonOption = False,
 ) -> None:
     """Estimates the parameters, with uncertainty, from logs."""
-    from excite import crosscheck, examine, folder, identify, log, report
+    from excite import crosscheck, examine, folder, identify, log, report, reports
 
     model = _model(machine)
     out = out or Path(f"results/identify-{model.machine.name}")
@@ -332,6 +332,7 @@ def identify(
                 title = f"{model.machine.title}: {one.source}"
                 figure = report.comparison_figure(model, crosscheck.torques(model, one, estimate, chosen), title)
                 report.save(figure, place / (f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png"))
+        reports.write(place, "identify", summary)
         (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
     terminal.finish(summary, out, json, terminal.identify_table)
 
@@ -342,7 +343,7 @@ def identify(
 def _design(place: Path, machine: str, problem: str | None, duration: float | None, brief: Brief) -> dict[str, Any]:
     import time
 
-    from excite import folder, log, report
+    from excite import folder, log, report, reports
     from excite.brief import answer
     from excite.brief import summary as said
     from excite.objective import OBJECTIVES
@@ -370,12 +371,13 @@ def _design(place: Path, machine: str, problem: str | None, duration: float | No
     title = f"{model.machine.title}: {name}, cond(Phi) = {found.design.cond_phi:.2f}"
     report.save(report.design_figure(found.model, chosen, found.design.motion, title), place / "design.png")
     report.save(report.sigma_figure(summary["sigma_percent"], title), place / "sigma.png")
+    reports.write(place, "design", summary)
     (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
     return summary
 
 
 def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: str, seed: int) -> dict[str, Any]:
-    from excite import folder, identify, report, sensors, stored
+    from excite import folder, identify, report, reports, sensors, stored
     from excite.verify import biased, verify
     from excite.verify import summary as table
 
@@ -410,6 +412,7 @@ def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: s
     }
     title = f"{model.machine.title}: {runs} simulated runs, {method}, kit {kit}"
     report.save(report.verify_figure(result, title), place / "verify.png")
+    reports.write(place, "verify", summary)
     (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
     return summary
 
@@ -419,7 +422,7 @@ def _compare(
 ) -> dict[str, Any]:
     import pandas as pd
 
-    from excite import compare, folder, report
+    from excite import compare, folder, report, reports
 
     model = _model(machine)
     name, chosen = _problem(model.machine, problem, None)
@@ -446,6 +449,7 @@ def _compare(
                 "kept": row.kept,
                 "samples": row.samples,
                 "wall_s": row.wall_s,
+                "equal_score_s": row.equal_s,
                 "knots": knots,
                 "start": dict(zip(model.coordinates, row.start, strict=True)),
             }
@@ -463,6 +467,7 @@ def _compare(
     }
     title = f"{model.machine.title}: {name}, the designed drive and the usual ones"
     report.save(report.compare_figure(result.rows, title), place / "compare.png")
+    reports.write(place, "compare", summary)
     (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
     return summary
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import jinja2
@@ -64,3 +68,52 @@ def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
         "band": {"speed": drive.BAND_SPEED, "angle": float(np.rad2deg(drive.BAND_ANGLE)), "time": drive.BAND_S},
         "log": {"time": machine.time_column, "rolls": rolls, "angle": angle},
     }
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of a report: a file (.png, .svg) and what it shows, in a sentence with its units."""
+
+    path: Path
+    caption: str
+
+    @property
+    def kind(self) -> str:
+        return {".png": "image/png", ".svg": "image/svg+xml"}[self.path.suffix]
+
+    @property
+    def data(self) -> str:
+        return base64.b64encode(self.path.read_bytes()).decode("ascii")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a report: cells are written as they are; `marked` rows (indices) are set off."""
+
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    marked: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        for k, row in enumerate(self.rows):
+            if len(row) != len(self.columns):
+                raise ValueError(f"table {self.caption!r}: row {k} has {len(row)} cells, not {len(self.columns)}")
+
+
+def report_page(
+    title: str,
+    answer: str,
+    figures: Sequence[Picture] = (),
+    tables: Sequence[Table] = (),
+    how: Mapping[str, str] | None = None,
+    remarks: Sequence[str] = (),
+) -> str:
+    """A report as one printable file: the answer first, then figures, tables and how it was made.
+
+    answer: one sentence; remarks: what else must be known, a line each; how: name -> value, `command` among them.
+    """
+    template = _templates().get_template("report.html")
+    return template.render(
+        title=title, answer=answer, figures=figures, tables=tables, how=dict(how or {}), remarks=remarks
+    )

@@ -238,4 +238,6 @@ def compare_figure(rows: Sequence[Row], title: str) -> Figure:
         ax.set_axisbelow(True)
     names = [r.name if r.breaks is None else f"{r.name}\n(breaks {r.breaks})" for r in rows]
     axes[0].set_yticks(places, names, fontsize=9)
+    for label, r in zip(axes[0].get_yticklabels(), rows, strict=True):  # in black and white colour tells nothing
+        label.set_fontweight("bold" if r.name == OURS else "normal")
     return figure

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import re
-import shutil
 import socket
 import subprocess
 import sys
@@ -30,18 +29,6 @@ TRACE = Trace(
     np.array([0.0, 3, 6, 8.5, 11, 14]), np.array([0.0, 1.2, 1.2, 0, -0.8, 0]), -np.array([0.0, 0, 0.3, 0.3, 0, 0]), -1
 )
 STARTS = [0.0, 3, 6, 8.5, 11]
-
-
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Any]:
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if path is None:
-        pytest.skip("no Chromium on this machine (Debian: apt install chromium)")
-    with api.sync_playwright() as play:
-        chromium = play.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture(scope="module")

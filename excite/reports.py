@@ -1,0 +1,205 @@
+"""What each command's `report.html` says: the answer in a sentence, figure, table, how it was made."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from excite.page import Picture, Table, report_page
+from excite.terminal import rounded
+
+NAME = "report.html"
+Summary = Mapping[str, Any]
+
+CAPTIONS = {
+    "design.png": "The drive: torques in per cent of their limits, speeds [m/s], articulation [rad] and slips [-] over"
+    " time, dotted lines the limits; its path on the lane from above, dots the start; how much of each limit it uses.",
+    "sigma.png": "What accuracy the drive makes attainable: one standard deviation (Cramer-Rao bound, all sensors"
+    " together) of every parameter in per cent of its nominal value, on a logarithmic axis.",
+    "verify.png": "Left, every simulated run's error of every parameter in per cent of the true value: dots are runs,"
+    " diamonds their mean, grey bars the 95 % interval that the estimator itself predicts. Right, in how many runs the"
+    " interval holds the truth; 95 % is what it claims.",
+    "compare.png": "Drives side by side: condition number of Phi, and attainable standard deviation of the worst"
+    " parameter [%]; hatched drives break a limit that their label names.",
+}
+FIT = "Measured and predicted drive torques, and what is left between them, over time, for {}."
+
+
+def write(place: Path, kind: str, summary: Summary) -> None:
+    """report.html of a command's folder, from its summary and the figures that are there. KeyError: unknown kind."""
+    title, answer, remarks, tables = KINDS[kind](summary)
+    pictures = [Picture(path, _caption(path.name, summary)) for path in sorted(place.glob("*.png"))]
+    order = list(CAPTIONS)
+    pictures.sort(key=lambda p: order.index(p.path.name) if p.path.name in order else len(order))
+    text = report_page(title, answer, pictures, tables, how(summary), remarks)
+    (place / NAME).write_text(text, encoding="utf-8")
+
+
+def how(summary: Summary) -> dict[str, str]:
+    """How a result was made: command, machine, settings, seed, versions."""
+    rows = {"command": shlex.join(["excite", *sys.argv[1:]])}
+    names = ("machine", "problem", "objective", "method", "kit", "runs", "samples", "starts", "design", "duration_s")
+    for key in (*names, "budget_s", "seed", "wall_s"):
+        value = summary.get(key)
+        if value is not None:
+            name, unit = (key[:-2], " s") if key.endswith("_s") else (key, "")
+            rows[{"wall": "computed in"}.get(name, name)] = f"{rounded(value, 4)}{unit}"
+    if summary.get("logs"):
+        rows["logs"] = ", ".join(summary["logs"])
+    rows["versions"] = ", ".join(f"{name} {version}" for name, version in summary["versions"].items())
+    return rows
+
+
+def _caption(name: str, summary: Summary) -> str:
+    if name in CAPTIONS:
+        return CAPTIONS[name]
+    kind, _, number = name.removesuffix(".png").partition("-")
+    k = int(number or 1) - 1
+    if kind == "validation":
+        return FIT.format(f"{summary['validation'][k]['log']}, which the parameters were not fitted on")
+    return FIT.format(summary["logs"][k]) if kind == "fit" else name
+
+
+Said = tuple[str, str, Sequence[str], Sequence[Table]]
+
+
+def _design(s: Summary) -> Said:
+    sigma = s["sigma_percent"]
+    worst = max(sigma, key=lambda n: sigma[n])
+    kept = s["max_violation"] <= 1e-3
+    limits = (
+        "every limit is kept" if kept else f"limits are exceeded by {100 * s['max_violation']:.2f} % of their range"
+    )
+    answer = (
+        f"Driven as designed, these {s['duration_s']:g} s can tell every parameter to {sigma[worst]:.2g} % or better"
+        f" (one standard deviation; worst {worst}, median {np.median(list(sigma.values())):.2g} %); {limits}."
+    )
+    remarks = [
+        f"Condition number of Phi {s['cond_phi']:.4g}, of W {s['cond_w']:.4g}; best start {s['cond_phi_start']:.4g}."
+    ]
+    if not s["complete"]:
+        remarks.append("Cut short: the best drive so far, more time may find a better one.")
+    if s.get("advice"):
+        remarks.append(s["advice"])
+    remarks.append(
+        "A person at the levers drives something else: `excite drive` makes phases of it and says what is kept."
+    )
+    rows = tuple((name, rounded(value, 3)) for name, value in sorted(sigma.items(), key=lambda x: -x[1]))
+    tables = [Table("Attainable standard deviation of each parameter, the worst first.", ("parameter", "%"), rows)]
+    if s.get("violations"):
+        over = tuple((name, f"{100 * value:.3f}") for name, value in s["violations"].items() if value > 0)
+        if over:
+            tables.append(Table("Limits that are exceeded, in per cent of their range.", ("limit", "%"), over))
+    return f"Test drive for {s['machine']}, problem {s['problem']}", answer, remarks, tables
+
+
+def _verify(s: Summary) -> Said:
+    rows = s["parameters"]
+    errors = {n: float(np.hypot(r["bias_percent"], r["std_percent"])) for n, r in rows.items()}
+    worst = max(errors, key=lambda n: errors[n])
+    cover = 100 * float(np.mean([r["coverage95"] for r in rows.values()]))
+    median = float(np.median(list(errors.values())))
+    answer = (
+        f"In {s['runs']} simulated test days the parameters came out within {median:.2g} % of the truth (median; worst"
+        f" {worst}, {errors[worst]:.2g} %), and the 95 % intervals held it in {cover:.0f} % of cases."
+    )
+    remarks = [f"Biased, the intervals do not hold: {', '.join(s['biased'])}."] if s["biased"] else []
+    if s["failed"]:
+        remarks.append(f"{s['failed']} runs gave no estimate.")
+    table = tuple(
+        (
+            n,
+            r["unit"],
+            rounded(r["true"], 6),
+            rounded(r["mean"], 6),
+            *(rounded(r[k], 3) for k in ("bias_percent", "std_percent", "predicted_std_percent")),
+            rounded(100 * r["coverage95"], 3),
+        )
+        for n, r in rows.items()
+    )
+    names = ("parameter", "unit", "true", "mean", "bias %", "spread %", "predicted %", "coverage %")
+    marked = tuple(k for k, n in enumerate(rows) if n in s["biased"])
+    caption = "True and estimated parameters; biased ones are set off."
+    return f"Verification of a drive for {s['machine']}", answer, remarks, [Table(caption, names, table, marked)]
+
+
+def _compare(s: Summary) -> Said:
+    ratio = s["ratio_equal_time"]
+    kept = [d for d in s["designs"] if d["breaks"] is None]
+    best = min(kept, key=lambda d: d["cond_phi"]) if kept else None
+    if ratio is None or not np.isfinite(ratio):
+        answer = "No usual drive found in the same time keeps every limit; the designed one does."
+    else:
+        word = "lower" if ratio > 1 else "higher"
+        answer = (
+            f"In the same time the designed drive reaches a condition number {max(ratio, 1 / ratio):.2g} times {word}"
+            " than the best usual one."
+        )
+    remarks = (
+        [f"Lowest among those that keep every limit: {best['name']}, cond(Phi) {best['cond_phi']:.4g}."] if best else []
+    )
+    rows = tuple(
+        (
+            d["name"],
+            *(rounded(d[k], 4) for k in ("cond_phi", "cond_w", "worst_std_percent", "median_std_percent")),
+            f"{d['kept']}/{d['samples']}",
+            "-" if d["breaks"] is None else f"{d['breaks']} by {100 * d['max_violation']:.2g} %",
+            f"{d['wall_s']:.1f}",
+        )
+        for d in s["designs"]
+    )
+    names = ("drive", "cond(Phi)", "cond(W)", "worst std %", "median std %", "kept", "limit broken", "time s")
+    caption = "Drives on the same problem, limits and time; the designed one is set off."
+    ours = tuple(k for k, d in enumerate(s["designs"]) if d["name"].startswith("designed"))
+    return (
+        f"Drives compared for {s['machine']}, problem {s['problem']}",
+        answer,
+        remarks,
+        [Table(caption, names, rows, ours)],
+    )
+
+
+def _identify(s: Summary) -> Said:
+    rows = s["parameters"]
+    known = {n: abs(r["std_percent"]) for n, r in rows.items() if r["std_percent"] is not None}
+    known = {n: v for n, v in known.items() if np.isfinite(v)}
+    worst = max(known, key=lambda n: known[n])
+    count = (
+        f"{len(known)} parameters"
+        if not s["unidentifiable"]
+        else f"{len(known)} of {len(known) + len(s['unidentifiable'])} parameters"
+    )
+    logs = "one log" if len(s["logs"]) == 1 else f"{len(s['logs'])} logs"
+    median, rest = float(np.median(list(known.values()))), float(s["relative_error_percent"])
+    answer = (
+        f"From {logs}, {count} are found to {median:.2g} % (median, one standard deviation; worst {worst},"
+        f" {known[worst]:.2g} %); the prediction leaves {rest:.2g} % of what was measured."
+    )
+    remarks = [f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()] + list(s["notes"])
+    for check in s["validation"]:
+        errors = ", ".join(f"{n} {v:.1f} %" for n, v in check["torque_error_percent"].items())
+        remarks.append(f"On {check['log']}, which it was not fitted on, torques are off by: {errors}.")
+    biased = any("bias" in r for r in rows.values())
+    table = tuple(
+        (
+            n,
+            r["unit"],
+            rounded(r["value"], 6),
+            rounded(r["std"], 3),
+            rounded(r["std_percent"], 3),
+            *((rounded(r.get("bias"), 3),) if biased else ()),
+        )
+        for n, r in rows.items()
+    )
+    names = ("parameter", "unit", "value", "std", "std %", *(("bias of the method",) if biased else ()))
+    conds = f"cond(W) {s['cond_w']:.4g}, cond(Phi) {s['cond_phi']:.4g}"
+    caption = f"Parameters with one standard deviation, method {s['method']}; {conds}."
+    return f"Parameters of {s['machine']}", answer, remarks, [Table(caption, names, table)]
+
+
+KINDS = {"design": _design, "verify": _verify, "compare": _compare, "identify": _identify}
