@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
+import scipy.integrate
 
 from excite.estimate import NotIdentifiable
 from excite.linearise import Chart
@@ -122,6 +123,26 @@ def first_point(c: Chart, r: Record, log: Log, filter: Filter) -> Point:
                 [[0], np.cumsum(speed[1:] + speed[:-1]) / (2 * rate)]
             )
     return Point(s, np.zeros_like(r.torque[1:]), np.zeros(len(r.origin)))
+
+
+def carried(c: Chart, r: Record, p: Point, of: Chart, X: np.ndarray) -> Point:
+    """A point of another chart of the same machine and sensors, whose effects differ, in this chart's states."""
+    q, nu, _ = of.parts(p.s)
+    machine, rate = c.model.machine, float(c.model.machine.sampling_hz)
+    n_q, n_z = len(c.model.coordinates), len(c.model.memory)
+    if machine.planar and machine.body[0].coordinates[2] in c.model.coordinates:
+        k = c.model.coordinates.index(machine.body[0].coordinates[2])
+        if k not in of.index:
+            q[:, k] = scipy.integrate.cumulative_trapezoid(nu[:, k], dx=1 / rate, initial=0)
+    full = np.zeros((len(p.s), c.full))
+    shared = of.index < of.full - len(of.model.memory)
+    full[:, of.index[shared]] = p.s[:, shared]
+    full[:, :n_q] = q
+    if n_z:
+        u, _ = c.delivered(r.torque, X)
+        full[:, c.full - n_z :] = remember(c.model, q, nu, u, X)
+    old = dict(zip(origins(of, r.counts), p.offset, strict=True))
+    return Point(full[:, c.index], p.w, np.array([old.get(j, 0.0) for j in r.origin]))
 
 
 def remember(model: Model, q: np.ndarray, nu: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:

@@ -123,7 +123,7 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     X, trouble = model.nominal, ""
     for tries in range(3):
         try:
-            fit = _iterate(c, records, points, X, starts, 0.0, held)
+            fit = iterate(c, records, points, X, starts, 0.0, held)
         except NotConverged as failed:
             trouble = trouble or str(failed)
             if tries == 0:
@@ -134,19 +134,19 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
             if tries == 2 or X is not model.nominal:
                 break
             # The model with disturbing forces finds its way from further off.
-            loose = _disturbed(c, logs, records, starts, model.nominal, starts, held)
+            loose = loosely(c, logs, records, starts, model.nominal, starts, held)
             points, X = loose.points, loose.X
             continue
-        found = _suspects(c, logs, fit)
+        found = suspects(c, logs, fit)
         if not found:
             return _estimate(c, records, fit, filter, notes)
-        loose = _disturbed(c, logs, records, fit.points, fit.X, starts, held)
+        loose = loosely(c, logs, records, fit.points, fit.X, starts, held)
         trouble = "; ".join(found)
         break
     return _estimate(c, records, loose, filter, (*notes, trouble, DOUBT))
 
 
-def _disturbed(
+def loosely(
     c: Chart,
     logs: Sequence[Log],
     records: Sequence[Record],
@@ -160,11 +160,11 @@ def _disturbed(
     fit: Fit | None = None
     for times in DISTURBED:
         try:
-            fit = _iterate(c, records, points, X, starts, times, held)
+            fit = iterate(c, records, points, X, starts, times, held)
         except NotConverged as failed:
             trouble = failed
             continue
-        if not _suspects(c, logs, fit):
+        if not suspects(c, logs, fit):
             return fit
         points, X = fit.points, fit.X
     if fit is None:
@@ -355,7 +355,7 @@ def state_scale(c: Chart) -> np.ndarray:
     return np.where(_speeds(c), 1e-2, 1e-3)
 
 
-def _iterate(
+def iterate(
     c: Chart,
     records: Sequence[Record],
     points: Sequence[Point],
@@ -505,7 +505,7 @@ def _between(
     return points, mixed(here[1], there[1])
 
 
-def _suspects(c: Chart, logs: Sequence[Log], fit: Fit) -> list[str]:
+def suspects(c: Chart, logs: Sequence[Log], fit: Fit) -> list[str]:
     """Sensors whose innovations are not what the model and their noise say, each as a line for the report."""
     texts = []
     for log, linear in zip(logs, fit.linear, strict=True):
