@@ -63,7 +63,8 @@ class Row:
 
     worst_std_percent, median_std_percent: of the Cramer-Rao bound, kit `full`. breaks: the limit that is exceeded by
     more than the tolerance, None where every one is kept. kept, samples: how many drives of this kind kept every limit,
-    out of how many. wall_s [s]: for all of them.
+    out of how many. wall_s [s]: for all of them, in the processes there are. equal_s [s]: until one of this kind has
+    the designed drive's cond(Phi) within the limits, None where none got there in wall_s.
     """
 
     name: str
@@ -78,6 +79,7 @@ class Row:
     kept: int
     samples: int
     wall_s: float
+    equal_s: float | None
 
 
 @dataclass(frozen=True)
@@ -384,7 +386,7 @@ def compare(
     if not ours.complete and (budget_s is None or wall < budget_s):
         raise KeyboardInterrupt  # the design kept its best so far; a comparison with it would mislead
     best = Candidate(ours.manoeuvre, ours.motion.q[0], 2 * float(np.log(ours.cond_phi)), ours.violations)
-    rows = [_row(model, OURS, best, 1, 1, wall)]
+    rows = [_row(model, OURS, best, 1, 1, wall, wall)]
     lowest = ours.cond_phi
     if progress is not None:
         progress(1, total, lowest)
@@ -402,7 +404,7 @@ def compare(
     found.sort(key=lambda s: s.number)
     in_time = [np.inf]
     for name in usual:
-        rows += _rows(model, name, [s for s in found if s.kind == name])
+        rows += _rows(model, name, [s for s in found if s.kind == name], ours.cond_phi)
         in_time += _in_time([s for s in found if s.kind == name], wall)
     return Comparison(tuple(rows), min(in_time) / ours.cond_phi)
 
@@ -431,11 +433,26 @@ def _in_time(samples: Sequence[_Sample], seconds: float) -> list[float]:
     ]
 
 
-def _rows(model: Model, name: str, samples: Sequence[_Sample]) -> list[Row]:
+def _equal(samples: Sequence[_Sample], cond_phi: float) -> float | None:
+    """Time [s] until one of these samples, taken one after the other, is as good as cond(Phi); None where none is."""
+    used = np.cumsum([s.wall_s for s in samples]) / min(_processes(), len(samples))
+    for s, t in zip(samples, used, strict=True):
+        if s.found.feasible and objective.reported("cond", s.found.score) <= cond_phi:
+            return float(t)
+    return None
+
+
+def _rows(model: Model, name: str, samples: Sequence[_Sample], ours: float) -> list[Row]:
     """The one row of a kind, or the best and the median sample of a random one."""
     ranked = sorted(samples, key=_order)
-    row = partial(_row, model, kept=sum(s.found.feasible for s in samples), samples=len(samples))
-    wall = sum(s.wall_s for s in samples)
+    row = partial(
+        _row,
+        model,
+        kept=sum(s.found.feasible for s in samples),
+        samples=len(samples),
+        equal_s=_equal(samples, ours),
+    )
+    wall = sum(s.wall_s for s in samples) / min(_processes(), len(samples))
     if not USUAL[name].random:
         return [row(name, s.found, wall_s=wall) for s in ranked]
     n = len(ranked)
@@ -445,7 +462,7 @@ def _rows(model: Model, name: str, samples: Sequence[_Sample]) -> list[Row]:
     ]
 
 
-def _row(model: Model, name: str, c: Candidate, kept: int, samples: int, wall_s: float) -> Row:
+def _row(model: Model, name: str, c: Candidate, kept: int, samples: int, wall_s: float, equal_s: float | None) -> Row:
     motion = simulate(model, c.manoeuvre.sample(float(model.machine.sampling_hz)), q0=c.start)
     spread = 100 * np.sqrt(np.diag(smoothing.cramer_rao(model, motion))) / np.abs(model.nominal)
     breaks = None if c.feasible else max(c.violations, key=lambda limit: c.violations[limit])
@@ -462,4 +479,5 @@ def _row(model: Model, name: str, c: Candidate, kept: int, samples: int, wall_s:
         kept,
         samples,
         wall_s,
+        equal_s,
     )

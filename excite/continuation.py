@@ -76,7 +76,7 @@ PLAN = (
 SCOUTS = 3  # stages that every start goes through; the best third of the starts go on to the end
 REPAIR = Stage(1, 1, 1, 800, 1e-6, 1, 30, 0.1, elements=3)
 REFINE = Stage(1, 1, 1, 800, 1e-6, 1, 30, 0.1)
-REFINES = 3  # of an aim with a ceiling, at most
+REFINES = 5  # of an aim with a ceiling, at most
 GAINED = 2e-3  # of the score by which another one is worth its time
 
 
@@ -212,7 +212,7 @@ def refine(
             break
         track = _advance(model, problem, aim, track, REFINE, {}, over) or track
         tell(track)
-        if track.best is before or (before.feasible and before.score - track.best.score < GAINED):
+        if before.feasible and track.latest.feasible and before.score - track.best.score < GAINED:
             break
     return track
 
@@ -298,10 +298,8 @@ def _advance(
     if stage.friction == 1:
         seen = aims.optimism(aim, model, track.motion)
         if seen is not None:
-            # what turned out too optimistic before is trusted again by half only, or drives go back and forth
-            careful = seen if track.optimism is None else np.maximum(seen, np.sqrt(seen * track.optimism))
-            track = replace(track, optimism=careful)
-            wanted = aims.calibrated(aim, careful)
+            careful = _careful(seen, track.optimism)
+            track, wanted = replace(track, optimism=careful), aims.calibrated(aim, careful)
     wanted = aims.lowered(wanted, margins.get(SIGMA_MAX, 0.0))
     knots = len(_knots(problem)) - 1
     intervals = max(4, round(knots / stage.coarse))
@@ -378,6 +376,14 @@ def _advance(
         times=nodes.ravel(),
         states=point.Z.reshape(-1, tr.n_z),
     )
+
+
+def _careful(seen: np.ndarray, before: np.ndarray | None) -> np.ndarray:
+    """The optimism to correct for, where `before` was corrected for and this is seen: half of a growth is expected
+    again, half of a decline is believed. Drives would go back and forth otherwise."""
+    if before is None:
+        return seen
+    return np.asarray(np.where(seen > before, seen * np.sqrt(seen / before), np.sqrt(seen * before)))
 
 
 def _one_way(

@@ -102,7 +102,9 @@ def verify_table(summary: dict[str, Any]) -> None:
 
 def compare_table(summary: dict[str, Any]) -> None:
     """A comparison, a drive a line."""
-    rows = table("drive", "cond(Phi)", "cond(W)", "worst std %", "median std %", "kept", "limit broken", "time s")
+    rows = table(
+        "drive", "cond(Phi)", "cond(W)", "worst std %", "median std %", "kept", "limit broken", "time s", "as good in s"
+    )
     for row in summary["designs"]:
         rows.add_row(
             row["name"],
@@ -110,6 +112,7 @@ def compare_table(summary: dict[str, Any]) -> None:
             f"{row['kept']}/{row['samples']}",
             "-" if row["breaks"] is None else f"{row['breaks']} by {100 * row['max_violation']:.2g} %",
             f"{row['wall_s']:.1f}",
+            f"not in {row['wall_s']:.0f}" if row["equal_score_s"] is None else f"{row['equal_score_s']:.0f}",
         )
     say(f"{summary['machine']} {summary['problem']}: the designed drive and the usual ones")
     say(rows)

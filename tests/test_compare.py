@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pandas as pd
 import pytest
 
 from excite import objective
-from excite.compare import OURS, USUAL, Comparison, compare, judge, shrunk, within
+from excite.compare import OURS, USUAL, Comparison, _equal, _processes, _Sample, compare, judge, shrunk, within
 from excite.continuation import TOLERANCE
 from excite.limit import check
 from excite.manoeuvre import Manoeuvre, multisine
@@ -30,7 +31,7 @@ def problem(straight: Model) -> Problem:
 
 @pytest.fixture(scope="module")
 def result(straight: Model, problem: Problem) -> Comparison:
-    return compare(straight, problem, samples=3, seed=1, budget_s=8.0, usual=KINDS)
+    return compare(straight, problem, samples=3, seed=1, budget_s=60.0, usual=KINDS)
 
 
 def test_every_kind_has_its_rows(result: Comparison) -> None:
@@ -58,6 +59,19 @@ def test_every_score_is_that_of_a_fresh_simulation(straight: Model, problem: Pro
         assert max(over.values()) == pytest.approx(r.max_violation, abs=1e-9)
         assert (r.breaks is None) == (r.max_violation <= TOLERANCE)
         assert 0 < r.median_std_percent <= r.worst_std_percent
+
+
+def test_time_to_an_equal_score(result: Comparison, straight: Model, problem: Problem) -> None:
+    """Samples count one after the other, shared among the processes; infeasible ones take time and don't count."""
+    ours, *others = result.rows
+    assert ours.equal_s == ours.wall_s
+    assert all(r.equal_s is None for r in others)
+    found, _ = judge(straight, problem, shrunk(straight, problem, multisine(straight, problem, 0)))
+    kept = replace(found, violations={}, score=2 * np.log(100.0))
+    samples = [_Sample("x", k, c, 10.0) for k, c in enumerate([replace(kept, violations={"power": 1.0}), kept, kept])]
+    shared = min(_processes(), 3)
+    assert _equal(samples, 101.0) == pytest.approx(20.0 / shared)
+    assert _equal(samples, 99.0) is None
 
 
 def test_what_cannot_be_brought_inside_says_what_it_breaks(straight: Model, problem: Problem) -> None:
@@ -105,7 +119,7 @@ def test_the_command_writes_drives_that_score_what_it_says(
     kept = {name: USUAL[name] for name in ("chirp", "hand-made")}
     monkeypatch.setattr(room.compare, "__defaults__", (*room.compare.__defaults__[:-1], tuple(kept)))
     out = tmp_path / "compared"
-    code, shown, err = excite("compare", "va12_straight", "--samples", 2, "--budget", 6, "--out", out, "--json")
+    code, shown, err = excite("compare", "va12_straight", "--samples", 2, "--budget", 60, "--out", out, "--json")
     assert code == 0, err
     summary = json.loads(shown)
     assert summary == json.loads((out / "summary.json").read_text())
