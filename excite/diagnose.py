@@ -121,15 +121,13 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
     tell(0.0, "fitting the model")
     before = fitted(model.machine, logs, filter)
     stage, chosen, first = before, list[_Choice](), tuple[evidence.Score, ...]()
-    for round in range(MOST):
-        tell(0.15 + 0.2 * round, "scoring effects")
+    for turn in range(MOST):
+        tell(0.15 + 0.2 * turn, "scoring effects")
         known = [e.name for e in stage.model.effects]
         found = evidence.candidates(model.machine, [s.name for s in stage.prepared.c.sensors], _duration(logs), known)
         scores = evidence.scan(stage.prepared.c, stage.prepared.records, stage.fit, found).scores
         first = first or scores
-        choice = _choose(
-            stage, scores, logs, filter, lambda k, r=round: tell(0.2 + 0.2 * r + 0.03 * k, "fitting causes")
-        )
+        choice = _choose(stage, scores, logs, filter, tell, 0.2 + 0.2 * turn)
         if choice is None:
             break
         chosen.append(choice)

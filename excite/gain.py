@@ -1,0 +1,115 @@
+"""What an extended model gains on data that it wasn't fitted on.
+
+Stretches of the logs are withheld: their readings are hidden, parameters and states are fitted to the rest, and the
+exact dynamics predict what the sensors read in them. The same stretches for the model before and after, so that the
+difference is the model's; intervals from stretches drawn anew (Efron, 1979).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from excite import smoothing
+from excite.diagnose import Stage
+from excite.record import readings
+from excite.smoothing import NotConverged
+
+HIDDEN, PERIOD = 3.0, 9.0  # [s] withheld of every so many
+DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Withheld:
+    """Errors of a model on withheld stretches: mean squares (stretches, m) [SI squared] and how many readings (same).
+
+    sensors (m): names and units; motion (m,): mean square of what each signal does in a stretch.
+    """
+
+    sensors: tuple[tuple[str, str], ...]
+    squares: np.ndarray
+    counts: np.ndarray
+    motion: np.ndarray
+
+    def percent(self, draw: np.ndarray | None = None) -> float:
+        """The error in per cent of the motion, root mean square over signals; of some stretches where drawn."""
+        at = slice(None) if draw is None else draw
+        error = self.squares[at].sum(axis=0) / np.maximum(self.counts[at].sum(axis=0), 1)
+        told = (self.counts[at].sum(axis=0) > 0) & (self.motion > 0)
+        return float(100 * np.sqrt(np.mean(error[told] / self.motion[told]))) if told.any() else float("nan")
+
+    def rms(self) -> dict[str, tuple[float, str]]:
+        """Root mean square error of every signal, with its unit."""
+        size = np.sqrt(self.squares.sum(axis=0) / np.maximum(self.counts.sum(axis=0), 1))
+        return {name: (float(x), unit) for (name, unit), x in zip(self.sensors, size, strict=True)}
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Error before and after [%], the gain in per cent of the error before, and its 95 % interval."""
+
+    before: float
+    after: float
+    percent: float
+    interval: tuple[float, float]
+    signals: Mapping[str, tuple[float, float, str]]
+
+
+def withheld(stage: Stage) -> Withheld | None:
+    """How well a fitted model predicts stretches that are hidden from it; None where no fit to the rest is found."""
+    prepared, fit = stage.prepared, stage.fit
+    c, rate = prepared.c, float(stage.machine.sampling_hz)
+    stretches = [_stretches(len(r.used), rate) for r in prepared.records]
+    masked = []
+    for r, own in zip(prepared.records, stretches, strict=True):
+        used = r.used.copy()
+        for a, b in own:
+            used[a:b] = 0.0
+        masked.append(replace(r, used=used))
+    damping = smoothing.DAMPING[0] * smoothing.DAMPING[1] ** 2
+    try:
+        rest = smoothing.iterate(
+            c, masked, fit.points, fit.X, prepared.starts, fit.disturbed, prepared.held | fit.unseen, damping
+        )
+    except NotConverged:
+        return None
+    squares, counts, motion = [], [], []
+    for r, p, own in zip(prepared.records, rest.points, stretches, strict=True):
+        u = c.delivered(r.torque, rest.X)[0] + np.concatenate([p.w, p.w[-1:]])
+        h = readings(c, r, p, u, rest.X)[0]
+        for a, b in own:
+            told = r.used[a:b] > 0
+            error = np.where(told, r.reading[a:b] - h[a:b], 0.0)
+            squares.append((error**2).sum(axis=0))
+            counts.append(told.sum(axis=0))
+            motion.append(h[a:b].var(axis=0))
+    sensors = tuple((s.name, "rad" if s.resolution is not None and s.unit == "rad" else s.unit) for s in c.sensors)
+    return Withheld(sensors, np.array(squares), np.array(counts), np.mean(motion, axis=0))
+
+
+def gain(before: Withheld, after: Withheld, seed: int = 0) -> Gain:
+    """What a model gains on the same stretches, with an interval from stretches drawn anew."""
+    rng = np.random.default_rng(seed)
+    n = len(before.squares)
+    ratios = []
+    for _ in range(DRAWS):
+        draw = rng.integers(0, n, n)
+        ratios.append(100 * (1 - after.percent(draw) / before.percent(draw)))
+    old, new = before.percent(), after.percent()
+    was, now = before.rms(), after.rms()
+    return Gain(
+        old,
+        new,
+        100 * (1 - new / old),
+        (float(np.nanpercentile(ratios, 2.5)), float(np.nanpercentile(ratios, 97.5))),
+        {name: (was[name][0], now[name][0], was[name][1]) for name in was},
+    )
+
+
+def _stretches(samples: int, rate: float) -> Sequence[tuple[int, int]]:
+    """First and last sample of the withheld stretches, none at the ends."""
+    length, period = round(HIDDEN * rate), round(PERIOD * rate)
+    first = (period - length) // 2
+    return [(a, a + length) for a in range(first, samples - length - first // 2, period)]
