@@ -1,0 +1,76 @@
+"""What is asked of a design on the command line, and what is said of the answer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Excite
+
+from excite import log, sensors, stored
+from excite.brief import POOR, Brief, advice
+from excite.simulate import Motion
+from excite.smoothing import cramer_rao
+from model.prediction import Model
+
+
+def test_advice_names_what_to_do() -> None:
+    assert advice(Brief(), "Kx1", POOR) is None
+    text = advice(Brief(), "Kx1", 3 * POOR)
+    assert text is not None
+    assert "hides poor accuracy: Kx1 can't be found better than 15 %" in text
+    assert "--objective accuracy" in text
+    assert "--sigma-max" in text
+    for brief in (Brief("accuracy"), Brief("cond", sigma_max=20.0)):
+        said = advice(brief, "Kx1", 3 * POOR)
+        assert said is not None
+        assert "hides" not in said
+
+
+def test_a_design_says_score_and_accuracy(excite: Excite, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    code, shown, err = excite(
+        "design", "va12_straight", "--duration", 12, "--starts", 1, "--seed", 3, "--out", out, "--json"
+    )
+    assert code == 0, err
+    summary = json.loads(shown)
+    found = stored.read(out)
+    spread = 100 * np.sqrt(np.diag(cramer_rao(found.model, found.motion))) / np.abs(found.model.nominal)
+    assert list(summary["sigma_percent"].values()) == pytest.approx(spread.tolist(), rel=1e-6)
+    assert summary["worst_percent"] == pytest.approx(spread.max(), rel=1e-6)
+    assert summary["median_percent"] == pytest.approx(np.median(spread), rel=1e-6)
+    assert summary["hides_poor_accuracy"] == (spread.max() > POOR)
+    assert (summary["advice"] is not None) == (spread.max() > POOR)
+
+
+def test_after_a_log_the_next_drive_is_for_the_estimated_machine(
+    excite: Excite, straight: Model, straight_motion: Motion, tmp_path: Path
+) -> None:
+    path, out = tmp_path / "log.csv", tmp_path / "d"
+    sensors.measure(straight, straight_motion, seed=5).to_csv(path, index=False)
+    code, shown, err = excite(
+        "design", "va12_straight", "--after", path, "--duration", 12, "--starts", 1, "--out", out, "--json"
+    )
+    assert code == 0, err
+    summary = json.loads(shown)
+    assert summary["after"] == [str(path)]
+    found = stored.read(out)
+    assert list(summary["nominal"].values()) == pytest.approx(found.model.nominal.tolist())
+    assert not np.array_equal(found.model.nominal, straight.nominal)
+    profile, _, _ = log.read_profile(out / "profile.csv", found.model)
+    assert np.abs(found.motion.nu[-1]).max() < 0.04  # at rest for the machine that the log told of
+    assert len(profile) == 1201
+    # both drives together: never worse than the one that was there
+    before = 100 * np.sqrt(np.diag(cramer_rao(straight, straight_motion))) / np.abs(straight.nominal)
+    assert summary["worst_percent"] < 1.1 * before.max()
+    code, _, err = excite("verify", out, "--runs", 1)
+    assert code == 2
+    assert "without --after" in err
+
+
+def test_an_accuracy_must_be_positive(excite: Excite) -> None:
+    code, _, err = excite("design", "va12_straight", "--sigma-max", 0)
+    assert code == 2
+    assert "--sigma-max: must be > 0 %" in err
