@@ -366,18 +366,18 @@ def payload_shift(s: Scene, place: str, A: float, draw: DRAW) -> None:
 
 _JOINTS, _WHEELED = tuple(JOINTS), (*ROLLS, *WHEELS)
 _TABLE: tuple[tuple[Hide, tuple[str, ...], str, dict[str, tuple[float, float]], dict[str, Any]], ...] = (
-    (stribeck_friction, _JOINTS, "N m", {"": (25, 150), "articulation": (150, 900)}, {}),
-    (load_dependent_friction, _JOINTS, "-", {"": (0.01, 0.08), "articulation": (0.01, 0.1)}, {}),
+    (stribeck_friction, _JOINTS, "N m", {"": (40, 180), "articulation": (200, 1000)}, {}),
+    (load_dependent_friction, _JOINTS, "-", {"": (0.012, 0.1), "articulation": (0.02, 0.12)}, {}),
     (asymmetric_coulomb, _JOINTS, "N m", {"": (20, 90), "articulation": (100, 500)}, {"signed": True}),
     (asymmetric_viscous, _JOINTS, "N m s", {"": (6, 40), "articulation": (400, 2500)}, {"signed": True}),
-    (quadratic_drag, _JOINTS, "N m s2", {"": (4, 25), "articulation": (3000, 25000)}, {}),
+    (quadratic_drag, _JOINTS, "N m s2", {"": (7, 35), "articulation": (3000, 25000)}, {}),
     (friction_warm_up, _JOINTS, "-", {"": (0.1, 0.8), "articulation": (0.15, 0.9)}, {}),
     (actuator_lag, _JOINTS, "s", {"": (0.02, 0.15), "articulation": (0.04, 0.2)}, {}),
     (channel_delay, _JOINTS, "s", {"": (0.02, 0.12), "articulation": (0.03, 0.15)}, {}),
-    (torque_gain, _JOINTS, "-", {"": (0.01, 0.08), "articulation": (0.02, 0.12)}, {"signed": True}),
+    (torque_gain, _JOINTS, "-", {"": (0.02, 0.12), "articulation": (0.03, 0.15)}, {"signed": True}),
     (torque_offset_drift, _JOINTS, "N m/s", {"": (0.4, 3), "articulation": (3, 20)}, {"signed": True}),
     (torque_deadband, ROLLS, "N m", {"": (20, 150)}, {}),
-    (pump_coupling, ("drive",), "-", {"": (0.01, 0.08)}, {"signed": True}),
+    (pump_coupling, ("drive",), "-", {"": (0.02, 0.12)}, {"signed": True}),
     (roll_unbalance, ROLLS, "N m", {"": (10, 100)}, {}),
     (encoder_eccentricity, _WHEELED, "rad", {"": (0.001, 0.01)}, {}),
     (torque_ripple, ROLLS, "N m", {"": (20, 150)}, {}),

@@ -152,7 +152,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 def confusion(rows: Sequence[Row]) -> Figure:
     """Hidden against named, visible cases only; a tie that holds the truth counts for the truth."""
-    across = [*CAUSES, "other names", "unexplained", "clean", "failed"]
+    across = [*CAUSES, "other names", "wrong place", "unexplained", "clean", "failed"]
     down = ["nothing", *CAUSES, *SURPRISES]
     table = np.zeros((len(down), len(across)), int)
     for r in rows:
@@ -160,6 +160,7 @@ def confusion(rows: Sequence[Row]) -> Figure:
             continue
         hidden = r["hidden"][0].split("@")[0] if r["hidden"] else "nothing"
         said = hidden if r["outcome"] in GOOD and r["kind"] == "cause" else r["named"].split("@")[0]
+        said = "wrong place" if r["outcome"] == "place" else said
         table[down.index(hidden), across.index(said if said in across else "other names")] += 1
     figure = Figure(figsize=(13, 15), layout="constrained")
     ax = figure.subplots()
