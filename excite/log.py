@@ -18,6 +18,7 @@ from excite.simulate import Motion
 from model import machine as machines
 from model.machine import Machine, Sensor
 from model.prediction import Model
+from model.units import UNITS
 
 SHORTEST = 100  # samples: below this no filter and no estimate makes sense
 
@@ -51,31 +52,54 @@ def read(path: str | Path, machine: Machine, needs: Sequence[str] = ()) -> Log:
 def check(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> Log:
     """A table of columns as a Log. Raises LogError."""
     wanted = machine.sensors("full")
-    known = [s for s in wanted if s.column in table.columns]
+    known = [s for s in wanted if set(s.columns) <= set(table.columns)]
     if machine.time_column not in table.columns:
         raise LogError(f"{source}: no column {machine.time_column} (time), {_columns(table)}{_other(table, machine)}")
     missing = [s for s in wanted if s.name in needs and s not in known]
     if missing:
-        names = ", ".join(f"{s.column} ({_what(s, machine)})" for s in missing)
+        names = ", ".join(f"{c} ({_what(s, machine)})" for s in missing for c in s.columns if c not in table.columns)
         raise LogError(f"{source}: no column {names}, {_columns(table)}{_other(table, machine)}")
-    t = _numbers(table, machine.time_column, source)
+    t = times(table, machine, source)
     least = max(SHORTEST, sum(machine.filter.drop) + 12 * machine.filter.decimation)
     if len(t) < least:
         raise LogError(f"{source}: only {len(t)} rows, at least {least} are needed: is the file complete?")
-    values = {s.name: float(s.factor) * _numbers(table, s.column, source) for s in known}
     rate = float(machine.sampling_hz)
+    values = {s.name: values_of(s, table, rate, source) for s in known}
     _check_time(t, rate, machine.time_column, source)
     for s in known:
         _check_values(s, values[s.name], rate, machine, source)
     for s in machine.sensor:
         if s.kind == "angle" and s not in wanted and s.column in table.columns:
-            moved = float(s.factor) * _numbers(table, s.column, source)
+            moved = values_of(s, table, rate, source)
             if np.ptp(moved) > 0.05:
                 raise LogError(
                     f"{source}: column {s.column}: moves by {np.ptp(moved):.2g} {s.unit}, {machine.name} holds it"
                     " still; is this a log of another machine?"
                 )
     return Log(source, np.arange(len(t)) / rate, values)
+
+
+def times(table: pd.DataFrame, machine: Machine, source: str) -> np.ndarray:
+    """The time column (N,) [s]: numbers in the machine file's unit, or dates from the first on. Raises LogError."""
+    raw = table[machine.time_column]
+    if raw.dtype.kind in "OTU" and pd.to_numeric(raw, errors="coerce").isna().all():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # a format that pandas has to guess
+            raw = pd.to_datetime(raw, errors="coerce", utc=True)
+    if raw.dtype.kind == "M":
+        since = (raw - raw.iloc[0]).dt.total_seconds()
+        return _numbers(pd.DataFrame({machine.time_column: since}), machine.time_column, source)
+    return UNITS[machine.time_unit][1] * _numbers(table, machine.time_column, source)
+
+
+def values_of(sensor: Sensor, table: pd.DataFrame, rate: float, source: str) -> np.ndarray:
+    """A sensor's readings (N,) [SI] from its columns: units, pressures, rates summed up. Raises LogError."""
+    number = _numbers(table, sensor.column, source)
+    if sensor.return_column is not None:
+        number = number - _numbers(table, sensor.return_column, source)
+    if sensor.summed:
+        number = np.concatenate([[0.0], np.cumsum((number[1:] + number[:-1]) / 2)]) / rate
+    return sensor.gain * number
 
 
 def read_table(path: str | Path) -> pd.DataFrame:
@@ -196,7 +220,7 @@ def _check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
 def _check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Machine, source: str) -> None:
     """Units and wrapping: what no such machine can do is a wrong log, not a measurement."""
     body = machine.find(sensor.body)
-    if sensor.kind in ("angle", "wheel") and sensor.unit == "rad":
+    if sensor.kind == "wheel" or (sensor.kind == "angle" and body.joint == "revolute"):
         step = np.abs(np.diff(values))
         k = int(np.argmax(step))
         if step[k] > 2.0:

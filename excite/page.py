@@ -16,6 +16,7 @@ import numpy as np
 from excite import drive
 from excite.drive import Trace
 from model.prediction import Model
+from model.units import UNITS
 
 TIMES = re.compile(r" (in|for) [\d.]+ s| at \d+:[\d.]+")  # the page counts down, so its words need no times
 
@@ -42,7 +43,11 @@ def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
     degrees = trace.left * 180 / np.pi
     by_body = {s.body: s for s in machine.sensors("full") if s.kind == "angle"}
     rolls = [
-        {"column": by_body[b.index].column, "gain": float(b.contact.radius) * float(by_body[b.index].factor)}
+        {
+            "column": by_body[b.index].column,
+            "gain": float(b.contact.radius) * by_body[b.index].gain,
+            "rate": by_body[b.index].summed,
+        }
         for b in machine.contacts
         if b.contact is not None and b.index in by_body
     ]
@@ -50,7 +55,7 @@ def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
     sensor = by_body.get(wheel.index) if wheel is not None else None
     angle = {
         "column": sensor.column if sensor else "",
-        "gain": degrees * float(sensor.factor) if sensor else 0.0,
+        "gain": degrees * sensor.gain if sensor else 0.0,
         "degrees": degrees,
     }
     words = [drive.parts(trace, k) for k in range(len(trace))]
@@ -66,7 +71,7 @@ def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
             for t, (go, steer) in zip(trace.times[:-1], words, strict=True)
         ],
         "band": {"speed": drive.BAND_SPEED, "angle": float(np.rad2deg(drive.BAND_ANGLE)), "time": drive.BAND_S},
-        "log": {"time": machine.time_column, "rolls": rolls, "angle": angle},
+        "log": {"time": machine.time_column, "second": UNITS[machine.time_unit][1], "rolls": rolls, "angle": angle},
     }
 
 

@@ -8,8 +8,10 @@ import pandas as pd
 from excite.simulate import Motion
 from model.machine import Sensor
 from model.prediction import Model
+from model.units import UNITS
 
 KITS = ("paper", "full")
+IDLE = 15e5  # Pa in the line of a hydraulic motor that does not push (boost pressure)
 SENSORS = 1  # stream of random numbers: one seed drives and measures, but not with the same numbers
 
 
@@ -26,12 +28,22 @@ def measure(
         raise ValueError(f"kit: {kit} is unknown, allowed: {', '.join(KITS)}")
     exact = signals(model, motion, X)
     rng = np.random.default_rng([seed, SENSORS])
-    columns = {model.machine.time_column: motion.t}
+    columns = {model.machine.time_column: motion.t / UNITS[model.machine.time_unit][1]}
     for sensor in model.machine.sensors(kit):
-        columns[sensor.column] = (_flawed(sensor, exact[sensor.name], rng) if noise else exact[sensor.name]) / float(
-            sensor.factor
-        )
+        read = _flawed(sensor, exact[sensor.name], rng) if noise else exact[sensor.name]
+        columns |= _written(sensor, read, float(model.machine.sampling_hz))
     return pd.DataFrame(columns)
+
+
+def _written(sensor: Sensor, read: np.ndarray, rate: float) -> dict[str, np.ndarray]:
+    """A reading (N,) [SI] as its columns: in the file's unit, as a rate, or as the two pressures of a motor."""
+    if sensor.summed:
+        read = np.gradient(read) * rate
+    number = read / sensor.gain
+    if sensor.return_column is None:
+        return {sensor.column: number}
+    idle = IDLE / (sensor.gain * 2 * np.pi / float(sensor.displacement or 1))
+    return {sensor.column: np.maximum(number, 0) + idle, sensor.return_column: np.maximum(-number, 0) + idle}
 
 
 def signals(model: Model, motion: Motion, X: np.ndarray | None = None) -> dict[str, np.ndarray]:

@@ -23,6 +23,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from model.machine import Machine
+from model.units import UNITS
 
 HOST = "127.0.0.1"
 MESSAGE = 1024  # bytes
@@ -142,9 +143,14 @@ class Tail:
         rolls = [(b, sensors[b.index]) for b in self.machine.contacts if b.index in sensors]
         wheel = next((s for i, s in sensors.items() if self.machine.find(i).contact is None), None)
         try:
-            t = float(cells[self.machine.time_column])
-            ways = [float(b.contact.radius) * float(s.factor) * float(cells[s.column]) for b, s in rolls if b.contact]
-            angle = float(s.factor) * float(cells[s.column]) if (s := wheel) is not None else None
+            t = UNITS[self.machine.time_unit][1] * float(cells[self.machine.time_column])
+            ways = []
+            for b, s in rolls:
+                number = float(b.contact.radius if b.contact else 0) * s.gain * float(cells[s.column])
+                if s.summed and self.rows:
+                    number = self.rows[-1][1] + number * (t - self.rows[-1][0])
+                ways.append(number)
+            angle = wheel.gain * float(cells[wheel.column]) if wheel is not None else None
         except (KeyError, ValueError):
             return None
         if not ways or not math.isfinite(t + sum(ways)):

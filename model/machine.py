@@ -27,6 +27,8 @@ from pydantic import (
     model_validator,
 )
 
+from model import units
+
 MACHINES = Path(__file__).parent / "machines"
 Source = Literal["paper", "data sheet", "measured", "published", "identified", "assumed", "definition"]
 
@@ -258,7 +260,12 @@ class Body(Record):
 
 
 class Sensor(Record):
-    """One column of a log. SI value = factor x (number in the column).
+    """One column of a log, in `unit` (see `units`). SI value = `gain` x (number in the column).
+
+    A `factor` that is given is the SI value of one, whatever `unit` says; it is needed where the unit has none, V say.
+    A torque may come as the pressures on both sides of a hydraulic motor, in `column` and `return_column`, with the
+    `displacement` [m3 per turn of the joint, gear included]: u = displacement / (2 pi) (p - p_return); `factor` is then
+    the pressure of one [Pa], 4e6 for 0-10 V over 0-400 bar. An angle that comes as a rate (rpm, m/s) is summed up.
 
     kind `angle`: encoder of a joint; `wheel`: measuring wheel of `radius` [m] at `lateral` [m] (+ left) on the axis
     through the body's origin (32); `torque`: delivered torque or force + u0; `yaw_rate`, `lateral_speed`: of the
@@ -270,7 +277,9 @@ class Sensor(Record):
     body: Index
     column: Annotated[str, Field(min_length=1)]
     unit: str
-    factor: Quantity = Quantity(value=1.0, source="definition")
+    factor: Quantity | None = None
+    return_column: Annotated[str | None, Field(min_length=1)] = None
+    displacement: Positive | None = None
     kits: tuple[Literal["paper", "full"], ...] = ("paper", "full")
     place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
     counts_per_turn: Positive | None = None
@@ -283,13 +292,43 @@ class Sensor(Record):
         """One count [SI unit of the column], None for an analogue sensor."""
         return None if self.counts_per_turn is None else 2 * math.pi / self.counts_per_turn.value
 
+    @property
+    def gain(self) -> float:
+        """SI value of one in the column; of pressures, the torque [N m]."""
+        one = float(self.factor) if self.factor is not None else units.UNITS[self.unit][1]
+        return one if self.displacement is None else one * float(self.displacement) / (2 * math.pi)
+
+    @property
+    def summed(self) -> bool:
+        """Whether the column holds the rate of what the sensor stands for."""
+        known = units.UNITS.get(self.unit, ("", 1.0))[0]
+        return self.kind in ("angle", "wheel") and known in units.SUMMED
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of a log that it is in."""
+        return (self.column,) if self.return_column is None else (self.column, self.return_column)
+
     @model_validator(mode="after")
     def _consistent(self) -> Sensor:
+        if (self.displacement is None) != (self.return_column is None):
+            key = "return_column" if self.return_column is None else "displacement"
+            raise ValueError(f"{key}: two pressures of a motor need column, return_column and displacement")
+        if self.displacement is not None and self.kind != "torque":
+            raise ValueError(f"displacement: makes a torque of pressures, not kind {self.kind}")
+        measured = ("pressure",) if self.displacement is not None else units.MEASURES[self.kind]
+        if self.factor is None and units.UNITS.get(self.unit, ("",))[0] not in measured:
+            raise ValueError(
+                f"unit: {self.unit!r} is no {' or '.join(measured)}, allowed for kind {self.kind}:"
+                f" {units.allowed(measured)}, or any with its factor (the SI value of one)"
+            )
+        if self.summed and self.counts_per_turn is not None:
+            raise ValueError("counts_per_turn: is for a column that counts, not for a rate")
         if self.kind == "wheel" and (self.radius is None or self.lateral is None):
             raise ValueError(f"{'lateral' if self.radius else 'radius'}: a measuring wheel needs radius and lateral")
         if self.kind != "wheel" and (self.radius is not None or self.lateral is not None):
             raise ValueError(f"{'radius' if self.radius else 'lateral'}: is for kind wheel only")
-        if self.factor.value == 0:
+        if self.factor is not None and self.factor.value == 0:
             raise ValueError("factor: must not be 0")
         return self
 
@@ -365,6 +404,7 @@ class Machine(Record):
     reference: str = ""
     sampling_hz: Positive
     time_column: str = "t_s"
+    time_unit: Literal["s", "ms", "us", "min"] = "s"
     gravity: Vector3 = (0.0, 0.0, -9.81)
     power_limit: Positive | None = None
     locked: tuple[str, ...] = ()
@@ -491,8 +531,10 @@ class Machine(Record):
                 raise ValueError(f"sensor[{k}].kind: {sensor.kind} needs a planar root, allowed here: angle, torque")
             if sensor.name in names:
                 raise ValueError(f"sensor[{k}].name: {sensor.name} is used twice")
-            if sensor.column in columns:
-                raise ValueError(f"sensor[{k}].column: {sensor.column} is used twice")
+            for column in sensor.columns:
+                if column in columns:
+                    raise ValueError(f"sensor[{k}].column: {column} is used twice")
+                columns.add(column)
             twin = (sensor.kind, sensor.body)
             if sensor.kind in ("angle", "torque") and twin in measured:
                 raise ValueError(
@@ -500,7 +542,6 @@ class Machine(Record):
                 )
             measured.add(twin)
             names.add(sensor.name)
-            columns.add(sensor.column)
 
 
 def shipped() -> tuple[str, ...]:

@@ -1,0 +1,68 @@
+"""Units that a log may be in: what kind of quantity each is, and its SI value. One table; values by definition."""
+
+from __future__ import annotations
+
+import math
+
+TURN = 2 * math.pi
+BAR, INCH, POUND_FORCE = 1e5, 0.0254, 4.4482216152605  # Pa, m, N
+
+# unit -> (quantity, SI value of one of it)
+UNITS: dict[str, tuple[str, float]] = {
+    "rad": ("angle", 1.0),
+    "mrad": ("angle", 1e-3),
+    "deg": ("angle", TURN / 360),
+    "°": ("angle", TURN / 360),
+    "turn": ("angle", TURN),
+    "rev": ("angle", TURN),
+    "rad/s": ("angular rate", 1.0),
+    "deg/s": ("angular rate", TURN / 360),
+    "°/s": ("angular rate", TURN / 360),
+    "rpm": ("angular rate", TURN / 60),
+    "1/min": ("angular rate", TURN / 60),
+    "Hz": ("angular rate", TURN),
+    "m": ("length", 1.0),
+    "cm": ("length", 1e-2),
+    "mm": ("length", 1e-3),
+    "km": ("length", 1e3),
+    "in": ("length", INCH),
+    "ft": ("length", 12 * INCH),
+    "m/s": ("speed", 1.0),
+    "mm/s": ("speed", 1e-3),
+    "km/h": ("speed", 1 / 3.6),
+    "mph": ("speed", 1609.344 / 3600),
+    "N m": ("torque", 1.0),
+    "Nm": ("torque", 1.0),
+    "kN m": ("torque", 1e3),
+    "kNm": ("torque", 1e3),
+    "lbf ft": ("torque", POUND_FORCE * 12 * INCH),
+    "N": ("force", 1.0),
+    "kN": ("force", 1e3),
+    "lbf": ("force", POUND_FORCE),
+    "Pa": ("pressure", 1.0),
+    "kPa": ("pressure", 1e3),
+    "MPa": ("pressure", 1e6),
+    "bar": ("pressure", BAR),
+    "psi": ("pressure", POUND_FORCE / INCH**2),
+    "s": ("time", 1.0),
+    "ms": ("time", 1e-3),
+    "us": ("time", 1e-6),
+    "min": ("time", 60.0),
+}
+
+# what a column may hold for a sensor of each kind; rates and speeds of an angle are summed up over time
+MEASURES: dict[str, tuple[str, ...]] = {
+    "angle": ("angle", "length", "angular rate", "speed"),
+    "wheel": ("angle", "angular rate"),
+    "torque": ("torque", "force"),
+    "yaw_rate": ("angular rate",),
+    "lateral_speed": ("speed",),
+    "x": ("length",),
+    "y": ("length",),
+}
+SUMMED = ("angular rate", "speed")
+
+
+def allowed(quantities: tuple[str, ...]) -> str:
+    """The units of some quantities, as a message lists them."""
+    return ", ".join(unit for unit, (quantity, _) in UNITS.items() if quantity in quantities)
