@@ -46,8 +46,10 @@ SETTLED = 3  # passes until the states fit the dynamics well enough to tell whic
 UNSEEN = 1.0  # a parameter that a log tells less than this well, in its scale, stays at the machine file's value
 DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's scale, and its share from pass to pass
 HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
-# Left undone at the end of the iteration, in standard deviations; with disturbing forces two and a half times that.
-CONVERGED = 0.02
+CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviations
+ENOUGH = 0.2  # likewise with disturbing forces, whose deviations are no promise
+# Steps that turn back and hardly shrink are shortened by TURNED; others grow by SHARE up to the whole.
+TURNED, SHARE, SLOW = 0.7, 1.15, 0.3
 LARGEST_STEP = 0.5  # of a parameter in one pass, relative to its size
 # Disturbing forces where the model is not trusted, white from sample to sample, as accelerations [m/s2, rad/s2]: on a
 # roller of 11 t they are 500 N. Four and sixteen times that until the innovations are what they should be.
@@ -374,6 +376,7 @@ def iterate(
     step, before = np.inf, np.inf
     shorter, here = 0, (list(points), X)
     there = here
+    whole, last = 1.0, np.zeros(len(X))
     prior = np.where(held, HELD**-2, PRIOR**-2)
     unseen = held.copy()
     for k in range(PASSES):
@@ -400,10 +403,14 @@ def iterate(
         before, step = step, left
         if k >= HOPELESS[0] and step > HOPELESS[1]:
             break
+        # Where Gauss-Newton swings about the answer, shorter steps end it.
+        turned = move[0][: len(X)] / np.sqrt(np.diag(covariance))[: len(X)]
+        swings = turned @ last < 0 and step > SLOW * before
+        whole = max(TURNED * whole, 0.3) if swings else min(SHARE * whole, 1.0)
+        last = turned
         limit = LARGEST_STEP * np.maximum(np.abs(X) / model.scale, 1.0)
         for m in move:
-            m[: len(X)] = np.clip(m[: len(X)], -limit, limit)
-        for m in move:
+            m[: len(X)] = np.clip(whole * m[: len(X)], -limit, limit)
             # Amounts that make sense above zero only stay there.
             low = -0.8 * X[model.positive] / model.scale[model.positive]
             m[: len(X)][model.positive] = np.maximum(m[: len(X)][model.positive], low)
@@ -412,9 +419,8 @@ def iterate(
             X + move[0][: len(X)] * model.scale,
         )
         # What this step will have left undone, if steps go on shrinking as they do.
-        ratio = min(step / before, 0.9)
-        small = CONVERGED if disturbed == 0 else 2.5 * CONVERGED
-        if step < 10 * small and step * ratio / (1 - ratio) < small:
+        ratio = min(max(step / before, 1 - whole), 0.9)
+        if (step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED) or (disturbed > 0 and step < ENOUGH):
             base = covariance[: len(X), : len(X)] * np.outer(model.scale, model.scale)
             return Fit(there[1], base, unseen, tuple(there[0]), tuple(linear), cost, disturbed)
     raise NotConverged(
