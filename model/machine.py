@@ -560,7 +560,7 @@ def load(name: str | Path) -> Machine:
     try:
         return Machine.model_validate(raw)
     except ValidationError as err:
-        raise MachineError(_one_line(path, err)) from None
+        raise MachineError(one_line(path, err, Machine)) from None
 
 
 def _find(name: str) -> Path:
@@ -604,23 +604,24 @@ def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _one_line(path: Path, err: ValidationError) -> str:
+def one_line(path: Path | str, err: ValidationError, root: type[Record]) -> str:
+    """What is wrong with a file that holds a `root` record: file, key, what is wrong, what is allowed, in a line."""
     first = err.errors(include_url=False)[0]
     key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in first["loc"]).lstrip(".")
     kind, message, got = first["type"], first["msg"], first.get("input")
     if kind == "extra_forbidden":
-        message = f"no such key here, allowed: {', '.join(_record(first['loc'][:-1]).model_fields)}"
+        message = f"no such key here, allowed: {', '.join(_record(first['loc'][:-1], root).model_fields)}"
     elif kind == "missing":
         message = "is missing"
     elif kind == "model_type":
-        record = _record(first["loc"])
+        record = _record(first["loc"], root)
         number = record in (Quantity, Point)
         table = '{ value = ..., source = "..." }' if number else f"with keys {', '.join(record.model_fields)}"
         message = f"must be a table {table} (got {reprlib.repr(got)})"
     elif kind == "value_error":
         message = message.removeprefix("Value error, ")
         inner, _, rest = message.partition(": ")
-        if inner in _record(first["loc"]).model_fields:
+        if inner in _record(first["loc"], root).model_fields:
             key, message = f"{key}.{inner}".lstrip("."), rest
     elif kind == "too_short":
         message = f"must have at least {first['ctx']['min_length']} (got {first['ctx']['actual_length']})"
@@ -634,9 +635,9 @@ def _one_line(path: Path, err: ValidationError) -> str:
     return " ".join(f"{path}: {key + ': ' if key else ''}{message}{tail}".split())
 
 
-def _record(where: tuple[int | str, ...]) -> type[Record]:
+def _record(where: tuple[int | str, ...], root: type[Record]) -> type[Record]:
     """The record that the file holds at this key."""
-    record: type[Record] = Machine
+    record = root
     for step in where:
         field = record.model_fields.get(str(step))
         if field is not None:
