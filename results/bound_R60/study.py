@@ -1,0 +1,113 @@
+"""How low cond(Phi) of R60 could be: the bound of `excite.bound`, from the states of the designed drives.
+
+python results/bound_R60/study.py [--rounds 80] [--minutes 45] rebuilds summary.json and bound.png beside this file.
+"""
+
+from __future__ import annotations
+
+# ruff: noqa: E402  (threads are set before numpy loads)
+import argparse
+import dataclasses
+import os
+import time
+from pathlib import Path
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from excite import folder, log, objective
+from excite.bound import Bound, bound
+from excite.limit import placed
+from excite.manoeuvre import Manoeuvre
+from excite.report import COLOURS, save
+from excite.simulate import Motion, simulate
+from model import machine, prediction
+from model.prediction import Model
+
+HERE = Path(__file__).parent
+DESIGNS = HERE.parent / "R60" / "design", HERE.parent / "R60_accuracy" / "design"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=80, help="of column generation, at most")
+    parser.add_argument("--minutes", type=float, default=45, help="after which no new round begins")
+    parser.add_argument("--degree", type=int, default=2, help="of the polynomials")
+    parser.add_argument("--polished", type=int, default=12, help="states that are made worse locally in a round")
+    options = parser.parse_args()
+    model = prediction.build(machine.load("va12"))
+    motions = drives(model)
+    path: list[Bound] = []
+    begin = time.monotonic()
+
+    def seen(found: Bound) -> bool:
+        path.append(found)
+        spent = (time.monotonic() - begin) / 60
+        print(
+            f"round {found.rounds}, {spent:.1f} min: {found.certified:.2f} <= optimum <= {found.mixture:.2f}",
+            flush=True,
+        )
+        return spent > options.minutes
+
+    found = bound(
+        model,
+        model.machine.problems["R60"],
+        motions,
+        options.degree,
+        options.rounds,
+        polished=options.polished,
+        progress=seen,
+    )
+    best = min(objective.cond_phi(model, m) for m in motions)
+    summary = {
+        "machine": "va12",
+        "problem": "R60",
+        "designed_cond_phi": best,
+        **dataclasses.asdict(found),
+        "gap_percent": 100 * (best / found.certified - 1) if found.certified > 0 else None,
+        "wall_s": time.monotonic() - begin,
+        "certified_by_round": [f.certified for f in path],
+        "mixture_by_round": [f.mixture for f in path],
+    }
+    save(figure(path, found, best), HERE / "bound.png")
+    with folder.writing_file(HERE / "summary.json") as place:
+        place.write_text(folder.dump(summary), encoding="utf-8")
+
+
+def drives(model: Model) -> list[Motion]:
+    """The designs of the studies R60 and R60_accuracy, and the best drive that a long search found (drive.csv)."""
+    rate = float(model.machine.sampling_hz)
+    knots = np.loadtxt(HERE / "drive.csv", delimiter=",", skiprows=1)
+    torque = Manoeuvre(knots[:, 0], knots[:, 1:]).sample(rate)
+    start = placed(model, model.machine.problems["R60"], simulate(model, torque))
+    found = [simulate(model, torque, q0=start)]
+    for place in DESIGNS:
+        torque, q0, nu0 = log.read_profile(place / "profile.csv", model)
+        found.append(simulate(model, torque, q0=q0, nu0=nu0))
+    return found
+
+
+def figure(path: list[Bound], found: Bound, best: float) -> Figure:
+    """Mixture and certificate, round by round, against the best drive."""
+    fig = Figure(figsize=(8, 4.5), layout="constrained")
+    ax = fig.subplots()
+    rounds = [f.rounds for f in path]
+    ax.plot(rounds, [f.mixture for f in path], color=COLOURS[0], label="best mixture of the states found")
+    ax.plot(rounds, [f.certified for f in path], "--", color=COLOURS[1], label="certified so far")
+    ax.plot(
+        rounds[-1], found.certified, "D", color=COLOURS[1], markeredgecolor="black", label="after a thorough search"
+    )
+    ax.axhline(best, color="black", linestyle=":", label=f"best drive known, {best:.2f}")
+    ax.set_xlabel("round of column generation")
+    ax.set_ylabel("cond(Phi)")
+    ax.set_ylim(0, 2 * best)
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=9)
+    return fig
+
+
+if __name__ == "__main__":
+    main()

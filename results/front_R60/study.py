@@ -1,0 +1,121 @@
+"""The front between condition number and accuracy on R60: the lowest cond(Phi) for what the worst parameter may be.
+
+python results/front_R60/study.py [--sigma-max 1 1.5 2 3 5] rebuilds summary.json, front.png and the designs' knots
+beside this file, from the designs of the studies R60 and R60_accuracy. A design that is in `drives/` is not made again.
+"""
+
+from __future__ import annotations
+
+# ruff: noqa: E402  (threads are set before numpy loads)
+import argparse
+import os
+import time
+from pathlib import Path
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from excite import aim as aims
+from excite import folder, log, objective
+from excite.continuation import verdict
+from excite.design import design
+from excite.limit import InfeasibleError
+from excite.manoeuvre import Manoeuvre, knots
+from excite.report import COLOURS, save
+from model import machine, prediction
+from model.machine import Problem
+from model.prediction import Model
+
+HERE = Path(__file__).parent
+ENDS = {"cond": HERE.parent / "R60" / "design", "accuracy": HERE.parent / "R60_accuracy" / "design"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sigma-max", type=float, nargs="*", default=[1.0, 1.5, 2.0, 3.0, 5.0], help="per cent")
+    options = parser.parse_args()
+    (HERE / "drives").mkdir(exist_ok=True)
+    model = prediction.build(machine.load("va12"))
+    problem = model.machine.problems["R60"]
+    ends = {name: stored(model, problem, place) for name, place in ENDS.items()}
+    points = [point(model, problem, name, None, drive, 0.0) for name, drive in ends.items()]
+    before = ends["accuracy"]
+    for level in sorted(options.sigma_max):
+        path, wall = HERE / "drives" / f"{level:g}.csv", 0.0
+        if not path.is_file():
+            begin = time.monotonic()
+            try:
+                found = design(model, problem, aims.aim(model, "cond", level), 0, warm=[before, ends["cond"]])
+            except InfeasibleError as err:
+                print(err, flush=True)
+                continue
+            wall = time.monotonic() - begin
+            rows = np.column_stack([found.manoeuvre.times, found.manoeuvre.torque])
+            with folder.writing_file(path) as place:
+                np.savetxt(place, rows, "%.12g", ",", header="t_s,u1_Nm,u2_Nm,u4_Nm", comments="")
+        rows = np.loadtxt(path, delimiter=",", skiprows=1)
+        before = Manoeuvre(rows[:, 0], rows[:, 1:])
+        points.append(point(model, problem, "cond", level, before, wall))
+        print(points[-1], flush=True)
+    points.sort(key=lambda p: float(p["worst_percent"]))
+    summary = {"machine": "va12", "problem": "R60", "designs": points}
+    save(figure(points), HERE / "front.png")
+    with folder.writing_file(HERE / "summary.json") as place:
+        place.write_text(folder.dump(summary), encoding="utf-8")
+
+
+def stored(model: Model, problem: Problem, place: Path) -> Manoeuvre:
+    """The knots of a design folder."""
+    torque, _, _ = log.read_profile(place / "profile.csv", model)
+    times = knots(problem)
+    return Manoeuvre(times, torque[np.rint(times * float(model.machine.sampling_hz)).astype(int)])
+
+
+def point(
+    model: Model, problem: Problem, name: str, level: float | None, drive: Manoeuvre, wall_s: float
+) -> dict[str, object]:
+    """One design, judged afresh."""
+    aim = aims.aim(model, "cond", level)
+    found, motion = verdict(model, problem, aim, drive)
+    sigma = aims.sigma_percent(aim, model, motion)
+    return {
+        "objective": name,
+        "sigma_max": level,
+        "cond_phi": objective.cond_phi(model, motion),
+        "worst_percent": float(sigma.max()),
+        "worst_parameter": model.base.names[int(sigma.argmax())],
+        "median_percent": float(np.median(sigma)),
+        "max_violation": found.excess,
+        "wall_s": wall_s,
+    }
+
+
+def figure(points: list[dict[str, object]]) -> Figure:
+    """cond(Phi) against the worst and the median parameter."""
+    fig = Figure(figsize=(7.5, 4.8), layout="constrained")
+    ax = fig.subplots()
+    for k, (key, label) in enumerate((("worst_percent", "worst parameter"), ("median_percent", "median parameter"))):
+        x = np.array([p[key] for p in points], float)
+        y = np.array([p["cond_phi"] for p in points], float)
+        ax.plot(x, y, "o^"[k] + ("-" if k == 0 else "--"), color=COLOURS[k], label=label)
+    for p in points:
+        text = p["objective"] if p["sigma_max"] is None else f"at most {p['sigma_max']:g} %"
+        ax.annotate(
+            str(text), (p["worst_percent"], p["cond_phi"]), xytext=(5, 5), textcoords="offset points", fontsize=8
+        )
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlabel("attainable standard deviation [%]")
+    ax.set_ylabel("cond(Phi)")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_formatter("{x:g}")
+    ax.grid(alpha=0.3, which="both")
+    ax.legend()
+    return fig
+
+
+if __name__ == "__main__":
+    main()

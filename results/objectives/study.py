@@ -1,0 +1,222 @@
+"""Which criterion predicts true errors: some twenty drives of R60, what each criterion says, what identification gives.
+
+python results/objectives/study.py [--runs 12] [--jobs 2] rebuilds summary.json and objectives.png beside this file.
+Drives that are in `drives/` are not made again, and neither are runs that are in `runs/`.
+"""
+
+from __future__ import annotations
+
+# ruff: noqa: E402  (threads are set before numpy loads)
+import argparse
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import numpy as np
+import scipy.stats
+from matplotlib.figure import Figure
+
+from excite import aim as aims
+from excite import compare, folder, log, objective
+from excite.design import design
+from excite.manoeuvre import Manoeuvre, knots
+from excite.report import COLOURS, save
+from excite.simulate import Motion, simulate
+from excite.smoothing import cramer_rao
+from excite.verify import verify
+from model import machine, prediction
+from model.machine import Problem
+from model.prediction import Model
+
+HERE = Path(__file__).parent
+RANDOM = {"multisine": 5, "slow multisine": 3, "random steps": 3, "chirp": 2, "hand-made": 1}
+DESIGNED = ("D", "A", "E", "worst", "weighted-cond")
+STORED = {"cond": HERE.parent / "R60" / "design", "accuracy": HERE.parent / "R60_accuracy" / "design"}
+DRAWS = 2000  # of the bootstrap
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=12, help="simulated and identified logs of every drive")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--few", type=int, default=None, help="only so many drives, to try it out")
+    options = parser.parse_args()
+    for name in ("drives", "runs"):
+        (HERE / name).mkdir(exist_ok=True)
+    model = prediction.build(machine.load("va12"))
+    problem = model.machine.problems["R60"]
+    rows = []
+    for name, make in list(drives(model, problem).items())[: options.few]:
+        motion = driven(model, problem, name, make)
+        said = {c: f(model, motion) for c, f in CRITERIA.items()}
+        error = errors(model, motion, name, options.runs, options.jobs)
+        rows.append({"drive": name, "criteria": said, "rms_percent": dict(zip(model.base.names, error, strict=True))})
+        print(f"{name}: cond(Phi) {said['cond(Phi)']:.0f}, worst {max(error):.2f} %", flush=True)
+    worst = np.array([max(r["rms_percent"].values()) for r in rows])
+    median = np.array([np.median(list(r["rms_percent"].values())) for r in rows])
+    ranks = {
+        c: {
+            "worst": rank(np.array([r["criteria"][c] for r in rows]), worst),
+            "median": rank(np.array([r["criteria"][c] for r in rows]), median),
+        }
+        for c in CRITERIA
+    }
+    summary = {"machine": "va12", "problem": "R60", "runs": options.runs, "rank_correlation": ranks, "drives": rows}
+    save(figure(rows, worst, ranks), HERE / "objectives.png")
+    with folder.writing_file(HERE / "summary.json") as place:
+        place.write_text(folder.dump(summary), encoding="utf-8")
+
+
+# ------------------------------------------------------------------------------------------------ criteria
+
+
+def _of(name: str) -> Callable[[Model, Motion], float]:
+    def score(model: Model, motion: Motion) -> float:
+        P = objective.phi(model, motion, name)
+        return objective.reported(name, objective.value(name, P.T @ P))
+
+    return score
+
+
+def torque_noise(model: Model, motion: Motion) -> float:
+    """Worst relative standard deviation [%] if the torques' noise were all there is, on the rows that have a torque."""
+    W = model.stacked(motion.q.T, motion.nu.T, motion.a.T)
+    noise = objective.row_noise(model)
+    W = np.concatenate([W[:, row] / noise[row] for row in range(W.shape[1]) if row in model.actuated]) * model.scale
+    # rows without a torque hold exactly: they count a thousand times as much
+    still = model.stacked(motion.q.T, motion.nu.T, motion.a.T)
+    exact = [row for row in range(still.shape[1]) if row not in model.actuated]
+    held = np.concatenate([1e3 * still[:, row] / noise[row] for row in exact]) * model.scale
+    C = np.linalg.inv(W.T @ W + held.T @ held)
+    return float(100 * np.sqrt((np.diag(C) * model.scale**2 / model.nominal**2).max()))
+
+
+def bound(model: Model, motion: Motion) -> float:
+    """Worst relative standard deviation [%] of the Cramer-Rao bound."""
+    return float((100 * np.sqrt(np.diag(cramer_rao(model, motion))) / np.abs(model.nominal)).max())
+
+
+CRITERIA: dict[str, Callable[[Model, Motion], float]] = {
+    "cond(Phi)": objective.cond_phi,
+    "cond(W)": objective.cond_w,
+    "weighted cond": _of("weighted-cond"),
+    "D": _of("D"),
+    "A": _of("A"),
+    "E": _of("E"),
+    "worst (weighted regressor)": _of("worst"),
+    "torque noise alone": torque_noise,
+    "Cramer-Rao": bound,
+}
+
+
+# ------------------------------------------------------------------------------------------------ drives
+
+
+Make = Callable[[], Manoeuvre]
+
+
+def drives(model: Model, problem: Problem) -> dict[str, Make]:
+    """How to come by every drive, by name."""
+    found: dict[str, Make] = {}
+    for kind, count in RANDOM.items():
+        for k in range(count):
+            found[f"{kind} {k + 1}"] = lambda kind=kind, k=k: usual(model, problem, kind, k)  # type: ignore[misc]
+    for name, place in STORED.items():
+        found[f"designed for {name}"] = lambda place=place: stored(model, problem, place)  # type: ignore[misc]
+    for name in DESIGNED:
+        found[f"designed for {name}"] = lambda name=name: made(model, problem, name)  # type: ignore[misc]
+    return found
+
+
+def usual(model: Model, problem: Problem, kind: str, seed: int) -> Manoeuvre:
+    return compare.within(model, problem, compare.USUAL[kind].make(model, problem, seed, 0.0)).manoeuvre
+
+
+def stored(model: Model, problem: Problem, place: Path) -> Manoeuvre:
+    torque, _, _ = log.read_profile(place / "profile.csv", model)
+    times = knots(problem)
+    return Manoeuvre(times, torque[np.rint(times * float(model.machine.sampling_hz)).astype(int)])
+
+
+def made(model: Model, problem: Problem, name: str) -> Manoeuvre:
+    warm = [stored(model, problem, place) for place in STORED.values()]
+    return design(model, problem, aims.aim(model, name), starts=0, warm=warm).manoeuvre
+
+
+def driven(model: Model, problem: Problem, name: str, make: Make) -> Motion:
+    path = HERE / "drives" / f"{name.replace(' ', '-')}.csv"
+    if not path.is_file():
+        m = make()
+        with folder.writing_file(path) as place:
+            rows = np.column_stack([m.times, m.torque])
+            np.savetxt(place, rows, "%.12g", ",", header="t_s,u1_Nm,u2_Nm,u4_Nm", comments="")
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    return simulate(model, Manoeuvre(rows[:, 0], rows[:, 1:]).sample(float(model.machine.sampling_hz)))
+
+
+def errors(model: Model, motion: Motion, name: str, runs: int, jobs: int) -> list[float]:
+    """Root mean square error [%] of every parameter over the runs."""
+    path = HERE / "runs" / f"{name.replace(' ', '-')}-{runs}.json"
+    if not path.is_file():
+        v = verify(model, motion, "joint", "full", runs, seed=1, jobs=jobs)
+        with folder.writing_file(path) as place:
+            place.write_text(json.dumps(np.sqrt(np.nanmean(v.error_percent**2, axis=0)).tolist()))
+    return [float(x) for x in json.loads(path.read_text())]
+
+
+# ------------------------------------------------------------------------------------------------ ranks
+
+
+def rank(criterion: np.ndarray, error: np.ndarray) -> dict[str, float]:
+    """Spearman's rank correlation with a 95 % bootstrap interval over the drives."""
+    rng = np.random.default_rng(0)
+    n = len(error)
+    draws = []
+    for _ in range(DRAWS):
+        k = rng.integers(n, size=n)
+        if len(np.unique(k)) > 2:
+            draws.append(float(scipy.stats.spearmanr(criterion[k], error[k]).statistic))
+    low, high = np.nanpercentile(draws, [2.5, 97.5])
+    return {"rho": float(scipy.stats.spearmanr(criterion, error).statistic), "low": float(low), "high": float(high)}
+
+
+def figure(rows: Sequence[Mapping], worst: np.ndarray, ranks: Mapping[str, Mapping]) -> Figure:
+    """Left: how well every criterion ranks. Right: cond(Phi) and the bound against the true error."""
+    fig = Figure(figsize=(11.5, 4.6), layout="constrained")
+    left, right = fig.subplots(1, 2, width_ratios=(1.2, 1))
+    names = list(ranks)[::-1]
+    for k, which in enumerate(("worst", "median")):
+        for y, name in enumerate(names):
+            r = ranks[name][which]
+            left.plot([r["low"], r["high"]], [y + 0.15 * (1 - 2 * k)] * 2, color=COLOURS[k])
+            left.plot(
+                r["rho"],
+                y + 0.15 * (1 - 2 * k),
+                "o^"[k],
+                color=COLOURS[k],
+                label=f"{which} parameter" if y == 0 else None,
+            )
+    left.set_yticks(range(len(names)), names)
+    left.axvline(0, color="black", linewidth=0.8)
+    left.set_xlim(-1.05, 1.05)
+    left.set_xlabel("rank correlation with the true error (95 %)")
+    left.grid(axis="x", alpha=0.3)
+    left.legend(fontsize=8, loc="lower left")
+    for k, name in enumerate(("cond(Phi)", "Cramer-Rao")):
+        right.plot([r["criteria"][name] for r in rows], worst, "o^"[k], color=COLOURS[k], label=name)
+    right.plot([0.5, 20], [0.5, 20], ":", color="black", linewidth=0.8)
+    right.set_xscale("log")
+    right.set_yscale("log")
+    right.set_xlabel("criterion (cond; bound of the worst parameter [%])")
+    right.set_ylabel("worst parameter: true rms error [%]")
+    right.grid(alpha=0.3)
+    right.legend(fontsize=8)
+    return fig
+
+
+if __name__ == "__main__":
+    main()
