@@ -337,6 +337,29 @@ def identify(
     terminal.finish(summary, out, json, terminal.identify_table)
 
 
+logs = typer.Typer(help="What is in a log.", rich_markup_mode=None)
+app.add_typer(logs, name="log")
+
+
+@logs.command("check")
+def check_log(
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="a log (.csv, .txt, .parquet, .mat, .mf4)")],
+    machine: Annotated[str | None, typer.Option("--machine", help="whose log it is; guessed by default")] = None,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Says what is in a log and everything that is wrong with it, with a picture."""
+    from excite import folder, reports
+
+    out = out or Path(f"results/log-{path.stem}")
+    folder.claim(out, [path])
+    with folder.writing(out) as place:
+        summary = reports.check_log(place, path, machine, _versions())
+    terminal.finish(summary, out, json, terminal.log_table)
+    if summary["faults"]:
+        raise typer.Exit(1)
+
+
 # ------------------------------------------------------------------------------------------------ the work
 
 

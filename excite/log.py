@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import re
 import warnings
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import scipy.io
 
+from excite import tables
 from excite.simulate import Motion
+from excite.tables import MDF_TIME
+from excite.tables import LogError as LogError
 from model import machine as machines
 from model.machine import Machine, Sensor
 from model.prediction import Model
 from model.units import UNITS
 
 SHORTEST = 100  # samples: below this no filter and no estimate makes sense
-
-
-class LogError(ValueError):
-    """A log or profile that can't be used: one line with file, place, what is wrong and what to do."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +36,21 @@ class Log:
 
 
 def read(path: str | Path, machine: Machine, needs: Sequence[str] = ()) -> Log:
-    """A log (.csv, .parquet, .mat) as the machine file names its columns, checked.
+    """A log (a file that `tables` reads) as the machine file names its columns, checked.
 
     `needs`: names of sensors that must be there. Raises LogError: a missing column, a NaN, time that goes back, a
     gap, a wrong rate, another machine's log, an empty file.
     """
-    table = read_table(path)
-    return check(table, machine, needs, str(path))
+    return check(table_of(path, machine), machine, needs, str(path))
+
+
+def table_of(path: str | Path, machine: Machine) -> pd.DataFrame:
+    """The columns of a log as they are; MDF files give the machine's time column its name. Raises LogError."""
+    table = tables.read(path)
+    if MDF_TIME in table.columns and machine.time_column not in table.columns:
+        one = UNITS[machine.time_unit][1]
+        table.insert(0, machine.time_column, table[MDF_TIME] / one)
+    return table
 
 
 def check(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> Log:
@@ -54,20 +58,22 @@ def check(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sour
     wanted = machine.sensors("full")
     known = [s for s in wanted if set(s.columns) <= set(table.columns)]
     if machine.time_column not in table.columns:
-        raise LogError(f"{source}: no column {machine.time_column} (time), {_columns(table)}{_other(table, machine)}")
+        raise LogError(
+            f"{source}: no column {machine.time_column} (time), {_columns(table)}{looks_like(table, machine)}"
+        )
     missing = [s for s in wanted if s.name in needs and s not in known]
     if missing:
-        names = ", ".join(f"{c} ({_what(s, machine)})" for s in missing for c in s.columns if c not in table.columns)
-        raise LogError(f"{source}: no column {names}, {_columns(table)}{_other(table, machine)}")
+        names = ", ".join(f"{c} ({what_of(s, machine)})" for s in missing for c in s.columns if c not in table.columns)
+        raise LogError(f"{source}: no column {names}, {_columns(table)}{looks_like(table, machine)}")
     t = times(table, machine, source)
     least = max(SHORTEST, sum(machine.filter.drop) + 12 * machine.filter.decimation)
     if len(t) < least:
         raise LogError(f"{source}: only {len(t)} rows, at least {least} are needed: is the file complete?")
     rate = float(machine.sampling_hz)
     values = {s.name: values_of(s, table, rate, source) for s in known}
-    _check_time(t, rate, machine.time_column, source)
+    check_time(t, rate, machine.time_column, source)
     for s in known:
-        _check_values(s, values[s.name], rate, machine, source)
+        check_values(s, values[s.name], rate, machine, source)
     for s in machine.sensor:
         if s.kind == "angle" and s not in wanted and s.column in table.columns:
             moved = values_of(s, table, rate, source)
@@ -88,93 +94,21 @@ def times(table: pd.DataFrame, machine: Machine, source: str) -> np.ndarray:
             raw = pd.to_datetime(raw, errors="coerce", utc=True)
     if raw.dtype.kind == "M":
         since = (raw - raw.iloc[0]).dt.total_seconds()
-        return _numbers(pd.DataFrame({machine.time_column: since}), machine.time_column, source)
-    return UNITS[machine.time_unit][1] * _numbers(table, machine.time_column, source)
+        return numbers(pd.DataFrame({machine.time_column: since}), machine.time_column, source)
+    return UNITS[machine.time_unit][1] * numbers(table, machine.time_column, source)
 
 
 def values_of(sensor: Sensor, table: pd.DataFrame, rate: float, source: str) -> np.ndarray:
     """A sensor's readings (N,) [SI] from its columns: units, pressures, rates summed up. Raises LogError."""
-    number = _numbers(table, sensor.column, source)
+    number = numbers(table, sensor.column, source)
     if sensor.return_column is not None:
-        number = number - _numbers(table, sensor.return_column, source)
+        number = number - numbers(table, sensor.return_column, source)
     if sensor.summed:
         number = np.concatenate([[0.0], np.cumsum((number[1:] + number[:-1]) / 2)]) / rate
     return sensor.gain * number
 
 
-def read_table(path: str | Path) -> pd.DataFrame:
-    """The columns of a .csv, .parquet or .mat file as they are. Raises LogError."""
-    path = Path(path)
-    if not path.is_file():
-        raise LogError(f"{path}: no such file" if not path.is_dir() else f"{path}: is a folder, give a file")
-    if path.stat().st_size == 0:
-        raise LogError(f"{path}: the file is empty")
-    readers = {".csv": _read_csv, ".parquet": _read_parquet, ".mat": _read_mat}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise LogError(f"{path}: unknown kind of file {path.suffix!r}, allowed: {', '.join(readers)}")
-    table = reader(path)
-    if table.empty:
-        raise LogError(f"{path}: no rows of data")
-    return table
-
-
-def _read_csv(path: Path) -> pd.DataFrame:
-    try:
-        first = pd.read_csv(path, header=None, nrows=1, dtype=str).iloc[0]
-        twice = first[first.duplicated()]
-        if len(twice):
-            raise LogError(f"{path}: line 1: column {twice.iloc[0]} is there twice, keep one")
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", pd.errors.ParserWarning)
-            table = pd.read_csv(path, skipinitialspace=True, low_memory=False, index_col=False)
-    except UnicodeDecodeError:
-        raise LogError(f"{path}: not a text file, is it really CSV?") from None
-    except pd.errors.EmptyDataError:
-        raise LogError(f"{path}: the file is empty") from None
-    except pd.errors.ParserWarning:
-        raise LogError(f"{path}: not a table: lines have more cells than the header has names") from None
-    except pd.errors.ParserError as err:
-        raise LogError(f"{path}: not a table: {' '.join(str(err).split())}") from None
-    except OSError as err:
-        raise LogError(f"{path}: can't be read: {err.strerror}") from None
-    table.columns = table.columns.astype(str).str.strip()
-    return table
-
-
-def _read_parquet(path: Path) -> pd.DataFrame:
-    try:
-        return pd.read_parquet(path)
-    except (pa.ArrowInvalid, OSError) as err:
-        raise LogError(f"{path}: not a Parquet file: {' '.join(str(err).split())[:120]}") from None
-
-
-def _read_mat(path: Path) -> pd.DataFrame:
-    try:
-        raw = scipy.io.loadmat(path)
-    except (ValueError, TypeError, OSError, NotImplementedError, zipfile.BadZipFile, IndexError, KeyError) as err:
-        raise LogError(
-            f"{path}: not a MATLAB file that can be read (v5 to v7): {' '.join(str(err).split())[:120]}"
-        ) from None
-    columns = {
-        k: np.ravel(v)
-        for k, v in raw.items()
-        if not k.startswith("__")
-        and isinstance(v, np.ndarray)
-        and v.dtype.kind in "fiub"
-        and 1 in v.shape
-        and v.size > 1
-    }
-    if not columns:
-        raise LogError(f"{path}: holds no columns of numbers")
-    lengths = {k: len(v) for k, v in columns.items()}
-    if len(set(lengths.values())) > 1:
-        listed = ", ".join(f"{k} {n}" for k, n in lengths.items())
-        raise LogError(f"{path}: the variables have different lengths ({listed}), they must be one table")
-    return pd.DataFrame(columns)
-
-
-def _numbers(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
+def numbers(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
     raw = table[column]
     if raw.dtype.kind == "c":
         raise LogError(f"{source}: column {column}: complex numbers, a measurement is real")
@@ -190,7 +124,7 @@ def _numbers(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
     return values
 
 
-def _check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
+def check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
     dt = np.diff(t)
     if (dt <= 0).any():
         k = int(np.argmax(dt <= 0))
@@ -217,7 +151,7 @@ def _check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
         raise LogError(f"{source}: column {column}: the clock is {100 * (drift - 1):+.1f} % off {rate:g} Hz on average")
 
 
-def _check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Machine, source: str) -> None:
+def check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Machine, source: str) -> None:
     """Units and wrapping: what no such machine can do is a wrong log, not a measurement."""
     body = machine.find(sensor.body)
     if sensor.kind == "wheel" or (sensor.kind == "angle" and body.joint == "revolute"):
@@ -259,7 +193,7 @@ def _fastest(sensor: Sensor, machine: Machine) -> float | None:
     return None if limit.rate is None else float(limit.rate)
 
 
-def _what(sensor: Sensor, machine: Machine) -> str:
+def what_of(sensor: Sensor, machine: Machine) -> str:
     where = sensor.place or machine.find(sensor.body).where
     kind = {"angle": "angle", "wheel": "angle", "torque": "torque"}.get(sensor.kind, sensor.kind.replace("_", " "))
     return f"{kind} of {where.replace('_', ' ')}"
@@ -271,7 +205,7 @@ def _columns(table: pd.DataFrame) -> str:
     return f"the file has {shown}"
 
 
-def _other(table: pd.DataFrame, machine: Machine) -> str:
+def looks_like(table: pd.DataFrame, machine: Machine) -> str:
     """A shipped machine whose log this looks like."""
     if {s.column for s in machine.sensors("paper")} <= {str(c) for c in table.columns}:
         return "; without it --method joint works"
@@ -319,7 +253,7 @@ def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray
 
     Raises LogError as for a log.
     """
-    table = read_table(path)
+    table = tables.read(path)
     source = str(path)
     needed = ["t_s", *(torque_column(model, n) for n in model.inputs)]
     missing = [c for c in needed if c not in table.columns]
@@ -330,12 +264,12 @@ def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray
         raise LogError(
             f"{source}: no column {', '.join(missing)}, {_columns(table)}; is this a profile of {model.machine.name}?"
         )
-    t = _numbers(table, "t_s", source)
+    t = numbers(table, "t_s", source)
     if len(t) < 2:
         raise LogError(f"{source}: only {len(t)} row, a profile needs at least 2")
     rate = float(model.machine.sampling_hz)
-    _check_time(t, rate, "t_s", source)
-    torque = np.column_stack([_numbers(table, c, source) for c in needed[1:]])
+    check_time(t, rate, "t_s", source)
+    torque = np.column_stack([numbers(table, c, source) for c in needed[1:]])
     for k, name in enumerate(model.inputs):
         limit = model.machine.find(int(name[1:])).limit.torque
         top = float(np.abs(torque[:, k]).max())
@@ -347,7 +281,7 @@ def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray
     start, speed = np.zeros(len(model.coordinates)), np.zeros(len(model.coordinates))
     for k, (place, rate_column) in enumerate(motion_columns(model)):
         if place in table.columns:
-            start[k] = _numbers(table, place, source)[0]
+            start[k] = numbers(table, place, source)[0]
         if rate_column in table.columns:
-            speed[k] = _numbers(table, rate_column, source)[0]
+            speed[k] = numbers(table, rate_column, source)[0]
     return torque, start, speed

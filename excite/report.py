@@ -241,3 +241,20 @@ def compare_figure(rows: Sequence[Row], title: str) -> Figure:
     for label, r in zip(axes[0].get_yticklabels(), rows, strict=True):  # in black and white colour tells nothing
         label.set_fontweight("bold" if r.name == OURS else "normal")
     return figure
+
+
+def log_figure(signals: Mapping[str, tuple[np.ndarray, np.ndarray, str]], gaps: Sequence[float], title: str) -> Figure:
+    """What a log holds, channel by channel over time [SI]: name -> (t (N,) [s], values (N,), unit); gaps [s] dashed."""
+    count = max(len(signals), 1)
+    figure = Figure(figsize=(10, 0.8 + 1.15 * count), layout="constrained")
+    figure.suptitle(title, fontsize=11)
+    axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+    for ax, (name, (t, values, unit)) in zip(axes, signals.items(), strict=False):
+        ax.plot(t, values, color=COLOURS[0], linewidth=1)
+        for gap in gaps:
+            ax.axvline(gap, color=COLOURS[1], linewidth=1, linestyle="--")
+        ax.set_ylabel(f"{name}\n[{unit}]", fontsize=8)
+        ax.tick_params(labelsize=8)
+        ax.grid(alpha=0.3)
+    axes[-1].set_xlabel("time [s]" + ("; dashed: gaps" if gaps else ""))
+    return figure

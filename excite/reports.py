@@ -5,13 +5,16 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from excite import folder, log, logcheck, report, tables
 from excite.page import Picture, Table, report_page
 from excite.terminal import rounded
+from model import machine as machines
 
 NAME = "report.html"
 Summary = Mapping[str, Any]
@@ -24,6 +27,7 @@ CAPTIONS = {
     "verify.png": "Left, every simulated run's error of every parameter in per cent of the true value: dots are runs,"
     " diamonds their mean, grey bars the 95 % interval that the estimator itself predicts. Right, in how many runs the"
     " interval holds the truth; 95 % is what it claims.",
+    "log.png": "Every channel that the machine file knows, in SI units, over time; dashed lines mark gaps.",
     "compare.png": "Drives side by side: condition number of Phi, and attainable standard deviation of the worst"
     " parameter [%]; hatched drives break a limit that their label names.",
 }
@@ -32,11 +36,11 @@ FIT = "Measured and predicted drive torques, and what is left between them, over
 
 def write(place: Path, kind: str, summary: Summary) -> None:
     """report.html of a command's folder, from its summary and the figures that are there. KeyError: unknown kind."""
-    title, answer, remarks, tables = KINDS[kind](summary)
+    title, answer, remarks, shown = KINDS[kind](summary)
     pictures = [Picture(path, _caption(path.name, summary)) for path in sorted(place.glob("*.png"))]
     order = list(CAPTIONS)
     pictures.sort(key=lambda p: order.index(p.path.name) if p.path.name in order else len(order))
-    text = report_page(title, answer, pictures, tables, how(summary), remarks)
+    text = report_page(title, answer, pictures, shown, how(summary), remarks)
     (place / NAME).write_text(text, encoding="utf-8")
 
 
@@ -63,6 +67,32 @@ def _caption(name: str, summary: Summary) -> str:
     if kind == "validation":
         return FIT.format(f"{summary['validation'][k]['log']}, which the parameters were not fitted on")
     return FIT.format(summary["logs"][k]) if kind == "fit" else name
+
+
+def check_log(place: Path, path: Path, machine: str | None, versions: Mapping[str, str]) -> dict[str, Any]:
+    """What is in a log, with its picture and report in a folder. Raises LogError where it can't be read at all."""
+    table = tables.read(path)
+    loaded = machines.load(machine) if machine is not None else logcheck.guess(table)
+    if loaded is not None:
+        table = log.table_of(path, loaded)
+    found = logcheck.inspect(table, loaded, str(path))
+    summary: dict[str, Any] = {
+        "log": str(path),
+        "machine": found.machine,
+        "usable": found.usable and found.machine is not None,
+        "rows": found.rows,
+        "duration_s": found.duration_s if np.isfinite(found.duration_s) else None,
+        "rate_hz": found.rate_hz if np.isfinite(found.rate_hz) else None,
+        "faults": list(found.faults),
+        "remarks": list(found.remarks),
+        "columns": [asdict(c) for c in found.columns],
+        "versions": dict(versions),
+    }
+    if found.signals:
+        report.save(report.log_figure(found.signals, found.gaps, str(path)), place / "log.png")
+    write(place, "log", summary)
+    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    return summary
 
 
 Said = tuple[str, str, Sequence[str], Sequence[Table]]
@@ -202,4 +232,23 @@ def _identify(s: Summary) -> Said:
     return f"Parameters of {s['machine']}", answer, remarks, [Table(caption, names, table)]
 
 
-KINDS = {"design": _design, "verify": _verify, "compare": _compare, "identify": _identify}
+def _log(s: Summary) -> Said:
+    faults, name = s["faults"], s["log"]
+    span = f"{s['rows']} rows" + (f", {s['duration_s']:.4g} s at {s['rate_hz']:.4g} Hz" if s["rate_hz"] else "")
+    if s["machine"] is None:
+        answer = f"{name} is a table of {span}; no machine was named that it could be checked against."
+    elif faults:
+        count = "One thing is" if len(faults) == 1 else f"{len(faults)} things are"
+        answer = f"{count} wrong with {name} as a log of {s['machine']} ({span})."
+    else:
+        answer = f"{name} is a usable log of {s['machine']}: {span}."
+    rows = tuple(
+        (c["name"], c["what"] or "-", c["unit"] or "-", rounded(c["low"], 5), rounded(c["high"], 5), str(c["bad"]))
+        for c in s["columns"]
+    )
+    names = ("column", "what it is", "unit", "lowest", "highest", "bad cells")
+    remarks = [*faults, *s["remarks"]]
+    return f"The log {name}", answer, remarks, [Table("Columns as the file has them.", names, rows)]
+
+
+KINDS = {"design": _design, "verify": _verify, "compare": _compare, "identify": _identify, "log": _log}

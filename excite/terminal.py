@@ -144,6 +144,22 @@ def identify_table(summary: dict[str, Any]) -> None:
         say(f"{check['log']}, not fitted on: torque error {errors}")
 
 
+def log_table(summary: dict[str, Any]) -> None:
+    """What a log holds, a column a line, and what is wrong with it."""
+    rows = table("column", "what it is", "unit", "lowest", "highest", "bad cells")
+    for c in summary["columns"]:
+        rows.add_row(
+            c["name"], c["what"] or "-", c["unit"] or "-", rounded(c["low"], 5), rounded(c["high"], 5), str(c["bad"])
+        )
+    say(rows)
+    for fault in summary["faults"]:
+        say(f"wrong: {fault}")
+    for remark in summary["remarks"]:
+        say(remark)
+    if summary["machine"] is not None and not summary["faults"]:
+        say(f"{summary['log']}: a usable log of {summary['machine']}")
+
+
 def drive_table(summary: dict[str, Any]) -> None:
     """A drive for a person: its phases, what it keeps of the design, what to mind."""
     rows = table("at", "what it is")

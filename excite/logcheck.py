@@ -1,0 +1,225 @@
+"""What is in a log, and everything that is wrong with it: `excite log check`."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import pandas as pd
+
+from excite import log
+from excite.examine import find_dropouts, find_spikes
+from excite.log import LogError
+from model import machine as machines
+from model.machine import Machine, Sensor
+
+T = TypeVar("T")
+SHOWN = 5  # places named of a fault that is there many times
+STUCK = 50  # equal extreme readings in a row that look like the end of a range
+ALIKE = 0.6  # share of a machine's columns that makes a log look like one of its
+AGAINST = -0.5  # correlation of two rolls' speeds that says one is wired the other way round
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column: what it is for the machine ("" if nothing), its unit, range (low, high) and how many cells are bad."""
+
+    name: str
+    what: str
+    unit: str
+    low: float
+    high: float
+    bad: int
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """faults make the log unusable as it is, remarks don't. signals: by column what can be drawn, (t, values [SI])."""
+
+    source: str
+    machine: str | None
+    rows: int
+    duration_s: float
+    rate_hz: float
+    columns: tuple[Column, ...]
+    faults: tuple[str, ...]
+    remarks: tuple[str, ...]
+    signals: dict[str, tuple[np.ndarray, np.ndarray, str]]
+    gaps: tuple[float, ...]
+
+    @property
+    def usable(self) -> bool:
+        return not self.faults
+
+
+def guess(table: pd.DataFrame) -> Machine | None:
+    """The shipped machine whose columns the table has most of, None where none is alike."""
+    names = set(map(str, table.columns))
+
+    def share(machine: Machine) -> float:
+        own = {machine.time_column, *(c for s in machine.sensors("full") for c in s.columns)}
+        return len(own & names) / len(own)
+
+    known = [machines.load(name) for name in machines.shipped()]
+    best = max(known, key=lambda m: (share(m), len(m.sensor)))
+    return best if share(best) >= ALIKE else None
+
+
+def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -> Inspection:
+    """Everything that is wrong with a table of measurements, not only the first fault. Never raises for its content."""
+    columns, faults, remarks = [], [], []
+    found = {c: s for s in machine.sensors("full") for c in s.columns} if machine else {}
+    for name in map(str, table.columns):
+        column, fault = _column(table, name, machine, found.get(name))
+        columns.append(column)
+        if fault and machine and (name in found or name == machine.time_column):
+            faults.append(fault)
+        elif fault and not machine:
+            remarks.append(fault)
+    if machine is None:
+        remarks.append("no shipped machine has these columns: name yours with --machine to have them checked")
+        return Inspection(source, None, len(table), np.nan, np.nan, tuple(columns), (), tuple(remarks), {}, ())
+    t, gaps = _time(table, machine, faults)
+    signals: dict[str, tuple[np.ndarray, np.ndarray, str]] = {}
+    readings: dict[str, np.ndarray] = {}
+    rate = float(machine.sampling_hz)
+    after = tuple(f"row {int(np.searchsorted(t, gap)) + 2}," for gap in gaps)
+    for sensor in machine.sensors("full"):
+        missing = [c for c in sensor.columns if c not in table.columns]
+        if missing:
+            needed = "paper" in sensor.kits
+            line = f"no column {', '.join(missing)} ({log.what_of(sensor, machine)})"
+            remarks.append(line + ("; some methods need it" if needed else "; optional"))
+            continue
+        values = _caught(lambda s=sensor: log.values_of(s, table, rate, ""), None)  # type: ignore[misc]
+        if values is None:
+            continue
+        readings[sensor.name] = values
+        signals[" - ".join(sensor.columns)] = (t if len(t) else np.arange(len(values)) / rate, values, _si(sensor))
+        jumps: list[str] = []
+        _caught(lambda s=sensor, v=values: log.check_values(s, v, rate, machine, ""), jumps)  # type: ignore[misc]
+        faults += [line for line in jumps if not line.startswith(after)]  # across a gap an angle may jump
+        remarks += _oddities(sensor, values)
+    faults += _wiring(machine, readings)
+    if not readings:
+        faults.append(f"none of the columns of {machine.name} is there: is it a log of another machine?")
+    unknown = [c.name for c in columns if not c.what]
+    if unknown:
+        remarks.append(f"not used: {', '.join(unknown)}")
+    least = max(log.SHORTEST, sum(machine.filter.drop) + 12 * machine.filter.decimation)
+    if len(table) < least:
+        faults.append(f"only {len(table)} rows, at least {least} are needed: is the file complete?")
+    if not faults:  # what the piecewise look does not see
+        _caught(lambda: log.check(table, machine, (), ""), faults)
+    seconds = float(t[-1] - t[0]) if len(t) > 1 else np.nan
+    typical = 1 / float(np.median(np.diff(t))) if len(t) > 1 and np.median(np.diff(t)) > 0 else np.nan
+    return Inspection(
+        source,
+        machine.name,
+        len(table),
+        seconds,
+        typical,
+        tuple(columns),
+        tuple(dict.fromkeys(faults)),
+        tuple(remarks),
+        signals,
+        gaps,
+    )
+
+
+def _caught(work: Callable[[], T], faults: list[str] | None) -> T | None:
+    """The result, or None with the fault's line kept."""
+    try:
+        return work()
+    except LogError as err:
+        if faults is not None:
+            faults.append(str(err).removeprefix(": "))
+        return None
+
+
+def _column(table: pd.DataFrame, name: str, machine: Machine | None, sensor: Sensor | None) -> tuple[Column, str]:
+    raw = table[name]
+    time = machine is not None and name == machine.time_column
+    if time and raw.dtype.kind not in "fiu" and pd.to_numeric(raw, errors="coerce").isna().all():
+        return Column(name, "time (dates)", "", np.nan, np.nan, 0), ""
+    number = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float) if raw.dtype.kind != "M" else np.zeros(len(raw))
+    bad = ~np.isfinite(number)
+    good = number[~bad]
+    what, unit = "", ""
+    if machine is not None and time:
+        what, unit = "time", machine.time_unit
+    elif machine is not None and sensor is not None:
+        what, unit = log.what_of(sensor, machine), sensor.unit
+    low, high = (float(good.min()), float(good.max())) if len(good) else (np.nan, np.nan)
+    fault = ""
+    if bad.any():
+        rows = ", ".join(str(k + 1) for k in np.flatnonzero(bad)[:SHOWN]) + (", ..." if bad.sum() > SHOWN else "")
+        fault = f"column {name}: {int(bad.sum())} cells are empty or no numbers (rows {rows}); repair or cut there"
+    return Column(name, what, unit, low, high, int(bad.sum())), fault
+
+
+def _time(table: pd.DataFrame, machine: Machine, faults: list[str]) -> tuple[np.ndarray, tuple[float, ...]]:
+    """The times [s], empty where they can't be read, and where gaps begin [s]."""
+    name, rate = machine.time_column, float(machine.sampling_hz)
+    if name not in table.columns:
+        faults.append(f"no column {name} (time)")
+        return np.empty(0), ()
+    t = _caught(lambda: log.times(table, machine, ""), None)
+    if t is None or len(t) < 2:
+        return np.empty(0), ()
+    dt = np.diff(t)
+    back = np.flatnonzero(dt <= 0)
+    if len(back):
+        rows = ", ".join(str(k + 2) for k in back[:SHOWN]) + (", ..." if len(back) > SHOWN else "")
+        faults.append(f"column {name}: time goes back or stands still {len(back)} times (rows {rows}); sort or cut it")
+    typical = float(np.median(dt))
+    wide = np.flatnonzero(dt > 1.5 * typical) if typical > 0 else np.empty(0, int)
+    if typical > 0 and abs(typical * rate - 1) <= 0.02:
+        for k in wide[:SHOWN]:
+            faults.append(f"column {name}: a gap of {dt[k]:.4g} s in row {k + 2} (from {t[k]:g} s to {t[k + 1]:g} s)")
+        if len(wide) > SHOWN:
+            faults.append(f"column {name}: {len(wide) - SHOWN} more gaps")
+    elif typical > 0:
+        _caught(lambda: log.check_time(t, rate, name, ""), faults)
+    return t, tuple(float(t[k]) for k in wide)
+
+
+def _oddities(sensor: Sensor, values: np.ndarray) -> list[str]:
+    """What leaves a log usable: a channel that never changes or is at the end of its range, spikes, drop-outs."""
+    name = sensor.column
+    if np.ptp(values) == 0:
+        return [f"column {name}: never changes ({values[0]:g}): is the sensor connected?"]
+    lines = []
+    for end, word in ((values.max(), "highest"), (values.min(), "lowest")):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], values == end, [0]])))
+        runs = edges[1::2] - edges[::2]
+        if sensor.counts_per_turn is None and len(runs) and runs.max() >= STUCK:
+            lines.append(f"column {name}: stands at its {word} value for {runs.max()} rows: the end of its range?")
+    if not sensor.summed:
+        spikes = find_spikes(sensor, values)
+        if len(spikes):
+            lines.append(f"column {name}: {len(spikes)} spikes of a single row, the first in row {spikes[0] + 1}")
+        for first, last in find_dropouts(sensor, values)[:SHOWN]:
+            lines.append(f"column {name}: held in rows {first + 1} to {last + 1} while the machine moved: a drop-out?")
+    return lines
+
+
+def _wiring(machine: Machine, readings: dict[str, np.ndarray]) -> list[str]:
+    """Rolls that turn against each other: one of them counts the wrong way."""
+    rolls = [s for s in machine.sensors("full") if s.kind == "angle" and machine.find(s.body).contact is not None]
+    rolls = [s for s in rolls if s.name in readings]
+    lines = []
+    for one, other in itertools.pairwise(rolls):
+        a, b = (np.diff(readings[s.name][::10]) for s in (one, other))
+        if len(a) > 10 and np.ptp(a) > 0 and np.ptp(b) > 0 and np.corrcoef(a, b)[0, 1] < AGAINST:
+            lines.append(
+                f"columns {one.column}, {other.column}: the rolls turn against each other; give one a negative factor"
+            )
+    return lines
+
+
+def _si(sensor: Sensor) -> str:
+    return {"torque": "N m", "yaw_rate": "rad/s", "lateral_speed": "m/s", "x": "m", "y": "m"}.get(sensor.kind, "rad")

@@ -1,0 +1,114 @@
+"""`excite log check`: everything that is wrong with a log at once, and nothing that is not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from conftest import Excite
+
+from excite import logcheck, sensors
+from excite.simulate import Motion
+from model.prediction import Model
+
+
+@pytest.fixture(scope="module")
+def table(va12: Model, va12_motion: Motion) -> pd.DataFrame:
+    return sensors.measure(va12, va12_motion, seed=2)
+
+
+def test_a_good_log_has_nothing_wrong(
+    va12: Model, straight: Model, table: pd.DataFrame, straight_motion: Motion
+) -> None:
+    found = logcheck.inspect(table, va12.machine)
+    assert found.faults == ()
+    assert found.remarks == ()
+    assert (found.rows, found.duration_s, found.rate_hz) == (6001, 60, pytest.approx(100))
+    by_name = {c.name: c for c in found.columns}
+    assert by_name["u1_Nm"].what == "torque of front roll"
+    assert by_name["u1_Nm"].high == table["u1_Nm"].max()
+    assert len(found.signals) == len(va12.machine.sensors("full"))
+    assert logcheck.inspect(sensors.measure(straight, straight_motion), straight.machine).usable
+
+
+def edit(name: str, row: int, value: object) -> Callable[[pd.DataFrame], pd.DataFrame]:
+    def change(table: pd.DataFrame) -> pd.DataFrame:
+        column = table[name].astype(object)
+        column.iloc[row] = value
+        return table.assign(**{name: column})
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "faults", "remarks"),
+    [
+        (edit("u1_Nm", 40, None), ["column u1_Nm: 1 cells are empty or no numbers (rows 41)"], []),
+        (edit("u1_Nm", 40, "error"), ["column u1_Nm: 1 cells"], []),
+        (lambda t: t.drop(columns="u4_Nm"), [], ["no column u4_Nm (torque of rear roll); some methods need it"]),
+        (lambda t: t.drop(columns="vy_m_s"), [], ["no column vy_m_s (lateral speed of front chassis); optional"]),
+        (lambda t: t.drop(columns="t_s"), ["no column t_s (time)"], []),
+        (lambda t: t.drop(index=range(100, 150)), ["a gap of 0.51 s in row 101 (from 0.99 s to 1.5 s)"], []),
+        (
+            lambda t: t.drop(index=[*range(100, 150), *range(3000, 3100)]),
+            ["row 101", "a gap of 1.01 s in row 2951"],
+            [],
+        ),
+        (lambda t: t.iloc[::4], ["sampled at 25 Hz"], []),
+        (lambda t: pd.concat([t.iloc[:50], t.iloc[20:]]), ["goes back or stands still 1 times (rows 51)"], []),
+        (lambda t: t.assign(theta2_rad=np.rad2deg(t["theta2_rad"])), ["theta2_rad", "degrees"], []),
+        (lambda t: t.assign(theta4_rad=-t["theta4_rad"]), ["theta1_rad, theta4_rad: the rolls turn against"], []),
+        (lambda t: t.assign(u2_Nm=3.0), [], ["column u2_Nm: never changes (3)"]),
+        (lambda t: t.assign(u1_Nm=t["u1_Nm"].clip(-700, 700)), [], ["u1_Nm: stands at its highest value"]),
+        (edit("vy_m_s", 3000, 4.0), [], ["column vy_m_s: 1 spikes of a single row, the first in row 3001"]),
+        (lambda t: t.assign(comment=1.0), [], ["not used: comment"]),
+        (lambda t: t.head(60), ["only 60 rows"], []),
+    ],
+)
+def test_what_is_wrong_is_said(
+    va12: Model,
+    table: pd.DataFrame,
+    change: Callable[[pd.DataFrame], pd.DataFrame],
+    faults: list[str],
+    remarks: list[str],
+) -> None:
+    found = logcheck.inspect(change(table), va12.machine)
+    for words in faults:
+        assert any(words in line for line in found.faults), found.faults
+    for words in remarks:
+        assert any(words in line for line in found.remarks), found.remarks
+    assert found.usable == (not faults)
+
+
+def test_every_fault_at_once(va12: Model, table: pd.DataFrame) -> None:
+    bad = edit("u1_Nm", 40, None)(table).drop(index=range(1000, 1150)).assign(theta4_rad=lambda t: -t["theta4_rad"])
+    faults = logcheck.inspect(bad, va12.machine).faults
+    assert len(faults) == 3, faults
+
+
+def test_the_machine_is_guessed(table: pd.DataFrame, straight: Model, straight_motion: Motion) -> None:
+    assert logcheck.guess(table).name == "va12"  # type: ignore[union-attr]
+    assert logcheck.guess(sensors.measure(straight, straight_motion)).name == "va12_straight"  # type: ignore[union-attr]
+    assert logcheck.guess(pd.DataFrame({"a": [1.0], "b": [2.0]})) is None
+
+
+def test_log_check_command(excite: Excite, table: pd.DataFrame, tmp_path: Path) -> None:
+    table.to_csv(tmp_path / "good.csv", index=False, sep=";", decimal=",")
+    table.drop(index=range(100, 150)).to_csv(tmp_path / "gap.csv", index=False)
+    code, stdout, _ = excite("log", "check", tmp_path / "good.csv", "--out", tmp_path / "g", "--json")
+    assert code == 0
+    assert json.loads(stdout)["usable"] is True
+    assert (tmp_path / "g" / "log.png").stat().st_size > 20_000
+    assert "is a usable log of va12: 6001 rows, 60 s at 100 Hz" in (tmp_path / "g" / "report.html").read_text()
+    code, stdout, _ = excite("log", "check", tmp_path / "gap.csv", "--machine", "va12", "--out", tmp_path / "b")
+    assert code == 1
+    assert "wrong: column t_s: a gap of 0.51 s" in stdout
+    assert "One thing is wrong" in (tmp_path / "b" / "report.html").read_text()
+    code, _, stderr = excite("log", "check", tmp_path / "nothing.csv", "--out", tmp_path / "n")
+    assert (code, stderr.count("\n")) == (2, 1)
+    assert "no such file" in stderr
+    assert not (tmp_path / "n").exists()
