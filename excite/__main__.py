@@ -293,7 +293,7 @@ def identify(
     json: JsonOption = False,
 ) -> None:
     """Estimates the parameters, with uncertainty, from logs."""
-    from excite import crosscheck, examine, folder, identify, log, report, reports
+    from excite import crosscheck, examine, folder, gaps, identify, log, report, reports
 
     model = _model(machine)
     out = out or Path(f"results/identify-{model.machine.name}")
@@ -303,7 +303,8 @@ def identify(
     method = _method(method, model)
     _known("--filter", filtering, ("machine", "auto"))
     needs = identify.needed_sensors(model, method)
-    read = [log.read(path, model.machine, needs) for path in logs]
+    parts = [gaps.read(path, model.machine, needs) for path in logs]
+    read, cut = [one for some, _ in parts for one in some], [note for _, notes in parts for note in notes]
     fresh = [log.read(path, model.machine, needs) for path in validate or []]
     with terminal.busy("identifying"):
         chosen, reason = examine.choose(model, read) if filtering == "auto" else (model.machine.filter, "")
@@ -323,7 +324,7 @@ def identify(
             "relative_error_percent": estimate.relative_error_percent,
             "unidentifiable": list(estimate.unidentifiable),
             "reasons": dict(estimate.unidentifiable),
-            "notes": [*([reason] if reason else []), *estimate.notes, *late],
+            "notes": [*cut, *([reason] if reason else []), *estimate.notes, *late],
             "validation": checks,
             "versions": _versions(),
         }

@@ -1,0 +1,55 @@
+"""A log with a few gaps is several logs: the stretches between them, each checked as a log of its own."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from excite import log
+from excite.log import Log, LogError
+from model.machine import Machine
+
+LONG = 5.0  # s that a stretch must last: a start and some seconds of motion
+MOST = 10  # gaps: a file with more has a fault that cutting does not mend
+
+
+def read(path: str | Path, machine: Machine, needs: Sequence[str] = ()) -> tuple[list[Log], list[str]]:
+    """The logs in a file, one stretch after another, with a note where it was cut. Raises LogError as `log.read`:
+    also for a gap beside which too little is left, and for more than MOST of them."""
+    return split(log.table_of(path, machine), machine, needs, str(path))
+
+
+def split(
+    table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log"
+) -> tuple[list[Log], list[str]]:
+    """The same from a table of columns."""
+    cuts = _gaps(table, machine, source)
+    rate = float(machine.sampling_hz)
+    rows = [0, *cuts, len(table)]
+    if not cuts or len(cuts) > MOST or min(np.diff(rows)) < LONG * rate:
+        return [log.check(table, machine, needs, source)], []
+    t = log.times(table, machine, source)
+    stretches = [
+        log.check(table.iloc[first:last].reset_index(drop=True), machine, needs, f"{source} from row {first + 1}")
+        for first, last in itertools.pairwise(rows)
+    ]
+    where = ", ".join(f"{t[k] - t[k - 1]:.3g} s before row {k + 1}" for k in cuts)
+    gaps = "a gap" if len(cuts) == 1 else f"{len(cuts)} gaps"
+    return stretches, [f"{source}: {gaps} ({where}): identified from the {len(stretches)} stretches between"]
+
+
+def _gaps(table: pd.DataFrame, machine: Machine, source: str) -> list[int]:
+    """First rows (from 0) after each gap; none where time is not what it should be in other ways."""
+    if machine.time_column not in table.columns or len(table) < 2:
+        return []
+    try:
+        dt = np.diff(log.times(table, machine, source)) * float(machine.sampling_hz)
+    except LogError:
+        return []
+    if (dt <= 0).any() or abs(float(np.median(dt)) - 1) > 0.02:
+        return []
+    return [int(k) + 1 for k in np.flatnonzero(dt > 1.5)]

@@ -1,0 +1,46 @@
+"""A file with a gap: two logs, and the answer of both; a file in pieces is refused as before."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from excite import gaps, sensors
+from excite.identify import identify
+from excite.log import LogError
+from excite.simulate import simulate
+from model.prediction import Model
+
+
+@pytest.fixture(scope="module")
+def table(straight: Model) -> pd.DataFrame:
+    t = np.arange(4001) / 100
+    rise = np.clip(np.minimum(t, t[-1] - t) / 2, 0, 1)
+    torque = 2500 * np.sin(2 * np.pi * t / 9) + 1200 * np.sin(2 * np.pi * t / 3.7)
+    motion = simulate(straight, np.column_stack([torque, torque]) * rise[:, None])
+    return sensors.measure(straight, motion, kit="paper", seed=1)
+
+
+def test_a_gap_makes_two_logs(straight: Model, table: pd.DataFrame) -> None:
+    """Also while the machine moves: what was not seen is not made up."""
+    whole, none = gaps.split(table, straight.machine)
+    holed = table.drop(index=range(1700, 1853)).reset_index(drop=True)
+    logs, notes = gaps.split(holed, straight.machine, source="holed.csv")
+    assert (len(whole), none) == (1, [])
+    assert [len(one) for one in logs] == [1700, 4001 - 1853]
+    assert notes == ["holed.csv: a gap (1.54 s before row 1701): identified from the 2 stretches between"]
+    full, both = identify(straight, whole, "joint"), identify(straight, logs, "joint")
+    assert np.sqrt(np.mean(((both.value - straight.nominal) / both.std) ** 2)) < 1.6
+    assert (both.std > 0.99 * full.std).all()
+    assert (both.std < 1.6 * full.std).all()
+
+
+@pytest.mark.parametrize(
+    "drop",
+    [range(100, 200), range(3700, 3800), [k for k in range(500, 3500) if k % 100 < 20]],
+    ids=["near the start", "near the end", "everywhere"],
+)
+def test_gaps_beside_which_too_little_is_left(straight: Model, table: pd.DataFrame, drop: list[int]) -> None:
+    with pytest.raises(LogError, match="gap of"):
+        gaps.split(table.drop(index=list(drop)).reset_index(drop=True), straight.machine)
