@@ -316,7 +316,7 @@ def identify(
     with folder.writing(out) as place:
         summary = {
             "machine": model.machine.name,
-            "logs": [str(p) for p in logs],
+            "logs": [one.source for one in read],
             "method": estimate.method,
             "parameters": _parameters(estimate),
             "cond_w": estimate.cond_w,

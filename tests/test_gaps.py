@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import Excite
 
 from excite import gaps, sensors
 from excite.identify import identify
@@ -44,3 +48,12 @@ def test_a_gap_makes_two_logs(straight: Model, table: pd.DataFrame) -> None:
 def test_gaps_beside_which_too_little_is_left(straight: Model, table: pd.DataFrame, drop: list[int]) -> None:
     with pytest.raises(LogError, match="gap of"):
         gaps.split(table.drop(index=list(drop)).reset_index(drop=True), straight.machine)
+
+
+def test_identify_reports_the_cut(excite: Excite, table: pd.DataFrame, tmp_path: Path) -> None:
+    table.drop(index=range(1700, 1853)).to_csv(tmp_path / "holed.csv", index=False)
+    code, stdout, _ = excite("identify", "va12_straight", tmp_path / "holed.csv", "--out", tmp_path / "a", "--json")
+    summary = json.loads(stdout)
+    assert code == 0
+    assert [source.partition(" ")[2] for source in summary["logs"]] == ["from row 1", "from row 1701"]
+    assert any("a gap (1.54 s before row 1701)" in note for note in summary["notes"])
