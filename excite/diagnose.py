@@ -101,7 +101,7 @@ class Diagnosis:
     """verdict: clean, named, tied or unexplained. `before`, `after`: the model without and with what was found.
 
     share: of the excess misfit that the names explain. scores: the first scan's, best first. located: lines that say
-    where what is unexplained sits.
+    where what is unexplained sits. stages: the model with the first finding, the first two, and so on.
     """
 
     verdict: str
@@ -112,6 +112,7 @@ class Diagnosis:
     scores: tuple[evidence.Score, ...]
     located: tuple[str, ...]
     notes: tuple[str, ...]
+    stages: tuple[Stage, ...] = ()
 
 
 def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance | None = None) -> Diagnosis:
@@ -135,7 +136,7 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
         if not stage.suspects and stage.exact and stage.excess < LEVEL:
             break
     tell(0.95, "weighing")
-    return _verdict(before, stage, chosen, first)
+    return replace(_verdict(before, stage, chosen, first), stages=tuple(x.stage for x in chosen))
 
 
 @dataclass(frozen=True)
