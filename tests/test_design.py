@@ -39,9 +39,12 @@ def shorter(model: Model, seconds: float, **other: object) -> Problem:
     return problem.model_copy(update={"duration_s": duration, **other})
 
 
+SEEN: list[tuple[int, int, float]] = []  # progress of the design below
+
+
 @pytest.fixture(scope="module")
 def quick(straight: Model) -> Design:
-    return design(straight, shorter(straight, 12.0), starts=1, seed=3)
+    return design(straight, shorter(straight, 12.0), starts=1, seed=3, progress=lambda *at: SEEN.append(at))
 
 
 def fresh_check(model: Model, problem: Problem, d: Design) -> None:
@@ -88,6 +91,16 @@ def test_the_answer_holds_when_simulated_by_another_integrator(straight: Model, 
     assert quick.max_violation <= TOLERANCE
     assert quick.cond_phi < 0.7 * quick.cond_phi_start
     assert quick.complete
+
+
+def test_progress_shows_every_stage_and_the_best_so_far(quick: Design) -> None:
+    done, total, best = zip(*SEEN, strict=True)
+    assert len(done) >= 5
+    assert set(total) == {6}
+    assert list(done) == sorted(done)
+    assert done[-1] == 6
+    assert list(best) == sorted(best, reverse=True)
+    assert best[-1] == pytest.approx(quick.cond_phi, rel=1e-6)
 
 
 def test_same_seed_same_design(straight: Model, quick: Design) -> None:
