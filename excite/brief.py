@@ -18,7 +18,7 @@ from excite import aim as aims
 from excite import identify, log, scenario, sequential
 from excite.aim import Aim
 from excite.design import Design, design
-from model.machine import Problem
+from model.machine import MachineError, Problem
 from model.prediction import Model
 
 POOR = 5.0  # attainable standard deviation [%] that a low condition number should not hide
@@ -50,7 +50,17 @@ class Answer:
 def answer(
     model: Model, problem: Problem, brief: Brief, progress: Callable[[int, int, float], None] | None = None
 ) -> Answer:
-    """The design that a brief asks for. Raises what `design`, `log.read` and `identify` raise."""
+    """The design that a brief asks for.
+
+    Raises MachineError for sensors of unknown noise, whose accuracy can't be stated, and what `design`, `log.read` and
+    `identify` raise.
+    """
+    for s in model.machine.sensors("full"):
+        if s.kind not in ("x", "y") and s.noise is None and s.counts_per_turn is None:
+            raise MachineError(
+                f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file, a design states"
+                " the accuracy that it makes attainable"
+            )
     prior = None
     if brief.after:
         needs = identify.needed_sensors(model, "joint")

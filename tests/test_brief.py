@@ -70,6 +70,20 @@ def test_after_a_log_the_next_drive_is_for_the_estimated_machine(
     assert "without --after" in err
 
 
+def test_sensors_of_unknown_noise_are_named(excite: Excite, tmp_path: Path) -> None:
+    path = tmp_path / "bench.toml"
+    number = 'source = "assumed"'
+    problem = (
+        f'extends = "emps"\n[problems.P]\n{number}\nduration_s = {{ value = 10, {number} }}\n'
+        f"knot_s = {{ value = 0.1, {number} }}\nlane_m = [1, 1]\nlane_points = []\n"
+    )
+    path.write_text(problem, encoding="utf-8")
+    code, _, err = excite("design", path, "--problem", "P", "--out", tmp_path / "d")
+    assert code == 2
+    assert "sensor q1: give noise or counts_per_turn" in err
+    assert not (tmp_path / "d").exists()
+
+
 def test_an_accuracy_must_be_positive(excite: Excite) -> None:
     code, _, err = excite("design", "va12_straight", "--sigma-max", 0)
     assert code == 2
