@@ -317,7 +317,7 @@ def articulation_backlash(s: Scene, place: str, A: float, draw: DRAW) -> None:
     """Two pins in holes that are too wide: free between the flanks, hard at them. A is the whole play."""
     if A == 0:
         return
-    k, J = draw.uniform(0.8e7, 1.5e7), draw.uniform(30, 60)
+    k, J = draw.uniform(2e8, 3e8), draw.uniform(60, 90)  # so hard that the flanks' own give is below a count
     c = 2 * draw.uniform(0.2, 0.4) * np.sqrt(k * J)
 
     def past(twist: ca.SX) -> ca.SX:
@@ -326,7 +326,7 @@ def articulation_backlash(s: Scene, place: str, A: float, draw: DRAW) -> None:
     _two_masses(
         s,
         lambda twist: k * past(twist),
-        lambda twist, rate: c * rate * ca.fmin(ca.fabs(past(twist)) / 2e-5, 1) + 50 * rate,
+        lambda twist, rate: c * rate * ca.fmin(ca.fabs(past(twist)) / 2e-6, 1) + 50 * rate,
         J,
     )
 
