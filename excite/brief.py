@@ -58,8 +58,8 @@ def answer(
     for s in model.machine.sensors("full"):
         if s.kind not in ("x", "y") and s.noise is None and s.counts_per_turn is None:
             raise MachineError(
-                f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file, a design states"
-                " the accuracy that it makes attainable"
+                f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file, a design"
+                " states the accuracy that it makes attainable"
             )
     prior = None
     if brief.after:
