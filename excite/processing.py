@@ -127,8 +127,8 @@ def lowpass(x: np.ndarray, rate: float, filter: Filter) -> np.ndarray:
 
 
 def derivative(x: np.ndarray, rate: float) -> np.ndarray:
-    """Central difference; one-sided at the two ends."""
-    return np.gradient(x, 1 / rate)
+    """Central difference along the last axis; one-sided at the two ends."""
+    return np.asarray(np.gradient(x, 1 / rate, axis=-1))
 
 
 def decimate(x: np.ndarray, factor: int) -> np.ndarray:

@@ -21,7 +21,9 @@ from excite.processing import samples, white_noise
 from model.machine import Filter, Sensor
 from model.prediction import Model
 
-EDGE = 0.29  # least standard deviation of an encoder edge [counts]
+# Least standard deviation of an encoder edge [counts]: what a good encoder's divisions are off. Slow passages, where
+# edges come at exact moments, would be believed without end; a third of a count would make little of them.
+EDGE = 0.1
 
 
 @dataclass(frozen=True)

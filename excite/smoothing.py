@@ -20,7 +20,7 @@ from excite.estimate import Estimate, NoEstimate, NotIdentifiable
 from excite.innovations import innovation_sizes
 from excite.linearise import BATCH, Chart, advance, chart, differentiate
 from excite.log import Log
-from excite.processing import decimate
+from excite.processing import decimate, derivative
 from excite.record import (
     Noise,
     Point,
@@ -197,9 +197,15 @@ def _estimate(c: Chart, records: Sequence[Record], fit: Fit, filter: Filter, not
         remembered = () if model.plain else (z.T,)
         a = model.acceleration(q.T, nu.T, u.T, *remembered, fit.X).full()
         beside = () if model.plain else (u.T, z.T)
-        W.append(model.stacked(q.T, nu.T, a, *beside).reshape(-1, len(fit.X)))
+        forced = fit.disturbed > 0 and model.plain
+        if forced:  # what the forces do is not the model's
+            a = derivative(nu.T, float(model.machine.sampling_hz))
+        rows = model.stacked(q.T, nu.T, a, *beside)
+        W.append(rows.reshape(-1, len(fit.X)))
         measured, error = np.zeros((2, len(model.rows), len(u)))
         measured[list(model.actuated)], error[list(model.actuated)] = r.torque.T, -w.T
+        if forced:
+            error = measured - (rows @ fit.X).T
         Y.append(decimate(measured, filter.decimation))
         errors.append(decimate(error, filter.decimation))
     # In blocks that fit the cache: ten times faster than all rows at once.
