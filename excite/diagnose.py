@@ -25,7 +25,9 @@ from model.prediction import Model, build
 
 LEVEL = 22.0  # of twice the log-likelihood that an effect must gain; 200 logs without any stayed below
 WORTH = 12.0  # a first-order gain below which a candidate isn't fitted
-HOPE = 0.15  # share of the best first-order gain below which a candidate isn't fitted
+HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
+STRONG = 1.3  # misfit over readings from which first-order gains are rough
+PASSES = 9  # of a candidate's fit
 TRIED = 5  # candidates that are fitted, of different names
 MOST = 4  # effects that are looked for
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
@@ -159,14 +161,17 @@ def fitted(
     """
     prepared = _prepared(machine, logs, filter, of)
     c, X, points, damping = prepared.c, prepared.c.model.nominal, prepared.starts, smoothing.DAMPING[0]
+    passes = smoothing.PASSES
     if of is not None:
         old = dict(zip(of.model.base.names, of.fit.X, strict=True))
         X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, X, strict=True)])
         points = tuple(carried(c, r, p, of.prepared.c, X) for r, p in zip(prepared.records, of.fit.points, strict=True))
-        damping *= smoothing.DAMPING[1] ** 2
+        damping, passes = damping * smoothing.DAMPING[1] ** 2, PASSES
 
     def solve(disturbed: float) -> Fit:
-        return smoothing.iterate(c, prepared.records, points, X, prepared.starts, disturbed, prepared.held, damping)
+        return smoothing.iterate(
+            c, prepared.records, points, X, prepared.starts, disturbed, prepared.held, damping, passes
+        )
 
     if not loose:
         try:
@@ -209,11 +214,12 @@ def _entry(score: evidence.Score) -> EffectEntry:
     )
 
 
-def _shortlist(scores: Sequence[evidence.Score]) -> list[evidence.Score]:
+def _shortlist(stage: Stage, scores: Sequence[evidence.Score]) -> list[evidence.Score]:
     """The best candidate of each name, best first, as far as worth a fit."""
+    rough = not stage.exact or stage.fit.cost > STRONG * stage.prepared.readings
     best: dict[str, evidence.Score] = {}
     for s in scores:
-        if s.gain >= max(WORTH, HOPE * scores[0].gain) and s.values["A"] != 0:
+        if s.gain >= max(WORTH, HOPE[rough] * scores[0].gain) and s.values["A"] != 0:
             best.setdefault(s.candidate.name, s)
     return list(best.values())[:TRIED]
 
@@ -223,7 +229,7 @@ def _choose(
 ) -> _Choice | None:
     """The effect that the logs like best beside those that are in the model; None if none is worth it."""
     tries: list[tuple[evidence.Score, Stage]] = []
-    for k, score in enumerate(_shortlist(scores)):
+    for k, score in enumerate(_shortlist(stage, scores)):
         tell(done + 0.03 * k, f"fitting {score.candidate.name}")
         machine = effects.extended(stage.machine, _entry(score))
         try:

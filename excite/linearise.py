@@ -152,8 +152,8 @@ class Chart:
 
     State s (n,): first the `core`, the coordinates that forces depend on, the velocities and what effects remember,
     then measured angles that are integrals of these. `index` (n,): their places in simulate's state (q, nu, wheels, z),
-    whose size is `full`. `sensors`: those with a reading h(s), in order; `angle`: the state that each encoder reads,
-    -1 for another sensor. `offsets` (n_u, n_base) takes the torque offsets u0 out of X. `flawed`: parameters that readings
+    whose size is `full`. `sensors`: those with a reading h(s), in order; `angle`: the state that each encoder reads, -1
+    for another sensor. `offsets` (n_u, n_base) takes the torque offsets u0 out of X. `flawed`: parameters that readings
     depend on directly. `known` (n,): states whose start is known, and how well; NaN for the others.
     `pushed`: rows on which disturbing forces may act, the unactuated ones, or all where there are none; `inertia`:
     theirs, nominal [kg, kg m2].
@@ -189,7 +189,7 @@ class Chart:
 
     def delivered(self, torque: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Torques (N, n_u) [N m] behind measured ones, and how they move with X (N, n_u, n_base)."""
-        if self.model.plain:
+        if not any(e.effect.channel for e in self.model.effects):
             return torque - X @ self.offsets.T, np.broadcast_to(-self.offsets, (len(torque), *self.offsets.shape))
         N, n_u = torque.shape
         step = 1 / float(self.model.machine.sampling_hz)
@@ -202,6 +202,13 @@ class Chart:
         u = (early - offset) / gain
         slope = (rise[:, :, None] * by[2] - by[1] - u[:, :, None] * by[0]) / gain[:, :, None]
         return u, slope
+
+    def felt(self, noise: np.ndarray, X: np.ndarray) -> np.ndarray:
+        """What noise of the torque sensors (n_u,) is as noise of the delivered torques."""
+        if not any(e.effect.channel for e in self.model.effects):
+            return noise
+        gain: np.ndarray = self.model.channels(0.0, X)[0].full()[:, 0]
+        return noise / np.abs(gain)
 
     def measured(self, u: np.ndarray, X: np.ndarray) -> np.ndarray:
         """What torque sensors read of delivered torques (N, n_u)."""

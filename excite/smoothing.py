@@ -78,7 +78,7 @@ class Linear:
     Z: twice the negative log-likelihood is [1 p]' Z [1 p] for steps p of parameters and offsets, scaled. gain
     (N - 1, n, n_u): what a torque error of one standard deviation does to the scaled state. stages: by part of the
     log. H (N, m, n), weight, residual (N, m): the readings; direct (N, m, n_f + n_o): how they move with flaws of
-    sensors and offsets.
+    sensors and offsets. noise (n_u,): standard deviation of the delivered torques' errors [N m].
     """
 
     solved: chain.Solved
@@ -89,6 +89,7 @@ class Linear:
     weight: np.ndarray
     residual: np.ndarray
     direct: np.ndarray
+    noise: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -280,6 +281,7 @@ def linearise(
     `exact`: the point is a motion of the machine, which needs no integration.
     """
     delivered, behind = c.delivered(r.torque, X)
+    noise = c.felt(r.noise.torque, X)
     if exact:
         defect = np.zeros_like(p.s[1:])
     else:
@@ -297,14 +299,14 @@ def linearise(
     for at in range(0, N - 1, BATCH):
         until = min(at + BATCH, N - 1)
         by = differentiate(c, p.s[at : until + 1], u[at : until + 1], X, disturbed > 0)
-        gain = by.B * r.noise.torque / scale[:, None]
+        gain = by.B * noise / scale[:, None]
         C = gain @ gain.transpose(0, 2, 1)
         if disturbed > 0:
             push = by.F * (disturbed * DISTURBANCE * c.inertia) / scale[:, None]
             C += push @ push.transpose(0, 2, 1)
         A = by.A * (scale / scale[:, None])
         b = np.zeros((until - at, c.n, 1 + n_p + n_o))
-        b[:, :, 0] = defect[at:until] / scale - (gain @ (p.w[at:until] / r.noise.torque)[:, :, None])[:, :, 0]
+        b[:, :, 0] = defect[at:until] / scale - (gain @ (p.w[at:until] / noise)[:, :, None])[:, :, 0]
         b[:, :, 1 : 1 + n_p] = (by.X + by.B @ behind[at:until]) * (c.model.scale / scale[:, None])
         gains.append(gain)
         for k in range(at, until, PART):
@@ -326,7 +328,7 @@ def linearise(
     Z = solved.Z.copy()
     place = np.concatenate([[0], 1 + np.array(c.flawed, int), np.arange(1 + n_p, 1 + n_p + n_o)])
     Z[np.ix_(place, place)] += flat.T @ flat
-    return Linear(solved, Z, np.concatenate(gains), tuple(stages), S, weight, residual, direct)
+    return Linear(solved, Z, np.concatenate(gains), tuple(stages), S, weight, residual, direct, noise)
 
 
 def _known_before(c: Chart, p: Point, first: np.ndarray, columns: int) -> chain.Section:
@@ -372,9 +374,11 @@ def iterate(
     disturbed: float,
     held: np.ndarray,
     damping: float = DAMPING[0],
+    passes: int = PASSES,
 ) -> Fit:
     """Gauss-Newton from points and X; the prior stands about the machine file's values and the states of `starts`.
-    Parameters `held` (n_base,) stay at their values. damping: of the first step.
+    Parameters `held` (n_base,) stay at their values. damping: of the first step;
+    passes: at most.
 
     Raises NotConverged.
     """
@@ -385,7 +389,7 @@ def iterate(
     whole, last = 1.0, np.zeros(len(X))
     prior = np.where(held, HELD**-2, PRIOR**-2)
     unseen = held.copy()
-    for k in range(PASSES):
+    for k in range(passes):
         linear = _all_linear(c, records, there[0], starts, there[1], disturbed)
         if linear is None:
             # Too far: the mass matrix is not positive or a motion can't be integrated.
@@ -499,7 +503,7 @@ def _parameters(
 def _moved(c: Chart, r: Record, p: Point, linear: Linear, move: np.ndarray) -> Point:
     """The point after a step of parameters and offsets, with the states that go with it."""
     x, slope = linear.solved.states(move)
-    w = (linear.gain.transpose(0, 2, 1) @ slope[1:, :, None])[:, :, 0] * r.noise.torque
+    w = (linear.gain.transpose(0, 2, 1) @ slope[1:, :, None])[:, :, 0] * linear.noise
     offset = move[len(move) - len(r.origin) :]
     return Point(p.s + x * state_scale(c), w, p.offset + offset * one_count(c, r))
 

@@ -149,7 +149,8 @@ class Effect:
 
     `places`: joints, rolls, drive, articulation, wheels, yaw_rate, lateral_speed, machine. `amount`: a typical one
     [unit] at a site, `grid`: shares of it that are tried where the signature isn't proportional to the amount.
-    `positive`: a negative amount makes no sense; `inverse`: the smaller the amount, the larger the effect. Hooks take the scene, the body they act on, and the values.
+    `positive`: a negative amount makes no sense; `inverse`: the smaller the amount, the larger the effect. Hooks take
+    the scene, the body they act on, and the values.
     """
 
     name: str
@@ -379,6 +380,7 @@ _declare(
         "torque errors proportional to the torque's rate of change, with the sign of a torque that comes early",
         "Ljung, System Identification, 2nd ed., 10.3",
         _constant(0.03),
+        positive=True,
         channel=lambda t, p: Channel(delay=p["A"]),
     ),
     Effect(

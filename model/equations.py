@@ -149,15 +149,18 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[cat
     inertia = {b.index: tree.inertial_vector(b, s.by_name) for b in machine.body}
     time = ca.SX.sym("t")
     exact = ca.SX.sym("exact", sum(x.kind != "torque" for x in machine.sensors("full")))
-    force, reading, states, rates = [], [], [], []
+    force, reading, rates = [], [], list[ca.SX]()
+    states: list[ca.SX] = []
+    scene = _scene(s, time)
+    rollings = {b.index: _rolling(s, b) for b in machine.contacts}
     for e in placed:
-        memory, z, (own,) = _acting(s, [e])
-        own = Acting(e, replace(own.scene, time=time), own.values)
+        z = {m: ca.SX.sym(m) for m in e.effect.memory}
+        own = _seeing(s, scene, e, z)
         added = _added(s, own, inertia)
         if e.effect.soil is not None:
             for k in e.bodies:
                 body = machine.find(k)
-                rolling, lever = _rolling(s, body)
+                rolling, lever = rollings[k]
                 soil = _soil(s, body, rolling)
                 changed = e.effect.soil(own.scene, k, own.values, soil)
                 added += _pushed(body, changed, lever) - _pushed(body, soil, lever)
@@ -168,15 +171,14 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[cat
             at = next(i for i, x in enumerate(sensors) if x.name == e.sensor)
             read[at] = e.effect.reading(own.scene, exact[at], sensors[at].body, own.values)
         reading.append(read)
-        kept = [k for k, m in enumerate(memory) if m != "time"]
-        states += [z[k] for k in kept]
+        states += z.values()
         rates += [m.rate(own.scene, e.bodies[0], own.values) for m in e.effect.memory.values()]
-    z = ca.vertcat(*states, ca.SX(0, 1))
-    arguments = [s.q, s.nu, s.a, s.u, time, z, exact, s.p]
+    held = ca.vertcat(*states, ca.SX(0, 1))
+    arguments = [s.q, s.nu, s.a, s.u, time, held, exact, s.p]
     return Signatures(
         ca.Function("force", arguments, [ca.horzcat(*force)]),
         ca.Function("reading", arguments, [ca.horzcat(*reading)]),
-        ca.Function("flow", [s.q, s.nu, s.u, time, z, s.p], [ca.vertcat(*rates, ca.SX(0, 1))]),
+        ca.Function("flow", [s.q, s.nu, s.u, time, held, s.p], [ca.vertcat(*rates, ca.SX(0, 1))]),
     )
 
 
@@ -186,8 +188,15 @@ def _acting(s: Sample, placed: Sequence[catalogue.Placed]) -> tuple[tuple[str, .
     memory += [f"{e.name}.{m}" for e in placed for m in e.effect.memory]
     z = ca.SX.sym("z", len(memory))
     known = dict(zip(memory, ca.vertsplit(z), strict=True))
+    scene = _scene(s, known.get("time", ca.SX(0)))
+    acting = [_seeing(s, scene, e, {m: known[f"{e.name}.{m}"] for m in e.effect.memory}) for e in placed]
+    return tuple(memory), z, acting
+
+
+def _scene(s: Sample, time: ca.SX) -> catalogue.Scene:
+    """A sample as every effect sees it."""
     turning = [b for b in s.machine.body if b.coordinates and b.joint != "planar" and b.friction is not None]
-    scene = catalogue.Scene(
+    return catalogue.Scene(
         {b.index: s.at[b.coordinates[0]] for b in turning},
         {b.index: s.rate[b.coordinates[0]] for b in turning},
         dict(zip([b.index for b in s.machine.actuated], ca.vertsplit(s.u), strict=True)),
@@ -195,14 +204,13 @@ def _acting(s: Sample, placed: Sequence[catalogue.Placed]) -> tuple[tuple[str, .
         {b.index: float(b.friction.smoothing) for b in turning if b.friction is not None},
         {b.index: _rolling(s, b)[0] for b in s.machine.contacts},
         {b.index: s.frames[b.index].velocity[0] for b in s.machine.body},
-        known.get("time", ca.SX(0)),
+        time,
     )
-    acting = []
-    for e in placed:
-        own = {m: known[f"{e.name}.{m}"] for m in e.effect.memory}
-        values = {key: s.by_name.get(name, ca.SX(e.values[key])) for name, (key, _) in e.parameters.items()}
-        acting.append(Acting(e, replace(scene, z=own), values))
-    return tuple(memory), z, acting
+
+
+def _seeing(s: Sample, scene: catalogue.Scene, e: catalogue.Placed, z: Mapping[str, ca.SX]) -> Acting:
+    values = {key: s.by_name.get(name, ca.SX(e.values[key])) for name, (key, _) in e.parameters.items()}
+    return Acting(e, replace(scene, z=z), values)
 
 
 def _friction(s: Sample, body: Body) -> ca.SX:
