@@ -31,7 +31,19 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-MachineArgument = Annotated[str, typer.Argument(metavar="MACHINE", help="a shipped name or a machine file (.toml)")]
+
+def _machine_names(incomplete: str) -> list[str]:
+    """For the shell's completion: shipped names, looked up without loading anything."""
+    from importlib.resources import files
+
+    names = (Path(p.name).stem for p in files("model").joinpath("machines").iterdir() if p.name.endswith(".toml"))
+    return sorted(n for n in names if n.startswith(incomplete))
+
+
+MachineArgument = Annotated[
+    str,
+    typer.Argument(metavar="MACHINE", help="a shipped name or a machine file (.toml)", autocompletion=_machine_names),
+]
 DesignArgument = Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="what `excite design` wrote")]
 OutOption = Annotated[Path | None, typer.Option("--out", help="folder to write [results/<command>-<machine>]")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the summary as JSON and nothing else")]
@@ -206,7 +218,7 @@ def run(
 def drive(
     design_dir: DesignArgument,
     phases: Annotated[
-        int | None, typer.Option("--phases", min=2, help="at most so many phases; one in three seconds by default")
+        int | None, typer.Option("--phases", min=2, help="at most so many phases; as many as it takes by default")
     ] = None,
     shortest: Annotated[float, typer.Option("--shortest", help="of a phase [s]")] = 2.0,
     seed: SeedOption = 0,
@@ -359,6 +371,19 @@ def check_log(
     terminal.finish(summary, out, json, terminal.log_table)
     if summary["faults"]:
         raise typer.Exit(1)
+
+
+@app.command()
+def docs(out: OutOption = None, json: JsonOption = False) -> None:
+    """Writes reference pages made from the code: effects, machine file, units, commands, Python interface."""
+    from excite import folder, reference
+
+    out = out or Path("results/docs-excite")
+    folder.claim(out)
+    with folder.writing(out) as place:
+        summary = {"pages": reference.write(place), "versions": _versions()}
+        (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    terminal.finish(summary, out, json, lambda s: terminal.say(", ".join(s["pages"])))
 
 
 # ------------------------------------------------------------------------------------------------ the work

@@ -22,6 +22,8 @@ from model.prediction import Model
 
 PEOPLE = 3  # drives by different people, in simulation
 PAGE = "driver.html"
+PACES = (4.0, 3.0, 2.5)  # s per phase that are tried where nobody says how many phases
+ENOUGH = 1.2
 NEAR = 0.8  # of the articulation's stop
 Progress = Callable[[int, int, float | None], None]
 
@@ -38,18 +40,27 @@ def prepare(
     model, motion, problem = design.model, design.motion, design.problem
     if problem is None:
         raise DriveError(f"{model.machine.name}: has no problem {design.summary.get('problem')}, design again")
-    trace, own = drive.phases(model, motion, shortest, most), drive.as_designed(model, motion)
-    done = 0
+    own = drive.as_designed(model, motion)
+    counts = [most] if most is not None else [round(motion.t[-1] / pace) for pace in PACES]
+    choices = [drive.phases(model, motion, shortest, max(2, n)) for n in counts]
+    choices = [c for k, c in enumerate(choices) if len(c) not in [len(b) for b in choices[:k]]]
+    done, total = 0, 2 * PEOPLE + len(choices)
+
+    def person(way: Trace, who: int) -> Motion:
+        nonlocal done
+        driven = drive.driven(model, way, None, seed + who, motion.q[0])
+        done += 1
+        if progress is not None:
+            progress(done, total, None)
+        return driven
 
     def people(way: Trace) -> tuple[Motion, ...]:
-        nonlocal done
-        motions = []
-        for k in range(PEOPLE):
-            motions.append(drive.driven(model, way, None, seed + k, motion.q[0]))
-            done += 1
-            if progress is not None:
-                progress(done, 2 * PEOPLE, None)
-        return tuple(motions)
+        return tuple(person(way, k) for k in range(PEOPLE))
+
+    trace = choices[0]
+    if len(choices) > 1:  # the fewest phases that keep about what the best keep
+        lost = [_loss(drive.score(model, person(c, 0))) for c in choices]
+        trace = next(c for c, x in zip(choices, lost, strict=True) if x <= ENOUGH * min(lost))
 
     scores: list[tuple[str, Score]] = [(PLAYED, drive.score(model, motion))]
     try:
@@ -69,11 +80,16 @@ def prepare(
         lane,
         tuple(_warnings(model, problem, trace, motions, room)),
         tuple(scores),
-        verdict(scores[0][1], scores[-1][1]),
+        verdict(scores[0][1], scores[-1][1], str(design.summary.get("objective"))),
     )
 
 
-def verdict(played: Score, person: Score) -> str:
+def _loss(score: Score) -> float:
+    """How poor a score is: worst and median error alike."""
+    return score.worst_percent * score.median_percent
+
+
+def verdict(played: Score, person: Score, objective: str = "accuracy") -> str:
     """What a person keeps of a design, in a sentence."""
     worst, median = person.worst_percent / played.worst_percent, person.median_percent / played.median_percent
     ratio = max(worst, median)
@@ -85,7 +101,9 @@ def verdict(played: Score, person: Score) -> str:
         return f"{begin}: nothing that counts is lost."
     if ratio <= drive.LOST:
         return f"{begin}: good enough to drive."
-    return f"{begin}: too much is lost; design again with --objective accuracy, or play back the torques."
+    if objective in ("cond", "weighted-cond"):
+        return f"{begin}: too much is lost; design again with --objective accuracy, or play back the torques."
+    return f"{begin}: too much is lost; allow more --phases, a longer drive, or play back the torques."
 
 
 def _warnings(model: Model, problem: Problem, trace: Trace, motions: tuple[Motion, ...], room: drive.Room) -> list[str]:

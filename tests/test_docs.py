@@ -1,0 +1,125 @@
+"""Documents that can't go stale: the tutorial is run, the README's lines too, reference pages come from the code."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from conftest import Excite
+
+from excite import reference
+from excite.__main__ import app
+from model import effects, units
+
+ROOT = Path(__file__).parents[1]
+ENVIRONMENT = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+
+
+def blocks(path: Path) -> list[tuple[str, str]]:
+    """Code blocks of a page in order: language, text."""
+    return re.findall(r"^```(\w+)\n(.*?)^```$", path.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.slow
+def test_tutorial_runs_as_it_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    shell = "excite() { " + f'"{sys.executable}" -m excite "$@"; ' + "}\nset -eu\n"
+    for language, text in blocks(ROOT / "docs" / "tutorial.md"):
+        if language == "python":
+            exec(compile(text, "tutorial.md", "exec"), names)
+        else:
+            subprocess.run(["bash", "-c", shell + text], check=True, env=ENVIRONMENT, timeout=300)
+    for written in ("design/report.html", "cab/sheet.pdf", "cab/driver.html", "checked/log.png", "found/report.html"):
+        assert (tmp_path / written).is_file()
+
+
+@pytest.mark.slow
+def test_readme_lines_of_python_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (text,) = [text for language, text in blocks(ROOT / "README.md") if language == "python"]
+    assert len([line for line in text.splitlines() if line and not line.startswith(("from", "import"))]) <= 5
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(compile(text.replace("starts=2", "starts=1, budget_s=30.0"), "README.md", "exec"), names)
+    assert len(names["estimate"].names) == 22
+
+
+def test_every_effect_is_in_its_page() -> None:
+    page = reference.effects_page()
+    for name, effect in effects.CATALOGUE.items():
+        section = page.split(f"## {name}\n")[1].split("\n## ")[0]
+        assert " ".join(effect.source.split())[1:40] in " ".join(section.split())
+        for shape in effect.shapes:
+            assert f"| {shape} |" in section
+    assert "`stribeck_friction@front_roll=" in page
+
+
+def test_reference_pages_hold_what_the_code_has(excite: Excite, tmp_path: Path) -> None:
+    code, stdout, _ = excite("docs", "--out", tmp_path / "d", "--json")
+    assert code == 0
+    assert set(json.loads(stdout)["pages"]) == set(reference.PAGES)
+    read = {name: (tmp_path / "d" / name).read_text() for name in reference.PAGES}
+    assert "def load(name: str | Path) -> Model" in read["python.md"]
+    assert "### identify.identify" in read["python.md"]
+    assert not re.search(r"0x[0-9a-f]{6}", "".join(read.values()))  # the same code gives the same bytes
+    for unit in units.UNITS:
+        assert f"| {unit} |" in read["machine-file.md"]
+    assert "| `--phases` |" in read["commands.md"]
+
+
+def test_public_functions_have_docstrings() -> None:
+    """A page of bare names helps nobody: all but a few have a text."""
+    page = reference.python_page()
+    entries = re.findall(r"^### ([\w.]+)\n\n```python\n.*?^```\n\n(.*?)\n", page, re.MULTILINE | re.DOTALL)
+    bare = [name for name, text in entries if not text.strip()]
+    assert len(entries) > 200
+    assert len(bare) < 0.12 * len(entries), bare
+
+
+def test_every_command_has_json() -> None:
+    for name, command in reference._commands(typer.main.get_command(app), "excite"):
+        assert "--json" in [o for p in command.params for o in p.opts], name
+
+
+def test_shell_completes_commands_and_machines() -> None:
+    def complete(words: str) -> list[str]:
+        count = len(words.split()) - (not words.endswith(" "))
+        asked = {"_EXCITE_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(count)}
+        code = "import sys; sys.argv = ['excite']; from excite.__main__ import main; main()"
+        run = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, env={**ENVIRONMENT, **asked}, check=False
+        )
+        return run.stdout.split()
+
+    assert complete("excite ver") == ["verify"]
+    assert complete("excite design va12") == ["va12", "va12_straight"]
+
+
+@pytest.mark.slow
+def test_progress_does_not_spoil_what_is_piped(tmp_path: Path) -> None:
+    """stderr on a terminal, stdout in a pipe: a bar there, pure JSON here."""
+    design = ROOT / "results" / "S40" / "design"
+    command = [sys.executable, "-m", "excite", "drive", str(design), "--phases", "4", "--json", "--out"]
+    master, slave = pty.openpty()
+    environment = {**ENVIRONMENT, "TERM": "xterm"}
+    run = subprocess.run(
+        [*command, str(tmp_path / "a")], stdout=subprocess.PIPE, stderr=slave, env=environment, check=True
+    )
+    os.close(slave)
+    assert json.loads(run.stdout)["machine"] == "va12_straight"
+    assert b"driving" in os.read(master, 100_000)
+    os.close(master)
+
+
+def test_piped_output_has_no_control_characters(excite: Excite, tmp_path: Path) -> None:
+    code, stdout, stderr = excite("machines")
+    assert code == 0
+    assert "\x1b" not in stdout + stderr
