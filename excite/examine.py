@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.signal
 
-from excite.estimate import Estimate
 from excite.log import Log, LogError
 from excite.noise import spread, whitener
 from excite.processing import decimate, derivative, lowpass, regression, samples
@@ -224,32 +223,3 @@ def choose(model: Model, logs: Sequence[Log]) -> tuple[Filter, str]:
         f" (Hz: {listed}); one row in {factor} kept, which passes {ROOM * rate / 2 / factor:.2g} Hz"
     )
     return machine.filter.model_copy(update={"cutoff_hz": quantity, "decimation": factor}), reason
-
-
-def scan(
-    model: Model,
-    logs: Sequence[Log],
-    method: Callable[[Model, Sequence[Log], Filter], Estimate],
-    filter: Filter,
-    factors: Sequence[float] = (0.5, 0.7, 1.0, 1.4, 2.0),
-) -> tuple[dict[float, np.ndarray], str]:
-    """Estimates {cut-off [Hz]: value (n_base,)} around a filter's cut-off, and how far they move, in a sentence."""
-    rate = float(model.machine.sampling_hz)
-    middle = method(model, logs, filter)
-    found: dict[float, np.ndarray] = {}
-    for factor in factors:
-        cutoff = min(float(filter.cutoff_hz) * factor, 0.45 * rate)
-        quantity = filter.cutoff_hz.model_copy(update={"value": cutoff})
-        other = filter.model_copy(
-            update={"cutoff_hz": quantity, "decimation": max(1, min(filter.decimation, int(ROOM * rate / 2 / cutoff)))}
-        )
-        found[cutoff] = middle.value if factor == 1.0 else method(model, logs, other).value
-    moved = np.array([(v - middle.value) / middle.std for v in found.values()])
-    worst = np.unravel_index(int(np.nanargmax(np.abs(moved))), moved.shape)
-    steady = float(np.nanmedian(np.abs(moved)))
-    text = (
-        f"cut-off between {min(found):.2g} and {max(found):.2g} Hz moves the {middle.method} estimate by {steady:.1f}"
-        f" standard deviations in the middle, {middle.names[worst[1]]} by up to {abs(moved[worst]):.1f}"
-        f" (at {list(found)[worst[0]]:.2g} Hz)"
-    )
-    return found, text

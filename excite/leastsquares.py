@@ -118,28 +118,6 @@ def solve(t: Triangle, tolerance: float = DEPENDENT) -> Solution:
     return Solution(x, tuple(kept), dependent, R * size[kept], float(np.linalg.norm(y - q @ z)), t.rows)
 
 
-def refine(A: np.ndarray, y: np.ndarray, solution: Solution, passes: int = 3) -> np.ndarray:
-    """x (n,) refined together with the residual, both as unknowns of the augmented system; what is left over is formed
-    in extended precision where the machine has it (Bjorck, "Iterative refinement of linear least squares solutions I",
-    BIT 7, 1967). Worth its time where columns are nearly dependent or residuals large."""
-    kept = list(solution.kept)
-    wide, target = A[:, kept].astype(np.longdouble), y.astype(np.longdouble)
-    size = np.linalg.norm(A[:, kept], axis=0)
-    Q, R = np.linalg.qr(A[:, kept] / size)
-    x = solution.x[kept].astype(np.longdouble)
-    r = target - wide @ x
-    for _ in range(passes):
-        f = (target - r - wide @ x).astype(float)
-        g = (wide.T @ r).astype(float) / size
-        along = scipy.linalg.solve_triangular(R, g, trans="T")
-        step = scipy.linalg.solve_triangular(R, Q.T @ f + along)
-        x = x + step / size
-        r = r + (f - Q @ (Q.T @ f) - Q @ along)
-    whole = solution.x.copy()
-    whole[kept] = x.astype(float)
-    return whole
-
-
 def scores_covariance(Z: np.ndarray, e: np.ndarray) -> np.ndarray:
     """Covariance (k, k) of sum Z'e over rows and samples, Z (n_rows, n, k) and noise e (n_rows, n) of any colour.
 

@@ -131,9 +131,3 @@ def test_filters_follow_the_log(straight: Model, clean: Log) -> None:
     coarse = {k: v + 0.02 * np.random.default_rng(1).standard_normal(len(v)) for k, v in clean.values.items()}
     lower, _ = examine.choose(straight, [Log("coarse", clean.t, coarse)])
     assert float(lower.cutoff_hz) < 0.7 * float(filter.cutoff_hz)
-
-
-def test_a_scan_says_how_far_estimates_move(straight: Model, clean: Log) -> None:
-    found, text = examine.scan(straight, [clean], identify.METHODS["tls"], straight.machine.filter, (0.7, 1.0, 1.4))
-    assert len(found) == 3
-    assert "standard deviations" in text

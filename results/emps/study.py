@@ -1,0 +1,148 @@
+"""EMPS by every method, and the rig simulated with what each found, in the rig's own closed loop.
+
+python results/emps/study.py [DATA_EMPS.mat] rebuilds methods.json and README.md beside this file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import scipy.io
+
+from excite import crosscheck, log
+from excite.identify import METHODS, NoEstimate, identify
+from excite.processing import derivative, lowpass
+from model import machine
+from model.prediction import Model, build
+
+HERE = Path(__file__).parent
+DATA = HERE.parents[1] / ".." / "shared" / "data" / "emps" / "DATA_EMPS.mat"
+KP, KV, TOP = 160.18, 243.45, 10.0  # 1/s, V/(m/s), V: the rig's controller, from its authors
+PUBLISHED = {
+    "value": {"M": 95.1089, "Fv": 203.5034, "Fc": 20.3935, "offset": -3.1648},
+    "std": {"M": 0.1085, "Fv": 1.1460, "Fc": 0.1012, "offset": 0.0444},
+    "relative_error_percent": 4.0834,
+    "closed_loop_percent": {"position": 0.013752, "velocity": 0.22911, "acceleration": 8.6036, "force": 5.848},
+}
+
+
+def relative(measured: np.ndarray, simulated: np.ndarray) -> float:
+    """100 |measured - simulated| / |measured|."""
+    return float(100 * np.linalg.norm(measured - simulated) / np.linalg.norm(measured))
+
+
+def closed_loop(model: Model, raw: dict[str, np.ndarray], X: np.ndarray, late: bool = False) -> dict[str, float]:
+    """Simulation errors [%] from the reference alone. Speed and acceleration are compared with those of the filtered
+    position, from where the filter has settled. `late`: the controller acts one sample later."""
+    gain, rate, filter = float(raw["gtau"][0]), float(model.machine.sampling_hz), model.machine.filter
+    control = crosscheck.cascade(raw["qg"], KP, KV, gain, TOP, rate)
+    motion = crosscheck.closed_loop(model, X, len(raw["qm"]), delayed(control) if late else control, raw["qm"][:1])
+    settled = slice(filter.drop[0], None)
+    speed = derivative(lowpass(raw["qm"], rate, filter), rate)
+    return {
+        "position": relative(raw["qm"], motion.q[:, 0]),
+        "velocity": relative(speed[settled], motion.nu[settled, 0]),
+        "acceleration": relative(derivative(speed, rate)[settled], motion.a[settled, 0]),
+        "force": relative(gain * raw["vir"], motion.u[:, 0] + crosscheck.offsets(model, X)),
+    }
+
+
+def delayed(control: crosscheck.Control) -> crosscheck.Control:
+    waiting = [np.zeros(1)]
+
+    def later(k: int, q: np.ndarray, nu: np.ndarray) -> np.ndarray:
+        waiting.append(control(k, q, nu))
+        return waiting.pop(0)
+
+    return later
+
+
+def loop(raw: dict[str, np.ndarray]) -> dict[str, float]:
+    """What the controller's stiffness makes of the published force error, and what the published position error is."""
+    rms = {k: float(np.sqrt(np.mean(v**2))) for k, v in raw.items()}
+    published = PUBLISHED["closed_loop_percent"]
+    assert isinstance(published, dict)
+    stiffness = float(raw["gtau"][0]) * KP * KV
+    position = published["position"] / 100 * rms["qm"]
+    speed = float(np.sqrt(np.mean(np.gradient(raw["qm"], 1e-3) ** 2)))
+    return {
+        "stiffness_N_m": stiffness,
+        "force_error_N": published["force"] / 100 * float(raw["gtau"][0]) * rms["vir"],
+        "position_of_force_error_m": published["force"] / 100 * float(raw["gtau"][0]) * rms["vir"] / stiffness,
+        "published_position_error_m": position,
+        "as_a_delay_s": position / speed,
+    }
+
+
+def readme(found: dict[str, dict[str, object]], own: dict[str, float], late: dict[str, float]) -> str:
+    names = list(PUBLISHED["value"])  # type: ignore[call-overload]
+    lines = [
+        "# EMPS by every method",
+        "",
+        "Real measurements of an electro-mechanical positioning system (Janot, Gautier, Brunot, 2019).",
+        "`summary.json` and `fit.png` are `excite identify`'s; `python results/emps/study.py` rebuilds this page and",
+        "`methods.json`. Value and standard deviation; residual: 100 |Y - W X| / |Y|; closed loop: the rig simulated",
+        "from its reference alone with its own controller, 100 |measured - simulated| / |measured|.",
+        "",
+        "| method | " + " | ".join(names) + " | residual | position | velocity | acceleration | force |",
+        "|---" * (len(names) + 6) + "|",
+    ]
+    rows = {"published": PUBLISHED, **found}
+    for method, r in rows.items():
+        value, std, errors = (r[k] for k in ("value", "std", "closed_loop_percent"))
+        cells = [f"{value[n]:.2f} ({std[n]:.2g})" for n in names]  # type: ignore[index]
+        loop = [f"{errors[k]:.3g} %" for k in ("position", "velocity", "acceleration", "force")]  # type: ignore[index]
+        lines.append(f"| {method} | " + " | ".join([*cells, f"{r['relative_error_percent']:.2f} %", *loop]) + " |")
+    lines += [
+        "",
+        f"The published position error, {1e6 * own['published_position_error_m']:.0f} um, is nine times what the"
+        f" published force error of {own['force_error_N']:.1f} N can do against the controller's stiffness of"
+        f" {own['stiffness_N_m'] / 1e6:.2f} MN/m ({1e6 * own['position_of_force_error_m']:.1f} um, about ours): it is"
+        f" no misfit of forces, but as much as {1e3 * own['as_a_delay_s']:.2f} ms between the simulated and the"
+        " measured signal make. The authors' simulator isn't published, so where that comes from stays open. With a controller"
+        f" that acts one sample later, ours gives {late['position']:.2g} %, {late['velocity']:.2g} %,"
+        f" {late['acceleration']:.2g} % and {late['force']:.2g} %: the loop's timing counts for more than the method.",
+        "",
+        "The methods agree within 0.6 % in M, 4 % in Fv, 2 % in Fc. Filtered residuals are autocorrelated, so that"
+        " `ols` as its authors use it states deviations that are 3.8 to 5.2 times too small; `wls`, `iv` and `tls` allow"
+        " for it. `joint` finds that the rig does something that the model doesn't know (friction of the screw differs by"
+        " direction, its authors say), allows for disturbing forces and says that its intervals do not hold."
+        " `+consistent` changes nothing: every answer is a possible machine.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("data", type=Path, nargs="?", default=DATA)
+    path = parser.parse_args().data
+    model = build(machine.load("emps"))
+    one = log.read(path, model.machine)
+    raw = {k: np.ravel(v) for k, v in scipy.io.loadmat(path).items() if not k.startswith("_")}
+    found: dict[str, dict[str, object]] = {}
+    for method in METHODS:
+        try:
+            e = identify(model, [one], method)
+        except NoEstimate as failure:
+            print(f"{method}: {failure}")
+            continue
+        found[method] = {
+            "value": {n: float(f"{v:.7g}") for n, v in zip(e.names, e.value, strict=True)},
+            "std": {n: float(f"{v:.4g}") for n, v in zip(e.names, e.std, strict=True)},
+            "relative_error_percent": float(f"{e.relative_error_percent:.5g}"),
+            "closed_loop_percent": {k: float(f"{v:.4g}") for k, v in closed_loop(model, raw, e.value).items()},
+            "notes": [note.replace(str(path), path.name) for note in e.notes],
+        }
+    own = loop(raw)
+    late = closed_loop(model, raw, np.array(list(found["ols"]["value"].values())), late=True)  # type: ignore[attr-defined]
+    rounded = {name: {k: float(f"{v:.4g}") for k, v in r.items()} for name, r in (("loop", own), ("late", late))}
+    content = {"published": PUBLISHED, "methods": found, **rounded}
+    (HERE / "methods.json").write_text(json.dumps(content, indent=1) + "\n")
+    (HERE / "README.md").write_text(readme(found, own, late))
+
+
+if __name__ == "__main__":
+    main()
