@@ -98,21 +98,27 @@ def readme(found: dict[str, dict[str, object]], own: dict[str, float], late: dic
         lines.append(f"| {method} | " + " | ".join([*cells, f"{r['relative_error_percent']:.2f} %", *loop]) + " |")
     lines += [
         "",
-        f"The published position error, {1e6 * own['published_position_error_m']:.0f} um, is nine times what the"
-        f" published force error of {own['force_error_N']:.1f} N can do against the controller's stiffness of"
-        f" {own['stiffness_N_m'] / 1e6:.2f} MN/m ({1e6 * own['position_of_force_error_m']:.1f} um, about ours): it is"
-        f" no misfit of forces, but as much as {1e3 * own['as_a_delay_s']:.2f} ms between the simulated and the"
-        " measured signal make. The authors' simulator isn't published, so where that comes from stays open. With a controller"
-        f" that acts one sample later, ours gives {late['position']:.2g} %, {late['velocity']:.2g} %,"
-        f" {late['acceleration']:.2g} % and {late['force']:.2g} %: the loop's timing counts for more than the method.",
+        _line(f"""
+        The published position error, {1e6 * own["published_position_error_m"]:.0f} um, is nine times what the
+        published force error of {own["force_error_N"]:.1f} N can do against the controller's stiffness of
+        {own["stiffness_N_m"] / 1e6:.2f} MN/m ({1e6 * own["position_of_force_error_m"]:.1f} um, about ours): it is no
+        misfit of forces, but as much as {1e3 * own["as_a_delay_s"]:.2f} ms between the simulated and the measured
+        signal make. The authors' simulator isn't published, so where that comes from stays open. With a controller that
+        acts one sample later, ours gives {late["position"]:.2g} %, {late["velocity"]:.2g} %,
+        {late["acceleration"]:.2g} % and {late["force"]:.2g} %: the loop's timing counts for more than the method."""),
         "",
-        "The methods agree within 0.6 % in M, 4 % in Fv, 2 % in Fc. Filtered residuals are autocorrelated, so that"
-        " `ols` as its authors use it states deviations that are 3.8 to 5.2 times too small; `wls`, `iv` and `tls` allow"
-        " for it. `joint` finds that the rig does something that the model doesn't know (friction of the screw differs by"
-        " direction, its authors say), allows for disturbing forces and says that its intervals do not hold."
-        " `+consistent` changes nothing: every answer is a possible machine.",
+        _line("""
+        The methods agree within 0.6 % in M, 4 % in Fv, 2 % in Fc. Filtered residuals are autocorrelated, so that `ols`
+        as its authors use it states deviations that are 3.8 to 5.2 times too small; `wls`, `iv` and `tls` allow for it.
+        `joint` finds that the rig does something that the model doesn't know (friction of the screw differs by
+        direction, its authors say), allows for disturbing forces and says that its intervals do not hold.
+        `+consistent` changes nothing: every answer is a possible machine."""),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())
 
 
 def main() -> None:
