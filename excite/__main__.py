@@ -350,6 +350,31 @@ def identify(
     terminal.finish(summary, out, json, terminal.identify_table)
 
 
+@app.command()
+def diagnose(
+    machine: MachineArgument,
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="one log or several (.csv, .parquet, .mat)")],
+    filtering: Annotated[
+        str, typer.Option("--filter", help="of the first guess; machine: the machine file's, or auto: by evidence")
+    ] = "machine",
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Shows what the simulation gets wrong, names the cause, extends the machine file, measures the gain."""
+    from excite import checkup, folder
+
+    model = _model(machine)
+    out = out or Path(f"results/diagnose-{model.machine.name}")
+    folder.claim(out, logs)
+    if len({path.resolve() for path in logs}) < len(logs):
+        raise UsageError("LOG: the same file is given twice, which would count it twice")
+    _known("--filter", filtering, ("machine", "auto"))
+    with folder.writing(out) as place:
+        with terminal.bar("diagnosing") as advance:
+            summary = checkup.write(place, machine, model, logs, filtering, _versions(), advance)
+    terminal.finish(summary, out, json, terminal.diagnose_table)
+
+
 logs = typer.Typer(help="What is in a log.", rich_markup_mode=None)
 app.add_typer(logs, name="log")
 

@@ -25,20 +25,25 @@ DRAWS = 2000
 class Withheld:
     """Errors of a model on withheld stretches: mean squares (stretches, m) [SI squared] and how many readings (same).
 
-    sensors (m): names and units; motion (m,): mean square of what each signal does in a stretch.
+    sensors (m): names and units; motion (m,): mean square of what each signal does in a stretch; noise (m,): variance
+    of a reading.
     """
 
     sensors: tuple[tuple[str, str], ...]
     squares: np.ndarray
     counts: np.ndarray
     motion: np.ndarray
+    noise: np.ndarray
 
     def percent(self, draw: np.ndarray | None = None) -> float:
-        """The error in per cent of the motion, root mean square over signals; of some stretches where drawn."""
+        """The error in per cent of the motion, all signals in units of their noise, so that what is measured badly
+        doesn't hide the rest; of some stretches where drawn."""
         at = slice(None) if draw is None else draw
         error = self.squares[at].sum(axis=0) / np.maximum(self.counts[at].sum(axis=0), 1)
         told = (self.counts[at].sum(axis=0) > 0) & (self.motion > 0)
-        return float(100 * np.sqrt(np.mean(error[told] / self.motion[told]))) if told.any() else float("nan")
+        if not told.any():
+            return float("nan")
+        return float(100 * np.sqrt(np.sum((error / self.noise)[told]) / np.sum((self.motion / self.noise)[told])))
 
     def rms(self) -> dict[str, tuple[float, str]]:
         """Root mean square error of every signal, with its unit."""
@@ -75,10 +80,11 @@ def withheld(stage: Stage) -> Withheld | None:
         )
     except NotConverged:
         return None
-    squares, counts, motion = [], [], []
+    squares, counts, motion, noise = [], [], [], []
     for r, p, own in zip(prepared.records, rest.points, stretches, strict=True):
         u = c.delivered(r.torque, rest.X)[0] + np.concatenate([p.w, p.w[-1:]])
-        h = readings(c, r, p, u, rest.X)[0]
+        h, _, weight, *_ = readings(c, r, p, u, rest.X)
+        noise.append(r.used.sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300))
         for a, b in own:
             told = r.used[a:b] > 0
             error = np.where(told, r.reading[a:b] - h[a:b], 0.0)
@@ -86,7 +92,7 @@ def withheld(stage: Stage) -> Withheld | None:
             counts.append(told.sum(axis=0))
             motion.append(h[a:b].var(axis=0))
     sensors = tuple((s.name, "rad" if s.resolution is not None and s.unit == "rad" else s.unit) for s in c.sensors)
-    return Withheld(sensors, np.array(squares), np.array(counts), np.mean(motion, axis=0))
+    return Withheld(sensors, np.array(squares), np.array(counts), np.mean(motion, axis=0), np.mean(noise, axis=0))
 
 
 def gain(before: Withheld, after: Withheld, seed: int = 0) -> Gain:

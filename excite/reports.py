@@ -28,8 +28,17 @@ CAPTIONS = {
     " diamonds their mean, grey bars the 95 % interval that the estimator itself predicts. Right, in how many runs the"
     " interval holds the truth; 95 % is what it claims.",
     "log.png": "Every channel that the machine file knows, in SI units, over time; dashed lines mark gaps.",
+    "signals.png": "Left, how much of each signal's error is systematic, the rest being noise. Right, the error on"
+    " stretches that were withheld from the fit, in the signal's unit and in per cent of the error without what was"
+    " found.",
     "compare.png": "Drives side by side: condition number of Phi, and attainable standard deviation of the worst"
     " parameter [%]; hatched drives break a limit that their label names.",
+}
+LOGGED = {
+    "misfit": "What the model lacks in {}: the torque (and force, where only such let the model follow the log) that is"
+    " missing on average, against what the machine does. Flat at zero is right; grey is what noise alone leaves.",
+    "when": "Left, when and in which signal the model is off in {}; right, at which speed and steering angle (or"
+    " torque). The error of one step ahead in units of noise: 1 is noise alone.",
 }
 FIT = "Measured and predicted drive torques, and what is left between them, over time, for {}."
 
@@ -66,6 +75,8 @@ def _caption(name: str, summary: Summary) -> str:
     k = int(number or 1) - 1
     if kind == "validation":
         return FIT.format(f"{summary['validation'][k]['log']}, which the parameters were not fitted on")
+    if kind in LOGGED:
+        return LOGGED[kind].format(summary["logs"][k])
     return FIT.format(summary["logs"][k]) if kind == "fit" else name
 
 
@@ -251,4 +262,74 @@ def _log(s: Summary) -> Said:
     return f"The log {name}", answer, remarks, [Table("Columns as the file has them.", names, rows)]
 
 
-KINDS = {"design": _design, "verify": _verify, "compare": _compare, "identify": _identify, "log": _log}
+def _diagnose(s: Summary) -> Said:
+    remarks = []
+    if s["separating_run"]:
+        remarks.append(f"To tell apart what is tied, drive: {s['separating_run']}.")
+    remarks += [f"What is left: {line}." for line in s["located"]]
+    if s["machine_file"]:
+        remarks.append(
+            f"{s['machine_file']} beside this page is the machine with what was found: `excite design`, `verify`,"
+            " `simulate` and `identify` take it."
+        )
+    remarks += s["notes"]
+    tables = []
+    if s["findings"]:
+        found = tuple(
+            (
+                f"{f['effect']}@{f['where']}",
+                rounded(f["amount"], 5),
+                rounded(f["amount_std"], 2),
+                f["unit"],
+                "; ".join(f"{n} {rounded(x['value'], 4)} {x['unit']}" for n, x in f["shapes"].items()) or "-",
+                rounded(f["p_value"], 2),
+                rounded(f["gain_percent"], 3),
+                "-" if f["gain_ci95"] is None else " to ".join(rounded(x, 3) for x in f["gain_ci95"]),
+                ", ".join(f["tied_with"]) or "-",
+            )
+            for f in s["findings"]
+        )
+        columns = ("effect", "amount", "std", "unit", "shape", "p-value", "gain %", "95 % of it", "as well could be")
+        caption = (
+            "What was found, in the order in which it was. p-value: of no effect at all, for all causes that were"
+            " tried. Gain: how much less the model errs on stretches that were not fitted on."
+        )
+        tables.append(Table(caption, columns, found))
+    rows = tuple(
+        (
+            n,
+            r["unit"],
+            *(rounded(r[k], 3) for k in ("rms_before", "rms_after")),
+            *(rounded(r[f"systematic_{k}_percent"], 2) for k in ("before", "after")),
+        )
+        for n, r in s["signals"].items()
+    )
+    heads = ("signal", "unit", "error before", "error after", "systematic before %", "systematic after %")
+    caption = (
+        "Signal by signal: root mean square error on stretches that were withheld from the fit (the sensor's own noise"
+        " is in it), and the share of the error one step ahead that noise doesn't make."
+    )
+    tables.append(Table(caption, heads, rows))
+    if s["findings"]:
+        moved = tuple(
+            (
+                n,
+                r["unit"],
+                *(rounded(r[k], 6) for k in ("before", "after")),
+                *(rounded(r[k], 2) for k in ("std_before", "std_after", "moved")),
+            )
+            for n, r in s["parameters"].items()
+        )
+        titles = ("parameter", "unit", "before", "after", "std before", "std after", "moved by std")
+        tables.append(Table("What the finding does to the parameters: the bias that it took away.", titles, moved))
+    return f"Diagnosis of {s['machine']}", s["answer"], remarks, tables
+
+
+KINDS = {
+    "design": _design,
+    "verify": _verify,
+    "compare": _compare,
+    "identify": _identify,
+    "log": _log,
+    "diagnose": _diagnose,
+}

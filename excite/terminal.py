@@ -160,6 +160,44 @@ def log_table(summary: dict[str, Any]) -> None:
         say(f"{summary['log']}: a usable log of {summary['machine']}")
 
 
+def diagnose_table(summary: dict[str, Any]) -> None:
+    """A diagnosis: the answer, a finding a line, errors signal by signal, what to drive next."""
+    say(summary["answer"])
+    if summary["findings"]:
+        rows = table("effect", "where", "amount", "std", "unit", "p-value", "gain %", "95 % of it", "tied with")
+        for f in summary["findings"]:
+            low, high = f["gain_ci95"] or (None, None)
+            rows.add_row(
+                f["effect"],
+                f["where"],
+                rounded(f["amount"], 5),
+                rounded(f["amount_std"], 2),
+                f["unit"],
+                rounded(f["p_value"], 2),
+                rounded(f["gain_percent"], 3),
+                "-" if low is None else f"{rounded(low, 3)} to {rounded(high, 3)}",
+                ", ".join(f["tied_with"]) or "-",
+            )
+        say(rows)
+    rows = table("signal", "unit", "error before", "after", "systematic before %", "after %")
+    for name, row in summary["signals"].items():
+        rows.add_row(
+            name,
+            row["unit"],
+            *(rounded(row[f"rms_{k}"], 3) for k in ("before", "after")),
+            *(rounded(row[f"systematic_{k}_percent"], 2) for k in ("before", "after")),
+        )
+    say(rows)
+    for line in summary["located"]:
+        say(line)
+    if summary["separating_run"]:
+        say(f"to tell them apart, drive: {summary['separating_run']}")
+    if summary["machine_file"]:
+        say(f"the machine with what was found: {summary['machine_file']}, for every command")
+    for note in summary["notes"]:
+        say(note)
+
+
 def drive_table(summary: dict[str, Any]) -> None:
     """A drive for a person: its phases, what it keeps of the design, what to mind."""
     rows = table("at", "what it is")

@@ -1,0 +1,237 @@
+"""A diagnosis as people and programs read it: the summary of `excite diagnose`, and the extended machine file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from excite import gain, misfit, separate
+from excite.diagnose import Advance, Diagnosis, Finding
+from excite.gain import Gain
+from excite.misfit import Course
+from model.machine import EffectEntry, Machine, shipped
+
+DIGITS = 8  # of amounts in a machine file
+
+
+@dataclass(frozen=True)
+class Account:
+    """What is to be told of a diagnosis.
+
+    whole, single: gains of all findings and of each, on stretches that were withheld; None where no model could be
+    fitted to what these leave. before, after: the courses of the logs; missing: those that show what is missing in both
+    alike. located: where the misfit sits. run: what would separate causes that are tied.
+    """
+
+    diagnosis: Diagnosis
+    whole: Gain | None
+    single: tuple[Gain | None, ...]
+    before: tuple[Course, ...]
+    after: tuple[Course, ...]
+    missing: tuple[tuple[Course, ...], tuple[Course, ...]]
+    located: tuple[str, ...]
+    run: str | None
+
+
+def account(d: Diagnosis, advance: Advance | None = None) -> Account:
+    """Measures gains and locates the misfit. Each finding's gain is that of the model with it over the model with those
+    found before it."""
+    tell = advance or (lambda share, what: None)
+    stages = [d.before, *d.stages]
+    held = []
+    for k, stage in enumerate(stages):
+        tell(k / len(stages), "measuring the gain")
+        held.append(gain.withheld(stage))
+    single = tuple(gain.gain(a, b) if a is not None and b is not None else None for a, b in pairwise(held))
+    first, last = held[0], held[-1]
+    whole = gain.gain(first, last) if first is not None and last is not None else None
+    before = misfit.courses(d.before)
+    after = misfit.courses(d.after) if d.stages else before
+    missing = before, after
+    if d.before.exact != d.after.exact:
+        # Forces that the one needs must be shown for the other too.
+        missing = misfit.courses(misfit.loosened(d.before)), misfit.courses(misfit.loosened(d.after))
+    located = misfit.located(d.after) if d.verdict == "unexplained" else ()
+    return Account(
+        d, whole, single, before, after, missing, tuple(dict.fromkeys((*located, *d.located))), separate.run(d)
+    )
+
+
+def summary(a: Account) -> dict[str, Any]:
+    """The keys of the contract, and: shapes, errors of each signal before and after, what is noise and what is
+    systematic, base parameters before and after."""
+    d = a.diagnosis
+    return {
+        "verdict": d.verdict,
+        "answer": answer(a),
+        "findings": [_finding(f, g) for f, g in zip(d.findings, a.single, strict=True)],
+        "error_before_percent": a.whole.before if a.whole else None,
+        "error_after_percent": a.whole.after if a.whole else None,
+        "gain_percent": a.whole.percent if a.whole and d.findings else None,
+        "gain_ci95": list(a.whole.interval) if a.whole and d.findings else None,
+        "signals": signals(a),
+        "separating_run": a.run,
+        "share_explained": d.share,
+        "located": list(a.located),
+        "parameters": parameters(d),
+        "exact": {"before": d.before.exact, "after": d.after.exact},
+        "notes": list(d.notes),
+    }
+
+
+def _finding(f: Finding, g: Gain | None) -> dict[str, Any]:
+    return {
+        "effect": f.effect,
+        "where": f.where,
+        "tied_with": list(f.tied_with),
+        "p_value": f.p_value,
+        "amount": f.amount,
+        "amount_std": f.amount_std,
+        "unit": f.unit,
+        "shapes": {n: {"value": value, "std": std, "unit": unit} for n, (value, std, unit) in f.shapes.items()},
+        "chi2_gain": f.gain,
+        "gain_percent": g.percent if g else None,
+        "gain_ci95": list(g.interval) if g else None,
+    }
+
+
+def signals(a: Account) -> dict[str, dict[str, Any]]:
+    """Per signal: error on withheld stretches before and after [unit]; what of the innovations is systematic [%]."""
+    before, after = misfit.mean_sizes(a.before), misfit.mean_sizes(a.after)
+    rows: dict[str, dict[str, Any]] = {}
+    for name in before:
+        was, now, unit = a.whole.signals[name] if a.whole and name in a.whole.signals else (np.nan, np.nan, "")
+        rows[name] = {
+            "unit": unit,
+            "rms_before": was,
+            "rms_after": now,
+            "systematic_before_percent": before[name].systematic_percent,
+            "systematic_after_percent": after[name].systematic_percent,
+        }
+    return rows
+
+
+def parameters(d: Diagnosis) -> dict[str, dict[str, Any]]:
+    """Base parameters without and with what was found: value and deviation; `moved`: in deviations before."""
+    after = dict(zip(d.after.model.base.names, zip(d.after.fit.X, d.after.fit.std, strict=True), strict=True))
+    rows = {}
+    model = d.before.model
+    for name, unit, value, std in zip(
+        model.base.names, model.base.units, d.before.fit.X, d.before.fit.std, strict=True
+    ):
+        new, new_std = after[name]
+        rows[name] = {
+            "unit": unit,
+            "before": value,
+            "std_before": std,
+            "after": new,
+            "std_after": new_std,
+            "moved": (new - value) / std if std > 0 else None,
+        }
+    return rows
+
+
+def words(effect: str, where: str) -> str:
+    """An effect at its place, in words."""
+    return f"{effect.replace('_', ' ')} ({where.replace('_', ' ')})"
+
+
+def amount(row: Mapping[str, Any]) -> str:
+    """An amount with its deviation, to the digits that it has."""
+    value, std = float(row["amount"]), float(row["amount_std"])
+    unit = "" if row["unit"] == "-" else f" {row['unit']}"
+    if not (np.isfinite(std) and std > 0):
+        return f"{value:.4g}{unit}"
+    digits = int(np.clip(np.floor(np.log10(max(abs(value), std))) - np.floor(np.log10(std)) + 2, 2, 8))
+    return f"{value:.{digits}g} ± {std:.2g}{unit}"
+
+
+def answer(a: Account) -> str:
+    """The diagnosis in a sentence or two."""
+    d = a.diagnosis
+    logs = "The log shows" if len(d.before.prepared.logs) == 1 else "The logs show"
+    if d.verdict == "clean":
+        return f"{logs} nothing that the model doesn't know: what is left between the two is noise."
+    rows = [_finding(f, g) for f, g in zip(d.findings, a.single, strict=True)]
+    named = ", and ".join(
+        " or ".join(words(*x.split("@")) for x in (f"{r['effect']}@{r['where']}", *r["tied_with"])) for r in rows
+    )
+    if d.verdict == "unexplained":
+        text = f"{logs} something that no known effect explains"
+        if rows:
+            text += f"; {named} would account for {100 * d.share:.0f} % of it, too little to be its name"
+        return text + "."
+    gained = ""
+    if a.whole:
+        better = [(1 - now / was, n) for n, (was, now, _) in a.whole.signals.items() if was > 0]
+        most = max(better)
+        low, high = a.whole.interval
+        gained = (
+            f" On stretches that were not fitted on, the model with it errs {_change(a.whole.percent)} (95 %:"
+            f" {low:.2g} to {high:.2g} %); most in {most[1]}, by {100 * most[0]:.0f} %."
+        )
+    if d.verdict == "tied":
+        return f"{logs} {named}: this data can't tell which.{gained}"
+    return f"{logs} {named}: {'; '.join(amount(r) for r in rows)}.{gained}"
+
+
+def _change(percent: float) -> str:
+    return f"{percent:.2g} % less" if percent >= 0 else f"{-percent:.2g} % more"
+
+
+# ------------------------------------------------------------------------------------------------ machine file
+
+
+def machine_file(name: str, machine: Machine, d: Diagnosis) -> str | None:
+    """The machine with what was found in it, as a TOML file; None where nothing is named.
+
+    Of a shipped machine only what is new; of a file all of it, so that it stands on its own. Base parameters are
+    groups of what a file gives, and stay out.
+    """
+    if not d.findings or d.verdict == "unexplained":
+        return None
+    found = [_entry(f) for f in d.findings]
+    entries = [*map(_table, machine.effect), *map(_table, found)]
+    if name in shipped():
+        content: dict[str, Any] = {"extends": name}
+    else:
+        content = machine.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
+        content.pop("effect", None)
+    logs = ", ".join(x.source for x in d.before.prepared.logs)
+    head = [
+        f"# {machine.title}, with what `excite diagnose` found in {logs}.",
+        *(f"# {f.name} could as well be {' or '.join(f.tied_with)}." for f in d.findings if f.tied_with),
+        "# The other parameters are as they were: logs tell combinations of masses and inertias, not each of them;",
+        "# `excite identify` with this file gives those.",
+    ]
+    return "\n".join(head) + "\n\n" + tomli_w.dumps({**content, "effect": entries})
+
+
+def _entry(f: Finding) -> dict[str, Any]:
+    return {
+        "name": f.effect,
+        "where": f.where,
+        "amount": {"value": _short(f.amount), "source": "identified"},
+        "std": {"value": _short(f.amount_std), "source": "identified"},
+        "shape": {
+            n: {"value": _short(value), "source": "identified", "note": f"± {std:.2g} {unit}".rstrip(" -")}
+            for n, (value, std, unit) in f.shapes.items()
+        },
+    }
+
+
+def _table(entry: EffectEntry | Mapping[str, Any]) -> dict[str, Any]:
+    """An effect as a table of a machine file."""
+    if isinstance(entry, EffectEntry):
+        return entry.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
+    return {key: value for key, value in entry.items() if value != {}}
+
+
+def _short(value: float) -> float:
+    """A number to as many digits as a file needs."""
+    return float(f"{value:.{DIGITS}g}")
