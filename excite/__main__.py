@@ -7,7 +7,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 # One BLAS thread: our matrices are small, and threads turn a 0.3 ms eigenproblem into 100 ms.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -411,6 +411,32 @@ def docs(out: OutOption = None, json: JsonOption = False) -> None:
     terminal.finish(summary, out, json, lambda s: terminal.say(", ".join(s["pages"])))
 
 
+@app.command()
+def study(
+    file: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="what to vary, and what to do with each")],
+    jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="processes; every core by default")] = None,
+    cluster: Annotated[
+        str | None, typer.Option("--cluster", help="address of a Dask scheduler (tcp://...) to compute on")
+    ] = None,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Carries out a scripted study, or goes on with one that was interrupted."""
+    from excite import plan
+    from excite import study as studies
+
+    wanted = plan.read(file)
+    out = out or Path(f"results/study-{wanted.study.name}")
+    if jobs is not None and cluster is not None:
+        raise UsageError("--jobs: the cluster's workers are as many as they are, leave --jobs or --cluster out")
+    try:
+        with terminal.study_bar() as tell:
+            summary = studies.carry(wanted, out, jobs, cluster, tell)
+    except (KeyboardInterrupt, typer.Abort):
+        _fail("interrupted; what is done is kept, the same command goes on", INTERRUPTED)
+    terminal.finish(summary, out, json, terminal.study_table)
+
+
 # ------------------------------------------------------------------------------------------------ the work
 
 
@@ -680,23 +706,26 @@ def _terminate(*_: object) -> None:
 def _exit_code(err: Exception) -> int | None:
     """What an error means for the person who must act; None for a defect of ours, which shows its traceback."""
     from excite.drive import DriveError
+    from excite.engine import EngineError
     from excite.estimate import NoEstimate
     from excite.folder import FolderError
     from excite.limit import InfeasibleError
     from excite.log import LogError
+    from excite.plan import StudyError
     from excite.serve import ServeError
     from excite.simulate import SimulationError
+    from excite.store import StoreError
     from excite.stored import StoredError
     from model.machine import MachineError
 
-    if isinstance(err, UsageError | MachineError | LogError | FolderError | StoredError | DriveError):
+    if isinstance(err, UsageError | MachineError | LogError | FolderError | StoredError | DriveError | StudyError):
         return 2
-    if isinstance(err, NoEstimate | InfeasibleError | SimulationError | ServeError):
+    if isinstance(err, NoEstimate | InfeasibleError | SimulationError | ServeError | EngineError | StoreError):
         return 1
     return None
 
 
-def _fail(message: str, code: int) -> None:
+def _fail(message: str, code: int) -> NoReturn:
     sys.stderr.write(f"excite: {message}\n")
     sys.exit(code)
 

@@ -16,7 +16,8 @@ import numpy as np
 
 SUMMARY = "summary.json"
 OURS = re.compile(
-    r"summary\.json|machine\.(json|toml)|(profile|phases)\.csv|README\.md|[a-z0-9-]+\.(png|pdf|html|md)|design|verify|drives|runs\.parquet|study\.json|machines"
+    r"summary\.json|machine\.(json|toml)|(profile|phases)\.csv|README\.md|[a-z0-9-]+\.(png|pdf|html|md)|design|verify"
+    r"|drives|runs\.parquet|study\.json|machines"
 )
 
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+SHOWN = 40  # cells of a study in the terminal
+PAUSE = 30.0  # s between lines of progress
 
 
 def say(thing: object) -> None:
@@ -229,6 +233,79 @@ def bar(label: str) -> Iterator[Advance]:
             progress.update(task, completed=done, total=total, description=text)
 
         yield advance
+
+
+def study_table(summary: dict[str, Any]) -> None:
+    """A study, a cell a line, and how many runs ended how."""
+    rows = table("cell", "done", "failed", "worst parameter", "rms %", "median rms %", "coverage %", "verdicts")
+    for row in summary["cells"][:SHOWN]:
+        rows.add_row(
+            row["cell"],
+            str(row["done"]),
+            str(row["failed"] + row["defect"]),
+            row.get("worst_parameter", "-"),
+            rounded(row.get("worst_rms_percent"), 3),
+            rounded(row.get("median_rms_percent"), 3),
+            rounded(100 * row["coverage95"] if row.get("coverage95") is not None else None, 3),
+            ", ".join(f"{k} {v}" for k, v in row.get("verdicts", {}).items()) or "-",
+        )
+    say(rows)
+    if len(summary["cells"]) > SHOWN:
+        say(f"and {len(summary['cells']) - SHOWN} cells more, see the report")
+    say(f"{summary['runs']} runs: {summary['done']} gave a result, {summary['failed']} could not")
+    if summary["defects"]:
+        say(f"{summary['defects']} runs showed a defect of the program, column `reason` of the table says which")
+
+
+@contextmanager
+def study_bar() -> Iterator[Callable[[int, int, str], None]]:
+    """What is done of a study and the time left: a bar on a terminal, elsewhere a line on stderr now and then."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines()
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, speed_estimate_period=120) as progress:
+        task = progress.add_task("", total=None)
+        shown = ""
+
+        def tell(done: int, total: int, what: str) -> None:
+            nonlocal shown
+            if what != shown:  # what was there before says nothing of the speed
+                progress.reset(task, total=total, completed=done, description=what)
+                shown = what
+            progress.update(task, completed=done)
+
+        yield tell
+
+
+def _lines() -> Callable[[int, int, str], None]:
+    """Progress for a file that is looked into: a line at the start, then every PAUSE seconds."""
+    began: dict[str, tuple[float, int]] = {}
+    last = -PAUSE
+
+    def tell(done: int, total: int, what: str) -> None:
+        nonlocal last
+        now = time.monotonic()
+        since, before = began.setdefault(what, (now, done))
+        if done < total and now - last < PAUSE:
+            return
+        last = now
+        left = (total - done) * (now - since) / (done - before) if done > before else None
+        tail = "" if left is None or done == total else f", about {_span(left)} left"
+        sys.stderr.write(f"{what}: {done} of {total}{tail}\n")
+        sys.stderr.flush()
+
+    return tell
+
+
+def _span(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 @contextmanager

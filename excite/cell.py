@@ -1,0 +1,175 @@
+"""What one run of a study does: a drive in simulation, its log, what is found in the log. Pure, for any worker."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from excite import brief, identify, log, sensors
+from excite.brief import Brief
+from excite.estimate import NoEstimate
+from excite.limit import InfeasibleError
+from excite.log import LogError
+from excite.simulate import Motion, SimulationError, simulate
+from model import machine as machines
+from model.machine import Machine, Problem
+from model.prediction import Model, build
+
+DONE, FAILED, DEFECT = STATUSES = ("done", "failed", "defect")
+Row = dict[str, Any]
+_ALONE = threading.Lock()  # CasADi's functions are not made for the threads of a cluster's worker
+
+
+@dataclass(frozen=True)
+class Driven:
+    """Torques (N, n_u) [N m] as bytes of float64, and the state q0, nu0 (n_q,) that they start from."""
+
+    torque: bytes
+    inputs: int
+    q0: tuple[float, ...]
+    nu0: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Work:
+    """Some runs of one cell. known: the machine that identification knows; true: the one that drives, with its effects
+    (both as JSON); runs: number and seed of each."""
+
+    known: str
+    true: str
+    driven: Driven
+    steps: tuple[str, ...]
+    kit: str
+    method: str
+    runs: tuple[tuple[int, int], ...]
+
+
+@lru_cache(maxsize=8)
+def model_of(machine: str) -> Model:
+    """A worker builds each machine's model once; CasADi functions are cheaper to build than to send."""
+    return build(Machine.model_validate_json(machine))
+
+
+@lru_cache(maxsize=4)
+def _motion(machine: str, driven: Driven) -> Motion:
+    torque = np.frombuffer(driven.torque).reshape(-1, driven.inputs)
+    return simulate(model_of(machine), torque, q0=np.array(driven.q0), nu0=np.array(driven.nu0))
+
+
+def carry(work: Work) -> tuple[str, list[tuple[int, Row]]]:
+    """The runs of a piece of work, in order: this worker's `program`; number and row of each (see `run`)."""
+    with _ALONE:
+        return program(), [(number, run(work, seed)) for number, seed in work.runs]
+
+
+def run(work: Work, seed: int) -> Row:
+    """One run: status, reason where it failed, and what its steps found.
+
+    A failure of the method (no estimate, no motion, a log that can't be used) is `failed`; any other error is a
+    defect of the program, which is told as such and doesn't end the study.
+    """
+    try:
+        return {"status": DONE} | _run(work, seed)
+    except (NoEstimate, SimulationError, LogError) as err:
+        return {"status": FAILED, "reason": _said(err)}
+    except Exception as err:
+        return {"status": DEFECT, "reason": f"{type(err).__name__}: {_said(err)}"}
+
+
+def _said(err: Exception) -> str:
+    return " ".join(str(err).split())[:500]
+
+
+def _run(work: Work, seed: int) -> Row:
+    known, steps = model_of(work.known), set(work.steps)
+    row: Row = {}
+    if not steps & {"simulate", "identify", "verify", "diagnose"}:
+        return row
+    table = sensors.measure(model_of(work.true), _motion(work.true, work.driven), kit=work.kit, seed=seed)
+    row["log_sha256"] = hashlib.sha256(table.to_numpy(float).tobytes()).hexdigest()[:16]
+    if steps & {"identify", "verify"}:
+        measured = log.check(table, known.machine, identify.needed_sensors(known, work.method))
+        estimate = identify.identify(known, [measured], work.method)
+        row["value"], row["std"] = _numbers(estimate.value), _numbers(estimate.std)
+        row["quantile95"] = estimate.quantile95
+        row["relative_error_percent"] = estimate.relative_error_percent
+    if "diagnose" in steps:
+        row |= _diagnosed(known, [log.check(table, known.machine)])
+    return row
+
+
+def _diagnosed(model: Model, logs: Sequence[log.Log]) -> Row:
+    from excite.diagnose import diagnose
+
+    found = diagnose(model, logs, model.machine.filter)
+    return {
+        "verdict": found.verdict,
+        "findings": [[f.name, f.amount, f.amount_std, f.unit, list(f.tied_with)] for f in found.findings],
+    }
+
+
+def _numbers(x: np.ndarray) -> list[float | None]:
+    """For a table: a number that is not finite is none at all."""
+    return [float(v) if math.isfinite(v) else None for v in x]
+
+
+@dataclass(frozen=True)
+class Order:
+    """A design that is wanted: of drive `number`, for a machine (JSON) and its problem."""
+
+    number: int
+    machine: str
+    name: str
+    problem: Problem
+    objective: str
+    starts: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Designed:
+    """What came of it: the profile (CSV) and the summary, or why there is none."""
+
+    profile: str
+    summary: dict[str, Any]
+    failure: str | None = None
+
+
+def designed(order: Order) -> Designed:
+    """A study's drive. Raises KeyboardInterrupt where it was cut short."""
+    model = build(Machine.model_validate_json(order.machine))
+    asked = Brief(order.objective, starts=order.starts, seed=order.seed)
+    try:
+        answer = brief.answer(model, order.problem, asked)
+    except (InfeasibleError, SimulationError, NoEstimate) as err:
+        return Designed("", {}, _said(err))
+    except Exception as err:
+        return Designed("", {}, f"{DEFECT}: {type(err).__name__}: {_said(err)}")
+    if not answer.design.complete:
+        raise KeyboardInterrupt
+    summary = {
+        "machine": model.machine.name,
+        "problem": order.name,
+        "duration_s": float(order.problem.duration_s),
+        **brief.summary(asked, answer),
+    }
+    return Designed(log.profile(answer.model, answer.design.motion).to_csv(index=False), summary)
+
+
+@lru_cache(maxsize=1)
+def program() -> str:
+    """Sixteen digits that change when the program does: rows of two programs are not put into one table."""
+    seen = hashlib.sha256()
+    here = Path(__file__).parent
+    there = Path(machines.__file__).parent
+    for file in sorted([*here.glob("*.py"), *there.glob("*.py"), *machines.MACHINES.glob("*.toml")]):
+        seen.update(file.name.encode() + file.read_bytes())
+    return seen.hexdigest()[:16]

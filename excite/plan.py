@@ -1,0 +1,444 @@
+"""What a study asks for: its file (TOML) as checked records, and the cells that it spans.
+
+    name = "soil"
+    runs = 50                               # of every cell, each with other sensor noise
+    steps = ["verify"]                      # of design, simulate, identify, diagnose, verify
+
+    [grid]                                  # every combination; [[grid]] for several
+    machine = ["va12", "my_roller.toml"]
+    objective = ["cond", "accuracy"]
+    duration_s = [30, 60]
+    limits = [{}, { rim_speed = 0.5 }]      # factors on the machine's own
+    method = ["joint", "ols"]
+    effects = [[], ["rolling_resistance@front_roll=30"]]
+
+    [sample]                                # so many cells drawn at random; [[sample]] for several
+    count = 100
+    machine = ["va12"]
+    duration_s = [{ low = 20, high = 60 }]
+    effects = [["ground_slope=0.0005..0.005"]]
+
+A cell is a drive (designed, or a given `profile`), a machine that drives it, sensors and an estimator. Cells that
+share a drive share its design. Paths are relative to the study file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import re
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
+
+from excite import identify, log
+from excite.log import LogError
+from excite.objective import OBJECTIVES
+from model import effects as catalogue
+from model import machine as machines
+from model import prediction
+from model.machine import Machine, MachineError, Number, Problem, Record
+
+STEPS = ("design", "simulate", "identify", "diagnose", "verify")
+LIMITS = ("torque", "torque_rate", "position", "rate", "rim_speed", "slip", "power", "lane")
+MOST = 1_000_000  # runs of a study
+MOST_CELLS = 100_000
+SPAN = re.compile(r"^(?P<what>[^=]*)=(?P<low>[^=]+)\.\.(?P<high>[^=]+)$")
+
+
+class StudyError(ValueError):
+    """A study that can't be carried out: the message is one line with file, key, what is wrong, what is allowed."""
+
+
+def _several(value: Any) -> Any:
+    return value if isinstance(value, list | tuple) else [value]
+
+
+def _sets(value: Any) -> Any:
+    """Every entry a set of effects; one effect stands for the set that holds it alone."""
+    return [_several(v) for v in _several(value)]
+
+
+class Range(Record):
+    """Numbers from low to high, drawn evenly, or evenly in their logarithm."""
+
+    low: Number
+    high: Number
+    log: Annotated[bool, Field(strict=True)] = False
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Range:
+        if not self.low < self.high or (self.log and self.low <= 0):
+            raise ValueError(f"high: must be above low{', which must be > 0 for log' if self.log else ''}")
+        return self
+
+    def draw(self, rng: np.random.Generator) -> float:
+        if self.log:
+            return float(np.exp(rng.uniform(math.log(self.low), math.log(self.high))))
+        return float(rng.uniform(self.low, self.high))
+
+
+Text = Annotated[str, Field(min_length=1, max_length=1000)]
+Whole = Annotated[int, Field(strict=True, ge=0, le=2**32 - 1)]
+Starts = Annotated[int, Field(strict=True, ge=1, le=1000)]
+Limit = Literal["torque", "torque_rate", "position", "rate", "rim_speed", "slip", "power", "lane"]
+
+
+class Axes(Record):
+    """What varies; an axis that is left out has the one value that the commands take by default.
+
+    limits: factors on the machine's own; effects: sets of NAME[@WHERE]=AMOUNT; profile: drives instead of designs.
+    seed: of the sensors' noise, as in `excite verify`; design_seed: of the search.
+    """
+
+    machine: Annotated[tuple[Text, ...], BeforeValidator(_several), Field(min_length=1)]
+    problem: Annotated[tuple[Text, ...], BeforeValidator(_several)] = ()
+    objective: Annotated[tuple[Text, ...], BeforeValidator(_several), Field(min_length=1)] = ("cond",)
+    starts: Annotated[tuple[Starts, ...], BeforeValidator(_several), Field(min_length=1)] = (2,)
+    design_seed: Annotated[tuple[Whole, ...], BeforeValidator(_several), Field(min_length=1)] = (0,)
+    profile: Annotated[tuple[Text, ...], BeforeValidator(_several)] = ()
+    kit: Annotated[tuple[Literal["paper", "full"], ...], BeforeValidator(_several), Field(min_length=1)] = ("full",)
+    method: Annotated[tuple[Text, ...], BeforeValidator(_several)] = ()
+    effects: Annotated[tuple[tuple[Text, ...], ...], BeforeValidator(_sets), Field(min_length=1)] = ((),)
+    seed: Annotated[tuple[Whole, ...], BeforeValidator(_several), Field(min_length=1)] = (0,)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Axes:
+        if self.profile:
+            named = {"problem", "objective", "starts", "design_seed", "duration_s", "limits"} & self.model_fields_set
+            if named:
+                raise ValueError(f"profile: is driven as it is, leave out {', '.join(sorted(named))}")
+        return self
+
+
+class Grid(Axes):
+    """Every combination of its axes."""
+
+    duration_s: Annotated[tuple[Number, ...], BeforeValidator(_several)] = ()
+    limits: Annotated[tuple[dict[Limit, Number], ...], BeforeValidator(_several), Field(min_length=1)] = ({},)
+
+    @property
+    def choices(self) -> dict[str, tuple[Any, ...]]:
+        """Values by axis; None stands for the machine's own."""
+        return {name: getattr(self, name) or (None,) for name in AXES}
+
+    def __len__(self) -> int:
+        return math.prod(len(v) for v in self.choices.values())
+
+    def cells(self) -> Iterator[Cell]:
+        for values in itertools.product(*self.choices.values()):
+            yield _cell(dict(zip(AXES, values, strict=True)))
+
+
+class Sample(Axes):
+    """`count` cells, each axis drawn at random with this seed from its values, numbers from ranges."""
+
+    count: Annotated[int, Field(strict=True, ge=1, le=MOST)]
+    sample_seed: Whole = 0
+    duration_s: Annotated[tuple[Number | Range, ...], BeforeValidator(_several)] = ()
+    limits: Annotated[tuple[dict[Limit, Number | Range], ...], BeforeValidator(_several), Field(min_length=1)] = ({},)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def cells(self) -> Iterator[Cell]:
+        for k in range(self.count):
+            rng = np.random.default_rng([self.sample_seed, k])
+            chosen = {n: _pick(getattr(self, n) or (None,), rng) for n in AXES}
+            chosen["duration_s"] = _drawn(chosen["duration_s"], rng)
+            chosen["limits"] = {n: _drawn(v, rng) for n, v in chosen["limits"].items()}
+            chosen["effects"] = tuple(_amount(text, rng) for text in chosen["effects"])
+            yield _cell(chosen)
+
+
+def _pick(values: Sequence[Any], rng: np.random.Generator) -> Any:
+    return values[int(rng.integers(len(values)))]
+
+
+def _drawn(value: Any, rng: np.random.Generator) -> Any:
+    """Rounded to six digits, so that it can be typed again."""
+    return float(f"{value.draw(rng):.6g}") if isinstance(value, Range) else value
+
+
+def _amount(text: str, rng: np.random.Generator) -> str:
+    """NAME=LOW..HIGH as NAME=AMOUNT. Raises StudyError."""
+    span = SPAN.match(text)
+    if span is None:
+        return text
+    try:
+        between = Range(low=float(span["low"]), high=float(span["high"]))
+    except (ValidationError, ValueError):
+        raise StudyError(f"effects: {text}: must be NAME[@WHERE]=LOW..HIGH with LOW below HIGH") from None
+    return f"{span['what']}={_drawn(between, rng):.6g}"
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What is driven: a design of a machine within limits, or a profile. None: the machine's own."""
+
+    machine: str
+    problem: str | None
+    objective: str
+    duration_s: float | None
+    limits: tuple[tuple[str, float], ...]
+    starts: int
+    seed: int
+    profile: str | None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One combination: a drive, and the machine, sensors and estimator that it is tried with."""
+
+    drive: Drive
+    kit: str
+    method: str | None
+    effects: tuple[str, ...]
+    seed: int
+
+
+AXES = (
+    *("machine", "problem", "objective", "duration_s", "limits", "starts", "design_seed", "profile"),
+    *("kit", "effects", "method", "seed"),
+)
+
+
+def _cell(v: dict[str, Any]) -> Cell:
+    limits = tuple(sorted((n, float(f)) for n, f in v["limits"].items()))
+    own = (v["problem"], v["objective"], v["duration_s"], limits, v["starts"], v["design_seed"])
+    if v["profile"] is not None:
+        own = (None, "", None, (), 0, 0)
+    return Cell(Drive(v["machine"], *own, v["profile"]), v["kit"], v["method"], tuple(v["effects"]), v["seed"])
+
+
+class Study(Record):
+    """A study file. runs: of every cell; steps: what is done with each."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,79}$")]
+    title: Annotated[str, Field(max_length=200)] = ""
+    runs: Annotated[int, Field(strict=True, ge=1, le=MOST)] = 1
+    steps: Annotated[
+        tuple[Literal["design", "simulate", "identify", "diagnose", "verify"], ...],
+        BeforeValidator(_several),
+        Field(min_length=1),
+    ] = ("verify",)
+    grid: Annotated[tuple[Grid, ...], BeforeValidator(_several)] = ()
+    sample: Annotated[tuple[Sample, ...], BeforeValidator(_several)] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Study:
+        if not self.grid and not self.sample:
+            raise ValueError("grid: is missing, give [grid] or [sample] with the machines at least")
+        if len(self) > MOST:
+            raise ValueError(f"runs: {len(self)} runs in all, at most {MOST} are allowed")
+        if len(self) // self.runs > MOST_CELLS:
+            raise ValueError(f"grid: {len(self) // self.runs} cells, at most {MOST_CELLS} are allowed")
+        if "design" in self.steps and any(a.profile for a in self.blocks):
+            raise ValueError("steps: design goes without a profile, leave one of them out")
+        return self
+
+    @property
+    def blocks(self) -> tuple[Grid | Sample, ...]:
+        return (*self.grid, *self.sample)
+
+    def __len__(self) -> int:
+        """Runs in all."""
+        return self.runs * sum(len(a) for a in self.blocks)
+
+    def cells(self) -> Iterator[Cell]:
+        for axes in self.blocks:
+            yield from axes.cells()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A study made ready: its cells, checked, and the machines by the name that the study gives them.
+
+    A run is numbered cell by cell: run r of cell c is number c * runs + r. drives: in the order of their first cell.
+    """
+
+    study: Study
+    base: Path
+    cells: tuple[Cell, ...]
+    machines: dict[str, Machine]
+    texts: dict[str, dict[str, str]] = field(default_factory=dict)
+
+    @cached_property
+    def drives(self) -> tuple[Drive, ...]:
+        return tuple(dict.fromkeys(c.drive for c in self.cells))
+
+    @cached_property
+    def number(self) -> dict[Drive, int]:
+        """The place of a drive in `drives`."""
+        return {d: k for k, d in enumerate(self.drives)}
+
+    @property
+    def total(self) -> int:
+        return len(self.cells) * self.study.runs
+
+    def method(self, cell: Cell) -> str:
+        return cell.method or self.recommended[cell.drive.machine]
+
+    @cached_property
+    def recommended(self) -> dict[str, str]:
+        return {name: identify.recommended(prediction.build(m)) for name, m in self.machines.items()}
+
+    @cached_property
+    def parameters(self) -> dict[str, tuple[str, ...]]:
+        """Base parameters of each machine, in its own order."""
+        return {name: prediction.build(m).base.names for name, m in self.machines.items()}
+
+    def seeds(self, cell: Cell) -> np.ndarray:
+        """(runs,) of the sensors' noise; cells of one seed share them, so estimators meet the same logs."""
+        return np.random.SeedSequence(cell.seed).generate_state(self.study.runs)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Changes when anything that the rows depend on does, the program aside."""
+        seen = hashlib.sha256(self.study.model_dump_json().encode())
+        for name in sorted(self.machines):
+            seen.update(self.machines[name].model_dump_json().encode())
+        for name in sorted({d.profile for d in self.drives if d.profile is not None}):
+            seen.update((self.base / name).read_bytes())
+        return seen.hexdigest()
+
+    def designed(self, drive: Drive) -> Machine:
+        """The machine that a drive is designed for: with the study's limits."""
+        return limited(self.machines[drive.machine], dict(drive.limits))
+
+
+def read(path: str | Path) -> Plan:
+    """A study file, checked with everything that it names. Raises StudyError, MachineError, LogError."""
+    path = Path(path)
+    if path.suffix != ".toml":
+        raise StudyError(f"{path}: must be a study file (.toml)")
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as err:
+        raise StudyError(f"{path}: not a TOML file: {err}") from None
+    except OSError as err:
+        raise StudyError(f"{path}: can't be read: {err.strerror}") from None
+    try:
+        study = Study.model_validate(raw)
+    except ValidationError as err:
+        raise StudyError(machines.one_line(path, err, Study)) from None
+    try:
+        return ready(study, path.parent)
+    except (StudyError, MachineError, LogError) as err:
+        raise type(err)(f"{path}: {err}") from None
+
+
+def ready(study: Study, base: Path | str = Path()) -> Plan:
+    """A study with its machines read and every cell checked before anything is computed. Paths are relative to `base`.
+
+    Raises StudyError, MachineError, LogError.
+    """
+    base = Path(base)
+    known: dict[str, Machine] = {}
+    texts: dict[str, dict[str, str]] = {}
+    for axes in study.blocks:
+        for name in dict.fromkeys(axes.machine):
+            if name not in known:
+                place = name if name in machines.shipped() else base / name
+                known[name], texts[name] = machines.load(place), _texts(place)
+    plan = Plan(study, base, tuple(study.cells()), known, texts)
+    seen: set[Any] = set()
+    for cell in plan.cells:
+        _check(plan, cell, seen)
+    return plan
+
+
+def _texts(place: str | Path) -> dict[str, str]:
+    """A machine's own files by name, those that it extends included; none of a shipped one."""
+    found: dict[str, str] = {}
+    while str(place) not in machines.shipped():
+        path = Path(place)
+        found[path.name] = path.read_text(encoding="utf-8")
+        parent = tomllib.loads(found[path.name]).get("extends")
+        if parent is None or parent in machines.shipped():
+            break
+        place = path.parent / parent
+    return found
+
+
+def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:
+    """Refuses a cell that can't be had; what was checked once is not checked again. Raises StudyError, MachineError."""
+    d, machine = cell.drive, plan.machines[cell.drive.machine]
+
+    def fresh(*key: Any) -> bool:
+        new = key not in seen
+        seen.add(key)
+        return new
+
+    if fresh(d):
+        if d.profile is not None:
+            log.read_profile(plan.base / d.profile, prediction.build(machine))
+        else:
+            if d.objective not in OBJECTIVES:
+                raise StudyError(f"objective: {d.objective} is unknown, allowed: {', '.join(OBJECTIVES)}")
+            problem(plan.designed(d), d.problem, d.duration_s)
+    if fresh(d.machine, cell.effects):
+        for text in cell.effects:
+            catalogue.parse(text, machine, catalogue.DURATION)
+        names = [t.partition("=")[0] for t in cell.effects]
+        if len(set(names)) < len(names):
+            raise StudyError(f"effects: {', '.join(cell.effects)}: an effect is given twice")
+    if fresh(d.machine, cell.method, cell.kit) and set(plan.study.steps) & {"identify", "verify"}:
+        method = plan.method(cell)
+        if method not in identify.METHODS:
+            raise StudyError(f"method: {method} is unknown, allowed: {', '.join(identify.METHODS)}")
+        have = {s.name for s in machine.sensors(cell.kit)}
+        needs = identify.needed_sensors(prediction.build(machine), method)
+        missing = [s.column for s in machine.sensors("full") if s.name in needs and s.name not in have]
+        if missing:
+            raise StudyError(f"method: {method} needs {', '.join(missing)}, which kit {cell.kit} doesn't measure")
+
+
+def problem(machine: Machine, name: str | None, duration: float | None) -> tuple[str, Problem]:
+    """A machine's design problem, its own by default, with another duration [s] where given. Raises StudyError."""
+    name = name or machine.problem
+    if name is None or name not in machine.problems:
+        allowed = ", ".join(machine.problems) or "its machine file has none"
+        raise StudyError(f"problem: {machine.name} has no problem {name or 'of its own'}, allowed: {allowed}")
+    found = machine.problems[name]
+    if duration is not None:
+        knot = float(found.knot_s)
+        if not 4 * knot <= duration <= 3600:
+            raise StudyError(f"duration_s: must be between {4 * knot:g} and 3600 s (got {duration:g})")
+        longer = found.duration_s.model_copy(update={"value": round(duration / knot) * knot})
+        found = found.model_copy(update={"duration_s": longer})
+    return name, found
+
+
+def limited(machine: Machine, factors: dict[str, float]) -> Machine:
+    """The machine with its limits multiplied. Raises StudyError where it has no such limit."""
+    if not factors:
+        return machine
+    raw = json.loads(machine.model_dump_json())
+    for name, factor in factors.items():
+        if not 0 < factor <= 1000:
+            raise StudyError(f"limits: {name}: must be a factor on the machine's own limit, > 0 (got {factor:g})")
+        found = False
+        for body in raw["body"]:
+            at = (body["contact"] or {}).get("slip_limit") if name == "slip" else body["limit"].get(name)
+            if at is not None:
+                at["value"] *= factor
+                found = True
+        if name == "power" and raw["power_limit"] is not None:
+            raw["power_limit"]["value"] *= factor
+            found = True
+        for one in raw["problems"].values() if name == "lane" else ():
+            one["lane_m"] = [factor * x for x in one["lane_m"]]
+            one["lane_polygon_m"] = [[factor * x for x in corner] for corner in one["lane_polygon_m"]]
+            found = True
+        if not found:
+            raise StudyError(f"limits: {machine.name} has no limit {name}")
+    return Machine.model_validate_json(json.dumps(raw))

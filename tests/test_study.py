@@ -1,0 +1,652 @@
+"""Studies: what a file spans, the same table whatever computes it, and nothing lost or done twice by any end."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from conftest import Excite
+
+from excite import cell, engine, log, plan, store, stored, study
+from excite import verify as verification
+from excite.folder import FolderError
+from excite.limit import InfeasibleError
+from excite.plan import Plan
+from excite.simulate import Motion, simulate
+from model.machine import Problem
+from model.prediction import Model
+
+ROOT = Path(__file__).parents[1]
+TINY = """
+name = "tiny"
+runs = {runs}
+steps = ["verify"]
+[grid]
+machine = "va12_straight"
+profile = "drive.csv"
+method = "ols"
+effects = [[], "rolling_resistance@front_roll=300"]
+"""
+
+
+def wave(seconds: float, rate: float = 100.0) -> np.ndarray:
+    """Torques (N, 2) [N m] that move the straight-line machine."""
+    t = np.arange(round(seconds * rate) + 1) / rate
+    return np.column_stack([1500 * np.sin(2 * np.pi * t / seconds * 2), 1200 * np.sin(2 * np.pi * t / seconds * 3)])
+
+
+@pytest.fixture(scope="module")
+def short(straight: Model) -> Motion:
+    return simulate(straight, wave(2.5))
+
+
+@pytest.fixture
+def tiny(tmp_path: Path, straight: Model, short: Motion) -> Callable[..., Plan]:
+    """A study of two cells on a drive of 2.5 s."""
+    log.profile(straight, short).to_csv(tmp_path / "drive.csv", index=False)
+
+    def make(runs: int = 3, text: str = TINY) -> Plan:
+        (tmp_path / "tiny.toml").write_text(text.replace("{runs}", str(runs)))
+        return plan.read(tmp_path / "tiny.toml")
+
+    return make
+
+
+# ------------------------------------------------------------------------------------------------ what is asked
+
+
+def spans(text: str) -> plan.Study:
+    import tomllib
+
+    return plan.Study.model_validate(tomllib.loads('name = "s"\n' + text))
+
+
+def test_a_grid_is_every_combination() -> None:
+    asked = spans(
+        'runs = 5\n[grid]\nmachine = ["va12", "va12_straight"]\nobjective = ["cond", "D", "accuracy"]\n'
+        'duration_s = [20, 30]\neffects = [[], ["ground_slope=0.001"], ["a=1", "b=2"]]\n'
+    )
+    cells = list(asked.cells())
+    assert len(cells) == 2 * 3 * 2 * 3
+    assert len(set(cells)) == len(cells)
+    assert len(asked) == 5 * len(cells)
+    assert {c.drive.duration_s for c in cells} == {20.0, 30.0}
+
+
+def test_several_grids_add_up() -> None:
+    asked = spans('[[grid]]\nmachine = "va12"\n[[grid]]\nmachine = "emps"\nkit = ["paper", "full"]\n')
+    assert [c.drive.machine for c in asked.cells()] == ["va12", "emps", "emps"]
+
+
+def test_a_sample_draws_evenly_and_again_the_same() -> None:
+    text = (
+        '[sample]\ncount = 400\nmachine = ["va12", "va12_straight"]\nduration_s = { low = 20, high = 60 }\n'
+        'limits = { rim_speed = { low = 0.1, high = 10, log = true } }\neffects = ["ground_slope=0.001..0.005"]\n'
+    )
+    cells = list(spans(text).cells())
+    assert cells == list(spans(text).cells())
+    assert cells != list(spans(text.replace("count = 400", "count = 400\nsample_seed = 1")).cells())
+    durations = np.array([c.drive.duration_s for c in cells], float)
+    assert durations.min() >= 20
+    assert durations.max() <= 60
+    assert abs(durations.mean() - 40) < 3 * 40 / np.sqrt(12 * 400)
+    factors = np.log10([dict(c.drive.limits)["rim_speed"] for c in cells])
+    assert abs(factors.mean()) < 3 * 2 / np.sqrt(12 * 400)
+    amounts = np.array([float(c.effects[0].partition("=")[2]) for c in cells])
+    assert 0.001 <= amounts.min() < 0.0012
+    assert 0.0048 < amounts.max() <= 0.005
+    assert 150 < sum(c.drive.machine == "va12" for c in cells) < 250
+
+
+GRID = '[grid]\nmachine = "va12_straight"\n'
+WRONG = {
+    "no file": (None, "can't be read"),
+    "not TOML": ("= 3", "not a TOML file"),
+    "nothing to do": ("", "grid: is missing"),
+    "misspelt": (GRID + 'metod = "ols"', "grid[0].metod: no such key here, allowed: machine, problem"),
+    "machine unknown": (GRID.replace("va12_straight", "va13"), "va13: no such machine, allowed: emps, va12"),
+    "machine missing": ("[grid]\nkit = 'full'", "grid[0].machine: is missing"),
+    "kit unknown": (GRID + 'kit = "best"', "grid[0].kit[0]: must be 'paper' or 'full' (got 'best')"),
+    "method unknown": (GRID + 'method = "magic"', "method: magic is unknown, allowed: ols"),
+    "method without its sensors": (
+        '[grid]\nmachine = "va12"\nmethod = "ols"\nkit = "paper"',
+        "method: ols needs vy_m_s, which kit paper doesn't measure",
+    ),
+    "objective unknown": (GRID + 'objective = "best"', "objective: best is unknown, allowed: cond"),
+    "problem unknown": (GRID + 'problem = "S41"', "problem: va12_straight has no problem S41, allowed: R60, S40"),
+    "effect unknown": (GRID + 'effects = "magic=1"', "effect magic: unknown, allowed"),
+    "effect without amount": (GRID + 'effects = "ground_slope"', "must be NAME[@WHERE]=AMOUNT"),
+    "effect twice": (GRID + 'effects = [["ground_slope=0.1", "ground_slope=0.2"]]', "an effect is given twice"),
+    "duration too short": (GRID + "duration_s = 0.1", "duration_s: must be between 0.8 and 3600 s (got 0.1)"),
+    "duration not a number": (GRID + 'duration_s = "long"', "grid[0].duration_s[0]: must be a number"),
+    "limit unknown": (GRID + "limits = { charm = 2 }", "grid[0].limits[0].charm"),
+    "limit that it hasn't": ('[grid]\nmachine = "emps"\nlimits = { slip = 2 }', "limits: emps has no limit slip"),
+    "limit not positive": (GRID + "limits = { torque = 0 }", "limits: torque: must be a factor"),
+    "range upside down": (GRID.replace("grid", "sample") + "count = 1\nduration_s = { low = 9, high = 3 }", "high"),
+    "no runs": ("runs = 0\n" + GRID, "runs: must be greater than or equal to 1 (got 0)"),
+    "too many": (GRID.replace("grid", "sample") + "count = 1000000", "1000000 cells, at most 100000 are allowed"),
+    "far too many": ("runs = 1000000\n" + GRID + "kit = ['full', 'paper']", "2000000 runs in all"),
+    "profile and objective": (GRID + "profile = 'p.csv'\nobjective = 'D'", "profile: is driven as it is, leave out"),
+    "profile not there": (GRID + "profile = 'p.csv'", "p.csv: no such file"),
+    "name that leads away": (GRID, "name: must match pattern"),
+    "seed negative": (GRID + "seed = -1", "grid[0].seed[0]: must be greater than or equal to 0 (got -1)"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_study_is_one_clear_line(name: str, tmp_path: Path, excite: Excite) -> None:
+    text, words = WRONG[name]
+    path = tmp_path / "wrong.toml"
+    if text is not None:
+        title = "../../away" if name == "name that leads away" else "wrong"
+        path.write_text(f'name = "{title}"\n{text}\n')
+    code, stdout, stderr = excite("study", path, "--out", tmp_path / "out")
+    assert (code, stdout) == (2, ""), stderr
+    assert stderr.count("\n") == 1
+    assert str(path) in stderr
+    assert words in stderr
+    assert {p.name for p in tmp_path.iterdir()} <= {"wrong.toml"}
+
+
+def test_limits_are_multiplied() -> None:
+    from model import machine
+
+    one = machine.load("va12")
+    half = plan.limited(one, {"rim_speed": 0.5, "slip": 2.0, "power": 0.1, "lane": 3.0})
+    for before, after in zip(one.contacts, half.contacts, strict=True):
+        assert before.contact is not None
+        assert after.contact is not None
+        assert float(after.limit.rim_speed or 0) == pytest.approx(0.5 * float(before.limit.rim_speed or 0))
+        assert float(after.contact.slip_limit or 0) == pytest.approx(2 * float(before.contact.slip_limit or 0))
+        assert after.limit.torque == before.limit.torque
+    assert float(half.power_limit or 0) == pytest.approx(0.1 * float(one.power_limit or 0))
+    assert half.problems["R60"].lane_m == tuple(3 * x for x in one.problems["R60"].lane_m)
+
+
+# ------------------------------------------------------------------------------------------------ what comes out
+
+
+def test_runs_are_those_of_verify(tiny: Callable[..., Plan], tmp_path: Path, straight: Model, short: Motion) -> None:
+    """The same seeds, logs and estimates as `excite verify`, and the same sums."""
+    summary = study.carry(tiny(4), tmp_path / "out", jobs=1)
+    table = pd.read_parquet(tmp_path / "out" / "runs.parquet")
+    direct = verification.verify(straight, short, "ols", "full", runs=4, seed=0, jobs=1)
+    first = table[table["cell"] == 0]
+    assert len(table) == 8
+    for k, name in enumerate(straight.base.names):
+        assert np.array_equal(first[f"value.{name}"], direct.value[:, k])
+        assert np.array_equal(first[f"std.{name}"], direct.std[:, k])
+        assert (first[f"true.{name}"] == direct.true[k]).all()
+    rms = {n: p["rms_percent"] for n, p in verification.summary(direct).items()}
+    assert summary["cells"][0]["worst_rms_percent"] == max(rms.values())
+    other = table[table["cell"] == 1]
+    assert (other["log_sha256"] != first["log_sha256"].to_numpy()).all()  # 300 N more to push: another log
+
+
+def test_each_row_tells_how_to_repeat_it(
+    tiny: Callable[..., Plan], tmp_path: Path, excite: Excite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a machine file of its own and what it extends: the command of a row gives the row's numbers again."""
+    machine = tmp_path / "roller.toml"
+    machine.write_text('extends = "base.toml"\nname = "roller"\n')
+    (tmp_path / "base.toml").write_text('extends = "va12_straight"\nname = "base"\n')
+    study.carry(tiny(2, TINY.replace("va12_straight", "roller.toml")), tmp_path / "out", jobs=1)
+    machine.unlink()
+    monkeypatch.chdir(tmp_path / "out")
+    row = pd.read_parquet("runs.parquet").iloc[3]
+    first, _, second = row["command"].partition(" && ")
+    import shlex
+
+    code, _, stderr = excite(*shlex.split(first)[1:])
+    assert (code, stderr) == (0, "")
+    code, stdout, _ = excite(*shlex.split(second)[1:], "--out", tmp_path / "i", "--json")
+    assert code == 0
+    for name, found in json.loads(stdout)["parameters"].items():
+        assert found["value"] == pytest.approx(row[f"value.{name}"], rel=1e-9)
+
+
+def test_what_can_not_be_had_is_said_and_does_not_end_the_study(
+    tiny: Callable[..., Plan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from excite.estimate import NotIdentifiable
+
+    plain = cell._run
+
+    def moody(work: cell.Work, seed: int) -> cell.Row:
+        if seed == int(np.random.SeedSequence(0).generate_state(4)[1]):
+            raise NotIdentifiable("nothing\nmoves")
+        if seed == int(np.random.SeedSequence(0).generate_state(4)[2]):
+            raise TypeError("a slip of ours")
+        return plain(work, seed)
+
+    monkeypatch.setattr(cell, "_run", moody)
+    summary = study.carry(tiny(4), tmp_path / "out", jobs=1)
+    table = pd.read_parquet(tmp_path / "out" / "runs.parquet")
+    assert list(table["status"])[:4] == ["done", "failed", "defect", "done"]
+    assert list(table["reason"])[1:3] == ["nothing moves", "TypeError: a slip of ours"]
+    assert table.loc[1, "value.M"] != table.loc[1, "value.M"]  # none, not a number that looks like one
+    assert (summary["done"], summary["failed"], summary["defects"]) == (4, 2, 2)
+
+
+def test_designs_are_made_once_and_can_be_verified(
+    tmp_path: Path, excite: Excite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, asked = cell.brief.answer, []
+
+    def answer(model: Model, problem: Problem, *rest: Any) -> Any:
+        asked.append(problem.lane_m[0])
+        if problem.lane_m[0] < 30:
+            raise InfeasibleError("no drive found that keeps every limit", "lane", 1.0)
+        return plain(model, problem, *rest)
+
+    monkeypatch.setattr(cell.brief, "answer", answer)
+    path = tmp_path / "d.toml"
+    path.write_text(
+        'name = "d"\nruns = 2\nsteps = ["verify"]\n[grid]\nmachine = "va12_straight"\nduration_s = 8\nstarts = 1\n'
+        'method = "ols"\nkit = ["full", "paper"]\nlimits = [{}, { lane = 0.1 }]\n'
+    )
+    summary = study.carry(plan.read(path), tmp_path / "out", jobs=1)
+    table = pd.read_parquet(tmp_path / "out" / "runs.parquet")
+    assert len(table) == 8
+    assert sorted(p.name for p in (tmp_path / "out" / "drives").iterdir()) == ["0001"]
+    assert list(summary["failed_drives"]) == ["0002"]
+    assert asked == [60, 6]
+    assert (table["status"] == "failed").sum() == 4
+    assert table[table["status"] == "failed"]["reason"].str.startswith("no drive: ").all()
+    design = stored.read(tmp_path / "out" / "drives" / "0001")
+    assert design.motion.t[-1] == pytest.approx(8)
+    assert float(table["drive_cond_phi"].iloc[0]) == design.summary["cond_phi"]
+    code, _, _ = excite(
+        "verify", tmp_path / "out" / "drives" / "0001", "--runs", 1, "--method", "ols", "--out", tmp_path / "v"
+    )
+    assert code == 0
+
+
+# ------------------------------------------------------------------------------------------------ interrupted
+
+
+def test_the_table_does_not_depend_on_the_workers(tiny: Callable[..., Plan], tmp_path: Path) -> None:
+    for jobs in (1, 2):
+        study.carry(tiny(3), tmp_path / f"out{jobs}", jobs=jobs)
+    for name in ("runs.parquet", "study.png", "study.json"):
+        assert (tmp_path / "out1" / name).read_bytes() == (tmp_path / "out2" / name).read_bytes()
+
+
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Seeds of the runs that are computed in this process."""
+    seen: list[int] = []
+    plain = cell.run
+
+    def run(work: cell.Work, seed: int) -> cell.Row:
+        seen.append(seed)
+        return plain(work, seed)
+
+    monkeypatch.setattr(cell, "run", run)
+    return seen
+
+
+def test_it_goes_on_where_it_was(tiny: Callable[..., Plan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    study.carry(tiny(5), tmp_path / "whole", jobs=1)
+    seen = counted(monkeypatch)
+
+    kept = 0
+
+    def stop(done: int, total: int, what: str) -> None:
+        nonlocal kept
+        kept = done
+        if done >= 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        study.carry(tiny(5), tmp_path / "out", jobs=1, progress=stop)
+    assert not (tmp_path / "out").exists()
+    assert kept < 10
+    before = len(seen)
+    study.carry(tiny(5), tmp_path / "out", jobs=1)
+    assert len(seen) - before == 10 - kept
+    assert (tmp_path / "out" / "runs.parquet").read_bytes() == (tmp_path / "whole" / "runs.parquet").read_bytes()
+    assert not study.place_of(tmp_path / "out").exists()
+    study.carry(tiny(5), tmp_path / "out", jobs=1)  # done: nothing is computed
+    assert len(seen) - before == 10 - kept
+
+
+def test_another_study_is_not_mixed_in(tiny: Callable[..., Plan], tmp_path: Path) -> None:
+    def stop(done: int, total: int, what: str) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        study.carry(tiny(5), tmp_path / "out", jobs=1, progress=stop)
+    with pytest.raises(FolderError, match="another study file"):
+        study.carry(tiny(6), tmp_path / "out", jobs=1)
+    study.carry(tiny(5), tmp_path / "out", jobs=1)
+    with pytest.raises(FolderError, match="holds another study"):
+        study.carry(tiny(6), tmp_path / "out", jobs=1)
+
+
+def test_two_can_not_work_on_one_study(tmp_path: Path) -> None:
+    with (
+        store.opened(tmp_path / "s", "f"),
+        pytest.raises(FolderError, match="somebody is at work"),
+        store.opened(tmp_path / "s", "f"),
+    ):
+        pass
+
+
+def test_rows_are_kept_once_and_whole(tmp_path: Path) -> None:
+    with store.opened(tmp_path / "s", "f") as kept:
+        kept.keep([(3, {"a": 1.5}), (1, {"a": None})])
+        with pytest.raises(ValueError, match="there already"):
+            kept.keep([(2, {}), (3, {})])
+        with pytest.raises(ValueError, match="not JSON compliant"):
+            kept.keep([(4, {}), (5, {"a": float("nan")})])
+    with store.opened(tmp_path / "s", "f") as kept:
+        assert list(kept.rows()) == [(1, {"a": None}), (3, {"a": 1.5})]
+
+
+def test_a_damaged_store_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "s").write_bytes(b"SQLite format 3\0" + bytes(range(256)) * 20)
+    with pytest.raises(FolderError, match="damaged"), store.opened(tmp_path / "s", "f"):
+        pass
+
+
+def test_a_full_disk_loses_nothing(tmp_path: Path) -> None:
+    with store.opened(tmp_path / "s", "f") as kept:
+        kept.keep([(k, {"a": k}) for k in range(10)])
+        kept._db.execute(f"PRAGMA max_page_count = {kept._db.execute('PRAGMA page_count').fetchone()[0] + 2}")
+        with pytest.raises(store.StoreError, match=r"full.*repeat the command"):
+            kept.keep([(k, {"text": "x" * 500}) for k in range(10, 200)])
+    with store.opened(tmp_path / "s", "f") as kept:
+        assert kept.numbers() == set(range(10))
+        kept.keep([(k, {}) for k in range(10, 200)])
+
+
+def test_a_worker_that_dies_costs_nothing_and_a_deadly_piece_is_found(tmp_path: Path) -> None:
+    def dies(number: int) -> int:
+        """Piece 3 always kills its worker, piece 1 the first one."""
+        if number == 3 or (number == 1 and not (tmp_path / "died").exists()):
+            (tmp_path / "died").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return number
+
+    with engine.pool(2) as workers:
+        results = list(engine.spread(dies, range(8), workers))
+    assert sorted(r.piece for r in results) == list(range(8))
+    assert {r.piece for r in results if r.value is None} == {3}
+
+
+def test_pieces_are_taken_as_they_are_needed() -> None:
+    taken: list[int] = []
+
+    def pieces() -> Any:
+        for k in range(50):
+            taken.append(k)
+            yield k
+
+    ahead = 0
+    with engine.pool(1) as workers:
+        for k, _ in enumerate(engine.spread(abs, pieces(), workers)):
+            ahead = max(ahead, len(taken) - k)
+    assert ahead <= engine.AHEAD + 1
+
+
+def test_no_cluster_is_said_in_a_line(tiny: Callable[..., Plan], tmp_path: Path, excite: Excite) -> None:
+    pytest.importorskip("distributed")
+    tiny(2)
+    code, _, stderr = excite("study", tmp_path / "tiny.toml", "--cluster", "nonsense://x", "--out", tmp_path / "out")
+    assert code == 1
+    assert "--cluster nonsense://x: no scheduler" in stderr
+    assert stderr.strip().splitlines()[-1].startswith("excite: ")
+
+
+# ------------------------------------------------------------------------------------------------ really killed
+
+
+@pytest.fixture
+def snapshot(tmp_path: Path) -> dict[str, str]:
+    """An environment with a copy of the program, so that an edit under way doesn't change it while a study runs."""
+    for name in ("excite", "model"):
+        shutil.copytree(ROOT / name, tmp_path / "program" / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return os.environ | {"PYTHONPATH": str(tmp_path / "program"), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+
+
+NURSERY = '''
+"""Forks drivers of a study and kills each at a random time; says what was computed and what was kept."""
+import json, os, random, signal, sqlite3, sys, time
+from pathlib import Path
+from excite import cell, plan, study
+
+file, out, seed, kills = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
+rng = random.Random(seed)
+plain = cell.run
+
+def logged(work, s):
+    row = plain(work, s)
+    number = next(n for n, other in work.runs if other == s)
+    handle = os.open("computed", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.write(handle, f"{number}\\n".encode())
+    os.close(handle)
+    return row
+
+cell.run = logged
+
+def kept():
+    try:
+        with sqlite3.connect(study.place_of(out) / "runs.sqlite") as db:
+            return [n for (n,) in db.execute("SELECT number FROM runs")]
+    except sqlite3.Error:
+        return []
+
+wanted = plan.read(file)
+whole, trials, finished = 0.0, [], 0
+begin = time.perf_counter()
+pid = os.fork()
+if pid == 0:
+    study.carry(wanted, Path("measure"), jobs=1)
+    os._exit(0)
+os.waitpid(pid, 0)
+whole = time.perf_counter() - begin
+os.unlink("computed")
+count = 0
+while count < kills:
+    pid = os.fork()
+    if pid == 0:
+        try:
+            study.carry(wanted, out, jobs=1)
+            os._exit(0)
+        except BaseException as err:
+            print(repr(err), file=sys.stderr)
+            os._exit(3)
+    time.sleep(rng.uniform(0, 0.25 * whole))
+    sent = rng.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGINT])
+    os.kill(pid, sent)
+    _, status = os.waitpid(pid, 0)
+    killed = os.WIFSIGNALED(status) or os.waitstatus_to_exitcode(status) == 3
+    count += killed
+    computed = Path("computed").read_text().split() if Path("computed").exists() else []
+    trials.append({"killed": killed, "sent": int(sent), "kept": kept(), "computed": [int(n) for n in computed],
+                   "there": out.exists()})
+    if Path("computed").exists():
+        os.unlink("computed")
+    if out.exists():  # whole: begin another one
+        finished += 1
+        out.rename(f"finished{finished}")
+while not out.exists():
+    study.carry(wanted, out, jobs=1)
+Path("told.json").write_text(json.dumps({"trials": trials, "whole": whole, "finished": finished}))
+'''
+
+
+@pytest.mark.slow
+def test_killed_at_random_times_it_loses_nothing(
+    tiny: Callable[..., Plan], tmp_path: Path, snapshot: dict[str, str]
+) -> None:
+    """Sixty kills (-9, Ctrl-C) of the driver: what was kept stays, is not computed again, and the table is the same."""
+    tiny(60)
+    (tmp_path / "nursery.py").write_text(NURSERY)
+    command = [sys.executable, "nursery.py", "tiny.toml", "out", "7", "60"]
+    subprocess.run(command, cwd=tmp_path, env=snapshot, check=True, timeout=1500)
+    told = json.loads((tmp_path / "told.json").read_text())
+    before: set[int] = set()
+    lost = 0
+    for trial in told["trials"]:
+        now = set(trial["kept"])
+        if not trial["there"]:
+            assert before <= now, "a row that was kept is gone"
+        assert len(trial["computed"]) == len(set(trial["computed"]))
+        assert not before & set(trial["computed"]), "a row that was kept was computed again"
+        if not trial["there"]:
+            lost += len(set(trial["computed"]) - now)
+        before = set() if trial["there"] else now
+    kills = sum(t["killed"] for t in told["trials"])
+    print(f"\n{kills} kills, {told['finished'] + 1} studies finished, {lost} runs of batches under way computed again")
+    assert kills >= 50
+    reference = (tmp_path / "measure" / "runs.parquet").read_bytes()
+    done = [tmp_path / "out", *tmp_path.glob("finished*")]
+    assert {(p / "runs.parquet").read_bytes() for p in done} == {reference}
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")], "something is left behind"
+
+
+def children(pid: int) -> list[int]:
+    """Processes below this one."""
+    found = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True).stdout.split()
+    return [c for p in map(int, found) for c in (p, *children(p))]
+
+
+@pytest.mark.slow
+def test_the_command_survives_the_death_of_workers_and_its_own(
+    tiny: Callable[..., Plan], tmp_path: Path, snapshot: dict[str, str]
+) -> None:
+    """The real command with two processes: workers killed under way, then the driver, then Ctrl-C to all of them."""
+    study.carry(tiny(400), tmp_path / "reference", jobs=1)
+    command = [sys.executable, "-m", "excite", "study", "tiny.toml", "--jobs", "2", "--out", "out"]
+    rng, worker_kills, ends = random.Random(3), 0, []
+    for _ in range(40):
+        run = subprocess.Popen(command, cwd=tmp_path, env=snapshot, stderr=subprocess.PIPE, start_new_session=True)
+        how = rng.choice(["worker", "driver", "interrupt"])
+        start = time.monotonic()
+        while run.poll() is None and time.monotonic() - start < 120:
+            rows = kept_rows(tmp_path / "out")
+            if rows > 0 and how == "worker":
+                workers = [p for p in children(run.pid) if "resource_tracker" not in command_of(p)]
+                if workers:
+                    os.kill(rng.choice(workers), signal.SIGKILL)
+                    worker_kills += 1
+                    how = rng.choice(["driver", "interrupt"])
+            time.sleep(rng.uniform(0.5, 3))
+            if how != "worker" and run.poll() is None:
+                os.kill(run.pid, signal.SIGKILL) if how == "driver" else os.killpg(run.pid, signal.SIGINT)
+                break
+        _, stderr = run.communicate(timeout=120) if how != "driver" else (None, b"")
+        run.wait(timeout=120)
+        ends.append(run.returncode)
+        assert run.returncode in (0, -9, 130), stderr.decode()
+        assert b"Traceback" not in stderr, stderr.decode()
+        if run.returncode == 0:
+            break
+    if not (tmp_path / "out").exists():
+        subprocess.run(command, cwd=tmp_path, env=snapshot, check=True, timeout=600)
+    print(f"\n{worker_kills} workers and {len(ends)} commands ended: {ends}")
+    table, reference = (pd.read_parquet(tmp_path / n / "runs.parquet") for n in ("out", "reference"))
+    same = [c for c in table.columns if c != "versions"]
+    pd.testing.assert_frame_equal(table[same], reference[same])
+
+
+def command_of(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_text()
+    except OSError:
+        return "resource_tracker"
+
+
+def kept_rows(out: Path) -> int:
+    try:
+        db = sqlite3.connect(f"file:{study.place_of(out) / 'runs.sqlite'}?mode=ro&immutable=1", uri=True)
+        return int(db.execute("SELECT count(*) FROM runs").fetchone()[0])
+    except sqlite3.Error:
+        return 0
+
+
+@pytest.mark.slow
+def test_a_full_file_system_is_said_and_the_study_goes_on_after(
+    tiny: Callable[..., Plan], tmp_path: Path, snapshot: dict[str, str]
+) -> None:
+    """A real file system of 300 kB: exit 1 with a line that says so; with room again the same command goes on."""
+    small = tmp_path / "small"
+    small.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=160k", "none", str(small)]
+    if os.geteuid() != 0 or subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("needs the right to mount a small file system")
+    try:
+        tiny(150)
+        command = [sys.executable, "-m", "excite", "study", "tiny.toml", "--jobs", "1", "--out", "small/out"]
+        full = subprocess.run(command, cwd=tmp_path, env=snapshot, capture_output=True, text=True, timeout=600)
+        assert full.returncode == 1, full.stderr
+        last = full.stderr.strip().splitlines()[-1]
+        assert last.startswith("excite: ")
+        assert "repeat the command" in last
+        assert "Traceback" not in full.stderr
+        assert not (small / "out").exists()
+        kept = kept_rows(small / "out")
+        subprocess.run(["mount", "-o", "remount,size=20m", str(small)], check=True)
+        again = subprocess.run(command, cwd=tmp_path, env=snapshot, capture_output=True, text=True, timeout=600)
+        assert again.returncode == 0, again.stderr
+        assert f"running: {kept} of 300" in again.stderr
+        assert len(pd.read_parquet(small / "out" / "runs.parquet")) == 300
+    finally:
+        subprocess.run(["umount", str(small)], check=False)
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_table_and_survives_a_worker(
+    tiny: Callable[..., Plan], tmp_path: Path, snapshot: dict[str, str]
+) -> None:
+    """A real Dask scheduler and two workers, each a process of its own; one is killed (-9) under way."""
+    pytest.importorskip("distributed")
+    wanted = tiny(300)
+    study.carry(wanted, tmp_path / "here", jobs=1)
+    dask = [sys.executable, "-m", "distributed.cli"]
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(*args: str) -> subprocess.Popen[bytes]:
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        started.append(subprocess.Popen([*dask, *args], cwd=tmp_path, env=snapshot, **quiet))  # type: ignore[call-overload]
+        return started[-1]
+
+    dask[-1:] = ["distributed.cli.dask_scheduler"]
+    try:
+        start("--port", "0", "--no-dashboard", "--scheduler-file", "scheduler.json", "--host", "127.0.0.1")
+        begin = time.monotonic()
+        while not (tmp_path / "scheduler.json").exists() and time.monotonic() - begin < 60:
+            time.sleep(0.2)
+        address = json.loads((tmp_path / "scheduler.json").read_text())["address"]
+        dask[-1:] = ["distributed.cli.dask_worker"]
+        workers = [start(address, "--nthreads", "1", "--no-dashboard", "--no-nanny") for _ in range(2)]
+        command = [sys.executable, "-m", "excite", "study", "tiny.toml", "--cluster", address, "--out", "there"]
+        run = subprocess.Popen(command, cwd=tmp_path, env=snapshot, stderr=subprocess.PIPE)
+        begin = time.monotonic()
+        while kept_rows(tmp_path / "there") < 5 and run.poll() is None and time.monotonic() - begin < 120:
+            time.sleep(0.1)
+        workers[0].kill()
+        _, stderr = run.communicate(timeout=600)
+        assert run.returncode == 0, stderr.decode()
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+    table, reference = (pd.read_parquet(tmp_path / n / "runs.parquet") for n in ("there", "here"))
+    same = [c for c in table.columns if c != "versions"]
+    pd.testing.assert_frame_equal(table[same], reference[same])
