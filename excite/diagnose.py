@@ -15,6 +15,7 @@ import numpy as np
 import scipy.stats
 
 from excite import evidence, hidden, smoothing
+from excite.anomaly import anomalies
 from excite.linearise import Chart, chart
 from excite.log import Log
 from excite.record import Point, Record, carried, common_sensors, first_point, origins, record
@@ -24,7 +25,7 @@ from model.machine import EffectEntry, Filter, Machine, Quantity
 from model.prediction import Model, build
 
 LEVEL = 22.0  # of twice the log-likelihood that an effect must gain; 200 logs without any stayed below
-WORTH = 12.0  # a first-order gain below which a candidate isn't fitted
+WORTH = 15.0  # a first-order gain below which a candidate isn't fitted
 HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
 STRONG = 1.3  # misfit over readings from which first-order gains are rough
 PASSES = 9  # of a candidate's fit
@@ -55,11 +56,13 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Stage:
-    """A model with the effects found so far, fitted. `exact`: without disturbing forces."""
+    """A model with the effects found so far, fitted. `exact`: without disturbing forces. Not `settled`: no fit was
+    found that the log agrees to, this is how far it came."""
 
     machine: Machine
     prepared: Prepared
     fit: Fit
+    settled: bool = True
 
     @property
     def model(self) -> Model:
@@ -124,7 +127,7 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
     tell(0.0, "fitting the model")
     before = fitted(model.machine, logs, filter)
     stage, chosen, first = before, list[_Choice](), tuple[evidence.Score, ...]()
-    for turn in range(MOST):
+    for turn in range(MOST if before.settled else 0):
         tell(0.15 + 0.2 * turn, "scoring effects")
         known = [e.name for e in stage.model.effects]
         found = evidence.candidates(model.machine, [s.name for s in stage.prepared.c.sensors], _duration(logs), known)
@@ -135,8 +138,6 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
             break
         chosen.append(choice)
         stage = choice.stage
-        if not stage.suspects and stage.exact and stage.excess < LEVEL:
-            break
     tell(0.95, "weighing")
     return replace(_verdict(before, stage, chosen, first), stages=tuple(x.stage for x in chosen))
 
@@ -178,7 +179,15 @@ def fitted(
             return Stage(machine, prepared, solve(0.0))
         except NotConverged:
             pass
-    return Stage(machine, prepared, solve(1.0))
+    stood: Fit | None = None
+    for disturbed in smoothing.DISTURBED:
+        try:
+            return Stage(machine, prepared, solve(disturbed))
+        except NotConverged as failed:
+            stood, trouble = failed.fit or stood, failed
+    if stood is None or of is not None:
+        raise trouble
+    return Stage(machine, prepared, stood, settled=False)
 
 
 def _prepared(machine: Machine, logs: Sequence[Log], filter: Filter, of: Stage | None) -> Prepared:
@@ -255,18 +264,20 @@ def _choose(
 
 
 def _verdict(before: Stage, after: Stage, chosen: Sequence[_Choice], scores: Sequence[evidence.Score]) -> Diagnosis:
+    """The verdict: what is named must explain most of the misfit, and what is left must be noise or be shown."""
+    findings = tuple(_finding(x, after) for x in chosen)
+    sensors, machine = after.prepared.c.sensors, after.machine
+    odd = [a for k, log in enumerate(after.prepared.logs) for a in anomalies(machine, sensors, log, after.fit, k)]
+    located = tuple(dict.fromkeys([*after.suspects, *map(str, odd)]))
     share = 1.0
-    left = not after.exact or bool(after.suspects)
-    if left:
+    if not after.exact or after.suspects or odd:
         gained = sum(x.gain for x in chosen)
         share = gained / (gained + after.excess) if gained + after.excess > 0 else 0.0
-    findings = tuple(_finding(x, after) for x in chosen)
-    located = tuple(after.suspects)
-    if left and (share < SHARE or not findings):
-        return Diagnosis("unexplained", findings, before, after, share, tuple(scores), located, ())
-    if not findings:
-        return Diagnosis("clean", (), before, after, share, tuple(scores), (), ())
-    verdict = "tied" if any(f.tied_with for f in findings) else "named"
+    verdict = "clean"
+    if findings:
+        verdict = "tied" if any(f.tied_with for f in findings) else "named"
+    if not after.settled or (located and (share < SHARE or not findings)) or (not after.exact and not findings):
+        verdict = "unexplained"
     return Diagnosis(verdict, findings, before, after, share, tuple(scores), located, ())
 
 

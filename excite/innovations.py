@@ -128,12 +128,14 @@ def _filter(linear: Linear) -> list[_Step]:
         h, weight = linear.H[at], linear.weight[at]
         PH = P[going] @ h.transpose(0, 2, 1)
         # A reading that isn't used counts as one with a huge variance.
-        variance = 1 / np.maximum(weight, 1e-12 * np.where(most > 0, most, 1.0))
+        variance = 1 / np.maximum(weight, 1e-9 * np.where(most > 0, most, 1.0))
         S = h @ PH
+        S = (S + S.transpose(0, 2, 1)) / 2
         S[:, range(h.shape[1]), range(h.shape[1])] += variance
         K = np.linalg.solve(S, PH.transpose(0, 2, 1)).transpose(0, 2, 1)
         A, C = (np.stack([getattr(linear.stages[i], f)[j] for i in going]) for f in ("A", "C"))
-        P[going] = A @ (P[going] - K @ PH.transpose(0, 2, 1)) @ A.transpose(0, 2, 1) + C
+        left = P[going] - K @ PH.transpose(0, 2, 1)
+        P[going] = A @ ((left + left.transpose(0, 2, 1)) / 2) @ A.transpose(0, 2, 1) + C
         steps.append(_Step(at, going, K, np.linalg.cholesky(S), weight > 0))
     return steps
 

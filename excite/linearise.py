@@ -321,7 +321,7 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     channels = model.channels(t, X)
     known = np.full(len(index), np.nan)
     known[len(core) - len(model.memory) : len(core)] = model.remembered
-    mass = ca.Function("mass", [q, X], [ca.diag(M)])(np.zeros(n_q), model.nominal).full()[:, 0]
+    mass = ca.Function("mass", [q, u, z, X], [ca.diag(M)])(0, 0, 0, model.nominal).full()[:, 0]
     table = np.array([model.base.standard.index(f"u{b.index}0") for b in machine.actuated])
     return Chart(
         model,

@@ -68,7 +68,11 @@ SPREAD_SPEED, SPREAD_ANGLE = 0.05, 0.1
 
 
 class NotConverged(NoEstimate):
-    """Joint smoothing found no estimate; the message says how far it came and what to do."""
+    """Joint smoothing found no estimate; the message says how far it came and what to do, `fit` where it stood."""
+
+    def __init__(self, message: str, fit: Fit | None = None) -> None:
+        super().__init__(message)
+        self.fit = fit
 
 
 @dataclass(frozen=True)
@@ -433,9 +437,14 @@ def iterate(
         if (step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED) or (disturbed > 0 and step < ENOUGH):
             base = covariance[: len(X), : len(X)] * np.outer(model.scale, model.scale)
             return Fit(there[1], base, unseen, tuple(there[0]), tuple(linear), cost, disturbed)
+    stood = None
+    if linear is not None:
+        base = covariance[: len(X), : len(X)] * np.outer(model.scale, model.scale)
+        stood = Fit(X, base, unseen, tuple(points), tuple(linear), cost, disturbed)
     raise NotConverged(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
-        " log with `excite diagnose`, or start from better values in the machine file"
+        " log with `excite diagnose`, or start from better values in the machine file",
+        stood,
     )
 
 
