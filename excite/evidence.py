@@ -26,6 +26,7 @@ from model.equations import signatures
 from model.machine import Machine
 
 CHUNK = 20_000  # innovations whose products are summed at once
+ABSORBED = 1e-5  # share of a signature that is left, below which it is but single precision's error
 
 
 @dataclass(frozen=True)
@@ -223,18 +224,24 @@ def _square(E: np.ndarray) -> np.ndarray:
 
 def _score(x: Candidate, S: np.ndarray, g: np.ndarray, own: np.ndarray) -> Score | None:
     """The evidence of one candidate; None where the parameters absorb all of it or nothing shows it."""
-    at = list(x.columns)
-    left = float(np.min(np.diag(S)[at] / np.maximum(np.diag(own)[at], 1e-30)))
-    if not left > 0 or np.diag(own)[at].max() < 1e-6:
+    size = np.diag(own)[list(x.columns)]
+    if size.max() < 1e-6:
         return None
-    step = -np.linalg.solve(S[np.ix_(at, at)] + 1e-9 * np.diag(np.diag(own)[at]), g[at])
+    # A sine or a cosine that does nothing here, as a slope across a straight lane, stays out.
+    shown = size > 1e-9 * size.max()
+    at = [k for k, told in zip(x.columns, shown, strict=True) if told]
+    left = float(np.min(np.diag(S)[at] / np.diag(own)[at]))
+    if not left > ABSORBED:
+        return None
+    step = np.zeros(len(shown))
+    step[shown] = -np.linalg.solve(S[np.ix_(at, at)] + 1e-9 * np.diag(np.diag(own)[at]), g[at])
     values, effect = dict(x.placed.values), x.placed.effect
-    if len(at) == 2:
+    if len(shown) == 2:
         circular = next(n for n, s in effect.shapes.items() if s.circular)
         values[circular] = float(np.arctan2(step[1], step[0]))
         values["A"] *= float(np.hypot(*step))
     else:
         values["A"] *= float(step[0])
-    if effect.positive and step[0] <= 0 and len(at) == 1:
+    if effect.positive and step[0] <= 0 and len(shown) == 1:
         return Score(x, 0.0, values, left)
-    return Score(x, float(-step @ g[at]), values, left)
+    return Score(x, float(-step[shown] @ g[at]), values, left)

@@ -188,13 +188,11 @@ def _split(here: np.ndarray, there: np.ndarray, pairs: Sequence[tuple[int, int]]
 
 def _by_place(machine: Machine, a: Placed, b: Placed) -> str | None:
     """What separates two causes that answer alike because they differ in place alone, or not even in that."""
-    rolls = {x.index for x in machine.contacts}
-    if a.where != b.where and set(a.bodies) <= rolls and set(b.bodies) <= rolls and not (a.sensor and b.sensor):
-        return "pull with the front roll alone, then with the rear roll alone"
-    if a.where != b.where:
-        return "tight turns to the left and to the right, and the same forward and backward"
-    scaling = [e for e in (a, b) if e.effect.channel is not None]
-    if len(scaling) == 1:
+    if a.where != b.where and machine.planar:
+        rolls = {x.index for x in machine.contacts}
+        driven = all((e.effect.torque or e.effect.soil or e.effect.channel) and set(e.bodies) <= rolls for e in (a, b))
+        return "pull with one roll alone, then with the other" if driven else "tight turns to both sides"
+    if (a.effect.channel is None) != (b.effect.channel is None):
         return "the same drive with a known ballast on the machine"
     return None
 
