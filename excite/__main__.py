@@ -256,11 +256,16 @@ def simulate(
     seed: SeedOption = 0,
     noise: Annotated[str, typer.Option("--noise", help="on, or off for exact signals")] = "on",
     kit: KitOption = "full",
+    effect: Annotated[
+        list[str] | None, typer.Option("--effect", help="NAME[@WHERE]=AMOUNT: what else the machine does (repeatable)")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Drives a profile in simulation and writes the log that the sensors would write."""
     from excite import folder, log, sensors
     from excite.simulate import simulate as drive
+    from model import effects
+    from model.prediction import build
 
     if noise not in ("on", "off"):
         raise UsageError(f"--noise: {noise} is unknown, allowed: on, off")
@@ -269,6 +274,10 @@ def simulate(
     _known("--out: ending", out.suffix.lower(), tuple(writers))
     model = _model(machine)
     torque, q0, nu0 = log.read_profile(profile, model)
+    if effect:
+        seconds = (len(torque) - 1) / float(model.machine.sampling_hz)
+        entries = [effects.parse(text, model.machine, seconds) for text in effect]
+        model = build(effects.extended(model.machine, *entries))
     with folder.writing_file(out) as path:
         motion = drive(model, torque, q0=q0, nu0=nu0)
         table = sensors.measure(model, motion, kit=kit, seed=seed, noise=noise == "on")
@@ -282,6 +291,7 @@ def simulate(
         "duration_s": float(motion.t[-1]),
         "kit": kit,
         "noise": noise,
+        "effects": effect or [],
         "seed": seed,
     }
     if json:
@@ -369,9 +379,8 @@ def diagnose(
     if len({path.resolve() for path in logs}) < len(logs):
         raise UsageError("LOG: the same file is given twice, which would count it twice")
     _known("--filter", filtering, ("machine", "auto"))
-    with folder.writing(out) as place:
-        with terminal.bar("diagnosing") as advance:
-            summary = checkup.write(place, machine, model, logs, filtering, _versions(), advance)
+    with folder.writing(out) as place, terminal.bar("diagnosing") as advance:
+        summary = checkup.write(place, machine, model, logs, filtering, _versions(), advance)
     terminal.finish(summary, out, json, terminal.diagnose_table)
 
 
@@ -448,7 +457,7 @@ def _design(place: Path, machine: str, problem: str | None, duration: float | No
     from excite.brief import summary as said
     from excite.objective import OBJECTIVES
 
-    model = _model(machine)
+    model = _model(machine, flaws=False)
     name, chosen = _problem(model.machine, problem, duration)
     _known("--objective", brief.objective, tuple(OBJECTIVES))
     for option, value, unit in (("--budget", brief.budget_s, "s"), ("--sigma-max", brief.sigma_max, "%")):
@@ -524,7 +533,7 @@ def _compare(
 
     from excite import compare, folder, report, reports
 
-    model = _model(machine)
+    model = _model(machine, flaws=False)
     name, chosen = _problem(model.machine, problem, None)
     if budget is not None and not budget > 0:
         raise UsageError(f"--budget: must be > 0 s (got {budget:g})")
@@ -626,12 +635,13 @@ def _check_needs(model: Model, method: str, kit: str) -> None:
         )
 
 
-def _model(name: str) -> Model:
+def _model(name: str, flaws: bool = True) -> Model:
+    """The model of a machine; without `flaws` effects that no equation of motion shows are no parameters."""
     from model import machine, prediction
 
     loaded = machine.load(name)
     try:
-        return prediction.build(loaded)
+        return prediction.build(loaded, flaws)
     except machine.MachineError as err:
         raise machine.MachineError(f"{name}: {str(err).removeprefix(f'{loaded.name}: ')}") from None
 
@@ -726,7 +736,8 @@ def _exit_code(err: Exception) -> int | None:
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    sys.stderr.write(f"excite: {message}\n")
+    shown = "".join(c if c.isprintable() else "?" for c in message)  # names from files don't steer the terminal
+    sys.stderr.write(f"excite: {shown}\n")
     sys.exit(code)
 
 

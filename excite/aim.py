@@ -20,7 +20,7 @@ import numpy as np
 from excite import objective as objectives
 from excite import smoothing
 from excite.objective import EXACT, OBJECTIVES, Local
-from excite.simulate import Motion
+from excite.simulate import Motion, beside
 from model.prediction import Model
 
 # A ceiling is a smooth hinge: PRICE for what is above it, per unit of the logarithm of a variance, from WIDTH on.
@@ -171,7 +171,7 @@ def _hinge(x: float) -> tuple[float, float, float]:
 
 def information(aim: Aim, model: Model, motion: Motion) -> list[np.ndarray]:
     """The matrices (n_base, n_base) of a motion in the scale, every sample counted, one for each of `aim.rows`."""
-    W = model.stacked(motion.q.T, motion.nu.T, motion.a.T)
+    W = model.stacked(motion.q.T, motion.nu.T, motion.a.T, *beside(model, motion))
     found: list[np.ndarray] = []
     for weights in aim.rows:
         # by QR: squaring W would cost half of the digits

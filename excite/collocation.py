@@ -203,9 +203,9 @@ def transcribe(
 ) -> Transcription:
     """The nonlinear program of a problem on `intervals` equal intervals, each of `elements` collocation elements.
 
-    state_size: the typical size of every coordinate and velocity (named c and c'). The pose is a state only where
-    `with_pose`: nothing but the lane depends on it. weights (n_blocks, n_rows): of the regressor's rows [1/SI], one
-    information matrix for each; all 1 by default.
+    state_size: the typical size of every coordinate and velocity (named c and c') and of what effects remember. The
+    pose is a state only where `with_pose`: nothing but the lane depends on it. weights (n_blocks, n_rows): of the
+    regressor's rows [1/SI], one information matrix for each; all 1 by default.
     """
     every = limits(model, problem)
     s = symbols(model)
@@ -216,7 +216,7 @@ def transcribe(
     pose = model.machine.body[0].coordinates if with_pose else ()
     needed = {*pose, *model.felt, *(model.coordinates[k] for k in resting(model))}
     used = [c for c in model.coordinates if c in needed]
-    names = (*used, *[c + "'" for c in model.coordinates])
+    names = (*used, *[c + "'" for c in model.coordinates], *model.memory)
     z_size = np.array([state_size[c] for c in names])
     u_size = np.array([float(b.limit.torque) if b.limit.torque is not None else 1.0 for b in model.machine.actuated])
     knot = float(problem.duration_s) / intervals
@@ -230,18 +230,22 @@ def transcribe(
     q = ca.SX(n_q, 1)
     for k, c in enumerate(used):
         q[model.coordinates.index(c)] = z[k]
-    nu, a = (ca.vertcat(*ca.vertsplit(x)[len(used) :]) for x in (z, rate))
+    nu, a = (x[len(used) : len(used) + n_q] for x in (z, rate))
+    kept = z[len(used) + n_q :]
+    beside = () if model.plain else (u, kept)
     p = model.expand @ model.nominal
-    for body in model.machine.actuated:
-        p[model.base.standard.index(f"u{body.index}0")] = 0.0
     drive = ca.SX(n_q, 1)
     for k, row in enumerate(model.actuated):
         drive[row] = u[k]
     dq = model.kinematics(q, nu)[0]
     turns = [(rate[k] - dq[model.coordinates.index(c)]) * knot / z_size[k] for k, c in enumerate(used)]
-    residual = ca.vertcat(*turns, (model.predict(q, nu, a, p) - drive) / float(u_size.max()))
+    going = (
+        (rate[len(used) + n_q :] - model.flow(q, nu, u, kept, model.nominal)) * knot / ca.DM(z_size[len(used) + n_q :])
+    )
+    balance = (model.balance(q, nu, a, p, *beside) - drive) / float(u_size.max())
+    residual = ca.vertcat(*turns, balance, going)
     g = ca.vertcat(*[(g.expression(q, nu, u, 0) - g.centre) * (2 / g.range) for g in staged], ca.SX(0, 1))
-    W = model.regressor(q, nu, a)
+    W = model.regressor(q, nu, a, *beside)
     Phi = ca.mtimes(W, ca.diag(ca.DM(model.scale)))
     blocks = np.ones((1, n_q)) if weights is None else weights
     every_A = [ca.triu(ca.mtimes(P.T, P)) for P in (ca.mtimes(ca.diag(ca.DM(w)), Phi) for w in blocks)]

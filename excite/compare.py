@@ -329,8 +329,8 @@ def _nearest(
     times = manoeuvre.knots(problem)
     intervals = len(times) - 1
     tr = transcribe(model, problem, track.sizes, intervals, elements=elements, with_pose=on_lane)
-    names = [*model.coordinates, *[c + "'" for c in model.coordinates]]
-    every = np.hstack([track.motion.q, track.motion.nu])
+    names = [*model.coordinates, *[c + "'" for c in model.coordinates], *model.memory]
+    every = np.hstack([track.motion.q, track.motion.nu, track.motion.memory])
     nodes = (np.arange(intervals)[:, None] + tr.place) * tr.knot
     columns = [every[:, names.index(c)] / size for c, size in zip(tr.state_names, tr.state_scale, strict=True)]
     Z = np.stack([np.interp(nodes, track.motion.t, x) for x in columns], axis=-1)

@@ -32,7 +32,6 @@ from excite.manoeuvre import Manoeuvre, multisine, scaled
 from excite.manoeuvre import knots as _knots
 from excite.scenario import followed
 from excite.simulate import Motion, SimulationError, simulate
-from model import prediction
 from model.machine import Machine, Problem
 from model.prediction import Model
 
@@ -163,11 +162,14 @@ def resume(model: Model, problem: Problem, aim: Aim, number: int, drive: Manoeuv
 
 
 def typical_sizes(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
-    """Typical size of every coordinate and velocity (c and c') in a motion; of the pose, half the lane."""
+    """Typical size of every coordinate and velocity (c and c') in a motion, and of what effects remember; of the pose,
+    half the lane."""
     sizes = {}
     for k, c in enumerate(model.coordinates):
         sizes[c] = max(1e-3, 2 * float(np.sqrt((motion.q[:, k] ** 2).mean())))
         sizes[c + "'"] = max(1e-3, 2 * float(np.sqrt((motion.nu[:, k] ** 2).mean())))
+    for name, values in zip(model.memory, motion.memory.T, strict=True):
+        sizes[name] = max(1e-3, 2 * float(np.sqrt((values**2).mean())))
     if model.machine.planar:
         x, y, heading = model.machine.body[0].coordinates
         sizes |= {x: problem.lane_m[0] / 2, y: problem.lane_m[1] / 2, heading: 1.0}
@@ -325,8 +327,8 @@ def _advance(
             start[k] = track.pose[model.coordinates.index(c)] / tr.state_scale[k] if c in model.coordinates else 0.0
     fresh = track.states is None
     if track.states is None or track.states.shape[1] != tr.n_z:
-        names = [*model.coordinates, *[c + "'" for c in model.coordinates]]
-        every = np.hstack([track.motion.q, track.motion.nu])
+        names = [*model.coordinates, *[c + "'" for c in model.coordinates], *model.memory]
+        every = np.hstack([track.motion.q, track.motion.nu, track.motion.memory])
         columns = [every[:, names.index(c)] / size for c, size in zip(tr.state_names, tr.state_scale, strict=True)]
         Z = np.stack([np.interp(nodes, track.motion.t, x) for x in columns], axis=-1)
     else:
@@ -434,4 +436,4 @@ def soften(model: Model, friction: float, slip: float) -> Model:
             changed["contact"] = body.contact.model_copy(update={"v_eps": wider})
         bodies.append(body.model_copy(update=changed))
     machine: Machine = model.machine.model_copy(update={"body": tuple(bodies)})
-    return replace(prediction.build(machine), nominal=model.nominal, scale=model.scale)
+    return replace(model.of(machine), nominal=model.nominal, scale=model.scale)

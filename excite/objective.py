@@ -16,7 +16,7 @@ from typing import Literal
 import casadi as ca
 import numpy as np
 
-from excite.simulate import Motion
+from excite.simulate import Motion, beside
 from model.prediction import Model
 
 Function = Callable[[ca.SX, ca.SX], ca.SX]
@@ -214,7 +214,7 @@ def weights(model: Model, objective: str) -> tuple[np.ndarray, np.ndarray]:
 def phi(model: Model, motion: Motion, objective: str = "cond") -> np.ndarray:
     """Phi = W diag(scale) (rows of all samples, n_base), rows and columns weighted as the objective asks."""
     rows, columns = weights(model, objective)
-    W = model.stacked(motion.q.T, motion.nu.T, motion.a.T) * rows[:, None]
+    W = model.stacked(motion.q.T, motion.nu.T, motion.a.T, *beside(model, motion)) * rows[:, None]
     return (W * columns).reshape(-1, len(columns))
 
 

@@ -64,6 +64,11 @@ class Motion:
     memory: np.ndarray
 
 
+def beside(model: Model, motion: Motion) -> tuple[np.ndarray, ...]:
+    """What the model's functions of a sample take beside q, nu and a of a motion: nothing, or with effects u and z."""
+    return () if model.plain else (motion.u.T, motion.memory.T)
+
+
 def simulate(
     model: Model,
     torque: np.ndarray,

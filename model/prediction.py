@@ -17,7 +17,7 @@ import numpy as np
 
 from model import effects as catalogue
 from model import tree
-from model.equations import equations, kinematics
+from model.equations import Equations, equations, kinematics
 from model.machine import Machine, MachineError
 
 
@@ -105,6 +105,8 @@ class Model:
     readable: tuple[str, ...]
     memory: tuple[str, ...]
     effects: tuple[catalogue.Placed, ...]
+    flaws: bool
+    shapes: bool
 
     @property
     def plain(self) -> bool:
@@ -221,6 +223,10 @@ class Model:
         """Symbols of what functions of a sample take beside q, nu and a: u and z with effects, nothing without."""
         return () if self.plain else (ca.SX.sym("u", len(self.inputs)), ca.SX.sym("z", len(self.memory)))
 
+    def of(self, machine: Machine) -> Model:
+        """The same kind of model of a changed machine. Raises MachineError."""
+        return build(machine, self.flaws, self.shapes)
+
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         n = len(self.coordinates)
         return ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
@@ -242,9 +248,9 @@ class Model:
 def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
     """The equations of a machine, with its base parameters found numerically.
 
-    The amounts of its effects are parameters behind the base parameters; without `flaws` those of effects that sit in
-    a sensor only, which no equation of motion shows, are constants; with `shapes` the shapes of effects are parameters
-    as well. Raises MachineError if no parameter is left, or for an effect that the machine can't have.
+    The amounts of its effects are parameters behind the base parameters; without `flaws` those that no equation of
+    motion shows, since they sit in a sensor, are constants; with `shapes` the shapes of effects are parameters as well.
+    Raises MachineError if no parameter is left, or for an effect that the machine can't have.
     """
     table = standard_parameters(machine)
     _check_names(machine, tuple(table))
@@ -266,7 +272,10 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
                 f"{machine.name}: scale.{s}: the nominal value is 0, give a scale > 0 in the machine file"
             )
     if placed:
-        amounts = _amounts(machine, placed, flaws, shapes)
+        amounts = _amounts(machine, placed, shapes)
+        if not flaws:
+            shown = _shown(equations(machine, (*table, *amounts), placed))
+            amounts = {name: amount for name, amount in amounts.items() if name in shown}
         base = _beside_base(base, amounts)
         nominal = np.concatenate([nominal, [v for v, _, _ in amounts.values()]])
         scale = np.concatenate([scale, [size for _, _, size in amounts.values()]])
@@ -290,17 +299,21 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
         found.readable,
         found.memory,
         placed,
+        flaws,
+        shapes,
     )
 
 
-def _amounts(
-    machine: Machine, placed: Sequence[catalogue.Placed], flaws: bool, shapes: bool
-) -> dict[str, tuple[float, str, float]]:
+def _shown(found: Equations) -> set[str]:
+    """Standard parameters that the prediction depends on."""
+    columns = found.standard_regressor.sparsity_out(0).get_triplet()[1]
+    return {list(found.sample.by_name)[k] for k in set(columns)}
+
+
+def _amounts(machine: Machine, placed: Sequence[catalogue.Placed], shapes: bool) -> dict[str, tuple[float, str, float]]:
     """Value, unit and typical size of every amount and shape that is a parameter, by name."""
     found: dict[str, tuple[float, str, float]] = {}
     for e in placed:
-        if e.effect.sensed and not flaws:
-            continue
         site = catalogue.Site(machine, machine.find(e.bodies[0]), catalogue.DURATION)
         for name, (key, unit) in e.parameters.items():
             if key == "A":
