@@ -95,10 +95,13 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
             remarks.append(line + ("; some methods need it" if needed else "; optional"))
             continue
         values = _caught(lambda s=sensor: log.values_of(s, table, rate, ""), None)  # type: ignore[misc]
-        if values is None:
+        when = t if len(t) else np.arange(len(table)) / rate
+        if values is None:  # shown as far as it can be read
+            number = pd.to_numeric(table[sensor.column], errors="coerce").to_numpy(dtype=float)
+            signals[sensor.column] = (when, number, sensor.unit)
             continue
         readings[sensor.name] = values
-        signals[" - ".join(sensor.columns)] = (t if len(t) else np.arange(len(values)) / rate, values, _si(sensor))
+        signals[" - ".join(sensor.columns)] = (when, values, _si(sensor))
         jumps: list[str] = []
         _caught(lambda s=sensor, v=values: log.check_values(s, v, rate, machine, ""), jumps)  # type: ignore[misc]
         faults += [line for line in jumps if not line.startswith(after)]  # across a gap an angle may jump

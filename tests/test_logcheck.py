@@ -82,6 +82,7 @@ def test_what_is_wrong_is_said(
     for words in remarks:
         assert any(words in line for line in found.remarks), found.remarks
     assert found.usable == (not faults)
+    assert all(len(t) == len(values) for t, values, _ in found.signals.values())
 
 
 def test_every_fault_at_once(va12: Model, table: pd.DataFrame) -> None:
