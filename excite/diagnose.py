@@ -32,6 +32,7 @@ PASSES = 9  # of a candidate's fit
 TRIED = 5  # candidates that are fitted, of different names
 MOST = 4  # effects that are looked for
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
+LEAST = 0.05  # of the excess misfit that an effect must explain to be worth a place
 SHARE = 0.6  # of the excess misfit that names must explain, or it is unexplained
 NEAR = 0.3  # of what the best name leaves unexplained, by which a rival may be worse and still is a tie
 
@@ -178,7 +179,8 @@ def fitted(
         try:
             return Stage(machine, prepared, solve(0.0))
         except NotConverged:
-            pass
+            if of is not None and of.exact:
+                raise
     stood: Fit | None = None
     for disturbed in smoothing.DISTURBED:
         try:
@@ -255,7 +257,7 @@ def _choose(
     score, best = tries[0]
     gain = stage.fit.cost - best.fit.cost if stage.exact == best.exact else score.gain
     spread = max(1.0, best.fit.cost / best.prepared.readings)
-    if gain / spread < LEVEL:
+    if gain / spread < max(LEVEL, LEAST * stage.excess / spread):
         return None
     near = max(CLOSE * spread, NEAR * best.excess)
     rivals = tuple(s.candidate.name for s, t in tries[1:] if t.fit.cost - best.fit.cost < near)
