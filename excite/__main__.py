@@ -112,6 +112,10 @@ def design(
     sigma_max: SigmaMaxOption = None,
     robust: RobustOption = False,
     after: AfterOption = None,
+    between: Annotated[
+        list[str] | None,
+        typer.Option("--between", help="twice: NAME[@WHERE]=AMOUNT, two effects that the drive is to tell apart"),
+    ] = None,
     starts: StartsOption = 2,
     seed: SeedOption = 0,
     budget: BudgetOption = None,
@@ -124,7 +128,11 @@ def design(
 
     out = out or Path(f"results/design-{_stem(machine)}")
     folder.claim(out, after or [])
-    brief = Brief(objective, sigma_max, robust, tuple(after or ()), starts, seed, budget)
+    if between:
+        if len(between) != 2 or objective not in ("cond", "discrimination"):
+            raise UsageError("--between: give it twice, two effects, and no other --objective")
+        objective = "discrimination"
+    brief = Brief(objective, sigma_max, robust, tuple(after or ()), starts, seed, budget, tuple(between or ()))
     with folder.writing(out) as place:
         summary = _design(place, machine, problem, duration, brief)
     terminal.finish(summary, out, json, terminal.design_table)
@@ -453,13 +461,17 @@ def _design(place: Path, machine: str, problem: str | None, duration: float | No
     import time
 
     from excite import folder, log, report, reports
-    from excite.brief import answer
+    from excite.brief import answer, rivals
     from excite.brief import summary as said
     from excite.objective import OBJECTIVES
 
     model = _model(machine, flaws=False)
     name, chosen = _problem(model.machine, problem, duration)
     _known("--objective", brief.objective, tuple(OBJECTIVES))
+    if brief.between:
+        model = rivals(model, brief.between, float(chosen.duration_s))
+    elif brief.objective == "discrimination" and len(model.effects) < 2:
+        raise UsageError("--objective discrimination: needs two effects to tell apart, give --between twice")
     for option, value, unit in (("--budget", brief.budget_s, "s"), ("--sigma-max", brief.sigma_max, "%")):
         if value is not None and not value > 0:
             raise UsageError(f"{option}: must be > 0 {unit} (got {value:g})")

@@ -18,6 +18,7 @@ from excite import aim as aims
 from excite import identify, log, scenario, sequential
 from excite.aim import Aim
 from excite.design import Design, design
+from model import effects
 from model.machine import MachineError, Problem
 from model.prediction import Model
 
@@ -27,7 +28,8 @@ SCENARIOS, SPREAD = 5, 0.2  # machines of a robust design, and how far their val
 
 @dataclass(frozen=True)
 class Brief:
-    """objective: a name of the table. sigma_max [%]. robust: for every machine within SPREAD. after: logs."""
+    """objective: a name of the table. sigma_max [%]. robust: for every machine within SPREAD. after: logs. between: two
+    effects that the drive is to tell apart."""
 
     objective: str = "cond"
     sigma_max: float | None = None
@@ -36,6 +38,7 @@ class Brief:
     starts: int = 2
     seed: int = 0
     budget_s: float | None = None
+    between: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,22 @@ class Answer:
     model: Model
     aim: Aim
     design: Design
+
+
+def rivals(model: Model, between: tuple[str, ...], duration: float) -> Model:
+    """A model with two effects more, NAME[@WHERE]=AMOUNT each, that a drive of duration [s] is to tell apart.
+
+    Raises MachineError for an effect that is unknown, that the machine can't have, or that driving doesn't show.
+    """
+    entries = [effects.parse(text, model.machine, duration) for text in between]
+    both = model.of(effects.extended(model.machine, *entries))
+    for text, e in zip(between, both.effects[-2:], strict=True):
+        if e.name not in both.base.names:
+            raise MachineError(
+                f"effect {text}: no equation of motion shows its amount at once (it sits in a sensor, or acts through"
+                " what it remembers), so no drive can be designed for it by the regressor"
+            )
+    return both
 
 
 def answer(
@@ -96,6 +115,8 @@ def summary(brief: Brief, a: Answer) -> dict[str, Any]:
     }
     if brief.sigma_max is not None:
         said["sigma_max"] = brief.sigma_max
+    if brief.between:
+        said["between"] = list(brief.between)
     if brief.robust:
         said["robust"] = {"machines": SCENARIOS, "spread": SPREAD}
     if brief.after:

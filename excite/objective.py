@@ -70,6 +70,16 @@ def accuracy(variances: ca.SX, sharp: ca.SX) -> ca.SX:
     return (_top(logs, sharp) + 2 * (ca.logsumexp(logs / 2) - float(np.log(logs.numel())))) / 2
 
 
+def discrimination(variances: ca.SX, sharp: ca.SX) -> ca.SX:
+    """log of the larger relative variance of the last two parameters, the amounts of two rival effects.
+
+    The drive on which the two explanations differ most, once each may take on all that the base parameters and the
+    other one can: to first order the noncentrality of the one against the other is the inverse of that variance
+    (T-optimality, Atkinson and Fedorov, Biometrika 62, 1975; with all others free Ds-optimality).
+    """
+    return _top(ca.log(variances[-2:]), sharp)
+
+
 OBJECTIVES: dict[str, Objective] = {
     "cond": Objective(cond, "eigenvalues", False),
     "weighted-cond": Objective(cond, "eigenvalues", True),
@@ -78,6 +88,7 @@ OBJECTIVES: dict[str, Objective] = {
     "E": Objective(e_optimal, "eigenvalues", True),
     "worst": Objective(worst_sigma, "variances", True),
     "accuracy": Objective(accuracy, "variances", True),
+    "discrimination": Objective(discrimination, "variances", True),
 }
 
 EXACT = 1e6  # sharp enough for a score that is reported
@@ -121,7 +132,7 @@ def reported(objective: str, value: float) -> float:
     """An objective as people read it: a condition number, a relative standard deviation [%], others as they are."""
     if objective in ("cond", "weighted-cond"):
         return float(np.exp(value / 2))
-    return 100 * float(np.exp(value / 2)) if objective == "worst" else value
+    return 100 * float(np.exp(value / 2)) if objective in ("worst", "discrimination") else value
 
 
 def local(objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, sharp: float) -> Local:
