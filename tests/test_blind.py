@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import plant
 import pytest
-from blind import Blind, Case, Hidden, blind, case, score
+from blind import Blind, Case, Hidden, ask, blind, case, score
 from causes import CAUSES
+from surprises import SURPRISES
 from visibility import VISIBLE, visibility
 
 from excite import log as logs
@@ -152,3 +153,56 @@ def test_amounts_and_gains_are_judged_by_their_intervals() -> None:
     assert far.amount_error == pytest.approx(-0.4 / 1.1)
     assert far.gain_sure
     assert score(one, said("clean")).amount_in is None
+
+
+# ------------------------------------------------------------------------------------------------ the diagnosis
+HALF = 30.0  # [s] of driving is enough for what is strong
+
+
+def named(hidden: Hidden) -> None:
+    one = slalom(hidden, duration=HALF)
+    judged = score(one, ask(blind(one).log))
+    assert judged.outcome == "right", judged
+    assert abs(judged.amount_error or 0) < 0.1
+    assert judged.gain is not None
+    assert judged.gain > 0
+
+
+def test_a_clean_log_is_clean() -> None:
+    one = slalom(kind="nothing", duration=HALF)
+    assert score(one, ask(blind(one).log)).outcome == "clean"
+
+
+def test_a_heavy_side_of_a_roll_is_named_with_its_amount_and_gain() -> None:
+    named(Hidden("roll_unbalance", "front_roll", 60.0))
+
+
+@pytest.mark.slow
+def test_a_slope_is_named_with_its_amount_and_gain() -> None:
+    named(Hidden("ground_slope", "machine", 0.004))
+
+
+@pytest.mark.slow
+def test_most_visible_causes_are_named_and_hardly_any_wrongly() -> None:
+    """One case of each cause; the study in results/diagnosis has many more."""
+    told: dict[str, str] = {}
+    for name in CAUSES:
+        seen = next(b for k in range(20) if visibility(b := blind(case("cause", name, k))) > 10 * VISIBLE)
+        told[seen.case.key] = score(seen.case, ask(seen.log)).outcome
+    assert sum(o in ("right", "tied") for o in told.values()) >= 0.85 * len(told), told
+    assert sum(o in ("wrong", "place") for o in told.values()) <= 1, told
+
+
+@pytest.mark.slow
+def test_hardly_any_clean_log_is_accused() -> None:
+    told = {k: score(case("nothing", "", k), ask(blind(case("nothing", "", k)).log)).outcome for k in range(12)}
+    assert sum(o != "clean" for o in told.values()) <= 1, told
+
+
+@pytest.mark.slow
+def test_surprises_stay_unexplained() -> None:
+    told: dict[str, str] = {}
+    for name in SURPRISES:
+        seen = next(b for k in range(20) if visibility(b := blind(case("surprise", name, k))) > 10 * VISIBLE)
+        told[seen.case.key] = score(seen.case, ask(seen.log)).outcome
+    assert sum(o == "unexplained" for o in told.values()) >= 0.85 * len(told), told
