@@ -92,12 +92,13 @@ def advice(model: Model, logs: Sequence[Samples], names: Sequence[str]) -> dict[
     q, nu, a = (np.concatenate([getattr(s, part) for s in logs], axis=1) for part in ("q", "nu", "a"))
     chosen = rng.choice(q.shape[1], min(SAMPLES, q.shape[1]), replace=False)
     q, nu, a = q[:, chosen], nu[:, chosen], a[:, chosen]
+    beside = [np.concatenate(parts, axis=1)[:, chosen] for parts in zip(*(s.beside for s in logs), strict=True)]
     # Noise of a coordinate at rest would pass for motion.
     still = np.abs(nu).max(axis=1) < STILL
     nu, a = np.where(still[:, None], 0.0, nu), np.where(still[:, None], 0.0, a)
-    here = _rows(model, q, nu, a)
+    here = _rows(model, q, nu, a, *beside)
     options = changes(model, still)
-    tried = [np.concatenate([here, _rows(model, *_changed(m, q, nu, a, rng))]) for m in options]
+    tried = [np.concatenate([here, _rows(model, *_changed(m, q, nu, a, rng), *beside)]) for m in options]
     level = np.maximum(np.sqrt(np.mean([(t**2).mean(axis=0) for t in tried], axis=0)), 1e-300)
     found: dict[str, str] = {}
     for name in names:
@@ -160,8 +161,8 @@ def _changed(
     return q, nu, a
 
 
-def _rows(model: Model, q: np.ndarray, nu: np.ndarray, a: np.ndarray) -> np.ndarray:
-    return model.stacked(q, nu, a).reshape(-1, len(model.base.names))
+def _rows(model: Model, *sample: np.ndarray) -> np.ndarray:
+    return model.stacked(*sample).reshape(-1, len(model.base.names))
 
 
 def _apart(W: np.ndarray, k: int) -> float:

@@ -51,6 +51,7 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     if not logs:
         raise ValueError("identify: no log given")
     _measurable(model)
+    _linear(model, method)
     examined = [examine(model, log) for log in logs]
     mended, filter = [e.log for e in examined], filter or model.machine.filter
     if not any(v.any() for log in mended for v in log.values.values()):
@@ -88,6 +89,21 @@ def _measurable(model: Model) -> None:
         )
 
 
+def _linear(model: Model, method: str) -> None:
+    """Refuses a method that can't estimate a machine's effects. Raises MachineError."""
+    if model.plain or method == "joint":
+        return
+    machine = model.machine.name
+    if method != "ols":
+        raise MachineError(f"{machine}: effect: method {method} doesn't know effects, use joint, or ols")
+    for e in model.effects:
+        if e.name in model.nonlinear or e.effect.sensed:
+            raise MachineError(
+                f"{machine}: effect {e.name}: no least squares finds it, since the equations of motion are not linear"
+                " in its amount: use joint"
+            )
+
+
 def with_bias(
     model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter | None = None, runs: int = bootstrap.RUNS
 ) -> Estimate:
@@ -96,6 +112,8 @@ def with_bias(
     Of the machine that instrumental variables find, where they find one: least squares can be so far off that its own
     machine says nothing of its bias.
     """
+    if not model.plain:
+        return noted(estimate, "the method's bias on these logs was not looked for: the machine has effects")
     filter = filter or model.machine.filter
     around: np.ndarray | None = None
     if estimate.method.partition("+")[0] in ("ols", "wls"):
@@ -106,9 +124,9 @@ def with_bias(
 
 def recommended(model: Model) -> str:
     """The method that a machine calls for: joint smoothing where slips, which are measured with noise, make the
-    regressor; least squares where a joint's own motion makes it.
+    regressor, and for a machine with effects; least squares where a joint's own motion makes it.
     """
-    return "joint" if model.slips else "ols"
+    return "joint" if model.slips or not model.plain else "ols"
 
 
 def needed_sensors(model: Model, method: str) -> tuple[str, ...]:

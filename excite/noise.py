@@ -85,7 +85,8 @@ def whitener(model: Model, s: Samples, x: np.ndarray, noise: Spread, filter: Fil
     """
     keep = kept_samples(filter.drop[0], s.q.shape[1] - filter.drop[1], filter.decimation)
     n_rows = len(noise.rows)
-    J = _slopes(model)(s.q[:, keep], s.nu[:, keep], s.a[:, keep], model.expand @ x).full()
+    sample = [v[:, keep] for v in (s.q, s.nu, s.a, *s.beside)]
+    J = _slopes(model)(*sample, model.expand @ x).full()
     J = J.reshape(n_rows, len(keep), 3 * n_rows).transpose(1, 0, 2)
     least = noise.rows + (EXACT * np.sqrt(np.mean(s.Y**2))) ** 2
     C = J @ noise.motion @ J.transpose(0, 2, 1) + np.diag(least)
@@ -94,11 +95,12 @@ def whitener(model: Model, s: Samples, x: np.ndarray, noise: Spread, filter: Fil
 
 @lru_cache(maxsize=8)
 def _slopes(model: Model) -> ca.Function:
-    """(q, nu, a, standard parameters) -> slopes (n_rows, 3 n_q) of the prediction by (q, nu, a)."""
+    """(q, nu, a, beside, standard parameters) -> slopes (n_rows, 3 n_q) of the prediction by (q, nu, a)."""
     q, nu, a = model.symbols()
+    beside = model.beside()
     p = ca.SX.sym("p", len(model.base.standard))
-    slope = ca.jacobian(model.predict(q, nu, a, p), ca.vertcat(q, nu, a))
-    return ca.Function("slopes", [q, nu, a, p], [ca.densify(slope)], {"cse": True})
+    slope = ca.jacobian(model.predict(q, nu, a, p, *beside), ca.vertcat(q, nu, a))
+    return ca.Function("slopes", [q, nu, a, *beside, p], [ca.densify(slope)], {"cse": True})
 
 
 def row_levels(errors: Sequence[list[np.ndarray]], x: np.ndarray) -> np.ndarray:

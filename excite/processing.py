@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 import scipy.integrate
 import scipy.signal
@@ -19,12 +20,14 @@ REACH = 200  # decimated rows after which the decimation filter has forgotten th
 
 @dataclass(frozen=True)
 class Samples:
-    """A log as the regressor needs it: q, nu, a (n_q, N) and Y (n_rows, N), all at the log's rate."""
+    """A log as the regressor needs it: q, nu, a (n_q, N) and Y (n_rows, N), all at the log's rate; for a machine with
+    effects also what they answer to, torques (n_u, N) and what they remember (n_z, N)."""
 
     q: np.ndarray
     nu: np.ndarray
     a: np.ndarray
     Y: np.ndarray
+    beside: tuple[np.ndarray, ...] = ()
 
 
 def filtered_regression(model: Model, log: Log, filter: Filter, block: int = BLOCK) -> tuple[np.ndarray, np.ndarray]:
@@ -48,7 +51,7 @@ def _blocks(model: Model, s: Samples, first: int, last: int, factor: int, block:
     for at in range(0, len(kept), count):
         mine = kept[at : at + count]
         low, high = max(first, mine[0] - reach), min(last, mine[-1] + 1 + reach)
-        W = model.stacked(s.q[:, low:high], s.nu[:, low:high], s.a[:, low:high]).transpose(1, 0, 2)
+        W = model.stacked(*(x[:, low:high] for x in (s.q, s.nu, s.a, *s.beside))).transpose(1, 0, 2)
         yield (W if factor == 1 else smooth(W, factor))[:, mine - low]
 
 
@@ -90,7 +93,32 @@ def samples(model: Model, log: Log, filter: Filter) -> Samples:
     for sensor in machine.sensors("full"):
         if sensor.kind == "torque":
             Y[model.coordinates.index(machine.find(sensor.body).coordinates[0])] = log.values[sensor.name]
-    return Samples(q, nu, a, Y)
+    return Samples(q, nu, a, Y, _beside(model, q, nu, Y))
+
+
+def _beside(model: Model, q: np.ndarray, nu: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Torques as far as the machine file's offsets tell, and what effects remember, along measured motion."""
+    if model.plain:
+        return ()
+    nominal = dict(zip(model.base.standard, model.expand @ model.nominal, strict=True))
+    offset = np.array([nominal[f"u{b.index}0"] for b in model.machine.actuated])
+    u = Y[list(model.actuated)] - offset[:, None]
+    return u, remember(model, q.T, nu.T, u.T, model.nominal).T
+
+
+def remember(model: Model, q: np.ndarray, nu: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """What effects remember (N, n_z) along a motion, from rest: linearly implicit Euler, sample by sample."""
+    n_q, n_u, n_z = len(model.coordinates), len(model.inputs), len(model.memory)
+    at = ca.SX.sym("at", 2 * n_q + n_u)
+    z, p = ca.SX.sym("z", n_z), ca.SX.sym("X", len(X))
+    rate = model.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q :], z, p)
+    h = 1 / float(model.machine.sampling_hz)
+    ahead = z + ca.solve(ca.SX.eye(n_z) - h * ca.jacobian(rate, z), h * rate)
+    step = ca.Function("step", [z, at, p], [ahead])
+    path = step.mapaccum("path", len(q) - 1)(
+        model.fresh, np.hstack([q, nu, u])[:-1].T, ca.repmat(ca.DM(X), 1, len(q) - 1)
+    )
+    return np.vstack([model.fresh, path.full().T])
 
 
 def unmeasured(model: Model, log: Log) -> tuple[int, ...]:

@@ -10,14 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import casadi as ca
 import numpy as np
 import scipy.integrate
 
 from excite.estimate import NotIdentifiable
 from excite.linearise import Chart
 from excite.log import Log
-from excite.processing import samples, white_noise
+from excite.processing import remember, samples, white_noise
 from model.machine import Filter, Sensor
 from model.prediction import Model
 
@@ -145,21 +144,6 @@ def carried(c: Chart, r: Record, p: Point, of: Chart, X: np.ndarray) -> Point:
         full[:, c.full - n_z :] = remember(c.model, q, nu, u, X)
     old = dict(zip(origins(of, r.counts), p.offset, strict=True))
     return Point(full[:, c.index], p.w, np.array([old.get(j, 0.0) for j in r.origin]))
-
-
-def remember(model: Model, q: np.ndarray, nu: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """What effects remember (N, n_z) along a motion, from rest: linearly implicit Euler, sample by sample."""
-    n_q, n_u, n_z = len(model.coordinates), len(model.inputs), len(model.memory)
-    at = ca.SX.sym("at", 2 * n_q + n_u)
-    z, p = ca.SX.sym("z", n_z), ca.SX.sym("X", len(X))
-    rate = model.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q :], z, p)
-    h = 1 / float(model.machine.sampling_hz)
-    ahead = z + ca.solve(ca.SX.eye(n_z) - h * ca.jacobian(rate, z), h * rate)
-    step = ca.Function("step", [z, at, p], [ahead])
-    path = step.mapaccum("path", len(q) - 1)(
-        model.fresh, np.hstack([q, nu, u])[:-1].T, ca.repmat(ca.DM(X), 1, len(q) - 1)
-    )
-    return np.vstack([model.fresh, path.full().T])
 
 
 def one_count(c: Chart, r: Record) -> np.ndarray:
