@@ -50,6 +50,7 @@ CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviati
 ENOUGH = 0.2  # likewise with disturbing forces, whose deviations are no promise
 # Steps that turn back and hardly shrink are shortened by TURNED; others grow by SHARE up to the whole.
 TURNED, SHARE, SLOW = 0.7, 1.15, 0.3
+ALONG = 0.9  # cosine between two steps that go the same way
 LARGEST_STEP = 0.5  # of a parameter in one pass, relative to its size
 # Disturbing forces where the model is not trusted, white from sample to sample, as accelerations [m/s2, rad/s2]: on a
 # roller of 11 t they are 500 N. Four and sixteen times that until the innovations are what they should be.
@@ -420,7 +421,10 @@ def iterate(
         # Where Gauss-Newton swings about the answer, shorter steps end it.
         turned = move[0][: len(X)] / np.sqrt(np.diag(covariance))[: len(X)]
         swings = turned @ last < 0 and step > SLOW * before
-        whole = max(TURNED * whole, 0.3) if swings else min(SHARE * whole, 1.0)
+        whole = max(TURNED * min(whole, 1.0), 0.3) if swings else min(SHARE * whole, 1.0)
+        creeps = turned @ last > ALONG * np.linalg.norm(turned) * np.linalg.norm(last) and step < 1.0
+        if creeps and SLOW * before < step < 0.7 * before:
+            whole = 1 / (1 - step / before)  # Aitken: all the steps to come at once
         last = turned
         limit = LARGEST_STEP * np.maximum(np.abs(X) / model.scale, 1.0)
         for m in move:
