@@ -16,6 +16,7 @@ import numpy as np
 from excite import brief, identify, log, sensors
 from excite.brief import Brief
 from excite.estimate import NoEstimate
+from excite.examine import examine
 from excite.limit import InfeasibleError
 from excite.log import LogError
 from excite.simulate import Motion, SimulationError, simulate
@@ -98,27 +99,38 @@ def _run(work: Work, seed: int) -> Row:
     if steps & {"identify", "verify"}:
         measured = log.check(table, known.machine, identify.needed_sensors(known, work.method))
         estimate = identify.identify(known, [measured], work.method)
-        row["value"], row["std"] = _numbers(estimate.value), _numbers(estimate.std)
-        row["quantile95"] = estimate.quantile95
-        row["relative_error_percent"] = estimate.relative_error_percent
+        row["value"], row["std"] = _plain(estimate.value.tolist()), _plain(estimate.std.tolist())
+        row["quantile95"] = _plain(estimate.quantile95)
+        row["relative_error_percent"] = _plain(estimate.relative_error_percent)
     if "diagnose" in steps:
-        row |= _diagnosed(known, [log.check(table, known.machine)])
+        needs = identify.needed_sensors(known, "joint")
+        row |= _diagnosed(known, [log.check(table, known.machine, needs)])
     return row
 
 
 def _diagnosed(model: Model, logs: Sequence[log.Log]) -> Row:
+    """The keys of `excite diagnose` that go into a table."""
+    from excite import findings
     from excite.diagnose import diagnose
 
-    found = diagnose(model, logs, model.machine.filter)
+    mended = [examine(model, one).log for one in logs]
+    said = findings.summary(findings.account(diagnose(model, mended, model.machine.filter)))
+    told = ("effect", "where", "tied_with", "p_value", "amount", "amount_std", "unit", "gain_percent", "gain_ci95")
     return {
-        "verdict": found.verdict,
-        "findings": [[f.name, f.amount, f.amount_std, f.unit, list(f.tied_with)] for f in found.findings],
+        "verdict": said["verdict"],
+        "findings": [{k: _plain(one.get(k)) for k in told} for one in said["findings"]],
+        "error_before_percent": _plain(said["error_before_percent"]),
+        "error_after_percent": _plain(said["error_after_percent"]),
     }
 
 
-def _numbers(x: np.ndarray) -> list[float | None]:
-    """For a table: a number that is not finite is none at all."""
-    return [float(v) if math.isfinite(v) else None for v in x]
+def _plain(value: Any) -> Any:
+    """As JSON has it: a number that is not finite is none at all."""
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value
 
 
 @dataclass(frozen=True)

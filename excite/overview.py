@@ -56,6 +56,8 @@ ABOUT = {
     "relative_error_percent": pa.float64(),
     "verdict": pa.string(),
     "findings": pa.string(),
+    "error_before_percent": pa.float64(),
+    "error_after_percent": pa.float64(),
     "versions": pa.string(),
     "command": pa.string(),
 }

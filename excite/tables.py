@@ -6,15 +6,12 @@ import csv
 import io
 import re
 import warnings
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 import scipy.io
-from scipy.io.matlab import MatReadError
 
 SEPARATORS = ("\t", ";", ",", "|")
 ENCODINGS = ("utf-8-sig", "cp1252")  # the second reads any byte: what European loggers write
@@ -122,14 +119,14 @@ def _numeric_below(lines: list[str], start: int, separator: str) -> bool:
 def _parquet(path: Path) -> pd.DataFrame:
     try:
         return pd.read_parquet(path)
-    except (pa.ArrowInvalid, OSError) as err:
+    except Exception as err:  # what the parsers of these formats raise on damaged bytes is anything at all
         raise LogError(f"{path}: not a Parquet file: {' '.join(str(err).split())[:120]}") from None
 
 
 def _mat(path: Path) -> pd.DataFrame:
     try:
         raw = scipy.io.loadmat(path)
-    except (MatReadError, ValueError, TypeError, OSError, NotImplementedError, zipfile.BadZipFile, LookupError) as err:
+    except Exception as err:
         raise LogError(
             f"{path}: not a MATLAB file that can be read (v5 to v7): {' '.join(str(err).split())[:120]}"
         ) from None
@@ -155,7 +152,6 @@ def _mdf(path: Path) -> pd.DataFrame:
     """Every channel at the times of the fastest one, time in `timestamps` [s] from the first sample on."""
     try:
         from asammdf import MDF
-        from asammdf.blocks.utils import MdfException
     except ImportError:
         raise LogError(f"{path}: MDF files need asammdf: pip install 'excite[mdf]'") from None
     try:
@@ -164,7 +160,7 @@ def _mdf(path: Path) -> pd.DataFrame:
             counts = {name: len(mdf.get(name, *at[0])) for name, at in mdf.channels_db.items() if not times & set(at)}
             fastest = max(counts, key=lambda name: counts[name])
             table = mdf.to_dataframe(raster=fastest, time_from_zero=True, ignore_value2text_conversions=True)
-    except (MdfException, ValueError, OSError, KeyError, TypeError, IndexError) as err:
+    except Exception as err:
         raise LogError(f"{path}: not an MDF file that can be read: {' '.join(str(err).split())[:120]}") from None
     table.insert(0, MDF_TIME, table.index.to_numpy(dtype=float))
     return table.reset_index(drop=True)

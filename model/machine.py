@@ -589,7 +589,7 @@ def _read(path: Path, depth: int = 0) -> dict[str, Any]:
     if not isinstance(parent, str):
         raise MachineError(f"{path}: extends: must be a shipped name or a file name")
     base = MACHINES / f"{parent}.toml" if parent in shipped() else path.parent / parent
-    if not base.is_file():
+    if parent not in shipped() and (Path(parent).name != parent or "\x00" in parent or not base.is_file()):
         raise MachineError(
             f"{path}: extends: no machine {parent}, allowed: {', '.join(shipped())}, or a file beside it"
         )
