@@ -1,4 +1,4 @@
-"""`excite diagnose` as people and scripts use it: what it says, what it leaves behind, what its machine file is good for."""
+"""`excite diagnose` as people and scripts use it: what it says and leaves behind, what its machine file is good for."""
 
 from __future__ import annotations
 
