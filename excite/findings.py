@@ -164,7 +164,9 @@ def answer(a: Account) -> str:
     if d.verdict == "unexplained":
         text = f"{logs} something that no known effect explains"
         if rows:
-            text += f"; {named} would account for {100 * d.share:.0f} % of it, too little to be its name"
+            more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
+            first = words(rows[0]["effect"], rows[0]["where"])
+            text += f"; {first}{more} would account for {100 * d.share:.0f} % of it, too little to be its name"
         return text + "."
     gained = ""
     if a.whole:

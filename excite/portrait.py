@@ -28,7 +28,7 @@ def write(place: Path, a: Account, signals: Mapping[str, Mapping[str, Any]], tit
     save(signals_figure(a, signals, title), place / "signals.png")
     found = bool(a.diagnosis.stages)
     for k, before in enumerate(a.before):
-        name, words = f"-{k + 1}" if several else "", f"{title}: {before.source}"
+        name, words = f"-{k + 1}" if several else "", f"{title}: {Path(before.source).name}"
         shown = [side[k] for side in a.missing]
         save(misfit_figure(shown[0], shown[1] if found else None, words), place / f"misfit{name}.png")
         save(when_figure(before, a.after[k] if found else None, words), place / f"when{name}.png")
@@ -66,7 +66,8 @@ def misfit_figure(before: Course, after: Course | None, title: str) -> Figure:
     first.plot([], [], color=BEFORE, label="without what was found" if after is not None else "missing (mean)")
     if after is not None:
         first.plot([], [], color=AFTER, linestyle="--", label="with it")
-    first.fill_between([], [], [], color="0.8", label="what noise alone leaves")
+    if any(np.isfinite(before.missing[row][2]) for row in rows):
+        first.fill_between([], [], [], color="0.8", label="what noise alone leaves")
     figure.legend(*first.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9, frameon=False)
     return figure
 
