@@ -11,6 +11,7 @@ from typing import Any
 
 SHOWN = 40  # cells of a study in the terminal
 PAUSE = 30.0  # s between lines of progress
+TELLING = 10  # runs before the time left can be told
 
 
 def say(thing: object) -> None:
@@ -294,7 +295,7 @@ def _lines() -> Callable[[int, int, str], None]:
         if done < total and now - last < PAUSE:
             return
         last = now
-        left = (total - done) * (now - since) / (done - before) if done > before else None
+        left = (total - done) * (now - since) / (done - before) if done - before >= TELLING else None
         tail = "" if left is None or done == total else f", about {_span(left)} left"
         sys.stderr.write(f"{what}: {done} of {total}{tail}\n")
         sys.stderr.flush()
