@@ -28,10 +28,13 @@ LEVEL = 22.0  # of twice the log-likelihood that an effect must gain; 200 logs w
 WORTH = 15.0  # a first-order gain below which a candidate isn't fitted
 HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
 STRONG = 1.3  # misfit over readings from which first-order gains are rough
-PASSES = 9  # of a candidate's fit
+PASSES = 14  # of a candidate's fit
+NEARLY = 1.0  # step, in standard deviations, at which a fit that runs out of passes is as good as found
 TRIED = 5  # candidates that are fitted, of different names
 MOST = 4  # effects that are looked for
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
+SHAPE = 0.005  # of what is explained already, that a further effect must gain: nature is never exactly the formula
+CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
 LEAST = 0.05  # of the excess misfit that an effect must explain to be worth a place
 SHARE = 0.6  # of the excess misfit that names must explain, or it is unexplained
 NEAR = 0.3  # of what the best name leaves unexplained, by which a rival may be worse and still is a tie
@@ -128,28 +131,47 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
     tell(0.0, "fitting the model")
     before = fitted(model.machine, logs, filter)
     stage, chosen, first = before, list[_Choice](), tuple[evidence.Score, ...]()
-    for turn in range(MOST if before.settled else 0):
+    for turn in range(MOST):
         tell(0.15 + 0.2 * turn, "scoring effects")
         known = [e.name for e in stage.model.effects]
         found = evidence.candidates(model.machine, [s.name for s in stage.prepared.c.sensors], _duration(logs), known)
         scores = evidence.scan(stage.prepared.c, stage.prepared.records, stage.fit, found).scores
         first = first or scores
-        choice = _choose(stage, scores, logs, filter, tell, 0.2 + 0.2 * turn)
+        explained = sum(x.gain for x in chosen)
+        choice = _choose(stage, scores, logs, filter, explained, tell, 0.2 + 0.2 * turn)
         if choice is None:
             break
         chosen.append(choice)
         stage = choice.stage
     tell(0.95, "weighing")
-    return replace(_verdict(before, stage, chosen, first), stages=tuple(x.stage for x in chosen))
+    # A name that leaves most of the misfit where it was is none, unless with what came after it nothing is left.
+    odd = _odd(stage)
+    while chosen and (odd or not stage.exact) and chosen[-1].gain < SHARE * (chosen[-1].gain + stage.excess):
+        chosen.pop()
+        stage = chosen[-1].stage if chosen else before
+        odd = _odd(stage)
+    return replace(_verdict(before, stage, chosen, first, odd), stages=tuple(x.stage for x in chosen))
+
+
+def _odd(stage: Stage) -> tuple[str, ...]:
+    """What is left beside noise, a line each: innovations that are too large, and what stands out in them."""
+    found = [
+        a
+        for k, log in enumerate(stage.prepared.logs)
+        for a in anomalies(stage.machine, stage.prepared.c.sensors, log, stage.fit, k)
+    ]
+    return tuple(dict.fromkeys([*stage.suspects, *map(str, found)]))
 
 
 @dataclass(frozen=True)
 class _Choice:
-    """An effect that was added, the model with it, and the rivals that the log likes about as well."""
+    """An effect that was added, the model with it, and the rivals that the log likes about as well. gain: of twice the
+    log-likelihood, which what is left of the misfit makes `spread` times less sure."""
 
     name: str
     stage: Stage
     gain: float
+    spread: float
     tried: int
     rivals: tuple[str, ...]
 
@@ -171,9 +193,14 @@ def fitted(
         damping, passes = damping * smoothing.DAMPING[1] ** 2, PASSES
 
     def solve(disturbed: float) -> Fit:
-        return smoothing.iterate(
-            c, prepared.records, points, X, prepared.starts, disturbed, prepared.held, damping, passes
-        )
+        try:
+            return smoothing.iterate(
+                c, prepared.records, points, X, prepared.starts, disturbed, prepared.held, damping, passes
+            )
+        except NotConverged as failed:
+            if failed.fit is None or failed.step > NEARLY:
+                raise
+            return failed.fit
 
     if not loose:
         try:
@@ -236,51 +263,78 @@ def _shortlist(stage: Stage, scores: Sequence[evidence.Score]) -> list[evidence.
 
 
 def _choose(
-    stage: Stage, scores: Sequence[evidence.Score], logs: Sequence[Log], filter: Filter, tell: Advance, done: float
+    stage: Stage,
+    scores: Sequence[evidence.Score],
+    logs: Sequence[Log],
+    filter: Filter,
+    explained: float,
+    tell: Advance,
+    done: float,
 ) -> _Choice | None:
-    """The effect that the logs like best beside those that are in the model; None if none is worth it."""
-    tries: list[tuple[evidence.Score, Stage]] = []
-    for k, score in enumerate(_shortlist(stage, scores)):
-        tell(done + 0.03 * k, f"fitting {score.candidate.name}")
-        machine = effects.extended(stage.machine, _entry(score))
+    """The effect that the logs like best beside those that are in the model; None if none is worth it. explained: how
+    much those in the model have gained."""
+    likely = _shortlist(stage, scores)
+    if not likely:
+        return None
+    for reach in CLOSER:
+        nearby = evidence.finer(likely, stage.machine, _duration(logs), reach)
+        if len(nearby) > len(likely):
+            closer = evidence.scan(stage.prepared.c, stage.prepared.records, stage.fit, nearby).scores
+            likely = _shortlist(stage, sorted([*likely, *closer], key=lambda s: -s.gain))
+    tries = _tries(stage, likely, logs, filter, lambda k: tell(done + 0.03 * k, f"fitting {likely[k].candidate.name}"))
+    if stage.exact and likely[0].candidate.name not in {s.candidate.name for s, _ in tries}:
+        # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
         try:
-            tries.append((score, fitted(machine, logs, filter, stage)))
+            stage = fitted(stage.machine, logs, filter, stage, loose=True)
+            tries = _tries(stage, likely, logs, filter, lambda k: None)
         except NotConverged:
-            continue
+            return None
     if any(t.exact for _, t in tries):
         tries = [(s, t) for s, t in tries if t.exact]
-    elif stage.exact:
-        return None
     if not tries:
         return None
     tries.sort(key=lambda x: x[1].fit.cost)
     score, best = tries[0]
     gain = stage.fit.cost - best.fit.cost if stage.exact == best.exact else score.gain
     spread = max(1.0, best.fit.cost / best.prepared.readings)
-    if gain / spread < max(LEVEL, LEAST * stage.excess / spread):
+    if gain / spread < LEVEL or gain < max(LEAST * stage.excess, SHAPE * explained):
         return None
     near = max(CLOSE * spread, NEAR * best.excess)
     rivals = tuple(s.candidate.name for s, t in tries[1:] if t.fit.cost - best.fit.cost < near)
     names = len({s.candidate.name for s in scores})
-    return _Choice(score.candidate.name, best, gain / spread, names, rivals)
+    return _Choice(score.candidate.name, best, gain, spread, names, rivals)
 
 
-def _verdict(before: Stage, after: Stage, chosen: Sequence[_Choice], scores: Sequence[evidence.Score]) -> Diagnosis:
+def _tries(
+    stage: Stage, likely: Sequence[evidence.Score], logs: Sequence[Log], filter: Filter, tell: Callable[[int], None]
+) -> list[tuple[evidence.Score, Stage]]:
+    """The candidates whose fits were found."""
+    tries: list[tuple[evidence.Score, Stage]] = []
+    for k, score in enumerate(likely):
+        tell(k)
+        machine = effects.extended(stage.machine, _entry(score))
+        try:
+            tries.append((score, fitted(machine, logs, filter, stage)))
+        except NotConverged:
+            continue
+    return tries
+
+
+def _verdict(
+    before: Stage, after: Stage, chosen: Sequence[_Choice], scores: Sequence[evidence.Score], odd: tuple[str, ...]
+) -> Diagnosis:
     """The verdict: what is named must explain most of the misfit, and what is left must be noise or be shown."""
     findings = tuple(_finding(x, after) for x in chosen)
-    sensors, machine = after.prepared.c.sensors, after.machine
-    odd = [a for k, log in enumerate(after.prepared.logs) for a in anomalies(machine, sensors, log, after.fit, k)]
-    located = tuple(dict.fromkeys([*after.suspects, *map(str, odd)]))
     share = 1.0
-    if not after.exact or after.suspects or odd:
+    if odd or not after.exact:
         gained = sum(x.gain for x in chosen)
         share = gained / (gained + after.excess) if gained + after.excess > 0 else 0.0
     verdict = "clean"
     if findings:
         verdict = "tied" if any(f.tied_with for f in findings) else "named"
-    if not after.settled or (located and (share < SHARE or not findings)) or (not after.exact and not findings):
+    if not after.settled or (odd and (share < SHARE or not findings)) or (not after.exact and not findings):
         verdict = "unexplained"
-    return Diagnosis(verdict, findings, before, after, share, tuple(scores), located, ())
+    return Diagnosis(verdict, findings, before, after, share, tuple(scores), odd, ())
 
 
 def _finding(choice: _Choice, after: Stage) -> Finding:
@@ -293,7 +347,8 @@ def _finding(choice: _Choice, after: Stage) -> Finding:
         for s, shape in placed.effect.shapes.items()
     }
     added = sum(n == placed.name or n.startswith(placed.name + ".") for n in after.model.base.names)
-    p = min(1.0, choice.tried * float(scipy.stats.chi2.sf(choice.gain, added)))
+    gain = choice.gain / choice.spread
+    p = min(1.0, choice.tried * float(scipy.stats.chi2.sf(gain, added)))
     return Finding(
         placed.effect.name,
         placed.where,
@@ -303,5 +358,5 @@ def _finding(choice: _Choice, after: Stage) -> Finding:
         float(std),
         placed.effect.unit,
         shapes,
-        choice.gain,
+        gain,
     )

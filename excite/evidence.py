@@ -25,6 +25,7 @@ from model.effects import CATALOGUE, Effect, Placed
 from model.equations import signatures
 from model.machine import Machine
 
+NEARBY = 0.6, 0.8, 1.0, 1.3, 1.7  # amounts that are tried about the grid's, where they aren't a factor
 CHUNK = 20_000  # innovations whose products are summed at once
 ABSORBED = 1e-5  # share of a signature that is left, below which it is but single precision's error
 
@@ -93,6 +94,40 @@ def _grid(effect: Effect, site: effects.Site) -> list[tuple[dict[str, float], in
                 continue
             tried.append((values | ({circular: 0.0} if circular else {}), 2 if circular else 1))
     return tried
+
+
+def finer(scores: Sequence[Score], machine: Machine, duration: float, reach: float = 1.0) -> list[Candidate]:
+    """Candidates about the best ones so far, with shapes and amounts between their grid's points; reach: in shares of
+    the way to the next points."""
+    found: list[Candidate] = []
+    columns = 0
+    for score in scores:
+        placed = score.candidate.placed
+        site = effects.Site(machine, machine.find(placed.bodies[0]), duration)
+        for values in _about(placed, site, reach):
+            width = len(score.candidate.columns)
+            own = Placed(placed.effect, placed.where, placed.bodies, placed.sensor, values)
+            found.append(Candidate(own, tuple(range(columns, columns + width))))
+            columns += width
+    return found
+
+
+def _about(placed: Placed, site: effects.Site, reach: float) -> list[dict[str, float]]:
+    """Values near those of a candidate: shapes up to two thirds of the way to the grid's next points."""
+    grids: dict[str, list[float]] = {}
+    if len(placed.effect.grid) > 1:
+        grids["A"] = [placed.values["A"] * f**reach for f in NEARBY]
+    for name, shape in placed.effect.shapes.items():
+        if shape.circular or shape.whole or len(shape.grid) == 1:
+            continue
+        points, value = sorted(g * shape.size(site) for g in shape.grid), placed.values[name]
+        k = int(np.argmin(np.abs(np.array(points) - value)))
+        step = points[k] - points[k - 1] if k else points[1] - points[0]
+        below, above = max(points[k] - step, 0.0), points[k + 1] if k + 1 < len(points) else points[k] + step
+        shares = np.array([-2, -1, 0, 1, 2]) / 3 * reach
+        grids[name] = [float(value + x * (value - below if x < 0 else above - value)) for x in shares]
+    every = [dict(zip(grids, values, strict=True)) for values in product(*grids.values())]
+    return [{**placed.values, **values} for values in every if min(values.values(), default=1.0) >= 0]
 
 
 class Signatures:

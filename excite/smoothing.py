@@ -69,11 +69,12 @@ SPREAD_SPEED, SPREAD_ANGLE = 0.05, 0.1
 
 
 class NotConverged(NoEstimate):
-    """Joint smoothing found no estimate; the message says how far it came and what to do, `fit` where it stood."""
+    """Joint smoothing found no estimate; the message says how far it came and what to do, `fit` where it stood and
+    `step` the next step, in standard deviations."""
 
-    def __init__(self, message: str, fit: Fit | None = None) -> None:
+    def __init__(self, message: str, fit: Fit | None = None, step: float = np.inf) -> None:
         super().__init__(message)
-        self.fit = fit
+        self.fit, self.step = fit, step
 
 
 @dataclass(frozen=True)
@@ -449,6 +450,7 @@ def iterate(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
         " log with `excite diagnose`, or start from better values in the machine file",
         stood,
+        float(step),
     )
 
 
