@@ -156,7 +156,11 @@ def scaled(text: str, rng: random.Random) -> str:
         return text
     m = rng.choice(found)
     value = float(m[0]) * rng.choice((-1, 0, 0.5, 1.001, 1.01, 2, 10, 1e3, 1e-3))
-    return text[: m.start()] + (str(round(value)) if "." not in m[0] else repr(value)) + text[m.end() :]
+    return (
+        text[: m.start()]
+        + (repr(value) if "." in m[0] or not math.isfinite(value) else str(round(value)))
+        + text[m.end() :]
+    )
 
 
 def spoilt_toml(text: str, rng: random.Random) -> bytes:
