@@ -1,0 +1,203 @@
+"""Effects: one declaration each, which prediction, simulation, sensors and signatures all follow from."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from excite import evidence, sensors
+from excite.simulate import simulate
+from model import effects, machine
+from model.effects import CATALOGUE, Effect, Placed
+from model.equations import signatures
+from model.machine import EffectEntry, MachineError, Quantity
+from model.prediction import Model, build
+
+CONTRACT = (  # CONTRACT.md section 4: the names that others rely on, and their units
+    ("stribeck_friction", "N m"),
+    ("load_dependent_friction", "-"),
+    ("asymmetric_coulomb", "N m"),
+    ("asymmetric_viscous", "N m s"),
+    ("quadratic_drag", "N m s2"),
+    ("friction_warm_up", "-"),
+    ("actuator_lag", "s"),
+    ("channel_delay", "s"),
+    ("torque_gain", "-"),
+    ("torque_offset_drift", "N m/s"),
+    ("torque_deadband", "N m"),
+    ("pump_coupling", "-"),
+    ("roll_unbalance", "N m"),
+    ("encoder_eccentricity", "rad"),
+    ("torque_ripple", "N m"),
+    ("shear_saturation", "-"),
+    ("lateral_saturation", "-"),
+    ("drive_brake_asymmetry", "-"),
+    ("compaction_per_pass", "-"),
+    ("slip_relaxation", "m"),
+    ("rolling_resistance", "N"),
+    ("ground_slope", "rad"),
+    ("measuring_wheel_radius", "-"),
+    ("articulation_backlash", "rad"),
+    ("articulation_compliance", "rad/(N m)"),
+    ("articulation_stop_spring", "N m/rad"),
+    ("vibration_on", "-"),
+    ("payload_shift", "kg m"),
+)
+VA12 = machine.load("va12")
+
+
+def where(effect: Effect) -> str:
+    return next(iter(effects.places(VA12, effect)))
+
+
+def typical(effect: Effect) -> float:
+    bodies, _ = effects.places(VA12, effect)[where(effect)]
+    return effect.amount(effects.Site(VA12, VA12.find(bodies[0]), effects.DURATION))
+
+
+def extended(effect: Effect, amount: float) -> Model:
+    entry = EffectEntry(
+        name=effect.name, where=where(effect), amount=Quantity(value=amount, source="assumed"), shape={}
+    )
+    return build(effects.extended(VA12, entry))
+
+
+def samples(model: Model, count: int = 40, seed: int = 0) -> list[np.ndarray]:
+    """q, nu, a, u, z of states a roller may be in."""
+    rng = np.random.default_rng(seed)
+    n = len(model.coordinates)
+    q, nu, a = (rng.uniform(-1, 1, (n, count)) for _ in range(3))
+    nu[3] = nu[0] / 0.65 + rng.uniform(-0.1, 0.1, count)
+    nu[5] = nu[0] / 0.65 + rng.uniform(-0.1, 0.1, count)
+    return [q, nu, a, rng.uniform(-3000, 3000, (3, count)), rng.uniform(0, 0.5, (len(model.memory), count))]
+
+
+def test_the_contract_is_in_the_catalogue() -> None:
+    assert {(name, CATALOGUE[name].unit) for name, _ in CONTRACT} == set(CONTRACT)
+
+
+@pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
+def test_what_an_effect_predicts_is_what_it_does(effect: Effect) -> None:
+    """Forward dynamics put into the prediction give the torques that the sensors read, and the regressor is the exact
+    slope of the prediction, by differences."""
+    model = extended(effect, typical(effect))
+    q, nu, _, u, z = samples(model)
+    X = model.nominal
+    a = model.acceleration(q, nu, u, z, X).full()
+    Y = model.predict(q, nu, a, model.expand @ X, u, z).full()
+    time = z[[model.memory.index("time")]] if "time" in model.memory else np.zeros((1, q.shape[1]))
+    gain, offset, _ = (x.full() for x in model.channels(time, X))
+    measured = np.zeros_like(Y)
+    measured[list(model.actuated)] = gain * u + offset
+    assert np.abs(Y - measured).max() < 1e-7 * np.abs(measured).max()
+    W = model.stacked(q, nu, a, u, z)
+    for k in range(len(X)):
+        step = 1e-5 * model.scale[k] * np.eye(len(X))[k]
+        up, down = (model.predict(q, nu, a, model.expand @ (X + s * step), u, z).full() for s in (1, -1))
+        slope = ((up - down) / (2e-5 * model.scale[k])).T
+        assert np.abs(W[:, :, k] - slope).max() <= 1e-4 * np.abs(slope).max() + 1e-6 * np.abs(Y).max() / model.scale[k]
+
+
+@pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
+def test_an_effect_of_no_size_changes_nothing(effect: Effect, va12: Model) -> None:
+    """A motion of a few seconds, and what all sensors read of it: as without; with a typical amount it differs."""
+    t = np.arange(400) / 100
+    torque = np.column_stack([1500 * np.sin(1.5 * t), 4000 * np.sin(0.8 * t), 1500 * np.sin(1.5 * t)])
+    plain = sensors.signals(va12, simulate(va12, torque))
+
+    def change(amount: float) -> float:
+        model = extended(effect, amount)
+        if effect.name == "vibration_on":  # its shaking of the torque channel is a shape
+            effect_at = model.machine.effect[0].model_copy(
+                update={"shape": {s: Quantity(value=v, source="assumed") for s, v in SHAKEN.items()}}
+            )
+            model = build(effects.extended(VA12, effect_at))
+        read = sensors.signals(model, simulate(model, torque))
+        return max(float(np.abs(read[n] - x).max() / np.abs(x).max()) for n, x in plain.items())
+
+    size = typical(effect)
+    assert change(size * 1e4 if effect.inverse else max(size * 1e-6, 1e-12)) < 1e-4
+    assert change(size) > 1e-5 or effect.name in FAR
+
+
+SHAKEN = {"begin": 1.0, "length": 2.0, "shake": 0.0}
+# Beyond what these seconds hold: a moment late in the log, an angle or a torque that isn't reached.
+FAR = ("payload_shift", "articulation_stop_spring", "relief_valve")
+
+
+@pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
+def test_a_signature_is_what_the_extended_model_has_more(effect: Effect, va12: Model) -> None:
+    """The force of a signature is the difference of the two balances, and so is its reading."""
+    model = extended(effect, typical(effect))
+    e = model.effects[0]
+    q, nu, a, u, z = samples(model)
+    count = q.shape[1]
+    t = z[model.memory.index("time")] if "time" in model.memory else np.full(count, 3.0)
+    own = z[[k for k, m in enumerate(model.memory) if m != "time"]]
+    exact = va12.read(q, nu, np.ones((2, count)), u, np.zeros((0, count)), va12.nominal).full()
+    made = signatures(VA12, va12.base.standard, [e])
+    p = va12.expand @ va12.nominal
+    force = made.force(q, nu, a, u, t[None], own, exact, p).full()
+    difference = va12.balance(q, nu, a, p).full() - model.balance(q, nu, a, model.expand @ model.nominal, u, z).full()
+    assert np.abs(force - difference).max() < 1e-8 * max(np.abs(va12.balance(q, nu, a, p).full()).max(), 1.0)
+    reading = made.reading(q, nu, a, u, t[None], own, exact, p).full()
+    read = model.read(q, nu, np.ones((2, count)), u, z, model.nominal).full()
+    assert np.abs(reading - (read - exact)).max() < 1e-12
+
+
+def test_a_new_effect_is_one_declaration(monkeypatch: pytest.MonkeyPatch, va12: Model) -> None:
+    """Simulated, a parameter of the regressor, a candidate of the diagnosis: from one entry of the catalogue."""
+    dry = Effect(
+        "sticky_spot",
+        ("rolls",),
+        "N m",
+        "a torque against the motion in one half of a turn",
+        "a torque error in half of every turn",
+        "made up for this test",
+        lambda site: 80.0,
+        torque=lambda s, k, p: -p["A"] * s.sign(k) * (1 + ca.tanh(ca.sin(s.q[k]) / 0.1)) / 2,
+    )
+    monkeypatch.setitem(CATALOGUE, dry.name, dry)
+    model = build(effects.extended(VA12, effects.parse("sticky_spot@rear_roll=80", VA12, 10.0)))
+    assert model.base.names[-1] == "sticky_spot@rear_roll"
+    q, nu, a, u, z = samples(model)
+    assert np.abs(model.stacked(q, nu, a, u, z)[:, 5, -1]).max() > 0.9
+    torque = np.full((300, 3), 800.0) * np.array([1, 0, 1])
+    assert simulate(model, torque).nu[-1, 0] < simulate(va12, torque).nu[-1, 0] - 1e-3
+    names = {c.name for c in evidence.candidates(VA12, [s.name for s in VA12.sensors("full")], 60.0)}
+    assert {"sticky_spot@front_roll", "sticky_spot@rear_roll"} <= names
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("no_such_thing=1", "unknown, allowed: stribeck_friction"),
+        ("shear_saturation=0.2", "where must be one of front_roll, rear_roll"),
+        ("shear_saturation@articulation=0.2", "where must be one of front_roll, rear_roll"),
+        ("torque_deadband@rear_roll=-3", "amount must be > 0"),
+        ("ground_slope", "NAME\\[@WHERE\\]=AMOUNT"),
+        ("ground_slope=nan", "NAME\\[@WHERE\\]=AMOUNT"),
+        ("../x@y=1", "NAME\\[@WHERE\\]=AMOUNT"),
+    ],
+)
+def test_a_wrong_effect_is_one_clear_line(text: str, said: str) -> None:
+    with pytest.raises(MachineError, match=said) as caught:
+        effects.parse(text, VA12, 60.0)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_effect_twice_at_one_place_is_refused() -> None:
+    entry = effects.parse("ground_slope=0.01", VA12, 60.0)
+    with pytest.raises(MachineError, match="twice"):
+        build(effects.extended(VA12, entry, entry))
+
+
+def test_phases_and_places_follow_the_machine() -> None:
+    """The straight machine has no articulation and no gyro; a machine without contacts has joints only."""
+    straight, bench = machine.load("va12_straight"), machine.load("emps")
+    assert not effects.places(straight, CATALOGUE["articulation_backlash"])
+    assert not effects.places(straight, CATALOGUE["yaw_rate_bias"])
+    assert set(effects.places(bench, CATALOGUE["asymmetric_viscous"])) == {"carriage"}
+    assert not effects.places(bench, CATALOGUE["ground_slope"])
+    assert isinstance(effects.placed(bench, effects.parse("torque_gain=0.1", bench, 10.0)), Placed)
