@@ -33,6 +33,7 @@ NEARLY = 1.0  # step, in standard deviations, at which a fit that runs out of pa
 TRIED = 5  # candidates that are fitted, of different names
 MOST = 4  # effects that are looked for
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
+SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 SHAPE = 0.005  # of what is explained already, that a further effect must gain: nature is never exactly the formula
 CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
 LEAST = 0.05  # of the excess misfit that an effect must explain to be worth a place
@@ -78,8 +79,8 @@ class Stage:
 
     @property
     def excess(self) -> float:
-        """How much more misfit there is than noise makes."""
-        return max(0.0, self.fit.cost - self.prepared.readings)
+        """How much more misfit there is than noise may make."""
+        return max(0.0, self.fit.cost - (1 + SLACK) * self.prepared.readings)
 
     @property
     def suspects(self) -> list[str]:

@@ -467,7 +467,10 @@ def _all_linear(
     for r, p, begin in zip(records, points, starts, strict=True):
         if not (c.pivots(p.s[::10], X)[0] > 0).all():
             return None
-        found = linearise(c, r, p, begin.s[0], X, disturbed)
+        try:
+            found = linearise(c, r, p, begin.s[0], X, disturbed)
+        except np.linalg.LinAlgError:  # so far off that the chain has no numbers any more
+            found = None
         if found is None:
             return None
         linear.append(found)

@@ -299,12 +299,19 @@ _declare(
         "stribeck_friction",
         ("joints",),
         "N m",
-        "friction above Fs near standstill, fading with speed: A sgn(w) exp(-(w/decay)^2)",
+        "friction above Fs near standstill, fading with speed: A sgn(w) exp(-abs(w/decay)^power)",
         "torque missing just after every start and reversal",
         "Stribeck 1902; Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30 (1994), eq. (4)",
         _coulomb(0.5),
-        {"decay": Shape("rad/s", 15.0, (4.0, 12.0, 36.0), _smooth)},
-        torque=lambda s, k, p: -p["A"] * s.sign(k) * ca.exp(-((s.w[k] / p["decay"]) ** 2)),
+        {
+            "decay": Shape("rad/s", 15.0, (4.0, 12.0, 36.0), _smooth),
+            "power": Shape("-", 2.0, (1.0, 2.0), whole=True),
+        },
+        torque=lambda s, k, p: (
+            -p["A"]
+            * s.sign(k)
+            * ca.exp(-(((s.w[k] ** 2 + (0.1 * s.smooth[k]) ** 2) / p["decay"] ** 2) ** (p["power"] / 2)))
+        ),
     ),
     Effect(
         "load_dependent_friction",
