@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -742,6 +743,8 @@ def _exit_code(err: Exception) -> int | None:
 
     if isinstance(err, UsageError | MachineError | LogError | FolderError | StoredError | DriveError | StudyError):
         return 2
+    if isinstance(err, OSError) and err.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
+        return 1
     if isinstance(err, NoEstimate | InfeasibleError | SimulationError | ServeError | EngineError | StoreError):
         return 1
     return None

@@ -356,16 +356,19 @@ def _advance(
         interior.Level(p, stage.barrier / 3**i, stage.patience / p, stage.iterations) for i, p in enumerate(sharp)
     )
     kept = not fresh
-    if kept:
-        point = interior.begin(tr, task, start, Z, U, stage.barrier, 1e-3)
-        point, state = interior.minimise(tr, task, point, levels, watch)
-        kept = interior.infeasibility(state, point) < STUCK
-    if not kept:  # by way of the nearest torques that keep every limit and come to rest
-        near = replace(task, aim=None, pull=1.0, goal=U)
-        point = interior.begin(tr, near, start, Z, U, 1e-3, 0.05)
-        point, _ = interior.minimise(tr, near, point, (interior.Level(1.0, 1e-3, 1e-3, 40),), watch)
-        point = interior.begin(tr, task, point.start, point.Z, point.U, max(stage.barrier, 1e-4), 0.05)
-        point, _ = interior.minimise(tr, task, point, levels, watch)
+    try:
+        if kept:
+            point = interior.begin(tr, task, start, Z, U, stage.barrier, 1e-3)
+            point, state = interior.minimise(tr, task, point, levels, watch)
+            kept = interior.infeasibility(state, point) < STUCK
+        if not kept:  # by way of the nearest torques that keep every limit and come to rest
+            near = replace(task, aim=None, pull=1.0, goal=U)
+            point = interior.begin(tr, near, start, Z, U, 1e-3, 0.05)
+            point, _ = interior.minimise(tr, near, point, (interior.Level(1.0, 1e-3, 1e-3, 40),), watch)
+            point = interior.begin(tr, task, point.start, point.Z, point.U, max(stage.barrier, 1e-4), 0.05)
+            point, _ = interior.minimise(tr, task, point, levels, watch)
+    except np.linalg.LinAlgError:  # the information is singular: the machine hardly moves
+        return None
     try:
         found, motion = verdict(model, problem, aim, Manoeuvre(times, point.U * tr.torque_scale))
     except SimulationError:
