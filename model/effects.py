@@ -476,7 +476,7 @@ _declare(
         "piston motors, Ivantysyn, Hydrostatic Pumps and Motors, 2001",
         _constant(100.0),
         {
-            "order": Shape("1/turn", 5.0, tuple(float(n) for n in range(2, 13)), whole=True),
+            "order": Shape("1/turn", 5.0, tuple(float(n) for n in range(2, 21)), whole=True),
             "phase": PHASE,
         },
         torque=lambda s, k, p: p["A"] * ca.sin(p["order"] * s.q[k] + p["phase"]),
