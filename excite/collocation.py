@@ -230,8 +230,9 @@ def transcribe(
     q = ca.SX(n_q, 1)
     for k, c in enumerate(used):
         q[model.coordinates.index(c)] = z[k]
-    nu, a = (x[len(used) : len(used) + n_q] for x in (z, rate))
-    kept = z[len(used) + n_q :]
+    memory = len(used) + n_q
+    nu, a = (ca.vertcat(*ca.vertsplit(x)[len(used) : memory]) for x in (z, rate))
+    kept, kept_rate = (ca.vertcat(*ca.vertsplit(x)[memory:], ca.SX(0, 1)) for x in (z, rate))
     beside = () if model.plain else (u, kept)
     p = model.expand @ model.nominal
     drive = ca.SX(n_q, 1)
@@ -239,9 +240,7 @@ def transcribe(
         drive[row] = u[k]
     dq = model.kinematics(q, nu)[0]
     turns = [(rate[k] - dq[model.coordinates.index(c)]) * knot / z_size[k] for k, c in enumerate(used)]
-    going = (
-        (rate[len(used) + n_q :] - model.flow(q, nu, u, kept, model.nominal)) * knot / ca.DM(z_size[len(used) + n_q :])
-    )
+    going = (kept_rate - model.flow(q, nu, u, kept, model.nominal)) * knot / ca.DM(z_size[memory:])
     balance = (model.balance(q, nu, a, p, *beside) - drive) / float(u_size.max())
     residual = ca.vertcat(*turns, balance, going)
     g = ca.vertcat(*[(g.expression(q, nu, u, 0) - g.centre) * (2 / g.range) for g in staged], ca.SX(0, 1))
