@@ -30,6 +30,7 @@ HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate i
 STRONG = 1.3  # misfit over readings from which first-order gains are rough
 PASSES = 14  # of a candidate's fit
 NEARLY = 1.0  # step, in standard deviations, at which a fit that runs out of passes is as good as found
+ROUGHLY = 2  # the same where not even the model without them was fitted
 TRIED = 5  # candidates that are fitted, of different names
 MOST = 4  # effects that are looked for
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
@@ -210,7 +211,9 @@ def fitted(
             if of is not None and of.exact:
                 raise
     stood: Fit | None = None
-    for disturbed in smoothing.DISTURBED:
+    # A candidate is tried as its model was fitted, a model with more and more disturbing forces.
+    levels = smoothing.DISTURBED if of is None or of.exact else (of.fit.disturbed,)
+    for disturbed in levels:
         try:
             return Stage(machine, prepared, solve(disturbed))
         except NotConverged as failed:
@@ -260,7 +263,7 @@ def _shortlist(stage: Stage, scores: Sequence[evidence.Score]) -> list[evidence.
     for s in scores:
         if s.gain >= max(WORTH, HOPE[rough] * scores[0].gain) and s.values["A"] != 0:
             best.setdefault(s.candidate.name, s)
-    return list(best.values())[:TRIED]
+    return list(best.values())[: TRIED if stage.settled else ROUGHLY]
 
 
 def _choose(
