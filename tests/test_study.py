@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import shutil
 import signal
 import sqlite3
@@ -520,58 +519,6 @@ def test_killed_at_random_times_it_loses_nothing(
     done = [tmp_path / "out", *tmp_path.glob("finished*")]
     assert {(p / "runs.parquet").read_bytes() for p in done} == {reference}
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")], "something is left behind"
-
-
-def children(pid: int) -> list[int]:
-    """Processes below this one."""
-    found = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True).stdout.split()
-    return [c for p in map(int, found) for c in (p, *children(p))]
-
-
-@pytest.mark.slow
-def test_the_command_survives_the_death_of_workers_and_its_own(
-    tiny: Callable[..., Plan], tmp_path: Path, snapshot: dict[str, str]
-) -> None:
-    """The real command with two processes: workers killed under way, then the driver, then Ctrl-C to all of them."""
-    study.carry(tiny(400), tmp_path / "reference", jobs=1)
-    command = [sys.executable, "-m", "excite", "study", "tiny.toml", "--jobs", "2", "--out", "out"]
-    rng, worker_kills, ends = random.Random(3), 0, []
-    for _ in range(40):
-        run = subprocess.Popen(command, cwd=tmp_path, env=snapshot, stderr=subprocess.PIPE, start_new_session=True)
-        how = rng.choice(["worker", "driver", "interrupt"])
-        start = time.monotonic()
-        while run.poll() is None and time.monotonic() - start < 120:
-            rows = kept_rows(tmp_path / "out")
-            if rows > 0 and how == "worker":
-                workers = [p for p in children(run.pid) if "resource_tracker" not in command_of(p)]
-                if workers:
-                    os.kill(rng.choice(workers), signal.SIGKILL)
-                    worker_kills += 1
-                    how = rng.choice(["driver", "interrupt"])
-            time.sleep(rng.uniform(0.5, 3))
-            if how != "worker" and run.poll() is None:
-                os.kill(run.pid, signal.SIGKILL) if how == "driver" else os.killpg(run.pid, signal.SIGINT)
-                break
-        _, stderr = run.communicate(timeout=120) if how != "driver" else (None, b"")
-        run.wait(timeout=120)
-        ends.append(run.returncode)
-        assert run.returncode in (0, -9, 130), stderr.decode()
-        assert b"Traceback" not in stderr, stderr.decode()
-        if run.returncode == 0:
-            break
-    if not (tmp_path / "out").exists():
-        subprocess.run(command, cwd=tmp_path, env=snapshot, check=True, timeout=600)
-    print(f"\n{worker_kills} workers and {len(ends)} commands ended: {ends}")
-    table, reference = (pd.read_parquet(tmp_path / n / "runs.parquet") for n in ("out", "reference"))
-    same = [c for c in table.columns if c != "versions"]
-    pd.testing.assert_frame_equal(table[same], reference[same])
-
-
-def command_of(pid: int) -> str:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_text()
-    except OSError:
-        return "resource_tracker"
 
 
 def kept_rows(out: Path) -> int:
