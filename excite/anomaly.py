@@ -14,7 +14,6 @@ import scipy.ndimage
 import scipy.signal
 import scipy.stats
 
-from excite.innovations import innovations
 from excite.log import Log
 from excite.processing import white_noise
 from excite.smoothing import Fit
@@ -54,8 +53,7 @@ class Anomaly:
 
 def anomalies(machine: Machine, sensors: tuple[Sensor, ...], log: Log, fit: Fit, number: int = 0) -> list[Anomaly]:
     """What a fitted log holds beside noise, the most striking first. number: which of the fit's logs it is."""
-    linear = fit.linear[number]
-    z = innovations(linear)
+    z = fit.linear[number].innovations
     t, rate = log.t, float(machine.sampling_hz)
     found: list[Anomaly] = []
     for j, sensor in enumerate(sensors):

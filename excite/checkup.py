@@ -55,7 +55,7 @@ def write(
         "logs": [one.source for one in mended],
         **said,
         "machine_file": MACHINE if text is not None else None,
-        "notes": [*notes, *said["notes"]],
+        "notes": notes,
         "versions": dict(versions),
     }
     portrait.write(place, account, summary["signals"], model.machine.title)

@@ -24,14 +24,14 @@ from model import effects
 from model.machine import EffectEntry, Filter, Machine, Quantity
 from model.prediction import Model, build
 
-LEVEL = 22.0  # of twice the log-likelihood that an effect must gain; 200 logs without any stayed below
+LEVEL = 22.0  # of twice the log-likelihood that an effect must gain; logs without any stayed below 16
 WORTH = 15.0  # a first-order gain below which a candidate isn't fitted
 HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
 STRONG = 1.3  # misfit over readings from which first-order gains are rough
 PASSES = 14  # of a candidate's fit
 NEARLY = 1.0  # step, in standard deviations, at which a fit that runs out of passes is as good as found
-ROUGHLY = 2  # the same where not even the model without them was fitted
 TRIED = 5  # candidates that are fitted, of different names
+ROUGHLY = 2  # the same where not even the model without them was fitted
 MOST = 4  # effects that are looked for
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
@@ -122,8 +122,7 @@ class Diagnosis:
     share: float
     scores: tuple[evidence.Score, ...]
     located: tuple[str, ...]
-    notes: tuple[str, ...]
-    stages: tuple[Stage, ...] = ()
+    stages: tuple[Stage, ...]
 
 
 def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance | None = None) -> Diagnosis:
@@ -152,7 +151,7 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
         chosen.pop()
         stage = chosen[-1].stage if chosen else before
         odd = _odd(stage)
-    return replace(_verdict(before, stage, chosen, first, odd), stages=tuple(x.stage for x in chosen))
+    return _verdict(before, stage, chosen, first, odd)
 
 
 def _odd(stage: Stage) -> tuple[str, ...]:
@@ -192,7 +191,7 @@ def fitted(
         old = dict(zip(of.model.base.names, of.fit.X, strict=True))
         X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, X, strict=True)])
         points = tuple(carried(c, r, p, of.prepared.c, X) for r, p in zip(prepared.records, of.fit.points, strict=True))
-        damping, passes = damping * smoothing.DAMPING[1] ** 2, PASSES
+        damping, passes = smoothing.RESUMED, PASSES
 
     def solve(disturbed: float) -> Fit:
         try:
@@ -338,7 +337,7 @@ def _verdict(
         verdict = "tied" if any(f.tied_with for f in findings) else "named"
     if not after.settled or (odd and (share < SHARE or not findings)) or (not after.exact and not findings):
         verdict = "unexplained"
-    return Diagnosis(verdict, findings, before, after, share, tuple(scores), odd, ())
+    return Diagnosis(verdict, findings, before, after, share, tuple(scores), odd, tuple(x.stage for x in chosen))
 
 
 def _finding(choice: _Choice, after: Stage) -> Finding:

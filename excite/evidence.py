@@ -19,9 +19,11 @@ import numpy as np
 from excite import smoothing
 from excite.innovations import whitened
 from excite.linearise import BATCH, Batch, Chart, Slopes, differentiate
-from excite.record import Point, Record
+from excite.processing import implicit
+from excite.record import Point, Record, smoothed
 from model import effects
 from model.effects import CATALOGUE, Effect, Placed
+from model.equations import Signatures as MadeSignatures
 from model.equations import signatures
 from model.machine import Machine
 
@@ -148,20 +150,15 @@ class Signatures:
         self.force, self.reading = Batch(made.force, (7,)), Batch(made.reading, (7,))
         self.rows = [model.readable.index(s.name) for s in c.sensors]
         self.p = (model.expand @ fit.X)[: len(standard)]
-        u, _ = c.delivered(r.torque, fit.X)
-        u = u + np.concatenate([p.w, p.w[-1:]])
-        q, nu, z = c.parts(p.s)
-        known = () if model.plain else (z.T,)
-        a = model.acceleration(q.T, nu.T, u.T, *known, fit.X).full().T
+        q, nu, z, u, a = smoothed(c, r, p, fit.X)
         t = np.arange(len(u)) / float(model.machine.sampling_hz)
         wheels = np.zeros((len(u), sum(s.kind == "wheel" for s in model.machine.sensor)))
         n_q = q.shape[1]
         for k, at in enumerate(c.index):
             if 2 * n_q <= at < 2 * n_q + wheels.shape[1]:
                 wheels[:, at - 2 * n_q] = p.s[:, k]
-        plain = np.zeros((len(u), len(model.memory)))
-        exact = model.read(q.T, nu.T, wheels.T, u.T, plain.T if model.plain else z.T, fit.X).full().T
-        memory = _remembered(made.flow, q, nu, u, t, self.p)
+        exact = model.read(q.T, nu.T, wheels.T, u.T, z.T, fit.X).full().T
+        memory = remembered(made, q, nu, u, t, self.p)
         self.samples = (q, nu, a, u, t[:, None], memory, exact)
         self.torque = np.zeros((*u.shape, self.columns))
         for k, e in enumerate(every):
@@ -196,11 +193,7 @@ def _pushed(c: Chart, by: Slopes, force: np.ndarray, torque: np.ndarray) -> np.n
 
 def _misread(c: Chart, e: Placed, measured: np.ndarray, u: np.ndarray, t: np.ndarray) -> np.ndarray:
     """How much more torque would be delivered (N, n_u) where a channel reads as the effect has it."""
-    assert e.effect.channel is not None
-    time = ca.SX.sym("t")
-    channel = e.effect.channel(time, {k: ca.SX(v) for k, v in e.values.items()})
-    read = ca.Function("channel", [time], [ca.SX(x) for x in (channel.gain, channel.offset, channel.delay)])
-    gain, offset, delay = (np.broadcast_to(x.full()[0], t.shape) for x in read(t[None]))
+    gain, offset, delay = e.channel(t)
     more = np.zeros_like(u)
     for k, body in enumerate(c.model.machine.actuated):
         if body.index in e.bodies:
@@ -209,22 +202,17 @@ def _misread(c: Chart, e: Placed, measured: np.ndarray, u: np.ndarray, t: np.nda
     return more
 
 
-def _remembered(
-    flow: ca.Function, q: np.ndarray, nu: np.ndarray, u: np.ndarray, t: np.ndarray, p: np.ndarray
+def remembered(
+    made: MadeSignatures, q: np.ndarray, nu: np.ndarray, u: np.ndarray, t: np.ndarray, p: np.ndarray
 ) -> np.ndarray:
-    """What candidates remember (N, n_z) along a motion: linearly implicit Euler, sample by sample."""
-    n_z = flow.size1_in(4)
+    """What effects with these signatures remember (N, n_z) along a motion, from rest."""
+    n_q, n_u, n_z = q.shape[1], u.shape[1], made.flow.size1_in(4)
     if n_z == 0:
         return np.zeros((len(t), 0))
-    n_q, n_u = q.shape[1], u.shape[1]
     at, z = ca.SX.sym("at", 2 * n_q + n_u + 1), ca.SX.sym("z", n_z)
-    rate = flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q : -1], at[-1], z, p)
-    h = float(t[1] - t[0])
-    # Each remembers for itself: the Jacobian is diagonal.
-    slope = ca.diag(ca.jacobian(rate, z))
-    step = ca.Function("step", [z, at], [z + h * rate / (1 - h * slope)])
-    path = step.mapaccum("path", len(t) - 1)(np.zeros(n_z), np.hstack([q, nu, u, t[:, None]])[:-1].T)
-    return np.vstack([np.zeros(n_z), path.full().T])
+    rate = made.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q : -1], at[-1], z, ca.DM(p))
+    flow = ca.Function("flow", [z, at], [rate])
+    return implicit(flow, np.zeros(n_z), np.hstack([q, nu, u, t[:, None]]), float(t[1] - t[0]))
 
 
 def scan(c: Chart, records: Sequence[Record], fit: smoothing.Fit, found: Sequence[Candidate]) -> Scan:

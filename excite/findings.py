@@ -80,7 +80,6 @@ def summary(a: Account) -> dict[str, Any]:
         "located": list(a.located),
         "parameters": parameters(d),
         "exact": {"before": d.before.exact, "after": d.after.exact},
-        "notes": list(d.notes),
     }
 
 

@@ -73,16 +73,15 @@ def withheld(stage: Stage) -> Withheld | None:
         for a, b in own:
             used[a:b] = 0.0
         masked.append(replace(r, used=used))
-    damping = smoothing.DAMPING[0] * smoothing.DAMPING[1] ** 2
     try:
         rest = smoothing.iterate(
-            c, masked, fit.points, fit.X, prepared.starts, fit.disturbed, prepared.held | fit.unseen, damping
+            c, masked, fit.points, fit.X, prepared.starts, fit.disturbed, prepared.held | fit.unseen, smoothing.RESUMED
         )
     except NotConverged:
         return None
     squares, counts, motion, noise = [], [], [], []
     for r, p, own in zip(prepared.records, rest.points, stretches, strict=True):
-        u = c.delivered(r.torque, rest.X)[0] + np.concatenate([p.w, p.w[-1:]])
+        u = c.delivered(r.torque, rest.X)[0] + p.errors
         h, _, weight, *_ = readings(c, r, p, u, rest.X)
         noise.append(r.used.sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300))
         for a, b in own:

@@ -19,7 +19,7 @@ SLOW = 25  # readings whose mean counts as slow
 
 
 @dataclass(frozen=True)
-class _Step:
+class Step:
     """A filter's step j in all parts that are as long: samples `at`, which parts `going`, gain K, whitening root."""
 
     at: np.ndarray
@@ -33,7 +33,7 @@ def innovations(linear: Linear) -> np.ndarray:
     """Each reading less its prediction from all before it, over its standard deviation (N, m); NaN where unused."""
     z = np.full(linear.residual.shape, np.nan)
     x = _before(linear)
-    for step in _filter(linear):
+    for step in linear.filter:
         e = linear.residual[step.at, :, None] - linear.H[step.at] @ x[step.going, :, None]
         size = np.sqrt(np.diagonal(step.root @ step.root.transpose(0, 2, 1), axis1=1, axis2=2))
         z[step.at] = np.where(step.used, e[:, :, 0] / size, np.nan)
@@ -45,7 +45,7 @@ def innovations(linear: Linear) -> np.ndarray:
 def innovation_sizes(linear: Linear) -> np.ndarray:
     """Mean square of the normalised innovations of every sensor, and of their means over blocks, times the block, both
     1 where model and noise are right; and the number of blocks: (m, 3)."""
-    z = innovations(linear)
+    z = linear.innovations
     sizes = np.zeros((z.shape[1], 3))
     for j, column in enumerate(z.T):
         own = column[np.isfinite(column)]
@@ -72,7 +72,7 @@ def whitened(linear: Linear, flawed: tuple[int, ...], push: np.ndarray, reading:
     x = np.zeros((parts, n, columns + n))
     x[:, :, columns:] = np.eye(n)
     told = np.concatenate([1 + np.array(flawed, int), np.arange(own - linear.direct.shape[2] + n_f, own)])
-    for step in _filter(linear):
+    for step in linear.filter:
         y = np.zeros((len(step.going), m, columns + n))
         y[:, :, 0] = linear.residual[step.at]
         y[:, :, told] = -linear.direct[step.at]
@@ -116,12 +116,12 @@ def _known(linear: Linear) -> tuple[np.ndarray, np.ndarray]:
     return x, P
 
 
-def _filter(linear: Linear) -> list[_Step]:
+def steps(linear: Linear) -> list[Step]:
     """The filter's gains, which don't depend on data, step by step in all parts."""
     starts = np.cumsum([0, *(len(s) for s in linear.stages)])
     P = _known(linear)[1]
     most = linear.weight.max(axis=0)
-    steps = []
+    found = []
     for j in range(max(len(s) for s in linear.stages)):
         going = np.array([i for i, s in enumerate(linear.stages) if j < len(s)])
         at = starts[going] + j
@@ -136,11 +136,11 @@ def _filter(linear: Linear) -> list[_Step]:
         A, C = (np.stack([getattr(linear.stages[i], f)[j] for i in going]) for f in ("A", "C"))
         left = P[going] - K @ PH.transpose(0, 2, 1)
         P[going] = A @ ((left + left.transpose(0, 2, 1)) / 2) @ A.transpose(0, 2, 1) + C
-        steps.append(_Step(at, going, K, np.linalg.cholesky(S), weight > 0))
-    return steps
+        found.append(Step(at, going, K, np.linalg.cholesky(S), weight > 0))
+    return found
 
 
-def _leading(linear: Linear, step: _Step) -> tuple[np.ndarray, np.ndarray]:
+def _leading(linear: Linear, step: Step) -> tuple[np.ndarray, np.ndarray]:
     """Transition and drift (n, 1 + n_p + n_o) behind a step, of the parts that go on."""
     starts = np.cumsum([0, *(len(s) for s in linear.stages)])
     j = int(step.at[0] - starts[step.going[0]])

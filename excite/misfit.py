@@ -14,7 +14,6 @@ import numpy as np
 import scipy.signal
 
 from excite.diagnose import Stage, fitted
-from excite.innovations import innovations
 from excite.linearise import advance, differentiate
 from excite.smoothing import NotConverged, state_scale
 
@@ -89,7 +88,7 @@ def _course(stage: Stage, k: int) -> Course:
     N = len(p.s)
     rate = float(stage.machine.sampling_hz)
     t = np.arange(N) / rate
-    w = np.concatenate([p.w, p.w[-1:]])
+    w = p.errors
     u = c.delivered(r.torque, fit.X)[0] + w
     q, nu, _ = c.parts(p.s)
     missing: dict[str, tuple[np.ndarray, str, float]] = {}
@@ -110,7 +109,7 @@ def _course(stage: Stage, k: int) -> Course:
         missing,
         _quantities(stage, q, nu, u, own),
         tuple(s.name for s in c.sensors),
-        innovations(fit.linear[k]),
+        fit.linear[k].innovations,
     )
 
 

@@ -107,18 +107,21 @@ def _beside(model: Model, q: np.ndarray, nu: np.ndarray, Y: np.ndarray) -> tuple
 
 
 def remember(model: Model, q: np.ndarray, nu: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """What effects remember (N, n_z) along a motion, from rest: linearly implicit Euler, sample by sample."""
-    n_q, n_u, n_z = len(model.coordinates), len(model.inputs), len(model.memory)
-    at = ca.SX.sym("at", 2 * n_q + n_u)
-    z, p = ca.SX.sym("z", n_z), ca.SX.sym("X", len(X))
-    rate = model.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q :], z, p)
-    h = 1 / float(model.machine.sampling_hz)
-    ahead = z + ca.solve(ca.SX.eye(n_z) - h * ca.jacobian(rate, z), h * rate)
-    step = ca.Function("step", [z, at, p], [ahead])
-    path = step.mapaccum("path", len(q) - 1)(
-        model.fresh, np.hstack([q, nu, u])[:-1].T, ca.repmat(ca.DM(X), 1, len(q) - 1)
-    )
-    return np.vstack([model.fresh, path.full().T])
+    """What a model's effects remember (N, n_z) along a motion, from rest."""
+    n_q, n_u = len(model.coordinates), len(model.inputs)
+    at, z = ca.SX.sym("at", 2 * n_q + n_u), ca.SX.sym("z", len(model.memory))
+    rate = model.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q :], z, ca.DM(X))
+    flow = ca.Function("flow", [z, at], [rate])
+    return implicit(flow, model.fresh, np.hstack([q, nu, u]), 1 / float(model.machine.sampling_hz))
+
+
+def implicit(flow: ca.Function, start: np.ndarray, along: np.ndarray, step: float) -> np.ndarray:
+    """z (N, n_z) of dz/dt = flow(z, along) for given signals (N, k): linearly implicit Euler, a step [s] a sample."""
+    z, at = ca.SX.sym("z", len(start)), ca.SX.sym("at", along.shape[1])
+    rate = flow(z, at)
+    ahead = z + ca.solve(ca.SX.eye(len(start)) - step * ca.jacobian(rate, z), step * rate)
+    path = ca.Function("step", [z, at], [ahead]).mapaccum("path", len(along) - 1)(start, along[:-1].T)
+    return np.vstack([start, path.full().T])
 
 
 def unmeasured(model: Model, log: Log) -> tuple[int, ...]:

@@ -58,6 +58,11 @@ class Point:
     w: np.ndarray
     offset: np.ndarray
 
+    @property
+    def errors(self) -> np.ndarray:
+        """Torque errors of every sample (N, n_u); no interval leads on from the last, which has the one before."""
+        return np.concatenate([self.w, self.w[-1:]])
+
 
 def common_sensors(model: Model, logs: Sequence[Log]) -> tuple[str, ...]:
     """Sensors that every log has."""
@@ -124,6 +129,17 @@ def first_point(c: Chart, r: Record, log: Log, filter: Filter) -> Point:
                 [[0], np.cumsum(speed[1:] + speed[:-1]) / (2 * rate)]
             )
     return Point(s, np.zeros_like(r.torque[1:]), np.zeros(len(r.origin)))
+
+
+def smoothed(
+    c: Chart, r: Record, p: Point, X: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The motion at a point: q, nu (N, n_q), what effects remember (N, n_z), delivered torques u (N, n_u), and the
+    accelerations (N, n_q) that follow from these."""
+    q, nu, z = c.parts(p.s)
+    u = c.delivered(r.torque, X)[0] + p.errors
+    known = () if c.model.plain else (z.T,)
+    return q, nu, z, u, c.model.acceleration(q.T, nu.T, u.T, *known, X).full().T
 
 
 def carried(c: Chart, r: Record, p: Point, of: Chart, X: np.ndarray) -> Point:

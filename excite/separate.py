@@ -11,10 +11,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
-import casadi as ca
 import numpy as np
 
 from excite.diagnose import Diagnosis, Stage
+from excite.evidence import remembered
+from excite.record import smoothed
 from model import effects
 from model.effects import Placed, Site
 from model.equations import Signatures, signatures
@@ -110,10 +111,7 @@ def _motion(stage: Stage) -> Motion:
     c, fit = stage.prepared.c, stage.fit
     k = int(np.argmax([len(log) for log in stage.prepared.logs]))
     p, r = fit.points[k], stage.prepared.records[k]
-    u = c.delivered(r.torque, fit.X)[0] + np.concatenate([p.w, p.w[-1:]])
-    q, nu, z = c.parts(p.s)
-    beside = () if stage.model.plain else (z.T,)
-    a = stage.model.acceleration(q.T, nu.T, u.T, *beside, fit.X).full().T
+    q, nu, _, u, a = smoothed(c, r, p, fit.X)
     root = stage.machine.body[0].coordinates
     if stage.machine.planar and root[2] in stage.model.coordinates:
         heading = stage.model.coordinates.index(root[2])
@@ -137,7 +135,7 @@ class _Asked:
 
     def __call__(self, m: Motion) -> np.ndarray:
         N, C = len(m.t), len(self.placed)
-        z = self._remembered(m)
+        z = remembered(self.made, m.q, m.nu, m.u, m.t, self.p)
         exact = np.broadcast_to(np.abs(m.t)[:, None], (N, self.readings)) * 0.1
         exact = exact * np.sign(m.nu.sum() or 1.0)
         given = [x.T for x in (m.q, m.nu, m.a, m.u, m.t[:, None], z, exact)]
@@ -151,30 +149,13 @@ class _Asked:
 
     def _misread(self, e: Placed, m: Motion) -> np.ndarray:
         """What a torque channel reads beside the torque (n_q, N)."""
-        assert e.effect.channel is not None
-        time = ca.SX.sym("t")
-        channel = e.effect.channel(time, {k: ca.SX(v) for k, v in e.values.items()})
-        read = ca.Function("channel", [time], [ca.SX(x) for x in (channel.gain, channel.offset, channel.delay)])
-        gain, offset, delay = (np.broadcast_to(x.full()[0], m.t.shape) for x in read(m.t[None]))
+        gain, offset, delay = e.channel(m.t)
         added = np.zeros((m.q.shape[1], len(m.t)))
         for k, body in enumerate(self.machine.actuated):
             if body.index in e.bodies:
                 rate = np.gradient(m.u[:, k], m.t)
                 added[self.rows[body.index]] = (gain - 1) * m.u[:, k] + offset - delay * rate
         return added
-
-    def _remembered(self, m: Motion) -> np.ndarray:
-        flow = self.made.flow
-        n_z = flow.size1_in(4)
-        if n_z == 0:
-            return np.zeros((len(m.t), 0))
-        h = float(m.t[1] - m.t[0])
-        n_q, n_u = m.q.shape[1], m.u.shape[1]
-        at, z = ca.SX.sym("at", 2 * n_q + n_u + 1), ca.SX.sym("z", n_z)
-        rate = flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q : -1], at[-1], z, self.p)
-        step = ca.Function("step", [z, at], [z + h * rate / (1 - h * ca.diag(ca.jacobian(rate, z)))])
-        path = step.mapaccum("path", len(m.t) - 1)(np.zeros(n_z), np.hstack([m.q, m.nu, m.u, m.t[:, None]])[:-1].T)
-        return np.vstack([np.zeros(n_z), path.full().T])
 
 
 def _split(here: np.ndarray, there: np.ndarray, pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:

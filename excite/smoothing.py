@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from excite import chain, hidden
 from excite.estimate import Estimate, NoEstimate, NotIdentifiable
-from excite.innovations import innovation_sizes
+from excite.innovations import Step, innovation_sizes, innovations, steps
 from excite.linearise import BATCH, Chart, advance, chart, differentiate
 from excite.log import Log
 from excite.processing import decimate, derivative
@@ -33,6 +34,7 @@ from excite.record import (
     origins,
     readings,
     record,
+    smoothed,
     torque_sensor,
 )
 from excite.simulate import Motion
@@ -45,6 +47,7 @@ HELD = 1e-6  # standard deviation of such a parameter, in its scale
 SETTLED = 3  # passes until the states fit the dynamics well enough to tell which these are
 UNSEEN = 1.0  # a parameter that a log tells less than this well, in its scale, stays at the machine file's value
 DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's scale, and its share from pass to pass
+RESUMED = DAMPING[0] * DAMPING[1] ** 2  # damping of a fit that goes on from another
 HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
 CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviations
 ENOUGH = 0.2  # likewise with disturbing forces, whose deviations are no promise
@@ -96,6 +99,16 @@ class Linear:
     residual: np.ndarray
     direct: np.ndarray
     noise: np.ndarray
+
+    @cached_property
+    def innovations(self) -> np.ndarray:
+        """Of every reading (N, m), normalised; NaN where unused."""
+        return innovations(self)
+
+    @cached_property
+    def filter(self) -> list[Step]:
+        """The Kalman filter's steps along the log."""
+        return steps(self)
 
 
 @dataclass(frozen=True)
@@ -198,19 +211,15 @@ def _estimate(c: Chart, records: Sequence[Record], fit: Fit, filter: Filter, not
     }
     W, Y, errors = [], [], []
     for r, p in zip(records, fit.points, strict=True):
-        w = np.concatenate([p.w, p.w[-1:]])
-        q, nu, z = c.parts(p.s)
-        u = c.delivered(r.torque, fit.X)[0] + w
-        remembered = () if model.plain else (z.T,)
-        a = model.acceleration(q.T, nu.T, u.T, *remembered, fit.X).full()
+        q, nu, z, u, a = smoothed(c, r, p, fit.X)
         beside = () if model.plain else (u.T, z.T)
         forced = fit.disturbed > 0 and model.plain
         if forced:  # what the forces do is not the model's
-            a = derivative(nu.T, float(model.machine.sampling_hz))
-        rows = model.stacked(q.T, nu.T, a, *beside)
+            a = derivative(nu.T, float(model.machine.sampling_hz)).T
+        rows = model.stacked(q.T, nu.T, a.T, *beside)
         W.append(rows.reshape(-1, len(fit.X)))
         measured, error = np.zeros((2, len(model.rows), len(u)))
-        measured[list(model.actuated)], error[list(model.actuated)] = r.torque.T, -w.T
+        measured[list(model.actuated)], error[list(model.actuated)] = r.torque.T, -p.errors.T
         if forced:
             error = measured - (rows @ fit.X).T
         Y.append(decimate(measured, filter.decimation))
@@ -294,7 +303,7 @@ def linearise(
         defect = advance(c, p.s[:-1], delivered[:-1] + p.w, delivered[1:] + p.w, X) - p.s[1:]
         if not np.isfinite(defect).all():
             return None
-    u = delivered + np.concatenate([p.w, p.w[-1:]])
+    u = delivered + p.errors
     h, H, weight, D, flaws = readings(c, r, p, u, X)
     residual = np.zeros_like(h) if exact else np.where(r.used > 0, r.reading - h, 0.0)
     flaws = flaws * c.model.scale[list(c.flawed)]

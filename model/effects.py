@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from math import pi
 
 import casadi as ca
+import numpy as np
 
 from model import contact as law
 from model.machine import Body, Contact, EffectEntry, Machine, MachineError, Quantity, Sensor
@@ -713,6 +714,15 @@ class Placed:
         """Names as parameters of the model -> (value's key, unit): the amount first, then the shapes."""
         named = {self.name: ("A", self.effect.unit)}
         return named | {f"{self.name}.{s}": (s, shape.unit) for s, shape in self.effect.shapes.items()}
+
+    def channel(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gain, offset and delay (N,) that the effect gives a torque sensor at times t (N,) [s]."""
+        assert self.effect.channel is not None
+        time = ca.SX.sym("t")
+        own = self.effect.channel(time, {k: ca.SX(v) for k, v in self.values.items()})
+        read = ca.Function("channel", [time], [ca.SX(x) for x in (own.gain, own.offset, own.delay)])
+        gain, offset, delay = (np.broadcast_to(x.full()[0], t.shape) for x in read(t[None]))
+        return gain, offset, delay
 
 
 def places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...], str | None]]:

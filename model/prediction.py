@@ -36,6 +36,13 @@ class BaseParameters:
     invisible: tuple[str, ...]
     standard: tuple[str, ...]
 
+    @cached_property
+    def expand(self) -> np.ndarray:
+        """(n_standard, n_base): standard parameters with the same motions as the base parameters X (the rest zero)."""
+        matrix = np.zeros((len(self.standard), len(self.names)))
+        matrix[list(self.independent), range(len(self.names))] = 1.0
+        return matrix
+
     def grouping(self, name: str) -> dict[str, float]:
         """The standard parameters that make up a base parameter, with their coefficients."""
         row = self.matrix[self.names.index(name)]
@@ -141,12 +148,10 @@ class Model:
         """Indices of the actuated coordinates, one per input."""
         return tuple(self.coordinates.index(b.coordinates[0]) for b in self.machine.actuated)
 
-    @cached_property
+    @property
     def expand(self) -> np.ndarray:
         """(n_standard, n_base): standard parameters with the same motions as the base parameters X (the rest zero)."""
-        matrix = np.zeros((len(self.base.standard), len(self.base.names)))
-        matrix[list(self.base.independent), range(len(self.base.names))] = 1.0
-        return matrix
+        return self.base.expand
 
     @cached_property
     def regressor(self) -> ca.Function:
@@ -346,9 +351,7 @@ def _of_base(function: ca.Function, base: BaseParameters) -> ca.Function:
     """A function whose last argument is standard parameters, of base parameters instead."""
     arguments = function.sx_in()[:-1]
     X = ca.SX.sym("X", len(base.names))
-    expand = np.zeros((len(base.standard), len(base.names)))
-    expand[list(base.independent), range(len(base.names))] = 1.0
-    results = function.call([*arguments, ca.mtimes(ca.sparsify(ca.DM(expand)), X)])
+    results = function.call([*arguments, ca.mtimes(ca.sparsify(ca.DM(base.expand)), X)])
     return ca.Function(function.name(), [*arguments, X], results)
 
 
