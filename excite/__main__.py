@@ -16,7 +16,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import typer  # noqa: E402
 
-from excite import terminal  # noqa: E402
+from excite import interrupt, terminal  # noqa: E402
 
 if TYPE_CHECKING:
     from excite.brief import Brief
@@ -705,14 +705,18 @@ def _versions() -> dict[str, str]:
 def main() -> None:
     """Runs a command: exit 0 done, 1 could not be done, 2 bad input or usage; one clear line on stderr."""
     signal.signal(signal.SIGTERM, _terminate)
+    said = interrupt.Heard()
     try:
-        result = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+        with interrupt.heard() as said:
+            result = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
     except typer.TyperException as err:
         _fail(" ".join(err.format_message().split()), 2)
     except (KeyboardInterrupt, typer.Abort):
         _fail("interrupted, nothing was written", INTERRUPTED)
     except Exception as err:
         code = _exit_code(err)
+        if code is None and said.stop:
+            _fail("interrupted, nothing was written", INTERRUPTED)
         if code is None:
             raise
         _fail(" ".join(str(err).split()), code)

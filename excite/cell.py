@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from excite import brief, identify, log, sensors
+from excite import brief, identify, interrupt, log, sensors
 from excite.brief import Brief
 from excite.estimate import NoEstimate
 from excite.examine import examine
@@ -75,8 +75,17 @@ def run(work: Work, seed: int) -> Row:
     """One run: status, reason where it failed, and what its steps found.
 
     A failure of the method (no estimate, no motion, a log that can't be used) is `failed`; any other error is a
-    defect of the program, which is told as such and doesn't end the study.
+    defect of the program, which is told as such and doesn't end the study. Raises KeyboardInterrupt for one that came
+    meanwhile, in whatever guise.
     """
+    with interrupt.heard() as said:
+        row = _judged(work, seed)
+    if said.stop:
+        raise KeyboardInterrupt
+    return row
+
+
+def _judged(work: Work, seed: int) -> Row:
     try:
         return {"status": DONE} | _run(work, seed)
     except (NoEstimate, SimulationError, LogError) as err:
@@ -157,6 +166,14 @@ class Designed:
 
 def designed(order: Order) -> Designed:
     """A study's drive. Raises KeyboardInterrupt where it was cut short."""
+    with interrupt.heard() as said:
+        made = _designed(order)
+    if said.stop:
+        raise KeyboardInterrupt
+    return made
+
+
+def _designed(order: Order) -> Designed:
     model = build(Machine.model_validate_json(order.machine))
     asked = Brief(order.objective, starts=order.starts, seed=order.seed)
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -420,6 +421,29 @@ def snapshot(tmp_path: Path) -> dict[str, str]:
     for name in ("excite", "model"):
         shutil.copytree(ROOT / name, tmp_path / "program" / name, ignore=shutil.ignore_patterns("__pycache__"))
     return os.environ | {"PYTHONPATH": str(tmp_path / "program"), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+
+
+@pytest.mark.parametrize("lost_as", [None, TypeError("'NoneType' object is not iterable")])
+def test_ctrl_c_that_casadi_loses_ends_a_run_all_the_same(
+    tiny: Callable[..., Plan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lost_as: Exception | None
+) -> None:
+    """A KeyboardInterrupt within CasADi's calls comes out as another error, or not at all: never a row of the table."""
+
+    def lost(*_: object) -> dict[str, object]:
+        with contextlib.suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+        if lost_as is not None:
+            raise lost_as
+        return {}
+
+    wanted = tiny(2)
+    with monkeypatch.context() as patched:
+        patched.setattr(cell, "_run", lost)
+        with pytest.raises(KeyboardInterrupt):
+            study.carry(wanted, tmp_path / "out", jobs=1)
+    assert kept_rows(tmp_path / "out") == 0
+    study.carry(wanted, tmp_path / "out", jobs=1)
+    assert set(pd.read_parquet(tmp_path / "out" / "runs.parquet")["status"]) == {"done"}
 
 
 NURSERY = '''

@@ -1,0 +1,45 @@
+"""Ctrl-C that doesn't get lost.
+
+CasADi's Python wrapper drops a KeyboardInterrupt that falls into one of its calls: what comes back is a None in the
+place of a matrix, or a NotImplementedError about the number of arguments (seen with 3.7 in about a tenth of 230
+interrupts). Taken at its word that is a defect of the program, or a run of a study that failed.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Heard:
+    """Whether somebody asked to stop."""
+
+    def __init__(self) -> None:
+        self.stop = False
+
+
+@contextmanager
+def heard() -> Iterator[Heard]:
+    """Notes Ctrl-C and a polite kill within, and leaves them to the handlers that were there (main thread only)."""
+    said = Heard()
+    if threading.current_thread() is not threading.main_thread():
+        yield said
+        return
+    before = {number: handler for number in SIGNALS if callable(handler := signal.getsignal(number))}
+
+    def note(number: int, frame: FrameType | None) -> None:
+        said.stop = True
+        before[signal.Signals(number)](number, frame)
+
+    for number in before:
+        signal.signal(number, note)
+    try:
+        yield said
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
