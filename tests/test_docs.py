@@ -19,7 +19,7 @@ from conftest import Excite
 
 from excite import reference
 from excite.__main__ import app
-from model import effects, units
+from model import effects, machine, units
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
@@ -49,8 +49,12 @@ def test_readme_lines_of_python_run(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     (text,) = [text for language, text in blocks(ROOT / "README.md") if language == "python"]
     assert len([line for line in text.splitlines() if line and not line.startswith(("from", "import"))]) <= 5
     monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {}
-    exec(compile(text.replace("starts=2", "starts=1, budget_s=30.0"), "README.md", "exec"), names)
+    asked = machine.load("va12").problems["R60"]
+    names: dict[str, Any] = {
+        "half": asked.model_copy(update={"duration_s": asked.duration_s.model_copy(update={"value": 30.0})})
+    }
+    text = text.replace('model.machine.problems["R60"]', "half").replace("starts=2", "starts=1")
+    exec(compile(text, "README.md", "exec"), names)
     assert len(names["estimate"].names) == 22
 
 
