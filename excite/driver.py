@@ -1,7 +1,15 @@
-"""A person at the levers: follows speed and articulation late, slowly and not quite.
+"""A person at the levers: follows speed and articulation that can be seen coming, slowly and not quite.
 
 People do not play back torques. They set a speed lever and a steering wheel; the hydrostatic drive makes the torques
 that bring the rolls to that speed and the articulation to that rate, within the machine's limits.
+
+What is assumed of the person: the trace is seen ahead, as on the road (MacAdam, "Application of an optimal preview
+control for simulation of closed-loop automobile driving", IEEE Trans. SMC 11(6), 1981; Sheridan, 1966), so the hand
+moves early by about its own delay and only what the machine is late is left. What was not foreseen is corrected from
+what is seen, a reaction time late, against what the person expects of the machine: its usual lag is no error. The hand
+is slow (second order, McRuer and Jex, 1967) and all that it does goes through it, its slow errors too, so that nothing
+in the torques is faster than hand, drive and machine. With the lever in neutral there are no errors. Not assumed:
+fatigue, learning within a drive, coupling of speed and steering, the place on the lane.
 """
 
 from __future__ import annotations
@@ -16,14 +24,20 @@ from excite.simulate import Motion, respond
 from model.prediction import Model
 
 DRIVER = 2  # stream of random numbers, apart from the sensors'
+RESPONSE = 0.3  # s, in which a hydrostatic drive brings what it moves to speed
+HOLD = 5.0  # 1/s, with which the oil in the steering cylinders brings a joint back that the soil pushed away
+WANDER = 2.0  # s, twice: time constants of the slow errors
+NEUTRAL = 0.2  # m/s: below it the lever nears its detent, and errors and corrections fade with it
 
 
 @dataclass(frozen=True)
 class Driver:
     """delay [s] of reaction, bandwidth [Hz] of hand and lever, slow errors of speed [m/s] and angle [rad].
 
-    `attention` [1/s]: how fast a deviation seen is corrected. The values are of a practised operator; delays of
-    0.2-0.4 s and bandwidths below 1 Hz are usual in manual tracking (McRuer and Jex, 1967).
+    `attention` [1/s]: how fast a deviation seen is corrected. `preview` [s]: how early the hand moves for what comes;
+    0.6 makes up for reaction and hand. `hydraulics` [Hz]: no torque follows the drive's control loop faster. The values
+    are of a practised operator; delays of 0.2-0.4 s and bandwidths below 1 Hz are usual in manual tracking (McRuer and
+    Jex, 1967), swash plates of pumps settle in 0.05-0.2 s.
     """
 
     delay_s: float = 0.3
@@ -31,6 +45,11 @@ class Driver:
     speed_error_m_s: float = 0.03
     angle_error_rad: float = 0.01
     attention: float = 0.8
+    preview_s: float = 0.6
+    hydraulics_hz: float = 3.0
+
+
+STEADY = Driver(speed_error_m_s=0.0, angle_error_rad=0.0)  # a person without slow errors: the middle of all people
 
 
 def follow(
@@ -55,60 +74,106 @@ def follow(
     if angles.shape != (n, len(joints)):
         raise ValueError(f"angles: needs shape ({n}, {len(joints)}), got {angles.shape}")
     rng = np.random.default_rng([seed, DRIVER])
-    wanted_speed = _by_hand(speed, driver.speed_error_m_s, driver, rate, rng)
-    wanted_angle = np.array(angles, float)
-    for i in range(len(joints)):
-        wanted_angle[:, i] = _by_hand(angles[:, i], driver.angle_error_rad, driver, rate, rng)
+    foreseen = _ahead(np.asarray(speed, float), driver, rate)
+    detent = np.minimum(np.abs(foreseen) / NEUTRAL, 1.0)
+    pushed = foreseen + driver.speed_error_m_s * detent * _wander(n, rate, rng)
+    aimed = [_ahead(np.asarray(a, float), driver, rate) for a in angles.T]
+    wandered = [a + driver.angle_error_rad * _wander(n, rate, rng) for a in aimed]
+    turned = [np.gradient(a) * rate for a in wandered]
+    # lists: the loop below works sample by sample, where they are faster than arrays
+    expected = [_expected(x, driver, rate).tolist() for x in (foreseen, *aimed)]
+    commands = [x.tolist() for x in (pushed, *turned)]
+    hands = [_Hand(driver.bandwidth_hz, rate) for _ in commands]
     late = round(driver.delay_s * rate)
 
     n_q = len(model.coordinates)
     rows = list(model.actuated)
-    radius = [float(b.contact.radius) if b.contact is not None else 0.0 for b in machine.actuated]
-    gain = gains(model)
-    top = np.array([float(b.limit.torque) if b.limit.torque is not None else np.inf for b in machine.actuated])
-    climb = np.array(
-        [float(b.limit.torque_rate) if b.limit.torque_rate is not None else np.inf for b in machine.actuated]
-    )
-    rim = [float(b.limit.rim_speed) if b.limit.rim_speed is not None else np.inf for b in machine.actuated]
-    swing = [float(b.limit.rate) if b.limit.rate is not None else np.inf for b in machine.actuated]
-    seen = np.zeros((n, 1 + len(joints)))
+    limits = [b.limit for b in machine.actuated]
+    radius = [float(b.contact.radius) if b.contact is not None else 1.0 for b in machine.actuated]
+    most = [float(x.rim_speed) if x.rim_speed is not None else np.inf for x in limits]
+    swing = [float(x.rate) if x.rate is not None else np.inf for x in limits]
+    fastest = [(most[k] / radius[k] if k in rolls else swing[k]) for k in range(len(rows))]
+    gain = gains(model).tolist()
+    top = np.array([float(x.torque) if x.torque is not None else np.inf for x in limits])
+    climb = np.array([float(x.torque_rate) if x.torque_rate is not None else np.inf for x in limits]) / rate
+    share = 1 - np.exp(-2 * np.pi * driver.hydraulics_hz / rate)
+    seen: list[list[float]] = []
+    watched = [rows[j] for j in joints]
     last = np.zeros(len(rows))
+    start = np.zeros(n_q) if q0 is None else np.asarray(q0, float)
+    trim = 0.0
+    held = [float(start[r]) for r in watched]
 
     def torque(k: int, state: np.ndarray) -> np.ndarray:
-        q, nu = state[:n_q], state[n_q : 2 * n_q]
-        seen[k] = [nu[0], *(q[rows[j]] for j in joints)]
-        past = seen[max(k - late, 0)]
-        target = last.copy()
-        lever = wanted_speed[k] + driver.attention * driver.delay_s * (wanted_speed[max(k - late, 0)] - past[0])
+        nonlocal trim
+        seen.append([state[n_q], *(state[r] for r in watched)])
+        then = max(k - late, 0)
+        off = [e[then] - s for e, s in zip(expected, seen[then], strict=True)]
+        trim += driver.attention * off[0] * float(detent[k]) / rate
+        lever = hands[0].moved(commands[0][k] + trim * float(detent[k]))
+        target = np.empty(len(rows))
         for j in rolls:
-            asked = np.clip(lever, -rim[j], rim[j]) / radius[j]
-            target[j] = gain[j] * (asked - nu[rows[j]])
-        for i, j in enumerate(joints):
-            turn = np.clip(2.0 * (wanted_angle[k, i] - q[rows[j]]), -swing[j], swing[j])
-            target[j] = gain[j] * (turn - nu[rows[j]])
-        target = np.clip(target, -top, top)
-        last[:] = last + np.clip(target - last, -climb / rate, climb / rate)
-        if k == 0:
-            last[:] = 0.0
+            asked = min(max(lever / radius[j], -fastest[j]), fastest[j])
+            target[j] = gain[j] * (asked - state[n_q + rows[j]])
+        for i, j in enumerate(joints, 1):
+            turn = hands[i].moved(commands[i][k] + driver.attention * off[i])
+            turn = min(max(turn, -fastest[j]), fastest[j])
+            relief = top[j] / (gain[j] * HOLD)  # a relief valve opens before the oil is pressed further
+            away = held[i - 1] + turn / rate - state[rows[j]]
+            held[i - 1] = min(max(away, -relief), relief) + state[rows[j]]
+            target[j] = gain[j] * (turn - state[n_q + rows[j]] + HOLD * (held[i - 1] - state[rows[j]]))
+        wish = last + share * (np.minimum(np.maximum(target, -top), top) - last)
+        if k > 0:
+            last[:] += np.minimum(np.maximum(wish - last, -climb), climb)
         return last.copy()
 
     return respond(model, n, torque, X, q0)
 
 
-def _by_hand(wanted: np.ndarray, error: float, driver: Driver, rate: float, rng: np.random.Generator) -> np.ndarray:
-    """What the lever is set to: late, smoothed by the hand, with a slow error (2 s) that fades at rest."""
-    late = round(driver.delay_s * rate)
-    delayed = np.concatenate([np.full(late, wanted[0]), wanted[: len(wanted) - late]])
-    b, a = scipy.signal.butter(2, driver.bandwidth_hz / (rate / 2))
-    smooth = scipy.signal.lfilter(b, a, delayed - wanted[0]) + wanted[0]
-    keep = np.exp(-1 / (2.0 * rate))
-    noise = scipy.signal.lfilter([np.sqrt(1 - keep**2)], [1, -keep], rng.standard_normal(len(wanted)))
-    fade = np.clip(np.minimum(np.arange(len(wanted)), np.arange(len(wanted))[::-1]) / rate / 2, 0, 1)
-    return np.asarray(smooth + error * noise * fade)
+class _Hand:
+    """Second-order low-pass (Butterworth), a sample at a time, at rest at first."""
+
+    def __init__(self, bandwidth: float, rate: float) -> None:
+        b, a = _hand(bandwidth, rate)
+        self._b, self._a, self._z = b.tolist(), a.tolist(), (0.0, 0.0)
+
+    def moved(self, x: float) -> float:
+        y = self._b[0] * x + self._z[0]
+        self._z = (self._b[1] * x - self._a[1] * y + self._z[1], self._b[2] * x - self._a[2] * y)
+        return y
+
+
+def _hand(bandwidth: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    b, a = scipy.signal.butter(2, bandwidth / (rate / 2))
+    return np.asarray(b), np.asarray(a)
+
+
+def _ahead(wanted: np.ndarray, driver: Driver, rate: float) -> np.ndarray:
+    """What the hand aims at, sample by sample: the trace, `preview` early and a reaction late, held at its ends."""
+    at = np.arange(len(wanted)) + round((driver.preview_s - driver.delay_s) * rate)
+    return np.asarray(wanted[np.clip(at, 0, len(wanted) - 1)])
+
+
+def _expected(aimed: np.ndarray, driver: Driver, rate: float) -> np.ndarray:
+    """What the person expects of the machine: what the hand aims at, as late as hand and drive always are."""
+    keep = np.exp(-1 / (RESPONSE * rate))
+    slow = scipy.signal.lfilter(*_hand(driver.bandwidth_hz, rate), aimed - aimed[0])
+    return np.asarray(scipy.signal.lfilter([1 - keep], [1, -keep], slow) + aimed[0])
+
+
+def _wander(n: int, rate: float, rng: np.random.Generator) -> np.ndarray:
+    """Slow errors (n,) of deviation 1, that fade in the first and the last two seconds."""
+    keep = np.exp(-1 / (WANDER * rate))
+    shape = [1, -2 * keep, keep**2]
+    size = np.sqrt((1 + keep**2) / (1 - keep**2) ** 3)  # deviation of what the filter makes of white noise
+    before = round(5 * WANDER * rate)  # so that the errors are stationary from the first sample on
+    noise = scipy.signal.lfilter([1 / size], shape, rng.standard_normal(before + n))[before:]
+    fade = np.clip(np.minimum(np.arange(n), np.arange(n)[::-1]) / rate / 2, 0, 1)
+    return np.asarray(noise * fade)
 
 
 def gains(model: Model) -> np.ndarray:
-    """(n_u,) torque per speed error [N m s/rad] of each drive: its reflected inertia to speed in about 0.3 s."""
+    """(n_u,) torque per speed error [N m s/rad] of each drive: its reflected inertia to speed in RESPONSE."""
     q, nu, _ = model.symbols()
     mass = ca.Function("mass", [q], [model.equations(q, nu, ca.DM(model.nominal))[0]])
     M = mass(np.zeros(len(model.coordinates))).full()
@@ -116,5 +181,5 @@ def gains(model: Model) -> np.ndarray:
     gain = np.zeros(len(model.inputs))
     for j, (row, body) in enumerate(zip(model.actuated, model.machine.actuated, strict=True)):
         share = M[0, 0] * float(body.contact.radius) ** 2 / rolls if body.contact is not None else 0.0
-        gain[j] = (share + M[row, row]) / 0.3
+        gain[j] = (share + M[row, row]) / RESPONSE
     return gain
