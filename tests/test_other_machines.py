@@ -1,0 +1,247 @@
+"""Other machines by another table: their parameters, their dynamics against pinocchio, from design to estimate.
+
+A machine of the list is its file in model/machines and an entry in CASES; nothing else here knows it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import casadi as ca
+import numpy as np
+import pytest
+from test_tree import TOLERANCE, Case, relative
+
+from excite import design, identify, limit, log, manoeuvre, sensors
+from excite.limit import InfeasibleError
+from excite.simulate import simulate
+from model.machine import Machine, Problem, Quantity, load
+from model.prediction import Model, build, standard_parameters
+
+NEVER = ("MZ", "XX", "XY", "XZ", "YY", "YZ")  # of a chassis: what motion on the plane can't show
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a machine's parameters must be, worked out by hand from its table; `share` of full torque that it can take.
+
+    groups: the base parameters that stand for several, in standard parameters, with moments of inertia carried over by
+    Steiner. plain: the others. unseen: standard parameters that no motion on the plane shows.
+    """
+
+    groups: dict[str, dict[str, float]]
+    plain: str
+    unseen: tuple[str, ...]
+    share: float
+    locked: tuple[str, ...] = field(default=())
+
+
+def _chassis(*bodies: int) -> tuple[str, ...]:
+    return tuple(f"{name}{k}" for k in bodies for name in NEVER)
+
+
+H, T = 0.249, 0.29153  # half of the robot's wheelbase and of its track
+CASES = {
+    "single_drum": Expected(
+        {
+            "M": {"M0": 1, "M1": 1, "M2": 1, "M3": 1, "M5": 1},
+            "MX0R": {"MX0": 1, "M3": 1.45, "M5": 1.45},
+            "MY0R": {"MY0": 1, "M1": 0.8, "M2": -0.8},
+            "ZZ0R": {"ZZ0": 1, "M1": 0.64, "XX1": 1, "M2": 0.64, "XX2": 1, "M3": 1.45**2, "M5": 1.45**2},
+            "MX3R": {"MX3": 1, "M5": 1.5},
+            "ZZ3R": {"ZZ3": 1, "M5": 2.25, "XX5": 1},
+        },
+        "MY3 ZZ1 Fv1 Fs1 Kx1 Ky1 u10 ZZ2 Fv2 Fs2 Kx2 Ky2 u20 Fv3 Fs3 u30 ZZ5 Fv5 Fs5 Kx5 Ky5 u50",
+        _chassis(0, 3),
+        0.5,
+    ),
+    "tandem": Expected(
+        {
+            "M": {"M0": 1, "M1": 1, "M2": 1, "M3": 1, "M4": 1},
+            "MX0R": {"MX0": 1, "M1": 1.7, "M2": 1.7, "M3": -1.7, "M4": -1.7},
+            "ZZ0R": {"ZZ0": 1, "M1": 2.89, "M2": 2.89, "M3": 2.89, "M4": 2.89},
+            "ZZ1R": {"ZZ1": 1, "XX2": 1},
+            "ZZ3R": {"ZZ3": 1, "XX4": 1},
+        },
+        "MY0 Fv1 Fs1 u10 ZZ2 Fv2 Fs2 Kx2 Ky2 u20 Fv3 Fs3 u30 ZZ4 Fv4 Fs4 Kx4 Ky4 u40",
+        (*_chassis(0), "XX1", "XX3"),
+        0.6,
+    ),
+    "double_loader": Expected(
+        {
+            "M": {"M0": 1, "M1": 1, "M2": 1, "M3": 1, "M4": 1},
+            "MX0R": {"MX0": 1, "M2": -1.15, "M3": -1.15, "M4": -1.15},
+            "ZZ0R": {"ZZ0": 1, "XX1": 1, "M2": 1.15**2, "M3": 1.15**2, "M4": 1.15**2},
+            "MX2R": {"MX2": 1, "M3": -1.1, "M4": -1.1},
+            "ZZ2R": {"ZZ2": 1, "M3": 1.21, "M4": 1.21},
+            "ZZ3R": {"ZZ3": 1, "XX4": 1},
+        },
+        "MY0 MY2 ZZ1 Fv1 Fs1 Kx1 Ky1 u10 Fv2 Fs2 u20 Fv3 Fs3 u30 ZZ4 Fv4 Fs4 Kx4 Ky4 u40",
+        (*_chassis(0, 2), "XX3"),
+        0.4,
+    ),
+    "pendulum_loader": Expected(
+        {
+            "M": {"M0": 1, "M1": 1, "M2": 1, "M4": 1, "M5": 1},
+            "MX0R": {"MX0": 1, "M2": -1, "M4": -1, "M5": -1},
+            "ZZ0R": {"ZZ0": 1, "XX1": 1, "M2": 1, "M4": 1, "M5": 1},
+            "MX2R": {"MX2": 1, "MX4": 1, "M5": -1},
+            "MY2R": {"MY2": 1, "MY4": 1},
+            "ZZ2R": {"ZZ2": 1, "ZZ4": 1, "XX5": 1, "M5": 1},
+        },
+        "MY0 ZZ1 Fv1 Fs1 Kx1 Ky1 u10 Fv2 Fs2 u20 ZZ5 Fv5 Fs5 Kx5 Ky5 u50",
+        (*_chassis(0, 2, 4), "Fv3", "Fs3", "u30"),
+        0.6,
+        ("theta3",),
+    ),
+    "skid_robot": Expected(
+        {
+            "M": {"M0": 1, "M1": 1, "M2": 1, "M3": 1, "M4": 1},
+            "MX0R": {"MX0": 1, "M1": H, "M2": H, "M3": -H, "M4": -H},
+            "MY0R": {"MY0": 1, "M1": T, "M2": -T, "M3": T, "M4": -T},
+            "ZZ0R": {"ZZ0": 1} | {f"M{k}": H**2 + T**2 for k in (1, 2, 3, 4)} | {f"XX{k}": 1 for k in (1, 2, 3, 4)},
+        },
+        " ".join(f"ZZ{k} Fv{k} Fs{k} Kx{k} Ky{k} u{k}0" for k in (1, 2, 3, 4)),
+        _chassis(0),
+        0.8,
+    ),
+}
+
+
+@lru_cache
+def model_of(name: str) -> Model:
+    return build(load(name))
+
+
+@pytest.fixture(params=CASES)
+def name(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def model(name: str) -> Model:
+    return model_of(name)
+
+
+def short(machine: Machine, seconds: float) -> Problem:
+    problem = machine.problems[machine.problem or ""]
+    return problem.model_copy(update={"duration_s": problem.duration_s.model_copy(update={"value": seconds})})
+
+
+# --------------------------------------------------------------------------------------------- base parameters
+def test_base_parameters_are_those_worked_out_by_hand(name: str, model: Model) -> None:
+    want = CASES[name]
+    assert set(model.base.names) == set(want.groups) | set(want.plain.split())
+    for group, parts in want.groups.items():
+        assert model.base.grouping(group) == pytest.approx(parts, rel=1e-9), group
+    for plain in want.plain.split():
+        assert model.base.grouping(plain) == {plain: 1}
+
+
+def test_what_no_motion_on_the_plane_shows_is_said(name: str, model: Model) -> None:
+    """Of the pendulum: that the joint is there, what belongs to it alone, and the rear frame's rolling inertia."""
+    assert set(model.base.invisible) == set(CASES[name].unseen)
+    assert not set(CASES[name].locked) & set(model.coordinates)
+
+
+def test_rank_of_the_standard_regressor_is_the_number_of_base_parameters(model: Model) -> None:
+    """By singular values over fresh random motions: neither more nor fewer can be told apart."""
+    rng = np.random.default_rng(7)
+    n, p = 200, [v for v, _ in standard_parameters(model.machine).values()]
+    W = model.standard_regressor(*rng.normal(size=(3, len(model.coordinates), n)), p).full()
+    W = W.reshape(-1, n, len(p)).transpose(1, 0, 2).reshape(-1, len(p))
+    size = np.linalg.norm(W, axis=0)
+    kept = size > 1e-9 * size.max()
+    s = np.linalg.svd(W[:, kept] / size[kept], compute_uv=False)
+    assert int((s > 1e-8 * s[0]).sum()) == len(model.base.names)
+
+
+# ------------------------------------------------------------------------------------------------- rigid bodies
+def test_dynamics_are_pinocchios(name: str, model: Model) -> None:
+    """Mass matrix, bias and inverse dynamics; locked joints held at zero in pinocchio's tree, which has them all."""
+    one = Quantity(value=1, source="assumed")
+    scale = {n + end: one for n in standard_parameters(model.machine) for end in ("", "R")}
+    case = Case(model.machine.model_copy(update={"locked": (), "scale": scale}))
+    every, free = case.machine.coordinates, model.coordinates
+    rows = [every.index(c) for c in free]
+    table = standard_parameters(model.machine)
+    p = ca.DM([0.0 if n.startswith(("Fv", "Fs", "Kx", "Ky", "u")) else v for n, (v, _) in table.items()])
+    qs, nus, accels = model.symbols()
+    Y = model.predict(qs, nus, accels, p)
+    mass = ca.Function("mass", [qs], [ca.jacobian(Y, accels)])
+    for at, rate, accel in zip(*(x.T for x in case.states(100)), strict=True):
+        for c in CASES[name].locked:
+            at[every.index(c)] = rate[every.index(c)] = accel[every.index(c)] = 0.0
+        M, bias, inverse = case.reference(at, rate, accel)
+        q, nu, a = at[rows], rate[rows], accel[rows]
+        assert relative(mass(q).full(), M[np.ix_(rows, rows)]) <= TOLERANCE
+        assert relative(model.predict(q, nu, 0, p).full()[:, 0], bias[rows]) <= TOLERANCE
+        assert relative(model.predict(q, nu, a, p).full()[:, 0], inverse[rows]) <= TOLERANCE
+
+
+def test_an_axle_is_a_roll_as_wide_as_sqrt_3_times_its_track() -> None:
+    """What the loaders' files say: two wheels that turn together, and the roll that stands for them, push alike."""
+    one = load("pendulum_loader")
+    track, spin = 1.35, 1.7
+    body = one.find(1)
+    assert body.contact is not None
+    width = body.contact.width.model_copy(update={"value": float(np.sqrt(3) * track)})
+    roll = build(_contact(one, 1, {"width": width}))
+    q = np.zeros(6)
+    for Vx, Vy, yaw in ((1.0, 0.05, 0.2), (0.8, -0.02, -0.4), (-0.9, 0.1, 0.3)):
+        nu = np.array([Vx, Vy, yaw, spin, 0, 0])
+        got = _of_soil(roll, 1, q, nu)
+        want = np.zeros(6)
+        R, Kx, Ky = (float(x) for x in (body.contact.radius, body.contact.Kx, body.contact.Ky))
+        vn = np.hypot(R * spin, float(body.contact.v_eps))
+        for y in (track / 2, -track / 2):
+            push = Kx / 2 * (Vx - y * yaw - R * spin) / vn
+            side = Ky / 2 * Vy / vn
+            want += [push, side, -y * push, -R * push, 0, 0]
+        assert got == pytest.approx(want, rel=1e-9)
+
+
+def _contact(machine: Machine, index: int, update: dict[str, object]) -> Machine:
+    bodies = tuple(
+        b.model_copy(update={"contact": b.contact.model_copy(update=update)}) if b.index == index and b.contact else b
+        for b in machine.body
+    )
+    return machine.model_copy(update={"body": bodies})
+
+
+def _of_soil(model: Model, index: int, q: np.ndarray, nu: np.ndarray) -> np.ndarray:
+    """Generalised force of one contact: the prediction's part with its Kx, Ky, taken off."""
+    table = {n: v for n, (v, _) in standard_parameters(model.machine).items()}
+    none = [0.0] * len(table)
+    own = [v if n in (f"Kx{index}", f"Ky{index}") else 0.0 for n, v in table.items()]
+    a = np.zeros(len(q))
+    return -(model.predict(q, nu, a, own).full() - model.predict(q, nu, a, none).full())[:, 0]
+
+
+# --------------------------------------------------------------------------------- design, simulation, estimate
+def test_a_log_gives_the_true_parameters_back(name: str, model: Model) -> None:
+    """A random drive of twelve seconds with every sensor's flaws: no parameter four of its own deviations off."""
+    drive = manoeuvre.scaled(manoeuvre.multisine(model, short(model.machine, 12.0), 1, top=0.4), CASES[name].share)
+    motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
+    table = sensors.measure(model, motion, kit="full", seed=1)
+    estimate = identify.identify(model, [log.check(table, model.machine)], identify.recommended(model))
+    assert estimate.unidentifiable == {}
+    z = (estimate.value - model.nominal) / estimate.std
+    assert np.abs(z).max() < 4, dict(zip(model.base.names, z.round(1), strict=True))
+    assert 0.3 < float(np.mean(z**2)) < 2.5
+    size = np.maximum(np.abs(model.nominal), model.scale)
+    assert np.median(estimate.std / size) < 0.05
+
+
+def test_design_ends_with_a_drive_or_with_the_limit_that_it_misses(model: Model) -> None:
+    """With hardly any time: a drive that keeps every limit in a fresh simulation, or one clear line."""
+    problem = short(model.machine, 6.0)
+    excess, said = 0.0, "no drive found"
+    try:
+        found = design.design(model, problem, starts=1, seed=1, budget_s=0.1)
+        excess = max(limit.check(model, problem, found.motion).values())
+    except InfeasibleError as missed:
+        said = str(missed)
+    assert excess <= 1e-3
+    assert said.startswith("no drive found")
