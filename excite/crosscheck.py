@@ -12,7 +12,7 @@ from excite.log import Log
 from excite.processing import lowpass, samples
 from excite.sensors import signals
 from excite.simulate import Motion, respond, simulate
-from model.machine import Filter
+from model.machine import Filter, Sensor
 from model.prediction import Model
 
 Control = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
@@ -81,22 +81,25 @@ def motions(model: Model, log: Log, estimate: Estimate, filter: Filter | None = 
     motion = simulate(model, torque, X, s.q[:, 0], s.nu[:, 0])
     exact = signals(model, motion, X)
     chosen = [x for x in model.machine.sensors("full") if x.name in log.values and x.kind not in ("torque", "x", "y")]
-    turned = {x.name: x.kind in ("angle", "wheel") for x in chosen}
+    turned = {x.name: x.kind in ("angle", "wheel") and not x.is_rate for x in chosen}
 
     def counted(name: str, v: np.ndarray) -> np.ndarray:
         return v - v[0] if turned[name] else v
 
     return Comparison(
         tuple(x.name for x in chosen),
-        tuple({"yaw_rate": "rad/s", "lateral_speed": "m/s"}.get(x.kind, _length(x.unit)) for x in chosen),
+        tuple(_unit(x) for x in chosen),
         log.t,
         np.array([counted(x.name, log.values[x.name]) for x in chosen]),
         np.array([counted(x.name, exact[x.name]) for x in chosen]),
     )
 
 
-def _length(unit: str) -> str:
-    return unit if unit in ("rad", "m") else "SI"
+def _unit(sensor: Sensor) -> str:
+    if sensor.is_rate:
+        return "rad/s"
+    given = sensor.unit if sensor.unit in ("rad", "m") else "SI"
+    return {"yaw_rate": "rad/s", "lateral_speed": "m/s"}.get(sensor.kind, given)
 
 
 def offsets(model: Model, X: np.ndarray) -> np.ndarray:

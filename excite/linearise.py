@@ -155,7 +155,7 @@ class Chart:
     whose size is `full`. `sensors`: those with a reading h(s), in order; `angle`: the state that each encoder reads, -1
     for another sensor. `offsets` (n_u, n_base) takes the torque offsets u0 out of X. `flawed`: parameters that readings
     depend on directly. `known` (n,): states whose start is known, and how well; NaN for the others.
-    `pushed`: rows on which disturbing forces may act, the unactuated ones, or all where there are none; `inertia`:
+    `leaning`: whether readings depend on torques at once. `pushed`: rows on which disturbing forces may act, the unactuated ones, or all where there are none; `inertia`:
     theirs, nominal [kg, kg m2].
     """
 
@@ -170,6 +170,7 @@ class Chart:
     inertia: np.ndarray
     flawed: tuple[int, ...]
     known: np.ndarray
+    leaning: bool
     slopes: Batch
     readings: Batch
     step: Batch
@@ -187,8 +188,14 @@ class Chart:
         full[:, self.index] = s
         return full[:, :n_q], full[:, n_q : 2 * n_q], full[:, self.full - n_z :]
 
-    def delivered(self, torque: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Torques (N, n_u) [N m] behind measured ones, and how they move with X (N, n_u, n_base)."""
+    def delivered(
+        self, torque: np.ndarray, X: np.ndarray, errors: np.ndarray | float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Torques (N, n_u) [N m] behind measured ones, and how they move with X (N, n_u, n_base).
+
+        errors (N, n_u) [N m]: what is known of the torques' own. How a gain or a delay moves them is a matter of the
+        true torques: taken from noisy ones it follows the noise, and the amount is biased.
+        """
         if not any(e.effect.channel for e in self.model.effects):
             return torque - X @ self.offsets.T, np.broadcast_to(-self.offsets, (len(torque), *self.offsets.shape))
         N, n_u = torque.shape
@@ -198,9 +205,10 @@ class Chart:
         gain, offset, delay = (e.T for e in out[:3])
         by = [e.reshape(n_u, N, len(X)).transpose(1, 0, 2) for e in out[3:]]
         early = np.column_stack([np.interp(t + delay[:, k], t, torque[:, k]) for k in range(n_u)])
-        rise = np.gradient(early, step, axis=0)
         u = (early - offset) / gain
-        slope = (rise[:, :, None] * by[2] - by[1] - u[:, :, None] * by[0]) / gain[:, :, None]
+        true = u + errors
+        rise = np.gradient(gain * true + offset, step, axis=0)
+        slope = (rise[:, :, None] * by[2] - by[1] - true[:, :, None] * by[0]) / gain[:, :, None]
         return u, slope
 
     def felt(self, noise: np.ndarray, X: np.ndarray) -> np.ndarray:
@@ -259,7 +267,7 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     sensors = tuple(s for s in machine.sensors("full") if s.name in names and s.kind not in ("torque", "x", "y"))
     index, angle = list(core), []
     for s in sensors:
-        if s.kind in ("angle", "wheel"):
+        if s.kind in ("angle", "wheel") and not s.is_rate:
             at = (
                 model.coordinates.index(machine.find(s.body).coordinates[0])
                 if s.kind == "angle"
@@ -335,6 +343,7 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
         mass[list(pushed)],
         flawed,
         known,
+        bool(ca.depends_on(seen, u)),
         Batch(slopes, (2,)),
         Batch(readings, (2,)),
         Batch(step, (3, 4)),

@@ -15,6 +15,7 @@ from excite import tables
 from excite.simulate import Motion
 from excite.tables import MDF_TIME
 from excite.tables import LogError as LogError
+from model import hydraulics
 from model import machine as machines
 from model.machine import Machine, Sensor
 from model.prediction import Model
@@ -70,13 +71,13 @@ def check(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sour
     if len(t) < least:
         raise LogError(f"{source}: only {len(t)} rows, at least {least} are needed: is the file complete?")
     rate = float(machine.sampling_hz)
-    values = {s.name: values_of(s, table, rate, source) for s in known}
+    values = {s.name: values_of(s, machine, table, source) for s in known}
     check_time(t, rate, machine.time_column, source)
     for s in known:
         check_values(s, values[s.name], rate, machine, source)
     for s in machine.sensor:
         if s.kind == "angle" and s not in wanted and s.column in table.columns:
-            moved = values_of(s, table, rate, source)
+            moved = values_of(s, machine, table, source)
             if np.ptp(moved) > 0.05:
                 raise LogError(
                     f"{source}: column {s.column}: moves by {np.ptp(moved):.2g} {s.unit}, {machine.name} holds it"
@@ -98,14 +99,30 @@ def times(table: pd.DataFrame, machine: Machine, source: str) -> np.ndarray:
     return UNITS[machine.time_unit][1] * numbers(table, machine.time_column, source)
 
 
-def values_of(sensor: Sensor, table: pd.DataFrame, rate: float, source: str) -> np.ndarray:
-    """A sensor's readings (N,) [SI] from its columns: units, pressures, rates summed up. Raises LogError."""
+def values_of(sensor: Sensor, machine: Machine, table: pd.DataFrame, source: str) -> np.ndarray:
+    """A sensor's readings (N,) [SI] from its columns: units, torques of pressures. Raises LogError."""
     number = numbers(table, sensor.column, source)
-    if sensor.return_column is not None:
-        number = number - numbers(table, sensor.return_column, source)
-    if sensor.summed:
-        number = np.concatenate([[0.0], np.cumsum((number[1:] + number[:-1]) / 2)]) / rate
-    return sensor.gain * number
+    if sensor.return_column is None:
+        return sensor.gain * number
+    back = numbers(table, sensor.return_column, source)
+    if not sensor.cylinders:
+        return sensor.gain * (number - back)
+    push, pull = hydraulics.arms(sensor, _joint_angle(sensor, machine, table, source))
+    return sensor.gain * (push * number + pull * back)
+
+
+def _joint_angle(sensor: Sensor, machine: Machine, table: pd.DataFrame, source: str) -> np.ndarray:
+    """The angle (N,) [rad] of the joint that cylinders turn; zero where their lever is the same at every angle."""
+    still = machine.find(sensor.body).coordinates[0] in machine.locked
+    if still or all(c.lever is not None for c in sensor.cylinders):
+        return np.zeros(len(table))
+    angle = next(s for s in machine.sensor if s.kind == "angle" and s.body == sensor.body)
+    if angle.column not in table.columns:
+        raise LogError(
+            f"{source}: no column {angle.column} ({what_of(angle, machine)}), on which the lever of the cylinders of"
+            f" {sensor.column} depends"
+        )
+    return values_of(angle, machine, table, source)
 
 
 def numbers(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
@@ -154,6 +171,14 @@ def check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
 def check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Machine, source: str) -> None:
     """Units and wrapping: what no such machine can do is a wrong log, not a measurement."""
     body = machine.find(sensor.body)
+    if sensor.is_rate:
+        fastest, usual = _fastest(sensor, machine), float(np.percentile(np.abs(values), 99))
+        if fastest is not None and usual > 3 * fastest:
+            raise LogError(
+                f"{source}: column {sensor.column}: turns at {usual:.3g} rad/s, the machine allows {fastest:.3g} rad/s;"
+                f" is the unit {sensor.unit} right?"
+            )
+        return
     if sensor.kind == "wheel" or (sensor.kind == "angle" and body.joint == "revolute"):
         step = np.abs(np.diff(values))
         k = int(np.argmax(step))
@@ -196,6 +221,7 @@ def _fastest(sensor: Sensor, machine: Machine) -> float | None:
 def what_of(sensor: Sensor, machine: Machine) -> str:
     where = sensor.place or machine.find(sensor.body).where
     kind = {"angle": "angle", "wheel": "angle", "torque": "torque"}.get(sensor.kind, sensor.kind.replace("_", " "))
+    kind = "rate" if sensor.is_rate else kind
     return f"{kind} of {where.replace('_', ' ')}"
 
 

@@ -94,7 +94,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
             line = f"no column {', '.join(missing)} ({log.what_of(sensor, machine)})"
             remarks.append(line + ("; some methods need it" if needed else "; optional"))
             continue
-        values = _caught(lambda s=sensor: log.values_of(s, table, rate, ""), None)  # type: ignore[misc]
+        values = _caught(lambda s=sensor: log.values_of(s, machine, table, ""), None)  # type: ignore[misc]
         when = t if len(t) else np.arange(len(table)) / rate
         if values is None:  # shown as far as it can be read
             number = pd.to_numeric(table[sensor.column], errors="coerce").to_numpy(dtype=float)
@@ -201,7 +201,7 @@ def _oddities(sensor: Sensor, values: np.ndarray) -> list[str]:
         runs = edges[1::2] - edges[::2]
         if sensor.counts_per_turn is None and len(runs) and runs.max() >= STUCK:
             lines.append(f"column {name}: stands at its {word} value for {runs.max()} rows: the end of its range?")
-    if not sensor.summed:
+    if not sensor.is_rate:
         spikes = find_spikes(sensor, values)
         if len(spikes):
             lines.append(f"column {name}: {len(spikes)} spikes of a single row, the first in row {spikes[0] + 1}")
@@ -216,7 +216,8 @@ def _wiring(machine: Machine, readings: dict[str, np.ndarray]) -> list[str]:
     rolls = [s for s in rolls if s.name in readings]
     lines = []
     for one, other in itertools.pairwise(rolls):
-        a, b = (np.diff(readings[s.name][::10]) for s in (one, other))
+        a, b = (readings[s.name][::10] if s.is_rate else np.diff(readings[s.name][::10]) for s in (one, other))
+        a, b = a[: len(b)], b[: len(a)]
         if len(a) > 10 and np.ptp(a) > 0 and np.ptp(b) > 0 and np.corrcoef(a, b)[0, 1] < AGAINST:
             lines.append(
                 f"columns {one.column}, {other.column}: the rolls turn against each other; give one a negative factor"
@@ -225,4 +226,6 @@ def _wiring(machine: Machine, readings: dict[str, np.ndarray]) -> list[str]:
 
 
 def _si(sensor: Sensor) -> str:
+    if sensor.is_rate:
+        return "rad/s"
     return {"torque": "N m", "yaw_rate": "rad/s", "lateral_speed": "m/s", "x": "m", "y": "m"}.get(sensor.kind, "rad")

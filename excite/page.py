@@ -46,7 +46,7 @@ def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
         {
             "column": by_body[b.index].column,
             "gain": float(b.contact.radius) * by_body[b.index].gain,
-            "rate": by_body[b.index].summed,
+            "rate": by_body[b.index].is_rate,
         }
         for b in machine.contacts
         if b.contact is not None and b.index in by_body

@@ -77,9 +77,9 @@ def samples(model: Model, log: Log, filter: Filter) -> Samples:
             continue
         if sensor.kind == "angle":
             k = model.coordinates.index(machine.find(sensor.body).coordinates[0])
-            q[k], nu[k] = filtered[sensor.name], derivative(filtered[sensor.name], rate)
+            q[k], nu[k] = _angle_and_rate(sensor, filtered[sensor.name], rate)
         elif sensor.kind == "wheel":
-            wheels.append((sensor, derivative(filtered[sensor.name], rate)))
+            wheels.append((sensor, _angle_and_rate(sensor, filtered[sensor.name], rate)[1]))
         elif sensor.kind == "lateral_speed":
             nu[model.coordinates.index(machine.body[0].coordinates[1])] = filtered[sensor.name]
     if wheels:
@@ -94,6 +94,13 @@ def samples(model: Model, log: Log, filter: Filter) -> Samples:
         if sensor.kind == "torque":
             Y[model.coordinates.index(machine.find(sensor.body).coordinates[0])] = log.values[sensor.name]
     return Samples(q, nu, a, Y, _beside(model, q, nu, Y))
+
+
+def _angle_and_rate(sensor: Sensor, x: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Angle and rate (N,) of which a sensor reads one: a rate is summed up from zero, an angle differentiated."""
+    if sensor.is_rate:
+        return np.asarray(scipy.integrate.cumulative_trapezoid(x, dx=1 / rate, initial=0)), x
+    return x, derivative(x, rate)
 
 
 def _beside(model: Model, q: np.ndarray, nu: np.ndarray, Y: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -6,12 +6,13 @@ import numpy as np
 import pandas as pd
 
 from excite.simulate import Motion
+from model import hydraulics
 from model.machine import Sensor
 from model.prediction import Model
 from model.units import UNITS
 
 KITS = ("paper", "full")
-IDLE = 15e5  # Pa in the line of a hydraulic motor that does not push (boost pressure)
+IDLE = 15e5  # Pa in a hydraulic line that does not push (boost pressure)
 SENSORS = 1  # stream of random numbers: one seed drives and measures, but not with the same numbers
 
 
@@ -31,19 +32,30 @@ def measure(
     columns = {model.machine.time_column: motion.t / UNITS[model.machine.time_unit][1]}
     for sensor in model.machine.sensors(kit):
         read = _flawed(sensor, exact[sensor.name], rng) if noise else exact[sensor.name]
-        columns |= _written(sensor, read, float(model.machine.sampling_hz))
+        columns |= _written(sensor, read, _angle(model, motion, sensor))
     return pd.DataFrame(columns)
 
 
-def _written(sensor: Sensor, read: np.ndarray, rate: float) -> dict[str, np.ndarray]:
-    """A reading (N,) [SI] as its columns: in the file's unit, as a rate, or as the two pressures of a motor."""
-    if sensor.summed:
-        read = np.gradient(read) * rate
-    number = read / sensor.gain
+def _written(sensor: Sensor, read: np.ndarray, angle: np.ndarray) -> dict[str, np.ndarray]:
+    """A reading (N,) [SI] as its columns: in the file's unit, or as the pressures of a motor or of cylinders at a joint
+    at `angle` (N,) [rad]: one side pushes, the other is at IDLE."""
     if sensor.return_column is None:
-        return {sensor.column: number}
-    idle = IDLE / (sensor.gain * 2 * np.pi / float(sensor.displacement or 1))
-    return {sensor.column: np.maximum(number, 0) + idle, sensor.return_column: np.maximum(-number, 0) + idle}
+        return {sensor.column: read / sensor.gain}
+    push, pull = hydraulics.arms(sensor, angle)
+    more = read - (push + pull) * IDLE
+    forward = more * push > 0
+    pascal = sensor.gain if sensor.displacement is None else sensor.gain * 2 * np.pi / float(sensor.displacement)
+    return {
+        sensor.column: (IDLE + np.where(forward, more / push, 0)) / pascal,
+        sensor.return_column: (IDLE + np.where(forward, 0, more / pull)) / pascal,
+    }
+
+
+def _angle(model: Model, motion: Motion, sensor: Sensor) -> np.ndarray:
+    """(N,) [rad] the angle of a sensor's joint, zero where it is held or there is none."""
+    names = model.machine.find(sensor.body).coordinates
+    k = model.coordinates.index(names[0]) if names and names[0] in model.coordinates else None
+    return np.zeros(len(motion.t)) if k is None else motion.q[:, k]
 
 
 def signals(model: Model, motion: Motion, X: np.ndarray | None = None) -> dict[str, np.ndarray]:

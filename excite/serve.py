@@ -147,7 +147,7 @@ class Tail:
             ways = []
             for b, s in rolls:
                 number = float(b.contact.radius if b.contact else 0) * s.gain * float(cells[s.column])
-                if s.summed and self.rows:
+                if s.is_rate and self.rows:
                     number = self.rows[-1][1] + number * (t - self.rows[-1][0])
                 ways.append(number)
             angle = wheel.gain * float(cells[wheel.column]) if wheel is not None else None

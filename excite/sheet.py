@@ -269,6 +269,12 @@ def sensor_line(machine: Machine, sensor: Sensor) -> str:
         "x": f"position along x of the {where}",
         "y": f"position along y of the {where}",
     }[sensor.kind]
+    if sensor.is_rate:
+        what = f"rate of the {where}"
+    if sensor.cylinders:
+        what = f"torque at the {where}, by the pressures of its cylinders, the other in {sensor.return_column}"
+    elif sensor.displacement is not None:
+        what = f"torque at the {where}, by the motor's pressures, the other in {sensor.return_column}"
     extra = []
     if sensor.radius is not None and sensor.lateral is not None:
         side = "left" if float(sensor.lateral) > 0 else "right"
@@ -276,6 +282,6 @@ def sensor_line(machine: Machine, sensor: Sensor) -> str:
     if sensor.counts_per_turn is not None:
         extra.append(f"{float(sensor.counts_per_turn):g} counts per turn")
     if sensor.noise is not None:
-        extra.append(f"noise below {float(sensor.noise):g} {SI[sensor.kind]}")
+        extra.append(f"noise below {float(sensor.noise):g} {'rad/s' if sensor.is_rate else SI[sensor.kind]}")
     kit = "" if "paper" in sensor.kits else "; optional"
     return f"{sensor.column} [{sensor.unit}]: {what}" + (f"; {', '.join(extra)}" if extra else "") + kit

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -27,7 +28,7 @@ from pydantic import (
     model_validator,
 )
 
-from model import units
+from model import hydraulics, units
 
 MACHINES = Path(__file__).parent / "machines"
 Source = Literal["paper", "data sheet", "measured", "published", "identified", "assumed", "definition"]
@@ -259,13 +260,46 @@ class Body(Record):
         return self
 
 
+class Pin(Record):
+    """A point [m] in the plane, seen from a joint's axis, in the axes that both of its bodies have at angle zero."""
+
+    value: tuple[Number, Number]
+    source: Source
+    note: str = ""
+
+
+class Cylinder(Record):
+    """A hydraulic cylinder that turns a joint: `area` [m2] of the piston, `rod_area` [m2] what the rod leaves of it.
+
+    `piston`: the column with the pressure on the piston side, the rod side has the other one. Where it acts: `lever`
+    [m], how its length grows with the angle, constant; or `anchor` on the antecedent and `pin` on the body, of which
+    the lever at every angle follows.
+    """
+
+    area: Positive
+    rod_area: Positive
+    piston: Literal["column", "return_column"] = "column"
+    lever: Quantity | None = None
+    anchor: Pin | None = None
+    pin: Pin | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Cylinder:
+        if (self.lever is None) == (self.anchor is None) or (self.anchor is None) != (self.pin is None):
+            raise ValueError("lever: give it, or both anchor and pin")
+        if self.lever is not None and self.lever.value == 0:
+            raise ValueError("lever: must not be 0")
+        return self
+
+
 class Sensor(Record):
     """One column of a log, in `unit` (see `units`). SI value = `gain` x (number in the column).
 
     A `factor` that is given is the SI value of one, whatever `unit` says; it is needed where the unit has none, V say.
     A torque may come as the pressures on both sides of a hydraulic motor, in `column` and `return_column`, with the
-    `displacement` [m3 per turn of the joint, gear included]: u = displacement / (2 pi) (p - p_return); `factor` is then
-    the pressure of one [Pa], 4e6 for 0-10 V over 0-400 bar. An angle that comes as a rate (rpm, m/s) is summed up.
+    `displacement` [m3 per turn of the joint, gear included]: u = displacement / (2 pi) (p - p_return); or as those on
+    both sides of `cylinders` (see `hydraulics`). `factor` is then the pressure of one [Pa], 4e6 for 0-10 V over
+    0-400 bar. An angle may come as a rate (rpm, deg/s): it then stays one, with the `noise` of a rate [rad/s].
 
     kind `angle`: encoder of a joint; `wheel`: measuring wheel of `radius` [m] at `lateral` [m] (+ left) on the axis
     through the body's origin (32); `torque`: delivered torque or force + u0; `yaw_rate`, `lateral_speed`: of the
@@ -280,6 +314,7 @@ class Sensor(Record):
     factor: Quantity | None = None
     return_column: Annotated[str | None, Field(min_length=1)] = None
     displacement: Positive | None = None
+    cylinders: tuple[Cylinder, ...] = ()
     kits: tuple[Literal["paper", "full"], ...] = ("paper", "full")
     place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
     counts_per_turn: Positive | None = None
@@ -294,15 +329,15 @@ class Sensor(Record):
 
     @property
     def gain(self) -> float:
-        """SI value of one in the column; of pressures, the torque [N m]."""
+        """SI value of one in the column; of a motor's pressures the torque [N m], of cylinders' the pressure [Pa]."""
         one = float(self.factor) if self.factor is not None else units.UNITS[self.unit][1]
         return one if self.displacement is None else one * float(self.displacement) / (2 * math.pi)
 
     @property
-    def summed(self) -> bool:
-        """Whether the column holds the rate of what the sensor stands for."""
+    def is_rate(self) -> bool:
+        """Whether the column holds the rate of the angle that the sensor stands for."""
         known = units.UNITS.get(self.unit, ("", 1.0))[0]
-        return self.kind in ("angle", "wheel") and known in units.SUMMED
+        return self.kind in ("angle", "wheel") and known in units.RATES
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -311,18 +346,22 @@ class Sensor(Record):
 
     @model_validator(mode="after")
     def _consistent(self) -> Sensor:
-        if (self.displacement is None) != (self.return_column is None):
-            key = "return_column" if self.return_column is None else "displacement"
-            raise ValueError(f"{key}: two pressures of a motor need column, return_column and displacement")
-        if self.displacement is not None and self.kind != "torque":
-            raise ValueError(f"displacement: makes a torque of pressures, not kind {self.kind}")
-        measured = ("pressure",) if self.displacement is not None else units.MEASURES[self.kind]
+        pressed = self.displacement is not None or bool(self.cylinders)
+        if pressed != (self.return_column is not None):
+            key = "return_column" if pressed else "displacement"
+            raise ValueError(f"{key}: two pressures need column, return_column and displacement (or cylinders)")
+        if self.displacement is not None and self.cylinders:
+            raise ValueError("cylinders: a joint is turned by a motor of some displacement or by cylinders, not both")
+        if pressed and self.kind != "torque":
+            key = "cylinders" if self.cylinders else "displacement"
+            raise ValueError(f"{key}: makes a torque of pressures, not kind {self.kind}")
+        measured = ("pressure",) if pressed else units.MEASURES[self.kind]
         if self.factor is None and units.UNITS.get(self.unit, ("",))[0] not in measured:
             raise ValueError(
                 f"unit: {self.unit!r} is no {' or '.join(measured)}, allowed for kind {self.kind}:"
                 f" {units.allowed(measured)}, or any with its factor (the SI value of one)"
             )
-        if self.summed and self.counts_per_turn is not None:
+        if self.is_rate and self.counts_per_turn is not None:
             raise ValueError("counts_per_turn: is for a column that counts, not for a rate")
         if self.kind == "wheel" and (self.radius is None or self.lateral is None):
             raise ValueError(f"{'lateral' if self.radius else 'radius'}: a measuring wheel needs radius and lateral")
@@ -535,6 +574,8 @@ class Machine(Record):
                 if column in columns:
                     raise ValueError(f"sensor[{k}].column: {column} is used twice")
                 columns.add(column)
+            if sensor.cylinders:
+                self._check_cylinders(f"sensor[{k}].cylinders", sensor)
             twin = (sensor.kind, sensor.body)
             if sensor.kind in ("angle", "torque") and twin in measured:
                 raise ValueError(
@@ -542,6 +583,20 @@ class Machine(Record):
                 )
             measured.add(twin)
             names.add(sensor.name)
+
+    def _check_cylinders(self, key: str, sensor: Sensor) -> None:
+        """Whether every pressure turns the joint the same way all along its range, at an angle that is measured."""
+        body = self.find(sensor.body)
+        if body.joint != "revolute":
+            raise ValueError(f"{key}: turn a revolute joint, joint {body.index} is {body.joint}")
+        pinned = any(c.anchor is not None for c in sensor.cylinders)
+        angles = [s for s in self.sensor if s.kind == "angle" and s.body == sensor.body and not s.is_rate]
+        if pinned and not angles and body.coordinates[0] not in self.locked:
+            raise ValueError(f"{key}: the lever depends on the angle of joint {body.index}, which no sensor measures")
+        top = float(body.limit.position) if body.limit.position is not None else 0.5
+        for arm in hydraulics.arms(sensor, np.linspace(-top, top, 41)):
+            if not (arm > 0).all() and not (arm < 0).all():
+                raise ValueError(f"{key}: a pressure has no lever at some angle within {top:g} rad, check the pins")
 
 
 def shipped() -> tuple[str, ...]:

@@ -299,7 +299,7 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
         found.nonlinear,
         found.balance,
         _of_base(found.flow, base),
-        _of_base(found.read, base),
+        _of_base(_rated(machine, found), base),
         _of_base(found.channels, base),
         found.readable,
         found.memory,
@@ -345,6 +345,20 @@ def _beside_base(base: BaseParameters, amounts: Mapping[str, tuple[float, str, f
         base.invisible,
         base.standard + tuple(amounts),
     )
+
+
+def _rated(machine: Machine, found: Equations) -> ca.Function:
+    """What sensors read; of those of a rate, how their angle and what is wrong with it change along the motion."""
+    rates = {s.name for s in machine.sensor if s.is_rate}
+    if not rates & set(found.readable):
+        return found.read
+    q, nu, wheels, u, z, p = found.read.sx_in()
+    reading = found.read(q, nu, wheels, u, z, p)
+    dq, _, rolled, *_ = kinematics(found.sample, found.slips)(q, nu)
+    for k, name in enumerate(found.readable):
+        if name in rates:
+            reading[k] = ca.jtimes(reading[k], ca.vertcat(q, wheels), ca.vertcat(dq, rolled))
+    return ca.Function("read", [q, nu, wheels, u, z, p], [reading])
 
 
 def _of_base(function: ca.Function, base: BaseParameters) -> ca.Function:

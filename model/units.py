@@ -50,7 +50,7 @@ UNITS: dict[str, tuple[str, float]] = {
     "min": ("time", 60.0),
 }
 
-# what a column may hold for a sensor of each kind; rates and speeds of an angle are summed up over time
+# what a column may hold for a sensor of each kind; an angle's rate is a reading of its own
 MEASURES: dict[str, tuple[str, ...]] = {
     "angle": ("angle", "length", "angular rate", "speed"),
     "wheel": ("angle", "angular rate"),
@@ -60,7 +60,7 @@ MEASURES: dict[str, tuple[str, ...]] = {
     "x": ("length",),
     "y": ("length",),
 }
-SUMMED = ("angular rate", "speed")
+RATES = ("angular rate", "speed")
 
 
 def allowed(quantities: tuple[str, ...]) -> str:
