@@ -16,6 +16,7 @@ import scipy.stats
 
 from excite import evidence, hidden, smoothing
 from excite.anomaly import anomalies
+from excite.innovations import innovation_sizes
 from excite.linearise import Chart, chart
 from excite.log import Log
 from excite.record import Point, Record, carried, common_sensors, first_point, origins, record
@@ -29,16 +30,19 @@ WORTH = 15.0  # a first-order gain below which a candidate isn't fitted
 HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
 STRONG = 1.3  # misfit over readings from which first-order gains are rough
 PASSES = 14  # of a candidate's fit
+LESS = 0.3, 0.1  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
 NEARLY = 1.0  # step, in standard deviations, at which a fit that runs out of passes is as good as found
 TRIED = 5  # candidates that are fitted, of different names
 ROUGHLY = 2  # the same where not even the model without them was fitted
 MOST = 4  # effects that are looked for
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
-SHAPE = 0.005  # of what is explained already, that a further effect must gain: nature is never exactly the formula
+SHAPE = 0.005, 0.002  # of what is explained already, that a further effect must gain, as nature is never exactly the
+# formula: by the fits' gains, and by how many deviations the amounts are from none
 CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
-LEAST = 0.05  # of the excess misfit that an effect must explain to be worth a place
+LEAST = 0.05, 0.15  # of the excess misfit that an effect must explain to be worth a place: weak misfit, strong misfit
 SHARE = 0.6  # of the excess misfit that names must explain, or it is unexplained
+FURTHER = 0.8  # the same for names after the first: what nature has beside its formula looks like many a cause
 NEAR = 0.3  # of what the best name leaves unexplained, by which a rival may be worse and still is a tie
 
 Advance = Callable[[float, str], None]
@@ -82,6 +86,18 @@ class Stage:
     def excess(self) -> float:
         """How much more misfit there is than noise may make."""
         return max(0.0, self.fit.cost - (1 + SLACK) * self.prepared.readings)
+
+    @property
+    def rough(self) -> bool:
+        """Whether first-order gains are."""
+        return not self.exact or self.fit.cost > STRONG * self.prepared.readings
+
+    @property
+    def doubt(self) -> float:
+        """How much larger deviations are than the fit has them, for what it leaves unexplained: slow innovations."""
+        sizes = np.concatenate([innovation_sizes(linear) for linear in self.fit.linear])
+        told = sizes[:, 2] > 0
+        return float(np.sqrt(max(1.0, sizes[told, 1].mean()))) if told.any() else 1.0
 
     @property
     def suspects(self) -> list[str]:
@@ -139,7 +155,7 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
         scores = evidence.scan(stage.prepared.c, stage.prepared.records, stage.fit, found).scores
         first = first or scores
         explained = sum(x.gain for x in chosen)
-        choice = _choose(stage, scores, logs, filter, explained, tell, 0.2 + 0.2 * turn)
+        choice = _choose(stage, scores, explained, tell, 0.2 + 0.2 * turn)
         if choice is None:
             break
         chosen.append(choice)
@@ -147,7 +163,10 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
     tell(0.95, "weighing")
     # A name that leaves most of the misfit where it was is none, unless with what came after it nothing is left.
     odd = _odd(stage)
-    while chosen and (odd or not stage.exact) and chosen[-1].gain < SHARE * (chosen[-1].gain + stage.excess):
+    while chosen and (odd or not stage.exact):
+        share = SHARE if len(chosen) == 1 else FURTHER
+        if chosen[-1].gain >= share * (chosen[-1].gain + stage.excess):
+            break
         chosen.pop()
         stage = chosen[-1].stage if chosen else before
         odd = _odd(stage)
@@ -177,64 +196,75 @@ class _Choice:
     rivals: tuple[str, ...]
 
 
-def fitted(
-    machine: Machine, logs: Sequence[Log], filter: Filter, of: Stage | None = None, loose: bool = False
-) -> Stage:
-    """A machine's model fitted to logs, with shapes of effects free; from the fit `of` other effects where given.
+def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
+    """A machine's model fitted to logs, with shapes of effects free.
 
-    With disturbing forces where exact dynamics find no estimate, or `loose`. Raises NotConverged.
+    Where exact dynamics find no estimate, with disturbing forces as small as the log lets them be: the less they may
+    take up, the plainer the cause. Raises NotConverged where not even large ones let the model follow.
     """
-    prepared = _prepared(machine, logs, filter, of)
-    c, X, points, damping = prepared.c, prepared.c.model.nominal, prepared.starts, smoothing.DAMPING[0]
-    passes = smoothing.PASSES
-    if of is not None:
-        old = dict(zip(of.model.base.names, of.fit.X, strict=True))
-        X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, X, strict=True)])
-        points = tuple(carried(c, r, p, of.prepared.c, X) for r, p in zip(prepared.records, of.fit.points, strict=True))
-        damping, passes = smoothing.RESUMED, PASSES
-
-    def solve(disturbed: float) -> Fit:
-        try:
-            return smoothing.iterate(
-                c, prepared.records, points, X, prepared.starts, disturbed, prepared.held, damping, passes
-            )
-        except NotConverged as failed:
-            if failed.fit is None or failed.step > NEARLY:
-                raise
-            return failed.fit
-
-    if not loose:
-        try:
-            return Stage(machine, prepared, solve(0.0))
-        except NotConverged:
-            if of is not None and of.exact:
-                raise
+    prepared = _prepared(machine, logs, filter)
+    c, starts = prepared.c, prepared.starts
+    try:
+        fit = smoothing.iterate(c, prepared.records, starts, c.model.nominal, starts, 0.0, prepared.held)
+        return Stage(machine, prepared, fit)
+    except NotConverged:
+        pass
     stood: Fit | None = None
-    # A candidate is tried as its model was fitted, a model with more and more disturbing forces.
-    levels = smoothing.DISTURBED if of is None or of.exact else (of.fit.disturbed,)
-    for disturbed in levels:
+    for disturbed in smoothing.DISTURBED:
         try:
-            return Stage(machine, prepared, solve(disturbed))
+            fit = smoothing.iterate(c, prepared.records, starts, c.model.nominal, starts, disturbed, prepared.held)
         except NotConverged as failed:
             stood, trouble = failed.fit or stood, failed
-    if stood is None or of is not None:
+            if failed.fit is None or failed.step > NEARLY:
+                continue
+            fit = failed.fit
+        stage = Stage(machine, prepared, fit)
+        for less in LESS:
+            try:
+                stage = refitted(machine, stage, less * disturbed)
+            except NotConverged:
+                break
+        return stage
+    if stood is None:
         raise trouble
     return Stage(machine, prepared, stood, settled=False)
 
 
-def _prepared(machine: Machine, logs: Sequence[Log], filter: Filter, of: Stage | None) -> Prepared:
+def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
+    """The model of a machine with other effects fitted to the logs of a stage, from its fit, with so large disturbing
+    forces. Raises NotConverged."""
+    prepared = _resumed(machine, of)
+    c = prepared.c
+    old = dict(zip(of.model.base.names, of.fit.X, strict=True))
+    X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, c.model.nominal, strict=True)])
+    points = [carried(c, r, p, of.prepared.c, X) for r, p in zip(prepared.records, of.fit.points, strict=True)]
+    try:
+        fit = smoothing.iterate(
+            c, prepared.records, points, X, prepared.starts, disturbed, prepared.held, smoothing.RESUMED, PASSES
+        )
+    except NotConverged as failed:
+        if failed.fit is None or failed.step > NEARLY:
+            raise
+        fit = failed.fit
+    return Stage(machine, prepared, fit)
+
+
+def _prepared(machine: Machine, logs: Sequence[Log], filter: Filter) -> Prepared:
     model = build(machine, shapes=True)
     c = chart(model, common_sensors(model, logs))
-    if of is None:
-        records = tuple(record(c, log) for log in logs)
-        starts = tuple(first_point(c, r, log, filter) for r, log in zip(records, logs, strict=True))
-        return Prepared(c, tuple(logs), records, starts, hidden.unmoved(model, logs, filter, slow=False))
-    records = tuple(replace(r, origin=origins(c, r.counts)) for r in of.prepared.records)
-    starts = tuple(
-        carried(c, r, p, of.prepared.c, model.nominal) for r, p in zip(records, of.prepared.starts, strict=True)
-    )
-    held = dict(zip(of.model.base.names, of.prepared.held, strict=True))
-    return Prepared(c, tuple(logs), records, starts, np.array([held.get(n, False) for n in model.base.names]))
+    records = tuple(record(c, log) for log in logs)
+    starts = tuple(first_point(c, r, log, filter) for r, log in zip(records, logs, strict=True))
+    return Prepared(c, tuple(logs), records, starts, hidden.unmoved(model, logs, filter, slow=False))
+
+
+def _resumed(machine: Machine, of: Stage) -> Prepared:
+    """The logs of a stage made ready for a machine with other effects."""
+    model, before = build(machine, shapes=True), of.prepared
+    c = chart(model, common_sensors(model, before.logs))
+    records = tuple(replace(r, origin=origins(c, r.counts)) for r in before.records)
+    starts = tuple(carried(c, r, p, before.c, model.nominal) for r, p in zip(records, before.starts, strict=True))
+    held = dict(zip(of.model.base.names, before.held, strict=True))
+    return Prepared(c, before.logs, records, starts, np.array([held.get(n, False) for n in model.base.names]))
 
 
 def _duration(logs: Sequence[Log]) -> float:
@@ -257,19 +287,26 @@ def _entry(score: evidence.Score) -> EffectEntry:
 
 def _shortlist(stage: Stage, scores: Sequence[evidence.Score]) -> list[evidence.Score]:
     """The best candidate of each name, best first, as far as worth a fit."""
-    rough = not stage.exact or stage.fit.cost > STRONG * stage.prepared.readings
     best: dict[str, evidence.Score] = {}
     for s in scores:
-        if s.gain >= max(WORTH, HOPE[rough] * scores[0].gain) and s.values["A"] != 0:
+        if s.gain >= max(WORTH, HOPE[stage.rough] * scores[0].gain) and s.values["A"] != 0:
             best.setdefault(s.candidate.name, s)
     return list(best.values())[: TRIED if stage.settled else ROUGHLY]
+
+
+_Try = tuple[evidence.Score, Stage]
+
+
+def _sureness(stage: Stage) -> float:
+    """By how many deviations the amounts of the effects in a model are from none, squared (Wald's statistic)."""
+    names = stage.model.base.names
+    at = [names.index(e.name) for e in stage.model.effects if not e.effect.inverse]
+    return float(((stage.fit.X[at] / stage.fit.std[at]) ** 2).sum())
 
 
 def _choose(
     stage: Stage,
     scores: Sequence[evidence.Score],
-    logs: Sequence[Log],
-    filter: Filter,
     explained: float,
     tell: Advance,
     done: float,
@@ -280,47 +317,64 @@ def _choose(
     if not likely:
         return None
     for reach in CLOSER:
-        nearby = evidence.finer(likely, stage.machine, _duration(logs), reach)
+        nearby = evidence.finer(likely, stage.machine, _duration(stage.prepared.logs), reach)
         if len(nearby) > len(likely):
             closer = evidence.scan(stage.prepared.c, stage.prepared.records, stage.fit, nearby).scores
             likely = _shortlist(stage, sorted([*likely, *closer], key=lambda s: -s.gain))
-    tries = _tries(stage, likely, logs, filter, lambda k: tell(done + 0.03 * k, f"fitting {likely[k].candidate.name}"))
+    tries = _tries(stage, likely, lambda k: tell(done + 0.03 * k, f"fitting {likely[k].candidate.name}"))
     if stage.exact and likely[0].candidate.name not in {s.candidate.name for s, _ in tries}:
         # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
         try:
-            stage = fitted(stage.machine, logs, filter, stage, loose=True)
-            tries = _tries(stage, likely, logs, filter, lambda k: None)
+            stage = refitted(stage.machine, stage, LESS[-1] * smoothing.DISTURBED[0])
         except NotConverged:
             return None
-    if any(t.exact for _, t in tries):
-        tries = [(s, t) for s, t in tries if t.exact]
+        tries = _tries(stage, likely, lambda k: None)
     if not tries:
         return None
     tries.sort(key=lambda x: x[1].fit.cost)
     score, best = tries[0]
-    gain = stage.fit.cost - best.fit.cost if stage.exact == best.exact else score.gain
+    gain = stage.fit.cost - best.fit.cost
     spread = max(1.0, best.fit.cost / best.prepared.readings)
-    if gain / spread < LEVEL or gain < max(LEAST * stage.excess, SHAPE * explained):
+    least = max(LEAST[stage.rough] * stage.excess, SHAPE[0] * explained, SHAPE[1] * _sureness(stage))
+    if gain < max(LEVEL * spread, least):
         return None
-    near = max(CLOSE * spread, NEAR * best.excess)
-    rivals = tuple(s.candidate.name for s, t in tries[1:] if t.fit.cost - best.fit.cost < near)
-    names = len({s.candidate.name for s in scores})
-    return _Choice(score.candidate.name, best, gain, spread, names, rivals)
+    tries = _close(_without_forces(_close(tries)))
+    score, best = tries[0]
+    rivals = tuple(s.candidate.name for s, _ in tries[1:])
+    return _Choice(score.candidate.name, best, gain, spread, len(scores), rivals)
 
 
-def _tries(
-    stage: Stage, likely: Sequence[evidence.Score], logs: Sequence[Log], filter: Filter, tell: Callable[[int], None]
-) -> list[tuple[evidence.Score, Stage]]:
-    """The candidates whose fits were found."""
-    tries: list[tuple[evidence.Score, Stage]] = []
+def _tries(stage: Stage, likely: Sequence[evidence.Score], tell: Callable[[int], None]) -> list[_Try]:
+    """The candidates whose fits were found, as the model without them was fitted."""
+    tries: list[_Try] = []
     for k, score in enumerate(likely):
         tell(k)
         machine = effects.extended(stage.machine, _entry(score))
         try:
-            tries.append((score, fitted(machine, logs, filter, stage)))
+            tries.append((score, refitted(machine, stage, stage.fit.disturbed)))
         except NotConverged:
             continue
     return tries
+
+
+def _close(tries: Sequence[_Try]) -> list[_Try]:
+    """The best of sorted tries and those that the logs like about as well."""
+    best = tries[0][1]
+    near = max(CLOSE * max(1.0, best.fit.cost / best.prepared.readings), NEAR * best.excess)
+    return [x for x in tries if x[1].fit.cost - best.fit.cost < near]
+
+
+def _without_forces(tries: Sequence[_Try]) -> list[_Try]:
+    """Those that need no disturbing forces any more, best first; all, best first as they are, where none does."""
+    exact: list[_Try] = []
+    for score, stage in tries:
+        if stage.fit.cost > STRONG * stage.prepared.readings and not stage.exact:
+            continue  # what forces don't make good, none makes worse
+        try:
+            exact.append((score, stage if stage.exact else refitted(stage.machine, stage, 0.0)))
+        except NotConverged:
+            continue
+    return sorted(exact, key=lambda x: x[1].fit.cost) or list(tries)
 
 
 def _verdict(
@@ -343,8 +397,9 @@ def _verdict(
 def _finding(choice: _Choice, after: Stage) -> Finding:
     """A choice with amount and shapes as the last fit has them."""
     placed = next(e for e in after.model.effects if e.name == choice.name)
-    values = dict(zip(after.model.base.names, zip(after.fit.X, after.fit.std, strict=True), strict=True))
-    amount, std = values[placed.name]
+    std = after.fit.std * after.doubt
+    values = dict(zip(after.model.base.names, zip(after.fit.X, std, strict=True), strict=True))
+    amount, sure = values[placed.name]
     shapes = {
         s: (*values.get(f"{placed.name}.{s}", (placed.values[s], 0.0)), shape.unit)
         for s, shape in placed.effect.shapes.items()
@@ -358,7 +413,7 @@ def _finding(choice: _Choice, after: Stage) -> Finding:
         choice.rivals,
         p,
         float(amount),
-        float(std),
+        float(sure),
         placed.effect.unit,
         shapes,
         gain,

@@ -163,7 +163,7 @@ class Signatures:
         self.torque = np.zeros((*u.shape, self.columns))
         for k, e in enumerate(every):
             if e.effect.channel is not None:
-                self.torque[:, :, k] = _misread(c, e, r.torque, u, t)
+                self.torque[:, :, k] = _misread(c, e, u, t)
 
     def along(self, X: np.ndarray, r: Record, p: Point) -> tuple[np.ndarray, np.ndarray]:
         """What signatures do to the scaled state behind each sample (N - 1, n, C), and to readings (N, m, C)."""
@@ -191,14 +191,16 @@ def _pushed(c: Chart, by: Slopes, force: np.ndarray, torque: np.ndarray) -> np.n
     return moved
 
 
-def _misread(c: Chart, e: Placed, measured: np.ndarray, u: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """How much more torque would be delivered (N, n_u) where a channel reads as the effect has it."""
+def _misread(c: Chart, e: Placed, u: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """How much more torque would be delivered (N, n_u) where a channel reads as the effect has it.
+
+    From smoothed torques u: measured ones would answer to their own noise.
+    """
     gain, offset, delay = e.channel(t)
     more = np.zeros_like(u)
     for k, body in enumerate(c.model.machine.actuated):
         if body.index in e.bodies:
-            early = np.interp(t + delay, t, measured[:, k]) - measured[:, k]
-            more[:, k] = (u[:, k] + early - offset) / gain - u[:, k]
+            more[:, k] = (np.interp(t + delay, t, u[:, k]) - offset) / gain - u[:, k]
     return more
 
 

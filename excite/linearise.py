@@ -154,9 +154,9 @@ class Chart:
     then measured angles that are integrals of these. `index` (n,): their places in simulate's state (q, nu, wheels, z),
     whose size is `full`. `sensors`: those with a reading h(s), in order; `angle`: the state that each encoder reads, -1
     for another sensor. `offsets` (n_u, n_base) takes the torque offsets u0 out of X. `flawed`: parameters that readings
-    depend on directly. `known` (n,): states whose start is known, and how well; NaN for the others.
-    `leaning`: whether readings depend on torques at once. `pushed`: rows on which disturbing forces may act, the unactuated ones, or all where there are none; `inertia`:
-    theirs, nominal [kg, kg m2].
+    depend on directly. `known` (n,): states whose start is known, and how well; NaN for the others. `leaning`: whether
+    readings depend on torques at once. `pushed`: rows on which disturbing forces may act, the unactuated ones, or all
+    where there are none; `inertia`: theirs, nominal [kg, kg m2].
     """
 
     model: Model

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.signal
 
-from excite.diagnose import Stage, fitted
+from excite import smoothing
+from excite.diagnose import Stage, refitted
 from excite.linearise import advance, differentiate
 from excite.smoothing import NotConverged, state_scale
 
@@ -68,11 +69,11 @@ class Size:
 
 
 def loosened(stage: Stage) -> Stage:
-    """The same model with disturbing forces; as it is where those find no fit."""
-    if not stage.exact:
+    """The same model with disturbing forces of some size; as it is where those find no fit."""
+    if stage.fit.disturbed >= smoothing.DISTURBED[0]:
         return stage
     try:
-        return fitted(stage.machine, stage.prepared.logs, stage.machine.filter, stage, loose=True)
+        return refitted(stage.machine, stage, smoothing.DISTURBED[0])
     except NotConverged:
         return stage
 

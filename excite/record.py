@@ -183,11 +183,24 @@ def readings(
     h -= np.where(r.counts, np.clip(travel, -step, step) / 2, 0.0)
     H[slow] -= Hrate[slow] * (sample / 2)
     width = np.where(r.counts, np.maximum(np.minimum(np.abs(travel), step) / np.sqrt(12), EDGE * step), step)
+    width = np.hypot(width, _through(c, r, p, u, X))
     D = np.zeros((len(c.sensors), len(r.origin)))
     for k, j in enumerate(r.origin):
         D[j, k] = 1.0
     by = flaws[0] if flaws else np.zeros((*h.shape, 0))
     return h + D @ p.offset, H, r.used / width**2, D, by
+
+
+def _through(c: Chart, r: Record, p: Point, u: np.ndarray, X: np.ndarray) -> np.ndarray | float:
+    """Standard deviation that noise of the torques makes in readings (N, m) which they enter at once, as by a play."""
+    if not c.leaning:
+        return 0.0
+    parts = []
+    for k, noise in enumerate(c.felt(r.noise.torque, X)):
+        shift = np.eye(u.shape[1])[k] * noise
+        high, low = (c.readings(p.s, u + sign * shift, X)[0][:, :, 0] for sign in (1, -1))
+        parts.append((high - low) / 2)
+    return np.linalg.norm(parts, axis=0)
 
 
 def expected(c: Chart, r: Record, p: Point, u: np.ndarray, X: np.ndarray) -> Record:

@@ -250,9 +250,11 @@ def _estimate(c: Chart, records: Sequence[Record], fit: Fit, filter: Filter, not
 
 
 def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | None = None) -> np.ndarray:
-    """The least covariance (n_base, n_base) that a kit's sensors allow along a motion, whatever the method.
+    """The covariance (n_base, n_base) that a kit's sensors make attainable along a motion: the Cramer-Rao bound of a
+    model of them in which every noise is normal.
 
-    The machine file's noise; an encoder tells something as often as it counts. A weak prior (300 % of each scale) stays
+    The machine file's noise; an encoder tells something as often as it counts, and its edges are off by a tenth of a
+    count at least (a perfect encoder on a slow machine tells more than that). A weak prior (300 % of each scale) stays
     in, so that a parameter which the drive doesn't show has a large deviation and not an infinite one.
     Raises ValueError where a sensor has neither noise nor counts.
     """
@@ -295,7 +297,7 @@ def linearise(
 
     `exact`: the point is a motion of the machine, which needs no integration.
     """
-    delivered, behind = c.delivered(r.torque, X)
+    delivered, behind = c.delivered(r.torque, X, p.errors)
     noise = c.felt(r.noise.torque, X)
     if exact:
         defect = np.zeros_like(p.s[1:])

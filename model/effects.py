@@ -122,7 +122,8 @@ def _full_torque(site: Site) -> float:
 class Shape:
     """What an effect's amount leaves open: default and grid in units of `size`, which belongs to the site.
 
-    `circular`: a phase, found by its sine and cosine; `whole`: an integer, not refined.
+    `circular`: a phase, found by its sine and cosine; `whole`: an integer, not refined. What is zero by default may
+    have either sign.
     """
 
     unit: str
@@ -131,6 +132,10 @@ class Shape:
     size: Callable[[Site], float] = _one
     circular: bool = False
     whole: bool = False
+
+    @property
+    def signed(self) -> bool:
+        return self.circular or self.default == 0
 
 
 @dataclass(frozen=True)
@@ -169,7 +174,7 @@ class Effect:
     soil: Callable[[Scene, int, Values, Soil], Soil] | None = None
     push: Callable[[Scene, int, Values], tuple[ca.SX, ca.SX]] | None = None
     gravity: Callable[[Scene, Values], tuple[ca.SX, ca.SX]] | None = None
-    inertia: Callable[[Scene, Values], ca.SX] | None = None
+    inertia: Callable[[Scene, Values], dict[str, ca.SX]] | None = None
     reading: Callable[[Scene, ca.SX, int, Values], ca.SX] | None = None
     channel: Callable[[ca.SX, Values], Channel] | None = None
     memory: Mapping[str, Memory] = field(default_factory=dict)
@@ -199,9 +204,9 @@ def _coupling(s: Scene, k: int, p: Values) -> ca.SX:
 
 
 def _relaxed(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
-    """The forces' slips lag the geometric ones over the distance A."""
+    """The forces' slips lag the geometric ones over the distance A, the moment's by a share of it."""
     slip = law.Slip(s.z["gx"], s.z["gy"], soil.slip.vn)
-    return replace(soil, slip=slip, yaw=s.z["turn"] * soil.slip.vn)
+    return replace(soil, slip=slip, yaw=(1 - p["moment"]) * soil.yaw + p["moment"] * s.z["turn"] * soil.slip.vn)
 
 
 def _relaxation(slip: Callable[[Rolling], ca.SX], name: str) -> Memory:
@@ -210,6 +215,12 @@ def _relaxation(slip: Callable[[Rolling], ca.SX], name: str) -> Memory:
         return (slip(r) - s.z[name]) * r.slip.vn / p["A"]
 
     return Memory(rate, 0.05)
+
+
+def _slid(s: Scene, p: Values) -> dict[str, ca.SX]:
+    """What a load on the last chassis changes of its inertia when it slides to another place within so long."""
+    there = p["A"] * (1 + ca.tanh((s.time - p["instant"]) / ca.sqrt(p["takes"] ** 2 + 0.05**2))) / 2
+    return {"MX": there, "ZZ": p["arm"] * there}
 
 
 def _braking(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
@@ -539,6 +550,7 @@ _declare(
         "contact forces late against slip, by a distance",
         "relaxation length, Pacejka, Tire and Vehicle Dynamics, ch. 5",
         _constant(0.05),
+        {"moment": Shape("-", 1.0, (0.0, 1.0))},
         grid=(0.2, 1.0, 4.0),
         positive=True,
         soil=_relaxed,
@@ -581,7 +593,8 @@ _declare(
         "ground_slope",
         ("machine",),
         "rad",
-        "gravity along a fixed direction of the ground; `direction` points downhill, from the first heading",
+        "gravity along a fixed direction of the ground; `direction` points downhill, from x0 on, or from the"
+        " first heading where no x0 is",
         "a force that keeps its direction on the ground while the machine turns and reverses",
         "statics of an inclined plane",
         _constant(0.005),
@@ -599,8 +612,12 @@ _declare(
         "inertial and yaw forces that change at an instant",
         "a water tank or a load that moves",
         _rear_moment,
-        {"instant": Shape("s", 0.5, (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), _duration)},
-        inertia=lambda s, p: p["A"] * (1 + ca.tanh((s.time - p["instant"]) / 0.2)) / 2,
+        {
+            "instant": Shape("s", 0.5, (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), _duration),
+            "takes": Shape("s", 0.2, (0.2,)),
+            "arm": Shape("m", 0.0, (0.0,)),  # the yaw inertia about the joint changes by A times this
+        },
+        inertia=_slid,
         timed=True,
     ),
     # ---------------------------------------------------------------- articulation
@@ -764,9 +781,9 @@ def _shifting(machine: Machine) -> int | None:
     return free[-1] if free else None
 
 
-def shifted(machine: Machine) -> str:
-    """The standard parameter that `inertia` hooks change."""
-    return f"MX{_shifting(machine)}"
+def shifted(machine: Machine, change: Mapping[str, ca.SX]) -> dict[str, ca.SX]:
+    """What an `inertia` hook changes, by standard parameter of the body whose load may move."""
+    return {f"{name}{_shifting(machine)}": value for name, value in change.items()}
 
 
 def parse(text: str, machine: Machine, duration: float) -> EffectEntry:

@@ -262,7 +262,7 @@ def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
         rows = tree.generalised_forces(machine, s.at, frames, dict(inertia))
         force -= ca.vertcat(*[rows[c] for c in s.names])
     if effect.inertia is not None:
-        moved = {catalogue.shifted(machine): effect.inertia(e.scene, e.values)}
+        moved = catalogue.shifted(machine, effect.inertia(e.scene, e.values))
         none = {n: ca.SX(0) for n in s.by_name}
         change = {b.index: tree.inertial_vector(b, {**none, **moved}) for b in machine.body}
         rows = tree.generalised_forces(machine, s.at, s.frames, change)

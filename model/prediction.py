@@ -127,9 +127,9 @@ class Model:
 
     @cached_property
     def positive(self) -> np.ndarray:
-        """Which parameters make sense above zero only (n_base,): some effects' amounts, and shapes but for phases."""
+        """Which parameters make sense above zero only (n_base,): some effects' amounts, and shapes that aren't signed."""
         above = {e.name for e in self.effects if e.effect.positive}
-        above |= {f"{e.name}.{s}" for e in self.effects for s, shape in e.effect.shapes.items() if not shape.circular}
+        above |= {f"{e.name}.{s}" for e in self.effects for s, shape in e.effect.shapes.items() if not shape.signed}
         return np.array([name in above for name in self.base.names])
 
     @property
@@ -325,7 +325,7 @@ def _amounts(machine: Machine, placed: Sequence[catalogue.Placed], shapes: bool)
                 size = abs(e.effect.amount(site))
             elif shapes and not e.effect.shapes[key].whole:
                 shape = e.effect.shapes[key]
-                size = 1.0 if shape.circular else abs(shape.default * shape.size(site)) / 4
+                size = 1.0 if shape.signed else abs(shape.default * shape.size(site)) / 4
             else:
                 continue
             found[name] = e.values[key], unit, max(size, abs(e.values[key]) if key == "A" else 0.0)

