@@ -416,6 +416,41 @@ def check_log(
         raise typer.Exit(1)
 
 
+machine_files = typer.Typer(help="A machine file: one to start from, what is wrong with one.", rich_markup_mode=None)
+app.add_typer(machine_files, name="machine")
+
+
+@machine_files.command("new")
+def new_machine(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="of the machine")],
+    out: Annotated[Path | None, typer.Option("--out", help="file to write [NAME.toml]")] = None,
+) -> None:
+    """Writes a commented machine file to start from."""
+    from excite import machinecheck
+
+    out = out or Path(f"{name}.toml")
+    machinecheck.start(name, out)
+    terminal.say(f"{out}: change what differs, then `excite machine check {out}`")
+
+
+@machine_files.command("check")
+def check_machine(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="a machine file (.toml)")],
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Says what is wrong or doubtful in a machine file, and draws the machine from above."""
+    from excite import folder, machinecheck
+
+    out = out or Path(f"results/machine-{file.stem}")
+    folder.claim(out, [file])
+    with folder.writing(out) as place:
+        summary = machinecheck.write(place, file, _versions())
+    terminal.finish(summary, out, json, machinecheck.show)
+    if summary["faults"]:
+        raise typer.Exit(1)
+
+
 @app.command()
 def docs(out: OutOption = None, json: JsonOption = False) -> None:
     """Writes reference pages made from the code: effects, machine file, units, commands, Python interface."""

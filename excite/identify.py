@@ -50,7 +50,7 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
         raise ValueError(f"method: {method} is unknown, allowed: {', '.join(METHODS)}")
     if not logs:
         raise ValueError("identify: no log given")
-    _measurable(model)
+    measurable(model)
     _linear(model, method)
     examined = [examine(model, log) for log in logs]
     mended, filter = [e.log for e in examined], filter or model.machine.filter
@@ -66,7 +66,7 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     return noted(estimate, *(note for e in examined for note in e.notes))
 
 
-def _measurable(model: Model) -> None:
+def measurable(model: Model) -> None:
     """Refuses a machine file whose sensors can't say what its equations need. Raises MachineError."""
     machine = model.machine
     have = {(s.kind, s.body) for s in machine.sensor}

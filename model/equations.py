@@ -13,7 +13,7 @@ import casadi as ca
 
 from model import contact, tree
 from model import effects as catalogue
-from model.machine import Body, Machine
+from model.machine import Body, Machine, MachineError
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,9 @@ def sample_of(machine: Machine, standard: tuple[str, ...]) -> Sample:
 
 
 def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[catalogue.Placed]) -> Equations:
-    """The functions of a machine with effects."""
+    """The functions of a machine with effects. Raises MachineError for a contact that can't roll as the law has it."""
+    for body in machine.contacts:
+        _check_axis(machine, body)
     s = sample_of(machine, standard)
     memory, z, acting = _acting(s, placed)
     balance, slips = _balance(s, acting)
@@ -141,6 +143,20 @@ def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[cata
         memory,
         tuple(name for name, bent in zip(standard, curved, strict=True) if bent),
     )
+
+
+def _check_axis(machine: Machine, body: Body) -> None:
+    """The law takes rolling along x of the carrier for a turn about its y; else the soil would push wrongly."""
+    assert not isinstance(body.antecedent, str)
+    own, _ = tree.place(body, {c: ca.SX(0) for c in body.coordinates})
+    axis = ca.DM(own[:, 2]).full()[:, 0]
+    upright = tree.poses(machine, {})[body.antecedent][0][2, 2]
+    if abs(axis[1] - 1) > 1e-9 or abs(upright - 1) > 1e-9:
+        raise MachineError(
+            f"{machine.name}: body {body.name}: contact: must turn about y of an upright chassis, so that rolling"
+            f' forward counts forward (alpha = "-pi/2", gamma 0); its axis there is ({axis[0]:.2g}, {axis[1]:.2g},'
+            f" {axis[2]:.2g})"
+        )
 
 
 def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[catalogue.Placed]) -> Signatures:

@@ -12,9 +12,11 @@ then appears only through the direction of gravity.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
 from model.machine import Body, Machine
 
@@ -145,6 +147,17 @@ def generalised_forces(
             force[body.antecedent] += R @ F
             moment[body.antecedent] += R @ N + ca.cross(P, R @ F)
     return rows
+
+
+def poses(machine: Machine, q: Mapping[str, float]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Rotation (3, 3) and position (3,) [m] of every body in the root's axes, by index.
+
+    q: coordinates by name [rad, m], zero where not given; those of a planar root change nothing.
+    """
+    every = [c for b in machine.body for c in b.coordinates]
+    still = dict.fromkeys(every, ca.SX(0))
+    frames = motion(machine, still | {c: ca.SX(x) for c, x in q.items()}, still, still, ca.SX(3, 1))
+    return {k: (ca.DM(f.rotation).full(), ca.DM(f.position).full()[:, 0]) for k, f in frames.items()}
 
 
 def standard_inertia(body: Body) -> dict[str, float]:

@@ -1,0 +1,446 @@
+"""What is wrong or doubtful in a machine file, and a file to start from.
+
+One plain function per kind of complaint, in the tables FAULTS (the machine can't be as the file says, or nothing can be
+done with it) and DOUBTS (it can, but hardly is); each takes a model and yields lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import jinja2
+import numpy as np
+from pydantic import ValidationError
+
+from excite import folder, identify, limit, manoeuvre, page, report, reports, smoothing, terminal, topview
+from excite.page import Picture, Table
+from excite.simulate import SimulationError, simulate
+from excite.terminal import rounded
+from model import machine as machines
+from model import tree
+from model.machine import Machine, MachineError, Problem, Quantity
+from model.prediction import Model, build, standard_parameters
+
+PICTURE = "machine.png"
+TEMPLATE = "machine.toml"
+LINEAR = 0.15  # slip up to which the linear law holds, where a contact gives no limit
+CRAWL = 0.05  # m/s2: a machine that can't be accelerated so much hardly moves
+LOADS = (0.3, 50.0)  # stiffness of a contact over the load on it
+TRIED, HARDLY = (0, 1), 50.0  # random drives; what is uncertain by so much [%] after the best of them
+TRIAL = Problem(
+    source="definition",
+    duration_s=Quantity(value=20.0, source="definition"),
+    knot_s=Quantity(value=0.2, source="definition"),
+    lane_m=(1e3, 1e3),
+    lane_points=(),
+)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A machine file: what is wrong, what is doubtful, what else must be known, a line each; its model if it has one.
+
+    sigma_percent: after the best of some random drives, one standard deviation by parameter (Cramer-Rao, all sensors);
+    empty where none could be driven.
+    """
+
+    faults: tuple[str, ...]
+    doubts: tuple[str, ...]
+    remarks: tuple[str, ...]
+    model: Model | None
+    sigma_percent: dict[str, float]
+
+
+def check(path: Path) -> Checked:
+    """Everything that can be said of a machine file without a log. Raises MachineError where there is none to read."""
+    faults = complaints(path)
+    if faults:
+        return Checked(tuple(faults), (), (), None, {})
+    try:
+        model = build(machines.load(path))
+    except MachineError as err:
+        return Checked((str(err),), (), (), None, {})
+    faults = [line for rule in FAULTS for line in rule(model)]
+    doubts = [line for rule in DOUBTS for line in rule(model)]
+    sigma = {} if faults else _trial(model)
+    doubts += [
+        f"{name}: random drives leave it uncertain by {value:.0f} %: hardly any drive shows it apart from the others"
+        for name, value in sigma.items()
+        if value > HARDLY
+    ]
+    return Checked(tuple(faults), tuple(doubts), tuple(unseen(model)), model, sigma)
+
+
+def complaints(path: Path) -> list[str]:
+    """All that keeps a file from being a machine, a line each. Raises MachineError where there's none to read."""
+    try:
+        machines.load(path)
+    except MachineError as err:
+        if not isinstance(err.__context__, ValidationError):
+            raise
+        every = err.__context__.errors(include_url=False)
+        return [machines.one_line(path, _Single(e), Machine) for e in every]  # type: ignore[arg-type]
+    return []
+
+
+@dataclass(frozen=True)
+class _Single:
+    """One of the complaints of a validation, as if it were the only one."""
+
+    error: Any
+
+    def errors(self, include_url: bool = False) -> list[Any]:
+        return [self.error]
+
+
+# ------------------------------------------------------------------------------------------------ wrong
+
+
+def _mass(model: Model) -> Iterator[str]:
+    q, nu, _ = model.symbols()
+    mass = ca.Function("mass", [q], [model.equations(q, nu, ca.DM(model.nominal))[0]])
+    rng = np.random.default_rng(0)
+    worst = np.inf
+    for at in rng.uniform(-1, 1, (20, len(model.coordinates))):
+        M = mass(at).full()
+        none = [c for c, m in zip(model.coordinates, np.diag(M), strict=True) if not m > 0]
+        if none:
+            yield f"{', '.join(none)}: neither mass nor inertia moves with it, its acceleration has no bound"
+            return
+        size = np.sqrt(np.diag(M))
+        worst = min(worst, float(np.linalg.eigvalsh(M / np.outer(size, size)).min()))
+    if worst <= 1e-9:
+        yield "the mass matrix is not positive definite: no real bodies have these masses, inertias and places"
+
+
+def _tensor(model: Model) -> Iterator[str]:
+    for b in model.machine.body:
+        i = b.inertia
+        if i is None or i.axisymmetric:
+            continue
+        if any(float(x) for x in (i.XY, i.XZ, i.YZ)) or all(float(x) for x in (i.XX, i.YY, i.ZZ)):
+            J = np.array([[i.XX, i.XY, i.XZ], [i.XY, i.YY, i.YZ], [i.XZ, i.YZ, i.ZZ]], float)
+            small, middle, large = np.linalg.eigvalsh(J)
+            if small < -1e-9 * large:
+                yield f"{b.name}: inertia: has a negative principal moment, {small:.4g} kg m2"
+            elif small + middle < large * (1 - 1e-9):
+                yield (
+                    f"{b.name}: inertia: principal moments {small:.4g}, {middle:.4g}, {large:.4g} kg m2: no body"
+                    " has one larger than the other two together"
+                )
+
+
+def _stuck(model: Model) -> Iterator[str]:
+    for b in model.machine.actuated:
+        assert b.friction is not None
+        top, rest = b.limit.torque, float(b.friction.Fs)
+        if top is not None and float(top) <= rest:
+            yield f"{b.name}: limit.torque: {float(top):g} is not above its own friction Fs {rest:g}: it never moves"
+
+
+def _lane(model: Model) -> Iterator[str]:
+    poses = tree.poses(model.machine, {})
+    for name, problem in model.machine.problems.items():
+        places = [poses[i][1][:2] for i in problem.lane_points]
+        apart = max((float(np.linalg.norm(a - b)) for a in places for b in places), default=0.0)
+        room = float(np.hypot(*problem.lane_m))
+        if apart >= room:
+            yield f"problems.{name}.lane_m: lane_points {apart:.3g} m apart don't fit its diagonal, {room:.3g} m"
+        for b in model.machine.actuated:
+            if b.limit.torque_rate is None or b.friction is None:
+                continue
+            reached = float(b.limit.torque_rate) * float(problem.duration_s) / 2
+            if reached <= float(b.friction.Fs):
+                yield (
+                    f"{b.name}: limit.torque_rate: in {float(problem.duration_s):g} s (problem {name}) the torque"
+                    f" comes to {reached:.3g} and back, which is not above its friction Fs {float(b.friction.Fs):g}"
+                )
+
+
+def _sensors(model: Model) -> Iterator[str]:
+    try:
+        identify.measurable(model)
+    except MachineError as err:
+        yield str(err).removeprefix(f"{model.machine.name}: ")
+
+
+FAULTS: tuple[Callable[[Model], Iterator[str]], ...] = (_mass, _tensor, _stuck, _lane, _sensors)
+
+
+# ------------------------------------------------------------------------------------------------ doubtful
+
+
+def _traction(model: Model) -> Iterator[str]:
+    machine = model.machine
+    if not machine.contacts:
+        return
+    mass = sum(float(b.inertia.mass) for b in machine.body if b.inertia is not None)
+    push = 0.0
+    for b in machine.contacts:
+        assert b.contact is not None
+        slip = float(b.contact.slip_limit) if b.contact.slip_limit is not None else LINEAR
+        push += abs(float(b.contact.Kx)) * slip * b.actuated
+        load = mass * 9.81 / len(machine.contacts)
+        for key in ("Kx", "Ky"):
+            stiff = abs(float(getattr(b.contact, key)))
+            if not LOADS[0] * load < stiff < LOADS[1] * load:
+                yield f"{b.name}: contact.{key}: {stiff:.3g} N per slip, {stiff / load:.2g} times its load"
+    if push < CRAWL * mass:
+        yield f"contacts: with all slip that is allowed they push {push:.3g} N, {push / mass:.2g} m/s2 for {mass:g} kg"
+
+
+def _speed(model: Model) -> Iterator[str]:
+    for b in model.machine.contacts:
+        if b.contact is None or b.limit.rim_speed is None:
+            continue
+        R, top = float(b.contact.radius), float(b.limit.rim_speed)
+        if float(b.contact.v_eps) > 0.2 * top:
+            yield f"{b.name}: contact.v_eps: {float(b.contact.v_eps):g} m/s is no small part of its rim_speed, {top:g}"
+        if b.friction is None or b.limit.torque is None or not b.actuated:
+            continue
+        spare = float(b.limit.torque) - float(b.friction.Fs)
+        reached = R * spare / float(b.friction.Fv) if float(b.friction.Fv) else np.inf
+        if reached < top:
+            yield (
+                f"{b.name}: limit.rim_speed: {top:g} m/s is never reached, friction alone holds it at {reached:.3g} m/s"
+                " with full torque"
+            )
+
+
+def _bounds(model: Model) -> Iterator[str]:
+    for b in model.machine.actuated:
+        missing = [key for key in ("torque", "torque_rate") if getattr(b.limit, key) is None]
+        if b.contact is not None:
+            missing += ["rim_speed"] * (b.limit.rim_speed is None)
+        elif b.limit.position is None:
+            missing.append("position")
+        if missing:
+            yield f"{b.name}: limit: {', '.join(missing)} not given: a designed drive knows no such bound"
+        if b.limit.position is not None and b.joint == "revolute" and float(b.limit.position) > np.pi:
+            yield f"{b.name}: limit.position: {float(b.limit.position):g} rad is beyond half a turn: degrees?"
+    for b in model.machine.contacts:
+        if b.contact is not None and b.contact.slip_limit is None and b.contact.law == "linear":
+            yield f"{b.name}: contact.slip_limit: not given: a drive may slip beyond where the linear law holds"
+
+
+def _bodies(model: Model) -> Iterator[str]:
+    """Centres of mass and radii of gyration against the size of the machine; spin inertia against a flat disc's."""
+    poses = tree.poses(model.machine, {})
+    places = np.array([P for _, P in poses.values()])
+    reach = float(np.ptp(places, axis=0).max()) + 2 * max(
+        (float(b.contact.radius) for b in model.machine.contacts if b.contact is not None), default=0.0
+    )
+    if not reach > 0:
+        return
+    for b in model.machine.body:
+        i = b.inertia
+        if i is None:
+            continue
+        away, around = float(np.linalg.norm(i.com.value)), float(np.sqrt(float(i.ZZ) / float(i.mass)))
+        if away > reach:
+            yield f"{b.name}: inertia.com: {away:.3g} m from its frame, the machine is {reach:.3g} m long"
+        if around > reach:
+            yield f"{b.name}: inertia.ZZ: {float(i.ZZ):g} kg m2: a radius of gyration of {around:.3g} on {reach:.3g} m"
+        if i.axisymmetric and float(i.XX) and float(i.ZZ) > 2 * float(i.XX) * (1 + 1e-9):
+            yield (
+                f"{b.name}: inertia.ZZ: {float(i.ZZ):g} kg m2 is more than a flat disc has beside XX {float(i.XX):g}:"
+                " right only with a motor behind its gear in it"
+            )
+
+
+def _noise(model: Model) -> Iterator[str]:
+    for s in model.machine.sensors("full"):
+        if s.noise is None and s.counts_per_turn is None:
+            yield f"sensor {s.name}: neither noise nor counts_per_turn: what accuracy is attainable can't be said"
+
+
+def _scales(model: Model) -> Iterator[str]:
+    """Scales that reach no base parameter, and base parameters so near zero that their relative error means nothing."""
+    base, groups = model.base, {s: n for n in model.base.names for s in model.base.grouping(n)}
+    for name in model.machine.scale:
+        if name not in base.names and groups.get(name) not in (None, name):
+            yield f"scale.{name}: does nothing, the base parameter is called {groups[name]}"
+    mass = sum(float(b.inertia.mass) for b in model.machine.body if b.inertia is not None)
+    for k, name in enumerate(base.names):
+        first = base.units[k] == "kg m"
+        if first and name not in model.machine.scale and abs(model.nominal[k]) < 5e-3 * mass:
+            yield (
+                f"{name}: {model.nominal[k]:.3g} kg m, a centre of mass {1e3 * abs(model.nominal[k]) / mass:.2g} mm"
+                f" off: errors relative to it mean little, give it a scale ([scale] {name} = ...)"
+            )
+
+
+DOUBTS: tuple[Callable[[Model], Iterator[str]], ...] = (_traction, _speed, _bounds, _bodies, _noise, _scales)
+
+
+# ------------------------------------------------------------------------------------------------ unseen
+
+
+def unseen(model: Model) -> Iterator[str]:
+    """Standard parameters other than zero that no drive reveals, and why; bodies that are only seen within others."""
+    machine = model.machine
+    table = dict(zip(model.base.standard, _standard(model), strict=True))
+    left = [n for n in model.base.invisible if table[n]]
+    for b in machine.body:
+        held = [c for c in b.coordinates if c in machine.locked]
+        if held and b.joint != "planar":
+            own = [n for n in left if n in (f"Fv{b.index}", f"Fs{b.index}", f"u{b.index}0")]
+            left = [n for n in left if n not in own]
+            yield f"{b.where}: {held[0]} is held at zero, no drive reveals what belongs to it alone" + (
+                f": {', '.join(own)}" if own else ""
+            )
+    if left:
+        yield f"no motion {'on the plane ' if machine.planar else ''}reveals {', '.join(left)}"
+
+
+def _standard(model: Model) -> list[float]:
+    values = {n: v for n, (v, _) in standard_parameters(model.machine).items()}
+    return [values.get(n, 0.0) for n in model.base.standard]
+
+
+def _trial(model: Model) -> dict[str, float]:
+    """One standard deviation [%] of every parameter after the best of some random drives; {} where there is none."""
+    best: dict[str, float] = {}
+    size = np.maximum(np.abs(model.nominal), model.scale)
+    for seed in TRIED:
+        wish = manoeuvre.multisine(model, TRIAL, seed, top=0.4)
+        for share in 0.75 ** np.arange(14):
+            try:
+                motion = simulate(model, manoeuvre.scaled(wish, share).sample(float(model.machine.sampling_hz)))
+            except SimulationError:
+                continue
+            over = limit.check(model, TRIAL, motion)
+            if all(v == 0 for n, v in over.items() if not n.startswith(("rest", "lane"))):
+                break
+        else:
+            continue
+        try:
+            sigma = 100 * np.sqrt(np.diag(smoothing.cramer_rao(model, motion))) / size
+        except (ValueError, np.linalg.LinAlgError):
+            return {}
+        for name, value in zip(model.base.names, sigma, strict=True):
+            best[name] = min(best.get(name, np.inf), float(value))
+    return best
+
+
+# ------------------------------------------------------------------------------------------------ the commands' work
+
+
+def write(place: Path, path: Path, versions: dict[str, str]) -> dict[str, Any]:
+    """What there is to say of a machine file, with its picture and report in a folder. Raises MachineError."""
+    found = check(path)
+    model = found.model
+    summary: dict[str, Any] = {
+        "file": str(path),
+        "machine": model.machine.name if model else None,
+        "usable": not found.faults,
+        "faults": list(found.faults),
+        "doubts": list(found.doubts),
+        "remarks": list(found.remarks),
+        "coordinates": list(model.coordinates) if model else [],
+        "inputs": list(model.inputs) if model else [],
+        "parameters": _parameters(model, found.sigma_percent) if model else {},
+        "invisible": list(model.base.invisible) if model else [],
+        "versions": versions,
+    }
+    if model is not None and model.machine.planar:
+        report.save(topview.figure(model.machine), place / PICTURE)
+    (place / "report.html").write_text(_page(summary, place), encoding="utf-8")
+    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    return summary
+
+
+def _parameters(model: Model, sigma: dict[str, float]) -> dict[str, dict[str, Any]]:
+    return {
+        name: {
+            "unit": unit,
+            "value": float(value),
+            "stands_for": model.base.grouping(name),
+            "random_drive_percent": sigma.get(name),
+        }
+        for name, unit, value in zip(model.base.names, model.base.units, model.nominal, strict=True)
+    }
+
+
+def answer(summary: dict[str, Any]) -> str:
+    """A check in a sentence."""
+    name, faults, doubts = summary["machine"] or summary["file"], summary["faults"], summary["doubts"]
+    if faults:
+        return f"{_count(len(faults), 'thing')} wrong with {name}."
+    said = f"{name} can be used: {len(summary['parameters'])} parameters can be told"
+    return f"{said}, {_count(len(doubts), 'thing')} doubtful." if doubts else f"{said}, nothing is doubtful."
+
+
+def _count(n: int, what: str) -> str:
+    return f"1 {what} is" if n == 1 else f"{n} {what}s are"
+
+
+def grouping(parts: dict[str, float]) -> str:
+    """What a base parameter stands for, as a sum: "MX0 + 1.45 M3"."""
+    said = ""
+    for name, c in parts.items():
+        said += ("-" if not said else " - ") if c < 0 else " + " if said else ""
+        said += name if abs(abs(c) - 1) < 1e-9 else f"{abs(c):.4g} {name}"
+    return said
+
+
+def rows(summary: dict[str, Any]) -> list[tuple[str, ...]]:
+    """The table of parameters: name, what it stands for, value, unit, what random drives leave uncertain [%]."""
+    return [
+        (n, grouping(r["stands_for"]), rounded(r["value"]), r["unit"], rounded(r["random_drive_percent"], 2))
+        for n, r in summary["parameters"].items()
+    ]
+
+
+COLUMNS = ("parameter", "stands for", "value", "unit", "random drives: std %")
+
+
+def _page(summary: dict[str, Any], place: Path) -> str:
+    caption = "The machine from above: dots its centres of mass; grey outlines, its steered joints at their stops."
+    pictures = [Picture(place / PICTURE, caption)] if (place / PICTURE).is_file() else []
+    remarks = [
+        *(f"Wrong: {x}" for x in summary["faults"]),
+        *(f"Doubtful: {x}" for x in summary["doubts"]),
+        *(x[:1].upper() + x[1:] for x in summary["remarks"]),
+    ]
+    tables = [Table("What a drive can tell of it.", COLUMNS, tuple(rows(summary)))] if summary["parameters"] else []
+    title = f"The machine file {summary['file']}"
+    return page.report_page(title, answer(summary), pictures, tables, reports.how(summary), remarks)
+
+
+def show(summary: dict[str, Any]) -> None:
+    """A check on the terminal."""
+    if summary["parameters"]:
+        table = terminal.table(*COLUMNS)
+        for row in rows(summary):
+            table.add_row(*row)
+        terminal.say(table)
+    for word, lines in (("wrong: ", summary["faults"]), ("doubtful: ", summary["doubts"]), ("", summary["remarks"])):
+        for line in lines:
+            terminal.say(f"{word}{line}")
+    terminal.say(answer(summary))
+
+
+def start(name: str, file: Path) -> None:
+    """Writes a file to start from. Raises MachineError where there is one already, or for a name that can't be one."""
+    text = fresh(name, file)
+    if file.exists():
+        raise MachineError(f"{file}: is there already, give another --out")
+    with folder.writing_file(file) as place:
+        place.write_text(text, encoding="utf-8")
+
+
+def fresh(name: str, file: Path) -> str:
+    """A commented machine file to start from. Raises MachineError for a name that can't be one."""
+    if not name.replace("_", "").replace("-", "").isalnum() or not name[0].isalpha() or not name.isascii():
+        raise MachineError(f"{name}: a machine's name has letters, digits, _ and -, and begins with a letter")
+    if name in machines.shipped():
+        raise MachineError(f"{name}: is the name of a shipped machine, choose another")
+    text = jinja2.Environment(
+        loader=jinja2.PackageLoader("excite", "templates"), keep_trailing_newline=True, undefined=jinja2.StrictUndefined
+    ).get_template(TEMPLATE)
+    return text.render(name=name, title=name.replace("_", " ").replace("-", " "), file=file)
