@@ -117,6 +117,8 @@ def design(
         list[str] | None,
         typer.Option("--between", help="twice: NAME[@WHERE]=AMOUNT, two effects that the drive is to tell apart"),
     ] = None,
+    driver: Annotated[bool, typer.Option("--driver", help="a drive that people can follow, in phases")] = False,
+    phase_min: Annotated[float, typer.Option("--phase-min", help="shortest phase for --driver [s]")] = 3.0,
     starts: StartsOption = 2,
     seed: SeedOption = 0,
     budget: BudgetOption = None,
@@ -133,7 +135,10 @@ def design(
         if len(between) != 2 or objective not in ("cond", "discrimination"):
             raise UsageError("--between: give it twice, two effects, and no other --objective")
         objective = "discrimination"
-    brief = Brief(objective, sigma_max, robust, tuple(after or ()), starts, seed, budget, tuple(between or ()))
+    if phase_min != 3.0 and not driver:
+        raise UsageError("--phase-min is for --driver, give that too")
+    known, pair = tuple(after or ()), tuple(between or ())
+    brief = Brief(objective, sigma_max, robust, known, starts, seed, budget, pair, driver, phase_min)
     with folder.writing(out) as place:
         summary = _design(place, machine, problem, duration, brief)
     terminal.finish(summary, out, json, terminal.design_table)

@@ -7,6 +7,7 @@ by side, and says so where the one hides the other.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +16,11 @@ from typing import Any
 import numpy as np
 
 from excite import aim as aims
-from excite import identify, log, scenario, sequential
+from excite import drive, identify, log, phased, scenario, sequential
+from excite import objective as objectives
 from excite.aim import Aim
 from excite.design import Design, design
+from excite.phased import Phased
 from model import effects
 from model.machine import MachineError, Problem
 from model.prediction import Model
@@ -29,7 +32,7 @@ SCENARIOS, SPREAD = 5, 0.2  # machines of a robust design, and how far their val
 @dataclass(frozen=True)
 class Brief:
     """objective: a name of the table. sigma_max [%]. robust: for every machine within SPREAD. after: logs. between: two
-    effects that the drive is to tell apart."""
+    effects that the drive is to tell apart. driver: for people, in phases of phase_min_s [s] or more."""
 
     objective: str = "cond"
     sigma_max: float | None = None
@@ -39,15 +42,21 @@ class Brief:
     seed: int = 0
     budget_s: float | None = None
     between: tuple[str, ...] = ()
+    driver: bool = False
+    phase_min_s: float = 3.0
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A design, the model that it was made for (with `after`, the estimate is its nominal) and the aim."""
+    """A design, the model that it was made for (with `after`, the estimate is its nominal) and the aim.
+
+    phased: where it is for people, its phases and what they keep; the design is then what a steady person drives.
+    """
 
     model: Model
     aim: Aim
     design: Design
+    phased: Phased | None = None
 
 
 def rivals(model: Model, between: tuple[str, ...], duration: float) -> Model:
@@ -71,9 +80,11 @@ def answer(
 ) -> Answer:
     """The design that a brief asks for.
 
-    Raises MachineError for sensors of unknown noise, whose accuracy can't be stated, and what `design`, `log.read` and
-    `identify` raise.
+    Raises MachineError for sensors of unknown noise, whose accuracy can't be stated, DriveError for a drive that people
+    can't be asked for, and what `design`, `log.read` and `identify` raise.
     """
+    if brief.driver:
+        phased.check(model, problem, brief.phase_min_s)
     for s in model.machine.sensors("full"):
         if s.kind not in ("x", "y") and s.noise is None and s.counts_per_turn is None:
             raise MachineError(
@@ -87,7 +98,17 @@ def answer(
         model, prior = known.model, known.information
     machines = scenario.scenarios(model, SCENARIOS, SPREAD, brief.seed) if brief.robust else ()
     aim = aims.aim(model, brief.objective, brief.sigma_max, prior, machines)
-    return Answer(model, aim, design(model, problem, aim, brief.starts, brief.seed, brief.budget_s, progress))
+    if not brief.driver:
+        return Answer(model, aim, design(model, problem, aim, brief.starts, brief.seed, brief.budget_s, progress))
+    begin = time.time()
+    half = None if brief.budget_s is None else brief.budget_s / 2
+    free = design(model, problem, aim, brief.starts, brief.seed, half, progress)
+
+    def over() -> bool:
+        return brief.budget_s is not None and time.time() > begin + brief.budget_s
+
+    made = phased.phased(model, problem, aim, free.motion, brief.phase_min_s, brief.seed, over, progress)
+    return Answer(model, aim, phased.as_design(model, problem, free, made), made)
 
 
 def summary(brief: Brief, a: Answer) -> dict[str, Any]:
@@ -113,6 +134,8 @@ def summary(brief: Brief, a: Answer) -> dict[str, Any]:
         "starts": brief.starts,
         "seed": brief.seed,
     }
+    if a.phased is not None:
+        said["driver"] = _by_hand(brief, a.aim, a.phased)
     if brief.sigma_max is not None:
         said["sigma_max"] = brief.sigma_max
     if brief.between:
@@ -123,6 +146,29 @@ def summary(brief: Brief, a: Answer) -> dict[str, Any]:
         said["after"] = [str(p) for p in brief.after]
         said["nominal"] = dict(zip(names, a.model.nominal.tolist(), strict=True))
     return said
+
+
+def _by_hand(brief: Brief, aim: Aim, made: Phased) -> dict[str, Any]:
+    """What people keep of a design: phases, the score by three ways of driving, limits that they break."""
+    ways = ("played_back", "smoothed", "by_hand")
+    scores = {
+        way: {
+            "score": objectives.reported(aim.name, score),
+            "cond_phi": attained.cond_phi,
+            "worst_parameter": attained.worst,
+            "worst_percent": attained.worst_percent,
+            "median_percent": attained.median_percent,
+        }
+        for way, score, attained in zip(ways, made.scores, made.attained, strict=True)
+    }
+    return {
+        "phase_min_s": brief.phase_min_s,
+        "people": len(made.people),
+        **scores,
+        "limits_broken": made.over,
+        "complete": made.complete,
+        "phases": drive.table(made.trace),
+    }
 
 
 def advice(brief: Brief, worst: str, percent: float) -> str | None:

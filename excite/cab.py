@@ -40,11 +40,17 @@ def prepare(
     model, motion, problem = design.model, design.motion, design.problem
     if problem is None:
         raise DriveError(f"{model.machine.name}: has no problem {design.summary.get('problem')}, design again")
-    own = drive.as_designed(model, motion)
-    counts = [most] if most is not None else [round(motion.t[-1] / pace) for pace in PACES]
-    choices = [drive.phases(model, motion, shortest, max(2, n)) for n in counts]
-    choices = [c for k, c in enumerate(choices) if len(c) not in [len(b) for b in choices[:k]]]
-    done, total = 0, 2 * PEOPLE + len(choices)
+    made = design.summary.get("driver") if most is None else None  # by `--driver`: of phases already
+    if made is not None:
+        choices = [drive.from_table(model, made["phases"])]
+        free = made["played_back"]
+        played = Score(free["cond_phi"], free["worst_percent"], free["worst_parameter"], free["median_percent"])
+    else:
+        counts = [most] if most is not None else [round(motion.t[-1] / pace) for pace in PACES]
+        choices = [drive.phases(model, motion, shortest, max(2, n)) for n in counts]
+        choices = [c for k, c in enumerate(choices) if len(c) not in [len(b) for b in choices[:k]]]
+        played = drive.score(model, motion)
+    done, total = 0, (1 if made is not None else 2) * PEOPLE + len(choices)
 
     def person(way: Trace, who: int) -> Motion:
         nonlocal done
@@ -62,11 +68,13 @@ def prepare(
         lost = [_loss(drive.score(model, person(c, 0))) for c in choices]
         trace = next(c for c, x in zip(choices, lost, strict=True) if x <= ENOUGH * min(lost))
 
-    scores: list[tuple[str, Score]] = [(PLAYED, drive.score(model, motion))]
-    try:
-        scores.append((TRACED, drive.middle([drive.score(model, m) for m in people(own)])))
-    except SimulationError:  # a trace that no one can follow need not stop the phases
-        done = PEOPLE
+    scores: list[tuple[str, Score]] = [(PLAYED, played)]
+    if made is None:
+        try:
+            own = drive.as_designed(model, motion)
+            scores.append((TRACED, drive.middle([drive.score(model, m) for m in people(own)])))
+        except SimulationError:  # a trace that no one can follow need not stop the phases
+            done = PEOPLE
     motions = drive.placed(model, problem, people(trace))
     scores.append((PHASED, drive.middle([drive.score(model, m) for m in motions])))
     room = drive.room(model, motions)
@@ -144,16 +152,7 @@ def summary(made: Sheet) -> dict[str, Any]:
     trace = made.trace
     return {
         "duration_s": trace.duration,
-        "phases": [
-            {
-                "start_s": float(trace.times[k]),
-                "end_s": float(trace.times[k + 1]),
-                "speed_m_s": [float(trace.speed[k]), float(trace.speed[k + 1])],
-                "angle_rad": [float(trace.angle[k]), float(trace.angle[k + 1])],
-                "do": drive.words(trace, k),
-            }
-            for k in range(len(trace))
-        ],
+        "phases": drive.table(trace),
         "direction_changes_s": drive.reversals(trace),
         "room_m": [made.room.length, made.room.width],
         "tolerance": {

@@ -8,8 +8,9 @@ accuracy is what a person can keep.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -125,17 +126,23 @@ def phases(model: Model, motion: Motion, shortest: float = 2.0, most: int | None
     wheel, left = steered(model), turns_left(model)
     speed = motion.nu[:, 0]
     angle = motion.q[:, model.coordinates.index(wheel.coordinates[0])] if wheel else np.zeros(len(motion.t))
-    fastest, widest, swing = _bounds(model, wheel)
+    fastest, widest, swing = bounds(model, wheel)
     signal = np.column_stack([speed / (SPEED_STEP * 5), angle / (ANGLE_STEP * 5)])
     knots = _segments(motion.t, signal, shortest, most)
     fit = _refit(motion.t, np.column_stack([speed, angle]), knots)
     v = np.clip(np.round(fit[:, 0] / SPEED_STEP) * SPEED_STEP, -fastest, fastest)
     a = np.clip(np.round(fit[:, 1] / ANGLE_STEP) * ANGLE_STEP, -widest, widest)
+    return merged(Trace(knots, v + 0.0, slowed(knots, a, swing) + 0.0, left))
+
+
+def slowed(times: np.ndarray, angle: np.ndarray, swing: float) -> np.ndarray:
+    """Angles (K,) [rad] at times (K,) [s], steered no faster than `swing` [rad/s] in between; the ends stay."""
+    a, most = angle.copy(), swing * np.diff(times)
     for k in range(1, len(a)):  # from the start, then from the end, so that both ends stay where they are
-        a[k] = np.clip(a[k], a[k - 1] - swing * np.diff(knots)[k - 1], a[k - 1] + swing * np.diff(knots)[k - 1])
+        a[k] = np.clip(a[k], a[k - 1] - most[k - 1], a[k - 1] + most[k - 1])
     for k in range(len(a) - 2, -1, -1):
-        a[k] = np.clip(a[k], a[k + 1] - swing * np.diff(knots)[k], a[k + 1] + swing * np.diff(knots)[k])
-    return _merge(Trace(knots, v + 0.0, a + 0.0, left))
+        a[k] = np.clip(a[k], a[k + 1] - most[k], a[k + 1] + most[k])
+    return a
 
 
 def as_designed(model: Model, motion: Motion) -> Trace:
@@ -145,7 +152,7 @@ def as_designed(model: Model, motion: Motion) -> Trace:
     return Trace(motion.t, motion.nu[:, 0], angle, turns_left(model))
 
 
-def _bounds(model: Model, wheel: Body | None) -> tuple[float, float, float]:
+def bounds(model: Model, wheel: Body | None) -> tuple[float, float, float]:
     """Speed [m/s], angle [rad] and rate [rad/s] that a trace may ask for; speed and angle on the dial's grid."""
     rims = [float(b.limit.rim_speed) for b in model.machine.contacts if b.limit.rim_speed is not None]
     fastest = np.floor(RESERVE * min(rims) / SPEED_STEP + 1e-9) * SPEED_STEP if rims else np.inf
@@ -198,7 +205,7 @@ def _refit(t: np.ndarray, signal: np.ndarray, knots: np.ndarray) -> np.ndarray:
     return values
 
 
-def _merge(trace: Trace) -> Trace:
+def merged(trace: Trace) -> Trace:
     """Neighbours that are one straight line become one phase."""
     keep = [0]
     for k in range(1, len(trace.times) - 1):
@@ -233,6 +240,32 @@ def words(trace: Trace, k: int, letters: bool = False) -> str:
     `letters`: with the names that changes of direction have on the map.
     """
     return ", ".join(part for part in parts(trace, k, letters) if part)
+
+
+def table(trace: Trace) -> list[dict[str, Any]]:
+    """Every phase as numbers and words."""
+    return [
+        {
+            "start_s": float(trace.times[k]),
+            "end_s": float(trace.times[k + 1]),
+            "speed_m_s": [float(trace.speed[k]), float(trace.speed[k + 1])],
+            "angle_rad": [float(trace.angle[k]), float(trace.angle[k + 1])],
+            "do": words(trace, k),
+        }
+        for k in range(len(trace))
+    ]
+
+
+def from_table(model: Model, rows: Sequence[Mapping[str, Any]]) -> Trace:
+    """The trace that `table` was made of. Raises DriveError for a table that is damaged."""
+    try:
+        ends = [(0.0, 0.0, 0.0), *((r["end_s"], r["speed_m_s"][1], r["angle_rad"][1]) for r in rows)]
+        times, speed, angle = np.array(ends, float).T
+    except (KeyError, IndexError, TypeError, ValueError):
+        raise DriveError("summary.json: the design's phases are damaged, design again") from None
+    if len(times) < 2 or not (np.diff(times) > 0).all():
+        raise DriveError("summary.json: the design's phases are damaged, design again")
+    return Trace(times, speed, angle, turns_left(model))
 
 
 def parts(trace: Trace, k: int, letters: bool = False) -> tuple[str, str]:

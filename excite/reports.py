@@ -127,16 +127,63 @@ def _design(s: Summary) -> Said:
         remarks.append("Cut short: the best drive so far, more time may find a better one.")
     if s.get("advice"):
         remarks.append(s["advice"])
-    remarks.append(
-        "A person at the levers drives something else: `excite drive` makes phases of it and says what is kept."
-    )
     rows = tuple((name, rounded(value, 3)) for name, value in sorted(sigma.items(), key=lambda x: -x[1]))
     tables = [Table("Attainable standard deviation of each parameter, the worst first.", ("parameter", "%"), rows)]
+    if s.get("driver"):
+        said, more = _by_hand(s)
+        remarks = [*said, *remarks]
+        tables = [*more, *tables]
+    else:
+        remarks.append(
+            "A person at the levers drives something else: `excite drive` makes phases of it and says what is kept,"
+            " `excite design --driver` designs for people in the first place."
+        )
     if s.get("violations"):
         over = tuple((name, f"{100 * value:.3f}") for name, value in s["violations"].items() if value > 0)
         if over:
             tables.append(Table("Limits that are exceeded, in per cent of their range.", ("limit", "%"), over))
     return f"Test drive for {s['machine']}, problem {s['problem']}", answer, remarks, tables
+
+
+WAYS = {
+    "played_back": "torques played back: the design without a driver",
+    "smoothed": "people, on phases that only follow these torques",
+    "by_hand": "people, on this drive",
+}
+
+
+def kept(s: Summary) -> str:
+    """What people keep of a design for torques, in a sentence."""
+    d = s["driver"]
+    free, hand = d["played_back"], d["by_hand"]
+    name, unit = (s["objective"], "") if s["objective"] not in ("worst", "discrimination") else (s["objective"], " %")
+    name = {"cond": "cond(Phi)", "weighted-cond": "weighted cond(Phi)"}.get(name, f"objective {name}")
+    return (
+        f"In people's hands these {len(d['phases'])} phases give {name} {hand['score']:.4g}{unit}, torques played back"
+        f" {free['score']:.4g}{unit}; the worst parameter can be told to {hand['worst_percent']:.2g} %"
+        f" ({hand['worst_parameter']}) instead of {free['worst_percent']:.2g} %, the median one to"
+        f" {hand['median_percent']:.2g} % instead of {free['median_percent']:.2g} %"
+    )
+
+
+def _by_hand(s: Summary) -> tuple[list[str], list[Table]]:
+    d = s["driver"]
+    over = ", ".join(f"{name} by {100 * value:.2g} %" for name, value in d["limits_broken"].items())
+    remarks = [
+        f"{kept(s)}.",
+        f"In the hands of {d['people']} simulated people these limits are exceeded: {over} of their range."
+        if over
+        else f"In the hands of {d['people']} simulated people every limit is kept.",
+        "The numbers below are of a steady person; `excite drive` makes the driver's sheet and page of this drive.",
+    ]
+    keys = ("score", "cond_phi", "worst_percent", "median_percent")
+    rows = tuple((WAYS[w], *(rounded(d[w][k], 4) for k in keys), d[w]["worst_parameter"]) for w in WAYS)
+    names = ("driven by", "objective", "cond(Phi)", "worst std %", "median std %", "worst parameter")
+    phases = tuple((f"{r['start_s']:g}", f"{r['end_s'] - r['start_s']:g}", r["do"]) for r in d["phases"])
+    return remarks, [
+        Table(f"What people keep, objective {s['objective']} (lower is better).", names, rows, (2,)),
+        Table(f"The drive, phases of {d['phase_min_s']:g} s or more.", ("from s", "for s", "what to do"), phases),
+    ]
 
 
 def _verify(s: Summary) -> Said:

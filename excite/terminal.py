@@ -79,6 +79,16 @@ def design_table(summary: dict[str, Any]) -> None:
         f"attainable accuracy (Cramer-Rao, one standard deviation): worst {worst} {sigma[worst]:.2g} %,"
         f" median {middle:.2g} %"
     )
+    if "driver" in summary:
+        by_hand = summary["driver"]
+        free, hand = by_hand["played_back"], by_hand["by_hand"]
+        say(
+            f"in people's hands, {len(by_hand['phases'])} phases: objective {summary['objective']} {hand['score']:.4g}"
+            f" (torques played back {free['score']:.4g}), worst {hand['worst_parameter']} {hand['worst_percent']:.2g} %"
+            f" ({free['worst_percent']:.2g} %), median {hand['median_percent']:.2g} % ({free['median_percent']:.2g} %)"
+        )
+        broken = ", ".join(f"{name} by {100 * over:.2g} %" for name, over in by_hand["limits_broken"].items())
+        say(f"people exceed {broken} of the range" if broken else "people keep all limits")
     if summary["advice"] is not None:
         say(summary["advice"])
 
