@@ -35,7 +35,8 @@ from excite.driver import follow
 from excite.limit import check, limits, symbols
 from excite.manoeuvre import Manoeuvre, scaled
 from excite.simulate import Motion, SimulationError, simulate
-from model.machine import Problem
+from model import tree
+from model.machine import Body, Problem
 from model.prediction import Model
 
 SLOW = 0.08  # Hz, top of the band of slow multisines
@@ -126,7 +127,8 @@ def hand_made(model: Model, problem: Problem, seed: int, seconds: float) -> Mano
     """What an engineer asks a driver for: four legs forward and back at several speeds, each with a turn to the left
     and to the right, braking at its end; the torques of the driver model at the knots.
 
-    Machines without driven rolls get the joints swept to two thirds of their range instead.
+    Joints that steer from both ends turn against each other; a machine that has none to steer with has its sides driven
+    at different torques. Machines without driven rolls get the joints swept to two thirds of their range instead.
     """
     times = manoeuvre.knots(problem)
     rate = float(model.machine.sampling_hz)
@@ -140,11 +142,39 @@ def hand_made(model: Model, problem: Problem, seed: int, seconds: float) -> Mano
         turn += np.interp(at, [0.1, 0.25, 0.4, 0.6, 0.75, 0.9], [0, 1, 1, -1, -1, 0]) * ((at > 0) & (at < 1))
     joints = [b for b in model.machine.actuated if b.contact is None]
     wide = [float(b.limit.position) if b.limit.position is not None else 0.5 for b in joints]
-    angles = np.column_stack([2 / 3 * w * turn for w in wide]) if joints else np.zeros((len(t), 0))
+    ways = _leftward(model, joints)
+    angles = np.column_stack([2 / 3 * w * s * turn for w, s in zip(wide, ways, strict=True)] or [np.zeros((len(t), 0))])
     driven = follow(model, speed, angles, seed=seed)
     u = np.column_stack([np.interp(times, t, x) for x in driven.u.T])
+    if not joints:
+        u += np.interp(times, t, turn)[:, None] * _sides(model)
     u[0] = u[-1] = 0.0
     return Manoeuvre(times, u)
+
+
+def _leftward(model: Model, joints: Sequence[Body]) -> list[int]:
+    """Which way each joint turns the machine when it rolls forward, against the first one's: 1 the same way, -1 the
+    other. From pure rolling: the lateral speeds of all contacts vanish, which is linear in the chassis' speeds."""
+    rows = [k for k, s in enumerate(model.slips) if s.startswith("gy")]
+    if len(joints) < 2 or len(rows) < 2:
+        return [1] * len(joints)
+    turns = []
+    for b in joints:
+        q = np.zeros(len(model.coordinates))
+        q[model.coordinates.index(b.coordinates[0])] = 0.1
+        lateral = [model.kinematics(q, 1e-3 * nu)[1].full()[rows, 0] for nu in np.eye(len(q))[:3]]
+        turns.append(np.linalg.lstsq(np.column_stack(lateral[1:]), -lateral[0], rcond=None)[0][1])
+    return [1 if turn * turns[0] >= 0 else -1 for turn in turns]
+
+
+def _sides(model: Model) -> np.ndarray:
+    """(n_u,) torques that turn a machine to the left by driving its sides apart: a quarter of what the drives have."""
+    if not model.machine.planar:
+        return np.zeros(len(model.inputs))
+    poses = tree.poses(model.machine, {})
+    left = np.array([np.sign(poses[b.index][1][1].round(6)) for b in model.machine.actuated])
+    top = [float(b.limit.torque) if b.limit.torque is not None else 0.0 for b in model.machine.actuated]
+    return -left * np.array(top) / 4
 
 
 def fourier_slsqp(model: Model, problem: Problem, seed: int, seconds: float) -> Manoeuvre:
@@ -464,7 +494,8 @@ def _rows(model: Model, name: str, samples: Sequence[_Sample], ours: float) -> l
 
 def _row(model: Model, name: str, c: Candidate, kept: int, samples: int, wall_s: float, equal_s: float | None) -> Row:
     motion = simulate(model, c.manoeuvre.sample(float(model.machine.sampling_hz)), q0=c.start)
-    spread = 100 * np.sqrt(np.diag(smoothing.cramer_rao(model, motion))) / np.abs(model.nominal)
+    size = np.where(model.nominal != 0, np.abs(model.nominal), model.scale)
+    spread = 100 * np.sqrt(np.diag(smoothing.cramer_rao(model, motion))) / size
     breaks = None if c.feasible else max(c.violations, key=lambda limit: c.violations[limit])
     return Row(
         name,

@@ -139,6 +139,8 @@ def changes(model: Model, still: np.ndarray) -> list[Change]:
         else:
             found.append(Change(f"move the {where} with changing speed", own, "accelerate"))
             found.append(Change(f"move the {where} both ways", own, "reverse"))
+    if drive and across and not joints:
+        found.append(Change("turn (drive its sides at different speeds)", (*across, *drive), "move"))
     if drive:
         found.append(Change("let one roll drive against the other", drive, "move"))
     found.append(Change("move everything at once", tuple(range(len(still))), "move"))

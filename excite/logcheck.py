@@ -14,6 +14,7 @@ from excite import log
 from excite.examine import find_dropouts, find_spikes
 from excite.log import LogError
 from model import machine as machines
+from model import tree
 from model.machine import Machine, Sensor
 
 T = TypeVar("T")
@@ -211,11 +212,20 @@ def _oddities(sensor: Sensor, values: np.ndarray) -> list[str]:
 
 
 def _wiring(machine: Machine, readings: dict[str, np.ndarray]) -> list[str]:
-    """Rolls that turn against each other: one of them counts the wrong way."""
+    """Rolls that turn against each other: one of them counts the wrong way.
+
+    A machine with no joint to steer with turns its sides against each other: there only those of one side are compared.
+    """
     rolls = [s for s in machine.sensors("full") if s.kind == "angle" and machine.find(s.body).contact is not None]
     rolls = [s for s in rolls if s.name in readings]
+    places = tree.poses(machine, {})
+    steers = any(b.contact is None for b in machine.actuated)
+    side = {s.name: 0.0 if steers else np.sign(places[s.body][1][1].round(6)) for s in rolls}
+    rolls = sorted(rolls, key=lambda s: side[s.name])
     lines = []
     for one, other in itertools.pairwise(rolls):
+        if side[one.name] != side[other.name]:
+            continue
         a, b = (readings[s.name][::10] if s.is_rate else np.diff(readings[s.name][::10]) for s in (one, other))
         a, b = a[: len(b)], b[: len(a)]
         if len(a) > 10 and np.ptp(a) > 0 and np.ptp(b) > 0 and np.corrcoef(a, b)[0, 1] < AGAINST:

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from excite import drive
+from excite import drive, topview
 from excite.drive import Room, Score, Trace
 from excite.report import COLOURS
 from excite.simulate import Motion
@@ -116,12 +116,8 @@ def _lane(ax: Axes, sheet: Sheet) -> None:
     for ahead, colour, style, name in ((True, COLOURS[0], "-", "forward"), (False, COLOURS[1], "--", "backward")):
         part = np.where((forward == ahead)[:, None], centre, np.nan)
         ax.plot(*part.T, color=colour, linestyle=style, linewidth=1.8, label=name, zorder=3)
-    for b, roll in zip(model.machine.contacts, edges, strict=True):  # the machine as it stands at the start
-        right, left = roll[:, 0]
-        assert b.contact is not None
-        across = left - right
-        along = np.array([across[1], -across[0]]) / float(b.contact.width) * float(b.contact.radius)
-        outline = [right - along, right + along, left + along, left - along]
+    start = dict(zip(model.coordinates, motion.q[0], strict=True))
+    for outline in topview.footprints(model.machine, start):  # the machine as it stands at the start
         ax.add_patch(Polygon(outline, closed=True, facecolor="white", edgecolor="black", zorder=4))
     ax.plot(*edges.mean(axis=1)[:, 0].T, color="black", linewidth=1.5, zorder=4)
     _mark(ax, centre[0], "o", "START", (6, 8))

@@ -68,15 +68,31 @@ def steered(machine: Machine) -> list[Body]:
     return [b for b in driven if abs(poses[b.index][0][2, 2]) > 0.9]
 
 
-def _contacts(ax: Axes, machine: Machine, q: Mapping[str, float], ghost: bool) -> None:
-    """Rolls and wheels as rectangles, as long as they are high, their names beside them."""
+def footprints(machine: Machine, q: Mapping[str, float]) -> list[np.ndarray]:
+    """(4, 2) corners [m] of every roll and wheel as it stands on the ground at coordinates q, those of the root too.
+
+    As long as it is high; a contact that is a point is drawn NARROW.
+    """
     poses = tree.poses(machine, q)
+    x, y, heading = (q.get(c, 0.0) for c in machine.body[0].coordinates)
+    c, s = np.cos(heading), np.sin(heading)
+    shapes = []
     for b in machine.contacts:
         assert b.contact is not None
         assert not isinstance(b.antecedent, str)
-        radius, width = float(b.contact.radius), float(b.contact.width)
-        turned, place = poses[b.antecedent][0], poses[b.index][1]
-        shape = _footprint(turned, place, radius, width or NARROW * radius, 0.0)
+        radius = float(b.contact.radius)
+        own = _footprint(
+            poses[b.antecedent][0], poses[b.index][1], radius, float(b.contact.width) or NARROW * radius, 0.0
+        )
+        shapes.append(own @ np.array([[c, s], [-s, c]]) + [x, y])
+    return shapes
+
+
+def _contacts(ax: Axes, machine: Machine, q: Mapping[str, float], ghost: bool) -> None:
+    """Rolls and wheels as rectangles, as long as they are high, their names beside them."""
+    poses = tree.poses(machine, q)
+    for b, shape in zip(machine.contacts, footprints(machine, q), strict=True):
+        place = poses[b.index][1]
         if ghost:
             ax.add_patch(Polygon(shape, closed=True, facecolor="none", edgecolor=GHOST, linestyle="--", zorder=4))
             continue

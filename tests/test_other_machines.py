@@ -10,10 +10,11 @@ from functools import lru_cache
 
 import casadi as ca
 import numpy as np
+import pandas as pd
 import pytest
 from test_tree import TOLERANCE, Case, relative
 
-from excite import design, identify, limit, log, manoeuvre, sensors
+from excite import compare, design, hidden, identify, limit, log, logcheck, manoeuvre, sensors, topview
 from excite.limit import InfeasibleError
 from excite.simulate import simulate
 from model.machine import Machine, Problem, Quantity, load
@@ -245,3 +246,49 @@ def test_design_ends_with_a_drive_or_with_the_limit_that_it_misses(model: Model)
         said = str(missed)
     assert excess <= 1e-3
     assert said.startswith("no drive found")
+
+
+# ------------------------------------------------------------------------- what once knew that it is a compactor
+def turned(model: Model) -> float:
+    """How far the hand-made drive turns the machine, the range of its heading [rad]."""
+    drive = compare.hand_made(model, short(model.machine, 20.0), 0, 0.0)
+    motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
+    return float(np.ptp(motion.q[:, model.coordinates.index("theta0")]))
+
+
+@pytest.mark.parametrize("name", ["tandem", "skid_robot"])
+def test_a_hand_made_drive_turns_whatever_it_steers_with(name: str) -> None:
+    """Steering joints at both ends turn against each other (alike, they would only move it sideways), and where there
+    is no joint the sides are driven apart."""
+    assert turned(model_of(name)) > 0.1
+
+
+def test_sides_of_a_skid_steered_robot_may_turn_against_each_other() -> None:
+    """On the spot the sides do; two wheels of one side that do are wired wrongly."""
+    robot = load("skid_robot")
+    t = np.arange(500) / 100
+    way = np.sin(2 * t) + 0.3 * np.sin(5 * t)
+    signs = {"front_left": -1, "rear_left": -1, "front_right": 1, "rear_right": 1}
+
+    def wired() -> list[str]:
+        table = pd.DataFrame({"t_s": t} | {f"{n}_rad": sign * way for n, sign in signs.items()})
+        return [r for r in logcheck.inspect(table, robot).faults if "against each other" in r]
+
+    assert wired() == []
+    signs["rear_left"] = 1
+    assert len(wired()) == 1
+    assert "front_left_rad, rear_left_rad" in wired()[0]
+
+
+def test_what_a_straight_log_of_a_skid_steered_robot_hides_is_seen_by_turning() -> None:
+    model = model_of("skid_robot")
+    texts = [c.text for c in hidden.changes(model, np.zeros(len(model.coordinates), bool))]
+    assert "turn (drive its sides at different speeds)" in texts
+    assert not any("sides" in c.text for c in hidden.changes(model_of("tandem"), np.zeros(7, bool)))
+
+
+def test_footprints_stand_where_the_wheels_do() -> None:
+    """The robot turned by a quarter and moved: its front left wheel is now ahead on the left of where it stood."""
+    shapes = topview.footprints(load("skid_robot"), {"x0": 5.0, "y0": 1.0, "theta0": np.pi / 2})
+    assert shapes[0].mean(axis=0) == pytest.approx([5 - 0.29153, 1 + 0.249])
+    assert np.ptp(shapes[0], axis=0) == pytest.approx([topview.NARROW * 0.16459, 2 * 0.16459])
