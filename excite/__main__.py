@@ -429,13 +429,17 @@ app.add_typer(machine_files, name="machine")
 def new_machine(
     name: Annotated[str, typer.Argument(metavar="NAME", help="of the machine")],
     out: Annotated[Path | None, typer.Option("--out", help="file to write [NAME.toml]")] = None,
+    json: JsonOption = False,
 ) -> None:
     """Writes a commented machine file to start from."""
     from excite import machinecheck
 
     out = out or Path(f"{name}.toml")
     machinecheck.start(name, out)
-    terminal.say(f"{out}: change what differs, then `excite machine check {out}`")
+    if json:
+        terminal.show_json({"machine": name, "file": str(out)})
+    else:
+        terminal.say(f"{out}: change what differs, then `excite machine check {out}`")
 
 
 @machine_files.command("check")

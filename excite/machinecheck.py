@@ -287,7 +287,9 @@ def unseen(model: Model) -> Iterator[str]:
     left = [n for n in model.base.invisible if table[n]]
     for b in machine.body:
         held = [c for c in b.coordinates if c in machine.locked]
-        if held and b.joint != "planar":
+        if held and b.joint == "planar":
+            yield f"{', '.join(held)}: held at zero, the machine keeps to a line"
+        elif held:
             own = [n for n in left if n in (f"Fv{b.index}", f"Fs{b.index}", f"u{b.index}0")]
             left = [n for n in left if n not in own]
             yield f"{b.where}: {held[0]} is held at zero, no drive reveals what belongs to it alone" + (
@@ -400,7 +402,10 @@ COLUMNS = ("parameter", "stands for", "value", "unit", "random drives: std %")
 
 
 def _page(summary: dict[str, Any], place: Path) -> str:
-    caption = "The machine from above: dots its centres of mass; grey outlines, its steered joints at their stops."
+    caption = (
+        "The machine from above: dots its centres of mass, green its measuring wheels, dashed with every steered joint"
+        " at its stop."
+    )
     pictures = [Picture(place / PICTURE, caption)] if (place / PICTURE).is_file() else []
     remarks = [
         *(f"Wrong: {x}" for x in summary["faults"]),

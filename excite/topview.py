@@ -30,7 +30,7 @@ def figure(machine: Machine) -> Figure:
 
 
 def outline(ax: Axes, machine: Machine) -> None:
-    """Draws it: forward is to the right, left is up [m]."""
+    """Draws it: forward is to the right, left is up [m]. Dots are centres of mass, green outlines measuring wheels."""
     at_stop = {b.coordinates[0]: float(b.limit.position) for b in steered(machine) if b.limit.position is not None}
     if at_stop:
         _contacts(ax, machine, at_stop, ghost=True)
@@ -49,16 +49,12 @@ def outline(ax: Axes, machine: Machine) -> None:
             assert s.lateral is not None
             shape = _footprint(*poses[s.body], float(s.radius), 0.2 * float(s.radius), float(s.lateral))
             ax.add_patch(Polygon(shape, closed=True, facecolor="none", edgecolor=COLOURS[2], zorder=4))
-            ax.plot([], [], color=COLOURS[2], label="measuring wheel")
     ax.set_aspect("equal")
     ax.margins(0.1)
     ax.autoscale_view()
     ax.set_xlabel("x, forward [m]")
     ax.set_ylabel("y, left [m]")
     ax.grid(alpha=0.3)
-    handles, labels = ax.get_legend_handles_labels()
-    once = dict(zip(labels, handles, strict=True))
-    ax.legend(once.values(), once.keys(), fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3)
 
 
 def steered(machine: Machine) -> list[Body]:
@@ -90,9 +86,11 @@ def footprints(machine: Machine, q: Mapping[str, float]) -> list[np.ndarray]:
 
 def _contacts(ax: Axes, machine: Machine, q: Mapping[str, float], ghost: bool) -> None:
     """Rolls and wheels as rectangles, as long as they are high, their names beside them."""
-    poses = tree.poses(machine, q)
-    for b, shape in zip(machine.contacts, footprints(machine, q), strict=True):
+    poses, still = tree.poses(machine, q), footprints(machine, {})
+    for b, shape, before in zip(machine.contacts, footprints(machine, q), still, strict=True):
         place = poses[b.index][1]
+        if ghost and np.allclose(shape, before):
+            continue
         if ghost:
             ax.add_patch(Polygon(shape, closed=True, facecolor="none", edgecolor=GHOST, linestyle="--", zorder=4))
             continue
@@ -151,5 +149,5 @@ def _masses(ax: Axes, machine: Machine, poses: Mapping[int, tuple[np.ndarray, np
         turned, place = poses[b.index]
         x, y, _ = place + turned @ np.array(b.inertia.com.value)
         size = 4 + 8 * float(np.sqrt(float(b.inertia.mass) / most))
-        ax.plot(x, y, "o", markersize=size, color=COLOURS[0], alpha=0.35, zorder=5, label="centre of mass")
+        ax.plot(x, y, "o", markersize=size, color=COLOURS[0], alpha=0.35, zorder=5)
         ax.plot(x, y, "+", markersize=size, color=COLOURS[0], zorder=5)

@@ -148,6 +148,11 @@ def test_a_pendulum_on_the_plane_is_said_to_be_unseen() -> None:
 
 
 # ----------------------------------------------------------------------------------------------------- from above
+def test_a_machine_held_on_a_line_is_said_to_be() -> None:
+    lines = list(machinecheck.unseen(build(load("va12_straight"))))
+    assert lines[0] == "y0, theta0: held at zero, the machine keeps to a line"
+
+
 def test_poses_are_where_the_table_puts_the_bodies() -> None:
     """The tandem's yokes turned by hand; the robot's wheels at the corners of its wheelbase and track."""
     poses = tree.poses(load("tandem"), {"theta1": 0.3, "theta3": -0.2})

@@ -235,6 +235,24 @@ def test_a_log_gives_the_true_parameters_back(name: str, model: Model) -> None:
     assert np.median(estimate.std / size) < 0.05
 
 
+def test_a_drum_that_nothing_drives_is_found_as_well() -> None:
+    """The single-drum roller pulled along by its wheels: the drum's row says that no torque acts on it."""
+    pulled = load("single_drum")
+    body = tuple(b.model_copy(update={"actuated": False}) if b.name == "drum" else b for b in pulled.body)
+    sensor = tuple(s for s in pulled.sensor if s.name != "u_drum")
+    model = build(pulled.model_copy(update={"body": body, "sensor": sensor}))
+    assert model.inputs == ("u1", "u2", "u3")
+    assert "u50" in model.base.invisible
+    drive = manoeuvre.scaled(manoeuvre.multisine(model, short(model.machine, 12.0), 1, top=0.4), 0.5)
+    motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
+    measured = log.check(sensors.measure(model, motion, seed=1), model.machine)
+    estimate = identify.identify(model, [measured], "joint")
+    z = (estimate.value - model.nominal) / estimate.std
+    assert np.nanmax(np.abs(z)) < 4
+    drum = [k for k, n in enumerate(model.base.names) if n in ("ZZ5", "Fs5", "Kx5", "Ky5")]
+    assert (estimate.std[drum] < 0.1 * np.abs(model.nominal[drum])).all()
+
+
 def test_design_ends_with_a_drive_or_with_the_limit_that_it_misses(model: Model) -> None:
     """With hardly any time: a drive that keeps every limit in a fresh simulation, or one clear line."""
     problem = short(model.machine, 6.0)
