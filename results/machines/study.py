@@ -1,0 +1,252 @@
+"""Other machines by another table: of each, a designed drive, its verification, and random multisines beside it.
+
+python results/machines/study.py [NAME...] makes, in a folder of each machine's name beside this file, drive.json (the
+designed drive at its knots), verify.json (20 simulated runs), multisines.json (10), and of them README.md and
+figure.png. What is there already is not made again, so an interrupted study goes on; with --as-is pages are made of as
+many multisines as there are. A machine is its file in model/machines and a line of STUDIES.
+"""
+
+from __future__ import annotations
+
+# ruff: noqa: E402  (threads are set before numpy loads)
+import json
+import os
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
+
+from excite import compare, design, folder, identify, manoeuvre, objective, smoothing
+from excite.machinecheck import grouping
+from excite.manoeuvre import Manoeuvre
+from excite.report import COLOURS, save
+from excite.simulate import Motion, simulate
+from excite.terminal import rounded
+from excite.topview import outline
+from excite.verify import summary, verify
+from model import machine, prediction
+from model.machine import Problem
+from model.prediction import Model
+
+HERE = Path(__file__).parent
+SECONDS, BUDGET = 20.0, 60.0  # of every drive, and for its design [s]
+RUNS, RANDOM = 20, 10
+
+# What there is to say of each machine, beyond what its numbers say.
+STUDIES = {
+    "single_drum": "Two driven wheels stand on one axle, beside the drum: MY0R holds what sets the two apart, and the"
+    " wheels' own Ky differ only by what their rims' speeds differ in a turn.",
+    "tandem": "No articulation but two steering joints at the ends of one frame. The yokes are balanced about their"
+    " pivots, so of yoke and drum only the moment of inertia about the pivot is seen (ZZ1R, ZZ3R).",
+    "double_loader": "A chain of two vertical joints: the articulation, and the pivot of the rear axle behind it. What"
+    " is behind a joint is felt by it as one body, so mass and moments travel forward through both.",
+    "pendulum_loader": "The pendulum joint is in the table, about the longitudinal axis, and held at zero by"
+    ' `locked = ["theta3"]`. Its friction and offset (Fv3, Fs3, u30) and the rear frame\'s moments of inertia about'
+    " horizontal axes can't be seen on the plane; everything else is what an articulated loader without it has.",
+    "skid_robot": "No steering joint, four narrow wheels (contacts of width 0): it turns by driving its sides at"
+    " different speeds. The masses of the wheels hide in M, MX0R, MY0R and ZZ0R.",
+}
+
+
+def main(names: list[str], as_is: bool) -> None:
+    for name in names:
+        (HERE / name).mkdir(exist_ok=True)
+        model = prediction.build(machine.load(name))
+        problem = short(model)
+        drive = kept(HERE / name / "drive.json", lambda m=model, p=problem: designed(m, p))
+        drawn = Manoeuvre(np.array(drive["times_s"]), np.array(drive["torque"]))
+        motion = driven(model, drawn, np.array(drive["start"]))
+        runs = kept(HERE / name / "verify.json", lambda m=model, x=motion: verified(m, x))
+        path = HERE / name / "multisines.json"
+        others = read(path) if path.is_file() else []
+        while len(others) < (0 if as_is else RANDOM):
+            others.append(multisine(model, problem, len(others)))
+            write(path, others)
+        save(figure(model, drive, runs, others), HERE / name / "figure.png")
+        (HERE / name / "README.md").write_text(page(name, model, drive, runs, others), encoding="utf-8")
+        print(f"{name}: written", flush=True)
+
+
+def kept(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What a file holds; made first where it isn't there."""
+    if not path.is_file():
+        write(path, make())
+        print(f"{path.parent.name}: {path.stem}", flush=True)
+    return read(path)
+
+
+def read(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def write(path: Path, made: Any) -> None:
+    with folder.writing_file(path) as place:
+        place.write_text(folder.dump(made), encoding="utf-8")
+
+
+def short(model: Model) -> Problem:
+    problem = model.machine.problems[model.machine.problem or ""]
+    return problem.model_copy(update={"duration_s": problem.duration_s.model_copy(update={"value": SECONDS})})
+
+
+def driven(model: Model, drive: Manoeuvre, start: np.ndarray) -> Motion:
+    return simulate(model, drive.sample(float(model.machine.sampling_hz)), q0=start)
+
+
+# ------------------------------------------------------------------------------------------------ the work
+
+
+def designed(model: Model, problem: Problem) -> dict[str, Any]:
+    """The drive of lowest cond(Phi), as `excite design NAME --duration 20 --starts 1 --budget 60` finds it."""
+    found = design.design(model, problem, starts=1, seed=0, budget_s=BUDGET)
+    return {
+        "times_s": found.manoeuvre.times,
+        "torque": found.manoeuvre.torque,
+        "start": found.motion.q[0],
+        "cond_phi": found.cond_phi,
+        "cond_phi_start": found.cond_phi_start,
+        "max_violation": found.max_violation,
+        "complete": found.complete,
+        "sigma_percent": dict(zip(model.base.names, sigma(model, found.motion), strict=True)),
+    }
+
+
+def verified(model: Model, motion: Motion) -> dict[str, Any]:
+    method = identify.recommended(model)
+    found = verify(model, motion, method, "full", RUNS, seed=0, jobs=1)
+    return {
+        "method": method,
+        "failures": found.failures,
+        "parameters": summary(found),
+        "error_percent": dict(zip(found.names, found.error_percent.T, strict=True)),
+    }
+
+
+def multisine(model: Model, problem: Problem, seed: int) -> dict[str, Any]:
+    """A random multisine brought inside the limits as `excite compare` does it."""
+    found = compare.within(model, problem, manoeuvre.multisine(model, problem, seed))
+    error = sigma(model, driven(model, found.manoeuvre, found.start))
+    return {
+        "cond_phi": objective.reported("cond", found.score),
+        "worst_std_percent": float(error.max()),
+        "median_std_percent": float(np.median(error)),
+        "kept": found.feasible,
+        "excess": found.excess,
+    }
+
+
+def sigma(model: Model, motion: Motion) -> np.ndarray:
+    """(n_base,) Cramer-Rao bound, one standard deviation [%] of the nominal value."""
+    return 100 * np.sqrt(np.diag(smoothing.cramer_rao(model, motion))) / np.abs(model.nominal)
+
+
+# ------------------------------------------------------------------------------------------------ the page
+
+
+def figure(model: Model, drive: dict[str, Any], runs: dict[str, Any], others: list[dict[str, Any]]) -> Figure:
+    """The machine from above; the runs' errors against their predicted spread; the drive among random ones."""
+    n = len(model.base.names)
+    fig = Figure(figsize=(11.5, max(4.5, 1.2 + 0.21 * n)), layout="constrained")
+    above, errors, among = fig.subplots(1, 3, width_ratios=(1.0, 1.2, 1.0))
+    fig.suptitle(model.machine.title, fontsize=11)
+    outline(above, model.machine)
+    _errors(errors, runs)
+    for good, face, label in ((True, COLOURS[0], "random multisine"), (False, "none", "the same, breaks a limit")):
+        some = [r for r in others if r["kept"] == good]
+        if some:
+            x, y = ([r[k] for r in some] for k in ("cond_phi", "worst_std_percent"))
+            among.scatter(x, y, s=28, facecolors=face, edgecolors=COLOURS[0], label=label)
+    worst = max(drive["sigma_percent"].values())
+    among.scatter([drive["cond_phi"]], [worst], s=70, marker="D", color=COLOURS[1], edgecolors="k", label="designed")
+    among.set_xscale("log")
+    among.set_yscale("log")
+    for axis in (among.xaxis, among.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_minor_locator(NullLocator())
+        axis.set_major_formatter("{x:g}")
+    among.set_xlabel("cond(Phi)")
+    among.set_ylabel("worst parameter: attainable standard deviation [%]")
+    among.grid(alpha=0.3, which="both")
+    among.legend(fontsize=8)
+    return fig
+
+
+def _errors(ax: Axes, runs: dict[str, Any]) -> None:
+    names = list(runs["parameters"])
+    for y, name in enumerate(reversed(names)):
+        half = 1.96 * runs["parameters"][name]["predicted_std_percent"]
+        ax.plot([-half, half], [y, y], color="0.75", linewidth=6, solid_capstyle="butt", zorder=1)
+        e = np.array([x for x in runs["error_percent"][name] if x is not None], float)
+        ax.plot(e, y + np.linspace(-0.25, 0.25, len(e)), ".", color=COLOURS[0], markersize=2.5, zorder=2)
+    ax.axvline(0, color="black", linewidth=0.8)
+    ax.set_xscale("symlog", linthresh=1.0)
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.set_yticks(range(len(names)), names[::-1], fontsize=7)
+    ax.set_xlabel("error of one run [%]; grey: 95 % as predicted")
+    ax.grid(axis="x", alpha=0.3)
+
+
+def page(name: str, model: Model, drive: dict[str, Any], runs: dict[str, Any], others: list[dict[str, Any]]) -> str:
+    rows, base = runs["parameters"], model.base
+    sizes = drive["sigma_percent"]
+    inside = np.mean([r["coverage95"] for r in rows.values()])
+    good = [r for r in others if r["kept"]]
+    conds = sorted(r["cond_phi"] for r in good)
+    best = f"{conds[0]:.3g} (best) and {np.median(conds):.3g} (median)" if conds else "-"
+    errors = sorted(r["worst_std_percent"] for r in good)
+    worst = max(sizes, key=lambda n: sizes[n])
+    hurt = max(rows, key=lambda n: rows[n]["rms_percent"])
+    median = float(np.median([r["rms_percent"] for r in rows.values()]))
+    lines = [
+        f"# {model.machine.title}",
+        "",
+        f"`model/machines/{name}.toml`; made by `python results/machines/study.py {name}`. {STUDIES[name]}",
+        "",
+        "![The machine from above; errors of the runs; the designed drive among random ones](figure.png)",
+        "",
+        f"- **Drive**: {SECONDS:g} s, designed for cond(Phi) in {BUDGET:g} s"
+        + ("" if drive["complete"] else " (cut short by that)")
+        + f": {drive['cond_phi']:.3g}, its starting guess {drive['cond_phi_start']:.3g}; every limit kept within"
+        f" {100 * drive['max_violation']:.2g} % of its range. Attainable: worst {worst} {sizes[worst]:.2g} %, median"
+        f" {np.median(list(sizes.values())):.2g} %.",
+        f"- **Verification**: {RUNS} simulated runs with every sensor's flaws, method `{runs['method']}`,"
+        f" {len(runs['failures'])} failed. True error: worst {hurt} {rows[hurt]['rms_percent']:.2g} %, median"
+        f" {median:.2g} %; the 95 % intervals hold the truth in {100 * inside:.0f} % of cases.",
+        f"- **Random multisines**: {len(good)} of {len(others)} could be brought inside the limits; their"
+        f" cond(Phi) is {best}"
+        + (f", {conds[0] / drive['cond_phi']:.2g} times the designed one's at best" if conds else "")
+        + (f"; their worst parameter is attainable to {errors[0]:.2g} % at best." if errors else "."),
+    ]
+    if worst_better := [r for r in good if r["worst_std_percent"] < sizes[worst]]:
+        lines.append(
+            f"- A low cond(Phi) is not a small error: {len(worst_better)} of them would find the worst parameter"
+            " better; who wants accuracy designs for `--objective accuracy`."
+        )
+    lines = [textwrap.fill(line, 120, subsequent_indent="  " if line[:1] in "- " else "") for line in lines]
+    lines += ["", "| base parameter | stands for | true value | attainable [%] | true error of runs [%] | in 95 % |"]
+    lines += ["|---|---|---|---|---|---|"]
+    for n, row in rows.items():
+        value = f"{rounded(row['true'])} {row['unit']}"
+        parts = grouping(base.grouping(n))
+        lines.append(
+            f"| {n} | {parts} | {value} | {sizes[n]:.2g} | {row['rms_percent']:.2g} | {100 * row['coverage95']:.0f} % |"
+        )
+    lines += ["", textwrap.fill(f"Seen by no motion on the plane: {', '.join(base.invisible)}.", 120)]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    asked = [n for n in sys.argv[1:] if n != "--as-is"]
+    unknown = sorted(set(asked) - set(STUDIES))
+    if unknown:
+        sys.exit(f"no study of {', '.join(unknown)}, allowed: {', '.join(STUDIES)}")
+    main(asked or list(STUDIES), "--as-is" in sys.argv)
