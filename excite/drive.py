@@ -291,8 +291,9 @@ def _speed_words(v0: float, v1: float, took: float, start: float, name: str) -> 
         return f"through a stop {name + ' ' if name else ''}at {turn} to {abs(v1):.1f} m/s {way} {seconds}"
     if v1 == 0:
         return f"brake to a stop {seconds}"
-    verb = "accelerate" if abs(v1) > abs(v0) else "slow down"
-    return f"{verb}{way} to {abs(v1):.1f} m/s {seconds}"
+    if abs(v1) > abs(v0):
+        return f"accelerate{way} to {abs(v1):.1f} m/s {seconds}"
+    return f"slow down to {abs(v1):.1f} m/s{way} {seconds}"
 
 
 def _steer_words(a0: float, a1: float, took: float) -> str:

@@ -161,7 +161,9 @@ def _column(table: pd.DataFrame, name: str, machine: Machine | None, sensor: Sen
     fault = ""
     if bad.any():
         rows = ", ".join(str(k + 1) for k in np.flatnonzero(bad)[:SHOWN]) + (", ..." if bad.sum() > SHOWN else "")
-        fault = f"column {name}: {int(bad.sum())} cells are empty or no numbers (rows {rows}); repair or cut there"
+        which = f"{int(bad.sum())} cells are" if bad.sum() > 1 else "a cell is"
+        what = f"empty or no numbers (rows {rows})" if bad.sum() > 1 else f"empty or no number (row {rows})"
+        fault = f"column {name}: {which} {what}; repair or cut there"
     return Column(name, what, unit, low, high, int(bad.sum())), fault
 
 

@@ -12,21 +12,34 @@ from typing import Any
 
 import jinja2
 import numpy as np
+from markupsafe import Markup, escape
 
 from excite import drive
 from excite.drive import Trace
 from model.prediction import Model
 from model.units import UNITS
 
+WORD, COMMAND, NUMBER = re.compile(r"a|[a-z]{3,},?"), re.compile("`([^`]+)`"), re.compile(r"[<≤]?\s*[-+−]?\d")
 TIMES = re.compile(r" (in|for) [\d.]+ s| at \d+:[\d.]+")  # the page counts down, so its words need no times
 
 
 @lru_cache(maxsize=1)
 def _templates() -> jinja2.Environment:
     loader = jinja2.PackageLoader("excite", "templates")
-    return jinja2.Environment(
+    made = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    made.filters["sentence"] = sentence
+    return made
+
+
+def sentence(text: str) -> Markup:
+    """A remark as a page shows it: a capital letter first, unless it begins with a name, a full stop, `commands` set
+    off."""
+    first = text.partition(" ")[0]
+    text = text[:1].upper() + text[1:] if WORD.fullmatch(first) else text
+    whole = text if text.endswith((".", "!", "?", ":")) else f"{text}."
+    return Markup(COMMAND.sub(r"<code>\1</code>", str(escape(whole))))
 
 
 def driver_page(model: Model, trace: Trace, title: str) -> str:
@@ -100,10 +113,19 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     marked: tuple[int, ...] = ()
 
+    @property
+    def texts(self) -> tuple[int, ...]:
+        """Columns of words, which are set from the left; those of numbers from the right."""
+        return tuple(k for k in range(len(self.columns)) if k == 0 or not any(_number(r[k]) for r in self.rows))
+
     def __post_init__(self) -> None:
         for k, row in enumerate(self.rows):
             if len(row) != len(self.columns):
                 raise ValueError(f"table {self.caption!r}: row {k} has {len(row)} cells, not {len(self.columns)}")
+
+
+def _number(cell: str) -> bool:
+    return bool(NUMBER.match(cell))
 
 
 def report_page(

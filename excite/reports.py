@@ -20,8 +20,9 @@ NAME = "report.html"
 Summary = Mapping[str, Any]
 
 CAPTIONS = {
-    "design.png": "The drive: torques in per cent of their limits, speeds [m/s], articulation [rad] and slips [-] over"
-    " time, dotted lines the limits; its path on the lane from above, dots the start; how much of each limit it uses.",
+    "design.png": "The drive: torques in per cent of their limits, speeds [m/s], steered joints [rad] and slips [-]"
+    " over time, dotted lines the limits; how much of each limit it uses, in per cent; where the machine steers, its"
+    " path on the lane from above, dots the start.",
     "sigma.png": "What accuracy the drive makes attainable: one standard deviation (Cramer-Rao bound, all sensors"
     " together) of every parameter in per cent of its nominal value, on a logarithmic axis.",
     "verify.png": "Left, every simulated run's error of every parameter in per cent of the true value: dots are runs,"
@@ -116,8 +117,9 @@ def _design(s: Summary) -> Said:
     limits = (
         "every limit is kept" if kept else f"limits are exceeded by {100 * s['max_violation']:.2f} % of their range"
     )
+    driven = "Followed by a steady person" if s.get("driver") else "Driven as designed"
     answer = (
-        f"Driven as designed, these {s['duration_s']:g} s can tell every parameter to {sigma[worst]:.2g} % or better"
+        f"{driven}, these {s['duration_s']:g} s can tell every parameter to {sigma[worst]:.2g} % or better"
         f" (one standard deviation; worst {worst}, median {np.median(list(sigma.values())):.2g} %); {limits}."
     )
     remarks = [
@@ -139,7 +141,7 @@ def _design(s: Summary) -> Said:
             " `excite design --driver` designs for people in the first place."
         )
     if s.get("violations"):
-        over = tuple((name, f"{100 * value:.3f}") for name, value in s["violations"].items() if value > 0)
+        over = tuple((name, f"{100 * value:.3f}") for name, value in s["violations"].items() if value >= 5e-6)
         if over:
             tables.append(Table("Limits that are exceeded, in per cent of their range.", ("limit", "%"), over))
     return f"Test drive for {s['machine']}, problem {s['problem']}", answer, remarks, tables
@@ -329,7 +331,7 @@ def _diagnose(s: Summary) -> Said:
                 rounded(f["amount_std"], 2),
                 f["unit"],
                 "; ".join(f"{n} {rounded(x['value'], 4)} {x['unit']}" for n, x in f["shapes"].items()) or "-",
-                rounded(f["p_value"], 2),
+                "< 1e-12" if f["p_value"] < 1e-12 else rounded(f["p_value"], 2),
                 rounded(f["gain_percent"], 3),
                 "-" if f["gain_ci95"] is None else " to ".join(rounded(x, 3) for x in f["gain_ci95"]),
                 ", ".join(f["tied_with"]) or "-",

@@ -120,11 +120,10 @@ def _lane(ax: Axes, sheet: Sheet) -> None:
     for outline in topview.footprints(model.machine, start):  # the machine as it stands at the start
         ax.add_patch(Polygon(outline, closed=True, facecolor="white", edgecolor="black", zorder=4))
     ax.plot(*edges.mean(axis=1)[:, 0].T, color="black", linewidth=1.5, zorder=4)
-    _mark(ax, centre[0], "o", "START", (6, 8))
-    _mark(ax, centre[-1], "s", "END", (6, -13))
+    marks = [("o", "START", centre[0]), ("s", "END", centre[-1])]
     for k, t in enumerate(drive.reversals(sheet.trace)):
         at = centre[min(round(t * float(model.machine.sampling_hz)), len(centre) - 1)]
-        _mark(ax, at, "D", drive.letter(k), (7, 6) if k % 2 else (-13, 6))
+        marks.append(("D", drive.letter(k), at))
     for t in np.arange(3.0, sheet.trace.duration, 6.0):  # which way along the path
         k = min(round(t * float(model.machine.sampling_hz)), len(centre) - 11)
         step = centre[k + 10] - centre[k]
@@ -143,6 +142,7 @@ def _lane(ax: Axes, sheet: Sheet) -> None:
     ax.set_xlim(x + half_x - scale * width, x + half_x + scale * width)
     ax.set_ylim(y + half_y - scale * height, y + half_y + scale * height)
     ax.set_aspect("equal")
+    _mark(ax, marks, 36 / scale)  # the axis is 2 scale metres an inch
     ax.set_xlabel("along the lane [m]", fontsize=8)
     ax.set_ylabel("across [m]", fontsize=8)
     ax.tick_params(labelsize=7)
@@ -150,10 +150,41 @@ def _lane(ax: Axes, sheet: Sheet) -> None:
     ax.legend(fontsize=7, ncols=5, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False, borderpad=0)
 
 
-def _mark(ax: Axes, at: np.ndarray, marker: str, text: str, offset: tuple[float, float]) -> None:
-    filled = "white" if marker == "D" else "black"
-    ax.plot(*at, marker, color=filled, markeredgecolor="black", markersize=6, zorder=6)
-    ax.annotate(text, (at[0], at[1]), xytext=offset, textcoords="offset points", fontsize=8, weight="bold", zorder=7)
+def _mark(ax: Axes, marks: Sequence[tuple[str, str, np.ndarray]], metre: float) -> None:
+    """Markers with their names (marker, name, place), each name where it hides least; a metre is so many points."""
+    taken = [(*(at * metre), 7.0, 7.0) for _, _, at in marks]
+    for marker, text, at in marks:
+        filled = "white" if marker == "D" else "black"
+        ax.plot(*at, marker, color=filled, markeredgecolor="black", markersize=6, zorder=6)
+        width, height = 6.5 * len(text), 8.0
+        around = [
+            (far * np.cos(turn) + np.cos(turn) * width / 2, far * np.sin(turn) + np.sin(turn) * height / 2)
+            for far in (9.0, 16.0, 25.0)
+            for turn in np.deg2rad(np.arange(45, 405, 30))
+        ]
+        boxes = [(at[0] * metre + x, at[1] * metre + y, width, height) for x, y in around]
+        hidden = [sum(_overlap(box, other) for other in taken) for box in boxes]
+        k = int(np.argmin(hidden))  # the first of equals is the nearest
+        taken.append(boxes[k])
+        line = {"arrowstyle": "-", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3} if k >= len(boxes) // 3 else None
+        ax.annotate(
+            text,
+            (at[0], at[1]),
+            xytext=around[k],
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            fontsize=8,
+            weight="bold",
+            arrowprops=line,
+            zorder=7,
+        )
+
+
+def _overlap(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+    """Common area of two boxes (centre x, centre y, width, height)."""
+    wide, high = (max(0.0, (one[k + 2] + other[k + 2]) / 2 - abs(one[k] - other[k])) for k in (0, 1))
+    return wide * high
 
 
 def _trace(ax: Axes, sheet: Sheet, label: str, value: np.ndarray, band: float, least: float) -> None:
@@ -210,7 +241,7 @@ def _second(sheet: Sheet) -> Figure:
             str(k + 1),
             drive.clock(trace.times[k]),
             drive.words(trace, k, letters=True),
-            f"{trace.speed[k + 1]:+.1f} m/s".replace("+0.0", "0"),
+            f"{trace.speed[k + 1]:+.1f} m/s".replace("+0.0", "0").replace("-", "\N{MINUS SIGN}"),
             f"{abs(degrees):.0f}°{side}" if trace.left else "",
         )
         for x, text in zip(columns, cells, strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Excite
+from matplotlib.figure import Figure
 
 from excite import cab, drive, sheet, stored
 from excite.drive import DriveError, Trace
@@ -90,6 +92,8 @@ def test_words_say_what_to_do() -> None:
         "hold 1.2 m/s backward for 4 s, steer to 10° right",
         "brake to a stop in 4 s, straighten up",
     ]
+    slower = Trace(np.array([0.0, 3, 6, 9]), np.array([0.0, -1.5, -0.5, 0]), np.zeros(4), left=0)
+    assert drive.words(slower, 1) == "slow down to 0.5 m/s backward in 3 s"
     through = Trace(np.array([0.0, 2, 5, 7]), np.array([0.0, 1, -0.5, 0]), np.zeros(4), left=0)
     assert drive.words(through, 1) == "through a stop at 0:04 to 0.5 m/s backward in 3 s"
     assert drive.words(through, 1, letters=True).startswith("through a stop A at 0:04")
@@ -132,6 +136,22 @@ def test_moved_motion_is_the_same_motion_elsewhere(va12: Model, va12_motion: Mot
     start[:3] = [3.0, -2.0, 0.7]
     short = simulate(va12, va12_motion.u[:801], q0=start)
     assert drive.moved(va12, va12_motion, start).q[:801] == pytest.approx(short.q, abs=1e-6)
+
+
+def test_names_on_the_map_do_not_hide_each_other() -> None:
+    """Eight changes of direction within two metres, a metre on 11 points of paper: no name on another, nor on a mark."""
+    rng = np.random.default_rng(1)
+    marks = [("D", drive.letter(k), rng.uniform(0, 2, 2) * [3, 1]) for k in range(8)]
+    figure = Figure(figsize=(5, 5))
+    ax = figure.subplots()
+    ax.set_position((0, 0, 1, 1))
+    ax.set_xlim(-10, 22.7)
+    ax.set_ylim(-16, 16.7)
+    sheet._mark(ax, marks, 360 / 32.7)
+    figure.draw_without_rendering()
+    boxes = [t.get_window_extent() for t in ax.texts]
+    for one, other in itertools.combinations(boxes, 2):
+        assert not one.overlaps(other)
 
 
 def test_band_is_the_reference_a_second_around() -> None:

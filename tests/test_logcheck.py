@@ -47,8 +47,8 @@ def edit(name: str, row: int, value: object) -> Callable[[pd.DataFrame], pd.Data
 @pytest.mark.parametrize(
     ("change", "faults", "remarks"),
     [
-        (edit("u1_Nm", 40, None), ["column u1_Nm: 1 cells are empty or no numbers (rows 41)"], []),
-        (edit("u1_Nm", 40, "error"), ["column u1_Nm: 1 cells"], []),
+        (edit("u1_Nm", 40, None), ["column u1_Nm: a cell is empty or no number (row 41)"], []),
+        (edit("u1_Nm", 40, "error"), ["column u1_Nm: a cell"], []),
         (lambda t: t.drop(columns="u4_Nm"), [], ["no column u4_Nm (torque of rear roll); some methods need it"]),
         (lambda t: t.drop(columns="vy_m_s"), [], ["no column vy_m_s (lateral speed of front chassis); optional"]),
         (lambda t: t.drop(columns="t_s"), ["no column t_s (time)"], []),

@@ -379,3 +379,17 @@ def test_serve_command_shows_the_page_until_it_is_stopped(tmp_path: Path) -> Non
         run.terminate()
         assert run.wait(20) == 0
     assert (tmp_path / "d" / "driver.html").is_file()
+
+
+def test_remarks_are_sentences_and_commands_set_off() -> None:
+    assert str(page.sentence("a low cond hides it")) == "A low cond hides it."
+    assert str(page.sentence("poor accuracy: run `excite design`")) == "Poor accuracy: run <code>excite design</code>."
+    assert str(page.sentence("u1_Nm is <late>!")) == "u1_Nm is &lt;late&gt;!"
+    assert str(page.sentence("machine.toml beside it works.")) == "machine.toml beside it works."
+
+
+def test_words_stand_left_and_numbers_right() -> None:
+    table = page.Table(
+        "t", ("what", "unit", "value", "95 %", "kept"), (("M", "kg", "-3.1", "-", "3/20"), ("x", "m", "-", "-", "-"))
+    )
+    assert table.texts == (0, 1, 3)
