@@ -23,6 +23,8 @@ from model.prediction import Model
 # Least standard deviation of an encoder edge [counts]: what a good encoder's divisions are off. Slow passages, where
 # edges come at exact moments, would be believed without end; a third of a count would make little of them.
 EDGE = 0.1
+BEAT_HZ, HARMONICS = 3.0, 4  # [Hz] below which a beat is as slow as the machine; those of a sawtooth that matter
+LONGEST = 200  # readings that one beat is taken to last, at most
 
 
 @dataclass(frozen=True)
@@ -183,12 +185,34 @@ def readings(
     h -= np.where(r.counts, np.clip(travel, -step, step) / 2, 0.0)
     H[slow] -= Hrate[slow] * (sample / 2)
     width = np.where(r.counts, np.maximum(np.minimum(np.abs(travel), step) / np.sqrt(12), EDGE * step), step)
+    width = np.where(r.counts, width * np.sqrt(beating(travel / step, sample)), width)
     width = np.hypot(width, _through(c, r, p, u, X))
     D = np.zeros((len(c.sensors), len(r.origin)))
     for k, j in enumerate(r.origin):
         D[j, k] = 1.0
     by = flaws[0] if flaws else np.zeros((*h.shape, 0))
     return h + D @ p.offset, H, r.used / width**2, D, by
+
+
+def beating(counts: np.ndarray, sample: float) -> np.ndarray:
+    """By how much more an encoder's error weighs (N, m) where it beats with the clock, from counts per sample (N, m).
+
+    Where a multiple k of them is nearly whole, the k-th harmonic of the error (a sawtooth's: 6 / (pi k)^2 of its power)
+    is as slow as the machine, and a hundred readings tell no more than one: white noise that tells as little is larger
+    by half a period of the beat in readings, or by as many as it lasts. Of an encoder with less than one count per
+    sample only its edges are read, and it is the clock's samples per edge that count.
+    """
+    speed = np.abs(counts)
+    change = np.abs(np.gradient(speed, axis=0)) if len(speed) > 1 else np.zeros_like(speed)
+    edges = np.clip(speed, 1e-3, 1.0)  # readings per sample
+    turns, change = np.maximum(speed, 1.0) / edges, change / edges**3  # per reading: of the one in periods of the other
+    slow = BEAT_HZ * sample / edges  # per reading
+    more = np.ones_like(speed)
+    for k in range(1, HARMONICS + 1):
+        off = np.abs(k * turns - np.round(k * turns))
+        lasts = 0.5 / np.sqrt(off**2 + k * change / 4 + (0.5 / LONGEST) ** 2)
+        more += 6 / (np.pi * k) ** 2 * np.where(slow < 0.5, lasts / (1 + (off / slow) ** 4), 0.0)
+    return more
 
 
 def _through(c: Chart, r: Record, p: Point, u: np.ndarray, X: np.ndarray) -> np.ndarray | float:

@@ -13,6 +13,7 @@ from excite.driver import follow
 from excite.identify import identify
 from excite.linearise import advance, chart, differentiate
 from excite.log import Log, check
+from excite.record import beating
 from excite.simulate import Motion, simulate
 from model import machine, prediction
 from model.prediction import Model
@@ -310,3 +311,21 @@ def test_noise_is_found_in_the_log_not_taken_on_trust(va12: Model) -> None:
     note = next(n for n in estimate.notes if "u1" in n)
     assert 72 < float(note.split("u1 ")[1].split(" ")[0]) < 88
     assert "data sheet 40" in note
+
+
+@pytest.mark.parametrize("counts", [40.013, 40.0, 7.31, 2.502, 0.51, 1.0 / 3, 0.2])
+def test_an_encoder_that_beats_with_the_clock_tells_less(counts: float) -> None:
+    """Means of a third of a second of an encoder's errors, starts drawn at random: never worse than they are taken for,
+    and a hundred times worse than white ones at a constant whole number of counts per sample."""
+    phases = np.random.default_rng(0).uniform(size=4000)
+    samples = np.arange(33)
+    reading = np.floor(phases[:, None] + counts * samples)
+    counted = np.diff(reading, prepend=reading[:, :1] - 1, axis=1) != 0
+    past = min(counts, 1.0) / 2  # what is expected of the angle right after an edge
+    error = np.where(counted, phases[:, None] + counts * samples - reading - past, 0.0)[:, 1:]
+    found = np.mean((error.sum(axis=1) / np.maximum(counted[:, 1:].sum(axis=1), 1)) ** 2)
+    white = min(counts, 1.0) ** 2 / 12 / (min(counts, 1.0) * 32)
+    more = beating(np.full((33, 1), counts), 0.01)[5, 0]
+    assert found < 1.5 * more * white
+    if abs(counts - 40) < 0.02:
+        assert found > 10 * white
