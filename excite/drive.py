@@ -135,14 +135,17 @@ def phases(model: Model, motion: Motion, shortest: float = 2.0, most: int | None
     return merged(Trace(knots, v + 0.0, slowed(knots, a, swing) + 0.0, left))
 
 
-def slowed(times: np.ndarray, angle: np.ndarray, swing: float) -> np.ndarray:
-    """Angles (K,) [rad] at times (K,) [s], steered no faster than `swing` [rad/s] in between; the ends stay."""
-    a, most = angle.copy(), swing * np.diff(times)
-    for k in range(1, len(a)):  # from the start, then from the end, so that both ends stay where they are
-        a[k] = np.clip(a[k], a[k - 1] - most[k - 1], a[k - 1] + most[k - 1])
-    for k in range(len(a) - 2, -1, -1):
-        a[k] = np.clip(a[k], a[k + 1] - most[k], a[k + 1] + most[k])
-    return a
+def slowed(times: np.ndarray, angle: np.ndarray, swing: float, fixed: Sequence[int] = (0, -1)) -> np.ndarray:
+    """Angles (K,) [rad] at times (K,) [s], steered no faster than `swing` [rad/s] in between; those `fixed` stay.
+
+    Within reach of the fixed ones first, then the mean of the lower and upper envelopes (McShane, 1934).
+    """
+    if not np.isfinite(swing):
+        return angle.copy()
+    reach = swing * np.abs(times[:, None] - times)
+    ends = list(fixed)
+    a = np.clip(angle, (angle[ends] - reach[:, ends]).max(axis=1), (angle[ends] + reach[:, ends]).min(axis=1))
+    return np.asarray(((a + reach).min(axis=1) + (a - reach).max(axis=1)) / 2)
 
 
 def as_designed(model: Model, motion: Motion) -> Trace:

@@ -41,12 +41,14 @@ GUESSES = 16  # random drives beside the smoothed design
 PHASES = 4  # stream of random numbers
 ROUNDS, LEVELS, POLISHES = 8, 3, 2  # passes over knots and levels, over levels alone, by single steps of the dial
 SHARP = (20.0, 200.0)  # of the objective, first and last round
+FIXED = (0, -2, -1)  # knots whose levels are zero: the start, and the last phase
 THIN = 5  # samples of which one counts in the search
 WINDOWS = 12  # of the drive: every limit's extreme in each of them is a constraint
 STEPS, SIZES = (0.02, 0.01, 0.005), (1.0, 0.2, 0.1)  # differences, and what a round changes at first: s, m/s, rad
 PRICE = 30.0  # of a limit's excess, a fraction of its range, against the objective
 ROOM = 0.01  # of a limit's range that is kept free at least
 TOLERANCE = 1e-3  # of a limit's range: what counts as kept, as for any design
+FINE = 0.1  # what an excess over a tolerance for rest counts against one over a limit's range
 DRIVEN = ("torque",)  # limits that hidden valves keep, whoever drives
 
 Report = Callable[[int, int, float], None]
@@ -229,14 +231,14 @@ def on_grid(task: Task, trace: Trace) -> Trace:
     t[-1] = task.duration
     for k in range(len(t) - 2, 0, -1):
         t[k] = min(t[k], t[k + 1] - task.shortest)
-    return replace(trace, times=t, angle=drive.slowed(t, trace.angle, task.swing))
+    return replace(trace, times=t, angle=drive.slowed(t, trace.angle, task.swing, FIXED))
 
 
 def readable(task: Task, trace: Trace) -> Trace:
     """The trace with levels as a dial shows them."""
     v = np.clip(np.round(trace.speed / SPEED_STEP) * SPEED_STEP, -task.fastest, task.fastest)
     a = np.clip(np.round(trace.angle / ANGLE_STEP) * ANGLE_STEP, -task.widest, task.widest)
-    return replace(trace, speed=v + 0.0, angle=drive.slowed(trace.times, a, task.swing) + 0.0)
+    return replace(trace, speed=v + 0.0, angle=drive.slowed(trace.times, a, task.swing, FIXED) + 0.0)
 
 
 def _vector(trace: Trace) -> np.ndarray:
@@ -361,6 +363,12 @@ def _over(task: Task, motion: Motion) -> np.ndarray:
     values = within(motion.q.T, motion.nu.T, motion.u.T).full()
     above = np.maximum(values - high[:, None], low[:, None] - values) / size[:, None]
     found = np.column_stack([part.max(axis=1) for part in np.array_split(above, WINDOWS, axis=1)])
+    if task.problem.rest:
+        centred = list(limit.resting(task.model))
+        moving = np.abs(motion.nu[-1]) / limit.rest_tolerances(task.model) - 1
+        away = np.abs(motion.q[-1, centred]) / limit.REST_POSITION - 1
+        still = FINE * np.concatenate([moving, away])
+        found = np.vstack([found, np.repeat(still[:, None], WINDOWS, axis=1)])
     if task.problem.reversals is None:
         return found
     turns = limit.WHOLE[limit.REVERSALS](task.model, task.problem, motion).get(limit.REVERSALS, 0.0)
