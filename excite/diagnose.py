@@ -39,6 +39,7 @@ CLOSE = 10.0  # a rival that is worse by less than this is a tie
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 SHAPE = 0.005, 0.002  # of what is explained already, that a further effect must gain, as nature is never exactly the
 # formula: by the fits' gains, and by how many deviations the amounts are from none
+BESIDE = 250.0  # a gain that by the latter no effect can be denied
 CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
 LEAST = 0.05, 0.15  # of the excess misfit that an effect must explain to be worth a place: weak misfit, strong misfit
 SHARE = 0.6  # of the excess misfit that names must explain, or it is unexplained
@@ -335,7 +336,7 @@ def _choose(
     score, best = tries[0]
     gain = stage.fit.cost - best.fit.cost
     spread = max(1.0, best.fit.cost / best.prepared.readings)
-    least = max(LEAST[stage.rough] * stage.excess, SHAPE[0] * explained, SHAPE[1] * _sureness(stage))
+    least = max(LEAST[stage.rough] * stage.excess, SHAPE[0] * explained, min(SHAPE[1] * _sureness(stage), BESIDE))
     if gain < max(LEVEL * spread, least):
         return None
     tries = _close(_without_forces(_close(tries)))
