@@ -54,6 +54,8 @@ STUDIES = {
     " horizontal axes can't be seen on the plane; everything else is what an articulated loader without it has.",
     "skid_robot": "No steering joint, four narrow wheels (contacts of width 0): it turns by driving its sides at"
     " different speeds. The masses of the wheels hide in M, MX0R, MY0R and ZZ0R.",
+    "three_wheel": "The last one: added by its file and these lines alone. Its steered front roll is driven by nothing:"
+    " the row of its joint says that no torque acts on it, and there is no offset u40 to find.",
 }
 
 
