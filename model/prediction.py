@@ -127,7 +127,7 @@ class Model:
 
     @cached_property
     def positive(self) -> np.ndarray:
-        """Which parameters make sense above zero only (n_base,): some effects' amounts, and shapes that aren't signed."""
+        """Which parameters make sense above zero only (n_base,): some effects' amounts, shapes that aren't signed."""
         above = {e.name for e in self.effects if e.effect.positive}
         above |= {f"{e.name}.{s}" for e in self.effects for s, shape in e.effect.shapes.items() if not shape.signed}
         return np.array([name in above for name in self.base.names])

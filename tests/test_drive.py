@@ -139,7 +139,7 @@ def test_moved_motion_is_the_same_motion_elsewhere(va12: Model, va12_motion: Mot
 
 
 def test_names_on_the_map_do_not_hide_each_other() -> None:
-    """Eight changes of direction within two metres, a metre on 11 points of paper: no name on another, nor on a mark."""
+    """Eight changes of direction within two metres, a metre on 11 points of paper: no name on another or on a mark."""
     rng = np.random.default_rng(1)
     marks = [("D", drive.letter(k), rng.uniform(0, 2, 2) * [3, 1]) for k in range(8)]
     figure = Figure(figsize=(5, 5))
