@@ -1,7 +1,7 @@
 """The catalogue of effects: what real machines do beyond the model, each declared once.
 
 An effect says where it may sit, what its amount and shapes mean [unit], and what it does to one sample: to the torque
-that a joint gets, to the soil under a roll, to gravity, inertia, a sensor's reading or a torque channel. Simulation,
+that a joint gets, to the soil under a contact, to gravity, inertia, a sensor's reading or a torque channel. Simulation,
 regressor, smoothing, diagnosis, the documentation and the tests are made from that declaration; adding an effect is
 adding one entry to `CATALOGUE`. Amounts and names are those of the project's contract; where it leaves a shape open (a
 decay speed, a phase), the shape has a default for simulation and a grid on which diagnosis looks for it.
@@ -28,7 +28,8 @@ Values = Mapping[str, ca.SX]  # the amount "A" and the shapes by name
 
 @dataclass(frozen=True)
 class Rolling:
-    """How a roll moves: its centre's velocity along and across its chassis [m/s], spin and yaw rate [rad/s]."""
+    """How a contact, a roll or a wheel, moves: its centre's velocity along and across its chassis [m/s], spin and yaw
+    rate [rad/s]."""
 
     contact: Contact
     Vx: ca.SX
@@ -43,7 +44,7 @@ class Rolling:
 
 @dataclass(frozen=True)
 class Soil:
-    """What a roll's wrench is made from: slips, yaw rate, stiffnesses Kx, Ky [N], saturations (None: linear)."""
+    """What a contact's wrench is made from: slips, yaw rate, stiffnesses Kx, Ky [N], saturations (None: linear)."""
 
     slip: law.Slip
     yaw: ca.SX
@@ -58,8 +59,8 @@ class Scene:
     """One sample as an effect sees it.
 
     q, w: angle and rate of a joint [rad, rad/s] by body; u: torque that its sensor feels, flaws aside [N m]; friction:
-    Fv w + Fs sgn w [N m]; smooth: the rate over which sgn turns; rolling: of rolls; ahead: V_x of each body's origin in
-    its own axes [m/s]; time [s] since the log began; z: what this effect remembers, by name.
+    Fv w + Fs sgn w [N m]; smooth: the rate over which sgn turns; rolling: of contacts; ahead: V_x of each body's origin
+    in its own axes [m/s]; time [s] since the log began; z: what this effect remembers, by name.
     """
 
     q: Mapping[int, ca.SX]
@@ -77,7 +78,8 @@ class Scene:
         return ca.tanh(self.w[k] / self.smooth[k])
 
     def others(self, k: int) -> list[int]:
-        return [j for j in self.rolling if j != k]
+        """The other driven contacts."""
+        return [j for j in self.rolling if j != k and j in self.u]
 
 
 @dataclass(frozen=True)
@@ -153,10 +155,10 @@ PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
 class Effect:
     """One entry of the catalogue.
 
-    `places`: joints, rolls, drive, articulation, wheels, yaw_rate, lateral_speed, machine. `amount`: a typical one
-    [unit] at a site, `grid`: shares of it that are tried where the signature isn't proportional to the amount.
-    `positive`: a negative amount makes no sense; `inverse`: the smaller the amount, the larger the effect. Hooks take
-    the scene, the body they act on, and the values.
+    `places`: joints, contacts (driven ones), drive (all of these together), articulation, wheels (measuring ones),
+    yaw_rate, lateral_speed, machine. `amount`: a typical one [unit] at a site, `grid`: shares of it that are tried
+    where the signature isn't proportional to the amount. `positive`: a negative amount makes no sense; `inverse`: the
+    smaller the amount, the larger the effect. Hooks take the scene, the body they act on, and the values.
     """
 
     name: str
@@ -286,7 +288,7 @@ def _viscous(share: float, power: float = 0.0) -> Callable[[Site], float]:
     return size
 
 
-def _rear_moment(site: Site) -> float:
+def _load_moment(site: Site) -> float:
     total = sum(float(b.inertia.mass) for b in site.machine.body if b.inertia is not None)
     return 0.05 * total
 
@@ -425,7 +427,7 @@ _declare(
     ),
     Effect(
         "torque_deadband",
-        ("rolls",),
+        ("contacts",),
         "N m",
         "delivered sgn(u) max(abs(u) - A, 0), u measured",
         "a loss of torque with the sign of the torque, also at standstill",
@@ -439,8 +441,8 @@ _declare(
         "pump_coupling",
         ("drive",),
         "-",
-        "each roll's delivered torque grows by A times the other's measured one",
-        "one roll answers to the other's torque",
+        "each driven contact's delivered torque grows by A times what the others' sensors read",
+        "one driven contact answers to another's torque",
         "two motors on one hydraulic pump",
         _constant(0.05),
         torque=_coupling,
@@ -459,18 +461,18 @@ _declare(
     # ---------------------------------------------------------------- once or several times per turn
     Effect(
         "roll_unbalance",
-        ("rolls",),
+        ("contacts",),
         "N m",
-        "a torque once per turn of the roll: A sin(theta + phase)",
-        "a torque error periodic in the roll's angle",
-        "eccentric mass or bearing of a roll",
+        "a torque once per turn of the contact: A sin(theta + phase)",
+        "a torque error periodic in the contact's angle",
+        "eccentric mass or bearing of a roll or wheel",
         _constant(100.0),
         {"phase": PHASE},
         torque=lambda s, k, p: p["A"] * ca.sin(s.q[k] + p["phase"]),
     ),
     Effect(
         "encoder_eccentricity",
-        ("rolls", "wheels"),
+        ("contacts", "wheels"),
         "rad",
         "the encoder reads A sin(theta + phase) too much",
         "an angle error periodic in the angle itself",
@@ -481,10 +483,10 @@ _declare(
     ),
     Effect(
         "torque_ripple",
-        ("rolls",),
+        ("contacts",),
         "N m",
         "the delivered torque ripples several times per turn: A sin(order theta + phase)",
-        "a torque error periodic in the roll's angle, several times per turn",
+        "a torque error periodic in the contact's angle, several times per turn",
         "piston motors, Ivantysyn, Hydrostatic Pumps and Motors, 2001",
         _constant(100.0),
         {
@@ -496,7 +498,7 @@ _declare(
     # ---------------------------------------------------------------- soil
     Effect(
         "shear_saturation",
-        ("rolls",),
+        ("contacts",),
         "-",
         "law (18) instead of the linear one; A = K / xi_s, the slip at which j = K at the rear of the patch",
         "contact forces fall behind the linear law at large slips",
@@ -509,7 +511,7 @@ _declare(
     ),
     Effect(
         "lateral_saturation",
-        ("rolls",),
+        ("contacts",),
         "-",
         "law (18) for the lateral force alone",
         "lateral forces fall behind the linear law at large lateral slips",
@@ -522,7 +524,7 @@ _declare(
     ),
     Effect(
         "drive_brake_asymmetry",
-        ("rolls",),
+        ("contacts",),
         "-",
         "Kx larger by the factor 1 + A when braking (abs(V_x) > abs(R_c w))",
         "slip of another size when braking than when driving at the same force",
@@ -544,7 +546,7 @@ _declare(
     ),
     Effect(
         "slip_relaxation",
-        ("rolls",),
+        ("contacts",),
         "m",
         "contact forces build up over the distance A",
         "contact forces late against slip, by a distance",
@@ -562,9 +564,9 @@ _declare(
     ),
     Effect(
         "vibration_on",
-        ("rolls",),
+        ("contacts",),
         "-",
-        "for a while Kx and Ky are smaller by the factor 1 - A, the roll vibrates",
+        "for a while Kx and Ky are smaller by the factor 1 - A, the contact vibrates",
         "more slip at the same force between two instants",
         "vibratory rollers, Forssblad 1981",
         _constant(0.3),
@@ -581,9 +583,9 @@ _declare(
     # ---------------------------------------------------------------- forces
     Effect(
         "rolling_resistance",
-        ("rolls",),
+        ("contacts",),
         "N",
-        "a force against the motion at the roll's centre",
+        "a force against the motion at the contact's centre",
         "a force that turns with the direction of travel",
         "Bekker, Introduction to Terrain-Vehicle Systems, 1969",
         _constant(200.0),
@@ -608,10 +610,10 @@ _declare(
         "payload_shift",
         ("machine",),
         "kg m",
-        "at one instant the first moment of the rear chassis along its axis changes by A",
+        "at one instant the first moment of the last chassis along its axis changes by A",
         "inertial and yaw forces that change at an instant",
         "a water tank or a load that moves",
-        _rear_moment,
+        _load_moment,
         {
             "instant": Shape("s", 0.5, (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), _duration),
             "takes": Shape("s", 0.2, (0.2,)),
@@ -745,7 +747,7 @@ class Placed:
 def places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...], str | None]]:
     """Where an effect may sit on a machine: name of the place -> bodies, sensor."""
     free = list(machine.actuated)
-    rolls = [b for b in free if b.contact is not None]
+    rolling = [b for b in free if b.contact is not None]
     plain = [b for b in free if b.contact is None]
     sensors = machine.sensors("full")
     root = machine.body[0].index
@@ -753,10 +755,10 @@ def places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...],
     for place in effect.places:
         if place == "joints":
             found |= {b.where: ((b.index,), _angle(sensors, b)) for b in free}
-        elif place == "rolls":
-            found |= {b.where: ((b.index,), _angle(sensors, b)) for b in rolls}
-        elif place == "drive" and len(rolls) > 1:
-            found["drive"] = tuple(b.index for b in rolls), None
+        elif place == "contacts":
+            found |= {b.where: ((b.index,), _angle(sensors, b)) for b in rolling}
+        elif place == "drive" and len(rolling) > 1:
+            found["drive"] = tuple(b.index for b in rolling), None
         elif place == "articulation" and machine.planar:
             found |= {b.where: ((b.index,), _angle(sensors, b)) for b in plain}
         elif place == "wheels":
@@ -775,10 +777,18 @@ def _angle(sensors: Sequence[Sensor], body: Body) -> str | None:
 
 
 def _shifting(machine: Machine) -> int | None:
-    """The body whose load may move: the last chassis behind an articulation."""
-    hung = [b.index for b in machine.body[1:] if b.inertia is not None and not b.inertia.axisymmetric and b.coordinates]
-    free = [k for k in hung if machine.find(k).coordinates[0] in machine.coordinates]
-    return free[-1] if free else None
+    """The body whose load may move: the last chassis of those that turn, as a moment that never turns shows nowhere."""
+    chassis = [b for b in machine.body if b.inertia is not None and not b.inertia.axisymmetric and b.contact is None]
+    turning = [b.index for b in chassis if _turns(machine, b)]
+    return turning[-1] if turning else None
+
+
+def _turns(machine: Machine, body: Body) -> bool:
+    """Whether a free joint turns a body: its own, or one that carries it."""
+    own = {"planar": body.coordinates[2:], "revolute": body.coordinates}.get(body.joint, ())
+    if set(own) & set(machine.coordinates):
+        return True
+    return not isinstance(body.antecedent, str) and _turns(machine, machine.find(body.antecedent))
 
 
 def shifted(machine: Machine, change: Mapping[str, ca.SX]) -> dict[str, ca.SX]:

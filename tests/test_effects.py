@@ -153,7 +153,7 @@ def test_a_new_effect_is_one_declaration(monkeypatch: pytest.MonkeyPatch, va12: 
     """Simulated, a parameter of the regressor, a candidate of the diagnosis: from one entry of the catalogue."""
     dry = Effect(
         "sticky_spot",
-        ("rolls",),
+        ("contacts",),
         "N m",
         "a torque against the motion in one half of a turn",
         "a torque error in half of every turn",
@@ -204,6 +204,45 @@ def test_phases_and_places_follow_the_machine() -> None:
     assert set(effects.places(bench, CATALOGUE["asymmetric_viscous"])) == {"carriage"}
     assert not effects.places(bench, CATALOGUE["ground_slope"])
     assert isinstance(effects.placed(bench, effects.parse("torque_gain=0.1", bench, 10.0)), Placed)
+
+
+LOADED = {
+    "va12": 2,
+    "single_drum": 3,
+    "tandem": 0,
+    "double_loader": 2,
+    "pendulum_loader": 4,
+    "skid_robot": 0,
+    "three_wheel": 0,
+}
+
+
+@pytest.mark.parametrize(("name", "body"), LOADED.items())
+def test_a_load_slides_on_the_last_chassis(name: str, body: int) -> None:
+    """Long after, the machine is one whose first moment is larger by the amount; no chassis that turns, no place."""
+    known = machine.load(name)
+    plain, amount = build(known), 3.0
+    shifted = build(effects.extended(known, effects.parse(f"payload_shift={amount}", known, 10.0)))
+    n, rng = len(plain.coordinates), np.random.default_rng(0)
+    q, nu, a = rng.uniform(-1, 1, (3, n))
+    u, late = np.zeros(len(plain.inputs)), np.full(len(shifted.memory), 1e3)
+    p = plain.expand @ plain.nominal
+    moved = p.copy()
+    moved[plain.base.standard.index(f"MX{body}")] += amount
+    want = plain.balance(q, nu, a, moved).full()
+    assert shifted.balance(q, nu, a, shifted.expand @ shifted.nominal, u, late).full() == pytest.approx(want, rel=1e-9)
+    assert np.abs(want - plain.balance(q, nu, a, p).full()).max() > 0.1
+
+
+def test_effects_of_one_contact_on_others_need_a_drive() -> None:
+    """Of the three-wheel roller the steered front roll is driven by nothing: nothing couples to it."""
+    known = machine.load("three_wheel")
+    assert effects.places(known, CATALOGUE["pump_coupling"]) == {"drive": ((1, 2), None)}
+    model = build(effects.extended(known, effects.parse("pump_coupling=0.1", known, 10.0)))
+    still, torque = np.zeros(len(model.coordinates)), np.array([100.0, 200.0, 0.0])
+    more = model.balance(still, still, still, model.expand @ model.nominal, torque, []).full()
+    assert more[list(model.actuated), 0] == pytest.approx([-20, -10, 0])
+    assert not effects.places(machine.load("va12_straight"), CATALOGUE["payload_shift"])
 
 
 # ------------------------------------------------------------------------------------------------ noise is no effect
