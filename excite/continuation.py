@@ -75,6 +75,8 @@ PLAN = (
 SCOUTS = 3  # stages that every start goes through; the best third of the starts go on to the end
 REPAIR = Stage(1, 1, 1, 800, 1e-6, 1, 30, 0.1, elements=3)
 REFINE = Stage(1, 1, 1, 800, 1e-6, 1, 30, 0.1)
+REPAIRS = 3  # of a drive whose fresh simulation exceeds a limit, at most, and one more for every machine it is for
+MUCH = 0.05  # of a limit's range: exceeded by more, its ratio counts
 REFINES = 5  # of an aim with a ceiling, at most
 GAINED = 2e-3  # of the score by which another one is worth its time
 
@@ -220,15 +222,20 @@ def refine(
 
 
 def repair(model: Model, problem: Problem, aim: Aim, track: Track, over: Callable[[], bool]) -> Track:
-    """The same drive with what the fresh simulation exceeds moved in, three times at most."""
+    """The same drive with what the fresh simulation exceeds moved in, a few times at most.
+
+    By what is exceeded; by its ratio where that is much, as for other machines, which need more torque and power for
+    the same motion: a range can't be narrowed by more than itself.
+    """
     margins: dict[str, float] = {}
     track = land(model, problem, aim, track, over)
-    for _ in range(3):
+    for _ in range(REPAIRS + len(aim.machines)):
         if track.latest.feasible or over():
             break
         for name, excess in track.latest.violations.items():
             if excess > 0.3 * TOLERANCE:
-                margins[name] = margins.get(name, 0.0) + min(3 * excess, excess + 0.01)
+                old, more = margins.get(name, 0.0), min(3 * excess, excess + 0.01)
+                margins[name] = old + more if more < MUCH else 0.5 - (0.5 - old) / (1 + 2 * more)
         track = replace(track, pose=track.latest.start) if track.pose is not None else track
         track = _advance(model, problem, aim, track, REPAIR, margins, over) or track
         track = land(model, problem, aim, track, over)
