@@ -144,16 +144,18 @@ def _forces(stage: Stage, s: np.ndarray, u: np.ndarray) -> list[tuple[str, np.nd
 def _quantities(
     stage: Stage, q: np.ndarray, nu: np.ndarray, u: np.ndarray, own: Mapping[str, int | None]
 ) -> dict[str, tuple[str, dict[str, np.ndarray]]]:
-    """What the machine does at each sample, as each missing torque or force sees it."""
+    """What the machine does at each sample, as each missing torque or force sees it: one that belongs to a joint sees
+    that joint's, one that belongs to none what the contacts do on average."""
     model, machine = stage.model, stage.machine
     at = model.coordinates.index
     rate = float(machine.sampling_hz)
     t = np.arange(len(q)) / rate
-    bodies = {b.index: b for b in machine.actuated}
+    bodies = {b.index: b for b in machine.body if b.joint != "planar" and set(b.coordinates) & set(model.coordinates)}
+    driven = [b.index for b in machine.actuated]
     planar = machine.planar and machine.body[0].coordinates[0] in model.coordinates
     speed = nu[:, at(machine.body[0].coordinates[0])] if planar else None
     slips = dict(zip(model.slips, model.kinematics(q.T, nu.T)[1].full(), strict=True)) if model.slips else {}
-    turning = [b for b in machine.actuated if b.contact is None]
+    steered = [b for b in machine.actuated if b.contact is None]
     found: dict[str, tuple[str, dict[str, np.ndarray]]] = {"time": ("s", dict.fromkeys(own, t))}
 
     def each(name: str, unit: str, values: Mapping[str, np.ndarray | None]) -> None:
@@ -167,26 +169,26 @@ def _quantities(
         each("speed", "m/s", dict.fromkeys(own, speed))
         distance = np.cumsum(np.abs(speed)) / rate
         each("distance", "m", dict.fromkeys(own, distance))
-        rolls = {i for i, b in bodies.items() if b.contact is not None}
+        rolling = {i for i, b in bodies.items() if b.contact is not None}
         each(
-            "roll angle",
+            "rotation",
             "rad",
-            {k: np.mod(x, 2 * np.pi) if x is not None and own[k] in rolls else None for k, x in angles.items()},
+            {k: np.mod(x, 2 * np.pi) if x is not None and own[k] in rolling else None for k, x in angles.items()},
         )
-        for body in turning[:1]:
+        for body in steered:
             each(f"{body.where} angle", "rad", dict.fromkeys(own, q[:, at(body.coordinates[0])]))
     else:
         turns = all(b.joint == "revolute" for b in bodies.values())
         each("speed", "rad/s" if turns else "m/s", rates)
         each("position", "rad" if turns else "m", angles)
-    torque = dict(zip(bodies, u.T, strict=True))
+    torque: dict[int | None, np.ndarray] = dict(zip(driven, u.T, strict=True))
     # A force that belongs to no joint is shown against the torque of the first.
-    first = next(iter(bodies))
-    unit = "N m" if all(b.joint == "revolute" for b in bodies.values()) else "N"
-    each("torque" if unit == "N m" else "force", unit, {k: torque[first if i is None else i] for k, i in own.items()})
+    torque[None] = torque[driven[0]]
+    unit = "N m" if all(bodies[i].joint == "revolute" for i in driven) else "N"
+    each("torque" if unit == "N m" else "force", unit, {k: torque.get(i) for k, i in own.items()})
     if slips:
-        rolls_first = next(i for i, b in bodies.items() if b.contact is not None)
-        each("slip", "-", {k: slips.get(f"gx{rolls_first if i is None else i}") for k, i in own.items()})
+        mean = np.mean([x for name, x in slips.items() if name.startswith("gx")], axis=0)
+        each("slip", "-", {k: mean if i is None else slips.get(f"gx{i}") for k, i in own.items()})
     return found
 
 
@@ -296,15 +298,25 @@ def _places(course: Course, z: np.ndarray) -> list[str]:
         return []
     found: list[tuple[float, str]] = []
     for name, (unit, values) in course.quantities.items():
-        x = next(iter(values.values()))[: n * b].reshape(n, b).mean(axis=1)
         if name == "distance":
             continue  # says what time says
-        low, high, share, of = _densest(x, excess)
-        if share >= CONCENTRATED[0] and of <= CONCENTRATED[1]:
-            where = f"{name} from {low:.2g} to {high:.2g} {unit}".removesuffix(" -")
-            found.append((share / of, f"{100 * share:.0f} % of it at {where}, {100 * of:.0f} % of the log"))
+        for label, series in _distinct(values).items():
+            low, high, share, of = _densest(series[: n * b].reshape(n, b).mean(axis=1), excess)
+            if share >= CONCENTRATED[0] and of <= CONCENTRATED[1]:
+                where = f"{name}{label} from {low:.2g} to {high:.2g} {unit}".removesuffix(" -")
+                found.append((share / of, f"{100 * share:.0f} % of it at {where}, {100 * of:.0f} % of the log"))
     found.sort(reverse=True)
     return [text for _, text in found[:2]]
+
+
+def _distinct(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The different courses that a quantity has, by what to add to its name: nothing where there is one for all, else
+    the joint or contact that it is of."""
+    first, *others = values.values()
+    if all(x is first for x in others):
+        return {"": first}
+    # "torque u1, front roll" is of the front roll; a force that belongs to no joint has no course of its own.
+    return {f" of {row.partition(', ')[2]}": x for row, x in values.items() if ", " in row}
 
 
 def _densest(x: np.ndarray, excess: np.ndarray) -> tuple[float, float, float, float]:

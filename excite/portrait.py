@@ -131,7 +131,7 @@ def when_figure(before: Course, after: Course | None, title: str) -> Figure:
 def _map(ax: Axes, course: Course, norm: LogNorm) -> None:
     """Where in the state space: speed across, steering angle (or torque where nothing steers) up."""
     names = list(course.quantities)
-    up = next((n for n in names if n.endswith(" angle") and n != "roll angle"), None)
+    up = next((n for n in names if n.endswith(" angle")), None)
     up = up or next(n for n in names if n in ("torque", "force"))
     (x_unit, xs), (y_unit, ys) = course.quantities["speed"], course.quantities[up]
     x, y = next(iter(xs.values())), next(iter(ys.values()))

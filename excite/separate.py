@@ -22,12 +22,13 @@ from model.equations import Signatures, signatures
 from model.machine import Machine
 
 APART = 0.4  # relative difference of two answers from which they are told apart
+SAME = 1e-6  # share of two signatures that isn't in common, below which no drive tells them apart
 SAMPLES = 3000  # of the log that effects are asked along, at most
 SLOW = 0.05  # [m/s, rad/s] below which a machine or joint stands
 LOADED = 0.05  # of the largest torque, from which a torque counts
 STEADY = 2.0  # fast over slow stretches' speed, from which a log has both
 AROUND = 2.5  # [rad] of heading from which a log has been driven both ways along the lane
-STEERED = 0.05  # [rad] of an articulation from which a log turns
+STEERED = 0.05  # [rad] of a steered joint, or without one [rad/s] of yaw, from which a log turns
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,9 @@ class Motion:
 
 @dataclass(frozen=True)
 class Run:
-    """A change of the drive: what to do, on a roller and on a machine that stands on a bench; what becomes of a motion;
-    whether a motion holds it already."""
+    """A change of the drive: what to do, on a machine that drives and on one that stands on a bench; what becomes of a
+    motion; whether a motion holds it already. In `text` {against} stands for the machine's driven contacts at work
+    against each other, or against a wall."""
 
     text: str
     bench: str | None
@@ -54,7 +56,7 @@ class Run:
 
 def run(d: Diagnosis) -> str | None:
     """The simplest run that separates what is tied, in words; None where nothing is, or where it is not a matter of
-    the drive."""
+    the drive, as no drive tells which of two wheels of one side resists."""
     said: list[str] = []
     for f in d.findings:
         if f.tied_with:
@@ -83,13 +85,28 @@ def _separating(stage: Stage, names: Sequence[str]) -> str | None:
                 break
             chosen.append(r)
             open_ -= split
-    texts = [(r.text if machine.planar else r.bench or r.text) for r in dict.fromkeys(chosen)]
-    rest = [(tied[i], tied[j]) for i, j in open_]
+    texts = [_said(r, machine) for r in dict.fromkeys(chosen)]
+    same = _same(asked(_stirred(motion)), pairs)
+    rest = [(tied[i], tied[j]) for i, j in sorted(open_ - same)]
     for a, b in rest:
         more = _by_place(machine, a, b)
         if more is not None and more not in texts:
             texts.append(more)
     return ", and ".join(texts) if texts else None
+
+
+def _said(r: Run, machine: Machine) -> str:
+    """What to do, with the machine's own names."""
+    if not machine.planar:
+        return r.bench or r.text
+    driven = [_words(b.where) for b in machine.actuated if b.contact is not None]
+    each = f"{driven[0]} against {driven[1]}" if len(driven) == 2 else f"{', '.join(driven)} against each other"
+    wall = "against a wall"
+    return r.text.format(against=f"{each}, or {wall}" if len(driven) > 1 else wall)
+
+
+def _words(where: str) -> str:
+    return where.replace("_", " ")
 
 
 def _placed(stage: Stage, name: str) -> Placed:
@@ -167,12 +184,32 @@ def _split(here: np.ndarray, there: np.ndarray, pairs: Sequence[tuple[int, int]]
     }
 
 
+def _stirred(m: Motion) -> Motion:
+    """A motion about this one in which everything moves, each at a frequency of its own."""
+
+    def stir(x: np.ndarray, first: float) -> np.ndarray:
+        size = np.maximum(np.abs(x).max(axis=0), 0.1)
+        return x + size * np.sin(m.t[:, None] * (first + 0.37 * np.arange(x.shape[1])) + np.arange(x.shape[1]))
+
+    return replace(m, q=stir(m.q, 0.5), nu=stir(m.nu, 0.7), u=stir(m.u, 0.9))
+
+
+def _same(signature: np.ndarray, pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
+    """Pairs of effects that do the same along a motion (C, K), but for their size: wheels of one side resist alike."""
+    unit = signature / np.maximum(np.linalg.norm(signature, axis=1, keepdims=True), 1e-300)
+    return {(i, j) for i, j in pairs if abs(unit[i] @ unit[j]) > 1 - SAME}
+
+
 def _by_place(machine: Machine, a: Placed, b: Placed) -> str | None:
     """What separates two causes that answer alike because they differ in place alone, or not even in that."""
     if a.where != b.where and machine.planar:
-        rolls = {x.index for x in machine.contacts}
-        driven = all((e.effect.torque or e.effect.soil or e.effect.channel) and set(e.bodies) <= rolls for e in (a, b))
-        return "pull with one roll alone, then with the other" if driven else "tight turns to both sides"
+        rolling = {x.index for x in machine.contacts}
+        pulls = [bool(e.effect.torque or e.effect.soil or e.effect.channel) for e in (a, b)]
+        if not all(pulls) or not {*a.bodies, *b.bodies} <= rolling:
+            return "tight turns to both sides"
+        first, second = sorted((a, b), key=lambda e: len(e.bodies))
+        other = "the others" if len(second.bodies) > 1 else f"{_words(second.where)} alone"
+        return f"pull with {_words(first.where)} alone, then with {other}"
     if (a.effect.channel is None) != (b.effect.channel is None):
         return "the same drive with a known ballast on the machine"
     return None
@@ -232,7 +269,7 @@ def _steady(machine: Machine, m: Motion) -> bool:
 
 
 def _turns(machine: Machine) -> list[int]:
-    """Coordinates that are zero straight ahead: sideways, yaw and articulations."""
+    """Coordinates that are zero straight ahead: sideways, yaw and steered joints."""
     across = machine.body[0].coordinates[1:] if machine.planar else ()
     joints = [b.coordinates[0] for b in machine.actuated if b.contact is None] if machine.planar else []
     return [machine.coordinates.index(c) for c in (*across, *joints) if c in machine.coordinates]
@@ -248,10 +285,11 @@ def _straight(machine: Machine, m: Motion) -> Motion:
 
 def _went_straight(machine: Machine, m: Motion) -> bool:
     joints = [machine.coordinates.index(b.coordinates[0]) for b in machine.actuated if b.contact is None]
-    if not machine.planar or not joints:
+    heading = _heading(machine)
+    if not machine.planar or heading is None:
         return True
-    angle = np.abs(m.q[:, joints]).max(axis=1)
-    return bool((angle < STEERED / 2).mean() > 0.2 and (angle > STEERED).mean() > 0.2)
+    turn = np.abs(m.q[:, joints] if joints else m.nu[:, heading, None]).max(axis=1)
+    return bool((turn < STEERED / 2).mean() > 0.2 and (turn > STEERED).mean() > 0.2)
 
 
 def _never(machine: Machine, m: Motion) -> bool:
@@ -272,7 +310,7 @@ RUNS = (
         _both_ways,
     ),
     Run(
-        "standing still with torque: one roll against the other, or against a wall",
+        "standing still with torque: {against}",
         "standing still with torque, against a stop",
         lambda machine, m: replace(m, nu=0 * m.nu, a=0 * m.a),
         _stood,
