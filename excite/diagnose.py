@@ -129,7 +129,8 @@ class Diagnosis:
     """verdict: clean, named, tied or unexplained. `before`, `after`: the model without and with what was found.
 
     share: of the excess misfit that the names explain. scores: the first scan's, best first. located: lines that say
-    where what is unexplained sits. stages: the model with the first finding, the first two, and so on.
+    where what is unexplained sits. stages: the model with the first finding, the first two, and so on. nearest: where
+    nothing is named, the effect that explains most, and the share that it does.
     """
 
     verdict: str
@@ -140,6 +141,7 @@ class Diagnosis:
     scores: tuple[evidence.Score, ...]
     located: tuple[str, ...]
     stages: tuple[Stage, ...]
+    nearest: tuple[str, float] | None = None
 
 
 def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance | None = None) -> Diagnosis:
@@ -163,15 +165,17 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
         stage = choice.stage
     tell(0.95, "weighing")
     # A name that leaves most of the misfit where it was is none, unless with what came after it nothing is left.
-    odd = _odd(stage)
+    odd, nearest = _odd(stage), None
     while chosen and (odd or not stage.exact):
         share = SHARE if len(chosen) == 1 else FURTHER
-        if chosen[-1].gain >= share * (chosen[-1].gain + stage.excess):
+        explained = chosen[-1].gain / (chosen[-1].gain + stage.excess)
+        if explained >= share:
             break
-        chosen.pop()
+        nearest = chosen.pop().name, explained
         stage = chosen[-1].stage if chosen else before
         odd = _odd(stage)
-    return _verdict(before, stage, chosen, first, odd)
+    answer = _verdict(before, stage, chosen, first, odd)
+    return answer if answer.findings else replace(answer, nearest=nearest)
 
 
 def _odd(stage: Stage) -> tuple[str, ...]:

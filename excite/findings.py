@@ -78,6 +78,7 @@ def summary(a: Account) -> dict[str, Any]:
         "separating_run": a.run,
         "share_explained": d.share,
         "located": list(a.located),
+        "nearest": {"effect": d.nearest[0], "share": d.nearest[1]} if d.nearest else None,
         "parameters": parameters(d),
         "exact": {"before": d.before.exact, "after": d.after.exact},
     }
@@ -166,6 +167,8 @@ def answer(a: Account) -> str:
             more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
             first = words(rows[0]["effect"], rows[0]["where"])
             text += f"; {first}{more} would account for {100 * d.share:.0f} % of it, too little to be its name"
+        elif d.nearest:
+            text += f"; nearest comes {words(*d.nearest[0].split('@'))} with {100 * d.nearest[1]:.0f} % of it"
         return text + "."
     gained = ""
     if a.whole:
