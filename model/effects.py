@@ -158,7 +158,8 @@ class Effect:
     `places`: joints, contacts (driven ones), drive (all of these together), articulation, wheels (measuring ones),
     yaw_rate, lateral_speed, machine. `amount`: a typical one [unit] at a site, `grid`: shares of it that are tried
     where the signature isn't proportional to the amount. `positive`: a negative amount makes no sense; `inverse`: the
-    smaller the amount, the larger the effect. Hooks take the scene, the body they act on, and the values.
+    smaller the amount, the larger the effect; `angular`: a reading's error that only a sensor of an angle has, none of
+    a rate. Hooks take the scene, the body they act on, and the values.
     """
 
     name: str
@@ -181,6 +182,7 @@ class Effect:
     channel: Callable[[ca.SX, Values], Channel] | None = None
     memory: Mapping[str, Memory] = field(default_factory=dict)
     timed: bool = False
+    angular: bool = False
 
     @property
     def sensed(self) -> bool:
@@ -480,6 +482,7 @@ _declare(
         _constant(0.005),
         {"phase": PHASE},
         reading=lambda s, exact, k, p: p["A"] * (ca.sin(exact + p["phase"]) - ca.sin(p["phase"])),
+        angular=True,
     ),
     Effect(
         "torque_ripple",
@@ -634,6 +637,7 @@ _declare(
         {"turn": Shape("N m", 0.02, (0.01, 0.05), _full_torque)},
         positive=True,
         reading=lambda s, exact, k, p: p["A"] / 2 * ca.tanh(s.u[k] / p["turn"]),
+        angular=True,
     ),
     Effect(
         "articulation_compliance",
@@ -645,6 +649,7 @@ _declare(
         _one_over_torque,
         positive=True,
         reading=lambda s, exact, k, p: p["A"] * s.u[k],
+        angular=True,
     ),
     Effect(
         "articulation_stop_spring",
@@ -749,7 +754,7 @@ def places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...],
     free = list(machine.actuated)
     rolling = [b for b in free if b.contact is not None]
     plain = [b for b in free if b.contact is None]
-    sensors = machine.sensors("full")
+    sensors = [s for s in machine.sensors("full") if not (effect.angular and s.is_rate)]
     root = machine.body[0].index
     found: dict[str, tuple[tuple[int, ...], str | None]] = {}
     for place in effect.places:
@@ -769,6 +774,8 @@ def places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...],
             found["machine"] = (root,), None
     if effect.soil or effect.push:
         found = {w: at for w, at in found.items() if all(machine.find(k).contact for k in at[0])}
+    if effect.angular:
+        found = {w: at for w, at in found.items() if at[1] is not None}
     return found
 
 

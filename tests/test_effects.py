@@ -234,6 +234,29 @@ def test_a_load_slides_on_the_last_chassis(name: str, body: int) -> None:
     assert np.abs(want - plain.balance(q, nu, a, p).full()).max() > 0.1
 
 
+def test_a_rate_has_no_errors_of_an_angle() -> None:
+    """The front roll, the articulation and the left measuring wheel logged as rates: no encoder that is eccentric, no
+    play beside it; what a wrong radius does stays."""
+    rates = ("theta1", "theta2", "thetal")
+    rated = [
+        s.model_copy(update={"unit": "rpm", "counts_per_turn": None}) if s.name in rates else s for s in VA12.sensor
+    ]
+    known = VA12.model_copy(update={"sensor": tuple(rated)})
+
+    def offered(name: str) -> set[str]:
+        return set(effects.places(known, CATALOGUE[name]))
+
+    assert offered("encoder_eccentricity") == {"rear_roll", "measuring_wheel_right"}
+    assert not offered("articulation_backlash") | offered("articulation_compliance")
+    assert offered("articulation_stop_spring") == {"articulation"}
+    assert offered("measuring_wheel_radius") == {"measuring_wheel_left", "measuring_wheel_right"}
+    names = {c.name for c in evidence.candidates(known, [s.name for s in known.sensors("full")], 60.0)}
+    assert "encoder_eccentricity@rear_roll" in names
+    assert not names & {"encoder_eccentricity@front_roll", "articulation_backlash@articulation"}
+    with pytest.raises(MachineError, match="where must be one of rear_roll, measuring_wheel_right"):
+        effects.parse("encoder_eccentricity@front_roll=0.01", known, 60.0)
+
+
 def test_effects_of_one_contact_on_others_need_a_drive() -> None:
     """Of the three-wheel roller the steered front roll is driven by nothing: nothing couples to it."""
     known = machine.load("three_wheel")
