@@ -6,8 +6,10 @@ compared from its file alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import json
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -15,12 +17,29 @@ import pandas as pd
 import pytest
 from test_tree import TOLERANCE, Case, relative
 
-from excite import compare, design, hidden, identify, limit, log, logcheck, manoeuvre, sensors, topview
+from excite import (
+    compare,
+    design,
+    diagnose,
+    hidden,
+    identify,
+    limit,
+    log,
+    logcheck,
+    manoeuvre,
+    misfit,
+    sensors,
+    separate,
+    topview,
+)
+from excite.diagnose import Diagnosis
 from excite.limit import InfeasibleError
-from excite.simulate import simulate
+from excite.simulate import Motion, simulate
+from model import effects
 from model.machine import Machine, Problem, Quantity, load, shipped
 from model.prediction import Model, build, standard_parameters
 
+ROOT = Path(__file__).parents[1]
 NEVER = ("MZ", "XX", "XY", "XZ", "YY", "YZ")  # of a chassis: what motion on the plane can't show
 
 
@@ -314,6 +333,53 @@ def test_what_a_straight_log_of_a_skid_steered_robot_hides_is_seen_by_turning() 
     texts = [c.text for c in hidden.changes(model, np.zeros(len(model.coordinates), bool))]
     assert "turn (drive its sides at different speeds)" in texts
     assert not any("sides" in c.text for c in hidden.changes(model_of("tandem"), np.zeros(7, bool)))
+
+
+@pytest.fixture(scope="module")
+def biased() -> tuple[Motion, Diagnosis]:
+    """The robot on its designed drive, with a gyro that reads too much; and what the log shows."""
+    model = model_of("skid_robot")
+    drawn = json.loads((ROOT / "results" / "machines" / "skid_robot" / "drive.json").read_text())
+    torque = manoeuvre.Manoeuvre(np.array(drawn["times_s"]), np.array(drawn["torque"])).sample(100.0)[:801]
+    effect = effects.parse("yaw_rate_bias=0.01", model.machine, 8.0)
+    wrong = build(effects.extended(model.machine, effect))
+    motion = simulate(wrong, torque)
+    measured = log.check(sensors.measure(wrong, motion, seed=3), model.machine)
+    return motion, diagnose.diagnose(model, [measured], model.machine.filter)
+
+
+def test_a_diagnosis_names_what_a_robot_has(biased: tuple[Motion, Diagnosis]) -> None:
+    """Its slips are each wheel's own: the inner ones' and the outer ones' differ in a turn."""
+    motion, found = biased
+    assert (found.verdict, [f.name for f in found.findings]) == ("named", ["yaw_rate_bias@yaw_rate"])
+    (bias,) = found.findings
+    assert abs(bias.amount - 0.01) < 4 * bias.amount_std
+    (course,) = misfit.courses(found.after)
+    machine = model_of("skid_robot").machine
+    (Vx, _, yaw, *spins), slips = motion.nu.T, course.quantities["slip"][1]
+    for body, spin in zip(machine.contacts, spins, strict=True):
+        assert body.contact is not None
+        rim = float(body.contact.radius) * spin
+        slip = (Vx - float(body.r) * yaw - rim) / np.hypot(rim, float(body.contact.v_eps))
+        (own,) = (x for row, x in slips.items() if row.endswith(body.where.replace("_", " ")))
+        assert np.quantile(np.abs(own - slip), 0.99) < 0.1 * np.ptp(slip)  # not at rest, where a log says little
+
+
+@pytest.mark.parametrize(
+    ("cause", "rival", "said"),
+    [
+        ("rolling_resistance@front_left", "rolling_resistance@rear_left", None),
+        ("rolling_resistance@front_left", "rolling_resistance@front_right", "tight turns to both sides"),
+        ("torque_gain@front_left", "torque_gain@rear_left", "pull with front left alone, then with rear left alone"),
+    ],
+)
+def test_the_run_that_separates_has_the_machines_names(
+    biased: tuple[Motion, Diagnosis], cause: str, rival: str, said: str | None
+) -> None:
+    """No drive tells which of two wheels of one side resists: both push along the same line."""
+    effect, _, where = cause.partition("@")
+    found = replace(biased[1].findings[0], effect=effect, where=where, tied_with=(rival,))
+    assert separate.run(replace(biased[1], findings=(found,))) == said
 
 
 def test_footprints_stand_where_the_wheels_do() -> None:
