@@ -24,7 +24,7 @@ PEOPLE = 3  # drives by different people, in simulation
 PAGE = "driver.html"
 PACES = (4.0, 3.0, 2.5)  # s per phase that are tried where nobody says how many phases
 ENOUGH = 1.2
-NEAR = 0.8  # of the articulation's stop
+NEAR = 0.8  # of the steered joint's stop
 Progress = Callable[[int, int, float | None], None]
 
 PLAYED, TRACED, PHASED = "torques played back", "a person on the design's own trace", "a person on these phases"
@@ -117,7 +117,7 @@ def verdict(played: Score, person: Score, objective: str = "accuracy") -> str:
 def _warnings(model: Model, problem: Problem, trace: Trace, motions: tuple[Motion, ...], room: drive.Room) -> list[str]:
     free = (np.ceil(room.length + 2 * sheet.AHEAD), np.ceil(room.width + 2 * sheet.AHEAD))
     lines = [
-        f"Keep everybody off {free[0]:.0f} m x {free[1]:.0f} m: the rolls touch {room.length:.1f} m x"
+        f"Keep everybody off {free[0]:.0f} m x {free[1]:.0f} m: the {_rolling(model)} touch {room.length:.1f} m x"
         f" {room.width:.1f} m, {sheet.AHEAD:g} m are left all around for overhangs and for stopping. Stop at once if"
         " anybody comes near.",
         "Vibration off, engine speed and drive settings the same all along, ground level and firm.",
@@ -128,15 +128,16 @@ def _warnings(model: Model, problem: Problem, trace: Trace, motions: tuple[Motio
         lines.append(f"The machine changes direction {times}: somebody must see the ground behind it.")
     ends = np.array([drive.edges(model, m)[0].mean(axis=0)[-1] for m in motions])
     spread = float(np.hypot(*(ends.max(axis=0) - ends.min(axis=0))))
+    wheel, joint = drive.steered(model), drive.steered_name(model)
+    followed = f"speed and {joint}" if joint else "the speed"
     lines.append(
-        f"People drift: between {len(motions)} simulated drives the ends lie {spread:.1f} m apart. Follow speed and"
-        " articulation, not the place; don't correct the place before the end."
+        f"People drift: between {len(motions)} simulated drives the ends lie {spread:.1f} m apart. Follow"
+        f" {followed}, not the place; don't correct the place before the end."
     )
-    wheel = drive.steered(model)
     if wheel is not None and wheel.limit.position is not None:
         top = float(np.abs(trace.angle).max()) / float(wheel.limit.position)
         if top > NEAR:
-            lines.append(f"The articulation goes to {100 * top:.0f} % of its stop: hands and feet away from the joint.")
+            lines.append(f"The {joint} goes to {100 * top:.0f} % of its stop: hands and feet away from the joint.")
     over: dict[str, float] = {}
     for m in motions:
         for name, value in drive.broken(model, problem, m).items():
@@ -145,6 +146,11 @@ def _warnings(model: Model, problem: Problem, trace: Trace, motions: tuple[Motio
         named = ", ".join(f"{n.replace('_', ' ')} by {100 * v:.0f} %" for n, v in over.items())
         lines.append(f"In a person's hands these limits are exceeded: {named} of their range.")
     return lines
+
+
+def _rolling(model: Model) -> str:
+    """What touches the ground, in a word: narrow contacts are wheels."""
+    return "wheels" if all(float(b.contact.width) == 0 for b in model.machine.contacts if b.contact) else "rolls"
 
 
 def summary(made: Sheet) -> dict[str, Any]:

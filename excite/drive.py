@@ -1,9 +1,9 @@
 """From a designed motion to a drive that a person can follow: phases of some seconds, their words, room and score.
 
-People follow a trace of speed and articulation, as in drive-cycle testing, not torques. A design is smoothed into few
-straight pieces of at least some seconds (piecewise linear least squares; the knots by dynamic programming, Bellman and
-Roth, 1969), rounded to what a dial shows, and driven in simulation by `driver`: what is left of the attainable
-accuracy is what a person can keep.
+People follow a trace of speed and of a steered joint's angle, as in drive-cycle testing, not torques. A design is
+smoothed into few straight pieces of at least some seconds (piecewise linear least squares; the knots by dynamic
+programming, Bellman and Roth, 1969), rounded to what a dial shows, and driven in simulation by `driver`: what is left
+of the attainable accuracy is what a person can keep.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Score:
 
 @dataclass(frozen=True)
 class Room:
-    """The ground that the rolls' edges touch, along the lane's axes [m]: length, width, corner (x, y) of the box."""
+    """The ground that the contacts' edges touch, along the lane's axes [m]: length, width, corner (x, y) of the box."""
 
     length: float
     width: float
@@ -80,7 +80,7 @@ class Room:
 def steered(model: Model) -> Body | None:
     """The joint that a person steers, None on a straight lane. Raises DriveError: no wheels, or several such joints."""
     if not model.machine.planar or not model.machine.contacts:
-        raise DriveError(f"{model.machine.name}: has no rolls on the ground, so there is nobody to drive it")
+        raise DriveError(f"{model.machine.name}: has no rolls or wheels on the ground, so there is nobody to drive it")
     joints = [b for b in model.machine.actuated if b.contact is None]
     if len(joints) > 1:
         names = ", ".join(b.where for b in joints)
@@ -88,10 +88,16 @@ def steered(model: Model) -> Body | None:
     return joints[0] if joints else None
 
 
+def steered_name(model: Model) -> str:
+    """What the machine file calls the steered joint, in words; empty where nothing is steered. Raises as `steered`."""
+    body = steered(model)
+    return body.where.replace("_", " ") if body is not None else ""
+
+
 def turns_left(model: Model) -> int:
     """The sign of the steered joint's angle that turns the machine left when rolling forward, 0 without steering.
 
-    From pure rolling: the lateral speeds of both rolls vanish, which is linear in the chassis' speeds.
+    From pure rolling: the lateral speeds of all contacts vanish, which is linear in the chassis' speeds.
     """
     body = steered(model)
     if body is None:
@@ -149,7 +155,7 @@ def slowed(times: np.ndarray, angle: np.ndarray, swing: float, fixed: Sequence[i
 
 
 def as_designed(model: Model, motion: Motion) -> Trace:
-    """A motion's own speed and articulation as a trace, sample by sample: what the phases are compared with."""
+    """A motion's own speed and steering as a trace, sample by sample: what the phases are compared with."""
     wheel = steered(model)
     angle = motion.q[:, model.coordinates.index(wheel.coordinates[0])] if wheel else np.zeros(len(motion.t))
     return Trace(motion.t, motion.nu[:, 0], angle, turns_left(model))

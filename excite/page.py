@@ -43,7 +43,7 @@ def sentence(text: str) -> Markup:
 
 
 def driver_page(model: Model, trace: Trace, title: str) -> str:
-    """The driver's aid: a moving reference of speed and articulation, with the countdown to what comes next.
+    """The driver's aid: a moving reference of speed and steering, with the countdown to what comes next.
 
     It shows what was driven beside it, from a log in the machine's own columns or from `serve`, and scores it.
     """
@@ -79,6 +79,7 @@ def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
         "speed": trace.speed.tolist(),
         "angle": (degrees * trace.angle).tolist(),
         "steers": trace.left != 0,
+        "joint": drive.steered_name(model),
         "phases": [
             {"start": float(t), "go": go, "steer": steer}
             for t, (go, steer) in zip(trace.times[:-1], words, strict=True)

@@ -62,7 +62,7 @@ def facts(sheet: Sheet) -> list[tuple[str, str]]:
         ("top speed", f"{top:.1f} m/s, {3.6 * top:.1f} km/h"),
     ]
     if trace.left:
-        rows.append(("articulation up to", f"{np.rad2deg(np.abs(trace.angle).max()):.0f}°"))
+        rows.append((f"{drive.steered_name(sheet.model)} up to", f"{np.rad2deg(np.abs(trace.angle).max()):.0f}°"))
     rows.append(
         ("free ground", f"{np.ceil(sheet.room.length + 2 * AHEAD):.0f} x {np.ceil(sheet.room.width + 2 * AHEAD):.0f} m")
     )
@@ -89,7 +89,8 @@ def _first(sheet: Sheet) -> Figure:
     if steers:
         bottom = figure.add_axes((LEFT, 0.075, RIGHT - LEFT, height), sharex=speed)
         angle = np.rad2deg(sheet.trace.left * sheet.trace.angle)
-        _trace(bottom, sheet, "articulation [°]\nright  |  left", angle, np.rad2deg(drive.BAND_ANGLE), 5.0)
+        label = f"{drive.steered_name(sheet.model)} [°]\nright  |  left"
+        _trace(bottom, sheet, label, angle, np.rad2deg(drive.BAND_ANGLE), 5.0)
         speed.tick_params(labelbottom=False)
     bottom.set_xlabel("time [s]; the grey band is the tolerance", fontsize=8)
     return figure

@@ -12,10 +12,11 @@ import pytest
 from conftest import Excite
 from matplotlib.figure import Figure
 
-from excite import cab, drive, sheet, stored
+from excite import cab, drive, page, sheet, stored
 from excite.drive import DriveError, Trace
 from excite.simulate import Motion, simulate
-from model.prediction import Model
+from model.machine import load
+from model.prediction import Model, build
 
 RESULTS = Path(__file__).parents[1] / "results"
 KNOTS = np.array([0.0, 4, 9, 12, 15, 19, 23, 27])
@@ -79,6 +80,18 @@ def test_what_makes_no_phases_is_refused(
 def test_a_machine_without_wheels_has_no_driver(emps: Model) -> None:
     with pytest.raises(DriveError, match="emps"):
         drive.steered(emps)
+
+
+@pytest.mark.parametrize(("name", "joint"), [("va12", "articulation"), ("three_wheel", "steering"), ("skid_robot", "")])
+def test_a_steered_joint_has_the_machines_name(name: str, joint: str) -> None:
+    """A machine without one is asked for none."""
+    model = build(load(name))
+    trace = Trace(np.array([0.0, 4, 8]), np.array([0.0, 1, 0]), np.array([0.0, 0.1, 0]), drive.turns_left(model))
+    data = page.driver_data(model, trace, name)
+    assert (data["joint"], data["steers"]) == (joint, bool(joint))
+    text = page.driver_page(model, trace, name)
+    assert f'<div class="name">{joint}</div>' in text
+    assert joint == "articulation" or "articulation" not in text
 
 
 def test_words_say_what_to_do() -> None:
