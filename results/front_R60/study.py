@@ -110,6 +110,7 @@ def figure(points: list[dict[str, object]]) -> Figure:
     ax.set_yscale("log")
     ax.set_xlabel("attainable standard deviation [%]")
     ax.set_ylabel("cond(Phi)")
+    ax.set_xlim(None, 1.5 * max(float(p["worst_percent"]) for p in points))
     ax.set_xticks([0.2, 0.5, 1, 2, 5, 10])
     ax.set_yticks([20, 30, 50, 100, 200])
     for axis in (ax.xaxis, ax.yaxis):
