@@ -16,11 +16,12 @@ import numpy as np
 import scipy.stats
 
 from excite import smoothing
-from excite.diagnose import Stage
+from excite.diagnose import NEARLY, Stage
 from excite.record import readings
-from excite.smoothing import NotConverged
+from excite.smoothing import Fit, NotConverged
 
 HIDDEN, PERIOD = 2.0, 6.0  # [s] withheld of every so many
+LOOSER = 0.1, 1.0, 4.0  # disturbing forces that are tried where a wrong model finds no fit to what isn't withheld
 DRAWS = 2000
 
 
@@ -76,11 +77,17 @@ def withheld(stage: Stage) -> Withheld | None:
         for a, b in own:
             used[a:b] = 0.0
         masked.append(replace(r, used=used))
-    try:
-        rest = smoothing.iterate(
-            c, masked, fit.points, fit.X, prepared.starts, fit.disturbed, prepared.held | fit.unseen, smoothing.RESUMED
-        )
-    except NotConverged:
+    rest: Fit | None = None
+    for disturbed in (fit.disturbed, *(x for x in LOOSER if x > fit.disturbed)):
+        try:
+            rest = smoothing.iterate(
+                c, masked, fit.points, fit.X, prepared.starts, disturbed, prepared.held | fit.unseen, smoothing.RESUMED
+            )
+        except NotConverged as failed:
+            rest = failed.fit if failed.step < NEARLY else None
+        if rest is not None:
+            break
+    if rest is None:
         return None
     squares, counts, motion, noise = [], [], [], []
     for r, p, own in zip(prepared.records, rest.points, stretches, strict=True):

@@ -86,7 +86,9 @@ def _separating(stage: Stage, names: Sequence[str]) -> str | None:
             chosen.append(r)
             open_ -= split
     texts = [_said(r, machine) for r in dict.fromkeys(chosen)]
-    same = _same(asked(_stirred(motion)), pairs)
+    # A machine that its file holds on a line turns where it is let go.
+    held = set(machine.body[0].coordinates) & set(machine.locked)
+    same = set() if held else _same(asked(_stirred(motion)), pairs)
     rest = [(tied[i], tied[j]) for i, j in sorted(open_ - same)]
     for a, b in rest:
         more = _by_place(machine, a, b)
