@@ -11,7 +11,7 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -423,6 +423,15 @@ def snapshot(tmp_path: Path) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": str(tmp_path / "program"), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
+@pytest.fixture
+def attentive() -> Iterator[None]:
+    """Ctrl-C is heard, also where the tests run in the background of a shell that has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("attentive")
 @pytest.mark.parametrize("lost_as", [None, TypeError("'NoneType' object is not iterable")])
 def test_ctrl_c_that_casadi_loses_ends_a_run_all_the_same(
     tiny: Callable[..., Plan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lost_as: Exception | None
