@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import re
@@ -79,6 +80,12 @@ def writing(out: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(partial, ignore_errors=True)
         _remove_empty(made)
+
+
+def sweep(out: Path) -> None:
+    """Removes what killed runs left beside `out`; for a caller that knows no other one at work on it."""
+    for left in out.absolute().parent.glob(f".{glob.escape(out.name)}.*.partial"):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 @contextmanager

@@ -66,6 +66,7 @@ def carry(
     try:
         (place / DRIVES).mkdir(parents=True, exist_ok=True)
         with store.opened(place / "runs.sqlite", finger) as kept:
+            folder.sweep(out)
             _design(wanted, place / DRIVES, kept, cluster, tell)
             _run(wanted, place / DRIVES, kept, jobs, cluster, tell)
             tell(wanted.total, wanted.total, "writing")
