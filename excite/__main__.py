@@ -6,7 +6,7 @@ import errno
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -410,13 +410,26 @@ def check_log(
     json: JsonOption = False,
 ) -> None:
     """Says what is in a log and everything that is wrong with it, with a picture."""
-    from excite import folder, reports
+    from excite import reports
 
     out = out or Path(f"results/log-{path.stem}")
-    folder.claim(out, [path])
+    _checked(path, out, json, lambda place: reports.check_log(place, path, machine, _versions()), terminal.log_table)
+
+
+def _checked(
+    file: Path,
+    out: Path,
+    json: bool,
+    work: Callable[[Path], dict[str, Any]],
+    show: Callable[[dict[str, Any]], None],
+) -> None:
+    """What is wrong with a file, as a folder and on the terminal; exit code 1 where anything is."""
+    from excite import folder
+
+    folder.claim(out, [file])
     with folder.writing(out) as place:
-        summary = reports.check_log(place, path, machine, _versions())
-    terminal.finish(summary, out, json, terminal.log_table)
+        summary = work(place)
+    terminal.finish(summary, out, json, show)
     if summary["faults"]:
         raise typer.Exit(1)
 
@@ -449,15 +462,10 @@ def check_machine(
     json: JsonOption = False,
 ) -> None:
     """Says what is wrong or doubtful in a machine file, and draws the machine from above."""
-    from excite import folder, machinecheck
+    from excite import machinecheck
 
     out = out or Path(f"results/machine-{file.stem}")
-    folder.claim(out, [file])
-    with folder.writing(out) as place:
-        summary = machinecheck.write(place, file, _versions())
-    terminal.finish(summary, out, json, machinecheck.show)
-    if summary["faults"]:
-        raise typer.Exit(1)
+    _checked(file, out, json, lambda place: machinecheck.write(place, file, _versions()), machinecheck.show)
 
 
 @app.command()
@@ -749,21 +757,20 @@ def _versions() -> dict[str, str]:
 def main() -> None:
     """Runs a command: exit 0 done, 1 could not be done, 2 bad input or usage; one clear line on stderr."""
     signal.signal(signal.SIGTERM, _terminate)
-    said = interrupt.Heard()
-    try:
-        with interrupt.heard() as said:
+    with interrupt.heard() as said:
+        try:
             result = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
-    except typer.TyperException as err:
-        _fail(" ".join(err.format_message().split()), 2)
-    except (KeyboardInterrupt, typer.Abort):
-        _fail("interrupted, nothing was written", INTERRUPTED)
-    except Exception as err:
-        code = _exit_code(err)
-        if code is None and said.stop:
+        except typer.TyperException as err:
+            _fail(" ".join(err.format_message().split()), 2)
+        except (KeyboardInterrupt, typer.Abort):
             _fail("interrupted, nothing was written", INTERRUPTED)
-        if code is None:
-            raise
-        _fail(" ".join(str(err).split()), code)
+        except Exception as err:
+            code = _exit_code(err)
+            if code is not None:
+                _fail(" ".join(str(err).split()), code)
+            if not said.stop:
+                raise
+            _fail("interrupted, nothing was written", INTERRUPTED)
     if result == INTERRUPTED:  # typer makes an exit code of Ctrl-C
         _fail("interrupted, nothing was written", INTERRUPTED)
     sys.exit(result if isinstance(result, int) else 0)

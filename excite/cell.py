@@ -78,11 +78,7 @@ def run(work: Work, seed: int) -> Row:
     defect of the program, which is told as such and doesn't end the study. Raises KeyboardInterrupt for one that came
     meanwhile, in whatever guise.
     """
-    with interrupt.heard() as said:
-        row = _judged(work, seed)
-    if said.stop:
-        raise KeyboardInterrupt
-    return row
+    return interrupt.whole(_judged, work, seed)
 
 
 def _judged(work: Work, seed: int) -> Row:
@@ -166,11 +162,7 @@ class Designed:
 
 def designed(order: Order) -> Designed:
     """A study's drive. Raises KeyboardInterrupt where it was cut short."""
-    with interrupt.heard() as said:
-        made = _designed(order)
-    if said.stop:
-        raise KeyboardInterrupt
-    return made
+    return interrupt.whole(_designed, order)
 
 
 def _designed(order: Order) -> Designed:

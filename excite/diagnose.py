@@ -31,7 +31,6 @@ HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate i
 STRONG = 1.3  # misfit over readings from which first-order gains are rough
 PASSES = 14  # of a candidate's fit
 LESS = 0.3, 0.1  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
-NEARLY = 1.0  # step, in standard deviations, at which a fit that runs out of passes is as good as found
 TRIED = 5  # candidates that are fitted, of different names
 ROUGHLY = 2  # the same where not even the model without them was fitted
 MOST = 4  # effects that are looked for
@@ -220,9 +219,9 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
             fit = smoothing.iterate(c, prepared.records, starts, c.model.nominal, starts, disturbed, prepared.held)
         except NotConverged as failed:
             stood, trouble = failed.fit or stood, failed
-            if failed.fit is None or failed.step > NEARLY:
+            if failed.nearly is None:
                 continue
-            fit = failed.fit
+            fit = failed.nearly
         stage = Stage(machine, prepared, fit)
         for less in LESS:
             try:
@@ -248,24 +247,29 @@ def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
             c, prepared.records, points, X, prepared.starts, disturbed, prepared.held, smoothing.RESUMED, PASSES
         )
     except NotConverged as failed:
-        if failed.fit is None or failed.step > NEARLY:
+        if failed.nearly is None:
             raise
-        fit = failed.fit
+        fit = failed.nearly
     return Stage(machine, prepared, fit)
 
 
-def _prepared(machine: Machine, logs: Sequence[Log], filter: Filter) -> Prepared:
+def _charted(machine: Machine, logs: Sequence[Log]) -> Chart:
     model = build(machine, shapes=True)
-    c = chart(model, common_sensors(model, logs))
+    return chart(model, common_sensors(model, logs))
+
+
+def _prepared(machine: Machine, logs: Sequence[Log], filter: Filter) -> Prepared:
+    c = _charted(machine, logs)
     records = tuple(record(c, log) for log in logs)
     starts = tuple(first_point(c, r, log, filter) for r, log in zip(records, logs, strict=True))
-    return Prepared(c, tuple(logs), records, starts, hidden.unmoved(model, logs, filter, slow=False))
+    return Prepared(c, tuple(logs), records, starts, hidden.unmoved(c.model, logs, filter, slow=False))
 
 
 def _resumed(machine: Machine, of: Stage) -> Prepared:
-    """The logs of a stage made ready for a machine with other effects."""
-    model, before = build(machine, shapes=True), of.prepared
-    c = chart(model, common_sensors(model, before.logs))
+    """The logs of a stage made ready for a machine with other effects, or for the same one again."""
+    before = of.prepared
+    c = before.c if machine is of.machine else _charted(machine, before.logs)
+    model = c.model
     records = tuple(replace(r, origin=origins(c, r.counts)) for r in before.records)
     starts = tuple(carried(c, r, p, before.c, model.nominal) for r, p in zip(records, before.starts, strict=True))
     held = dict(zip(of.model.base.names, before.held, strict=True))

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.stats
 
 from excite import smoothing
-from excite.diagnose import NEARLY, Stage
+from excite.diagnose import Stage
 from excite.record import readings
 from excite.smoothing import Fit, NotConverged
 
@@ -84,7 +84,7 @@ def withheld(stage: Stage) -> Withheld | None:
                 c, masked, fit.points, fit.X, prepared.starts, disturbed, prepared.held | fit.unseen, smoothing.RESUMED
             )
         except NotConverged as failed:
-            rest = failed.fit if failed.step < NEARLY else None
+            rest = failed.nearly
         if rest is not None:
             break
     if rest is None:

@@ -9,11 +9,15 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import ParamSpec, TypeVar
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class Heard:
@@ -43,3 +47,12 @@ def heard() -> Iterator[Heard]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def whole(call: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+    """What a call returns, where nobody asked to stop meanwhile. Raises KeyboardInterrupt where somebody did."""
+    with heard() as said:
+        result = call(*args, **kwargs)
+    if said.stop:
+        raise KeyboardInterrupt
+    return result

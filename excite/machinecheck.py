@@ -82,19 +82,8 @@ def complaints(path: Path) -> list[str]:
     except MachineError as err:
         if not isinstance(err.__context__, ValidationError):
             raise
-        every = err.__context__.errors(include_url=False)
-        return [machines.one_line(path, _Single(e), Machine) for e in every]  # type: ignore[arg-type]
+        return machines.complaints(path, err.__context__, Machine)
     return []
-
-
-@dataclass(frozen=True)
-class _Single:
-    """One of the complaints of a validation, as if it were the only one."""
-
-    error: Any
-
-    def errors(self, include_url: bool = False) -> list[Any]:
-        return [self.error]
 
 
 # ------------------------------------------------------------------------------------------------ wrong

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import casadi as ca
-import cvxpy as cp
 import joblib
 import numpy as np
 
@@ -402,6 +401,8 @@ def improved(
     task: Task, best: Trial, room: np.ndarray, reach: float, sharp: float, times: bool, run: joblib.Parallel
 ) -> tuple[Trial, float]:
     """One sequential quadratic program's step from the best, and how far the next may go; `times`: knots move too."""
+    import cvxpy as cp  # takes as long to load as all the rest, and few who load this module get here
+
     x, step = _vector(best.trace), _each(best.trace, STEPS)
     free = np.arange(0 if times else len(best.trace.times) - 2, len(x))
     near = trials(

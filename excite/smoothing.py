@@ -49,6 +49,7 @@ UNSEEN = 1.0  # a parameter that a log tells less than this well, in its scale, 
 DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's scale, and its share from pass to pass
 RESUMED = DAMPING[0] * DAMPING[1] ** 2  # damping of a fit that goes on from another
 HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
+NEARLY = 1.0  # a step, in standard deviations, at which a fit that runs out of passes is as good as found
 CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviations
 ENOUGH = 0.2  # likewise with disturbing forces, whose deviations are no promise
 # Steps that turn back and hardly shrink are shortened by TURNED; others grow by SHARE up to the whole.
@@ -78,6 +79,11 @@ class NotConverged(NoEstimate):
     def __init__(self, message: str, fit: Fit | None = None, step: float = np.inf) -> None:
         super().__init__(message)
         self.fit, self.step = fit, step
+
+    @property
+    def nearly(self) -> Fit | None:
+        """The fit where it stood, if that is as good as found."""
+        return self.fit if self.step <= NEARLY else None
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from pydantic import (
     WrapValidator,
     model_validator,
 )
+from pydantic_core import ErrorDetails
 
 from model import hydraulics, units
 
@@ -661,33 +662,40 @@ def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
 
 def one_line(path: Path | str, err: ValidationError, root: type[Record]) -> str:
     """What is wrong with a file that holds a `root` record: file, key, what is wrong, what is allowed, in a line."""
-    first = err.errors(include_url=False)[0]
-    key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in first["loc"]).lstrip(".")
-    kind, message, got = first["type"], first["msg"], first.get("input")
+    first, *more = complaints(path, err, root)
+    return f"{first} (and {len(more)} more)" if more else first
+
+
+def complaints(path: Path | str, err: ValidationError, root: type[Record]) -> list[str]:
+    """All that is wrong with a file that holds a `root` record, a line each."""
+    return [_complaint(path, one, root) for one in err.errors(include_url=False)]
+
+
+def _complaint(path: Path | str, one: ErrorDetails, root: type[Record]) -> str:
+    key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in one["loc"]).lstrip(".")
+    kind, message, got = one["type"], one["msg"], one.get("input")
     if kind == "extra_forbidden":
-        message = f"no such key here, allowed: {', '.join(_record(first['loc'][:-1], root).model_fields)}"
+        message = f"no such key here, allowed: {', '.join(_record(one['loc'][:-1], root).model_fields)}"
     elif kind == "missing":
         message = "is missing"
     elif kind == "model_type":
-        record = _record(first["loc"], root)
+        record = _record(one["loc"], root)
         number = record in (Quantity, Point)
         table = '{ value = ..., source = "..." }' if number else f"with keys {', '.join(record.model_fields)}"
         message = f"must be a table {table} (got {reprlib.repr(got)})"
     elif kind == "value_error":
         message = message.removeprefix("Value error, ")
         inner, _, rest = message.partition(": ")
-        if inner in _record(first["loc"], root).model_fields:
+        if inner in _record(one["loc"], root).model_fields:
             key, message = f"{key}.{inner}".lstrip("."), rest
     elif kind == "too_short":
-        message = f"must have at least {first['ctx']['min_length']} (got {first['ctx']['actual_length']})"
+        message = f"must have at least {one['ctx']['min_length']} (got {one['ctx']['actual_length']})"
     elif kind == "too_long":
-        message = f"must have at most {first['ctx']['max_length']} (got {first['ctx']['actual_length']})"
+        message = f"must have at most {one['ctx']['max_length']} (got {one['ctx']['actual_length']})"
     else:
         message = message.replace("Input should be", "must be").replace("String should", "must")
         message = message.replace("a valid tuple", "a list in brackets") + f" (got {reprlib.repr(got)})"
-    more = len(err.errors()) - 1
-    tail = f" (and {more} more)" if more else ""
-    return " ".join(f"{path}: {key + ': ' if key else ''}{message}{tail}".split())
+    return " ".join(f"{path}: {key + ': ' if key else ''}{message}".split())
 
 
 def _record(where: tuple[int | str, ...], root: type[Record]) -> type[Record]:
