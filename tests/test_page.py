@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import pandas as pd
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from excite import drive, page, sensors, serve
 from excite.drive import Trace
@@ -256,7 +257,7 @@ def test_a_log_that_began_earlier_is_found_in_time(
 
 
 @contextmanager
-def running(html: str) -> Iterator[tuple[str, Callable[[dict[str, float]], None]]]:
+def running(html: str) -> Iterator[tuple[str, Callable[[dict[str, float]], object]]]:
     loop, ready = asyncio.new_event_loop(), threading.Event()
     found: dict[str, Any] = {}
 
@@ -297,10 +298,10 @@ def test_pages_from_elsewhere_are_refused(html: str) -> None:
     with running(html) as (address, _):
         port = int(address.split(":")[1])
         with pytest.raises(InvalidStatus, match="403"):
-            connect(f"ws://{address}/live", origin="https://evil.example")
+            connect(f"ws://{address}/live", origin=Origin("https://evil.example"))
         with pytest.raises(InvalidStatus, match="403"):
-            connect(f"ws://{address}/live", origin="null")
-        with connect(f"ws://{address}/live", origin=f"http://{address}"):  # type: ignore[arg-type]
+            connect(f"ws://{address}/live", origin=Origin("null"))
+        with connect(f"ws://{address}/live", origin=Origin(f"http://{address}")):
             pass
         for host, status in (
             (f"evil.example:{port}", b"403"),
@@ -310,14 +311,65 @@ def test_pages_from_elsewhere_are_refused(html: str) -> None:
                 plain.sendall(f"GET / HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
                 answer = plain.recv(1000)
             assert answer.split()[1] == status
-        assert socket.gethostbyname("localhost") == "127.0.0.1"
+
+
+def test_only_this_machine_reaches_the_server(html: str) -> None:
+    with running(html) as (address, _):
+        unreachable(int(address.split(":")[1]))
+
+
+def unreachable(port: int) -> None:
+    """Nothing listens at this port but on 127.0.0.1, and no other address of this machine gets there."""
+    addresses = {"127.0.0.2", "::1"}  # loopback too, but not the one that is listened on
+    with suppress(OSError):
+        addresses |= {str(found[4][0]) for found in socket.getaddrinfo(socket.gethostname(), None)}
+    for family, outside in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::1")):
+        with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as udp:
+            udp.connect((outside, 9))  # sends nothing: tells which of our addresses would go there
+            addresses.add(str(udp.getsockname()[0]))
+    for other in addresses - {"127.0.0.1"}:
         with pytest.raises(OSError, match=r"."):
-            socket.create_connection((_other_address(), port), timeout=2)
+            socket.create_connection((other, port), timeout=2)
+    listening = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            local, state = line.split()[1], line.split()[3]
+            if state == "0A" and int(local.partition(":")[2], 16) == port:
+                listening.add(local.partition(":")[0])
+    assert listening == {"0100007F"}  # 127.0.0.1
 
 
-def _other_address() -> str:
-    """An address of this machine that is not the loopback one the server listens on."""
-    return "127.0.0.2"
+def test_a_message_may_be_as_long_as_is_said_and_no_longer(html: str) -> None:
+    """Also one that comes in pieces, each of them short."""
+    good = '{"v_m_s": 1}'
+    with running(html) as (address, _), connect(f"ws://{address}/live") as listener:
+        with connect(f"ws://{address}/live") as logger:
+            logger.send(good.ljust(serve.MESSAGE))
+            assert json.loads(listener.recv(timeout=5)) == {"v_m_s": 1.0}
+            logger.send(good.ljust(serve.MESSAGE + 1))
+            ends(logger, 1009)
+        with connect(f"ws://{address}/live") as logger:
+            with suppress(ConnectionClosed):
+                logger.send([good, *[" " * 100] * 11])
+            ends(logger, 1009)
+        with pytest.raises(TimeoutError):
+            listener.recv(timeout=0.1)
+
+
+def ends(logger: Any, code: int) -> None:
+    """The server ends this connection, for this reason."""
+    with pytest.raises(ConnectionClosed) as end:
+        logger.recv(timeout=5)
+    assert end.value.rcvd is not None
+    assert end.value.rcvd.code == code
+
+
+def test_more_pages_than_are_allowed_are_refused(html: str) -> None:
+    with running(html) as (address, _), ExitStack() as stack:
+        for _ in range(serve.CLIENTS):
+            stack.enter_context(connect(f"ws://{address}/live"))
+        with pytest.raises(InvalidStatus, match="503"):
+            connect(f"ws://{address}/live")
 
 
 @pytest.mark.parametrize(
@@ -336,10 +388,7 @@ def test_bad_messages_end_the_connection(html: str, message: str, code: int) -> 
     with running(html) as (address, _), connect(f"ws://{address}/live") as listener:
         with connect(f"ws://{address}/live") as logger:
             logger.send(message)
-            with pytest.raises(ConnectionClosed) as end:
-                logger.recv(timeout=5)
-            assert end.value.rcvd is not None
-            assert end.value.rcvd.code == code
+            ends(logger, code)
         with pytest.raises(TimeoutError):
             listener.recv(timeout=0.1)
 
@@ -365,10 +414,11 @@ def test_growing_log_becomes_values(va12: Model, followed: pd.DataFrame, tmp_pat
 
 @pytest.mark.slow
 def test_serve_command_shows_the_page_until_it_is_stopped(tmp_path: Path) -> None:
+    """The real command: the page for this machine alone, for no page from elsewhere, with no long message."""
     design = Path(__file__).parents[1] / "results" / "S40" / "design"
-    command = [sys.executable, "-m", "excite", "drive", design, "--phases", "6", "--serve", "--port", "0"]
+    command = [sys.executable, "-m", "excite", "drive", str(design), "--phases", "6", "--serve", "--port", "0"]
     with subprocess.Popen(
-        [*command, "--out", tmp_path / "d"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*command, "--out", str(tmp_path / "d")], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as run:
         assert run.stderr is not None
         address = run.stderr.readline().split()[0]
@@ -376,6 +426,12 @@ def test_serve_command_shows_the_page_until_it_is_stopped(tmp_path: Path) -> Non
         with socket.create_connection(("127.0.0.1", port)) as plain:
             plain.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode())
             assert b"200" in plain.recv(100)
+        unreachable(port)
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(f"ws://127.0.0.1:{port}/live", origin=Origin("https://evil.example"))
+        with connect(f"ws://127.0.0.1:{port}/live") as logger:
+            logger.send('{"v_m_s": 1}'.ljust(serve.MESSAGE + 1))
+            ends(logger, 1009)
         run.terminate()
         assert run.wait(20) == 0
     assert (tmp_path / "d" / "driver.html").is_file()
