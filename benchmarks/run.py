@@ -34,7 +34,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 import numpy as np
 from joblib.externals.loky import get_reusable_executor
 
-from excite import brief, cell, diagnose, identify, log, plan, sensors, study
+from excite import asked, brief, cell, diagnose, identify, log, plan, sensors, study
 from excite.simulate import Motion, simulate
 from model import machine, prediction
 from model.prediction import Model
@@ -94,7 +94,7 @@ def started(*words: str) -> None:
 
 
 def designed() -> None:
-    _, problem = plan.problem(straight().machine, None, 8.0)
+    _, problem = asked.problem(straight().machine, None, 8.0)
     brief.answer(straight(), problem, brief.Brief("cond", starts=1))
     get_reusable_executor().shutdown(wait=True)  # CPU time of a process counts when it has ended
 

@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 # One BLAS thread: our matrices are small, and threads turn a 0.3 ms eigenproblem into 100 ms.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -16,14 +16,8 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import typer  # noqa: E402
 
-from excite import interrupt, terminal  # noqa: E402
-
-if TYPE_CHECKING:
-    from excite.brief import Brief
-    from excite.identify import Estimate
-    from excite.log import Log
-    from model.machine import Filter, Machine, Problem
-    from model.prediction import Model
+from excite import asked, interrupt, terminal  # noqa: E402
+from excite.asked import UsageError  # noqa: E402
 
 app = typer.Typer(
     name="excite",
@@ -69,10 +63,6 @@ RunsOption = Annotated[int, typer.Option("--runs", min=1, help="simulated test d
 
 
 INTERRUPTED = 130  # exit code of Ctrl-C, as shells have it
-
-
-class UsageError(ValueError):
-    """Something asked for on the command line that can't be had: exit 2."""
 
 
 @app.command()
@@ -126,10 +116,10 @@ def design(
     json: JsonOption = False,
 ) -> None:
     """Designs a test drive."""
-    from excite import folder
+    from excite import folder, works
     from excite.brief import Brief
 
-    out = out or Path(f"results/design-{_stem(machine)}")
+    out = out or Path(f"results/design-{asked.stem(machine)}")
     folder.claim(out, after or [])
     if between:
         if len(between) != 2 or objective not in ("cond", "discrimination"):
@@ -140,7 +130,7 @@ def design(
     known, pair = tuple(after or ()), tuple(between or ())
     brief = Brief(objective, sigma_max, robust, known, starts, seed, budget, pair, driver, phase_min)
     with folder.writing(out) as place:
-        summary = _design(place, machine, problem, duration, brief)
+        summary = works.design(place, machine, problem, duration, brief)
     terminal.finish(summary, out, json, terminal.design_table)
 
 
@@ -155,13 +145,13 @@ def verify(
     json: JsonOption = False,
 ) -> None:
     """Simulates a designed drive and identifies from it, many times: how true and how sure is each parameter."""
-    from excite import folder, stored
+    from excite import folder, stored, works
 
     name = stored.summary(design_dir)["machine"]
     out = out or Path(f"results/verify-{name}")
     folder.claim(out, [design_dir])
     with folder.writing(out) as place:
-        summary = _verify(place, design_dir, runs, method, kit, seed)
+        summary = works.verify(place, design_dir, runs, method, kit, seed)
     terminal.finish(summary, out, json, terminal.verify_table)
 
 
@@ -176,12 +166,12 @@ def compare(
     json: JsonOption = False,
 ) -> None:
     """Compares a designed drive with the usual ones on the same problem, limits and time."""
-    from excite import folder
+    from excite import folder, works
 
-    out = out or Path(f"results/compare-{_stem(machine)}")
+    out = out or Path(f"results/compare-{asked.stem(machine)}")
     folder.claim(out)
     with folder.writing(out) as place:
-        summary = _compare(place, machine, problem, samples, seed, budget)
+        summary = works.compare(place, machine, problem, samples, seed, budget)
     terminal.finish(summary, out, json, terminal.compare_table)
 
 
@@ -203,21 +193,21 @@ def run(
     json: JsonOption = False,
 ) -> None:
     """Designs a test drive and verifies it, in one go."""
-    from excite import folder
+    from excite import folder, works
     from excite.brief import Brief
 
-    out = out or Path(f"results/run-{_stem(machine)}")
+    out = out or Path(f"results/run-{asked.stem(machine)}")
     folder.claim(out)
     with folder.writing(out) as place:
         designed = place / "design"
         designed.mkdir()
         brief = Brief(objective, sigma_max, robust, (), starts, seed, budget)
-        first = _design(designed, machine, problem, duration, brief)
+        first = works.design(designed, machine, problem, duration, brief)
         if not first["complete"] and budget is None:
             raise KeyboardInterrupt
         checked = place / "verify"
         checked.mkdir()
-        second = _verify(checked, designed, runs, method, kit, seed)
+        second = works.verify(checked, designed, runs, method, kit, seed)
         summary = {"design": first, "verify": second}
         (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
 
@@ -255,7 +245,7 @@ def drive(
         with terminal.bar("driving") as advance:
             made = cab.prepare(stored.read(design_dir), phases, shortest, seed, advance)
         summary = {"machine": name, "design": str(design_dir), "seed": seed, **cab.write(made, place)}
-        summary["versions"] = _versions()
+        summary["versions"] = asked.versions()
         (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
     terminal.finish(summary, out, json, terminal.drive_table)
     if serve:
@@ -283,10 +273,10 @@ def simulate(
 
     if noise not in ("on", "off"):
         raise UsageError(f"--noise: {noise} is unknown, allowed: on, off")
-    _known("--kit", kit, sensors.KITS)
+    asked.known("--kit", kit, sensors.KITS)
     writers = {".csv": lambda t, p: t.to_csv(p, index=False), ".parquet": lambda t, p: t.to_parquet(p, index=False)}
-    _known("--out: ending", out.suffix.lower(), tuple(writers))
-    model = _model(machine)
+    asked.known("--out: ending", out.suffix.lower(), tuple(writers))
+    model = asked.model(machine)
     torque, q0, nu0 = log.read_profile(profile, model)
     if effect:
         seconds = (len(torque) - 1) / float(model.machine.sampling_hz)
@@ -329,48 +319,14 @@ def identify(
     json: JsonOption = False,
 ) -> None:
     """Estimates the parameters, with uncertainty, from logs."""
-    from excite import crosscheck, examine, folder, gaps, identify, log, report, reports
+    from excite import folder, works
 
-    model = _model(machine)
+    model = asked.model(machine)
     out = out or Path(f"results/identify-{model.machine.name}")
     folder.claim(out, [*logs, *(validate or [])])
-    if len({path.resolve() for path in logs}) < len(logs):
-        raise UsageError("LOG: the same file is given twice, which would count it twice")
-    method = _method(method, model)
-    _known("--filter", filtering, ("machine", "auto"))
-    needs = identify.needed_sensors(model, method)
-    parts = [gaps.read(path, model.machine, needs) for path in logs]
-    read, cut = [one for some, _ in parts for one in some], [note for _, notes in parts for note in notes]
-    fresh = [log.read(path, model.machine, needs) for path in validate or []]
-    with terminal.busy("identifying"):
-        chosen, reason = examine.choose(model, read) if filtering == "auto" else (model.machine.filter, "")
-        estimate = identify.identify(model, read, method, chosen)
-        if model.slips and method.partition("+")[0] in ("ols", "wls"):  # slips measured with noise bias these
-            estimate = identify.with_bias(model, read, estimate, chosen)
-        late = [remark for one in read for remark in examine.late_channels(model, one, chosen)]
-    checks = [_check(model, one, estimate, chosen) for one in fresh]
+    _once(logs)
     with folder.writing(out) as place:
-        summary = {
-            "machine": model.machine.name,
-            "logs": [one.source for one in read],
-            "method": estimate.method,
-            "parameters": _parameters(estimate),
-            "cond_w": estimate.cond_w,
-            "cond_phi": estimate.cond_phi,
-            "relative_error_percent": estimate.relative_error_percent,
-            "unidentifiable": list(estimate.unidentifiable),
-            "reasons": dict(estimate.unidentifiable),
-            "notes": [*cut, *([reason] if reason else []), *estimate.notes, *late],
-            "validation": checks,
-            "versions": _versions(),
-        }
-        for kind, several in (("fit", read), ("validation", fresh)):
-            for k, one in enumerate(several):
-                title = f"{model.machine.title}: {one.source}"
-                figure = report.comparison_figure(model, crosscheck.torques(model, one, estimate, chosen), title)
-                report.save(figure, place / (f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png"))
-        reports.write(place, "identify", summary)
-        (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+        summary = works.identified(place, model, logs, method, filtering, validate or [])
     terminal.finish(summary, out, json, terminal.identify_table)
 
 
@@ -387,14 +343,13 @@ def diagnose(
     """Shows what the simulation gets wrong, names the cause, extends the machine file, measures the gain."""
     from excite import checkup, folder
 
-    model = _model(machine)
+    model = asked.model(machine)
     out = out or Path(f"results/diagnose-{model.machine.name}")
     folder.claim(out, logs)
-    if len({path.resolve() for path in logs}) < len(logs):
-        raise UsageError("LOG: the same file is given twice, which would count it twice")
-    _known("--filter", filtering, ("machine", "auto"))
+    _once(logs)
+    asked.known("--filter", filtering, ("machine", "auto"))
     with folder.writing(out) as place, terminal.bar("diagnosing") as advance:
-        summary = checkup.write(place, machine, model, logs, filtering, _versions(), advance)
+        summary = checkup.write(place, machine, model, logs, filtering, asked.versions(), advance)
     terminal.finish(summary, out, json, terminal.diagnose_table)
 
 
@@ -413,7 +368,14 @@ def check_log(
     from excite import reports
 
     out = out or Path(f"results/log-{path.stem}")
-    _checked(path, out, json, lambda place: reports.check_log(place, path, machine, _versions()), terminal.log_table)
+    _checked(
+        path, out, json, lambda place: reports.check_log(place, path, machine, asked.versions()), terminal.log_table
+    )
+
+
+def _once(logs: Sequence[Path]) -> None:
+    if len({path.resolve() for path in logs}) < len(logs):
+        raise UsageError("LOG: the same file is given twice, which would count it twice")
 
 
 def _checked(
@@ -465,7 +427,7 @@ def check_machine(
     from excite import machinecheck
 
     out = out or Path(f"results/machine-{file.stem}")
-    _checked(file, out, json, lambda place: machinecheck.write(place, file, _versions()), machinecheck.show)
+    _checked(file, out, json, lambda place: machinecheck.write(place, file, asked.versions()), machinecheck.show)
 
 
 @app.command()
@@ -476,7 +438,7 @@ def docs(out: OutOption = None, json: JsonOption = False) -> None:
     out = out or Path("results/docs-excite")
     folder.claim(out)
     with folder.writing(out) as place:
-        summary = {"pages": reference.write(place), "versions": _versions()}
+        summary = {"pages": reference.write(place), "versions": asked.versions()}
         (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
     terminal.finish(summary, out, json, lambda s: terminal.say(", ".join(s["pages"])))
 
@@ -505,250 +467,6 @@ def study(
     except (KeyboardInterrupt, typer.Abort):
         _fail("interrupted; what is done is kept, the same command goes on", INTERRUPTED)
     terminal.finish(summary, out, json, terminal.study_table)
-
-
-# ------------------------------------------------------------------------------------------------ the work
-
-
-def _design(place: Path, machine: str, problem: str | None, duration: float | None, brief: Brief) -> dict[str, Any]:
-    import time
-
-    from excite import folder, log, report, reports
-    from excite.brief import answer, rivals
-    from excite.brief import summary as said
-    from excite.objective import OBJECTIVES
-
-    model = _model(machine, flaws=False)
-    name, chosen = _problem(model.machine, problem, duration)
-    _known("--objective", brief.objective, tuple(OBJECTIVES))
-    if brief.between:
-        model = rivals(model, brief.between, float(chosen.duration_s))
-    elif brief.objective == "discrimination" and len(model.effects) < 2:
-        raise UsageError("--objective discrimination: needs two effects to tell apart, give --between twice")
-    for option, value, unit in (("--budget", brief.budget_s, "s"), ("--sigma-max", brief.sigma_max, "%")):
-        if value is not None and not value > 0:
-            raise UsageError(f"{option}: must be > 0 {unit} (got {value:g})")
-    begin = time.perf_counter()
-    with terminal.bar("designing") as advance:
-        found = answer(model, chosen, brief, advance)
-    wall = time.perf_counter() - begin
-    log.profile(found.model, found.design.motion).to_csv(place / "profile.csv", index=False)
-    (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
-    summary: dict[str, Any] = {
-        "machine": model.machine.name,
-        "problem": name,
-        "duration_s": float(chosen.duration_s),
-        **said(brief, found),
-        "wall_s": wall,
-        "versions": _versions(),
-    }
-    title = f"{model.machine.title}: {name}, cond(Phi) = {found.design.cond_phi:.2f}"
-    report.save(report.design_figure(found.model, chosen, found.design.motion, title), place / "design.png")
-    report.save(report.sigma_figure(summary["sigma_percent"], title), place / "sigma.png")
-    reports.write(place, "design", summary)
-    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
-    return summary
-
-
-def _verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: str, seed: int) -> dict[str, Any]:
-    from excite import folder, identify, report, reports, sensors, stored
-    from excite.verify import biased, verify
-    from excite.verify import summary as table
-
-    _known("--kit", kit, sensors.KITS)
-    design = stored.read(design_dir)
-    if design.summary.get("after"):
-        raise UsageError(
-            f"{design_dir}: was designed for the machine that {', '.join(design.summary['after'])} told of, not for the"
-            " machine file's; verify a design made without --after"
-        )
-    model, motion = design.model, design.motion
-    method = _method(method, model)
-    _check_needs(model, method, kit)
-    with terminal.bar("verifying") as advance:
-        result = verify(model, motion, method, kit, runs, seed, progress=lambda done, total: advance(done, total, None))
-    if len(result.failures) == runs:
-        raise identify.NotIdentifiable(f"all {runs} runs failed, the first one: {result.failures[0]}")
-    parameters = table(result)
-    summary = {
-        "machine": model.machine.name,
-        "problem": design.summary.get("problem"),
-        "design": str(design_dir),
-        "runs": runs,
-        "method": method,
-        "kit": kit,
-        "seed": seed,
-        "failed": len(result.failures),
-        "failures": result.failures,
-        "parameters": parameters,
-        "biased": biased(parameters),
-        "versions": _versions(),
-    }
-    title = f"{model.machine.title}: {runs} simulated runs, {method}, kit {kit}"
-    report.save(report.verify_figure(result, title), place / "verify.png")
-    reports.write(place, "verify", summary)
-    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
-    return summary
-
-
-def _compare(
-    place: Path, machine: str, problem: str | None, samples: int, seed: int, budget: float | None
-) -> dict[str, Any]:
-    import pandas as pd
-
-    from excite import compare, folder, report, reports
-
-    model = _model(machine, flaws=False)
-    name, chosen = _problem(model.machine, problem, None)
-    if budget is not None and not budget > 0:
-        raise UsageError(f"--budget: must be > 0 s (got {budget:g})")
-    with terminal.bar("comparing") as advance:
-        result = compare.compare(model, chosen, samples, seed, budget, advance)
-    columns = ["t_s", *[f"{u}_{'Nm' if b.joint == 'revolute' else 'N'}" for u, b in _inputs(model)]]
-    (place / "drives").mkdir()
-    designs = []
-    for row in result.rows:
-        knots = f"drives/{row.name.replace(',', '').replace(' ', '-')}.csv"
-        table = pd.DataFrame([[t, *u] for t, u in zip(row.manoeuvre.times, row.manoeuvre.torque, strict=True)])
-        table.to_csv(place / knots, index=False, header=columns, float_format="%.12g")
-        designs.append(
-            {
-                "name": row.name,
-                "cond_phi": row.cond_phi,
-                "cond_w": row.cond_w,
-                "worst_std_percent": row.worst_std_percent,
-                "median_std_percent": row.median_std_percent,
-                "max_violation": row.max_violation,
-                "breaks": row.breaks,
-                "kept": row.kept,
-                "samples": row.samples,
-                "wall_s": row.wall_s,
-                "equal_score_s": row.equal_s,
-                "knots": knots,
-                "start": dict(zip(model.coordinates, row.start, strict=True)),
-            }
-        )
-    summary = {
-        "machine": model.machine.name,
-        "problem": name,
-        "objective": "cond",
-        "samples": samples,
-        "seed": seed,
-        "budget_s": budget,
-        "designs": designs,
-        "ratio_equal_time": result.ratio_equal_time,
-        "versions": _versions(),
-    }
-    title = f"{model.machine.title}: {name}, the designed drive and the usual ones"
-    report.save(report.compare_figure(result.rows, title), place / "compare.png")
-    reports.write(place, "compare", summary)
-    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
-    return summary
-
-
-def _inputs(model: Model) -> list[tuple[str, Any]]:
-    return list(zip(model.inputs, model.machine.actuated, strict=True))
-
-
-def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:
-    rows: dict[str, dict[str, Any]] = {}
-    for k, (name, unit) in enumerate(zip(estimate.names, estimate.units, strict=True)):
-        rows[name] = {
-            "unit": unit,
-            "value": estimate.value[k],
-            "std": estimate.std[k],
-            "std_percent": estimate.std_percent[k],
-        }
-        if estimate.bias is not None and estimate.bias_std is not None:
-            rows[name] |= {"bias": estimate.bias[k], "bias_std": estimate.bias_std[k]}
-    return rows
-
-
-def _check(model: Model, one: Log, estimate: Estimate, chosen: Filter) -> dict[str, Any]:
-    """How well an estimate predicts a log that it was not fitted on: torques, and signals by direct simulation."""
-    from excite import crosscheck
-    from excite.simulate import SimulationError
-
-    torques = crosscheck.torques(model, one, estimate, chosen)
-    shown: dict[str, Any] = {
-        "log": one.source,
-        "torque_error_percent": dict(zip(torques.names, torques.percent, strict=True)),
-    }
-    try:
-        signals = crosscheck.motions(model, one, estimate, chosen)
-    except (ValueError, SimulationError) as err:
-        return shown | {"simulation": f"not possible: {err}"}
-    return shown | {
-        "simulation_rms": {
-            n: {"rms": r, "unit": u} for n, r, u in zip(signals.names, signals.rms, signals.units, strict=True)
-        }
-    }
-
-
-def _check_needs(model: Model, method: str, kit: str) -> None:
-    from excite import identify
-
-    have = {s.name for s in model.machine.sensors(kit)}
-    missing = [
-        s.column
-        for s in model.machine.sensors("full")
-        if s.name in identify.needed_sensors(model, method) and s.name not in have
-    ]
-    if missing:
-        raise UsageError(
-            f"--method {method} needs {', '.join(missing)}, which kit {kit} does not measure; try --kit full"
-        )
-
-
-def _model(name: str, flaws: bool = True) -> Model:
-    """The model of a machine; without `flaws` effects that no equation of motion shows are no parameters."""
-    from model import machine, prediction
-
-    loaded = machine.load(name)
-    try:
-        return prediction.build(loaded, flaws)
-    except machine.MachineError as err:
-        raise machine.MachineError(f"{name}: {str(err).removeprefix(f'{loaded.name}: ')}") from None
-
-
-def _problem(machine: Machine, name: str | None, duration: float | None) -> tuple[str, Problem]:
-    name = name or machine.problem
-    if name is None:
-        raise UsageError(
-            f"{machine.name} has no design problem of its own, give its machine file one ([problems.NAME])"
-        )
-    _known("--problem", name, tuple(machine.problems))
-    problem = machine.problems[name]
-    if duration is not None:
-        if not 4 * float(problem.knot_s) <= duration <= 3600:
-            raise UsageError(f"--duration: must be between {4 * float(problem.knot_s):g} and 3600 s (got {duration:g})")
-        steps = round(duration / float(problem.knot_s))
-        longer = problem.duration_s.model_copy(update={"value": steps * float(problem.knot_s)})
-        problem = problem.model_copy(update={"duration_s": longer})
-    return name, problem
-
-
-def _method(method: str | None, model: Model) -> str:
-    from excite import identify
-
-    method = method or identify.recommended(model)
-    _known("--method", method, tuple(identify.METHODS))
-    return method
-
-
-def _known(option: str, value: str, allowed: Sequence[str]) -> None:
-    if value not in allowed:
-        raise UsageError(f"{option}: {value} is unknown, allowed: {', '.join(allowed)}")
-
-
-def _stem(machine: str) -> str:
-    return Path(machine).stem if machine.endswith(".toml") else machine
-
-
-def _versions() -> dict[str, str]:
-    from importlib.metadata import version
-
-    return {name: version(name) for name in ("excite", "casadi", "numpy", "scipy")}
 
 
 # ------------------------------------------------------------------------------------------------ errors
@@ -789,14 +507,13 @@ def _exit_code(err: Exception) -> int | None:
     from excite.folder import FolderError
     from excite.limit import InfeasibleError
     from excite.log import LogError
-    from excite.plan import StudyError
     from excite.serve import ServeError
     from excite.simulate import SimulationError
     from excite.store import StoreError
     from excite.stored import StoredError
     from model.machine import MachineError
 
-    if isinstance(err, UsageError | MachineError | LogError | FolderError | StoredError | DriveError | StudyError):
+    if isinstance(err, UsageError | MachineError | LogError | FolderError | StoredError | DriveError):
         return 2
     if isinstance(err, OSError) and err.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
         return 1

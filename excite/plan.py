@@ -39,13 +39,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
-from excite import identify, log
+from excite import asked, identify, log
+from excite.asked import UsageError
 from excite.log import LogError
 from excite.objective import OBJECTIVES
 from model import effects as catalogue
 from model import machine as machines
 from model import prediction
-from model.machine import Machine, MachineError, Number, Problem, Record
+from model.machine import Machine, MachineError, Number, Record
 
 STEPS = ("design", "simulate", "identify", "diagnose", "verify")
 LIMITS = ("torque", "torque_rate", "position", "rate", "rim_speed", "slip", "power", "lane")
@@ -54,7 +55,7 @@ MOST_CELLS = 100_000
 SPAN = re.compile(r"^(?P<what>[^=]*)=(?P<low>[^=]+)\.\.(?P<high>[^=]+)$")
 
 
-class StudyError(ValueError):
+class StudyError(UsageError):
     """A study that can't be carried out: the message is one line with file, key, what is wrong, what is allowed."""
 
 
@@ -316,7 +317,7 @@ class Plan:
 
 
 def read(path: str | Path) -> Plan:
-    """A study file, checked with everything that it names. Raises StudyError, MachineError, LogError."""
+    """A study file, checked with everything that it names. Raises UsageError, MachineError, LogError."""
     path = Path(path)
     if path.suffix != ".toml":
         raise StudyError(f"{path}: must be a study file (.toml)")
@@ -332,14 +333,14 @@ def read(path: str | Path) -> Plan:
         raise StudyError(machines.one_line(path, err, Study)) from None
     try:
         return ready(study, path.parent)
-    except (StudyError, MachineError, LogError) as err:
-        raise type(err)(f"{path}: {err}") from None
+    except (UsageError, MachineError, LogError) as err:
+        raise type(err)(f"{path}: {str(err).removeprefix('--')}") from None
 
 
 def ready(study: Study, base: Path | str = Path()) -> Plan:
     """A study with its machines read and every cell checked before anything is computed. Paths are relative to `base`.
 
-    Raises StudyError, MachineError, LogError.
+    Raises UsageError, MachineError, LogError.
     """
     base = Path(base)
     known: dict[str, Machine] = {}
@@ -382,9 +383,8 @@ def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:
         if d.profile is not None:
             log.read_profile(plan.base / d.profile, prediction.build(machine))
         else:
-            if d.objective not in OBJECTIVES:
-                raise StudyError(f"objective: {d.objective} is unknown, allowed: {', '.join(OBJECTIVES)}")
-            problem(plan.designed(d), d.problem, d.duration_s)
+            asked.known("--objective", d.objective, tuple(OBJECTIVES))
+            asked.problem(plan.designed(d), d.problem, d.duration_s)
     if fresh(d.machine, cell.effects):
         for text in cell.effects:
             catalogue.parse(text, machine, catalogue.DURATION)
@@ -392,30 +392,7 @@ def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:
         if len(set(names)) < len(names):
             raise StudyError(f"effects: {', '.join(cell.effects)}: an effect is given twice")
     if fresh(d.machine, cell.method, cell.kit) and set(plan.study.steps) & {"identify", "verify"}:
-        method = plan.method(cell)
-        if method not in identify.METHODS:
-            raise StudyError(f"method: {method} is unknown, allowed: {', '.join(identify.METHODS)}")
-        have = {s.name for s in machine.sensors(cell.kit)}
-        needs = identify.needed_sensors(prediction.build(machine), method)
-        missing = [s.column for s in machine.sensors("full") if s.name in needs and s.name not in have]
-        if missing:
-            raise StudyError(f"method: {method} needs {', '.join(missing)}, which kit {cell.kit} doesn't measure")
-
-
-def problem(machine: Machine, name: str | None, duration: float | None) -> tuple[str, Problem]:
-    """A machine's design problem, its own by default, with another duration [s] where given. Raises StudyError."""
-    name = name or machine.problem
-    if name is None or name not in machine.problems:
-        allowed = ", ".join(machine.problems) or "its machine file has none"
-        raise StudyError(f"problem: {machine.name} has no problem {name or 'of its own'}, allowed: {allowed}")
-    found = machine.problems[name]
-    if duration is not None:
-        knot = float(found.knot_s)
-        if not 4 * knot <= duration <= 3600:
-            raise StudyError(f"duration_s: must be between {4 * knot:g} and 3600 s (got {duration:g})")
-        longer = found.duration_s.model_copy(update={"value": round(duration / knot) * knot})
-        found = found.model_copy(update={"duration_s": longer})
-    return name, found
+        asked.method(plan.method(cell), prediction.build(machine), cell.kit)
 
 
 def limited(machine: Machine, factors: dict[str, float]) -> Machine:

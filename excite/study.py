@@ -15,14 +15,13 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from excite import asked, engine, folder, log, overview, store
 from excite import cell as cells
-from excite import engine, folder, log, overview, plan, store
 from excite.cell import DEFECT, FAILED, Designed, Driven, Order, Work
 from excite.engine import EngineError, Pool
 from excite.folder import FolderError
@@ -56,7 +55,7 @@ def carry(
     is done is kept, and the same call goes on. KeyboardInterrupt likewise.
     """
     tell = progress or (lambda done, total, what: None)
-    finger = hashlib.sha256(f"{wanted.fingerprint} {cells.program()} {versions()}".encode()).hexdigest()
+    finger = hashlib.sha256(f"{wanted.fingerprint} {cells.program()} {asked.versions()}".encode()).hexdigest()
     place = place_of(out)
     before = _finished(out, finger)
     if before is not None:
@@ -86,11 +85,6 @@ def carry(
 def place_of(out: Path) -> Path:
     """The hidden folder beside `out` in which a study is kept while it is under way."""
     return out.absolute().parent / f".{out.name}.study"
-
-
-def versions() -> dict[str, str]:
-    """What the numbers depend on beside the study."""
-    return {name: version(name) for name in ("excite", "casadi", "numpy", "scipy")}
 
 
 def _inputs(wanted: Plan) -> list[Path]:
@@ -145,14 +139,14 @@ def _design(wanted: Plan, place: Path, kept: Store, cluster: str | None, tell: P
             with folder.writing(place / _name(order.number)) as partial:
                 (partial / "profile.csv").write_text(made.profile, encoding="utf-8")
                 (partial / "machine.json").write_text(order.machine + "\n", encoding="utf-8")
-                (partial / folder.SUMMARY).write_text(folder.dump(made.summary | {"versions": versions()}))
+                (partial / folder.SUMMARY).write_text(folder.dump(made.summary | {"versions": asked.versions()}))
         done += 1
         tell(done, len(wanted.drives), "designing")
 
 
 def _order(wanted: Plan, number: int, drive: Drive) -> Order:
     machine = wanted.designed(drive)
-    name, problem = plan.problem(machine, drive.problem, drive.duration_s)
+    name, problem = asked.problem(machine, drive.problem, drive.duration_s)
     text = machine.model_dump_json(indent=1)
     return Order(number, text, name, problem, drive.objective, drive.starts, drive.seed)
 
@@ -285,7 +279,7 @@ def _write(wanted: Plan, drives: Path, kept: Store, partial: Path, finger: str) 
     tracks = lru_cache(maxsize=8)(lambda k: _track(wanted, drives, k))
     failed = kept.failures()
     seen = overview.write_table(
-        wanted, kept.rows(), lambda k: None if k in failed else tracks(k), own, versions(), partial
+        wanted, kept.rows(), lambda k: None if k in failed else tracks(k), own, asked.versions(), partial
     )
     (partial / "study.json").write_text(wanted.study.model_dump_json(indent=1) + "\n", encoding="utf-8")
     summary = {
@@ -298,7 +292,7 @@ def _write(wanted: Plan, drives: Path, kept: Store, partial: Path, finger: str) 
         "compute_s": kept.seconds,
         "fingerprint": finger,
         "program": cells.program(),
-        "versions": versions(),
+        "versions": asked.versions(),
     }
     overview.draw(wanted, seen, summary, partial)
     (partial / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")

@@ -1,0 +1,78 @@
+"""What is asked for, checked: machines, problems, methods, sensors. Whatever can't be had is a UsageError."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+# Heavy imports happen inside, so that --help is there at once.
+if TYPE_CHECKING:
+    from model.machine import Machine, Problem
+    from model.prediction import Model
+
+LONGEST = 3600.0  # drive [s]
+
+
+class UsageError(ValueError):
+    """Something asked for that can't be had: exit 2."""
+
+
+def model(name: str, flaws: bool = True) -> Model:
+    """The model of a machine; without `flaws` effects that no equation of motion shows are no parameters."""
+    from model import machine, prediction
+
+    loaded = machine.load(name)
+    try:
+        return prediction.build(loaded, flaws)
+    except machine.MachineError as err:
+        raise machine.MachineError(f"{name}: {str(err).removeprefix(f'{loaded.name}: ')}") from None
+
+
+def problem(machine: Machine, name: str | None, duration: float | None) -> tuple[str, Problem]:
+    """A machine's design problem, its own by default, with another duration [s] where given."""
+    name = name or machine.problem
+    if name is None:
+        raise UsageError(
+            f"{machine.name} has no design problem of its own, give its machine file one ([problems.NAME])"
+        )
+    known("--problem", name, tuple(machine.problems))
+    found = machine.problems[name]
+    if duration is not None:
+        knot = float(found.knot_s)
+        if not 4 * knot <= duration <= LONGEST:
+            raise UsageError(f"--duration: must be between {4 * knot:g} and {LONGEST:g} s (got {duration:g})")
+        longer = found.duration_s.model_copy(update={"value": round(duration / knot) * knot})
+        found = found.model_copy(update={"duration_s": longer})
+    return name, found
+
+
+def method(name: str | None, model: Model, kit: str | None = None) -> str:
+    """An estimator's name, the recommended one by default; all that it needs is measured by a kit."""
+    from excite import identify
+
+    name = name or identify.recommended(model)
+    known("--method", name, tuple(identify.METHODS))
+    if kit is not None:
+        have = {s.name for s in model.machine.sensors(kit)}
+        needs = identify.needed_sensors(model, name)
+        missing = [s.column for s in model.machine.sensors("full") if s.name in needs and s.name not in have]
+        if missing:
+            raise UsageError(f"--method: {name} needs {', '.join(missing)}, which kit {kit} does not measure")
+    return name
+
+
+def known(what: str, value: str, allowed: Sequence[str]) -> None:
+    if value not in allowed:
+        raise UsageError(f"{what}: {value} is unknown, allowed: {', '.join(allowed)}")
+
+
+def stem(machine: str) -> str:
+    """What folders of a machine are called."""
+    return Path(machine).stem if machine.endswith(".toml") else machine
+
+
+def versions() -> dict[str, str]:
+    """Of what numbers depend on."""
+    return {name: version(name) for name in ("excite", "casadi", "numpy", "scipy")}

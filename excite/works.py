@@ -1,0 +1,223 @@
+"""The work of commands: each fills a folder with figures, a report and summary.json, and gives back the summary."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from excite import asked, crosscheck, examine, folder, gaps, identify, log, report, reports, sensors, stored, terminal
+from excite import brief as briefs
+from excite import compare as comparisons
+from excite import verify as verification
+from excite.asked import UsageError
+from excite.brief import Brief
+from excite.identify import Estimate
+from excite.log import Log
+from excite.objective import OBJECTIVES
+from excite.simulate import SimulationError
+from model.machine import Filter
+from model.prediction import Model
+
+
+def design(place: Path, machine: str, problem: str | None, duration: float | None, brief: Brief) -> dict[str, Any]:
+    model = asked.model(machine, flaws=False)
+    name, chosen = asked.problem(model.machine, problem, duration)
+    asked.known("--objective", brief.objective, tuple(OBJECTIVES))
+    if brief.between:
+        model = briefs.rivals(model, brief.between, float(chosen.duration_s))
+    elif brief.objective == "discrimination" and len(model.effects) < 2:
+        raise UsageError("--objective discrimination: needs two effects to tell apart, give --between twice")
+    for option, value, unit in (("--budget", brief.budget_s, "s"), ("--sigma-max", brief.sigma_max, "%")):
+        if value is not None and not value > 0:
+            raise UsageError(f"{option}: must be > 0 {unit} (got {value:g})")
+    begin = time.perf_counter()
+    with terminal.bar("designing") as advance:
+        found = briefs.answer(model, chosen, brief, advance)
+    wall = time.perf_counter() - begin
+    log.profile(found.model, found.design.motion).to_csv(place / "profile.csv", index=False)
+    (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    summary: dict[str, Any] = {
+        "machine": model.machine.name,
+        "problem": name,
+        "duration_s": float(chosen.duration_s),
+        **briefs.summary(brief, found),
+        "wall_s": wall,
+        "versions": asked.versions(),
+    }
+    title = f"{model.machine.title}: {name}, cond(Phi) = {found.design.cond_phi:.2f}"
+    report.save(report.design_figure(found.model, chosen, found.design.motion, title), place / "design.png")
+    report.save(report.sigma_figure(summary["sigma_percent"], title), place / "sigma.png")
+    reports.write(place, "design", summary)
+    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    return summary
+
+
+def verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: str, seed: int) -> dict[str, Any]:
+    asked.known("--kit", kit, sensors.KITS)
+    made = stored.read(design_dir)
+    if made.summary.get("after"):
+        raise UsageError(
+            f"{design_dir}: was designed for the machine that {', '.join(made.summary['after'])} told of, not for the"
+            " machine file's; verify a design made without --after"
+        )
+    model, motion = made.model, made.motion
+    method = asked.method(method, model, kit)
+    with terminal.bar("verifying") as advance:
+        result = verification.verify(
+            model, motion, method, kit, runs, seed, progress=lambda done, total: advance(done, total, None)
+        )
+    if len(result.failures) == runs:
+        raise identify.NotIdentifiable(f"all {runs} runs failed, the first one: {result.failures[0]}")
+    parameters = verification.summary(result)
+    summary = {
+        "machine": model.machine.name,
+        "problem": made.summary.get("problem"),
+        "design": str(design_dir),
+        "runs": runs,
+        "method": method,
+        "kit": kit,
+        "seed": seed,
+        "failed": len(result.failures),
+        "failures": result.failures,
+        "parameters": parameters,
+        "biased": verification.biased(parameters),
+        "versions": asked.versions(),
+    }
+    title = f"{model.machine.title}: {runs} simulated runs, {method}, kit {kit}"
+    report.save(report.verify_figure(result, title), place / "verify.png")
+    reports.write(place, "verify", summary)
+    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    return summary
+
+
+def compare(
+    place: Path, machine: str, problem: str | None, samples: int, seed: int, budget: float | None
+) -> dict[str, Any]:
+    model = asked.model(machine, flaws=False)
+    name, chosen = asked.problem(model.machine, problem, None)
+    if budget is not None and not budget > 0:
+        raise UsageError(f"--budget: must be > 0 s (got {budget:g})")
+    with terminal.bar("comparing") as advance:
+        result = comparisons.compare(model, chosen, samples, seed, budget, advance)
+    inputs = zip(model.inputs, model.machine.actuated, strict=True)
+    columns = ["t_s", *[f"{u}_{'Nm' if b.joint == 'revolute' else 'N'}" for u, b in inputs]]
+    (place / "drives").mkdir()
+    designs = []
+    for row in result.rows:
+        knots = f"drives/{row.name.replace(',', '').replace(' ', '-')}.csv"
+        table = pd.DataFrame([[t, *u] for t, u in zip(row.manoeuvre.times, row.manoeuvre.torque, strict=True)])
+        table.to_csv(place / knots, index=False, header=columns, float_format="%.12g")
+        designs.append(
+            {
+                "name": row.name,
+                "cond_phi": row.cond_phi,
+                "cond_w": row.cond_w,
+                "worst_std_percent": row.worst_std_percent,
+                "median_std_percent": row.median_std_percent,
+                "max_violation": row.max_violation,
+                "breaks": row.breaks,
+                "kept": row.kept,
+                "samples": row.samples,
+                "wall_s": row.wall_s,
+                "equal_score_s": row.equal_s,
+                "knots": knots,
+                "start": dict(zip(model.coordinates, row.start, strict=True)),
+            }
+        )
+    summary = {
+        "machine": model.machine.name,
+        "problem": name,
+        "objective": "cond",
+        "samples": samples,
+        "seed": seed,
+        "budget_s": budget,
+        "designs": designs,
+        "ratio_equal_time": result.ratio_equal_time,
+        "versions": asked.versions(),
+    }
+    title = f"{model.machine.title}: {name}, the designed drive and the usual ones"
+    report.save(report.compare_figure(result.rows, title), place / "compare.png")
+    reports.write(place, "compare", summary)
+    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    return summary
+
+
+def identified(
+    place: Path,
+    model: Model,
+    logs: Sequence[Path],
+    method: str | None,
+    filtering: str,
+    validate: Sequence[Path],
+) -> dict[str, Any]:
+    """Parameters from logs. filtering: machine or auto; validate: logs that the result is to predict."""
+    method = asked.method(method, model)
+    asked.known("--filter", filtering, ("machine", "auto"))
+    needs = identify.needed_sensors(model, method)
+    parts = [gaps.read(path, model.machine, needs) for path in logs]
+    read, cut = [one for some, _ in parts for one in some], [note for _, notes in parts for note in notes]
+    fresh = [log.read(path, model.machine, needs) for path in validate]
+    with terminal.busy("identifying"):
+        chosen, reason = examine.choose(model, read) if filtering == "auto" else (model.machine.filter, "")
+        estimate = identify.identify(model, read, method, chosen)
+        if model.slips and method.partition("+")[0] in ("ols", "wls"):  # slips measured with noise bias these
+            estimate = identify.with_bias(model, read, estimate, chosen)
+        late = [remark for one in read for remark in examine.late_channels(model, one, chosen)]
+    summary = {
+        "machine": model.machine.name,
+        "logs": [one.source for one in read],
+        "method": estimate.method,
+        "parameters": _parameters(estimate),
+        "cond_w": estimate.cond_w,
+        "cond_phi": estimate.cond_phi,
+        "relative_error_percent": estimate.relative_error_percent,
+        "unidentifiable": list(estimate.unidentifiable),
+        "reasons": dict(estimate.unidentifiable),
+        "notes": [*cut, *([reason] if reason else []), *estimate.notes, *late],
+        "validation": [_check(model, one, estimate, chosen) for one in fresh],
+        "versions": asked.versions(),
+    }
+    for kind, several in (("fit", read), ("validation", fresh)):
+        for k, one in enumerate(several):
+            title = f"{model.machine.title}: {one.source}"
+            figure = report.comparison_figure(model, crosscheck.torques(model, one, estimate, chosen), title)
+            report.save(figure, place / (f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png"))
+    reports.write(place, "identify", summary)
+    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    return summary
+
+
+def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:
+    rows: dict[str, dict[str, Any]] = {}
+    for k, (name, unit) in enumerate(zip(estimate.names, estimate.units, strict=True)):
+        rows[name] = {
+            "unit": unit,
+            "value": estimate.value[k],
+            "std": estimate.std[k],
+            "std_percent": estimate.std_percent[k],
+        }
+        if estimate.bias is not None and estimate.bias_std is not None:
+            rows[name] |= {"bias": estimate.bias[k], "bias_std": estimate.bias_std[k]}
+    return rows
+
+
+def _check(model: Model, one: Log, estimate: Estimate, chosen: Filter) -> dict[str, Any]:
+    """How well an estimate predicts a log that it was not fitted on: torques, and signals by direct simulation."""
+    torques = crosscheck.torques(model, one, estimate, chosen)
+    shown: dict[str, Any] = {
+        "log": one.source,
+        "torque_error_percent": dict(zip(torques.names, torques.percent, strict=True)),
+    }
+    try:
+        signals = crosscheck.motions(model, one, estimate, chosen)
+    except (ValueError, SimulationError) as err:
+        return shown | {"simulation": f"not possible: {err}"}
+    return shown | {
+        "simulation_rms": {
+            n: {"rms": r, "unit": u} for n, r, u in zip(signals.names, signals.rms, signals.units, strict=True)
+        }
+    }
