@@ -22,14 +22,14 @@ HOLD = 1.0  # time constant with which the simulated joints are held to the log'
 SURE = 3.0  # standard deviations of the mean that make a bias
 NOTABLE = 0.5  # of a parameter's own standard deviation: a smaller bias is not worth a remark
 
-Method = Callable[[Model, Sequence[Log], Filter], Estimate]
+Find = Callable[[Model, Sequence[Log], Filter], Estimate]
 
 
 def with_bias(
     model: Model,
     logs: Sequence[Log],
     estimate: Estimate,
-    method: Method,
+    method: Find,
     filter: Filter,
     around: np.ndarray | None = None,
     runs: int = RUNS,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from excite import bootstrap
+from excite.bootstrap import Find
 from excite.estimate import Estimate, NoEstimate, NotIdentifiable, noted
 from excite.examine import examine
 from excite.hidden import explained
@@ -37,7 +40,20 @@ __all__ = [
     "with_bias",
 ]
 
-Method = Callable[[Model, Sequence[Log], Filter], Estimate]
+
+@dataclass(frozen=True)
+class Method:
+    """A way to estimate: a function(model, logs, filter).
+
+    `effects`: which it can estimate with the base parameters: none, those in whose amounts the equations of motion are
+    linear, or any. `simulates`: it finds a speed that nothing measures from the dynamics. `biased`: by slips that are
+    measured with noise, so that `excite identify` looks for how much.
+    """
+
+    find: Find
+    effects: Literal["none", "linear", "any"] = "none"
+    simulates: bool = False
+    biased: bool = False
 
 
 def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Filter | None = None) -> Estimate:
@@ -57,7 +73,7 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     if not any(v.any() for log in mended for v in log.values.values()):
         raise NotIdentifiable(f"{mended[0].source}: every signal is zero: is the log empty of measurements?")
     try:
-        estimate = explained(model, mended, METHODS[method](model, mended, filter), filter)
+        estimate = explained(model, mended, METHODS[method].find(model, mended, filter), filter)
     except np.linalg.LinAlgError:
         raise NotIdentifiable(
             f"{mended[0].source}: the equations of {method} are singular along this log: check the sign and unit of"
@@ -91,11 +107,12 @@ def measurable(model: Model) -> None:
 
 def _linear(model: Model, method: str) -> None:
     """Refuses a method that can't estimate a machine's effects. Raises MachineError."""
-    if model.plain or method == "joint":
+    able = METHODS[method].effects
+    if model.plain or able == "any":
         return
-    machine = model.machine.name
-    if method != "ols":
-        raise MachineError(f"{machine}: effect: method {method} doesn't know effects, use joint, or ols")
+    machine, others = model.machine.name, " or ".join(name for name, m in METHODS.items() if m.effects != "none")
+    if able == "none":
+        raise MachineError(f"{machine}: effect: method {method} doesn't know effects, use {others}")
     for e in model.effects:
         if e.name in model.nonlinear or e.effect.sensed:
             raise MachineError(
@@ -116,10 +133,10 @@ def with_bias(
         return noted(estimate, "the method's bias on these logs was not looked for: the machine has effects")
     filter = filter or model.machine.filter
     around: np.ndarray | None = None
-    if estimate.method.partition("+")[0] in ("ols", "wls"):
+    if METHODS[estimate.method].biased:
         with suppress(NotIdentifiable):
             around = iv(model, logs, filter).value
-    return bootstrap.with_bias(model, logs, estimate, METHODS[estimate.method], filter, around, runs)
+    return bootstrap.with_bias(model, logs, estimate, METHODS[estimate.method].find, filter, around, runs)
 
 
 def recommended(model: Model) -> str:
@@ -131,25 +148,23 @@ def recommended(model: Model) -> str:
 
 def needed_sensors(model: Model, method: str) -> tuple[str, ...]:
     """Names of the sensors without which a method can't work on this machine."""
-    kinds = (
-        ("angle", "torque", "wheel")
-        if method.partition("+")[0] in SIMULATING
-        else ("angle", "torque", "wheel", "lateral_speed")
-    )
+    speed = () if METHODS[method].simulates else ("lateral_speed",)
+    kinds = ("angle", "torque", "wheel", *speed)
     return tuple(s.name for s in model.machine.sensors("full") if s.kind in kinds)
 
 
 def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
-    """The recommended method, joint smoothing; in a room of its own, which builds on this one."""
-    from excite import smoothing
+    """Joint smoothing: states, true torques and parameters together, every sensor by its noise."""
+    from excite import smoothing  # which builds on this room
 
     return smoothing.joint(model, logs, filter)
 
 
-def possible(plain: Method) -> Method:
-    """A linear method held to physically possible machines; the convex program is in a room of its own."""
+def possible(plain: Find) -> Find:
+    """A linear method held to physically possible machines."""
 
     def method(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
+        """The same, held to physically possible machines: the nearest one, by a convex program."""
         from excite.consistent import constrained  # cvxpy takes a second to load
 
         blocks = [filtered_regression(model, log, filter) for log in logs]
@@ -158,11 +173,15 @@ def possible(plain: Method) -> Method:
     return method
 
 
-LINEAR: dict[str, Method] = {"ols": ols, "wls": wls, "iv": iv, "tls": tls}
+LINEAR: dict[str, Method] = {
+    "ols": Method(ols, effects="linear", biased=True),
+    "wls": Method(wls, biased=True),
+    "iv": Method(iv, simulates=True),
+    "tls": Method(tls),
+}
 METHODS: dict[str, Method] = {
     **LINEAR,
-    "oe": oe,
-    "joint": joint,
-    **{f"{name}+consistent": possible(plain) for name, plain in LINEAR.items()},
+    "oe": Method(oe, simulates=True),
+    "joint": Method(joint, effects="any", simulates=True),
+    **{f"{name}+consistent": replace(m, find=possible(m.find), effects="none") for name, m in LINEAR.items()},
 }
-SIMULATING = ("iv", "oe", "joint")  # find a speed that nothing measures from the dynamics

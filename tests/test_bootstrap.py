@@ -51,7 +51,7 @@ def test_an_impossible_machine_is_replaced_by_the_nearest(straight: Model, logs:
     estimate = identify.identify(straight, logs[:1], "wls")
     value = estimate.value.copy()
     value[straight.base.names.index("Fv4")] = -50
-    method, filter = identify.METHODS["wls"], straight.machine.filter
+    method, filter = identify.METHODS["wls"].find, straight.machine.filter
     found = bootstrap.with_bias(straight, logs[:1], estimate, method, filter, value, 2)
     assert found.bias is not None
     assert np.isfinite(found.bias).all()

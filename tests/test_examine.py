@@ -51,7 +51,7 @@ def test_spikes_do_not_reach_the_estimate(straight: Model, clean: Log) -> None:
     x[[700, 2100, 3000]] += 0.3
     plain = identify.identify(straight, [clean], "wls")
     mended = identify.identify(straight, [changed(clean, "thetal", x)], "wls")
-    hurt = identify.METHODS["wls"](straight, [changed(clean, "thetal", x)], straight.machine.filter)
+    hurt = identify.METHODS["wls"].find(straight, [changed(clean, "thetal", x)], straight.machine.filter)
     assert (np.abs(mended.value - plain.value) < 0.2 * plain.std).all()
     assert (np.abs(hurt.value - plain.value) > plain.std).any()
     assert any("3 spikes" in note for note in mended.notes)
