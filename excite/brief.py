@@ -175,7 +175,7 @@ def advice(brief: Brief, worst: str, percent: float) -> str | None:
     """What to do where a design lets one know some parameter poorly, None where all is well."""
     if percent <= POOR:
         return None
-    blind = brief.objective in ("cond", "weighted-cond") and brief.sigma_max is None
+    blind = objectives.conditions(brief.objective) and brief.sigma_max is None
     text = f"a low cond(Phi) hides poor accuracy: {worst} can't be found better than {percent:.2g} %"
     if not blind:
         return f"poor accuracy: {worst} can't be found better than {percent:.2g} %; drive longer, or on more room"

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from excite import drive, page, sheet
+from excite import objective as objectives
 from excite.drive import DriveError, Score, Trace
 from excite.serve import Tail, run
 from excite.sheet import Sheet
@@ -109,7 +110,7 @@ def verdict(played: Score, person: Score, objective: str = "accuracy") -> str:
         return f"{begin}: nothing that counts is lost."
     if ratio <= drive.LOST:
         return f"{begin}: good enough to drive."
-    if objective in ("cond", "weighted-cond"):
+    if objectives.conditions(objective):
         return f"{begin}: too much is lost; design again with --objective accuracy, or play back the torques."
     return f"{begin}: too much is lost; allow more --phases, a longer drive, or play back the torques."
 

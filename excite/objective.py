@@ -27,11 +27,14 @@ class Objective:
     """A function(x, sharp) of `of`: the eigenvalues of A or the relative variances diag(A^-1), x (n,).
 
     `weighted`: Phi's rows are divided by their noise (`row_noise`), so that variances are those of the estimate.
+    `read`: how people read its value, which is then the logarithm of a square: as a condition number, or as a relative
+    standard deviation [%]; else as it is.
     """
 
     function: Function
     of: Literal["eigenvalues", "variances"]
     weighted: bool
+    read: Literal["cond", "percent", "value"] = "value"
 
 
 def _top(x: ca.SX, sharp: ca.SX) -> ca.SX:
@@ -39,7 +42,7 @@ def _top(x: ca.SX, sharp: ca.SX) -> ca.SX:
 
 
 def cond(eigenvalues: ca.SX, sharp: ca.SX) -> ca.SX:
-    """log of the largest over the smallest eigenvalue, 2 log cond(Phi): the paper's."""
+    """Condition number: log of the largest over the smallest eigenvalue, 2 log cond(Phi)."""
     logs = ca.log(eigenvalues)
     return _top(logs, sharp) + _top(-logs, sharp)
 
@@ -81,14 +84,14 @@ def discrimination(variances: ca.SX, sharp: ca.SX) -> ca.SX:
 
 
 OBJECTIVES: dict[str, Objective] = {
-    "cond": Objective(cond, "eigenvalues", False),
-    "weighted-cond": Objective(cond, "eigenvalues", True),
+    "cond": Objective(cond, "eigenvalues", False, "cond"),
+    "weighted-cond": Objective(cond, "eigenvalues", True, "cond"),
     "D": Objective(d_optimal, "eigenvalues", True),
     "A": Objective(a_optimal, "eigenvalues", True),
     "E": Objective(e_optimal, "eigenvalues", True),
-    "worst": Objective(worst_sigma, "variances", True),
+    "worst": Objective(worst_sigma, "variances", True, "percent"),
     "accuracy": Objective(accuracy, "variances", True),
-    "discrimination": Objective(discrimination, "variances", True),
+    "discrimination": Objective(discrimination, "variances", True, "percent"),
 }
 
 EXACT = 1e6  # sharp enough for a score that is reported
@@ -130,9 +133,20 @@ def of_values(objective: str, x: np.ndarray) -> float:
 
 def reported(objective: str, value: float) -> float:
     """An objective as people read it: a condition number, a relative standard deviation [%], others as they are."""
-    if objective in ("cond", "weighted-cond"):
-        return float(np.exp(value / 2))
-    return 100 * float(np.exp(value / 2)) if objective in ("worst", "discrimination") else value
+    read = OBJECTIVES[objective].read
+    return value if read == "value" else (100 if read == "percent" else 1) * float(np.exp(value / 2))
+
+
+def conditions(objective: str) -> bool:
+    """Whether an objective is a condition number, which is blind to signal against noise."""
+    return objective in OBJECTIVES and OBJECTIVES[objective].read == "cond"
+
+
+def titled(objective: str, value: float) -> str:
+    """A value as `reported`, with its name and unit."""
+    read = OBJECTIVES[objective].read
+    name = f"{objective}(Phi)" if read == "cond" else f"objective {objective}"
+    return f"{name} {value:.4g}{' %' if read == 'percent' else ''}"
 
 
 def local(objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, sharp: float) -> Local:

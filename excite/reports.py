@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from excite import folder, log, logcheck, report, tables
+from excite import folder, log, logcheck, objective, report, tables
 from excite.page import Picture, Table, report_page
 from excite.terminal import rounded
 from model import machine as machines
@@ -158,11 +158,9 @@ def kept(s: Summary) -> str:
     """What people keep of a design for torques, in a sentence."""
     d = s["driver"]
     free, hand = d["played_back"], d["by_hand"]
-    name, unit = (s["objective"], "") if s["objective"] not in ("worst", "discrimination") else (s["objective"], " %")
-    name = {"cond": "cond(Phi)", "weighted-cond": "weighted cond(Phi)"}.get(name, f"objective {name}")
     return (
-        f"In people's hands these {len(d['phases'])} phases give {name} {hand['score']:.4g}{unit}, torques played back"
-        f" {free['score']:.4g}{unit}; the worst parameter can be told to {hand['worst_percent']:.2g} %"
+        f"In people's hands these {len(d['phases'])} phases give {objective.titled(s['objective'], hand['score'])},"
+        f" torques played back {free['score']:.4g}; the worst parameter can be told to {hand['worst_percent']:.2g} %"
         f" ({hand['worst_parameter']}) instead of {free['worst_percent']:.2g} %, the median one to"
         f" {hand['median_percent']:.2g} % instead of {free['median_percent']:.2g} %"
     )

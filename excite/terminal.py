@@ -82,8 +82,10 @@ def design_table(summary: dict[str, Any]) -> None:
     if "driver" in summary:
         by_hand = summary["driver"]
         free, hand = by_hand["played_back"], by_hand["by_hand"]
+        from excite.objective import titled
+
         say(
-            f"in people's hands, {len(by_hand['phases'])} phases: objective {summary['objective']} {hand['score']:.4g}"
+            f"in people's hands, {len(by_hand['phases'])} phases: {titled(summary['objective'], hand['score'])}"
             f" (torques played back {free['score']:.4g}), worst {hand['worst_parameter']} {hand['worst_percent']:.2g} %"
             f" ({free['worst_percent']:.2g} %), median {hand['median_percent']:.2g} % ({free['median_percent']:.2g} %)"
         )
