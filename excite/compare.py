@@ -397,14 +397,15 @@ def compare(
     seed: int = 0,
     budget_s: float | None = None,
     progress: Progress | None = None,
-    usual: Sequence[str] = tuple(USUAL),
+    usual: Sequence[str] = (),
 ) -> Comparison:
     """A designed drive and the usual ones on one problem. Random ones are drawn `samples` times.
 
-    budget_s [s]: of the design; the searches among the usual ones get the time that it took. progress(done, total,
-    lowest cond(Phi) so far). Ctrl-C is KeyboardInterrupt. Raises InfeasibleError where the design finds nothing, and
-    KeyError for an unknown kind.
+    usual: names of the table, every one by default. budget_s [s]: of the design; the searches among the usual ones get
+    the time that it took. progress(done, total, lowest cond(Phi) so far). Ctrl-C is KeyboardInterrupt. Raises
+    InfeasibleError where the design finds nothing, and KeyError for an unknown kind.
     """
+    usual = tuple(dict.fromkeys(usual)) or tuple(USUAL)
     unknown = [name for name in usual if name not in USUAL]
     if unknown:
         raise KeyError(f"no usual drive {', '.join(unknown)}, allowed: {', '.join(USUAL)}")
@@ -425,7 +426,7 @@ def compare(
         run = joblib.Parallel(n_jobs=_processes(), return_as="generator_unordered")
         call = joblib.delayed(_sample)
         found: list[_Sample] = []
-        for done, one in enumerate(run(call(model, problem, n, k, int(seeds[k]), wall) for n, k in jobs), 2):
+        for done, one in enumerate(run(call(model, problem, n, USUAL[n], k, int(seeds[k]), wall) for n, k in jobs), 2):
             found.append(one)
             if one.found.feasible:
                 lowest = min(lowest, objective.reported("cond", one.found.score))
@@ -443,9 +444,9 @@ def _processes() -> int:
     return max(2, os.cpu_count() or 1)  # as the design has
 
 
-def _sample(model: Model, problem: Problem, kind: str, number: int, seed: int, seconds: float) -> _Sample:
+def _sample(model: Model, problem: Problem, kind: str, usual: Usual, number: int, seed: int, seconds: float) -> _Sample:
     begin = time.monotonic()
-    found = within(model, problem, USUAL[kind].make(model, problem, seed, seconds))
+    found = within(model, problem, usual.make(model, problem, seed, seconds))
     return _Sample(kind, number, found, time.monotonic() - begin)
 
 

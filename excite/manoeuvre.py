@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,9 +37,6 @@ class Manoeuvre:
     def sample(self, rate: float) -> np.ndarray:
         """Torques (N, n_u) at `rate` [Hz] from the first knot to the last, both included."""
         return self.at(self.times[0] + np.arange(round(self.duration * rate) + 1) / rate)
-
-
-Baseline = Callable[[Model, Problem, int], Manoeuvre]
 
 
 def knots(problem: Problem) -> np.ndarray:
@@ -104,9 +100,6 @@ def chirp(model: Model, problem: Problem, seed: int) -> Manoeuvre:
     swept = low * t[-1] / np.log(high / low) * ((high / low) ** (t / t[-1]) - 1)
     phase = rng.uniform(0, 2 * np.pi, len(model.inputs))
     return _within(model, t, np.sin(2 * np.pi * swept[:, None] + phase) * _amplitude(model))
-
-
-BASELINES: dict[str, Baseline] = {"multisine": multisine, "steps": steps, "chirp": chirp}
 
 
 def scaled(manoeuvre: Manoeuvre, factor: float | np.ndarray) -> Manoeuvre:

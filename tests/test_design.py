@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -16,7 +17,7 @@ from excite.aim import aim
 from excite.continuation import PLAN, TOLERANCE, depart, repair, search, soften
 from excite.design import Design, design
 from excite.limit import InfeasibleError, check, directions, limits, placed, reversals
-from excite.manoeuvre import BASELINES, Manoeuvre, multisine, scaled
+from excite.manoeuvre import Manoeuvre, chirp, multisine, scaled, steps
 from excite.simulate import simulate
 from model import machine, prediction
 from model.machine import Problem, Quantity
@@ -233,11 +234,11 @@ def test_placed_fits_a_diagonal_path_into_the_lane(roller: Model) -> None:
     assert max(v for k, v in check(roller, problem, again).items() if k.startswith("lane")) == 0
 
 
-@pytest.mark.parametrize("name", list(BASELINES))
-def test_baselines_keep_torque_and_rate(roller: Model, name: str) -> None:
+@pytest.mark.parametrize("make", [multisine, steps, chirp])
+def test_baselines_keep_torque_and_rate(roller: Model, make: Callable[[Model, Problem, int], Manoeuvre]) -> None:
     problem = roller.machine.problems["R60"]
-    drive = BASELINES[name](roller, problem, 5)
-    assert np.array_equal(drive.torque, BASELINES[name](roller, problem, 5).torque)
+    drive = make(roller, problem, 5)
+    assert np.array_equal(drive.torque, make(roller, problem, 5).torque)
     assert (np.abs(drive.torque).max(axis=0) <= [5000, 15000, 5000]).all()
     rate = np.abs(np.diff(drive.torque, axis=0)).max(axis=0) / 0.2
     assert (rate <= np.array([10000, 40000, 10000]) * (1 + 1e-12)).all()
@@ -291,7 +292,7 @@ def test_newton_step_is_the_dense_one() -> None:
 
 def test_settled_states_follow_the_accurate_simulation(roller: Model) -> None:
     problem = shorter(roller, 6.0)
-    drive = BASELINES["multisine"](roller, problem, 2)
+    drive = multisine(roller, problem, 2)
     motion = simulate(roller, drive.torque[:1] * 0 + drive.sample(100) * 0.3)
     sizes = dict.fromkeys(roller.coordinates, 1.0) | {c + "'": 1.0 for c in roller.coordinates}
     tr = collocation.transcribe(roller, problem, sizes, 30, elements=4)
