@@ -1,7 +1,9 @@
 """What the machine and the lane allow: every limit is a named expression between two bounds.
 
 One plain function per kind of limit, in the table KINDS; each yields the limits of its kind that the machine file and
-the problem state. Their scale comes from their bounds: an excess is a fraction of the range, high - low.
+the problem state, or has bounds of its own. Their scale comes from their bounds: an excess is a fraction of the range,
+high - low. A design, its check, comparisons and reports take every limit of the table. A limit's name that begins with
+`lane` says that it depends on where the machine stands on the ground.
 """
 
 from __future__ import annotations
@@ -69,10 +71,18 @@ class Symbols:
 
 
 Bounded = tuple[str, ca.SX, float, float, str]
-Kind = Callable[[Model, Problem, Symbols], Iterator[Bounded]]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """bounds(model, problem, symbols): the limits of a kind; `stated`: the places of a machine file that state them."""
+
+    bounds: Callable[[Model, Problem, Symbols], Iterator[Bounded]]
+    stated: tuple[str, ...] = ()
 
 
 def _torque(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    """What a motor or cylinder delivers, `torque` of a joint."""
     for k, body in enumerate(model.machine.actuated):
         if body.limit.torque is not None:
             high = float(body.limit.torque)
@@ -80,6 +90,7 @@ def _torque(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
 
 
 def _torque_rate(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    """How fast that changes, `torque_rate` of a joint."""
     for k, body in enumerate(model.machine.actuated):
         if body.limit.torque_rate is not None:
             high = float(body.limit.torque_rate)
@@ -87,6 +98,7 @@ def _torque_rate(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded
 
 
 def _position(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    """A joint's angle or stroke from its zero, `position` of a joint."""
     for body in model.machine.body:
         if body.limit.position is not None and body.coordinates[0] in model.coordinates:
             high = float(body.limit.position)
@@ -95,6 +107,7 @@ def _position(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
 
 
 def _rate(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    """A joint's speed, `rate` of a joint."""
     for body in model.machine.body:
         if body.limit.rate is not None and body.coordinates[0] in model.coordinates:
             high = float(body.limit.rate)
@@ -103,6 +116,7 @@ def _rate(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
 
 
 def _rim_speed(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    """Radius times spin of a roll or wheel, `rim_speed` of its joint."""
     for body in model.machine.contacts:
         if body.limit.rim_speed is not None and body.contact is not None:
             high = float(body.limit.rim_speed)
@@ -111,6 +125,7 @@ def _rim_speed(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
 
 
 def _slip(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    """Both slips of a contact, `slip_limit`: beyond it the soil law is no longer linear."""
     slips = model.kinematics(s.q, s.nu)[1]
     bodies = {str(b.index): b for b in model.machine.contacts}
     for k, name in enumerate(model.slips):
@@ -121,7 +136,10 @@ def _slip(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
 
 
 def _power(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
-    """Sum of |u_i q_i'| with |x| as sqrt(x^2 + e^2), e = 1/1000 of the limit: never less, and at the limit no more."""
+    """The hydraulics' power, sum of |u_i q_i'|, `power_limit` of the machine.
+
+    |x| as sqrt(x^2 + e^2), e = 1/1000 of the limit: never less, and at the limit no more.
+    """
     if model.machine.power_limit is not None:
         high = float(model.machine.power_limit)
         parts = [ca.sqrt((s.u[k] * s.nu[row]) ** 2 + (1e-3 * high) ** 2) for k, row in enumerate(model.actuated)]
@@ -129,6 +147,7 @@ def _power(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
 
 
 def _lane(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+    """Points of the machine that stay inside the lane's length and width, `lane_m` of the problem."""
     if not model.machine.planar:
         return
     places = model.kinematics(s.q, s.nu)[3]
@@ -142,7 +161,10 @@ def _lane(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
 
 
 def _polygon(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
-    """Every edge of a convex area: the distance across it, from the corner that is farthest to the edge itself."""
+    """The same points inside a convex area, `lane_polygon_m` of the problem.
+
+    Every edge: the distance across the area, from the corner that is farthest to the edge itself.
+    """
     if not model.machine.planar:
         return
     places = model.kinematics(s.q, s.nu)[3]
@@ -175,16 +197,16 @@ def edges(corners: Sequence[tuple[float, float]]) -> list[tuple[np.ndarray, floa
 
 
 KINDS: dict[str, Kind] = {
-    "torque": _torque,
-    "torque rate": _torque_rate,
-    "position": _position,
-    "rate": _rate,
-    "rim speed": _rim_speed,
-    "slip": _slip,
-    "power": _power,
-    "lane": _lane,
-    "polygon": _polygon,
-    "travel": _travel,
+    "torque": Kind(_torque, ("body.limit.torque",)),
+    "torque_rate": Kind(_torque_rate, ("body.limit.torque_rate",)),
+    "position": Kind(_position, ("body.limit.position",)),
+    "rate": Kind(_rate, ("body.limit.rate",)),
+    "rim_speed": Kind(_rim_speed, ("body.limit.rim_speed",)),
+    "slip": Kind(_slip, ("body.contact.slip_limit",)),
+    "power": Kind(_power, ("power_limit",)),
+    "lane": Kind(_lane, ("problems.lane_m", "problems.lane_polygon_m")),
+    "polygon": Kind(_polygon),
+    "travel": Kind(_travel),
 }
 
 
@@ -199,7 +221,7 @@ def limits(model: Model, problem: Problem) -> tuple[Limit, ...]:
     return tuple(
         Limit(name, ca.Function("limit", [s.q, s.nu, s.u, s.du], [e], ["q", "nu", "u", "du"], ["g"]), low, high, unit)
         for kind in KINDS.values()
-        for name, e, low, high, unit in kind(model, problem, s)
+        for name, e, low, high, unit in kind.bounds(model, problem, s)
     )
 
 
@@ -251,6 +273,7 @@ def check(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
 
 
 def _rest(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
+    """At both ends the machine stands still and what steers is centred, `rest` of the problem."""
     if not problem.rest:
         return {}
     tolerance = rest_tolerances(model)
@@ -266,6 +289,7 @@ def _rest(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
 
 
 def _reversals(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
+    """At most so many changes of the direction of travel, `reversals` of the problem."""
     if problem.reversals is None or not model.machine.planar:
         return {}
     return {REVERSALS: max(0.0, (reversals(motion) - problem.reversals) / max(1, problem.reversals))}

@@ -24,7 +24,7 @@ TIMES = re.compile(r" (in|for) [\d.]+ s| at \d+:[\d.]+")  # the page counts down
 
 
 @lru_cache(maxsize=1)
-def _templates() -> jinja2.Environment:
+def templates() -> jinja2.Environment:
     loader = jinja2.PackageLoader("excite", "templates")
     made = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -47,7 +47,7 @@ def driver_page(model: Model, trace: Trace, title: str) -> str:
 
     It shows what was driven beside it, from a log in the machine's own columns or from `serve`, and scores it.
     """
-    return _templates().get_template("driver.html").render(data=driver_data(model, trace, title))
+    return templates().get_template("driver.html").render(data=driver_data(model, trace, title))
 
 
 def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
@@ -141,7 +141,7 @@ def report_page(
 
     answer: one sentence; remarks: what else must be known, a line each; how: name -> value, `command` among them.
     """
-    template = _templates().get_template("report.html")
+    template = templates().get_template("report.html")
     return template.render(
         title=title, answer=answer, figures=figures, tables=tables, how=dict(how or {}), remarks=remarks
     )

@@ -1,4 +1,5 @@
-"""Reference pages made from the code: effects, machine file, units, commands and the Python interface."""
+"""Reference pages made from the code: effects, machine file and units, what there is to choose from, study file,
+commands, Python interface."""
 
 from __future__ import annotations
 
@@ -6,81 +7,135 @@ import importlib
 import inspect
 import pkgutil
 import re
-from collections.abc import Callable, Iterator
+import types
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import AfterValidator
 
 import excite
 import model
+from excite import compare, handbook, identify, limit, objective, plan, sensors
 from model import effects, units
 from model import machine as machines
 from model.machine import Machine, Record
 
 HIDDEN = ("__main__",)
+PLAIN = (str, int, float, tuple, type(None))  # defaults that read as they are
 ADDRESS = re.compile(r"<(?:function |bound method |built-in function )?_?(\S+?)(?: object)? at 0x[0-9a-f]+>")
+WORDS: Mapping[type, str] = {str: "text", int: "whole number", float: "number", bool: "true or false"}
+FORMULA = re.compile(r"\S*[_=()]")  # no sentence begins with a capital letter here
+PLACES = {
+    "joints": "each driven joint",
+    "contacts": "each driven roll or wheel",
+    "drive": "all driven rolls or wheels together",
+    "articulation": "each driven joint that is no roll or wheel",
+    "wheels": "each measuring wheel",
+    "yaw_rate": "the gyro",
+    "lateral_speed": "the lateral speed sensor",
+    "machine": "the machine as a whole",
+}
 
 
 def write(place: Path) -> list[str]:
-    """Writes every page into a folder; returns their names."""
-    for name, page in PAGES.items():
-        text = ADDRESS.sub(r"\1", page())  # where something lies in memory is no documentation
+    """Writes every page into a folder, and all of them as one `index.html`; returns their names."""
+    texts = {name: ADDRESS.sub(r"\1", page()) for name, page in PAGES.items()}  # places in memory say nothing
+    for name, text in texts.items():
         (place / name).write_text(text, encoding="utf-8")
-    return list(PAGES)
+    (place / handbook.NAME).write_text(handbook.page(texts), encoding="utf-8")
+    return [handbook.NAME, *texts]
+
+
+def _table(heads: str, rows: Iterable[Sequence[object]]) -> list[str]:
+    """A table's lines; heads: with bars in between."""
+    lines = [f"| {heads} |", "|" + "---|" * (heads.count("|") + 1)]
+    return [*lines, *("| " + " | ".join(_cell(str(cell)) for cell in row) + " |" for row in rows), ""]
+
+
+def _page(*lines: str) -> str:
+    return "\n".join(lines).rstrip() + "\n"
+
+
+# ------------------------------------------------------------------------------------------------ effects
 
 
 def effects_page() -> str:
     """The catalogue of effects: what each does, where it may sit, its amount and shapes, its trace in a log, source."""
+    catalogue, va12 = effects.CATALOGUE.values(), machines.load("va12")
     lines = [
         "# Effects",
         "",
         "What a real machine may do beyond the model. `excite simulate MACHINE PROFILE --effect NAME[@WHERE]=AMOUNT`",
-        "puts one into a log; a machine file may hold it for good (`[[effect]]`). Amounts in SI units.",
+        "puts one into a log, `excite diagnose` looks for all of them, a machine file may hold one for good",
+        "(`[[effect]]`). In the formulas A is the amount, in SI units, w a joint's speed, u its torque.",
         "",
-        "| effect | where | unit | what it does |",
-        "|---|---|---|---|",
+        *_table("where | what it stands for", PLACES.items()),
+        *_table(
+            "effect | where | unit | what it does",
+            ((f"[{e.name}](#{e.name})", ", ".join(e.places), e.unit, e.meaning) for e in catalogue),
+        ),
     ]
-    catalogue = effects.CATALOGUE
-    for e in catalogue.values():
-        lines.append(f"| [{e.name}](#{e.name}) | {', '.join(e.places)} | {e.unit} | {_cell(e.meaning)} |")
-    va12 = machines.load("va12")
-    for e in catalogue.values():
-        lines += ["", f"## {e.name}", "", f"{_sentence(e.meaning)} Amount in {_unit(e.unit)}" + _sign(e) + "."]
-        lines += ["", f"Seen in a log: {_sentence(e.signature)}", "", f"Source: {_sentence(e.source)}"]
+    for e in catalogue:
         sites = effects.places(va12, e)
-        if sites:
-            shown = []
-            for where, (bodies, _) in sites.items():
-                site = effects.Site(va12, va12.find(bodies[0]), effects.DURATION)
-                shown.append(f"`{e.name}@{where}={e.amount(site):.3g}`")
-            lines += ["", f"On va12, at a typical size: {', '.join(shown)}"]
+        typical = [f"`{e.name}@{where}={_typical(va12, e, bodies):.3g}`" for where, (bodies, _) in sites.items()]
+        lines += [f"## {e.name}", "", f"{_sentence(e.meaning)} {_amount(e)}", ""]
+        lines += [f"Seen in a log: {e.signature.strip('.')}.", "", f"Source: {e.source.strip('.')}.", ""]
+        if typical:
+            lines += [f"On va12, at a typical size: {', '.join(typical)}", ""]
         if e.shapes:
-            lines += ["", "| shape | unit | default | looked for at |", "|---|---|---|---|"]
-            for name, shape in e.shapes.items():
-                own = "" if shape.size is effects._one else " of the site's size"
-                grid = ", ".join(f"{x:.3g}" for x in shape.grid)
-                lines.append(f"| {name} | {shape.unit} | {shape.default:.3g}{own} | {grid}{own} |")
-    return "\n".join(lines) + "\n"
+            lines += _table("shape | unit | default | looked for at", (_shape(*s) for s in e.shapes.items()))
+    return _page(*lines)
 
 
-def _sign(e: effects.Effect) -> str:
-    if e.positive:
-        return ", positive"
-    return "; the smaller, the larger the effect" if e.inverse else ""
+def _typical(machine: Machine, e: effects.Effect, bodies: tuple[int, ...]) -> float:
+    return e.amount(effects.Site(machine, machine.find(bodies[0]), effects.DURATION))
+
+
+def _amount(e: effects.Effect) -> str:
+    unit = "without unit" if e.unit == "-" else f"in {e.unit}"
+    sign = ", positive" if e.positive else "; the smaller, the larger the effect" if e.inverse else ""
+    return f"Amount {unit}{sign}."
+
+
+def _shape(name: str, shape: effects.Shape) -> tuple[str, str, str, str]:
+    of = "" if shape.size is effects._one else " of the site's size"
+    return name, shape.unit, f"{shape.default:.3g}{of}", ", ".join(f"{x:.3g}" for x in shape.grid) + of
+
+
+# ------------------------------------------------------------------------------------------------ files
 
 
 def machine_page() -> str:
     """The machine file: every record with its keys, and the units that columns may be in."""
-    lines = ["# Machine file", "", 'TOML; a file may say `extends = "va12"` and give only what differs.', ""]
-    for record in _records(Machine, set()):
-        lines += [f"## {record.__name__}", "", _doc(record), "", "| key | type | default |", "|---|---|---|"]
-        for name, field in record.model_fields.items():
-            default = "needed" if field.is_required() else _cell(_plain(field.get_default(call_default_factory=True)))
-            lines.append(f"| {name} | {_cell(_type(field.annotation))} | {default} |")
-        lines.append("")
-    lines += ["## Units", "", "| unit | quantity | SI value of one |", "|---|---|---|"]
-    lines += [f"| {unit} | {quantity} | {value:.9g} |" for unit, (quantity, value) in units.UNITS.items()]
-    return "\n".join(lines) + "\n"
+    return _page(
+        "# Machine file",
+        "",
+        'TOML; a file may say `extends = "va12"` and give only what differs. `excite machine new NAME` writes one with',
+        "comments to start from.",
+        "",
+        *_keys(Machine),
+        "## Units",
+        "",
+        "What columns of logs may be in.",
+        "",
+        *_table(
+            "unit | quantity | SI value of one", ((u, quantity, f"{x:.9g}") for u, (quantity, x) in units.UNITS.items())
+        ),
+    )
+
+
+def study_page() -> str:
+    """The study file: every record with its keys."""
+    return _page("# Study file", "", _doc(plan), "", *_keys(plan.Study))
+
+
+def _keys(root: type[Record]) -> Iterator[str]:
+    """Every key of a record and of those inside it, a table for each."""
+    for record in _records(root, set()):
+        yield from (f"## {record.__name__}", "", _doc(record), "")
+        yield from _table("key | what | default", ((n, _type(f), _default(f)) for n, f in record.model_fields.items()))
 
 
 def _records(record: type[Record], seen: set[type[Record]]) -> Iterator[type[Record]]:
@@ -90,31 +145,116 @@ def _records(record: type[Record], seen: set[type[Record]]) -> Iterator[type[Rec
     seen.add(record)
     yield record
     for field in record.model_fields.values():
-        inner = _inside(field.annotation)
-        if inner is not None:
+        for inner in _inside(field.annotation):
             yield from _records(inner, seen)
 
 
-def _inside(annotation: Any) -> type[Record] | None:
+def _inside(annotation: Any) -> list[type[Record]]:
     if isinstance(annotation, type) and issubclass(annotation, Record):
-        return annotation
-    return next((r for a in getattr(annotation, "__args__", ()) if (r := _inside(a)) is not None), None)
+        return [annotation]
+    return [r for a in get_args(annotation) for r in _inside(a)]
 
 
-def _type(annotation: Any) -> str:
-    plain = isinstance(annotation, type) and not hasattr(annotation, "__args__")
-    text = annotation.__name__ if plain else str(annotation)
-    for noise in ("model.machine.", "typing.", "pathlib.", "<class '", "'>"):
-        text = text.replace(noise, "")
-    text = re.sub(r"Annotated\[(\w+), AfterValidator\(func=<function _(\w+) at 0x\w+>\)\]", r"\1 (\2)", text)
-    text = text.replace("_", " ") if "(" in text else text
-    return text if len(text) < 90 else text[:86] + " ..."
+def _type(field: Any) -> str:
+    """What a key holds, in words."""
+    return _worded(field.annotation) + _checked(field.metadata)
 
 
-def _plain(value: Any) -> str:
+def _worded(annotation: Any) -> str:
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _worded(inner[0]) + _checked(annotation.__metadata__)
+    if origin is Literal:
+        return ", ".join(f'"{x}"' for x in inner)
+    if origin in (Union, types.UnionType):
+        return " or ".join(_worded(a) for a in inner if a is not type(None))
+    if origin is tuple:
+        return f"list: {_worded(inner[0])}" if inner[-1] is Ellipsis else f"{len(inner)} x {_worded(inner[0])}"
+    if origin is dict:
+        return f"table, for each name: {_worded(inner[1])}"
+    if isinstance(annotation, type) and issubclass(annotation, Record):
+        return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
+    return WORDS.get(annotation, str(annotation))
+
+
+def _checked(metadata: Iterable[Any]) -> str:
+    """What a value must be, by the names of its checks."""
+    names = [m.func.__name__.strip("_").replace("_", " ") for m in metadata if isinstance(m, AfterValidator)]
+    return "".join(f", {name}" for name in names if name in ("positive", "not negative", "negative"))
+
+
+def _default(field: Any) -> str:
+    if field.is_required():
+        return "needed"
+    value = field.get_default(call_default_factory=True)
     if isinstance(value, Record):
-        return "value 0" if getattr(value, "value", None) == 0 else "its own defaults"
-    return f"`{value}`"
+        return "0" if getattr(value, "value", None) == 0 else "its own defaults"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "-" if value in (None, "", (), {}) else f"`{list(value) if isinstance(value, tuple) else value}`"
+
+
+# ------------------------------------------------------------------------------------------------ choices
+
+
+def choices_page() -> str:
+    """What commands and studies may ask for by name: objectives, limits, methods, kits, usual drives."""
+    every, yes = [machines.load(name) for name in machines.shipped()], {True: "yes", False: "no"}
+    return _page(
+        "# What there is to choose from",
+        "",
+        "## Objectives",
+        "",
+        "What a drive is best for, by the information that it gives: `--objective`. Lower is better.",
+        "",
+        *_table(
+            "objective | what it is | of | equations count by their noise",
+            ((n, _what(o.function), o.of, yes[o.weighted]) for n, o in objective.OBJECTIVES.items()),
+        ),
+        "## Limits",
+        "",
+        "What every drive keeps. The `limits` of a study are factors on what the machine file states.",
+        "",
+        *_table(
+            "limit | what it bounds | stated in the machine file as",
+            (
+                *((n, _what(k.bounds), ", ".join(f"`{s}`" for s in k.stated) or "-") for n, k in limit.KINDS.items()),
+                *((n, _what(whole), "-") for n, whole in limit.WHOLE.items()),
+            ),
+        ),
+        "## Methods",
+        "",
+        "How parameters are found: `--method`; by default `joint` where slips are measured, `ols` where none are.",
+        "",
+        *_table(
+            "method | what it does | effects that it estimates | needs the lateral speed",
+            ((n, _what(m.find), m.effects, yes[not m.simulates]) for n, m in identify.METHODS.items()),
+        ),
+        "## Kits",
+        "",
+        "Which sensors there are: `--kit`.",
+        "",
+        *_table(
+            "machine | kit | columns",
+            ((m.name, kit, ", ".join(s.column for s in m.sensors(kit))) for m in every for kit in sensors.KITS),
+        ),
+        "## Usual drives",
+        "",
+        "What `excite compare` sets a design against: all of them, or those given by `--against`.",
+        "",
+        *_table(
+            "drive | what it is | drawn at random",
+            ((n, _what(u.make), yes[u.random]) for n, u in compare.USUAL.items()),
+        ),
+    )
+
+
+def _what(function: Callable[..., object]) -> str:
+    """The first paragraph of what a function says of itself."""
+    return _doc(function).partition("\n\n")[0]
+
+
+# ------------------------------------------------------------------------------------------------ commands, Python
 
 
 def commands_page() -> str:
@@ -125,15 +265,16 @@ def commands_page() -> str:
 
     lines = ["# Commands", "", "`excite COMMAND --help` says the same.", ""]
     for name, command in _commands(typer.main.get_command(app), "excite"):
-        lines += [f"## {name}", "", command.help or "", "", "| option | default | what |", "|---|---|---|"]
-        for p in command.params:
-            named = p.param_type_name == "option"
-            label = ", ".join(f"`{o}`" for o in p.opts) if named else f"`{p.metavar or p.name.upper()}`"
-            default = "" if p.default in (None, False) or callable(p.default) else str(p.default)
-            default = "needed" if p.required else default
-            lines.append(f"| {label} | {default} | {_cell(getattr(p, 'help', None) or '')} |")
-        lines.append("")
-    return "\n".join(lines) + "\n"
+        lines += [f"## {name}", "", command.help or "", "", *_table("option | default | what", _options(command))]
+    return _page(*lines)
+
+
+def _options(command: Any) -> Iterator[tuple[str, str, str]]:
+    for p in command.params:
+        named = p.param_type_name == "option"
+        label = ", ".join(f"`{o}`" for o in p.opts) if named else f"`{p.metavar or p.name.upper()}`"
+        none = p.default is None or p.default is False or callable(p.default)
+        yield label, "needed" if p.required else "" if none else str(p.default), getattr(p, "help", None) or ""
 
 
 def _commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
@@ -154,7 +295,7 @@ def python_page() -> str:
             for name, thing in entries:
                 where = f"{module.__name__.rpartition('.')[2]}.{name}"
                 lines += [f"### {where}", "", "```python", _signature(name, thing), "```", "", _doc(thing), ""]
-    return "\n".join(lines) + "\n"
+    return _page(*lines)
 
 
 def _modules(package: ModuleType) -> Iterator[ModuleType]:
@@ -174,9 +315,14 @@ def _public(module: ModuleType) -> Iterator[tuple[str, Any]]:
 
 def _signature(name: str, thing: Any) -> str:
     if inspect.isclass(thing):
+        own = vars(thing)
         bases = ", ".join(b.__name__ for b in thing.__bases__ if b is not object)
         head = f"class {name}({bases})" if bases else f"class {name}"
-        fields = [f"    {key}: {kind}" for key, kind in inspect.get_annotations(thing).items() if key[0] != "_"]
+        fields = [
+            f"    {key}: {kind}" + (f" = {own[key]!r}" if isinstance(own.get(key, ...), PLAIN) else "")
+            for key, kind in inspect.get_annotations(thing).items()
+            if key[0] != "_"
+        ]
         return "\n".join([head, *fields])
     try:
         text = str(inspect.signature(thing))
@@ -191,21 +337,20 @@ def _doc(thing: Any) -> str:
 
 
 def _cell(text: str) -> str:
-    return " ".join(str(text).split()).replace("|", "\\|")
+    return " ".join(text.split()).replace("|", "\\|")
 
 
 def _sentence(text: str) -> str:
     text = text.strip()
-    return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")
-
-
-def _unit(text: str) -> str:
-    return "no unit" if text == "-" else text
+    first = text if FORMULA.match(text) else text[:1].upper() + text[1:]
+    return first + ("" if text.endswith(".") else ".")
 
 
 PAGES: dict[str, Callable[[], str]] = {
-    "effects.md": effects_page,
-    "machine-file.md": machine_page,
     "commands.md": commands_page,
+    "machine-file.md": machine_page,
+    "study-file.md": study_page,
+    "choices.md": choices_page,
+    "effects.md": effects_page,
     "python.md": python_page,
 }

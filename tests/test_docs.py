@@ -17,7 +17,7 @@ import pytest
 import typer
 from conftest import Excite
 
-from excite import reference
+from excite import handbook, reference
 from excite.__main__ import app
 from model import effects, machine, units
 
@@ -71,14 +71,38 @@ def test_every_effect_is_in_its_page() -> None:
 def test_reference_pages_hold_what_the_code_has(excite: Excite, tmp_path: Path) -> None:
     code, stdout, _ = excite("docs", "--out", tmp_path / "d", "--json")
     assert code == 0
-    assert set(json.loads(stdout)["pages"]) == set(reference.PAGES)
+    assert json.loads(stdout)["pages"] == [handbook.NAME, *reference.PAGES]
     read = {name: (tmp_path / "d" / name).read_text() for name in reference.PAGES}
+    assert (tmp_path / "d" / handbook.NAME).read_text() == handbook.page(read)
     assert "def load(name: str | Path) -> Model" in read["python.md"]
     assert "### identify.identify" in read["python.md"]
     assert not re.search(r"0x[0-9a-f]{6}", "".join(read.values()))  # the same code gives the same bytes
     for unit in units.UNITS:
         assert f"| {unit} |" in read["machine-file.md"]
     assert "| `--phases` |" in read["commands.md"]
+    assert "| `--seed` | 0 |" in read["commands.md"]
+    for noise in ("Annotated", "FieldInfo", "typing.", "<class", "Validator"):
+        assert noise not in read["machine-file.md"] + read["study-file.md"] + read["choices.md"]
+    assert "| pin | [Pin](#pin) | - |" in read["machine-file.md"]
+    assert '| antecedent | whole number or "ground" | needed |' in read["machine-file.md"]
+
+
+def test_every_place_of_an_effect_is_explained() -> None:
+    assert {p for e in effects.CATALOGUE.values() for p in e.places} == set(reference.PLACES)
+
+
+def test_the_handbook_is_whole() -> None:
+    """Every heading of every page, links that lead somewhere, and nothing left as it was written."""
+    pages = {name: page() for name, page in reference.PAGES.items() if name != "python.md"}
+    text = handbook.page(pages | {"python.md": "# Python\n\n## m\n\n```python\ndef f(x: a < b)\n```\n\n*x* | y <i>\n"})
+    anchors = re.findall(r'<h[123] id="([^"]+)"', text)
+    assert len(set(anchors)) == len(anchors) == 2 + sum(len(re.findall("^#+ ", p, re.M)) for p in pages.values())
+    assert set(re.findall(r'href="#([^"]+)"', text)) <= set(anchors)
+    assert {"effects-pump_coupling", "commands-excite-log-check", "machine-file-units"} <= set(anchors)
+    assert "<pre>def f(x: a &lt; b)</pre>" in text
+    assert "<p>*x* | y &lt;i&gt;</p>" in text
+    shown = re.sub("<pre>.*?</pre>", "", text.partition("<main>")[2], flags=re.DOTALL)
+    assert not re.search(r"^\||```|^#|`", shown, re.MULTILINE)
 
 
 def test_public_functions_have_docstrings() -> None:
