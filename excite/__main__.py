@@ -15,6 +15,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import typer  # noqa: E402
+import typer.core  # noqa: E402
 
 from excite import asked, interrupt, terminal  # noqa: E402
 from excite.asked import UsageError  # noqa: E402
@@ -35,6 +36,21 @@ def _machine_names(incomplete: str) -> list[str]:
     return sorted(n for n in names if n.startswith(incomplete))
 
 
+def _names(option: str) -> Callable[[str], list[str]]:
+    """For the shell's completion: what may be given for an option by name."""
+    return lambda incomplete: [n for n in asked.choices(option) if n.startswith(incomplete)]
+
+
+class Choosing(typer.core.TyperCommand):
+    """A command whose help lists what may be given by name; it takes the tables' time to load."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        for p in self.params:
+            if isinstance(p, typer.core.TyperOption):
+                p.help = asked.helped(p.name or "", p.help)
+        super().format_help(ctx, formatter)
+
+
 MachineArgument = Annotated[
     str,
     typer.Argument(metavar="MACHINE", help="a shipped name or a machine file (.toml)", autocompletion=_machine_names),
@@ -43,11 +59,16 @@ DesignArgument = Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="what
 OutOption = Annotated[Path | None, typer.Option("--out", help="folder to write [results/<command>-<machine>]")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the summary as JSON and nothing else")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="same seed, same result")]
-KitOption = Annotated[str, typer.Option("--kit", help="sensors: paper or full")]
-MethodOption = Annotated[str | None, typer.Option("--method", help="estimator; the recommended one by default")]
+KitOption = Annotated[str, typer.Option("--kit", help="sensors", autocompletion=_names("kit"))]
+MethodOption = Annotated[
+    str | None,
+    typer.Option("--method", help="estimator, the recommended one by default", autocompletion=_names("method")),
+]
 ProblemOption = Annotated[str | None, typer.Option("--problem", help="design problem; the machine's own by default")]
 DurationOption = Annotated[float | None, typer.Option("--duration", help="length of the drive [s]")]
-ObjectiveOption = Annotated[str, typer.Option("--objective", help="what the drive is best for")]
+ObjectiveOption = Annotated[
+    str, typer.Option("--objective", help="what the drive is best for", autocompletion=_names("objective"))
+]
 StartsOption = Annotated[int, typer.Option("--starts", min=1, help="number of starting guesses")]
 SigmaMaxOption = Annotated[
     float | None, typer.Option("--sigma-max", help="what the worst parameter's standard deviation may be [%]")
@@ -94,7 +115,7 @@ def machines(json: JsonOption = False) -> None:
     terminal.say(table)
 
 
-@app.command()
+@app.command(cls=Choosing)
 def design(
     machine: MachineArgument,
     problem: ProblemOption = None,
@@ -134,7 +155,7 @@ def design(
     terminal.finish(summary, out, json, terminal.design_table)
 
 
-@app.command()
+@app.command(cls=Choosing)
 def verify(
     design_dir: DesignArgument,
     runs: RunsOption = 50,
@@ -155,11 +176,17 @@ def verify(
     terminal.finish(summary, out, json, terminal.verify_table)
 
 
-@app.command()
+@app.command(cls=Choosing)
 def compare(
     machine: MachineArgument,
     problem: ProblemOption = None,
     samples: Annotated[int, typer.Option("--samples", "--runs", min=1, help="of every random kind of drive")] = 20,
+    against: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--against", help="one of the usual drives (repeatable), all by default", autocompletion=_names("against")
+        ),
+    ] = None,
     seed: SeedOption = 0,
     budget: BudgetOption = None,
     out: OutOption = None,
@@ -171,11 +198,11 @@ def compare(
     out = out or Path(f"results/compare-{asked.stem(machine)}")
     folder.claim(out)
     with folder.writing(out) as place:
-        summary = works.compare(place, machine, problem, samples, seed, budget)
+        summary = works.compare(place, machine, problem, samples, tuple(against or ()), seed, budget)
     terminal.finish(summary, out, json, terminal.compare_table)
 
 
-@app.command()
+@app.command(cls=Choosing)
 def run(
     machine: MachineArgument,
     problem: ProblemOption = None,
@@ -252,7 +279,7 @@ def drive(
         cab.serve(out, made, port, live, lambda address: typer.echo(f"{address} (Ctrl-C ends)", err=True))
 
 
-@app.command()
+@app.command(cls=Choosing)
 def simulate(
     machine: MachineArgument,
     profile: Annotated[Path, typer.Argument(metavar="PROFILE.csv", help="torques to drive")],
@@ -261,7 +288,12 @@ def simulate(
     noise: Annotated[str, typer.Option("--noise", help="on, or off for exact signals")] = "on",
     kit: KitOption = "full",
     effect: Annotated[
-        list[str] | None, typer.Option("--effect", help="NAME[@WHERE]=AMOUNT: what else the machine does (repeatable)")
+        list[str] | None,
+        typer.Option(
+            "--effect",
+            help="NAME[@WHERE]=AMOUNT: what else the machine does; `excite docs` lists all (repeatable)",
+            autocompletion=_names("effect"),
+        ),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -304,7 +336,7 @@ def simulate(
         terminal.say(f"{out}: {len(table)} rows, {motion.t[-1]:g} s, columns {', '.join(table.columns)}")
 
 
-@app.command()
+@app.command(cls=Choosing)
 def identify(
     machine: MachineArgument,
     logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="one log or several (.csv, .parquet, .mat)")],

@@ -63,6 +63,31 @@ def method(name: str | None, model: Model, kit: str | None = None) -> str:
     return name
 
 
+# Where the tables are of what may be given by name: a new entry is in the help, the shell's completion and the errors.
+CHOICES = {
+    "objective": ("excite.objective", "OBJECTIVES"),
+    "method": ("excite.identify", "METHODS"),
+    "against": ("excite.compare", "USUAL"),
+    "kit": ("excite.sensors", "KITS"),
+    "effect": ("model.effects", "CATALOGUE"),
+}
+LISTED = 12  # names that help still lists
+
+
+def choices(option: str) -> tuple[str, ...]:
+    """What may be given for an option by name; nothing for an option that takes something else."""
+    from importlib import import_module
+
+    module, table = CHOICES.get(option, ("", ""))
+    return tuple(getattr(import_module(module), table)) if module else ()
+
+
+def helped(option: str, text: str | None) -> str:
+    """An option's help with the names that may be given for it."""
+    names = choices(option)
+    return f"{text or ''}: {', '.join(names)}" if 0 < len(names) <= LISTED else text or ""
+
+
 def known(what: str, value: str, allowed: Sequence[str]) -> None:
     if value not in allowed:
         raise UsageError(f"{what}: {value} is unknown, allowed: {', '.join(allowed)}")

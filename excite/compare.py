@@ -217,8 +217,8 @@ def fourier_evolution(model: Model, problem: Problem, seed: int, seconds: float)
 
 
 USUAL: dict[str, Usual] = {
-    "Fourier, SLSQP": Usual(fourier_slsqp),
-    "Fourier, differential evolution": Usual(fourier_evolution),
+    "Fourier SLSQP": Usual(fourier_slsqp),
+    "Fourier differential evolution": Usual(fourier_evolution),
     "multisine": Usual(multisine, random=True),
     "slow multisine": Usual(slow_multisine, random=True),
     "random steps": Usual(steps, random=True),
@@ -406,9 +406,9 @@ def compare(
     InfeasibleError where the design finds nothing, and KeyError for an unknown kind.
     """
     usual = tuple(dict.fromkeys(usual)) or tuple(USUAL)
-    unknown = [name for name in usual if name not in USUAL]
-    if unknown:
-        raise KeyError(f"no usual drive {', '.join(unknown)}, allowed: {', '.join(USUAL)}")
+    for name in usual:
+        if name not in USUAL:
+            raise KeyError(f"no usual drive {name}, allowed: {', '.join(USUAL)}")
     jobs = [(name, k) for name in usual for k in range(samples if USUAL[name].random else 1)]
     total = len(jobs) + 1
     begin = time.monotonic()

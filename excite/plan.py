@@ -37,10 +37,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
 
 from excite import asked, identify, log
 from excite.asked import UsageError
+from excite.limit import KINDS
 from excite.log import LogError
 from excite.objective import OBJECTIVES
 from model import effects as catalogue
@@ -49,7 +50,6 @@ from model import prediction
 from model.machine import Machine, MachineError, Number, Record
 
 STEPS = ("design", "simulate", "identify", "diagnose", "verify")
-LIMITS = ("torque", "torque_rate", "position", "rate", "rim_speed", "slip", "power", "lane")
 MOST = 1_000_000  # runs of a study
 MOST_CELLS = 100_000
 SPAN = re.compile(r"^(?P<what>[^=]*)=(?P<low>[^=]+)\.\.(?P<high>[^=]+)$")
@@ -90,7 +90,16 @@ class Range(Record):
 Text = Annotated[str, Field(min_length=1, max_length=1000)]
 Whole = Annotated[int, Field(strict=True, ge=0, le=2**32 - 1)]
 Starts = Annotated[int, Field(strict=True, ge=1, le=1000)]
-Limit = Literal["torque", "torque_rate", "position", "rate", "rim_speed", "slip", "power", "lane"]
+
+
+def _limit(name: str) -> str:
+    allowed = [known for known, kind in KINDS.items() if kind.stated]
+    if name not in allowed:
+        raise ValueError(f"no such limit of a machine file, allowed: {', '.join(allowed)}")
+    return name
+
+
+Limit = Annotated[str, AfterValidator(_limit)]
 
 
 class Axes(Record):
@@ -403,19 +412,28 @@ def limited(machine: Machine, factors: dict[str, float]) -> Machine:
     for name, factor in factors.items():
         if not 0 < factor <= 1000:
             raise StudyError(f"limits: {name}: must be a factor on the machine's own limit, > 0 (got {factor:g})")
-        found = False
-        for body in raw["body"]:
-            at = (body["contact"] or {}).get("slip_limit") if name == "slip" else body["limit"].get(name)
-            if at is not None:
-                at["value"] *= factor
-                found = True
-        if name == "power" and raw["power_limit"] is not None:
-            raw["power_limit"]["value"] *= factor
-            found = True
-        for one in raw["problems"].values() if name == "lane" else ():
-            one["lane_m"] = [factor * x for x in one["lane_m"]]
-            one["lane_polygon_m"] = [[factor * x for x in corner] for corner in one["lane_polygon_m"]]
-            found = True
-        if not found:
+        stated = [_multiply(raw, path, factor) for path in KINDS[name].stated]
+        if not any(stated):
             raise StudyError(f"limits: {machine.name} has no limit {name}")
     return Machine.model_validate_json(json.dumps(raw))
+
+
+def _multiply(raw: dict[str, Any], path: str, factor: float) -> bool:
+    """Multiplies what a machine's JSON has at a path, in every body or problem on the way; whether it has anything."""
+    *way, last = path.split(".")
+    places = [raw]
+    for key in way:
+        inner = [place[key] for place in places if place[key]]
+        lists = [list(x.values()) if key == "problems" else x if isinstance(x, list) else [x] for x in inner]
+        places = [one for several in lists for one in several]
+    stated = [place for place in places if place[last]]
+    for place in stated:
+        place[last] = _times(place[last], factor)
+    return bool(stated)
+
+
+def _times(value: Any, factor: float) -> Any:
+    """A number of a machine's JSON, with its source, or in lists of lists."""
+    if isinstance(value, dict):
+        return value | {"value": factor * value["value"]}
+    return [_times(x, factor) for x in value] if isinstance(value, list) else factor * value

@@ -17,7 +17,7 @@ from pydantic import AfterValidator
 
 import excite
 import model
-from excite import compare, handbook, identify, limit, objective, plan, sensors
+from excite import asked, compare, handbook, identify, limit, objective, plan, sensors
 from model import effects, units
 from model import machine as machines
 from model.machine import Machine, Record
@@ -274,7 +274,11 @@ def _options(command: Any) -> Iterator[tuple[str, str, str]]:
         named = p.param_type_name == "option"
         label = ", ".join(f"`{o}`" for o in p.opts) if named else f"`{p.metavar or p.name.upper()}`"
         none = p.default is None or p.default is False or callable(p.default)
-        yield label, "needed" if p.required else "" if none else str(p.default), getattr(p, "help", None) or ""
+        yield (
+            label,
+            "needed" if p.required else "" if none else str(p.default),
+            asked.helped(p.name, getattr(p, "help", None)),
+        )
 
 
 def _commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:

@@ -95,18 +95,26 @@ def verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: st
 
 
 def compare(
-    place: Path, machine: str, problem: str | None, samples: int, seed: int, budget: float | None
+    place: Path,
+    machine: str,
+    problem: str | None,
+    samples: int,
+    against: Sequence[str],
+    seed: int,
+    budget: float | None,
 ) -> dict[str, Any]:
     model = asked.model(machine, flaws=False)
     name, chosen = asked.problem(model.machine, problem, None)
     if budget is not None and not budget > 0:
         raise UsageError(f"--budget: must be > 0 s (got {budget:g})")
     with terminal.bar("comparing") as advance:
-        result = comparisons.compare(model, chosen, samples, seed, budget, advance)
+        result = comparisons.compare(model, chosen, samples, seed, budget, advance, against)
     inputs = zip(model.inputs, model.machine.actuated, strict=True)
     columns = ["t_s", *[f"{u}_{'Nm' if b.joint == 'revolute' else 'N'}" for u, b in inputs]]
     (place / "drives").mkdir()
     designs = []
+    for usual in against:
+        asked.known("--against", usual, tuple(comparisons.USUAL))
     for row in result.rows:
         knots = f"drives/{row.name.replace(',', '').replace(' ', '-')}.csv"
         table = pd.DataFrame([[t, *u] for t, u in zip(row.manoeuvre.times, row.manoeuvre.torque, strict=True)])
@@ -164,7 +172,7 @@ def identified(
     with terminal.busy("identifying"):
         chosen, reason = examine.choose(model, read) if filtering == "auto" else (model.machine.filter, "")
         estimate = identify.identify(model, read, method, chosen)
-        if model.slips and method.partition("+")[0] in ("ols", "wls"):  # slips measured with noise bias these
+        if model.slips and identify.METHODS[method].biased:
             estimate = identify.with_bias(model, read, estimate, chosen)
         late = [remark for one in read for remark in examine.late_channels(model, one, chosen)]
     summary = {
