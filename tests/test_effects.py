@@ -149,29 +149,6 @@ def test_a_signature_is_what_the_extended_model_has_more(effect: Effect, va12: M
     assert np.abs(reading - (read - exact)).max() < 1e-12
 
 
-def test_a_new_effect_is_one_declaration(monkeypatch: pytest.MonkeyPatch, va12: Model) -> None:
-    """Simulated, a parameter of the regressor, a candidate of the diagnosis: from one entry of the catalogue."""
-    dry = Effect(
-        "sticky_spot",
-        ("contacts",),
-        "N m",
-        "a torque against the motion in one half of a turn",
-        "a torque error in half of every turn",
-        "made up for this test",
-        lambda site: 80.0,
-        torque=lambda s, k, p: -p["A"] * s.sign(k) * (1 + ca.tanh(ca.sin(s.q[k]) / 0.1)) / 2,
-    )
-    monkeypatch.setitem(CATALOGUE, dry.name, dry)
-    model = build(effects.extended(VA12, effects.parse("sticky_spot@rear_roll=80", VA12, 10.0)))
-    assert model.base.names[-1] == "sticky_spot@rear_roll"
-    q, nu, a, u, z = samples(model)
-    assert np.abs(model.stacked(q, nu, a, u, z)[:, 5, -1]).max() > 0.9
-    torque = np.full((300, 3), 800.0) * np.array([1, 0, 1])
-    assert simulate(model, torque).nu[-1, 0] < simulate(va12, torque).nu[-1, 0] - 1e-3
-    names = {c.name for c in evidence.candidates(VA12, [s.name for s in VA12.sensors("full")], 60.0)}
-    assert {"sticky_spot@front_roll", "sticky_spot@rear_roll"} <= names
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
