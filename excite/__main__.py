@@ -369,6 +369,9 @@ def diagnose(
     filtering: Annotated[
         str, typer.Option("--filter", help="of the first guess; machine: the machine file's, or auto: by evidence")
     ] = "machine",
+    onward: Annotated[
+        bool, typer.Option("--next", help="also design the drive that separates what is tied (folder next/; minutes)")
+    ] = False,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -380,8 +383,11 @@ def diagnose(
     folder.claim(out, logs)
     _once(logs)
     asked.known("--filter", filtering, ("machine", "auto"))
-    with folder.writing(out) as place, terminal.bar("diagnosing") as advance:
-        summary = checkup.write(place, machine, model, logs, filtering, asked.versions(), advance)
+    with folder.writing(out) as place:
+        with terminal.bar("diagnosing") as advance:
+            summary, tied = checkup.write(place, machine, model, logs, filtering, asked.versions(), advance)
+        summary["separating_drive"] = checkup.separating(place, model.machine, tied, onward)
+        checkup.finish(place, summary)
     terminal.finish(summary, out, json, terminal.diagnose_table)
 
 

@@ -8,7 +8,7 @@ by side, and says so where the one hides the other.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,8 @@ from excite.aim import Aim
 from excite.design import Design, design
 from excite.phased import Phased
 from model import effects
-from model.machine import MachineError, Problem
-from model.prediction import Model
+from model.machine import EffectEntry, MachineError, Problem
+from model.prediction import Model, build
 
 POOR = 5.0  # attainable standard deviation [%] that a low condition number should not hide
 SCENARIOS, SPREAD = 5, 0.2  # machines of a robust design, and how far their values are from the nominal ones
@@ -64,12 +64,17 @@ def rivals(model: Model, between: tuple[str, ...], duration: float) -> Model:
 
     Raises MachineError for an effect that is unknown, that the machine can't have, or that driving doesn't show.
     """
-    entries = [effects.parse(text, model.machine, duration) for text in between]
-    both = model.of(effects.extended(model.machine, *entries))
-    for text, e in zip(between, both.effects[-2:], strict=True):
+    return beside(model, [effects.parse(text, model.machine, duration) for text in between])
+
+
+def beside(model: Model, rivals: Sequence[EffectEntry]) -> Model:
+    """The same for effects as a machine file has them. What they can be mistaken for may have any shape: those of both
+    are parameters too. Raises MachineError."""
+    both = build(effects.extended(model.machine, *rivals), model.flaws, shapes=True)
+    for e in both.effects[-2:]:
         if e.name not in both.base.names:
             raise MachineError(
-                f"effect {text}: no equation of motion shows its amount at once (it sits in a sensor, or acts through"
+                f"effect {e.name}: no equation of motion shows its amount at once (it sits in a sensor, or acts through"
                 " what it remembers), so no drive can be designed for it by the regressor"
             )
     return both

@@ -6,11 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from excite import examine, findings, folder, gaps, identify, portrait, reports
+from excite import asked, brief, examine, findings, folder, gaps, identify, portrait, reports, separate, works
+from excite.brief import Brief
 from excite.diagnose import diagnose
-from model.prediction import Model
+from excite.separate import Rivals
+from model.machine import Machine, MachineError
+from model.prediction import Model, build
 
 MACHINE = "machine.toml"
+NEXT = "next"  # folder of the drive that separates what is tied
 PARTS = 0.8  # of the time that diagnosing takes; the rest measures gains
 
 Advance = Callable[[int, int, float | None], None]
@@ -24,8 +28,9 @@ def write(
     filtering: str,
     versions: Mapping[str, str],
     advance: Advance,
-) -> dict[str, Any]:
-    """Diagnoses logs and fills the folder: summary, figures, report, and machine.toml where something is named.
+) -> tuple[dict[str, Any], list[Rivals]]:
+    """Diagnoses logs and fills the folder: figures, and machine.toml where something is named. Its summary, and what a
+    drive could be designed to tell apart.
 
     machine: as it was asked for, a shipped name or a path. filtering: machine or auto. Raises LogError, MachineError,
     NoEstimate.
@@ -55,10 +60,37 @@ def write(
         "logs": [one.source for one in mended],
         **said,
         "machine_file": MACHINE if text is not None else None,
+        "separating_drive": None,
         "notes": notes,
         "versions": dict(versions),
     }
     portrait.write(place, account, summary["signals"], model.machine.title)
+    return summary, separate.rivals(found)
+
+
+def separating(place: Path, machine: Machine, tied: Sequence[Rivals], onward: bool) -> dict[str, Any] | None:
+    """The first pair of tied causes that driving can tell apart, and if it is wanted the drive, designed into a folder
+    of its own. None where there is no such pair, or no problem to design for. Raises InfeasibleError."""
+    if machine.problem is None:
+        return None
+    name, problem = asked.problem(machine, None, None)
+    for pair in tied:
+        try:
+            model = brief.beside(build(pair.machine, flaws=False), pair.between)
+        except MachineError:
+            continue  # a sensor's: no equation of motion shows it
+        between = tuple(f"{e.name}@{e.where}={float(e.amount):.5g}" for e in pair.between)
+        told: dict[str, Any] = {"between": list(between), "folder": None}
+        if onward:
+            (place / NEXT).mkdir()
+            made = works.designed(place / NEXT, model, name, problem, Brief("discrimination", between=between))
+            sigma = max(made["sigma_percent"][x.partition("=")[0]] for x in between)
+            told |= {"folder": NEXT, "sigma_percent": sigma}
+        return told
+    return None
+
+
+def finish(place: Path, summary: dict[str, Any]) -> None:
+    """Report and summary."""
     reports.write(place, "diagnose", summary)
     (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
-    return summary

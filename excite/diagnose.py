@@ -106,11 +106,12 @@ class Stage:
 
 @dataclass(frozen=True)
 class Finding:
-    """A named cause. gain: of twice the log-likelihood; p_value: that of no effect at all, for all that were tried."""
+    """A named cause. gain: of twice the log-likelihood; p_value: that of no effect at all, for all that were tried;
+    rivals: what it is tied with, as the logs have it."""
 
     effect: str
     where: str
-    tied_with: tuple[str, ...]
+    rivals: tuple[EffectEntry, ...]
     p_value: float
     amount: float
     amount_std: float
@@ -121,6 +122,17 @@ class Finding:
     @property
     def name(self) -> str:
         return f"{self.effect}@{self.where}"
+
+    @property
+    def tied_with(self) -> tuple[str, ...]:
+        return tuple(f"{e.name}@{e.where}" for e in self.rivals)
+
+    @property
+    def entry(self) -> EffectEntry:
+        """As a machine file has it."""
+        shapes = {n: Quantity(value=value, source="identified") for n, (value, _, _) in self.shapes.items()}
+        amount = Quantity(value=self.amount, source="identified")
+        return EffectEntry(name=self.effect, where=self.where, amount=amount, shape=shapes)
 
 
 @dataclass(frozen=True)
@@ -197,7 +209,7 @@ class _Choice:
     gain: float
     spread: float
     tried: int
-    rivals: tuple[str, ...]
+    rivals: tuple[EffectEntry, ...]
 
 
 def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
@@ -294,6 +306,15 @@ def _entry(score: evidence.Score) -> EffectEntry:
     )
 
 
+def _fitted(stage: Stage, name: str) -> EffectEntry:
+    """An effect with amount and shapes as a stage's fit has them."""
+    placed = next(e for e in stage.model.effects if e.name == name)
+    fitted = dict(zip(stage.model.base.names, stage.fit.X, strict=True))
+    values = {key: fitted.get(p, placed.values[key]) for p, (key, _) in placed.parameters.items()}
+    told = {key: Quantity(value=float(value), source="identified") for key, value in values.items()}
+    return EffectEntry(name=placed.effect.name, where=placed.where, amount=told.pop("A"), shape=told)
+
+
 def _shortlist(stage: Stage, scores: Sequence[evidence.Score]) -> list[evidence.Score]:
     """The best candidate of each name, best first, as far as worth a fit."""
     best: dict[str, evidence.Score] = {}
@@ -349,7 +370,7 @@ def _choose(
         return None
     tries = _close(_without_forces(_close(tries)))
     score, best = tries[0]
-    rivals = tuple(s.candidate.name for s, _ in tries[1:])
+    rivals = tuple(_fitted(other, s.candidate.name) for s, other in tries[1:])
     return _Choice(score.candidate.name, best, gain, spread, len(scores), rivals)
 
 

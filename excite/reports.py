@@ -309,10 +309,24 @@ def _log(s: Summary) -> Said:
     return f"The log {name}", answer, remarks, [Table("Columns as the file has them.", names, rows)]
 
 
+def _designed(drive: Mapping[str, Any]) -> str:
+    """The drive that was, or could be, designed to tell two causes apart."""
+    first, second = (x.partition("=")[0] for x in drive["between"])
+    if drive["folder"] is None:
+        return f"A drive can be designed to tell {first} from {second}: `excite diagnose` with `--next` does."
+    return (
+        f"{drive['folder']}/ beside this page is a drive designed to tell {first} from {second} (`profile.csv`; `excite"
+        f" drive` makes a sheet of it): from its log the amount of each can be found within"
+        f" {rounded(drive['sigma_percent'], 2)} % beside the other."
+    )
+
+
 def _diagnose(s: Summary) -> Said:
     remarks = []
     if s["separating_run"]:
         remarks.append(f"To tell apart what is tied, drive: {s['separating_run']}.")
+    if s["separating_drive"]:
+        remarks.append(_designed(s["separating_drive"]))
     remarks += [f"What is left: {line}." for line in s["located"]]
     if s["machine_file"]:
         remarks.append(

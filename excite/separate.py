@@ -19,7 +19,7 @@ from excite.record import smoothed
 from model import effects
 from model.effects import Placed, Site
 from model.equations import Signatures, signatures
-from model.machine import Machine
+from model.machine import EffectEntry, Machine
 
 APART = 0.4  # relative difference of two answers from which they are told apart
 SAME = 1e-6  # share of two signatures that isn't in common, below which no drive tells them apart
@@ -64,6 +64,26 @@ def run(d: Diagnosis) -> str | None:
             if text is not None and text not in said:
                 said.append(text)
     return "; then ".join(said) or None
+
+
+@dataclass(frozen=True)
+class Rivals:
+    """Two causes that are tied, as the logs have them, and the machine with what else was found."""
+
+    machine: Machine
+    between: tuple[EffectEntry, EffectEntry]
+
+
+def rivals(d: Diagnosis) -> list[Rivals]:
+    """The pairs of tied causes that do not the same whatever is driven, the likeliest first."""
+    found: list[Rivals] = []
+    for f in d.findings:
+        tied = [_placed(d.after, name) for name in (f.name, *f.tied_with)]
+        pairs = [(0, k) for k in range(1, len(tied))]
+        apart = set(pairs) - _same(_Asked(d.after, tied)(_stirred(_motion(d.after))), pairs)
+        machine = effects.extended(d.before.machine, *(x.entry for x in d.findings if x is not f))
+        found += [Rivals(machine, (f.entry, f.rivals[k - 1])) for _, k in sorted(apart)]
+    return found
 
 
 def _separating(stage: Stage, names: Sequence[str]) -> str | None:

@@ -209,6 +209,11 @@ def diagnose_table(summary: dict[str, Any]) -> None:
         say(line)
     if summary["separating_run"]:
         say(f"to tell them apart, drive: {summary['separating_run']}")
+    if summary["separating_drive"]:
+        first, second = (x.partition("=")[0] for x in summary["separating_drive"]["between"])
+        where = summary["separating_drive"]["folder"]
+        said = f"{where}/profile.csv is designed to" if where else "--next designs a drive to"
+        say(f"{said} tell {first} from {second}")
     if summary["machine_file"]:
         say(f"the machine with what was found: {summary['machine_file']}, for every command")
     for note in summary["notes"]:

@@ -19,11 +19,12 @@ from excite.identify import Estimate
 from excite.log import Log
 from excite.objective import OBJECTIVES
 from excite.simulate import SimulationError
-from model.machine import Filter
+from model.machine import Filter, Problem
 from model.prediction import Model
 
 
 def design(place: Path, machine: str, problem: str | None, duration: float | None, brief: Brief) -> dict[str, Any]:
+    """A drive for a machine as a brief asks for it."""
     model = asked.model(machine, flaws=False)
     name, chosen = asked.problem(model.machine, problem, duration)
     asked.known("--objective", brief.objective, tuple(OBJECTIVES))
@@ -34,6 +35,11 @@ def design(place: Path, machine: str, problem: str | None, duration: float | Non
     for option, value, unit in (("--budget", brief.budget_s, "s"), ("--sigma-max", brief.sigma_max, "%")):
         if value is not None and not value > 0:
             raise UsageError(f"{option}: must be > 0 {unit} (got {value:g})")
+    return designed(place, model, name, chosen, brief)
+
+
+def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief) -> dict[str, Any]:
+    """The same for a model and a problem of this name that are there already."""
     begin = time.perf_counter()
     with terminal.bar("designing") as advance:
         found = briefs.answer(model, chosen, brief, advance)
@@ -107,14 +113,14 @@ def compare(
     name, chosen = asked.problem(model.machine, problem, None)
     if budget is not None and not budget > 0:
         raise UsageError(f"--budget: must be > 0 s (got {budget:g})")
+    for usual in against:
+        asked.known("--against", usual, tuple(comparisons.USUAL))
     with terminal.bar("comparing") as advance:
         result = comparisons.compare(model, chosen, samples, seed, budget, advance, against)
     inputs = zip(model.inputs, model.machine.actuated, strict=True)
     columns = ["t_s", *[f"{u}_{'Nm' if b.joint == 'revolute' else 'N'}" for u, b in inputs]]
     (place / "drives").mkdir()
     designs = []
-    for usual in against:
-        asked.known("--against", usual, tuple(comparisons.USUAL))
     for row in result.rows:
         knots = f"drives/{row.name.replace(',', '').replace(' ', '-')}.csv"
         table = pd.DataFrame([[t, *u] for t, u in zip(row.manoeuvre.times, row.manoeuvre.torque, strict=True)])

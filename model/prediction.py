@@ -316,7 +316,7 @@ def _shown(found: Equations) -> set[str]:
 
 
 def _amounts(machine: Machine, placed: Sequence[catalogue.Placed], shapes: bool) -> dict[str, tuple[float, str, float]]:
-    """Value, unit and typical size of every amount and shape that is a parameter, by name."""
+    """Value, unit and typical size of every shape and amount that is a parameter, by name: amounts last."""
     found: dict[str, tuple[float, str, float]] = {}
     for e in placed:
         site = catalogue.Site(machine, machine.find(e.bodies[0]), catalogue.DURATION)
@@ -329,7 +329,8 @@ def _amounts(machine: Machine, placed: Sequence[catalogue.Placed], shapes: bool)
             else:
                 continue
             found[name] = e.values[key], unit, max(size, abs(e.values[key]) if key == "A" else 0.0)
-    return found
+    amounts = {e.name: found.pop(e.name) for e in placed}
+    return found | amounts
 
 
 def _beside_base(base: BaseParameters, amounts: Mapping[str, tuple[float, str, float]]) -> BaseParameters:

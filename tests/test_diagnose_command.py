@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from conftest import Excite
 
-from excite import sensors
+from excite import checkup, diagnose, log, sensors
+from excite.separate import Rivals
 from excite.simulate import Motion, simulate
 from model import effects, machine, prediction
 from model.machine import EffectEntry
@@ -86,6 +87,40 @@ def test_bad_input_is_refused_before_the_work(sloping: Path, tmp_path: Path, exc
         assert words in stderr
         assert stderr.count("\n") == 1
         assert not (tmp_path / "d").exists()
+
+
+def test_a_drive_is_designed_for_what_is_tied(straight: Model, tmp_path: Path) -> None:
+    """From its log both amounts can be told, each beside the other whatever its shape; a sensor's flaw is passed over,
+    and without a problem to design for there is none."""
+    short = straight.machine.problems["S40"].model_copy(
+        update={"duration_s": straight.machine.problems["S40"].duration_s.model_copy(update={"value": 12.0})}
+    )
+    machine = straight.machine.model_copy(update={"problems": {"S40": short}, "problem": "S40"})
+    told = ("torque_deadband@rear_roll=80", "asymmetric_coulomb@rear_roll=60", "encoder_eccentricity@rear_roll=0.01")
+    deadband, coulomb, eccentric = (effects.parse(text, machine, 12.0) for text in told)
+    pairs = [Rivals(machine, (deadband, eccentric)), Rivals(machine, (deadband, coulomb))]
+    assert checkup.separating(tmp_path, machine, pairs[:1], True) is None
+    nowhere = machine.model_copy(update={"problem": None})
+    assert checkup.separating(tmp_path, nowhere, pairs, True) is None
+    assert not list(tmp_path.iterdir())
+
+    said = checkup.separating(tmp_path, machine, pairs, False)
+    assert said == {"between": list(told[:2]), "folder": None}
+    said = checkup.separating(tmp_path, machine, pairs, True)
+    assert said is not None
+    assert said["between"] == list(told[:2])
+    drawn = json.loads((tmp_path / said["folder"] / "summary.json").read_text())
+    assert drawn["objective"] == "discrimination"
+    assert drawn["max_violation"] < 1e-3
+    assert said["sigma_percent"] == max(drawn["sigma_percent"][t.partition("=")[0]] for t in told[:2]) < 20
+
+    # Driven with the one, the log prefers it to the other by what the design promises.
+    torque, q0, nu0 = log.read_profile(tmp_path / said["folder"] / "profile.csv", straight)
+    both = [prediction.build(effects.extended(machine, e)) for e in (deadband, coulomb)]
+    motion = simulate(both[0], torque, q0=q0, nu0=nu0)
+    one = log.check(sensors.measure(both[0], motion, seed=2), machine)
+    right, wrong = (diagnose.fitted(m.machine, [one], machine.filter).fit for m in both)
+    assert wrong.cost - right.cost > diagnose.CLOSE
 
 
 @pytest.mark.slow

@@ -378,8 +378,13 @@ def test_the_run_that_separates_has_the_machines_names(
 ) -> None:
     """No drive tells which of two wheels of one side resists: both push along the same line."""
     effect, _, where = cause.partition("@")
-    found = replace(biased[1].findings[0], effect=effect, where=where, tied_with=(rival,))
-    assert separate.run(replace(biased[1], findings=(found,))) == said
+    machine = biased[1].before.machine
+    tied = (effects.parse(f"{rival}=1", machine, 8.0),)
+    found = replace(biased[1].findings[0], effect=effect, where=where, rivals=tied)
+    diagnosis = replace(biased[1], findings=(found,))
+    assert separate.run(diagnosis) == said
+    pairs = separate.rivals(diagnosis)
+    assert [(p.machine, p.between) for p in pairs] == ([] if said is None else [(machine, (found.entry, tied[0]))])
 
 
 def test_footprints_stand_where_the_wheels_do() -> None:
