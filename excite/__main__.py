@@ -521,6 +521,8 @@ def main() -> None:
         except (KeyboardInterrupt, typer.Abort):
             _fail("interrupted, nothing was written", INTERRUPTED)
         except Exception as err:
+            if isinstance(err, OSError) and err.errno == errno.ENAMETOOLONG:
+                _fail(f"{str(err.filename)[:40]}...: is too long a name for a file", 2)
             code = _exit_code(err)
             if code is not None:
                 _fail(" ".join(str(err).split()), code)
