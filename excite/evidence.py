@@ -22,7 +22,8 @@ from excite.linearise import BATCH, Batch, Chart, Slopes, differentiate
 from excite.processing import implicit
 from excite.record import Point, Record, smoothed
 from model import effects
-from model.effects import CATALOGUE, Effect, Placed
+from model.effect import Effect, Placed, Site
+from model.effects import CATALOGUE
 from model.equations import Signatures as MadeSignatures
 from model.equations import signatures
 from model.machine import Machine
@@ -74,7 +75,7 @@ def candidates(machine: Machine, sensors: Sequence[str], duration: float, known:
         for where, (bodies, sensor) in effects.places(machine, effect).items():
             if f"{effect.name}@{where}" in known or (effect.reading is not None and sensor not in sensors):
                 continue
-            site = effects.Site(machine, machine.find(bodies[0]), duration)
+            site = Site(machine, machine.find(bodies[0]), duration)
             for values, width in _grid(effect, site):
                 placed = Placed(effect, where, bodies, sensor, values)
                 found.append(Candidate(placed, tuple(range(columns, columns + width))))
@@ -82,7 +83,7 @@ def candidates(machine: Machine, sensors: Sequence[str], duration: float, known:
     return found
 
 
-def _grid(effect: Effect, site: effects.Site) -> list[tuple[dict[str, float], int]]:
+def _grid(effect: Effect, site: Site) -> list[tuple[dict[str, float], int]]:
     """Amounts and shapes that are tried, each with its number of columns."""
     names = [n for n, s in effect.shapes.items() if not s.circular]
     sizes = [effect.shapes[n].size(site) for n in names]
@@ -105,7 +106,7 @@ def finer(scores: Sequence[Score], machine: Machine, duration: float, reach: flo
     columns = 0
     for score in scores:
         placed = score.candidate.placed
-        site = effects.Site(machine, machine.find(placed.bodies[0]), duration)
+        site = Site(machine, machine.find(placed.bodies[0]), duration)
         for values in _about(placed, site, reach):
             width = len(score.candidate.columns)
             own = Placed(placed.effect, placed.where, placed.bodies, placed.sensor, values)
@@ -114,7 +115,7 @@ def finer(scores: Sequence[Score], machine: Machine, duration: float, reach: flo
     return found
 
 
-def _about(placed: Placed, site: effects.Site, reach: float) -> list[dict[str, float]]:
+def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
     """Values near those of a candidate: shapes up to two thirds of the way to the grid's next points."""
     grids: dict[str, list[float]] = {}
     if len(placed.effect.grid) > 1:

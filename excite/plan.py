@@ -47,6 +47,7 @@ from excite.objective import OBJECTIVES
 from model import effects as catalogue
 from model import machine as machines
 from model import prediction
+from model.effect import DURATION
 from model.machine import Machine, MachineError, Number, Record
 
 STEPS = ("design", "simulate", "identify", "diagnose", "verify")
@@ -396,7 +397,7 @@ def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:
             asked.problem(plan.designed(d), d.problem, d.duration_s)
     if fresh(d.machine, cell.effects):
         for text in cell.effects:
-            catalogue.parse(text, machine, catalogue.DURATION)
+            catalogue.parse(text, machine, DURATION)
         names = [t.partition("=")[0] for t in cell.effects]
         if len(set(names)) < len(names):
             raise StudyError(f"effects: {', '.join(cell.effects)}: an effect is given twice")

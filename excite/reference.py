@@ -20,6 +20,7 @@ import model
 from excite import asked, compare, handbook, identify, limit, objective, plan, sensors
 from model import effects, units
 from model import machine as machines
+from model.effect import DURATION, Effect, Shape, Site, one
 from model.machine import Machine, Record
 
 HIDDEN = ("__main__",)
@@ -89,18 +90,18 @@ def effects_page() -> str:
     return _page(*lines)
 
 
-def _typical(machine: Machine, e: effects.Effect, bodies: tuple[int, ...]) -> float:
-    return e.amount(effects.Site(machine, machine.find(bodies[0]), effects.DURATION))
+def _typical(machine: Machine, e: Effect, bodies: tuple[int, ...]) -> float:
+    return e.amount(Site(machine, machine.find(bodies[0]), DURATION))
 
 
-def _amount(e: effects.Effect) -> str:
+def _amount(e: Effect) -> str:
     unit = "without unit" if e.unit == "-" else f"in {e.unit}"
     sign = ", positive" if e.positive else "; the smaller, the larger the effect" if e.inverse else ""
     return f"Amount {unit}{sign}."
 
 
-def _shape(name: str, shape: effects.Shape) -> tuple[str, str, str, str]:
-    of = "" if shape.size is effects._one else " of the site's size"
+def _shape(name: str, shape: Shape) -> tuple[str, str, str, str]:
+    of = "" if shape.size is one else " of the site's size"
     return name, shape.unit, f"{shape.default:.3g}{of}", ", ".join(f"{x:.3g}" for x in shape.grid) + of
 
 

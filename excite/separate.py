@@ -17,7 +17,7 @@ from excite.diagnose import Diagnosis, Stage
 from excite.evidence import remembered
 from excite.record import smoothed
 from model import effects
-from model.effects import Placed, Site
+from model.effect import Placed, Site
 from model.equations import Signatures, signatures
 from model.machine import EffectEntry, Machine
 

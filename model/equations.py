@@ -13,6 +13,7 @@ import casadi as ca
 
 from model import contact, tree
 from model import effects as catalogue
+from model.effect import Placed, Rolling, Scene, Soil, Values
 from model.machine import Body, Machine, MachineError
 
 
@@ -46,9 +47,9 @@ class Sample:
 class Acting:
     """An effect in a sample: what it sees, and its amount and shapes."""
 
-    placed: catalogue.Placed
-    scene: catalogue.Scene
-    values: catalogue.Values
+    placed: Placed
+    scene: Scene
+    values: Values
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ def sample_of(machine: Machine, standard: tuple[str, ...]) -> Sample:
     )
 
 
-def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[catalogue.Placed]) -> Equations:
+def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Placed]) -> Equations:
     """The functions of a machine with effects. Raises MachineError for a contact that can't roll as the law has it."""
     for body in machine.contacts:
         _check_axis(machine, body)
@@ -159,7 +160,7 @@ def _check_axis(machine: Machine, body: Body) -> None:
         )
 
 
-def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[catalogue.Placed]) -> Signatures:
+def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Placed]) -> Signatures:
     """What each of these effects alone adds to a machine with standard parameters of these names."""
     s = sample_of(machine, standard)
     inertia = {b.index: tree.inertial_vector(b, s.by_name) for b in machine.body}
@@ -198,7 +199,7 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[cat
     )
 
 
-def _acting(s: Sample, placed: Sequence[catalogue.Placed]) -> tuple[tuple[str, ...], ca.SX, list[Acting]]:
+def _acting(s: Sample, placed: Sequence[Placed]) -> tuple[tuple[str, ...], ca.SX, list[Acting]]:
     """What effects remember, its symbols z, and the effects with what they see of a sample."""
     memory = ["time"] if any(e.effect.timed for e in placed) else []
     memory += [f"{e.name}.{m}" for e in placed for m in e.effect.memory]
@@ -209,10 +210,10 @@ def _acting(s: Sample, placed: Sequence[catalogue.Placed]) -> tuple[tuple[str, .
     return tuple(memory), z, acting
 
 
-def _scene(s: Sample, time: ca.SX) -> catalogue.Scene:
+def _scene(s: Sample, time: ca.SX) -> Scene:
     """A sample as every effect sees it."""
     turning = [b for b in s.machine.body if b.coordinates and b.joint != "planar" and b.friction is not None]
-    return catalogue.Scene(
+    return Scene(
         {b.index: s.at[b.coordinates[0]] for b in turning},
         {b.index: s.rate[b.coordinates[0]] for b in turning},
         dict(zip([b.index for b in s.machine.actuated], ca.vertsplit(s.u), strict=True)),
@@ -224,7 +225,7 @@ def _scene(s: Sample, time: ca.SX) -> catalogue.Scene:
     )
 
 
-def _seeing(s: Sample, scene: catalogue.Scene, e: catalogue.Placed, z: Mapping[str, ca.SX]) -> Acting:
+def _seeing(s: Sample, scene: Scene, e: Placed, z: Mapping[str, ca.SX]) -> Acting:
     values = {key: s.by_name.get(name, ca.SX(e.values[key])) for name, (key, _) in e.parameters.items()}
     return Acting(e, replace(scene, z=z), values)
 
@@ -286,7 +287,7 @@ def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
     return force
 
 
-def _rolling(s: Sample, body: Body) -> tuple[catalogue.Rolling, ca.SX]:
+def _rolling(s: Sample, body: Body) -> tuple[Rolling, ca.SX]:
     """How a roll moves, and how (Vx, Vy, spin, yaw) follow from the velocities (4, n_q)."""
     assert body.contact is not None
     assert not isinstance(body.antecedent, str)
@@ -297,10 +298,10 @@ def _rolling(s: Sample, body: Body) -> tuple[catalogue.Rolling, ca.SX]:
     spin = (R[:, 2].T @ turn) @ roll.omega
     yaw = carrier.omega[2]
     lever = ca.jacobian(ca.vertcat(centre[0], centre[1], spin, yaw), s.nu)
-    return catalogue.Rolling(body.contact, centre[0], centre[1], spin, yaw), lever
+    return Rolling(body.contact, centre[0], centre[1], spin, yaw), lever
 
 
-def _soil(s: Sample, body: Body, rolling: catalogue.Rolling) -> catalogue.Soil:
+def _soil(s: Sample, body: Body, rolling: Rolling) -> Soil:
     """The soil under a roll as the machine file has it."""
     law = rolling.contact
     saturation = None
@@ -308,10 +309,10 @@ def _soil(s: Sample, body: Body, rolling: catalogue.Rolling) -> catalogue.Soil:
         assert law.saturation_slip is not None
         saturation = ca.SX(float(law.saturation_slip))
     Kx, Ky = s.by_name[f"Kx{body.index}"], s.by_name[f"Ky{body.index}"]
-    return catalogue.Soil(rolling.slip, rolling.yaw, Kx, Ky, saturation)
+    return Soil(rolling.slip, rolling.yaw, Kx, Ky, saturation)
 
 
-def _pushed(body: Body, soil: catalogue.Soil, lever: ca.SX) -> ca.SX:
+def _pushed(body: Body, soil: Soil, lever: ca.SX) -> ca.SX:
     """Generalised contact force (n_q,) of a roll (11), by virtual power."""
     assert body.contact is not None
     w = contact.wrench(body.contact, soil.slip, soil.yaw, soil.Kx, soil.Ky, soil.saturation, soil.lateral)

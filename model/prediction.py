@@ -17,6 +17,7 @@ import numpy as np
 
 from model import effects as catalogue
 from model import tree
+from model.effect import DURATION, Placed, Site
 from model.equations import Equations, equations, kinematics
 from model.machine import Machine, MachineError
 
@@ -111,7 +112,7 @@ class Model:
     channels: ca.Function
     readable: tuple[str, ...]
     memory: tuple[str, ...]
-    effects: tuple[catalogue.Placed, ...]
+    effects: tuple[Placed, ...]
     flaws: bool
     shapes: bool
 
@@ -315,11 +316,11 @@ def _shown(found: Equations) -> set[str]:
     return {list(found.sample.by_name)[k] for k in set(columns)}
 
 
-def _amounts(machine: Machine, placed: Sequence[catalogue.Placed], shapes: bool) -> dict[str, tuple[float, str, float]]:
+def _amounts(machine: Machine, placed: Sequence[Placed], shapes: bool) -> dict[str, tuple[float, str, float]]:
     """Value, unit and typical size of every shape and amount that is a parameter, by name: amounts last."""
     found: dict[str, tuple[float, str, float]] = {}
     for e in placed:
-        site = catalogue.Site(machine, machine.find(e.bodies[0]), catalogue.DURATION)
+        site = Site(machine, machine.find(e.bodies[0]), DURATION)
         for name, (key, unit) in e.parameters.items():
             if key == "A":
                 size = abs(e.effect.amount(site))

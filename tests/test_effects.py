@@ -10,7 +10,8 @@ import pytest
 from excite import diagnose, evidence, log, sensors
 from excite.simulate import simulate
 from model import effects, machine
-from model.effects import CATALOGUE, Effect, Placed
+from model.effect import DURATION, Effect, Placed, Site
+from model.effects import CATALOGUE
 from model.equations import signatures
 from model.machine import EffectEntry, MachineError, Quantity
 from model.prediction import Model, build
@@ -55,7 +56,7 @@ def where(effect: Effect) -> str:
 
 def typical(effect: Effect) -> float:
     bodies, _ = effects.places(VA12, effect)[where(effect)]
-    return effect.amount(effects.Site(VA12, VA12.find(bodies[0]), effects.DURATION))
+    return effect.amount(Site(VA12, VA12.find(bodies[0]), DURATION))
 
 
 def extended(effect: Effect, amount: float) -> Model:

@@ -24,7 +24,8 @@ from scipy.optimize import least_squares
 
 from excite.report import COLOURS, STYLES, save
 from model import contact
-from model.effects import CATALOGUE, Rolling, Scene, Soil
+from model.effect import Rolling, Scene, Soil
+from model.effects import CATALOGUE
 from model.machine import Contact, Quantity
 
 HERE = Path(__file__).parent

@@ -1,0 +1,190 @@
+"""What an effect is: what it sees of a sample, where it can sit, what its amount and shapes mean, what it does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+
+from model import contact as law
+from model.machine import Body, Contact, Machine
+
+DURATION = 60.0  # [s] of a log, where nobody says
+Values = Mapping[str, ca.SX]  # the amount "A" and the shapes by name
+
+
+@dataclass(frozen=True)
+class Rolling:
+    """How a contact, a roll or a wheel, moves: its centre's velocity along and across its chassis [m/s], spin and yaw
+    rate [rad/s]."""
+
+    contact: Contact
+    Vx: ca.SX
+    Vy: ca.SX
+    spin: ca.SX
+    yaw: ca.SX
+
+    @property
+    def slip(self) -> law.Slip:
+        return law.slip(self.contact, self.Vx, self.Vy, self.spin)
+
+
+@dataclass(frozen=True)
+class Soil:
+    """What a contact's wrench is made from: slips, yaw rate, stiffnesses Kx, Ky [N], saturations (None: linear)."""
+
+    slip: law.Slip
+    yaw: ca.SX
+    Kx: ca.SX
+    Ky: ca.SX
+    saturation: ca.SX | None = None
+    lateral: ca.SX | None = None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One sample as an effect sees it.
+
+    q, w: angle and rate of a joint [rad, rad/s] by body; u: torque that its sensor feels, flaws aside [N m]; friction:
+    Fv w + Fs sgn w [N m]; smooth: the rate over which sgn turns; rolling: of contacts; ahead: V_x of each body's origin
+    in its own axes [m/s]; time [s] since the log began; z: what this effect remembers, by name.
+    """
+
+    q: Mapping[int, ca.SX]
+    w: Mapping[int, ca.SX]
+    u: Mapping[int, ca.SX]
+    friction: Mapping[int, ca.SX]
+    smooth: Mapping[int, float]
+    rolling: Mapping[int, Rolling]
+    ahead: Mapping[int, ca.SX]
+    time: ca.SX
+    z: Mapping[str, ca.SX] = field(default_factory=dict)
+
+    def sign(self, k: int) -> ca.SX:
+        """sgn of a joint's rate, smoothed as its friction is."""
+        return ca.tanh(self.w[k] / self.smooth[k])
+
+    def others(self, k: int) -> list[int]:
+        """The other driven contacts."""
+        return [j for j in self.rolling if j != k and j in self.u]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A torque sensor: u_measured(t) = gain u(t - delay) + offset."""
+
+    gain: ca.SX | float = 1.0
+    offset: ca.SX | float = 0.0
+    delay: ca.SX | float = 0.0
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where an effect is looked for: a body (the joint or the first of several), the log's length [s]."""
+
+    machine: Machine
+    body: Body
+    duration: float
+
+
+def one(site: Site) -> float:
+    return 1.0
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What an effect's amount leaves open: default and grid in units of `size`, which belongs to the site.
+
+    `circular`: a phase, found by its sine and cosine; `whole`: an integer, not refined. What is zero by default may
+    have either sign.
+    """
+
+    unit: str
+    default: float
+    grid: tuple[float, ...]
+    size: Callable[[Site], float] = one
+    circular: bool = False
+    whole: bool = False
+
+    @property
+    def signed(self) -> bool:
+        return self.circular or self.default == 0
+
+
+@dataclass(frozen=True)
+class Memory:
+    """A state of its own that an effect has: its rate of change, and how far it may be from zero when a log begins."""
+
+    rate: Callable[[Scene, int, Values], ca.SX]
+    spread: float
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One entry of the catalogue.
+
+    `places`: joints, contacts (driven ones), drive (all of these together), articulation, wheels (measuring ones),
+    yaw_rate, lateral_speed, machine. `amount`: a typical one [unit] at a site, `grid`: shares of it that are tried
+    where the signature isn't proportional to the amount. `positive`: a negative amount makes no sense; `inverse`: the
+    smaller the amount, the larger the effect; `angular`: a reading's error that only a sensor of an angle has, none of
+    a rate. Hooks take the scene, the body they act on, and the values.
+    """
+
+    name: str
+    places: tuple[str, ...]
+    unit: str
+    meaning: str
+    signature: str
+    source: str
+    amount: Callable[[Site], float]
+    shapes: Mapping[str, Shape] = field(default_factory=dict)
+    grid: tuple[float, ...] = (1.0,)
+    positive: bool = False
+    inverse: bool = False
+    torque: Callable[[Scene, int, Values], ca.SX] | None = None
+    soil: Callable[[Scene, int, Values, Soil], Soil] | None = None
+    push: Callable[[Scene, int, Values], tuple[ca.SX, ca.SX]] | None = None
+    gravity: Callable[[Scene, Values], tuple[ca.SX, ca.SX]] | None = None
+    inertia: Callable[[Scene, Values], dict[str, ca.SX]] | None = None
+    reading: Callable[[Scene, ca.SX, int, Values], ca.SX] | None = None
+    channel: Callable[[ca.SX, Values], Channel] | None = None
+    memory: Mapping[str, Memory] = field(default_factory=dict)
+    timed: bool = False
+    angular: bool = False
+
+    @property
+    def sensed(self) -> bool:
+        """Whether it sits in a sensor only, so that no equation of motion shows it."""
+        return not (self.torque or self.soil or self.push or self.gravity or self.inertia or self.channel)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An effect at a place: `bodies` it acts on, the sensor it sits in, values of amount and shapes."""
+
+    effect: Effect
+    where: str
+    bodies: tuple[int, ...]
+    sensor: str | None
+    values: Mapping[str, float]
+
+    @property
+    def name(self) -> str:
+        return f"{self.effect.name}@{self.where}"
+
+    @property
+    def parameters(self) -> dict[str, tuple[str, str]]:
+        """Names as parameters of the model -> (value's key, unit): the amount first, then the shapes."""
+        named = {self.name: ("A", self.effect.unit)}
+        return named | {f"{self.name}.{s}": (s, shape.unit) for s, shape in self.effect.shapes.items()}
+
+    def channel(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gain, offset and delay (N,) that the effect gives a torque sensor at times t (N,) [s]."""
+        assert self.effect.channel is not None
+        time = ca.SX.sym("t")
+        own = self.effect.channel(time, {k: ca.SX(v) for k, v in self.values.items()})
+        read = ca.Function("channel", [time], [ca.SX(x) for x in (own.gain, own.offset, own.delay)])
+        gain, offset, delay = (np.broadcast_to(x.full()[0], t.shape) for x in read(t[None]))
+        return gain, offset, delay
