@@ -6,6 +6,7 @@ that a worker that dies costs no result, and finds the piece that kills every wo
 
 from __future__ import annotations
 
+import logging
 import signal
 import time
 from collections import deque
@@ -19,6 +20,7 @@ import joblib
 
 AHEAD = 2  # pieces in flight per worker: one at work, one at hand
 TRIES = 2  # deaths of a worker that had a piece alone, before the piece is to blame
+LOGGERS = ("distributed", "distributed.client")  # of Dask, with levels of their own
 THREADS = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 T = TypeVar("T")
@@ -123,11 +125,15 @@ class Cluster:
             import distributed
         except ImportError:
             raise EngineError("--cluster needs Dask: pip install 'excite[cluster]'") from None
+        self._levels = {logger: logger.level for logger in map(logging.getLogger, LOGGERS)}
+        for logger in self._levels:  # their tracebacks of a lost connection: what it means is said in a line
+            logger.setLevel(logging.CRITICAL)
         try:
             client: Any = distributed.Client  # has no types
             self._client = client(address, timeout=10, set_as_default=False)
             self._client.wait_for_workers(1, timeout=30)
         except (OSError, ValueError, TimeoutError) as err:
+            self._loud()
             raise EngineError(f"--cluster {address}: no scheduler with a worker answers: {err}") from None
         self._executor = self._client.get_executor(pure=False)
 
@@ -148,6 +154,11 @@ class Cluster:
     def close(self) -> None:
         with suppress(Exception):  # the scheduler may be gone
             self._client.close(timeout=5)
+        self._loud()
+
+    def _loud(self) -> None:
+        for logger, level in self._levels.items():
+            logger.setLevel(level)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import shutil
 import signal
 import sqlite3
@@ -415,12 +416,13 @@ def test_no_cluster_is_said_in_a_line(tiny: Callable[..., Plan], tmp_path: Path,
 # ------------------------------------------------------------------------------------------------ really killed
 
 
-@pytest.fixture
-def snapshot(tmp_path: Path) -> dict[str, str]:
+@pytest.fixture(scope="module")
+def snapshot(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """An environment with a copy of the program, so that an edit under way doesn't change it while a study runs."""
+    place = tmp_path_factory.mktemp("program")
     for name in ("excite", "model"):
-        shutil.copytree(ROOT / name, tmp_path / "program" / name, ignore=shutil.ignore_patterns("__pycache__"))
-    return os.environ | {"PYTHONPATH": str(tmp_path / "program"), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        shutil.copytree(ROOT / name, place / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return os.environ | {"PYTHONPATH": str(place), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
 @pytest.fixture
@@ -592,43 +594,187 @@ def test_a_full_file_system_is_said_and_the_study_goes_on_after(
         subprocess.run(["umount", str(small)], check=False)
 
 
-@pytest.mark.slow
-def test_a_cluster_gives_the_same_table_and_survives_a_worker(
-    tiny: Callable[..., Plan], tmp_path: Path, snapshot: dict[str, str]
-) -> None:
-    """A real Dask scheduler and two workers, each a process of its own; one is killed (-9) under way."""
-    pytest.importorskip("distributed")
-    wanted = tiny(300)
-    study.carry(wanted, tmp_path / "here", jobs=1)
-    dask = [sys.executable, "-m", "distributed.cli"]
-    started: list[subprocess.Popen[bytes]] = []
+SAME = ("runs.parquet", "study.json", "study.png")  # the report and the summary say how long it took as well
 
-    def start(*args: str) -> subprocess.Popen[bytes]:
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        started.append(subprocess.Popen([*dask, *args], cwd=tmp_path, env=snapshot, **quiet))  # type: ignore[call-overload]
-        return started[-1]
 
-    dask[-1:] = ["distributed.cli.dask_scheduler"]
-    try:
-        start("--port", "0", "--no-dashboard", "--scheduler-file", "scheduler.json", "--host", "127.0.0.1")
+RUNS = 300
+
+
+class Command:
+    """`excite study` on a study of RUNS runs, as a process of its own."""
+
+    def __init__(self, file: Path, out: Path, env: dict[str, str], *options: str) -> None:
+        self.out = out
+        command = [sys.executable, "-m", "excite", "study", str(file), *options, "--out", str(out)]
+        self.run = subprocess.Popen(command, cwd=file.parent, env=env, stderr=subprocess.PIPE, text=True)
+
+    def midway(self, rows: int) -> int:
+        """Waits until so many rows are kept; how many there are then."""
         begin = time.monotonic()
-        while not (tmp_path / "scheduler.json").exists() and time.monotonic() - begin < 60:
-            time.sleep(0.2)
-        address = json.loads((tmp_path / "scheduler.json").read_text())["address"]
-        dask[-1:] = ["distributed.cli.dask_worker"]
-        workers = [start(address, "--nthreads", "1", "--no-dashboard", "--no-nanny") for _ in range(2)]
-        command = [sys.executable, "-m", "excite", "study", "tiny.toml", "--cluster", address, "--out", "there"]
-        run = subprocess.Popen(command, cwd=tmp_path, env=snapshot, stderr=subprocess.PIPE)
+        while (kept := kept_rows(self.out)) < rows:
+            assert self.run.poll() is None, f"ended with {kept} rows, too early to be disturbed"
+            assert time.monotonic() - begin < 300
+            time.sleep(0.02)
+        assert kept < RUNS
+        return kept
+
+    def said(self, code: int = 0) -> str:
+        """Waits for its end; what it wrote to stderr."""
+        _, stderr = self.run.communicate(timeout=600)
+        assert self.run.returncode == code, stderr
+        assert "Traceback" not in stderr
+        return stderr
+
+    def results(self) -> list[bytes]:
+        return [(self.out / name).read_bytes() for name in SAME]
+
+
+@pytest.fixture(scope="module")
+def whole(
+    tmp_path_factory: pytest.TempPathFactory, straight: Model, short: Motion, snapshot: dict[str, str]
+) -> Command:
+    """The study as one process computes it, undisturbed."""
+    place = tmp_path_factory.mktemp("whole")
+    log.profile(straight, short).to_csv(place / "drive.csv", index=False)
+    (place / "tiny.toml").write_text(TINY.replace("{runs}", str(RUNS // 2)))
+    command = Command(place / "tiny.toml", place / "out", snapshot, "--jobs", "1")
+    command.said()
+    return command
+
+
+@pytest.fixture
+def carried(whole: Command, tmp_path: Path, snapshot: dict[str, str]) -> Iterator[Callable[..., Command]]:
+    """Starts the command on the same study."""
+    running: list[Command] = []
+
+    def start(*options: str) -> Command:
+        running.append(Command(whole.out.parent / "tiny.toml", tmp_path / "out", snapshot, *options))
+        return running[-1]
+
+    yield start
+    for one in running:
+        one.run.kill()
+        one.run.wait()
+
+
+class Dask:
+    """A real Dask scheduler and its workers, each a process of its own."""
+
+    def __init__(self, place: Path, env: dict[str, str]) -> None:
+        self.place, self.env = place, env
+        self.started: list[subprocess.Popen[bytes]] = []
+        self.scheduler()
+
+    def _start(self, what: str, *args: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{what}", *args, "--no-dashboard"]
+        quiet = subprocess.DEVNULL
+        self.started.append(subprocess.Popen(command, cwd=self.place, env=self.env, stdout=quiet, stderr=quiet))
+        return self.started[-1]
+
+    def scheduler(self) -> subprocess.Popen[bytes]:
+        file = self.place / "scheduler.json"
+        file.unlink(missing_ok=True)
+        started = self._start("scheduler", "--port", "0", "--scheduler-file", file.name, "--host", "127.0.0.1")
         begin = time.monotonic()
-        while kept_rows(tmp_path / "there") < 5 and run.poll() is None and time.monotonic() - begin < 120:
+        while not file.exists() and time.monotonic() - begin < 60:
             time.sleep(0.1)
-        workers[0].kill()
-        _, stderr = run.communicate(timeout=600)
-        assert run.returncode == 0, stderr.decode()
-    finally:
-        for process in started:
+        self.address = str(json.loads(file.read_text())["address"])
+        return started
+
+    def worker(self) -> subprocess.Popen[bytes]:
+        return self._start("worker", self.address, "--nthreads", "1", "--no-nanny")
+
+    def close(self) -> None:
+        for process in self.started:
             process.kill()
             process.wait()
-    table, reference = (pd.read_parquet(tmp_path / n / "runs.parquet") for n in ("there", "here"))
-    same = [c for c in table.columns if c != "versions"]
-    pd.testing.assert_frame_equal(table[same], reference[same])
+
+
+@pytest.fixture
+def dask(tmp_path: Path, snapshot: dict[str, str]) -> Iterator[Dask]:
+    pytest.importorskip("distributed")
+    (tmp_path / "dask").mkdir()
+    cluster = Dask(tmp_path / "dask", snapshot)
+    yield cluster
+    cluster.close()
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_same_bytes_as_one(whole: Command, carried: Callable[..., Command]) -> None:
+    """Table, study and figure to the last byte."""
+    two = carried("--jobs", "2")
+    two.said()
+    assert two.results() == whole.results()
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_same_bytes_as_one_process(
+    whole: Command, carried: Callable[..., Command], dask: Dask
+) -> None:
+    for _ in range(2):
+        dask.worker()
+    there = carried("--cluster", dask.address)
+    there.said()
+    assert there.results() == whole.results()
+
+
+@pytest.mark.slow
+def test_killed_workers_of_a_cluster_cost_nothing(whole: Command, carried: Callable[..., Command], dask: Dask) -> None:
+    """Both workers are killed (-9) under way, one after the other, and a third one comes."""
+    workers = [dask.worker() for _ in range(2)]
+    struck = carried("--cluster", dask.address)
+    kept = struck.midway(RUNS // 10)
+    workers[0].kill()
+    struck.midway(kept + RUNS // 10)
+    dask.worker()
+    workers[1].kill()
+    struck.said()
+    assert struck.results() == whole.results()
+
+
+@pytest.mark.slow
+def test_a_killed_scheduler_is_said_and_the_study_goes_on(
+    whole: Command, carried: Callable[..., Command], dask: Dask
+) -> None:
+    """Exit 1 with a line; the same command goes on with another cluster, and again after it is killed (-9) itself."""
+    dask.worker()
+    first = carried("--cluster", dask.address)
+    first.midway(RUNS // 10)
+    dask.close()
+    last = first.said(1).strip().splitlines()[-1]
+    assert last.startswith("excite: ")
+    assert "repeat the command" in last
+    kept = kept_rows(first.out)
+    assert RUNS // 10 <= kept < RUNS
+    dask.scheduler()
+    dask.worker()
+    second = carried("--cluster", dask.address)
+    more = second.midway(kept + RUNS // 10)
+    second.run.kill()
+    assert f"running: {kept} of {RUNS}" in second.said(-signal.SIGKILL)
+    third = carried("--cluster", dask.address)
+    found = re.search(rf"running: (\d+) of {RUNS}", third.said())
+    assert found
+    assert more <= int(found[1]) < RUNS
+    assert third.results() == whole.results()
+
+
+def workers_of(driver: int) -> list[int]:
+    """The processes that compute for a driver, the oldest first."""
+    children = Path(f"/proc/{driver}/task/{driver}/children").read_text().split()
+    return [int(p) for p in children if b"LokyProcess" in Path(f"/proc/{p}/cmdline").read_bytes()]
+
+
+@pytest.mark.slow
+def test_killed_workers_of_this_machine_cost_nothing(whole: Command, carried: Callable[..., Command]) -> None:
+    """The plain command on two cores: three of its workers are killed (-9) under way."""
+    struck = carried("--jobs", "2")
+    kept, killed = 0, set()
+    for k in range(3):
+        kept = struck.midway(kept + RUNS // 10)
+        victim = workers_of(struck.run.pid)[k % 2]
+        os.kill(victim, signal.SIGKILL)
+        killed.add(victim)
+    assert len(killed) == 3
+    struck.said()
+    assert struck.results() == whole.results()
