@@ -441,14 +441,25 @@ app.add_typer(machine_files, name="machine")
 @machine_files.command("new")
 def new_machine(
     name: Annotated[str, typer.Argument(metavar="NAME", help="of the machine")],
+    like: Annotated[
+        str | None,
+        typer.Option(
+            "--like",
+            help="a shipped machine that it is but for its logger: columns and units to change",
+            autocompletion=_machine_names,
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="file to write [NAME.toml]")] = None,
     json: JsonOption = False,
 ) -> None:
     """Writes a commented machine file to start from."""
     from excite import machinecheck
+    from model import machine
 
+    if like is not None:
+        asked.known("--like", like, machine.shipped())
     out = out or Path(f"{name}.toml")
-    machinecheck.start(name, out)
+    machinecheck.start(name, out, like)
     if json:
         terminal.show_json({"machine": name, "file": str(out)})
     else:

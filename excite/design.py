@@ -129,18 +129,18 @@ def _infeasible(aim: Aim, best: Candidate, complete: bool) -> InfeasibleError:
     """What to say where no start ended inside the limits: which one can't be met, and by how much."""
     name = max(best.violations, key=lambda limit: best.violations[limit])
     excess = best.excess
-    short = "" if complete else ", give more time"
+    cut = "the search was cut short, give more time"
     if name == SIGMA_MAX and aim.sigma_max is not None:
         return InfeasibleError(
             f"no drive found that is accurate enough: {name} {aim.sigma_max:g} % is exceeded by {100 * excess:.2g} %,"
-            f" the worst parameter comes out at {aim.sigma_max * (1 + excess):.3g} % in the best attempt{short}; allow"
-            " more, or give a longer duration or more starts",
+            f" the worst parameter comes out at {aim.sigma_max * (1 + excess):.3g} % in the best attempt;"
+            f" {'allow more, or give a longer duration or more starts' if complete else cut}",
             name,
             excess,
         )
     return InfeasibleError(
         f"no drive found that keeps every limit: {name} is exceeded by {100 * excess:.2f} % of its range in the"
-        f" best attempt{short}; widen it, or give another duration or more starts",
+        f" best attempt; {'widen it, or give another duration or more starts' if complete else cut}",
         name,
         excess,
     )

@@ -242,7 +242,10 @@ def looks_like(table: pd.DataFrame, machine: Machine) -> str:
         columns = {other.time_column, *(s.column for s in other.sensors("paper"))}
         if columns <= {str(c) for c in table.columns}:
             return f"; this looks like a log of {name}"
-    return f"; is this a log of {machine.name}? The machine file names each sensor's column"
+    return (
+        f"; is this a log of {machine.name}? The machine file names each sensor's column: `excite machine new NAME"
+        f" --like {machine.name}` writes one with columns and units to change"
+    )
 
 
 def profile(model: Model, motion: Motion) -> pd.DataFrame:

@@ -15,14 +15,14 @@ TELLING = 10  # runs before the time left can be told
 
 
 def say(thing: object) -> None:
-    """Prints a line or a table."""
+    """Prints a line or a table, brackets as they are."""
     from rich.console import Console
 
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     if console.is_terminal:
         console.print(thing)
     else:  # a pipe or file has no width: whole lines, whole tables
-        Console(highlight=False, width=200).print(thing, soft_wrap=True)
+        Console(highlight=False, markup=False, width=200).print(thing, soft_wrap=True)
 
 
 def show_json(summary: dict[str, Any]) -> None:
@@ -215,7 +215,7 @@ def diagnose_table(summary: dict[str, Any]) -> None:
         said = f"{where}/profile.csv is designed to" if where else "--next designs a drive to"
         say(f"{said} tell {first} from {second}")
     if summary["machine_file"]:
-        say(f"the machine with what was found: {summary['machine_file']}, for every command")
+        say(f"the machine with what was found, for every command: {summary['machine_file']} in this folder")
     for note in summary["notes"]:
         say(note)
 

@@ -12,10 +12,11 @@ import pytest
 import tomli_w
 from conftest import Excite
 
-from excite import machinecheck, topview
+from excite import log, machinecheck, sensors, topview
+from excite.simulate import Motion
 from model import tree
 from model.machine import Machine, MachineError, load, shipped
-from model.prediction import build
+from model.prediction import Model, build
 
 FRESH = machinecheck.fresh("mine", Path("mine.toml"))
 
@@ -209,3 +210,29 @@ def test_a_faulty_file_ends_with_1_and_a_missing_one_with_2(tmp_path: Path, exci
     code, _, stderr = excite("machine", "check", tmp_path / "nowhere.toml", "--out", tmp_path / "no")
     assert code == 2
     assert "no such file" in stderr
+
+
+def test_a_logger_of_its_own(excite: Excite, straight: Model, straight_motion: Motion, tmp_path: Path) -> None:
+    """A shipped machine with other columns and units: the file is written, the columns are changed, the log is read."""
+    path = tmp_path / "own.toml"
+    code, _, err = excite("machine", "new", "own", "--like", "va12_straight", "--out", path)
+    assert code == 0, err
+    assert load(path).sensors("full") == straight.machine.sensors("full")
+    table = sensors.measure(straight, straight_motion, seed=1)
+    odd = table.rename(columns={"t_s": "Time [ms]", "theta1_rad": "Front roll [deg]"})
+    odd["Time [ms]"] *= 1000
+    odd["Front roll [deg]"] = np.rad2deg(odd["Front roll [deg]"])
+    odd.to_csv(tmp_path / "odd.csv", index=False, sep=";", decimal=",")
+    code, shown, _ = excite("log", "check", tmp_path / "odd.csv", "--machine", "va12_straight", "--out", tmp_path / "a")
+    assert code == 1
+    assert "Front roll [deg]" in shown  # brackets are no markup
+    code, _, err = excite("identify", "va12_straight", tmp_path / "odd.csv", "--out", tmp_path / "b")
+    assert (code, "excite machine new NAME --like va12_straight" in err) == (2, True)
+    text = (
+        path.read_text(encoding="utf-8").replace('"t_s"', '"Time [ms]"').replace('time_unit = "s"', 'time_unit = "ms"')
+    )
+    path.write_text(text.replace('"theta1_rad"\nunit = "rad"', '"Front roll [deg]"\nunit = "deg"'), encoding="utf-8")
+    read = log.read(tmp_path / "odd.csv", load(path))
+    assert read.values["theta1"] == pytest.approx(table["theta1_rad"].to_numpy(), abs=1e-9)
+    code, _, err = excite("machine", "new", "other", "--like", "va13", "--out", tmp_path / "other.toml")
+    assert (code, "--like: va13 is unknown, allowed: double_loader" in err) == (2, True)
