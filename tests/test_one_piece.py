@@ -46,7 +46,8 @@ from excite.objective import Objective
 from excite.plan import Study
 from excite.simulate import simulate
 from model import effects, machine
-from model.effects import CATALOGUE, Effect
+from model.effect import Effect
+from model.effects import CATALOGUE
 from model.machine import Filter, MachineError, Problem
 from model.prediction import Model, build
 
