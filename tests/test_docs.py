@@ -58,8 +58,9 @@ def test_tutorial_runs_as_it_is_written(tmp_path: Path, monkeypatch: pytest.Monk
         if language == "python":
             exec(compile(text, "tutorial.md", "exec"), names)
         else:
-            subprocess.run(["bash", "-c", shell + text], check=True, env=ENVIRONMENT, timeout=300)
-    for written in ("design/report.html", "cab/sheet.pdf", "cab/driver.html", "checked/log.png", "found/report.html"):
+            subprocess.run(["bash", "-c", shell + text], check=True, env=ENVIRONMENT, timeout=600)
+    files = "design/report.html cab/sheet.pdf cab/driver.html checked/log.png found/report.html my_logger.toml"
+    for written in (*files.split(), "diagnosed/report.html", "two/runs.parquet"):
         assert (tmp_path / written).is_file()
 
 
