@@ -234,7 +234,7 @@ def run(
             raise KeyboardInterrupt
         checked = place / "verify"
         checked.mkdir()
-        second = works.verify(checked, designed, runs, method, kit, seed)
+        second = works.verify(checked, designed, runs, method, kit, seed, out / "design")
         summary = {"design": first, "verify": second}
         (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
 

@@ -62,7 +62,10 @@ def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief
     return summary
 
 
-def verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: str, seed: int) -> dict[str, Any]:
+def verify(
+    place: Path, design_dir: Path, runs: int, method: str | None, kit: str, seed: int, name: Path | None = None
+) -> dict[str, Any]:
+    """How true and how sure parameters from a design are. name: what the design's folder will be called."""
     asked.known("--kit", kit, sensors.KITS)
     made = stored.read(design_dir)
     if made.summary.get("after"):
@@ -82,7 +85,7 @@ def verify(place: Path, design_dir: Path, runs: int, method: str | None, kit: st
     summary = {
         "machine": model.machine.name,
         "problem": made.summary.get("problem"),
-        "design": str(design_dir),
+        "design": str(name or design_dir),
         "runs": runs,
         "method": method,
         "kit": kit,
