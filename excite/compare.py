@@ -24,7 +24,7 @@ from functools import partial
 import casadi as ca
 import joblib
 import numpy as np
-import scipy.optimize
+import scipy
 
 from excite import interior, manoeuvre, objective, smoothing
 from excite.aim import aim

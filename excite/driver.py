@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-import scipy.signal
+import scipy
 
 from excite.simulate import Motion, respond
 from model.prediction import Model

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
+import scipy
 
 from excite.estimate import Estimate, noted
 from excite.log import Log
@@ -68,7 +68,7 @@ def unmoved(model: Model, logs: Sequence[Log], filter: Filter, slow: bool) -> np
         return none
     motions = [samples(model, log, filter) for log in logs]
     second = round(float(machine.sampling_hz))
-    speed = np.max([np.abs(uniform_filter1d(s.nu, second, axis=1)).max(axis=1) for s in motions], axis=0)
+    speed = np.max([np.abs(scipy.ndimage.uniform_filter1d(s.nu, second, axis=1)).max(axis=1) for s in motions], axis=0)
     still = speed < STILL
     still[list(at_rest)] = True
     if not still.any():

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from excite.estimate import Estimate, NotIdentifiable
 from excite.log import Log

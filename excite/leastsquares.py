@@ -14,8 +14,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
-import scipy.signal
+import scipy
 
 DEPENDENT = 1e-10  # a column this close to a combination of the others carries nothing [relative]
 BLOCK = 20_000  # rows of a tall matrix that are reduced at once

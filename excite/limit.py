@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-import scipy.optimize
+import scipy
 
 from excite.simulate import Motion
 from model.machine import Problem

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-import scipy.integrate
-import scipy.signal
+import scipy
 
 from excite.log import Log
 from model.machine import Filter, Sensor

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from excite.estimate import Estimate, NotIdentifiable, noted
 from excite.leastsquares import Solution, Triangle, lag_one, merge, reduce, scores_covariance, solve

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import scipy.io
+import scipy
 
 SEPARATORS = ("\t", ";", ",", "|")
 ENCODINGS = ("utf-8-sig", "cp1252")  # the second reads any byte: what European loggers write

@@ -413,6 +413,15 @@ def test_no_cluster_is_said_in_a_line(tiny: Callable[..., Plan], tmp_path: Path,
     assert stderr.strip().splitlines()[-1].startswith("excite: ")
 
 
+def test_a_worker_loads_what_it_needs_alone() -> None:
+    """SciPy's signal processing and statistics take half a second to load: only where something is filtered."""
+    code = (
+        "import sys, excite.cell; print([m for m in ('scipy.signal', 'scipy.stats', 'matplotlib') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 # ------------------------------------------------------------------------------------------------ really killed
 
 
