@@ -161,12 +161,10 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
     tell = advance or (lambda share, what: None)
     tell(0.0, "fitting the model")
     before = fitted(model.machine, logs, filter)
-    stage, chosen, first = before, list[_Choice](), tuple[evidence.Score, ...]()
+    stage, chosen, first = before, list[Choice](), tuple[evidence.Score, ...]()
     for turn in range(MOST):
         tell(0.15 + 0.2 * turn, "scoring effects")
-        known = [e.name for e in stage.model.effects]
-        found = evidence.candidates(model.machine, [s.name for s in stage.prepared.c.sensors], _duration(logs), known)
-        scores = evidence.scan(stage.prepared.c, stage.prepared.records, stage.fit, found).scores
+        scores = _scores(stage)
         first = first or scores
         explained = sum(x.gain for x in chosen)
         choice = _choose(stage, scores, explained, tell, 0.2 + 0.2 * turn)
@@ -174,6 +172,10 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
             break
         chosen.append(choice)
         stage = choice.stage
+    if len(chosen) > 1:
+        tell(0.9, "judging each given the others")
+        chosen = reviewed(before, chosen)
+        stage = chosen[-1].stage
     tell(0.95, "weighing")
     # A name that leaves most of the misfit where it was is none, unless with what came after it nothing is left.
     odd, nearest = _odd(stage), None
@@ -189,6 +191,52 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
     return answer if answer.findings else replace(answer, nearest=nearest)
 
 
+def reviewed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
+    """Each of several effects again, given all that came after it as well, so that their order doesn't count: one that
+    the others make good for is dropped, one that another name suits better gets that name, rivals are those beside the
+    others."""
+    queue = list(chosen)
+    for first in chosen[:-1]:
+        rest, whole = queue[1:], queue[-1].stage
+        try:
+            stage = _without(first.name, whole)
+        except NotConverged:
+            queue = [*rest, replace(first, stage=whole)]  # nothing fits without it
+            continue
+        choice = _choose(stage, _scores(stage), sum(x.gain for x in rest), lambda share, what: None, 0.0)
+        queue = [*rest, choice] if choice is not None else [*rest[:-1], replace(rest[-1], stage=stage)]
+    judged = {x.name: x for x in queue}
+    if judged.keys() == {x.name for x in chosen}:
+        return [replace(x, rivals=judged[x.name].rivals) for x in chosen]
+    whole, stage, found = queue[-1].stage, before, list[Choice]()
+    try:
+        for x in (*queue[1:], queue[0]):  # the one that came last comes last again
+            machine = effects.extended(stage.machine, _fitted(whole, x.name))
+            stage = refitted(machine, stage, whole.fit.disturbed)
+            found.append(replace(x, stage=stage))
+    except NotConverged:
+        return list(chosen)
+    return found
+
+
+def _without(name: str, stage: Stage) -> Stage:
+    """A stage's model without one of its effects, fitted. Raises NotConverged."""
+    rest = tuple(e for e in stage.machine.effect if f"{e.name}@{e.where}" != name)
+    machine = stage.machine.model_copy(update={"effect": rest})
+    try:
+        return refitted(machine, stage, stage.fit.disturbed)
+    except NotConverged:
+        return refitted(machine, stage, max(stage.fit.disturbed, LESS[-1] * smoothing.DISTURBED[0]))
+
+
+def _scores(stage: Stage) -> tuple[evidence.Score, ...]:
+    """What every effect that a model does not have promises, best first."""
+    known = [e.name for e in stage.model.effects]
+    sensors = [s.name for s in stage.prepared.c.sensors]
+    found = evidence.candidates(stage.machine, sensors, _duration(stage.prepared.logs), known)
+    return evidence.scan(stage.prepared.c, stage.prepared.records, stage.fit, found).scores
+
+
 def _odd(stage: Stage) -> tuple[str, ...]:
     """What is left beside noise, a line each: innovations that are too large, and what stands out in them."""
     found = [
@@ -200,7 +248,7 @@ def _odd(stage: Stage) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class _Choice:
+class Choice:
     """An effect that was added, the model with it, and the rivals that the log likes about as well. gain: of twice the
     log-likelihood, which what is left of the misfit makes `spread` times less sure."""
 
@@ -340,7 +388,7 @@ def _choose(
     explained: float,
     tell: Advance,
     done: float,
-) -> _Choice | None:
+) -> Choice | None:
     """The effect that the logs like best beside those that are in the model; None if none is worth it. explained: how
     much those in the model have gained."""
     likely = _shortlist(stage, scores)
@@ -371,7 +419,7 @@ def _choose(
     tries = _close(_without_forces(_close(tries)))
     score, best = tries[0]
     rivals = tuple(_fitted(other, s.candidate.name) for s, other in tries[1:])
-    return _Choice(score.candidate.name, best, gain, spread, len(scores), rivals)
+    return Choice(score.candidate.name, best, gain, spread, len(scores), rivals)
 
 
 def _tries(stage: Stage, likely: Sequence[evidence.Score], tell: Callable[[int], None]) -> list[_Try]:
@@ -408,7 +456,7 @@ def _without_forces(tries: Sequence[_Try]) -> list[_Try]:
 
 
 def _verdict(
-    before: Stage, after: Stage, chosen: Sequence[_Choice], scores: Sequence[evidence.Score], odd: tuple[str, ...]
+    before: Stage, after: Stage, chosen: Sequence[Choice], scores: Sequence[evidence.Score], odd: tuple[str, ...]
 ) -> Diagnosis:
     """The verdict: what is named must explain most of the misfit, and what is left must be noise or be shown."""
     findings = tuple(_finding(x, after) for x in chosen)
@@ -424,7 +472,7 @@ def _verdict(
     return Diagnosis(verdict, findings, before, after, share, tuple(scores), odd, tuple(x.stage for x in chosen))
 
 
-def _finding(choice: _Choice, after: Stage) -> Finding:
+def _finding(choice: Choice, after: Stage) -> Finding:
     """A choice with amount and shapes as the last fit has them."""
     placed = next(e for e in after.model.effects if e.name == choice.name)
     std = after.fit.std * after.doubt

@@ -176,3 +176,32 @@ def test_what_is_found_stands_beside_what_the_file_has(
     rows: dict[str, Any] = json.loads(stdout)["parameters"]
     for name, true in (("M", 11000.0), ("roll_unbalance@front_roll", 150.0)):
         assert abs(rows[name]["value"] - true) < 4 * rows[name]["std"]
+
+
+@pytest.mark.slow
+def test_the_order_in_which_several_are_found_does_not_count(straight: Model, straight_motion: Motion) -> None:
+    """Two at once; found the other way round they stay, and a wrong name that came before or between them goes."""
+    true = [
+        effects.parse(text, straight.machine, 40.0) for text in ("ground_slope=0.004", "torque_deadband@rear_roll=60")
+    ]
+    both = prediction.build(effects.extended(straight.machine, *true))
+    motion = simulate(both, straight_motion.u)
+    one = log.check(sensors.measure(both, motion, seed=4), straight.machine)
+    found = diagnose.diagnose(straight, [one], straight.machine.filter)
+    names = [f"{e.name}@{e.where}" for e in true]
+    assert (found.verdict, sorted(f.name for f in found.findings)) == ("named", sorted(names))
+    for f, e in zip(sorted(found.findings, key=lambda f: f.name), true, strict=True):
+        assert abs(f.amount - float(e.amount)) < 4 * f.amount_std
+
+    wrong = effects.parse("asymmetric_coulomb@rear_roll=60", straight.machine, 40.0)
+    more = diagnose.refitted(effects.extended(found.after.machine, wrong), found.after, 0.0)
+    name = f"{wrong.name}@{wrong.where}"
+    for order, stage in (
+        (names[::-1], found.after),
+        ([name, *names], more),
+        ([names[0], name, names[1]], more),
+    ):
+        chosen = [diagnose.Choice(n, stage, 1000.0, 1.0, 100, ()) for n in order]
+        again = diagnose.reviewed(found.before, chosen)
+        assert [x.name for x in again] == [n for n in order if n in names]
+        assert again[-1].stage.fit.cost == pytest.approx(found.after.fit.cost, abs=0.1)
