@@ -19,7 +19,7 @@ import numpy as np
 
 from excite import objective as objectives
 from excite import smoothing
-from excite.objective import EXACT, OBJECTIVES, Local
+from excite.objective import EXACT, OBJECTIVES, Local, relative
 from excite.simulate import Motion, beside
 from model.prediction import Model
 
@@ -62,11 +62,6 @@ class Aim:
     sigma_max: float | None = None
     prior: np.ndarray | None = None
     machines: tuple[Model, ...] = ()
-
-
-def relative(model: Model) -> np.ndarray:
-    """(n_base,) what errors are relative to: the nominal value's size, the scale where that is zero."""
-    return np.where(model.nominal != 0, np.abs(model.nominal), model.scale)
 
 
 def aim(

@@ -111,8 +111,8 @@ def verdict(played: Score, person: Score, objective: str = "accuracy") -> str:
     if ratio <= drive.LOST:
         return f"{begin}: good enough to drive."
     if objectives.conditions(objective):
-        return f"{begin}: too much is lost; design again with --objective accuracy, or play back the torques."
-    return f"{begin}: too much is lost; allow more --phases, a longer drive, or play back the torques."
+        return f"{begin}: too much is lost; design again with --objective accuracy --driver, or play back the torques."
+    return f"{begin}: too much is lost; design again with --driver, or a longer drive, or play back the torques."
 
 
 def _warnings(model: Model, problem: Problem, trace: Trace, motions: tuple[Motion, ...], room: drive.Room) -> list[str]:

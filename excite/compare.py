@@ -14,7 +14,6 @@ as the design had; one search uses one of them.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -30,7 +29,7 @@ from excite import interior, manoeuvre, objective, smoothing
 from excite.aim import aim
 from excite.collocation import UnsettledError, settle, transcribe
 from excite.continuation import MARGIN, TOLERANCE, Candidate, Track, land, typical_sizes, verdict
-from excite.design import design
+from excite.design import design, processes
 from excite.driver import follow
 from excite.limit import check, limits, symbols
 from excite.manoeuvre import Manoeuvre, scaled
@@ -423,7 +422,7 @@ def compare(
         progress(1, total, lowest)
     seeds = np.random.SeedSequence(seed).generate_state(max(samples, 1))
     with joblib.parallel_config("loky", inner_max_num_threads=1):
-        run = joblib.Parallel(n_jobs=_processes(), return_as="generator_unordered")
+        run = joblib.Parallel(n_jobs=processes(), return_as="generator_unordered")
         call = joblib.delayed(_sample)
         found: list[_Sample] = []
         for done, one in enumerate(run(call(model, problem, n, USUAL[n], k, int(seeds[k]), wall) for n, k in jobs), 2):
@@ -440,10 +439,6 @@ def compare(
     return Comparison(tuple(rows), min(in_time) / ours.cond_phi)
 
 
-def _processes() -> int:
-    return max(2, os.cpu_count() or 1)  # as the design has
-
-
 def _sample(model: Model, problem: Problem, kind: str, usual: Usual, number: int, seed: int, seconds: float) -> _Sample:
     begin = time.monotonic()
     found = within(model, problem, usual.make(model, problem, seed, seconds))
@@ -456,7 +451,7 @@ def _order(s: _Sample) -> tuple[bool, float]:
 
 def _in_time(samples: Sequence[_Sample], seconds: float) -> list[float]:
     """cond(Phi) of those that keep every limit, of as many samples as are had in the given time; a search always is."""
-    used = np.cumsum([s.wall_s for s in samples]) / _processes()
+    used = np.cumsum([s.wall_s for s in samples]) / processes()
     return [
         objective.reported("cond", s.found.score)
         for k, (s, t) in enumerate(zip(samples, used, strict=True))
@@ -466,7 +461,7 @@ def _in_time(samples: Sequence[_Sample], seconds: float) -> list[float]:
 
 def _equal(samples: Sequence[_Sample], cond_phi: float) -> float | None:
     """Time [s] until one of these samples, taken one after the other, is as good as cond(Phi); None where none is."""
-    used = np.cumsum([s.wall_s for s in samples]) / min(_processes(), len(samples))
+    used = np.cumsum([s.wall_s for s in samples]) / min(processes(), len(samples))
     for s, t in zip(samples, used, strict=True):
         if s.found.feasible and objective.reported("cond", s.found.score) <= cond_phi:
             return float(t)
@@ -483,7 +478,7 @@ def _rows(model: Model, name: str, samples: Sequence[_Sample], ours: float) -> l
         samples=len(samples),
         equal_s=_equal(samples, ours),
     )
-    wall = sum(s.wall_s for s in samples) / min(_processes(), len(samples))
+    wall = sum(s.wall_s for s in samples) / min(processes(), len(samples))
     if not USUAL[name].random:
         return [row(name, s.found, wall_s=wall) for s in ranked]
     n = len(ranked)
@@ -495,8 +490,7 @@ def _rows(model: Model, name: str, samples: Sequence[_Sample], ours: float) -> l
 
 def _row(model: Model, name: str, c: Candidate, kept: int, samples: int, wall_s: float, equal_s: float | None) -> Row:
     motion = simulate(model, c.manoeuvre.sample(float(model.machine.sampling_hz)), q0=c.start)
-    size = np.where(model.nominal != 0, np.abs(model.nominal), model.scale)
-    spread = 100 * np.sqrt(np.diag(smoothing.cramer_rao(model, motion))) / size
+    spread = 100 * np.sqrt(np.diag(smoothing.cramer_rao(model, motion))) / objective.relative(model)
     breaks = None if c.feasible else max(c.violations, key=lambda limit: c.violations[limit])
     return Row(
         name,

@@ -92,7 +92,7 @@ def design(
         joblib.parallel_config("loky", inner_max_num_threads=1),
     ):
         # loky even for one start: only there can the number of threads of the linear algebra be set
-        run = joblib.Parallel(n_jobs=max(2, os.cpu_count() or 1), return_as="generator_unordered")
+        run = joblib.Parallel(n_jobs=processes(), return_as="generator_unordered")
         call = joblib.delayed(_carry)
         for track in run(call(model, problem, aim, k, g, None, half, stop) for k, g in enumerate(guesses)):
             if track is not None:
@@ -123,6 +123,11 @@ def design(
         tuple(_score(aim, tracks[k].best) if k in tracks else float("inf") for k in range(len(guesses))),
         complete,
     )
+
+
+def processes() -> int:
+    """In how many processes drives are sought: one on every core, two at least."""
+    return max(2, os.cpu_count() or 1)
 
 
 def _infeasible(aim: Aim, best: Candidate, complete: bool) -> InfeasibleError:

@@ -338,8 +338,7 @@ def driven(model: Model, trace: Trace, who: driver.Driver | None, seed: int, q0:
 def score(model: Model, motion: Motion) -> Score:
     """cond(Phi) and what accuracy a motion makes attainable (Cramer-Rao, kit full), whoever drives it."""
     covariance = smoothing.cramer_rao(model, motion, "full")
-    reference = np.where(model.nominal != 0, np.abs(model.nominal), model.scale)
-    sigma = 100 * np.sqrt(np.diag(covariance)) / reference
+    sigma = 100 * np.sqrt(np.diag(covariance)) / objective.relative(model)
     worst = int(np.argmax(sigma))
     return Score(
         objective.cond_phi(model, motion), float(sigma[worst]), model.base.names[worst], float(np.median(sigma))

@@ -223,6 +223,11 @@ def row_noise(model: Model) -> np.ndarray:
     return noise
 
 
+def relative(model: Model) -> np.ndarray:
+    """(n_base,) what errors are relative to: the nominal value's size, the scale where that is zero."""
+    return np.where(model.nominal != 0, np.abs(model.nominal), model.scale)
+
+
 def weights(model: Model, objective: str) -> tuple[np.ndarray, np.ndarray]:
     """(n_rows,), (n_base,): what an objective multiplies the rows and the columns of W with.
 
@@ -233,7 +238,7 @@ def weights(model: Model, objective: str) -> tuple[np.ndarray, np.ndarray]:
     rows = 1 / row_noise(model) if chosen.weighted else np.ones(len(model.coordinates))
     if chosen.of == "eigenvalues":
         return rows, model.scale
-    return rows, np.where(model.nominal != 0, np.abs(model.nominal), model.scale)
+    return rows, relative(model)
 
 
 def phi(model: Model, motion: Motion, objective: str = "cond") -> np.ndarray:

@@ -11,7 +11,6 @@ errors drive it: limits that they come near are given more room, those that they
 
 from __future__ import annotations
 
-import os
 import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ from excite import aim as aims
 from excite import drive, limit
 from excite import objective as objectives
 from excite.aim import Aim
-from excite.design import Design
+from excite.design import Design, processes
 from excite.drive import ANGLE_STEP, GRID, SPEED_STEP, DriveError, Score, Trace
 from excite.driver import STEADY
 from excite.manoeuvre import Manoeuvre
@@ -93,7 +92,7 @@ def phased(
     begin = standing(task, designed)
     total = ROUNDS + LEVELS + POLISHES + 1
     with joblib.parallel_config("loky", inner_max_num_threads=1):
-        run = joblib.Parallel(n_jobs=max(2, os.cpu_count() or 1))
+        run = joblib.Parallel(n_jobs=processes())
         found = [t for t in trials(task, [begin, *guesses(task, begin, seed)], run) if t is not None]
         if not found:
             raise SimulationError("no drive made of phases can be followed on this machine; make phases longer")
@@ -293,9 +292,6 @@ class Trial:
     trace: Trace
     A: list[np.ndarray]
     over: np.ndarray
-
-
-Tries = Callable[[Sequence[object]], list[list[tuple[list[np.ndarray], np.ndarray] | None]]]
 
 
 def trials(task: Task, traces: Sequence[Trace], run: joblib.Parallel) -> list[Trial | None]:

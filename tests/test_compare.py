@@ -11,8 +11,9 @@ import pandas as pd
 import pytest
 
 from excite import objective
-from excite.compare import OURS, USUAL, Comparison, _equal, _processes, _Sample, compare, judge, shrunk, within
+from excite.compare import OURS, USUAL, Comparison, _equal, _Sample, compare, judge, shrunk, within
 from excite.continuation import TOLERANCE
+from excite.design import processes
 from excite.limit import check
 from excite.manoeuvre import Manoeuvre, multisine
 from excite.simulate import simulate
@@ -69,7 +70,7 @@ def test_time_to_an_equal_score(result: Comparison, straight: Model, problem: Pr
     found, _ = judge(straight, problem, shrunk(straight, problem, multisine(straight, problem, 0)))
     kept = replace(found, violations={}, score=2 * np.log(100.0))
     samples = [_Sample("x", k, c, 10.0) for k, c in enumerate([replace(kept, violations={"power": 1.0}), kept, kept])]
-    shared = min(_processes(), 3)
+    shared = min(processes(), 3)
     assert _equal(samples, 101.0) == pytest.approx(20.0 / shared)
     assert _equal(samples, 99.0) is None
 
