@@ -781,7 +781,10 @@ def test_killed_workers_of_this_machine_cost_nothing(whole: Command, carried: Ca
     kept, killed = 0, set()
     for k in range(3):
         kept = struck.midway(kept + RUNS // 10)
-        victim = workers_of(struck.run.pid)[k % 2]
+        while len(there := workers_of(struck.run.pid)) < 2:  # those that follow the last one are being started
+            assert struck.run.poll() is None, struck.said()
+            time.sleep(0.02)
+        victim = there[k % 2]
         os.kill(victim, signal.SIGKILL)
         killed.add(victim)
     assert len(killed) == 3
