@@ -1,8 +1,8 @@
 """Nominal, robust and sequential design on machines that nobody knows exactly, driven by people.
 
 python results/robust_sequential/study.py [--machines 100] [--sequential 100] [--identified 6] [--jobs 2] rebuilds
-summary.json and figure.png beside this file. Every machine is written to `runs/` as it is done; a study that was
-stopped goes on from there.
+summary.json, figure.png and README.md beside this file. Every machine is written to `runs/` as it is done; a study
+that was stopped goes on from there.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
@@ -77,8 +78,8 @@ def main() -> None:
     save(figure(rows), HERE / "figure.png")
     with folder.writing_file(HERE / "summary.json") as place:
         place.write_text(folder.dump(summary), encoding="utf-8")
-    for kind, line in summary["table"].items():
-        print(kind, json.dumps(folder._plain(line)))
+    with folder.writing_file(HERE / "README.md") as place:
+        place.write_text(readme(summary["table"], rows), encoding="utf-8")
 
 
 def short(model: Model) -> Problem:
@@ -214,31 +215,82 @@ def table(rows: Sequence[dict[str, object]]) -> dict[str, dict[str, object]]:
                 if all("failed" not in r[k] for k in KINDS[:2])  # type: ignore[operator]
             ]
         )
-        if pairs:
-            gain = [max(r[kind]["sigma_percent"]) / max(r["nominal"]["sigma_percent"]) for r in pairs]  # type: ignore[index]
-            out[kind]["worst_over_nominal"] = {
+        for name, of in (("worst", max), ("median", np.median)):
+            gain = [float(of(r[kind]["sigma_percent"]) / of(r["nominal"]["sigma_percent"])) for r in pairs]  # type: ignore[index, operator]
+            out[kind][f"{name}_over_nominal"] = {
                 "median": float(np.median(gain)),
                 "better": float(np.mean(np.array(gain) < 1)),
             }
     return out
 
 
+def readme(t: dict[str, dict[str, Any]], rows: Sequence[dict[str, Any]]) -> str:
+    lines = []
+    for kind in (k for k in KINDS if k in t):
+        r = t[kind]
+        broken = np.array([row[kind]["excess"] for row in rows if kind in row and "failed" not in row[kind]])
+        own = r["identified"]["rms_error_over_bound"] if "identified" in r else float("nan")
+        cells = [f"{r[n]['median']:.3g} ({r[n]['max']:.3g})" for n in ("cond_phi", "worst_percent", "median_percent")]
+        kept = f"{(broken <= 1e-3).sum()} of {len(broken)}"
+        lines.append(
+            f"| {kind} | {r['machines']} | {' | '.join(cells)} | {kept} | {100 * broken.max():.0f} % | {own:.2f} |"
+        )
+    ratio = {k: t[k]["median_over_nominal"] for k in KINDS[1:] if k in t}
+    said = {
+        k: f"{abs(100 * (v['median'] - 1)):.0f} % {'larger' if v['median'] > 1 else 'smaller'} for {k} (smaller on"
+        f" {100 * v['better']:.0f} % of the machines)"
+        for k, v in ratio.items()
+    }
+    return README.format(rows="\n".join(lines), said=" and ".join(said.values()))
+
+
+README = """# Nominal, robust and sequential design on machines that nobody knows exactly
+
+![every machine](figure.png)
+
+| design | machines | cond(Phi), median (worst) | worst parameter, attainable [%] | median parameter [%] | every limit kept | most exceeded | errors of `joint` / bound |
+|---|---|---|---|---|---|---|---|
+{rows}
+
+Against the nominal drive on the same machine the median parameter's attainable deviation is {said}. A drive designed for
+values that are up to 20 % off breaks limits when a person drives it on the true machine; the robust one pays for keeping
+them. A second drive designed for what the first log leaves is worth more than the first one driven twice, but keeps the
+limits no better: it is designed for the machine that the log told of, played back, not for people.
+
+`python results/robust_sequential/study.py --sequential 20` draws 100 machines whose bodies, friction and contacts are up to 20 % off
+(each value on its own, uniform), has each driven by the driver model, who follows the designed speed and articulation
+late, slowly and not quite, and compares at equal time, two drives of 30 s each, designed with `--objective accuracy`:
+
+- nominal: the drive designed for the machine file's values, twice;
+- robust: the drive designed for five machines, the nominal one and four corners of the box (`--robust`), twice;
+- sequential: the nominal drive, then one designed for what its log leaves uncertain, at the machine that it told of (`--after`).
+
+Told: cond(Phi) of both drives together and the Cramer-Rao bound, at the true machine; the limit that the true machine
+exceeds most (lane and rest, which people see to themselves, left out), kept up to 0.1 % of its range; and for six machines the
+errors of `--method joint` from both logs over the bound, rms over all parameters. 26 minutes of one core. Machines are written to
+`runs/` as they are done, and a study that was stopped goes on from there.
+"""  # noqa: E501
+
+
 def figure(rows: Sequence[dict[str, object]]) -> Figure:
     """Every machine: cond, worst and median parameter, by kind of design."""
-    fig = Figure(figsize=(11, 4), layout="constrained")
-    axes = fig.subplots(1, 3)
-    labels = ("cond(Phi), true", "worst parameter: bound [%]", "median parameter: bound [%]")
-    for i, (ax, label) in enumerate(zip(axes, labels, strict=True)):
+    fig = Figure(figsize=(11, 3.6), layout="constrained")
+    shown: tuple[tuple[str, Callable[[dict[str, Any]], float]], ...] = (
+        ("cond(Phi) at the true machine", lambda g: g["cond_phi"]),
+        ("worst parameter, attainable [%]", lambda g: max(g["sigma_percent"])),
+        ("median parameter, attainable [%]", lambda g: float(np.median(g["sigma_percent"]))),
+        ("limit exceeded most [% of its range]", lambda g: 100 * g["excess"]),
+    )
+    for ax, (label, value) in zip(fig.subplots(1, len(shown)), shown, strict=True):
         for k, kind in enumerate(KINDS):
-            got = [r[kind] for r in rows if kind in r and "failed" not in r[kind]]  # type: ignore[operator]
+            got: list[Any] = [r[kind] for r in rows if kind in r and "failed" not in r[kind]]  # type: ignore[operator]
             if not got:
                 continue
-            x = np.array([g["cond_phi"] if i == 0 else (max if i == 1 else np.median)(g["sigma_percent"]) for g in got])
+            x = np.array([value(g) for g in got])
             place = k + 0.25 * np.linspace(-1, 1, len(x))
             ax.plot(place, np.sort(x), "o^s"[k], color=COLOURS[k], markersize=3)
             ax.hlines(np.median(x), k - 0.35, k + 0.35, color="black")
         ax.set_xticks(range(len(KINDS)), KINDS)
-        ax.set_yscale("log")
         ax.set_ylabel(label)
         ax.grid(axis="y", alpha=0.3)
     return fig
