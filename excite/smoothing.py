@@ -10,7 +10,7 @@ problem); Bock, "Recent advances in parameter identification techniques for O.D.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -147,31 +147,45 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     starts = [first_point(c, r, log, filter) for r, log in zip(records, logs, strict=True)]
     notes = noise_notes(c, records)
     held = hidden.unmoved(model, logs, filter, slow=False)
-    points: Sequence[Point] = starts
-    X, trouble = model.nominal, ""
-    for tries in range(3):
+
+    def ways() -> Iterator[tuple[np.ndarray, bool]]:
+        yield held, False
+        still = held | hidden.unmoved(model, logs, filter, slow=True)
+        less = (still & ~held).any()
+        if less:
+            yield still, False
+        # The model with disturbing forces finds its way from further off.
+        yield held, True
+        if less:
+            yield still, True
+
+    trouble: NotConverged | None = None
+    loose: Fit | None = None
+    doubted: tuple[Fit, np.ndarray, list[str]] | None = None
+    for free, further in ways():
         try:
-            fit = iterate(c, records, points, X, starts, 0.0, held)
+            if further:
+                loose = loosely(c, logs, records, starts, model.nominal, starts, free)
+            points, X = (starts, model.nominal) if loose is None else (loose.points, loose.X)
+            fit = iterate(c, records, points, X, starts, 0.0, free)
         except NotConverged as failed:
-            trouble = trouble or str(failed)
-            if tries == 0:
-                still = hidden.unmoved(model, logs, filter, slow=True)
-                if (still & ~held).any():
-                    held = held | still
-                    continue
-            if tries == 2 or X is not model.nominal:
-                break
-            # The model with disturbing forces finds its way from further off.
-            loose = loosely(c, logs, records, starts, model.nominal, starts, held)
-            points, X = loose.points, loose.X
+            trouble = trouble or failed
             continue
         found = suspects(c, logs, fit)
         if not found:
             return _estimate(c, records, fit, filter, notes)
-        loose = loosely(c, logs, records, fit.points, fit.X, starts, held)
-        trouble = "; ".join(found)
-        break
-    return _estimate(c, records, loose, filter, (*notes, trouble, DOUBT))
+        if doubted is None or fit.cost < doubted[0].cost:
+            doubted = fit, free, found
+        if free is held:
+            break  # nothing was held back: it is the machine, not the way to it
+    said = str(trouble)
+    if doubted is not None:
+        fit, free, found = doubted
+        loose, said = loosely(c, logs, records, fit.points, fit.X, starts, free), "; ".join(found)
+    if loose is None:
+        assert trouble is not None
+        raise trouble
+    return _estimate(c, records, loose, filter, (*notes, said, DOUBT))
 
 
 def loosely(
