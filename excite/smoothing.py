@@ -50,6 +50,7 @@ DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's sca
 RESUMED = DAMPING[0] * DAMPING[1] ** 2  # damping of a fit that goes on from another
 HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
 NEARLY = 1.0  # a step, in standard deviations, at which a fit that runs out of passes is as good as found
+TOLERABLE = 0.1  # a step, in standard deviations, at which a fit that runs out of passes is an estimate
 CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviations
 ENOUGH = 0.2  # likewise with disturbing forces, whose deviations are no promise
 # Steps that turn back and hardly shrink are shortened by TURNED; others grow by SHARE up to the whole.
@@ -170,7 +171,9 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
             fit = iterate(c, records, points, X, starts, 0.0, free)
         except NotConverged as failed:
             trouble = trouble or failed
-            continue
+            if failed.fit is None or failed.fit.disturbed or failed.step > TOLERABLE:
+                continue
+            fit = failed.fit
         found = suspects(c, logs, fit)
         if not found:
             return _estimate(c, records, fit, filter, notes)
