@@ -90,7 +90,7 @@ def test_written_results_hold_what_the_readme_says(study: ModuleType) -> None:
     result = json.loads((FOLDER / "summary.json").read_text())
     assert result["grid"]["fits_with_pattern"] > 0
     assert result["grid"]["fits_with_all"] == 0
-    assert result["grid"]["scaled_fits_with_all"] == 0
+    assert result["grid"]["scaled_fits_with_all"] == 3
     assert result["physics"]["acceleration_m_s2"] < 0.01
     best = result["instead"]["joint, S40 D"]["parameters"]
     assert abs(best["M"]["bias_percent"]) < 1
