@@ -38,6 +38,7 @@ CLOSE = 10.0  # a rival that is worse by less than this is a tie
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 SHAPE = 0.005, 0.002  # of what is explained already, that a further effect must gain, as nature is never exactly the
 # formula: by the fits' gains, and by how many deviations the amounts are from none
+FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
 BESIDE = 250.0  # a gain that by the latter no effect can be denied
 CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
 LEAST = 0.05, 0.15  # of the excess misfit that an effect must explain to be worth a place: weak misfit, strong misfit
@@ -161,7 +162,7 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
     tell = advance or (lambda share, what: None)
     tell(0.0, "fitting the model")
     before = fitted(model.machine, logs, filter)
-    stage, chosen, first = before, list[Choice](), tuple[evidence.Score, ...]()
+    stage, chosen, first, left = before, list[Choice](), tuple[evidence.Score, ...](), 0.0
     for turn in range(MOST):
         tell(0.15 + 0.2 * turn, "scoring effects")
         scores = _scores(stage)
@@ -169,6 +170,7 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
         explained = sum(x.gain for x in chosen)
         choice = _choose(stage, scores, explained, tell, 0.2 + 0.2 * turn)
         if choice is None:
+            left = max(0.0, scores[0].gain - LEVEL) if scores else 0.0
             break
         chosen.append(choice)
         stage = choice.stage
@@ -187,7 +189,7 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
         nearest = chosen.pop().name, explained
         stage = chosen[-1].stage if chosen else before
         odd = _odd(stage)
-    answer = _verdict(before, stage, chosen, first, odd)
+    answer = _verdict(before, stage, chosen, first, odd, left)
     return answer if answer.findings else replace(answer, nearest=nearest)
 
 
@@ -416,7 +418,7 @@ def _choose(
     least = max(LEAST[stage.rough] * stage.excess, SHAPE[0] * explained, min(SHAPE[1] * _sureness(stage), BESIDE))
     if gain < max(LEVEL * spread, least):
         return None
-    tries = _close(_without_forces(_close(tries)))
+    tries = _close(_without_forces(_close(tries, gain)), gain)
     score, best = tries[0]
     rivals = tuple(_fitted(other, s.candidate.name) for s, other in tries[1:])
     return Choice(score.candidate.name, best, gain, spread, len(scores), rivals)
@@ -435,10 +437,11 @@ def _tries(stage: Stage, likely: Sequence[evidence.Score], tell: Callable[[int],
     return tries
 
 
-def _close(tries: Sequence[_Try]) -> list[_Try]:
-    """The best of sorted tries and those that the logs like about as well."""
+def _close(tries: Sequence[_Try], gain: float) -> list[_Try]:
+    """The best of sorted tries and those that the logs like about as well: no difference counts that is a matter of the
+    formula, of an effect that gains so much."""
     best = tries[0][1]
-    near = max(CLOSE * max(1.0, best.fit.cost / best.prepared.readings), NEAR * best.excess)
+    near = max(CLOSE * max(1.0, best.fit.cost / best.prepared.readings), NEAR * best.excess, SHAPE[1] * gain)
     return [x for x in tries if x[1].fit.cost - best.fit.cost < near]
 
 
@@ -456,10 +459,16 @@ def _without_forces(tries: Sequence[_Try]) -> list[_Try]:
 
 
 def _verdict(
-    before: Stage, after: Stage, chosen: Sequence[Choice], scores: Sequence[evidence.Score], odd: tuple[str, ...]
+    before: Stage,
+    after: Stage,
+    chosen: Sequence[Choice],
+    scores: Sequence[evidence.Score],
+    odd: tuple[str, ...],
+    left: float,
 ) -> Diagnosis:
-    """The verdict: what is named must explain most of the misfit, and what is left must be noise or be shown."""
-    findings = tuple(_finding(x, after) for x in chosen)
+    """The verdict: what is named must explain most of the misfit, and what is left must be noise or be shown. left:
+    what a further effect would gain that was not worth a name."""
+    findings = tuple(_finding(x, after, left) for x in chosen)
     share = 1.0
     if odd or not after.exact:
         gained = sum(x.gain for x in chosen)
@@ -472,12 +481,14 @@ def _verdict(
     return Diagnosis(verdict, findings, before, after, share, tuple(scores), odd, tuple(x.stage for x in chosen))
 
 
-def _finding(choice: Choice, after: Stage) -> Finding:
-    """A choice with amount and shapes as the last fit has them."""
+def _finding(choice: Choice, after: Stage, left: float) -> Finding:
+    """A choice with amount and shapes as the last fit has them. The amount is as unsure as what is left says of the
+    formula: where that is a part of what the effect gains, about half its root is a part of the amount."""
     placed = next(e for e in after.model.effects if e.name == choice.name)
     std = after.fit.std * after.doubt
     values = dict(zip(after.model.base.names, zip(after.fit.X, std, strict=True), strict=True))
     amount, sure = values[placed.name]
+    sure = float(np.hypot(sure, FORMULA * amount * np.sqrt(left / max(choice.gain, left, 1.0))))
     shapes = {
         s: (*values.get(f"{placed.name}.{s}", (placed.values[s], 0.0)), shape.unit)
         for s, shape in placed.effect.shapes.items()
