@@ -33,7 +33,7 @@ def model(name: str, flaws: bool = True) -> Model:
 def problem(machine: Machine, name: str | None, duration: float | None) -> tuple[str, Problem]:
     """A machine's design problem, its own by default, with another duration [s] where given."""
     name = name or machine.problem
-    if name is None:
+    if name is None or not machine.problems:
         raise UsageError(
             f"{machine.name} has no design problem of its own, give its machine file one ([problems.NAME])"
         )

@@ -68,9 +68,11 @@ def rivals(model: Model, between: tuple[str, ...], duration: float) -> Model:
 
 
 def beside(model: Model, rivals: Sequence[EffectEntry]) -> Model:
-    """The same for effects as a machine file has them. What they can be mistaken for may have any shape: those of both
-    are parameters too. Raises MachineError."""
-    both = build(effects.extended(model.machine, *rivals), model.flaws, shapes=True)
+    """The same for effects as a machine file has them. What they can be mistaken for may have any shape, so shapes of
+    effects are parameters too, unless they are times of a log. Raises MachineError."""
+    machine = effects.extended(model.machine, *rivals)
+    times = any(effects.CATALOGUE[e.name].timed for e in machine.effect)
+    both = build(machine, model.flaws, shapes=not times)
     for e in both.effects[-2:]:
         if e.name not in both.base.names:
             raise MachineError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,9 @@ from typing import Any
 from excite import asked, brief, examine, findings, folder, gaps, identify, portrait, reports, separate, works
 from excite.brief import Brief
 from excite.diagnose import diagnose
+from excite.limit import InfeasibleError
 from excite.separate import Rivals
+from excite.simulate import SimulationError
 from model.machine import Machine, MachineError
 from model.prediction import Model, build
 
@@ -70,7 +73,7 @@ def write(
 
 def separating(place: Path, machine: Machine, tied: Sequence[Rivals], onward: bool) -> dict[str, Any] | None:
     """The first pair of tied causes that driving can tell apart, and if it is wanted the drive, designed into a folder
-    of its own. None where there is no such pair, or no problem to design for. Raises InfeasibleError."""
+    of its own, or why there is none. None where there is no such pair, or no problem to design for."""
     if machine.problem is None:
         return None
     name, problem = asked.problem(machine, None, None)
@@ -83,9 +86,14 @@ def separating(place: Path, machine: Machine, tied: Sequence[Rivals], onward: bo
         told: dict[str, Any] = {"between": list(between), "folder": None}
         if onward:
             (place / NEXT).mkdir()
-            made = works.designed(place / NEXT, model, name, problem, Brief("discrimination", between=between))
+            try:
+                made = works.designed(place / NEXT, model, name, problem, Brief("discrimination", between=between))
+            except (InfeasibleError, MachineError, SimulationError, KeyboardInterrupt) as failed:
+                # The diagnosis is done, and not lost for it.
+                shutil.rmtree(place / NEXT)
+                return told | {"failed": str(failed) or "interrupted"}
             sigma = max(made["sigma_percent"][x.partition("=")[0]] for x in between)
-            told |= {"folder": NEXT, "sigma_percent": sigma}
+            told |= {"folder": NEXT, "sigma_percent": sigma, "complete": made["complete"]}
         return told
     return None
 

@@ -8,7 +8,7 @@ well are given together. What no name explains is said to be unexplained.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -196,8 +196,8 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
 def reviewed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
     """Each of several effects again, given all that came after it as well, so that their order doesn't count: one that
     the others make good for is dropped, one that another name suits better gets that name, rivals are those beside the
-    others."""
-    queue = list(chosen)
+    others. What came first stays where nothing better was found."""
+    queue, found = list(chosen), chosen[-1].stage
     for first in chosen[:-1]:
         rest, whole = queue[1:], queue[-1].stage
         try:
@@ -207,18 +207,31 @@ def reviewed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
             continue
         choice = _choose(stage, _scores(stage), sum(x.gain for x in rest), lambda share, what: None, 0.0)
         queue = [*rest, choice] if choice is not None else [*rest[:-1], replace(rest[-1], stage=stage)]
-    judged = {x.name: x for x in queue}
-    if judged.keys() == {x.name for x in chosen}:
-        return [replace(x, rivals=judged[x.name].rivals) for x in chosen]
-    whole, stage, found = queue[-1].stage, before, list[Choice]()
+    whole, judged = queue[-1].stage, {x.name: x for x in queue}
+    same = judged.keys() == {x.name for x in chosen}
+    worse = whole.fit.cost - found.fit.cost > LEVEL * max(1.0, found.fit.cost / found.prepared.readings)
+    if same or worse or whole.fit.disturbed > found.fit.disturbed:
+        judged = judged if same else {x.name: x for x in chosen}
+        return [replace(x, rivals=_others(judged[x.name], judged)) for x in chosen]
+    # The one that came last comes last again; gains are over those that stand before.
+    stages = [before]
     try:
-        for x in (*queue[1:], queue[0]):  # the one that came last comes last again
-            machine = effects.extended(stage.machine, _fitted(whole, x.name))
-            stage = refitted(machine, stage, whole.fit.disturbed)
-            found.append(replace(x, stage=stage))
+        for x in (*queue[1:], queue[0]):
+            machine = effects.extended(stages[-1].machine, _fitted(whole, x.name))
+            stages.append(refitted(machine, stages[-1], before.fit.disturbed))
+        stages[-1] = stages[-1] if whole.fit.disturbed == before.fit.disturbed else whole
     except NotConverged:
         return list(chosen)
-    return found
+    again = []
+    for x, old, new in zip((*queue[1:], queue[0]), stages, stages[1:], strict=False):
+        gain = old.fit.cost - new.fit.cost if old.fit.disturbed == new.fit.disturbed else x.gain
+        again.append(replace(x, stage=new, gain=max(gain, x.gain), rivals=_others(x, judged)))
+    return again
+
+
+def _others(choice: Choice, found: Container[str]) -> tuple[EffectEntry, ...]:
+    """The rivals of an effect that aren't found beside it."""
+    return tuple(e for e in choice.rivals if f"{e.name}@{e.where}" not in found)
 
 
 def _without(name: str, stage: Stage) -> Stage:

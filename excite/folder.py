@@ -17,7 +17,7 @@ import numpy as np
 
 SUMMARY = "summary.json"
 OURS = re.compile(
-    r"summary\.json|machine\.(json|toml)|(profile|phases)\.csv|README\.md|[a-z0-9-]+\.(png|pdf|html|md)|design|verify"
+    r"summary\.json|machine\.(json|toml)|(profile|phases)\.csv|README\.md|[a-z0-9-]+\.(png|pdf|html|md)|design|verify|next"
     r"|drives|runs\.parquet|study\.json|machines"
 )
 

@@ -44,7 +44,7 @@ def parts_of(name: str, text: str) -> Iterator[Part]:
             lines.append(line)
             continue
         if level:
-            anchor = name if level == 1 else f"{name}-{title.lower()}"
+            anchor = name if level == 1 else f"{name}-{title.lower() if level < 3 else title}"
             yield Part(level, title, anchor.replace(" ", "-"), Markup("\n").join(_blocks(name, lines)))
         level, title, lines = len(head[1]), head[2], []
 

@@ -242,6 +242,8 @@ def looks_like(table: pd.DataFrame, machine: Machine) -> str:
         columns = {other.time_column, *(s.column for s in other.sensors("paper"))}
         if columns <= {str(c) for c in table.columns}:
             return f"; this looks like a log of {name}"
+    if machine.name not in machines.shipped():
+        return f"; is this a log of {machine.name}? The machine file names each sensor's column"
     return (
         f"; is this a log of {machine.name}? The machine file names each sensor's column: `excite machine new NAME"
         f" --like {machine.name}` writes one with columns and units to change"

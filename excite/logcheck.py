@@ -109,9 +109,10 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         remarks += _oddities(sensor, values)
     faults += _wiring(machine, readings)
     if not readings:
+        own = f": `excite machine new NAME --like {machine.name}` writes a machine file to name them in"
         faults.append(
-            f"none of the columns of {machine.name} is there: is it a log of another machine, or with columns"
-            f" of its own? `excite machine new NAME --like {machine.name}` writes a machine file to name them in"
+            f"none of the columns of {machine.name} is there; is it a log of another machine, or with columns"
+            f" of its own{own if machine.name in machines.shipped() else '?'}"
         )
     unknown = [c.name for c in columns if not c.what]
     if unknown:

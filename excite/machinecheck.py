@@ -457,7 +457,7 @@ def renamed(name: str, file: Path, like: Machine) -> str:
         f'time_column = "{like.time_column}"',
         f'time_unit = "{like.time_unit}"',
     ]
-    for sensor in like.sensors("full"):
+    for sensor in like.sensor:
         keys = sensor.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
         lines += ["", "[[sensor]]", *(f"{key} = {_toml(value)}" for key, value in keys.items())]
     return "\n".join(lines) + "\n"

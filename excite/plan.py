@@ -344,7 +344,7 @@ def read(path: str | Path) -> Plan:
     try:
         return ready(study, path.parent)
     except (UsageError, MachineError, LogError) as err:
-        raise type(err)(f"{path}: {str(err).removeprefix('--')}") from None
+        raise type(err)(f"{path}: {str(err).removeprefix('--').replace('duration:', 'duration_s:', 1)}") from None
 
 
 def ready(study: Study, base: Path | str = Path()) -> Plan:

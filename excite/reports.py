@@ -312,12 +312,15 @@ def _log(s: Summary) -> Said:
 def _designed(drive: Mapping[str, Any]) -> str:
     """The drive that was, or could be, designed to tell two causes apart."""
     first, second = (x.partition("=")[0] for x in drive["between"])
+    if "failed" in drive:
+        return f"No drive was designed to tell {first} from {second}: {drive['failed']}."
     if drive["folder"] is None:
         return f"A drive can be designed to tell {first} from {second}: `excite diagnose` with `--next` does."
     return (
         f"{drive['folder']}/ beside this page is a drive designed to tell {first} from {second} (`profile.csv`; `excite"
         f" drive` makes a sheet of it): from its log the amount of each can be found within"
         f" {rounded(drive['sigma_percent'], 2)} % beside the other."
+        + ("" if drive["complete"] else " Its search was stopped early.")
     )
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from excite.driver import gains
 from excite.simulate import Motion, respond
-from model import prediction
 from model.machine import Body, Machine, Quantity
 from model.prediction import Model
 
@@ -29,7 +28,7 @@ def scenarios(model: Model, count: int, spread: float = 0.2, seed: int = 0) -> t
         raise ValueError(f"a robust design needs at least 2 machines (got {count})")
     rng = np.random.default_rng([seed, SCENARIO])
     machines = [varied(model.machine, spread, rng, corner=True) for _ in range(count - 1)]
-    return model, *(prediction.build(m) for m in machines)
+    return model, *(model.of(m) for m in machines)
 
 
 def varied(machine: Machine, spread: float, rng: np.random.Generator, corner: bool = False) -> Machine:

@@ -78,6 +78,8 @@ def rivals(d: Diagnosis) -> list[Rivals]:
     """The pairs of tied causes that do not the same whatever is driven, the likeliest first."""
     found: list[Rivals] = []
     for f in d.findings:
+        if not f.rivals:
+            continue
         tied = [_placed(d.after, name) for name in (f.name, *f.tied_with)]
         pairs = [(0, k) for k in range(1, len(tied))]
         apart = set(pairs) - _same(_Asked(d.after, tied)(_stirred(_motion(d.after))), pairs)

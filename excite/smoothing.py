@@ -184,7 +184,11 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     said = str(trouble)
     if doubted is not None:
         fit, free, found = doubted
-        loose, said = loosely(c, logs, records, fit.points, fit.X, starts, free), "; ".join(found)
+        said = "; ".join(found)
+        try:
+            loose = loosely(c, logs, records, fit.points, fit.X, starts, free)
+        except NotConverged as failed:
+            trouble = failed
     if loose is None:
         assert trouble is not None
         raise trouble

@@ -211,9 +211,9 @@ def diagnose_table(summary: dict[str, Any]) -> None:
         say(f"to tell them apart, drive: {summary['separating_run']}")
     if summary["separating_drive"]:
         first, second = (x.partition("=")[0] for x in summary["separating_drive"]["between"])
-        where = summary["separating_drive"]["folder"]
+        where, failed = summary["separating_drive"]["folder"], summary["separating_drive"].get("failed")
         said = f"{where}/profile.csv is designed to" if where else "--next designs a drive to"
-        say(f"{said} tell {first} from {second}")
+        say(f"no drive to tell {first} from {second}: {failed}" if failed else f"{said} tell {first} from {second}")
     if summary["machine_file"]:
         say(f"the machine with what was found, for every command: {summary['machine_file']} in this folder")
     for note in summary["notes"]:

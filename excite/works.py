@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from excite import asked, crosscheck, examine, folder, gaps, identify, log, report, reports, sensors, stored, terminal
@@ -19,7 +20,7 @@ from excite.identify import Estimate
 from excite.log import Log
 from excite.objective import OBJECTIVES
 from excite.simulate import SimulationError
-from model.machine import Filter, Problem
+from model.machine import Filter, MachineError, Problem
 from model.prediction import Model
 
 
@@ -42,7 +43,13 @@ def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief
     """The same for a model and a problem of this name that are there already."""
     begin = time.perf_counter()
     with terminal.bar("designing") as advance:
-        found = briefs.answer(model, chosen, brief, advance)
+        try:
+            found = briefs.answer(model, chosen, brief, advance)
+        except np.linalg.LinAlgError:
+            raise MachineError(
+                f"{model.machine.name}: some parameter moves nothing in problem {name}, so no drive shows it; is an"
+                " effect outside of what the drive can reach?"
+            ) from None
     wall = time.perf_counter() - begin
     log.profile(found.model, found.design.motion).to_csv(place / "profile.csv", index=False)
     (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")

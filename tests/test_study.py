@@ -131,7 +131,7 @@ WRONG = {
     "effect unknown": (GRID + 'effects = "magic=1"', "effect magic: unknown, allowed"),
     "effect without amount": (GRID + 'effects = "ground_slope"', "must be NAME[@WHERE]=AMOUNT"),
     "effect twice": (GRID + 'effects = [["ground_slope=0.1", "ground_slope=0.2"]]', "an effect is given twice"),
-    "duration too short": (GRID + "duration_s = 0.1", "duration: must be between 0.8 and 3600 s (got 0.1)"),
+    "duration too short": (GRID + "duration_s = 0.1", "duration_s: must be between 0.8 and 3600 s (got 0.1)"),
     "duration not a number": (GRID + 'duration_s = "long"', "grid[0].duration_s[0]: must be a number"),
     "limit unknown": (GRID + "limits = { charm = 2 }", "grid[0].limits[0].charm"),
     "limit that it hasn't": ('[grid]\nmachine = "emps"\nlimits = { slip = 2 }', "limits: emps has no limit slip"),
