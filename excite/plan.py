@@ -327,7 +327,7 @@ class Plan:
 
 
 def read(path: str | Path) -> Plan:
-    """A study file, checked with everything that it names. Raises UsageError, MachineError, LogError."""
+    """A study file, checked with everything that it names. Raises StudyError, MachineError, LogError."""
     path = Path(path)
     if path.suffix != ".toml":
         raise StudyError(f"{path}: must be a study file (.toml)")
@@ -343,8 +343,11 @@ def read(path: str | Path) -> Plan:
         raise StudyError(machines.one_line(path, err, Study)) from None
     try:
         return ready(study, path.parent)
-    except (UsageError, MachineError, LogError) as err:
-        raise type(err)(f"{path}: {str(err).removeprefix('--').replace('duration:', 'duration_s:', 1)}") from None
+    except UsageError as err:
+        said = str(err).removeprefix("--").replace("duration:", "duration_s:", 1)  # keys, not options
+        raise StudyError(f"{path}: {said}") from None
+    except (MachineError, LogError) as err:
+        raise type(err)(f"{path}: {err}") from None
 
 
 def ready(study: Study, base: Path | str = Path()) -> Plan:
