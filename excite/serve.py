@@ -9,6 +9,7 @@ must neither read nor fake measurements) and no message longer than MESSAGE byte
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import math
 from collections.abc import AsyncIterator, Callable
@@ -22,6 +23,7 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
+from excite import interrupt
 from model.machine import Machine
 from model.units import UNITS
 
@@ -166,10 +168,16 @@ class Tail:
 
 
 async def run(page: str, port: int, tail: Tail | None, ready: Callable[[str], None]) -> None:
-    """Serves the page until it is stopped; `ready` gets its address. Raises ServeError."""
+    """Serves the page until Ctrl-C or a polite kill; `ready` gets its address. Raises ServeError."""
+    stop = asyncio.Event()
+    with contextlib.suppress(RuntimeError, ValueError):  # not in the main thread: whoever started it stops it
+        # A KeyboardInterrupt may be raised anywhere in the loop and get lost there.
+        for number in interrupt.SIGNALS:
+            asyncio.get_running_loop().add_signal_handler(number, stop.set)
     async with serving(page, port) as (server, send):
         ready(f"http://{HOST}:{server.sockets[0].getsockname()[1]}/")
-        while True:
+        while not stop.is_set():
             for said in tail.new() if tail else ():
                 send(said)
-            await asyncio.sleep(POLL)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(stop.wait(), POLL)
