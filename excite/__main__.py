@@ -236,7 +236,7 @@ def run(
         checked.mkdir()
         second = works.verify(checked, designed, runs, method, kit, seed, out / "design")
         summary = {"design": first, "verify": second}
-        (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+        folder.keep(place, summary)
 
     def show(both: dict[str, Any]) -> None:
         terminal.design_table(both["design"])
@@ -273,7 +273,7 @@ def drive(
             made = cab.prepare(stored.read(design_dir), phases, shortest, seed, advance)
         summary = {"machine": name, "design": str(design_dir), "seed": seed, **cab.write(made, place)}
         summary["versions"] = asked.versions()
-        (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+        folder.keep(place, summary)
     terminal.finish(summary, out, json, terminal.drive_table)
     if serve:
         cab.serve(out, made, port, live, lambda address: typer.echo(f"{address} (Ctrl-C ends)", err=True))
@@ -376,7 +376,7 @@ def diagnose(
     json: JsonOption = False,
 ) -> None:
     """Shows what the simulation gets wrong, names the cause, extends the machine file, measures the gain."""
-    from excite import checkup, folder
+    from excite import checkup, folder, reports
 
     model = asked.model(machine)
     out = out or Path(f"results/diagnose-{model.machine.name}")
@@ -385,9 +385,9 @@ def diagnose(
     asked.known("--filter", filtering, ("machine", "auto"))
     with folder.writing(out) as place:
         with terminal.bar("diagnosing") as advance:
-            summary, tied = checkup.write(place, machine, model, logs, filtering, asked.versions(), advance)
+            summary, tied = checkup.write(place, machine, model, logs, filtering, advance)
         summary["separating_drive"] = checkup.separating(place, model.machine, tied, onward)
-        checkup.finish(place, summary)
+        reports.finish(place, "diagnose", summary)
     terminal.finish(summary, out, json, terminal.diagnose_table)
 
 
@@ -488,7 +488,7 @@ def docs(out: OutOption = None, json: JsonOption = False) -> None:
     folder.claim(out)
     with folder.writing(out) as place:
         summary = {"pages": reference.write(place), "versions": asked.versions()}
-        (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+        folder.keep(place, summary)
     terminal.finish(summary, out, json, lambda s: terminal.say(", ".join(s["pages"])))
 
 

@@ -93,6 +93,11 @@ def known(what: str, value: str, allowed: Sequence[str]) -> None:
         raise UsageError(f"{what}: {value} is unknown, allowed: {', '.join(allowed)}")
 
 
+def positive(option: str, value: float | None, unit: str) -> None:
+    if value is not None and not value > 0:
+        raise UsageError(f"{option}: must be > 0 {unit} (got {value:g})")
+
+
 def stem(machine: str) -> str:
     """What folders of a machine are called."""
     return Path(machine).stem if machine.endswith(".toml") else machine

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from excite import asked, brief, examine, findings, folder, gaps, identify, portrait, reports, separate, works
+from excite import asked, brief, examine, findings, gaps, identify, portrait, separate, works
 from excite.brief import Brief
 from excite.diagnose import diagnose
 from excite.limit import InfeasibleError
@@ -29,7 +29,6 @@ def write(
     model: Model,
     logs: Sequence[Path],
     filtering: str,
-    versions: Mapping[str, str],
     advance: Advance,
 ) -> tuple[dict[str, Any], list[Rivals]]:
     """Diagnoses logs and fills the folder: figures, and machine.toml where something is named. Its summary, and what a
@@ -65,7 +64,7 @@ def write(
         "machine_file": MACHINE if text is not None else None,
         "separating_drive": None,
         "notes": notes,
-        "versions": dict(versions),
+        "versions": asked.versions(),
     }
     portrait.write(place, account, summary["signals"], model.machine.title)
     return summary, separate.rivals(found)
@@ -96,9 +95,3 @@ def separating(place: Path, machine: Machine, tied: Sequence[Rivals], onward: bo
             told |= {"folder": NEXT, "sigma_percent": sigma, "complete": made["complete"]}
         return told
     return None
-
-
-def finish(place: Path, summary: dict[str, Any]) -> None:
-    """Report and summary."""
-    reports.write(place, "diagnose", summary)
-    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")

@@ -131,9 +131,7 @@ class Finding:
     @property
     def entry(self) -> EffectEntry:
         """As a machine file has it."""
-        shapes = {n: Quantity(value=value, source="identified") for n, (value, _, _) in self.shapes.items()}
-        amount = Quantity(value=self.amount, source="identified")
-        return EffectEntry(name=self.effect, where=self.where, amount=amount, shape=shapes)
+        return _identified(self.effect, self.where, self.amount, {n: value for n, (value, _, _) in self.shapes.items()})
 
 
 @dataclass(frozen=True)
@@ -363,19 +361,24 @@ def _entry(score: evidence.Score) -> EffectEntry:
         # Not proportional to the amount: no further from the grid's value than the signature holds.
         step = float(np.clip(amount / e.values["A"], 0.3, 2.0))
         amount = e.values["A"] / step if e.effect.inverse else e.values["A"] * step
-    shapes = {n: Quantity(value=round(v, 12), source="identified") for n, v in values.items()}
-    return EffectEntry(
-        name=e.effect.name, where=e.where, amount=Quantity(value=amount, source="identified"), shape=shapes
-    )
+    return _identified(e.effect.name, e.where, amount, {n: round(v, 12) for n, v in values.items()})
 
 
 def _fitted(stage: Stage, name: str) -> EffectEntry:
     """An effect with amount and shapes as a stage's fit has them."""
     placed = next(e for e in stage.model.effects if e.name == name)
     fitted = dict(zip(stage.model.base.names, stage.fit.X, strict=True))
-    values = {key: fitted.get(p, placed.values[key]) for p, (key, _) in placed.parameters.items()}
-    told = {key: Quantity(value=float(value), source="identified") for key, value in values.items()}
-    return EffectEntry(name=placed.effect.name, where=placed.where, amount=told.pop("A"), shape=told)
+    values = {key: float(fitted.get(p, placed.values[key])) for p, (key, _) in placed.parameters.items()}
+    return _identified(placed.effect.name, placed.where, values.pop("A"), values)
+
+
+def _identified(effect: str, where: str, amount: float, shapes: Mapping[str, float]) -> EffectEntry:
+    def told(value: float) -> Quantity:
+        return Quantity(value=value, source="identified")
+
+    return EffectEntry(
+        name=effect, where=where, amount=told(amount), shape={name: told(x) for name, x in shapes.items()}
+    )
 
 
 def _shortlist(stage: Stage, scores: Sequence[evidence.Score]) -> list[evidence.Score]:

@@ -26,6 +26,11 @@ class FolderError(ValueError):
     """An output place that can't be used: the message says why and what to do."""
 
 
+def keep(place: Path, summary: Any) -> None:
+    """Writes a folder's summary."""
+    (place / SUMMARY).write_text(dump(summary), encoding="utf-8")
+
+
 def claim(out: Path, inputs: Iterable[Path] = ()) -> None:
     """Checks before the work that `out` can be written at its end. Raises FolderError.
 

@@ -342,7 +342,7 @@ def write(place: Path, path: Path, versions: dict[str, str]) -> dict[str, Any]:
     if model is not None and model.machine.planar:
         report.save(topview.figure(model.machine), place / PICTURE)
     (place / "report.html").write_text(_page(summary, place), encoding="utf-8")
-    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    folder.keep(place, summary)
     return summary
 
 

@@ -54,6 +54,12 @@ def write(place: Path, kind: str, summary: Summary) -> None:
     (place / NAME).write_text(text, encoding="utf-8")
 
 
+def finish(place: Path, kind: str, summary: Summary) -> None:
+    """Report and summary of a command's folder, once its figures are there."""
+    write(place, kind, summary)
+    folder.keep(place, summary)
+
+
 def how(summary: Summary) -> dict[str, str]:
     """How a result was made: command, machine, settings, seed, versions."""
     rows = {"command": shlex.join(["excite", *sys.argv[1:]])}
@@ -102,8 +108,7 @@ def check_log(place: Path, path: Path, machine: str | None, versions: Mapping[st
     }
     if found.signals:
         report.save(report.log_figure(found.signals, found.gaps, str(path)), place / "log.png")
-    write(place, "log", summary)
-    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    finish(place, "log", summary)
     return summary
 
 

@@ -139,7 +139,7 @@ def _design(wanted: Plan, place: Path, kept: Store, cluster: str | None, tell: P
             with folder.writing(place / _name(order.number)) as partial:
                 (partial / "profile.csv").write_text(made.profile, encoding="utf-8")
                 (partial / "machine.json").write_text(order.machine + "\n", encoding="utf-8")
-                (partial / folder.SUMMARY).write_text(folder.dump(made.summary | {"versions": asked.versions()}))
+                folder.keep(partial, made.summary | {"versions": asked.versions()})
         done += 1
         tell(done, len(wanted.drives), "designing")
 
@@ -295,5 +295,5 @@ def _write(wanted: Plan, drives: Path, kept: Store, partial: Path, finger: str) 
         "versions": asked.versions(),
     }
     overview.draw(wanted, seen, summary, partial)
-    (partial / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    folder.keep(partial, summary)
     return summary

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from excite import asked, crosscheck, examine, folder, gaps, identify, log, report, reports, sensors, stored, terminal
+from excite import asked, crosscheck, examine, gaps, identify, log, report, reports, sensors, stored, terminal
 from excite import brief as briefs
 from excite import compare as comparisons
 from excite import verify as verification
@@ -33,9 +33,8 @@ def design(place: Path, machine: str, problem: str | None, duration: float | Non
         model = briefs.rivals(model, brief.between, float(chosen.duration_s))
     elif brief.objective == "discrimination" and len(model.effects) < 2:
         raise UsageError("--objective discrimination: needs two effects to tell apart, give --between twice")
-    for option, value, unit in (("--budget", brief.budget_s, "s"), ("--sigma-max", brief.sigma_max, "%")):
-        if value is not None and not value > 0:
-            raise UsageError(f"{option}: must be > 0 {unit} (got {value:g})")
+    asked.positive("--budget", brief.budget_s, "s")
+    asked.positive("--sigma-max", brief.sigma_max, "%")
     return designed(place, model, name, chosen, brief)
 
 
@@ -64,8 +63,7 @@ def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief
     title = f"{model.machine.title}: {name}, cond(Phi) = {found.design.cond_phi:.2f}"
     report.save(report.design_figure(found.model, chosen, found.design.motion, title), place / "design.png")
     report.save(report.sigma_figure(summary["sigma_percent"], title), place / "sigma.png")
-    reports.write(place, "design", summary)
-    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    reports.finish(place, "design", summary)
     return summary
 
 
@@ -105,8 +103,7 @@ def verify(
     }
     title = f"{model.machine.title}: {runs} simulated runs, {method}, kit {kit}"
     report.save(report.verify_figure(result, title), place / "verify.png")
-    reports.write(place, "verify", summary)
-    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    reports.finish(place, "verify", summary)
     return summary
 
 
@@ -121,8 +118,7 @@ def compare(
 ) -> dict[str, Any]:
     model = asked.model(machine, flaws=False)
     name, chosen = asked.problem(model.machine, problem, None)
-    if budget is not None and not budget > 0:
-        raise UsageError(f"--budget: must be > 0 s (got {budget:g})")
+    asked.positive("--budget", budget, "s")
     for usual in against:
         asked.known("--against", usual, tuple(comparisons.USUAL))
     with terminal.bar("comparing") as advance:
@@ -165,8 +161,7 @@ def compare(
     }
     title = f"{model.machine.title}: {name}, the designed drive and the usual ones"
     report.save(report.compare_figure(result.rows, title), place / "compare.png")
-    reports.write(place, "compare", summary)
-    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    reports.finish(place, "compare", summary)
     return summary
 
 
@@ -210,8 +205,7 @@ def identified(
             title = f"{model.machine.title}: {one.source}"
             figure = report.comparison_figure(model, crosscheck.torques(model, one, estimate, chosen), title)
             report.save(figure, place / (f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png"))
-    reports.write(place, "identify", summary)
-    (place / folder.SUMMARY).write_text(folder.dump(summary), encoding="utf-8")
+    reports.finish(place, "identify", summary)
     return summary
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import Excite
 
 from excite import objective
 from excite.compare import OURS, USUAL, Comparison, _equal, _Sample, compare, judge, shrunk, within
@@ -19,7 +20,6 @@ from excite.manoeuvre import Manoeuvre, multisine
 from excite.simulate import simulate
 from model.machine import Problem
 from model.prediction import Model
-from tests.conftest import Excite
 
 KINDS = ("multisine", "hand-made", "Fourier SLSQP")
 

@@ -28,6 +28,7 @@ import scipy.signal
 from excite import drive, log, sensors
 from excite.driver import Driver
 from excite.identify import NoEstimate, identify
+from excite.objective import relative
 from excite.scenario import varied
 from excite.simulate import Motion, simulate
 from excite.smoothing import DOUBT, cramer_rao
@@ -156,12 +157,7 @@ def done() -> list[dict[str, object]]:
 def bound(s: Set) -> np.ndarray:
     """Cramer-Rao bound (n,) [%] along the first drive of a set."""
     motion = moved(s.drive, "model", 0)
-    return 100 * np.sqrt(np.diag(cramer_rao(nominal(), motion, s.kit))) / reference()
-
-
-def reference() -> np.ndarray:
-    model = nominal()
-    return np.where(model.nominal != 0, np.abs(model.nominal), model.scale)
+    return 100 * np.sqrt(np.diag(cramer_rao(nominal(), motion, s.kit))) / relative(nominal())
 
 
 def judged(s: Set, rows: Sequence[Mapping[str, object]]) -> dict[str, object]:
@@ -174,7 +170,7 @@ def judged(s: Set, rows: Sequence[Mapping[str, object]]) -> dict[str, object]:
     warnings.simplefilter("ignore", RuntimeWarning)
     known = np.where(np.isfinite(error), 1.0, np.nan)
     inside = 100 * np.nanmean(known * (np.abs(error) <= quantile[:, None] * std), axis=0)
-    rms = 100 * np.sqrt(np.nanmean(error**2, axis=0)) / reference()
+    rms = 100 * np.sqrt(np.nanmean(error**2, axis=0)) / relative(nominal())
     least = bound(s)
     ratio = np.sqrt(np.nanmean((error / std) ** 2, axis=0))
     seconds = np.array([r["seconds"] for r in rows], float)
@@ -201,7 +197,7 @@ def judged(s: Set, rows: Sequence[Mapping[str, object]]) -> dict[str, object]:
                 "coverage": inside[k],
                 "rms_over_sigma": ratio[k],
                 "rms_percent": rms[k],
-                "bias_percent": 100 * float(np.nanmean(error[:, k])) / reference()[k],
+                "bias_percent": 100 * float(np.nanmean(error[:, k])) / relative(nominal())[k],
                 "bound_percent": least[k],
             }
             for k, n in enumerate(names)
@@ -303,6 +299,8 @@ def main() -> None:
                 out.flush()
     rows = {s: [r for r in done() if r["set"] == s.name and int(str(r["seed"])) < s.runs] for s in sets}
     found = [judged(s, own) for s, own in rows.items() if any("value" in r for r in own)]
+    if not found:
+        raise SystemExit(f"{RUNS} holds no run: the report stays as it is")
     (HERE / "summary.json").write_text(json.dumps(_plain({"off": OFF, "sets": found}), indent=1) + "\n")
     (HERE / "README.md").write_text(report(found))
 
