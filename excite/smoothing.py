@@ -419,10 +419,11 @@ def iterate(
     held: np.ndarray,
     damping: float = DAMPING[0],
     passes: int = PASSES,
+    enough: float = ENOUGH,
 ) -> Fit:
     """Gauss-Newton from points and X; the prior stands about the machine file's values and the states of `starts`.
-    Parameters `held` (n_base,) stay at their values. damping: of the first step;
-    passes: at most.
+    Parameters `held` (n_base,) stay at their values. damping: of the first step; passes: at most; enough: a step, in
+    standard deviations, at which a fit with disturbing forces is found.
 
     Raises NotConverged.
     """
@@ -477,7 +478,7 @@ def iterate(
         )
         # What this step will have left undone, if steps go on shrinking as they do.
         ratio = min(max(step / before, 1 - whole), 0.9)
-        if (step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED) or (disturbed > 0 and step < ENOUGH):
+        if (step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED) or (disturbed > 0 and step < enough):
             base = covariance[: len(X), : len(X)] * np.outer(model.scale, model.scale)
             return Fit(there[1], base, unseen, tuple(there[0]), tuple(linear), cost, disturbed)
     stood = None
