@@ -25,7 +25,7 @@ PEOPLE = 3  # drives by different people, in simulation
 PAGE = "driver.html"
 PACES = (4.0, 3.0, 2.5)  # s per phase that are tried where nobody says how many phases
 ENOUGH = 1.2
-NEAR = 0.8  # of the steered joint's stop
+NEAR = 0.8  # of a steered joint's stop
 Progress = Callable[[int, int, float | None], None]
 
 PLAYED, TRACED, PHASED = "torques played back", "a person on the design's own trace", "a person on these phases"
@@ -129,16 +129,21 @@ def _warnings(model: Model, problem: Problem, trace: Trace, motions: tuple[Motio
         lines.append(f"The machine changes direction {times}: somebody must see the ground behind it.")
     ends = np.array([drive.edges(model, m)[0].mean(axis=0)[-1] for m in motions])
     spread = float(np.hypot(*(ends.max(axis=0) - ends.min(axis=0))))
-    wheel, joint = drive.steered(model), drive.steered_name(model)
-    followed = f"speed and {joint}" if joint else "the speed"
+    *others, last = ("speed", *(lever.name for lever in trace.levers))
+    followed = f"{', '.join(others)} and {last}" if others else "the speed"
     lines.append(
         f"People drift: between {len(motions)} simulated drives the ends lie {spread:.1f} m apart. Follow"
         f" {followed}, not the place; don't correct the place before the end."
     )
-    if wheel is not None and wheel.limit.position is not None:
-        top = float(np.abs(trace.angle).max()) / float(wheel.limit.position)
-        if top > NEAR:
-            lines.append(f"The {joint} goes to {100 * top:.0f} % of its stop: hands and feet away from the joint.")
+    if len(trace.levers) > 1:
+        lines.append(
+            "Left, of every joint, is what turns the machine to the left when it goes forward: joints to one side turn"
+            " it tightly, to different sides they move it sideways."
+        )
+    for lever, angle in zip(trace.levers, trace.angle.T, strict=True):
+        stop = lever.body.limit.position
+        if stop is not None and (top := float(np.abs(angle).max()) / float(stop)) > NEAR:
+            lines.append(f"The {lever.name} goes to {100 * top:.0f} % of its stop: hands and feet away from the joint.")
     over: dict[str, float] = {}
     for m in motions:
         for name, value in drive.broken(model, problem, m).items():
@@ -186,7 +191,8 @@ def write(made: Sheet, place: Path) -> dict[str, Any]:
     sheet.save(made, place / "sheet.pdf")
     (place / PAGE).write_text(page.driver_page(made.model, made.trace, made.title), encoding="utf-8")
     t = made.trace.times
-    knots = pd.DataFrame({"t_s": t, "v_m_s": made.trace.speed, "angle_rad": made.trace.angle})
+    angles = {lever.column: angle for lever, angle in zip(made.trace.levers, made.trace.angle.T, strict=True)}
+    knots = pd.DataFrame({"t_s": t, "v_m_s": made.trace.speed, **angles})
     knots.to_csv(place / "phases.csv", index=False)
     return summary(made)
 
@@ -194,6 +200,7 @@ def write(made: Sheet, place: Path) -> dict[str, Any]:
 def serve(out: Path, made: Sheet, port: int, live: Path | None, ready: Callable[[str], None]) -> None:
     """The page of a written folder with live values, until Ctrl-C; `ready` gets its address. Raises ServeError."""
     text = (out / PAGE).read_text(encoding="utf-8")
-    tail = Tail(live, made.model.machine) if live is not None else None
+    levers = made.trace.levers
+    tail = Tail(live, made.model.machine, levers) if live is not None else None
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(run(text, port, tail, ready))
+        asyncio.run(run(text, [lever.column for lever in levers], port, tail, ready))

@@ -1,6 +1,6 @@
 """From a designed motion to a drive that a person can follow: phases of some seconds, their words, room and score.
 
-People follow a trace of speed and of a steered joint's angle, as in drive-cycle testing, not torques. A design is
+People follow a trace of speed and of every steered joint's angle, as in drive-cycle testing, not torques. A design is
 smoothed into few straight pieces of at least some seconds (piecewise linear least squares; the knots by dynamic
 programming, Bellman and Roth, 1969), rounded to what a dial shows, and driven in simulation by `driver`: what is left
 of the attainable accuracy is what a person can keep.
@@ -34,25 +34,47 @@ class DriveError(ValueError):
 
 
 @dataclass(frozen=True)
-class Trace:
-    """What a driver follows, linear between knots: times (K,) [s], speed (K,) [m/s] forward, angle (K,) [rad].
+class Lever:
+    """A joint that a person steers; `left` is +1 or -1, the sign of its angle that, alone, turns the machine to the
+    left when it goes forward."""
 
-    `angle` is that of the steered joint in the machine's own sign; `left` is +1 or -1, the sign that turns the machine
-    to the left when it goes forward, 0 where nothing is steered.
-    """
+    body: Body
+    left: int
+
+    @property
+    def name(self) -> str:
+        """What the machine file calls the joint, in words."""
+        return self.body.where.replace("_", " ")
+
+    @property
+    def column(self) -> str:
+        """Its angle in tables."""
+        return f"{self.body.where}_rad"
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a driver follows, linear between knots: times (K,) [s], speed (K,) [m/s] forward, angle (K, n) [rad] of the
+    n steered joints `levers`, in the machine's own signs."""
 
     times: np.ndarray
     speed: np.ndarray
     angle: np.ndarray
-    left: int
+    levers: tuple[Lever, ...]
 
     @property
     def duration(self) -> float:
         return float(self.times[-1])
 
+    @property
+    def degrees(self) -> np.ndarray:
+        """Angles (K, n) [deg], positive to the left."""
+        return np.asarray(np.rad2deg(self.angle) * [lever.left for lever in self.levers])
+
     def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Speed (N,) [m/s] and angle (N,) [rad] at times (N,) [s], held at the ends."""
-        return np.interp(t, self.times, self.speed), np.interp(t, self.times, self.angle)
+        """Speed (N,) [m/s] and angles (N, n) [rad] at times (N,) [s], held at the ends."""
+        angle = [np.interp(t, self.times, a) for a in self.angle.T]
+        return np.interp(t, self.times, self.speed), np.reshape(angle, (len(angle), len(t))).T
 
     def __len__(self) -> int:
         return len(self.times) - 1
@@ -77,31 +99,18 @@ class Room:
     corner: tuple[float, float]
 
 
-def steered(model: Model) -> Body | None:
-    """The joint that a person steers, None on a straight lane. Raises DriveError: no wheels, or several such joints."""
+def levers(model: Model) -> tuple[Lever, ...]:
+    """The joints that a person steers, none on a straight lane. Raises DriveError where nobody drives: no wheels."""
     if not model.machine.planar or not model.machine.contacts:
         raise DriveError(f"{model.machine.name}: has no rolls or wheels on the ground, so there is nobody to drive it")
-    joints = [b for b in model.machine.actuated if b.contact is None]
-    if len(joints) > 1:
-        names = ", ".join(b.where for b in joints)
-        raise DriveError(f"{model.machine.name}: {names} are steered at once, a person follows one; lock the others")
-    return joints[0] if joints else None
+    return tuple(Lever(b, _turns_left(model, b)) for b in model.machine.actuated if b.contact is None)
 
 
-def steered_name(model: Model) -> str:
-    """What the machine file calls the steered joint, in words; empty where nothing is steered. Raises as `steered`."""
-    body = steered(model)
-    return body.where.replace("_", " ") if body is not None else ""
-
-
-def turns_left(model: Model) -> int:
-    """The sign of the steered joint's angle that turns the machine left when rolling forward, 0 without steering.
+def _turns_left(model: Model, body: Body) -> int:
+    """The sign of a joint's angle that, alone, turns the machine left when rolling forward.
 
     From pure rolling: the lateral speeds of all contacts vanish, which is linear in the chassis' speeds.
     """
-    body = steered(model)
-    if body is None:
-        return 0
     names = model.coordinates
     q = np.zeros(len(names))
     q[names.index(body.coordinates[0])] = 0.1
@@ -129,47 +138,49 @@ def phases(model: Model, motion: Motion, shortest: float = 2.0, most: int | None
         raise DriveError(f"phases: at least 2 are needed, to go and to stop (got {most})")
     if not GRID <= shortest <= duration / 2:
         raise DriveError(f"shortest phase: must be between {GRID:g} and {duration / 2:g} s (got {shortest:g})")
-    wheel, left = steered(model), turns_left(model)
-    speed = motion.nu[:, 0]
-    angle = motion.q[:, model.coordinates.index(wheel.coordinates[0])] if wheel else np.zeros(len(motion.t))
-    fastest, widest, swing = bounds(model, wheel)
+    own = as_designed(model, motion)
+    speed, angle = own.speed, own.angle
+    fastest, widest, swing = bounds(model)
     signal = np.column_stack([speed / (SPEED_STEP * 5), angle / (ANGLE_STEP * 5)])
     knots = _segments(motion.t, signal, shortest, most)
     fit = _refit(motion.t, np.column_stack([speed, angle]), knots)
     v = np.clip(np.round(fit[:, 0] / SPEED_STEP) * SPEED_STEP, -fastest, fastest)
-    a = np.clip(np.round(fit[:, 1] / ANGLE_STEP) * ANGLE_STEP, -widest, widest)
-    return merged(Trace(knots, v + 0.0, slowed(knots, a, swing) + 0.0, left))
+    a = np.clip(np.round(fit[:, 1:] / ANGLE_STEP) * ANGLE_STEP, -widest, widest)
+    return merged(Trace(knots, v + 0.0, slowed(knots, a, swing) + 0.0, own.levers))
 
 
-def slowed(times: np.ndarray, angle: np.ndarray, swing: float, fixed: Sequence[int] = (0, -1)) -> np.ndarray:
-    """Angles (K,) [rad] at times (K,) [s], steered no faster than `swing` [rad/s] in between; those `fixed` stay.
+def slowed(times: np.ndarray, angle: np.ndarray, swing: np.ndarray, fixed: Sequence[int] = (0, -1)) -> np.ndarray:
+    """Angles (K, n) [rad] at times (K,) [s], steered no faster than `swing` (n,) [rad/s] between; those `fixed` stay.
 
     Within reach of the fixed ones first, then the mean of the lower and upper envelopes (McShane, 1934).
     """
-    if not np.isfinite(swing):
-        return angle.copy()
-    reach = swing * np.abs(times[:, None] - times)
-    ends = list(fixed)
-    a = np.clip(angle, (angle[ends] - reach[:, ends]).max(axis=1), (angle[ends] + reach[:, ends]).min(axis=1))
-    return np.asarray(((a + reach).min(axis=1) + (a - reach).max(axis=1)) / 2)
+    slow, ends = angle.copy(), list(fixed)
+    for j in np.flatnonzero(np.isfinite(swing)):
+        reach, a = swing[j] * np.abs(times[:, None] - times), angle[:, j]
+        a = np.clip(a, (a[ends] - reach[:, ends]).max(axis=1), (a[ends] + reach[:, ends]).min(axis=1))
+        slow[:, j] = ((a + reach).min(axis=1) + (a - reach).max(axis=1)) / 2
+    return slow
 
 
 def as_designed(model: Model, motion: Motion) -> Trace:
-    """A motion's own speed and steering as a trace, sample by sample: what the phases are compared with."""
-    wheel = steered(model)
-    angle = motion.q[:, model.coordinates.index(wheel.coordinates[0])] if wheel else np.zeros(len(motion.t))
-    return Trace(motion.t, motion.nu[:, 0], angle, turns_left(model))
+    """A motion's own speed and steering as a trace, sample by sample: what the phases are compared with.
+
+    Raises DriveError as `levers`.
+    """
+    joints = levers(model)
+    angle = motion.q[:, [model.coordinates.index(j.body.coordinates[0]) for j in joints]]
+    return Trace(motion.t, motion.nu[:, 0], angle, joints)
 
 
-def bounds(model: Model, wheel: Body | None) -> tuple[float, float, float]:
-    """Speed [m/s], angle [rad] and rate [rad/s] that a trace may ask for; speed and angle on the dial's grid."""
+def bounds(model: Model) -> tuple[float, np.ndarray, np.ndarray]:
+    """Speed [m/s], angles (n,) [rad] and rates (n,) [rad/s] that a trace may ask for; speed and angles on the dial's
+    grid."""
     rims = [float(b.limit.rim_speed) for b in model.machine.contacts if b.limit.rim_speed is not None]
     fastest = np.floor(RESERVE * min(rims) / SPEED_STEP + 1e-9) * SPEED_STEP if rims else np.inf
-    if wheel is None:
-        return float(fastest), np.inf, np.inf
-    top, rate = wheel.limit.position, wheel.limit.rate
-    widest = np.floor(RESERVE * float(top) / ANGLE_STEP) * ANGLE_STEP if top is not None else np.inf
-    return float(fastest), float(widest), RESERVE * float(rate) if rate is not None else np.inf
+    stated = [j.body.limit for j in levers(model)]
+    top = np.array([np.inf if x.position is None else float(x.position) for x in stated])
+    rate = np.array([np.inf if x.rate is None else float(x.rate) for x in stated])
+    return float(fastest), np.floor(RESERVE * top / ANGLE_STEP) * ANGLE_STEP, RESERVE * rate
 
 
 def _segments(t: np.ndarray, signal: np.ndarray, shortest: float, most: int) -> np.ndarray:
@@ -222,7 +233,7 @@ def merged(trace: Trace) -> Trace:
         share = (trace.times[k] - trace.times[before]) / (trace.times[after] - trace.times[before])
         bend_v = trace.speed[k] - (trace.speed[before] + share * (trace.speed[after] - trace.speed[before]))
         bend_a = trace.angle[k] - (trace.angle[before] + share * (trace.angle[after] - trace.angle[before]))
-        if abs(bend_v) > SPEED_STEP / 10 or abs(bend_a) > ANGLE_STEP / 10:
+        if abs(bend_v) > SPEED_STEP / 10 or (np.abs(bend_a) > ANGLE_STEP / 10).any():
             keep.append(k)
     keep.append(len(trace.times) - 1)
     return replace(trace, times=trace.times[keep], speed=trace.speed[keep], angle=trace.angle[keep])
@@ -258,7 +269,7 @@ def table(trace: Trace) -> list[dict[str, Any]]:
             "start_s": float(trace.times[k]),
             "end_s": float(trace.times[k + 1]),
             "speed_m_s": [float(trace.speed[k]), float(trace.speed[k + 1])],
-            "angle_rad": [float(trace.angle[k]), float(trace.angle[k + 1])],
+            **{lever.column: trace.angle[k : k + 2, j].tolist() for j, lever in enumerate(trace.levers)},
             "do": words(trace, k),
         }
         for k in range(len(trace))
@@ -267,27 +278,27 @@ def table(trace: Trace) -> list[dict[str, Any]]:
 
 def from_table(model: Model, rows: Sequence[Mapping[str, Any]]) -> Trace:
     """The trace that `table` was made of. Raises DriveError for a table that is damaged."""
+    joints = levers(model)
     try:
-        ends = [(0.0, 0.0, 0.0), *((r["end_s"], r["speed_m_s"][1], r["angle_rad"][1]) for r in rows)]
-        times, speed, angle = np.array(ends, float).T
+        ends = [(r["end_s"], r["speed_m_s"][1], *(r[j.column][1] for j in joints)) for r in rows]
+        times, speed, *angle = np.array([(0.0,) * (2 + len(joints)), *ends], float).T
     except (KeyError, IndexError, TypeError, ValueError):
         raise DriveError("summary.json: the design's phases are damaged, design again") from None
     if len(times) < 2 or not (np.diff(times) > 0).all():
         raise DriveError("summary.json: the design's phases are damaged, design again")
-    return Trace(times, speed, angle, turns_left(model))
+    return Trace(times, speed, np.reshape(angle, (len(joints), len(times))).T, joints)
 
 
 def parts(trace: Trace, k: int, letters: bool = False) -> tuple[str, str]:
-    """What to do in phase k with the speed lever and with the wheel, the latter empty where nothing is steered."""
+    """What to do in phase k with the speed lever and with what steers, the latter empty where nothing does."""
     start, end = float(trace.times[k]), float(trace.times[k + 1])
     took = end - start
     v0, v1 = float(trace.speed[k]), float(trace.speed[k + 1])
     names = [letter(n) for n, t in enumerate(reversals(trace)) if letters and start < t < end]
     go = _speed_words(v0, v1, took, start, names[0] if names else "")
-    if trace.left == 0:
-        return go, ""
-    steer = _steer_words(trace.left * float(trace.angle[k]), trace.left * float(trace.angle[k + 1]), took)
-    return go, steer
+    several = len(trace.levers) > 1
+    each = zip(trace.levers, trace.degrees[k], trace.degrees[k + 1], strict=True)
+    return go, ", ".join(_steer_words(a0, a1, lever.name if several else "") for lever, a0, a1 in each)
 
 
 def _speed_words(v0: float, v1: float, took: float, start: float, name: str) -> str:
@@ -305,13 +316,19 @@ def _speed_words(v0: float, v1: float, took: float, start: float, name: str) -> 
     return f"slow down to {abs(v1):.1f} m/s{way} {seconds}"
 
 
-def _steer_words(a0: float, a1: float, took: float) -> str:
-    """Angles positive to the left."""
-    degrees = round(abs(np.rad2deg(a1)))
-    side = "left" if a1 > 0 else "right"
-    if abs(a0 - a1) < ANGLE_STEP / 10:
-        return f"keep {degrees}° {side}" if degrees else "straight"
-    return f"steer to {degrees}° {side}" if degrees else "straighten up"
+def _steer_words(a0: float, a1: float, name: str) -> str:
+    """From angle to angle [deg], positive to the left; name: of the joint, empty where there is one only."""
+    kept, angle = abs(a0 - a1) < np.rad2deg(ANGLE_STEP) / 10, angle_words(a1)
+    if not round(abs(a1)):
+        return f"{name} straight".strip() if kept else f"straighten {name or 'up'}"
+    if kept:
+        return f"keep {name} {angle}".replace("  ", " ")
+    return f"{name or 'steer'} to {angle}"
+
+
+def angle_words(degrees: float) -> str:
+    """An angle, positive to the left, as a person reads it: 20° left."""
+    return f"{abs(degrees):.0f}°" + ("" if abs(degrees) < 0.5 else " left" if degrees > 0 else " right")
 
 
 def reversals(trace: Trace) -> list[float]:
@@ -330,9 +347,7 @@ def driven(model: Model, trace: Trace, who: driver.Driver | None, seed: int, q0:
     """A person follows the trace, in simulation. Raises SimulationError."""
     rate = float(model.machine.sampling_hz)
     t = np.arange(round(trace.duration * rate) + 1) / rate
-    speed, angle = trace.at(t)
-    angles = angle[:, None] if trace.left else np.zeros((len(t), 0))
-    return driver.follow(model, speed, angles, who, seed=seed, q0=q0)
+    return driver.follow(model, *trace.at(t), who, seed=seed, q0=q0)
 
 
 def score(model: Model, motion: Motion) -> Score:

@@ -1,15 +1,18 @@
-"""A person at the levers: follows speed and articulation that can be seen coming, slowly and not quite.
+"""A person at the levers: follows speed and steered angles that can be seen coming, slowly and not quite.
 
-People do not play back torques. They set a speed lever and a steering wheel; the hydrostatic drive makes the torques
-that bring the rolls to that speed and the articulation to that rate, within the machine's limits.
+People do not play back torques. They set a speed lever and what steers; the hydrostatic drive makes the torques that
+bring the driven contacts to that speed and the steered joints to that rate, within the machine's limits.
 
 What is assumed of the person: the trace is seen ahead, as on the road (MacAdam, "Application of an optimal preview
 control for simulation of closed-loop automobile driving", IEEE Trans. SMC 11(6), 1981; Sheridan, 1966), so the hand
 moves early by about its own delay and only what the machine is late is left. What was not foreseen is corrected from
 what is seen, a reaction time late, against what the person expects of the machine: its usual lag is no error. The hand
 is slow (second order, McRuer and Jex, 1967) and all that it does goes through it, its slow errors too, so that nothing
-in the torques is faster than hand, drive and machine. With the lever in neutral there are no errors. Not assumed:
-fatigue, learning within a drive, coupling of speed and steering, the place on the lane.
+in the torques is faster than hand, drive and machine. With the lever in neutral there are no errors. Who steers several
+joints looks at each of them and at the speed less often: deviations are corrected more slowly by that share, and the
+variance of the slow errors grows by it (Levison, Elkind and Ward, "Studies of multivariable manual control systems: a
+model for task interference", NASA CR-1746, 1971). Not assumed: fatigue, learning within a drive, coupling of speed and
+steering, the place on the lane.
 """
 
 from __future__ import annotations
@@ -25,8 +28,10 @@ from model.prediction import Model
 
 DRIVER = 2  # stream of random numbers, apart from the sensors'
 RESPONSE = 0.3  # s, in which a hydrostatic drive brings what it moves to speed
+WALK = 1.0  # m/s
 HOLD = 5.0  # 1/s, with which the oil in the steering cylinders brings a joint back that the soil pushed away
 WANDER = 2.0  # s, twice: time constants of the slow errors
+WATCHED = 2  # speed and one angle: what the driver's numbers are of
 NEUTRAL = 0.2  # m/s: below it the lever nears its detent, and errors and corrections fade with it
 
 
@@ -68,7 +73,7 @@ def follow(
     """
     driver = driver or Driver()
     machine, rate = model.machine, float(model.machine.sampling_hz)
-    rolls = [k for k, b in enumerate(machine.actuated) if b.contact is not None]
+    rolling = [k for k, b in enumerate(machine.actuated) if b.contact is not None]
     joints = [k for k, b in enumerate(machine.actuated) if b.contact is None]
     n = len(speed)
     if angles.shape != (n, len(joints)):
@@ -76,9 +81,11 @@ def follow(
     rng = np.random.default_rng([seed, DRIVER])
     foreseen = _ahead(np.asarray(speed, float), driver, rate)
     detent = np.minimum(np.abs(foreseen) / NEUTRAL, 1.0)
-    pushed = foreseen + driver.speed_error_m_s * detent * _wander(n, rate, rng)
+    share = min(WATCHED / (1 + len(joints)), 1.0)
+    attention, blur = driver.attention * share, share**-0.5
+    pushed = foreseen + blur * driver.speed_error_m_s * detent * _wander(n, rate, rng)
     aimed = [_ahead(np.asarray(a, float), driver, rate) for a in angles.T]
-    wandered = [a + driver.angle_error_rad * _wander(n, rate, rng) for a in aimed]
+    wandered = [a + blur * driver.angle_error_rad * _wander(n, rate, rng) for a in aimed]
     turned = [np.gradient(a) * rate for a in wandered]
     # lists: the loop below works sample by sample, where they are faster than arrays
     expected = [_expected(x, driver, rate).tolist() for x in (foreseen, *aimed)]
@@ -92,11 +99,11 @@ def follow(
     radius = [float(b.contact.radius) if b.contact is not None else 1.0 for b in machine.actuated]
     most = [float(x.rim_speed) if x.rim_speed is not None else np.inf for x in limits]
     swing = [float(x.rate) if x.rate is not None else np.inf for x in limits]
-    fastest = [(most[k] / radius[k] if k in rolls else swing[k]) for k in range(len(rows))]
+    fastest = [(most[k] / radius[k] if k in rolling else swing[k]) for k in range(len(rows))]
     gain = gains(model).tolist()
     top = np.array([float(x.torque) if x.torque is not None else np.inf for x in limits])
     climb = np.array([float(x.torque_rate) if x.torque_rate is not None else np.inf for x in limits]) / rate
-    share = 1 - np.exp(-2 * np.pi * driver.hydraulics_hz / rate)
+    settled = 1 - np.exp(-2 * np.pi * driver.hydraulics_hz / rate)
     seen: list[list[float]] = []
     watched = [rows[j] for j in joints]
     last = np.zeros(len(rows))
@@ -109,20 +116,20 @@ def follow(
         seen.append([state[n_q], *(state[r] for r in watched)])
         then = max(k - late, 0)
         off = [e[then] - s for e, s in zip(expected, seen[then], strict=True)]
-        trim += driver.attention * off[0] * float(detent[k]) / rate
+        trim += attention * off[0] * float(detent[k]) / rate
         lever = hands[0].moved(commands[0][k] + trim * float(detent[k]))
         target = np.empty(len(rows))
-        for j in rolls:
+        for j in rolling:
             asked = min(max(lever / radius[j], -fastest[j]), fastest[j])
             target[j] = gain[j] * (asked - state[n_q + rows[j]])
         for i, j in enumerate(joints, 1):
-            turn = hands[i].moved(commands[i][k] + driver.attention * off[i])
+            turn = hands[i].moved(commands[i][k] + attention * off[i])
             turn = min(max(turn, -fastest[j]), fastest[j])
             relief = top[j] / (gain[j] * HOLD)  # a relief valve opens before the oil is pressed further
             away = held[i - 1] + turn / rate - state[rows[j]]
             held[i - 1] = min(max(away, -relief), relief) + state[rows[j]]
             target[j] = gain[j] * (turn - state[n_q + rows[j]] + HOLD * (held[i - 1] - state[rows[j]]))
-        wish = last + share * (np.minimum(np.maximum(target, -top), top) - last)
+        wish = last + settled * (np.minimum(np.maximum(target, -top), top) - last)
         if k > 0:
             last[:] += np.minimum(np.maximum(wish - last, -climb), climb)
         return last.copy()
@@ -173,13 +180,28 @@ def _wander(n: int, rate: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def gains(model: Model) -> np.ndarray:
-    """(n_u,) torque per speed error [N m s/rad] of each drive: its reflected inertia to speed in RESPONSE."""
+    """(n_u,) torque per speed error [N m s/rad] of each drive: its reflected inertia to speed in RESPONSE.
+
+    Of a joint no less than what resists its turning at a WALK: oil that flows in has to go somewhere.
+    """
     q, nu, _ = model.symbols()
-    mass = ca.Function("mass", [q], [model.equations(q, nu, ca.DM(model.nominal))[0]])
-    M = mass(np.zeros(len(model.coordinates))).full()
-    rolls = sum(b.contact is not None for b in model.machine.actuated)
+    dry = [f"Fs{b.index}" for b in model.machine.body]  # is the same at any speed
+    mass, force = model.equations(q, nu, ca.DM(np.where(np.isin(model.base.names, dry), 0.0, model.nominal)))
+    at = ca.Function("at", [q, nu], [mass, ca.jacobian(force, nu)])
+    names, still = model.coordinates, np.zeros(len(model.coordinates))
+    rolling = still.copy()
+    rolling[0] = WALK
+    for b in model.machine.contacts:
+        assert b.contact is not None
+        rolling[names.index(b.coordinates[0])] = WALK / float(b.contact.radius)
+    M, D = at(still, still)[0].full(), at(still, rolling)[1].full()
+    aside = [names.index(c) for c in model.machine.body[0].coordinates[1:] if c in names]  # the chassis gives way
+    D -= D[:, aside] @ np.linalg.solve(D[np.ix_(aside, aside)], D[aside])
+    driven = sum(b.contact is not None for b in model.machine.actuated)
     gain = np.zeros(len(model.inputs))
     for j, (row, body) in enumerate(zip(model.actuated, model.machine.actuated, strict=True)):
-        share = M[0, 0] * float(body.contact.radius) ** 2 / rolls if body.contact is not None else 0.0
-        gain[j] = (share + M[row, row]) / RESPONSE
+        if body.contact is None:
+            gain[j] = max(M[row, row] / RESPONSE, D[row, row])
+        else:
+            gain[j] = (M[0, 0] * float(body.contact.radius) ** 2 / driven + M[row, row]) / RESPONSE
     return gain

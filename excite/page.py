@@ -53,9 +53,8 @@ def driver_page(model: Model, trace: Trace, title: str) -> str:
 def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
     """What the page knows: the trace (angles in degrees, positive to the left), its phases in words, the columns."""
     machine = model.machine
-    degrees = trace.left * 180 / np.pi
     by_body = {s.body: s for s in machine.sensors("full") if s.kind == "angle"}
-    rolls = [
+    rims = [
         {
             "column": by_body[b.index].column,
             "gain": float(b.contact.radius) * by_body[b.index].gain,
@@ -64,28 +63,32 @@ def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
         for b in machine.contacts
         if b.contact is not None and b.index in by_body
     ]
-    wheel = drive.steered(model)
-    sensor = by_body.get(wheel.index) if wheel is not None else None
-    angle = {
-        "column": sensor.column if sensor else "",
-        "gain": degrees * sensor.gain if sensor else 0.0,
-        "degrees": degrees,
-    }
+    levers = []
+    for lever, degrees in zip(trace.levers, trace.degrees.T, strict=True):
+        sensor, degree = by_body.get(lever.body.index), lever.left * 180 / np.pi
+        levers.append(
+            {
+                "name": lever.name,
+                "said": lever.column,
+                "column": sensor.column if sensor else "",
+                "gain": degree * sensor.gain if sensor else 0.0,
+                "degrees": degree,
+                "values": degrees.tolist(),
+            }
+        )
     words = [drive.parts(trace, k) for k in range(len(trace))]
     words = [(TIMES.sub("", go), steer) for go, steer in words]
     return {
         "title": title,
         "times": trace.times.tolist(),
         "speed": trace.speed.tolist(),
-        "angle": (degrees * trace.angle).tolist(),
-        "steers": trace.left != 0,
-        "joint": drive.steered_name(model),
+        "levers": levers,
         "phases": [
             {"start": float(t), "go": go, "steer": steer}
             for t, (go, steer) in zip(trace.times[:-1], words, strict=True)
         ],
         "band": {"speed": drive.BAND_SPEED, "angle": float(np.rad2deg(drive.BAND_ANGLE)), "time": drive.BAND_S},
-        "log": {"time": machine.time_column, "second": UNITS[machine.time_unit][1], "rolls": rolls, "angle": angle},
+        "log": {"time": machine.time_column, "second": UNITS[machine.time_unit][1], "rims": rims},
     }
 
 

@@ -1,8 +1,8 @@
 """A design that people can follow: the designer's own objective, sought among drives made of few phases.
 
-What is sought is a trace of speed and articulation, straight between knots that are some seconds apart, and what counts
-is what the machine does in a person's hands (`driver`), not what torques could do. The design for torques, smoothed
-into phases as `drive` does, and random phases are where it starts. Knots and levels are then improved by sequential
+What is sought is a trace of speed and steering, straight between knots that are some seconds apart, and what counts is
+what the machine does in a person's hands (`driver`), not what torques could do. The design for torques, smoothed into
+phases as `drive` does, and random phases are where it starts. Knots and levels are then improved by sequential
 quadratic programs: differences of the driven motion tell how the information matrix and every limit change, the
 objective's slope and convex curvature by that matrix are exact (`aim.local`), and a step counts only where the driven
 motion says so. In the end times are rounded to half seconds and levels to what a dial shows, and people with their slow
@@ -88,7 +88,7 @@ def phased(
     check(model, problem, shortest)
     duration = float(designed.t[-1])
     shortest = float(np.ceil(shortest / GRID - 1e-9) * GRID)
-    task = Task(model, problem, aim, duration, shortest, *drive.bounds(model, drive.steered(model)))
+    task = Task(model, problem, aim, duration, shortest, *drive.bounds(model))
     begin = standing(task, designed)
     total = ROUNDS + LEVELS + POLISHES + 1
     with joblib.parallel_config("loky", inner_max_num_threads=1):
@@ -128,7 +128,7 @@ def phased(
 
 def check(model: Model, problem: Problem, shortest: float) -> None:
     """Raises DriveError where nobody can be asked to drive phases of `shortest` [s] or more."""
-    drive.steered(model)
+    drive.levers(model)
     top = float(problem.duration_s) / 4
     if not GRID <= shortest <= top:
         raise DriveError(f"shortest phase (--phase-min): must be between {GRID:g} and {top:g} s (got {shortest:g})")
@@ -180,7 +180,8 @@ def _judged(task: Task, trace: Trace, begin: Trace, designed: Motion, seed: int,
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is sought: a trace of `duration` [s], phases of `shortest` [s] or more, within speed, angle and rate."""
+    """What is sought: a trace of `duration` [s], phases of `shortest` [s] or more, within `fastest` [m/s], and of each
+    steered joint `widest` (n,) [rad] and `swing` (n,) [rad/s]."""
 
     model: Model
     problem: Problem
@@ -188,8 +189,8 @@ class Task:
     duration: float
     shortest: float
     fastest: float
-    widest: float
-    swing: float
+    widest: np.ndarray
+    swing: np.ndarray
 
     @property
     def most(self) -> int:
@@ -201,23 +202,24 @@ def standing(task: Task, motion: Motion) -> Trace:
     """A motion as phases, a little faster, so that the last one can stand still: what the driver is late ends there."""
     share = 1 - task.shortest / task.duration
     trace = drive.phases(task.model, replace(motion, t=motion.t * share), task.shortest, task.most)
-    times = np.append(trace.times, task.duration)
-    return on_grid(task, replace(trace, times=times, speed=np.append(trace.speed, 0), angle=np.append(trace.angle, 0)))
+    times, speed = np.append(trace.times, task.duration), np.append(trace.speed, 0)
+    angle = np.concatenate([trace.angle, np.zeros((1, len(trace.levers)))])
+    return on_grid(task, replace(trace, times=times, speed=speed, angle=angle))
 
 
 def guesses(task: Task, like: Trace, seed: int) -> list[Trace]:
     """Random traces of as many phases as may be: levels anywhere within the machine, every one its own length."""
+    fast = task.fastest if np.isfinite(task.fastest) else 2.0
+    wide = np.where(np.isfinite(task.widest), task.widest, 0.5)
     found = []
     for k in range(GUESSES):
         rng = np.random.default_rng([seed, PHASES, k])
         spare = task.duration - (task.most + 1) * task.shortest
         cuts = np.sort(rng.uniform(0, spare, task.most))
         times = np.concatenate([[0], cuts + task.shortest * np.arange(1, task.most + 1), [task.duration]])
-        speed, angle = rng.uniform(-1, 1, (2, len(times)))
-        speed[[0, -2, -1]] = angle[[0, -2, -1]] = 0.0
-        fast = task.fastest if np.isfinite(task.fastest) else 2.0
-        wide = task.widest if np.isfinite(task.widest) else 0.5
-        found.append(on_grid(task, Trace(times, fast * speed, wide * angle if like.left else 0 * angle, like.left)))
+        levels = rng.uniform(-1, 1, (1 + len(wide), len(times)))
+        levels[:, FIXED] = 0.0
+        found.append(on_grid(task, Trace(times, fast * levels[0], wide * levels[1:].T, like.levers)))
     return found
 
 
@@ -240,24 +242,22 @@ def readable(task: Task, trace: Trace) -> Trace:
 
 
 def _vector(trace: Trace) -> np.ndarray:
-    """What may change: times of the knots, speeds, angles (none where nothing is steered) of those that move."""
-    free = [trace.times[1:-1], trace.speed[1:-2]] + ([trace.angle[1:-2]] if trace.left else [])
-    return np.concatenate(free)
+    """What may change: times of the knots, speeds, angles joint by joint, of those that move."""
+    return np.concatenate([trace.times[1:-1], trace.speed[1:-2], trace.angle[1:-2].T.ravel()])
 
 
 def _trace(like: Trace, x: np.ndarray) -> Trace:
     k = len(like.times) - 2
     times, speed, angle = like.times.copy(), like.speed.copy(), like.angle.copy()
     times[1:-1], speed[1:-2] = x[:k], x[k : 2 * k - 1]
-    if like.left:
-        angle[1:-2] = x[2 * k - 1 :]
+    angle[1:-2] = x[2 * k - 1 :].reshape(angle.shape[1], k - 1).T
     return replace(like, times=times, speed=speed, angle=angle)
 
 
 def _each(trace: Trace, by: Sequence[float]) -> np.ndarray:
     """One number for times, one for speeds, one for angles, for every entry of the vector."""
     k = len(trace.times) - 2
-    return np.repeat(by[: 3 if trace.left else 2], [k, k - 1, k - 1][: 3 if trace.left else 2])
+    return np.repeat(by, [k, k - 1, (k - 1) * len(trace.levers)])
 
 
 def _kept(task: Task, like: Trace) -> tuple[np.ndarray, np.ndarray]:
@@ -273,9 +273,8 @@ def _kept(task: Task, like: Trace) -> tuple[np.ndarray, np.ndarray]:
     def within(t: Trace) -> np.ndarray:
         length = np.diff(t.times)
         parts = [task.shortest - length, t.speed - task.fastest, -t.speed - task.fastest]
-        parts += [t.angle - task.widest, -t.angle - task.widest]
-        if np.isfinite(task.swing):
-            parts += [np.diff(t.angle) - task.swing * length, -np.diff(t.angle) - task.swing * length]
+        turn, most = np.diff(t.angle, axis=0), np.outer(length, task.swing)
+        parts += [t.angle - task.widest, -t.angle - task.widest, turn - most, -turn - most]
         return np.concatenate([p[np.isfinite(p)] for p in parts])
 
     C, base = rows(within)

@@ -1,7 +1,8 @@
 """The driver's page over this machine's own network alone, with live values: `excite drive --serve`.
 
 One small server gives the page and passes on what is measured: from a log that grows, or from any program on this
-machine that sends `{"v_m_s": 1.2, "angle_rad": 0.1}` to ws://127.0.0.1:PORT/live. It listens on the loopback address,
+machine that sends `{"v_m_s": 1.2, "articulation_rad": 0.1}` to ws://127.0.0.1:PORT/live, with the names that the
+machine file gives its steered joints. It listens on the loopback address,
 takes no connection that a page from elsewhere asks for (Origin and Host are checked: a web site in the same browser
 must neither read nor fake measurements) and no message longer than MESSAGE bytes.
 """
@@ -12,11 +13,10 @@ import asyncio
 import contextlib
 import json
 import math
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any
 
 from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
@@ -24,13 +24,14 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from excite import interrupt
+from excite.drive import Lever
 from model.machine import Machine
 from model.units import UNITS
 
 HOST = "127.0.0.1"
-MESSAGE = 1024  # bytes
+MESSAGE, REASON = 1024, 120  # bytes of a message, and of why a connection ends
 CLIENTS = 16
-KEYS = ("t_s", "v_m_s", "angle_rad")
+TIME, SPEED = "t_s", "v_m_s"  # and the angle of each steered joint, by the machine file's name of it
 POLL = 0.05  # s between looks at a growing log
 SPAN = 0.2  # s of rolling that a speed is taken from
 
@@ -40,11 +41,14 @@ class ServeError(RuntimeError):
 
 
 @asynccontextmanager
-async def serving(page: str, port: int = 0) -> AsyncIterator[tuple[Server, Callable[[dict[str, float]], None]]]:
+async def serving(
+    page: str, angles: Sequence[str], port: int = 0
+) -> AsyncIterator[tuple[Server, Callable[[dict[str, float]], None]]]:
     """The running server and a function that sends values to every page. Port 0 takes a free one.
 
-    Raises ServeError where the port is taken.
+    angles: the names of steered joints' angles in a message. Raises ServeError where the port is taken.
     """
+    keys = (TIME, SPEED, *angles)
     allowed: set[str] = set()
     pages: set[ServerConnection] = set()
 
@@ -74,9 +78,9 @@ async def serving(page: str, port: int = 0) -> AsyncIterator[tuple[Server, Calla
         pages.add(connection)
         try:
             async for message in connection:
-                said = checked(message)
+                said = checked(message, keys)
                 if said is None:
-                    await connection.close(1007, "send a JSON object of numbers t_s, v_m_s, angle_rad")
+                    await connection.close(1007, f"send a JSON object of numbers {', '.join(keys)}"[:REASON])
                     return
                 broadcast(pages - {connection}, json.dumps(said))
         except ConnectionClosed:
@@ -94,13 +98,13 @@ async def serving(page: str, port: int = 0) -> AsyncIterator[tuple[Server, Calla
         yield server, lambda said: broadcast(set(pages), json.dumps(said))
 
 
-def checked(message: str | bytes) -> dict[str, float] | None:
-    """A message as numbers by known keys, None where it is anything else."""
+def checked(message: str | bytes, keys: Sequence[str]) -> dict[str, float] | None:
+    """A message as numbers by known keys, the speed at least; None where it is anything else."""
     try:
         said = json.loads(message)
     except ValueError:
         return None
-    if not isinstance(said, dict) or "v_m_s" not in said or set(said) - set(KEYS):
+    if not isinstance(said, dict) or SPEED not in said or set(said) - set(keys):
         return None
     for value in said.values():
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
@@ -109,21 +113,25 @@ def checked(message: str | bytes) -> dict[str, float] | None:
 
 
 class Tail:
-    """A growing CSV log in a machine's own columns, read as it grows: speed of the rolls' rims and articulation."""
+    """A growing CSV log in a machine's own columns, read as it grows: speed of the contacts' rims, steered angles."""
 
-    def __init__(self, path: Path, machine: Machine) -> None:
-        self.path, self.machine = path, machine
+    def __init__(self, path: Path, machine: Machine, levers: Sequence[Lever]) -> None:
+        self.path, self.machine, self.levers = path, machine, levers
+        sensors = {s.body: s for s in machine.sensors("full") if s.kind == "angle"}
+        rolling = [b for b in machine.contacts if b.index in sensors]
+        self.rims = [(float(b.contact.radius), sensors[b.index]) for b in rolling if b.contact]
+        self.angles = [(lever.column, sensors[lever.body.index]) for lever in levers if lever.body.index in sensors]
         self.place = 0
         self.rest = ""
         self.names: list[str] = []
-        self.rows: list[tuple[float, float, float | None]] = []  # time [s], way rolled [m], angle [rad]
+        self.rows: list[tuple[float, float]] = []  # time [s], way rolled [m]
 
     def new(self) -> list[dict[str, float]]:
         """The values of the rows that are new since the last call; lines that are no numbers are left out."""
         if not self.path.is_file():
             return []
         if self.path.stat().st_size < self.place:  # begun afresh
-            self.__init__(self.path, self.machine)  # type: ignore[misc]
+            self.__init__(self.path, self.machine, self.levers)  # type: ignore[misc]
         with self.path.open(encoding="utf-8", errors="replace", newline="") as file:
             file.seek(self.place)
             text = self.rest + file.read()
@@ -141,40 +149,36 @@ class Tail:
         return said
 
     def _row(self, cells: dict[str, str]) -> dict[str, float] | None:
-        sensors = {s.body: s for s in self.machine.sensors("full") if s.kind == "angle"}
-        rolls = [(b, sensors[b.index]) for b in self.machine.contacts if b.index in sensors]
-        wheel = next((s for i, s in sensors.items() if self.machine.find(i).contact is None), None)
         try:
             t = UNITS[self.machine.time_unit][1] * float(cells[self.machine.time_column])
             ways = []
-            for b, s in rolls:
-                number = float(b.contact.radius if b.contact else 0) * s.gain * float(cells[s.column])
+            for radius, s in self.rims:
+                number = radius * s.gain * float(cells[s.column])
                 if s.is_rate and self.rows:
                     number = self.rows[-1][1] + number * (t - self.rows[-1][0])
                 ways.append(number)
-            angle = wheel.gain * float(cells[wheel.column]) if wheel is not None else None
+            angles = {key: s.gain * float(cells[s.column]) for key, s in self.angles}
         except (KeyError, ValueError):
             return None
         if not ways or not math.isfinite(t + sum(ways)):
             return None
-        self.rows.append((t, sum(ways) / len(ways), angle))
+        self.rows.append((t, sum(ways) / len(ways)))
         while len(self.rows) > 2 and self.rows[1][0] <= t - SPAN:
             self.rows.pop(0)
         before = self.rows[0]
         if t <= before[0]:
             return None
-        said: dict[str, Any] = {"t_s": t, "v_m_s": (self.rows[-1][1] - before[1]) / (t - before[0])}
-        return said if angle is None else said | {"angle_rad": angle}
+        return {TIME: t, SPEED: (self.rows[-1][1] - before[1]) / (t - before[0]), **angles}
 
 
-async def run(page: str, port: int, tail: Tail | None, ready: Callable[[str], None]) -> None:
-    """Serves the page until Ctrl-C or a polite kill; `ready` gets its address. Raises ServeError."""
+async def run(page: str, angles: Sequence[str], port: int, tail: Tail | None, ready: Callable[[str], None]) -> None:
+    """Serves the page until Ctrl-C or a polite kill; `ready` gets its address. Raises as `serving`."""
     stop = asyncio.Event()
     with contextlib.suppress(RuntimeError, ValueError):  # not in the main thread: whoever started it stops it
         # A KeyboardInterrupt may be raised anywhere in the loop and get lost there.
         for number in interrupt.SIGNALS:
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    async with serving(page, port) as (server, send):
+    async with serving(page, angles, port) as (server, send):
         ready(f"http://{HOST}:{server.sockets[0].getsockname()[1]}/")
         while not stop.is_set():
             for said in tail.new() if tail else ():

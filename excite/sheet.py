@@ -61,8 +61,8 @@ def facts(sheet: Sheet) -> list[tuple[str, str]]:
         ("distance", f"{length:.0f} m"),
         ("top speed", f"{top:.1f} m/s, {3.6 * top:.1f} km/h"),
     ]
-    if trace.left:
-        rows.append((f"{drive.steered_name(sheet.model)} up to", f"{np.rad2deg(np.abs(trace.angle).max()):.0f}°"))
+    tops = np.abs(trace.degrees).max(axis=0)
+    rows += [(f"{lever.name} up to", f"{top:.0f}°") for lever, top in zip(trace.levers, tops, strict=True)]
     rows.append(
         ("free ground", f"{np.ceil(sheet.room.length + 2 * AHEAD):.0f} x {np.ceil(sheet.room.width + 2 * AHEAD):.0f} m")
     )
@@ -80,18 +80,17 @@ def _first(sheet: Sheet) -> Figure:
         figure.text(x, 0.895, name, fontsize=7, color="0.25")
     lane = figure.add_axes((LEFT, 0.555, RIGHT - LEFT, 0.31))
     _lane(lane, sheet)
-    steers = sheet.trace.left != 0
-    height = 0.19 if steers else 0.38
-    speed = figure.add_axes((LEFT, 0.29 if steers else 0.1, RIGHT - LEFT, height))
-    _trace(speed, sheet, "speed [m/s]\nbackward  |  forward", sheet.trace.speed, drive.BAND_SPEED, 1.0)
-    _numbers(speed, sheet.trace)
-    bottom = speed
-    if steers:
-        bottom = figure.add_axes((LEFT, 0.075, RIGHT - LEFT, height), sharex=speed)
-        angle = np.rad2deg(sheet.trace.left * sheet.trace.angle)
-        label = f"{drive.steered_name(sheet.model)} [°]\nright  |  left"
-        _trace(bottom, sheet, label, angle, np.rad2deg(drive.BAND_ANGLE), 5.0)
-        speed.tick_params(labelbottom=False)
+    trace = sheet.trace
+    space = 0.43 / (1 + len(trace.levers))
+    bottom = figure.add_axes((LEFT, 0.48 - (space - 0.025), RIGHT - LEFT, space - 0.025))
+    _trace(bottom, sheet, "speed [m/s]\nbackward  |  forward", trace.speed, drive.BAND_SPEED, 1.0)
+    _numbers(bottom, trace)
+    for k, (lever, degrees) in enumerate(zip(trace.levers, trace.degrees.T, strict=True), 1):
+        bottom.tick_params(labelbottom=False)
+        place = (LEFT, 0.48 - (k + 1) * space + 0.025, RIGHT - LEFT, space - 0.025)
+        bottom = figure.add_axes(place, sharex=bottom)
+        label = f"{lever.name} [°]\nright  |  left"
+        _trace(bottom, sheet, label, degrees, np.rad2deg(drive.BAND_ANGLE), 5.0)
     bottom.set_xlabel("time [s]; the grey band is the tolerance", fontsize=8)
     return figure
 
@@ -230,20 +229,22 @@ def _second(sheet: Sheet) -> Figure:
     y = _title(figure, 0.91, "What to drive")
     space = min(0.0165, 0.40 / max(len(trace), 1))
     size = min(9.0, 8.5 * space / 0.0145)
-    columns = (LEFT, LEFT + 0.04, LEFT + 0.12, LEFT + 0.69, LEFT + 0.79)
-    titles = ("no.", "at", "do", "then speed", "then angle" if trace.left else "")
+    several = len(trace.levers) > 1
+    angles = [f"then {lever.name}" if several else "then angle" for lever in trace.levers]
+    width = 0.17 if several else 0.10
+    last = LEFT + 0.89 - width * max(len(angles), 1)
+    columns = (LEFT, LEFT + 0.04, LEFT + 0.12, last - 0.10, *(last + width * k for k in range(len(angles))))
+    titles = ("no.", "at", "do", "then speed", *angles)
     for x, text in zip(columns, titles, strict=True):
         figure.text(x, y, text, fontsize=7, color="0.25")
     y -= space
     for k in range(len(trace)):
-        degrees = trace.left * np.rad2deg(trace.angle[k + 1])
-        side = "" if abs(degrees) < 0.5 else " left" if degrees > 0 else " right"
         cells = (
             str(k + 1),
             drive.clock(trace.times[k]),
-            drive.words(trace, k, letters=True),
+            drive.parts(trace, k, letters=True)[0] if several else drive.words(trace, k, letters=True),
             f"{trace.speed[k + 1]:+.1f} m/s".replace("+0.0", "0").replace("-", "\N{MINUS SIGN}"),
-            f"{abs(degrees):.0f}°{side}" if trace.left else "",
+            *(drive.angle_words(degrees) for degrees in trace.degrees[k + 1]),
         )
         for x, text in zip(columns, cells, strict=True):
             figure.text(x, y, text, fontsize=size, weight="bold" if x == columns[1] else "normal")

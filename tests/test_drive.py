@@ -14,6 +14,8 @@ from matplotlib.figure import Figure
 
 from excite import cab, drive, page, sheet, stored
 from excite.drive import DriveError, Trace
+from excite.driver import STEADY
+from excite.manoeuvre import Manoeuvre
 from excite.simulate import Motion, simulate
 from model.machine import load
 from model.prediction import Model, build
@@ -21,7 +23,7 @@ from model.prediction import Model, build
 RESULTS = Path(__file__).parents[1] / "results"
 KNOTS = np.array([0.0, 4, 9, 12, 15, 19, 23, 27])
 SPEED = np.array([0.0, 1.5, 1.5, 0, 0, -1.2, -1.2, 0])
-ANGLE = np.deg2rad([0.0, 0, 20, 20, 0, 0, -10, 0])
+ANGLE = np.deg2rad([[0.0], [0], [20], [20], [0], [0], [-10], [0]])
 
 
 def motion_of(model: Model, speed: np.ndarray, angle: np.ndarray) -> Motion:
@@ -37,7 +39,7 @@ def motion_of(model: Model, speed: np.ndarray, angle: np.ndarray) -> Motion:
 
 def test_phases_of_a_drive_made_of_phases_are_these(va12: Model) -> None:
     t = np.arange(2701) / 100
-    motion = motion_of(va12, np.interp(t, KNOTS, SPEED), np.interp(t, KNOTS, ANGLE))
+    motion = motion_of(va12, np.interp(t, KNOTS, SPEED), np.interp(t, KNOTS, ANGLE[:, 0]))
     trace = drive.phases(va12, motion, most=9)
     assert trace.times == pytest.approx(KNOTS)
     assert trace.speed == pytest.approx(SPEED, abs=1e-9)
@@ -52,10 +54,10 @@ def test_phases_are_few_and_long_enough_and_within_the_machine(
     assert 2 <= len(trace) <= most
     assert np.diff(trace.times).min() >= shortest - 1e-9
     assert trace.times[-1] == va12_motion.t[-1]
-    assert [trace.speed[0], trace.speed[-1], trace.angle[0], trace.angle[-1]] == [0, 0, 0, 0]
+    assert [trace.speed[0], trace.speed[-1], *trace.angle[0], *trace.angle[-1]] == [0, 0, 0, 0]
     assert np.abs(trace.speed).max() <= 2.0
     assert np.abs(trace.angle).max() <= 0.6
-    assert np.abs(np.diff(trace.angle) / np.diff(trace.times)).max() <= 0.35
+    assert np.abs(np.diff(trace.angle[:, 0]) / np.diff(trace.times)).max() <= 0.35
 
 
 def test_more_phases_are_nearer_to_the_design(va12: Model, va12_motion: Motion) -> None:
@@ -79,23 +81,34 @@ def test_what_makes_no_phases_is_refused(
 
 def test_a_machine_without_wheels_has_no_driver(emps: Model) -> None:
     with pytest.raises(DriveError, match="emps"):
-        drive.steered(emps)
+        drive.levers(emps)
 
 
-@pytest.mark.parametrize(("name", "joint"), [("va12", "articulation"), ("three_wheel", "steering"), ("skid_robot", "")])
-def test_a_steered_joint_has_the_machines_name(name: str, joint: str) -> None:
-    """A machine without one is asked for none."""
+@pytest.mark.parametrize(
+    ("name", "joints"),
+    [
+        ("va12", ["articulation"]),
+        ("three_wheel", ["steering"]),
+        ("skid_robot", []),
+        ("tandem", ["front steering", "rear steering"]),
+        ("double_loader", ["articulation", "axle steering"]),
+    ],
+)
+def test_steered_joints_have_the_machines_names(name: str, joints: list[str]) -> None:
+    """A machine without any is asked for none."""
     model = build(load(name))
-    trace = Trace(np.array([0.0, 4, 8]), np.array([0.0, 1, 0]), np.array([0.0, 0.1, 0]), drive.turns_left(model))
-    data = page.driver_data(model, trace, name)
-    assert (data["joint"], data["steers"]) == (joint, bool(joint))
+    angle = np.outer([0.0, 0.1, 0], np.ones(len(joints)))
+    trace = Trace(np.array([0.0, 4, 8]), np.array([0.0, 1, 0]), angle, drive.levers(model))
+    assert [lever["name"] for lever in page.driver_data(model, trace, name)["levers"]] == joints
     text = page.driver_page(model, trace, name)
-    assert f'<div class="name">{joint}</div>' in text
-    assert joint == "articulation" or "articulation" not in text
+    assert [f'<div class="name">{joint}</div>' in text for joint in joints] == [True] * len(joints)
+    assert "articulation" in joints or "articulation" not in text
 
 
-def test_words_say_what_to_do() -> None:
-    trace = Trace(KNOTS, SPEED, -ANGLE, left=-1)
+def test_words_say_what_to_do(va12: Model) -> None:
+    (lever,) = drive.levers(va12)
+    assert lever.left == -1
+    trace = Trace(KNOTS, SPEED, -ANGLE, (lever,))
     assert [drive.words(trace, k) for k in range(len(trace))] == [
         "accelerate to 1.5 m/s in 4 s, straight",
         "hold 1.5 m/s for 5 s, steer to 20° left",
@@ -105,24 +118,89 @@ def test_words_say_what_to_do() -> None:
         "hold 1.2 m/s backward for 4 s, steer to 10° right",
         "brake to a stop in 4 s, straighten up",
     ]
-    slower = Trace(np.array([0.0, 3, 6, 9]), np.array([0.0, -1.5, -0.5, 0]), np.zeros(4), left=0)
+    slower = Trace(np.array([0.0, 3, 6, 9]), np.array([0.0, -1.5, -0.5, 0]), np.zeros((4, 0)), ())
     assert drive.words(slower, 1) == "slow down to 0.5 m/s backward in 3 s"
-    through = Trace(np.array([0.0, 2, 5, 7]), np.array([0.0, 1, -0.5, 0]), np.zeros(4), left=0)
+    through = Trace(np.array([0.0, 2, 5, 7]), np.array([0.0, 1, -0.5, 0]), np.zeros((4, 0)), ())
     assert drive.words(through, 1) == "through a stop at 0:04 to 0.5 m/s backward in 3 s"
     assert drive.words(through, 1, letters=True).startswith("through a stop A at 0:04")
     assert drive.reversals(through) == pytest.approx([4.0], abs=0.2)
     assert drive.reversals(trace) == pytest.approx([15.0], abs=0.2)
 
 
-def test_left_is_where_the_machine_goes(va12: Model, straight: Model) -> None:
-    """The sign from pure rolling is what simulation does: forward at an angle, the heading grows to the left."""
-    assert drive.turns_left(straight) == 0
-    left = drive.turns_left(va12)
-    t = np.arange(1201) / 100
-    trace = Trace(np.array([0.0, 4, 12]), np.array([0.0, 1, 1]), left * np.array([0.0, 0.3, 0.3]), left)
-    heading = drive.driven(va12, trace, None, 0).q[:, va12.coordinates.index("theta0")]
-    assert heading[-1] > 0.3
-    assert t[-1] == trace.duration
+def test_words_name_each_of_several_joints() -> None:
+    front, rear = drive.levers(build(load("tandem")))
+    degrees = np.array([[0.0, 0], [20, 0], [20, -10], [20, -10], [0, -10], [0, 0]])
+    times, speed = np.arange(0, 18, 3.0), np.array([0.0, 1, 1, 1, 1, 0])
+    trace = Trace(times, speed, np.deg2rad(degrees) * [front.left, rear.left], (front, rear))
+    assert [drive.parts(trace, k)[1] for k in range(len(trace))] == [
+        "front steering to 20° left, rear steering straight",
+        "keep front steering 20° left, rear steering to 10° right",
+        "keep front steering 20° left, keep rear steering 10° right",
+        "straighten front steering, keep rear steering 10° right",
+        "front steering straight, straighten rear steering",
+    ]
+    rows = drive.table(trace)
+    assert rows[1]["rear_steering_rad"] == pytest.approx([0, -rear.left * np.deg2rad(10)])
+    again = drive.from_table(build(load("tandem")), rows)
+    assert again.angle == pytest.approx(trace.angle)
+
+
+@pytest.mark.parametrize("name", ["va12", "tandem", "double_loader"])
+def test_left_is_where_the_machine_goes(name: str) -> None:
+    """The sign from pure rolling is what simulation does: forward, each joint alone to its left, the machine turns
+    left; all of them to the left it turns more, to different sides less than with the first alone."""
+    model = build(load(name))
+    levers = drive.levers(model)
+
+    def heading(*sides: int) -> float:
+        angle = np.outer([0.0, 1, 1], 0.2 * np.multiply(sides, [lever.left for lever in levers]))
+        trace = Trace(np.array([0.0, 4, 10]), np.array([0.0, 1, 1]), angle, levers)
+        return float(drive.driven(model, trace, STEADY, 0).q[-1, model.coordinates.index("theta0")])
+
+    alone = [heading(*row) for row in np.eye(len(levers), dtype=int)]
+    assert min(alone) > 0.1
+    if len(levers) > 1:
+        assert heading(1, 1) > 1.5 * min(alone)
+        assert abs(heading(1, -1)) < 0.5 * max(alone)
+
+
+def test_a_straight_lane_has_nothing_to_steer(straight: Model) -> None:
+    assert drive.levers(straight) == ()
+
+
+@pytest.mark.parametrize("name", ["tandem", "double_loader"])
+def test_several_joints_are_followed_by_one_person(name: str) -> None:
+    """The study's design as phases within the machine; each joint stays in its band, also where the soil resists its
+    turning much more than its own inertia does."""
+    model = build(load(name))
+    drawn = json.loads((RESULTS / "machines" / name / "drive.json").read_text())
+    torque = Manoeuvre(np.array(drawn["times_s"]), np.array(drawn["torque"])).sample(100.0)
+    motion = simulate(model, torque, q0=np.array(drawn["start"]))
+    trace = drive.phases(model, motion)
+    assert np.ptp(trace.angle, axis=0).min() > 3 * drive.ANGLE_STEP
+    _, widest, swing = drive.bounds(model)
+    assert (np.abs(trace.angle).max(axis=0) <= widest).all()
+    assert (np.abs(np.diff(trace.angle, axis=0)) <= np.outer(np.diff(trace.times), swing) + 1e-9).all()
+    person = drive.driven(model, trace, None, 1, motion.q[0])
+    wanted = trace.at(person.t)[1]
+    rows = [model.coordinates.index(lever.body.coordinates[0]) for lever in trace.levers]
+    for got, reference in zip(person.q[:, rows].T, wanted.T, strict=True):
+        low, high = drive.band(person.t, reference, drive.BAND_ANGLE)
+        assert np.mean((got >= low) & (got <= high)) > 0.9
+
+
+def test_a_design_with_two_steered_joints_is_sheet_and_page(excite: Excite, tmp_path: Path) -> None:
+    """By the real commands, from a design to what goes into the cab."""
+    code, _, err = excite("design", "tandem", "--duration", 8, "--starts", 1, "--budget", 30, "--out", tmp_path / "d")
+    assert code == 0, err
+    code, shown, err = excite("drive", tmp_path / "d", "--phases", 4, "--out", tmp_path / "cab", "--json")
+    assert code == 0, err
+    said = json.loads(shown)
+    assert {"front_steering_rad", "rear_steering_rad"} <= set(said["phases"][0])
+    assert any("to different sides they move it sideways" in line for line in said["warnings"])
+    header = (tmp_path / "cab" / "phases.csv").read_text().splitlines()[0]
+    assert header == "t_s,v_m_s,front_steering_rad,rear_steering_rad"
+    assert (tmp_path / "cab" / "sheet.pdf").read_bytes().count(b"/Type /Page ") == 2
 
 
 def test_room_of_a_straight_pass_is_its_length_and_the_rolls_width(straight: Model) -> None:

@@ -24,10 +24,14 @@ from websockets.typing import Origin
 
 from excite import drive, page, sensors, serve
 from excite.drive import Trace
-from model.prediction import Model
+from model.machine import load
+from model.prediction import Model, build
 
 TRACE = Trace(
-    np.array([0.0, 3, 6, 8.5, 11, 14]), np.array([0.0, 1.2, 1.2, 0, -0.8, 0]), -np.array([0.0, 0, 0.3, 0.3, 0, 0]), -1
+    np.array([0.0, 3, 6, 8.5, 11, 14]),
+    np.array([0.0, 1.2, 1.2, 0, -0.8, 0]),
+    -np.array([[0.0], [0], [0.3], [0.3], [0], [0]]),
+    drive.levers(build(load("va12"))),
 )
 STARTS = [0.0, 3, 6, 8.5, 11]
 
@@ -35,6 +39,21 @@ STARTS = [0.0, 3, 6, 8.5, 11]
 @pytest.fixture(scope="module")
 def html(va12: Model) -> str:
     return page.driver_page(va12, TRACE, "A drive")
+
+
+TANDEM = build(load("tandem"))
+FRONT, REAR = drive.levers(TANDEM)
+TWO = Trace(
+    TRACE.times,
+    TRACE.speed,
+    np.deg2rad([[0.0, 0], [0, -12], [26, -12], [26, 14], [0, 14], [0, 0]]) * [FRONT.left, REAR.left],
+    (FRONT, REAR),
+)
+
+
+@pytest.fixture(scope="module")
+def two_html() -> str:
+    return page.driver_page(TANDEM, TWO, "A drive with two steered joints")
 
 
 class Tab:
@@ -69,9 +88,9 @@ class Tab:
 def open_page(browser: Any, html: str, tmp_path: Path) -> Iterator[Callable[..., Tab]]:
     tabs: list[Tab] = []
     path = tmp_path / "driver.html"
-    path.write_text(html, encoding="utf-8")
 
-    def open(fake: bool = True, size: tuple[int, int] = (844, 390)) -> Tab:
+    def open(fake: bool = True, size: tuple[int, int] = (844, 390), text: str = html) -> Tab:
+        path.write_text(text, encoding="utf-8")
         tabs.append(Tab(browser, path.as_uri(), fake, size))
         return tabs[-1]
 
@@ -121,12 +140,40 @@ def test_what_the_driver_reads(open_page: Callable[..., Tab]) -> None:
     assert tab.text("#count") == "2"
     assert tab.page.get_attribute("#now", "class") == "soon"
     assert tab.text("#speed .value") == "1.2 m/s"
-    assert tab.text("#angle .value") == "7° left"
+    assert tab.text("#angle0 .value") == "7° left"
     assert tab.text("#clock") == "0:04 / 0:14"
     tab.page.keyboard.press("u")
     tab.page.clock.run_for(50)
     assert tab.text("#speed .value") == "4.3 km/h"
     assert tab.text("#action").startswith("hold 4.3 km/h")
+
+
+def test_the_driver_reads_every_joint(open_page: Callable[..., Tab], two_html: str, tmp_path: Path) -> None:
+    """Targets, words, what a log of the machine's own columns shows, and the score, joint by joint."""
+    tab = open_page(text=two_html)
+    table = sensors.measure(TANDEM, drive.driven(TANDEM, TWO, None, 4), seed=1)
+    table.to_csv(tmp_path / "log.csv", index=False)
+    tab.page.set_input_files("#log", tmp_path / "log.csv")
+    tab.shows("#note", "begins")
+    tab.page.tap("#start")
+    tab.page.clock.run_for(5000 + 4500)
+    assert tab.text("#action") == "hold 1.2 m/s, front steering to 26° left, keep rear steering 12° right"
+    assert tab.text("#next") == "then brake to a stop, rear steering to 14° left"  # what changes
+    t = tab.seconds()
+    for k, degrees in enumerate(np.interp(t, TWO.times, d) for d in TWO.degrees.T):
+        side = "left" if degrees > 0 else "right"
+        assert tab.text(f"#angle{k} .value") == f"{abs(degrees):.0f}° {side}"
+        assert tab.text(f"#angle{k} .seen").endswith(side)
+    tab.page.clock.run_for(11_000)
+    score = tab.page.evaluate("aid.score()")
+    t = table["t_s"].to_numpy()
+    for k, lever in enumerate((FRONT, REAR)):
+        got, wanted = table[lever.column], TWO.at(t)[1][:, k]
+        low, high = drive.band(t, wanted, drive.BAND_ANGLE)
+        assert score["angle_percent"][k] == pytest.approx(100 * np.mean((got >= low) & (got <= high)), abs=0.3)
+        off = np.rad2deg(np.sqrt(np.mean((got - wanted) ** 2)))
+        assert score["angle_rms_deg"][k] == pytest.approx(off, rel=0.01)
+    assert ", rear steering by" in tab.text("#next")
 
 
 def test_start_pause_and_repeat_by_touch_and_key(open_page: Callable[..., Tab]) -> None:
@@ -171,9 +218,12 @@ def test_real_time_is_kept(open_page: Callable[..., Tab]) -> None:
     assert float(np.median(lags)) < 0.05
 
 
+@pytest.mark.parametrize("name", ["va12", "tandem"])
 @pytest.mark.parametrize("size", [(844, 390), (667, 375), (1280, 800), (390, 844)])
-def test_everything_fits_and_is_big(open_page: Callable[..., Tab], size: tuple[int, int]) -> None:
-    tab = open_page(size=size)
+def test_everything_fits_and_is_big(
+    open_page: Callable[..., Tab], html: str, two_html: str, name: str, size: tuple[int, int]
+) -> None:
+    tab = open_page(size=size, text={"va12": html, "tandem": two_html}[name])
     tab.page.tap("#start")
     for wait in (100, 6000, 3500, 2500, 2500, 2500):
         tab.page.clock.run_for(wait)
@@ -183,7 +233,10 @@ def test_everything_fits_and_is_big(open_page: Callable[..., Tab], size: tuple[i
     style = "e => parseFloat(getComputedStyle(e).fontSize)"
     short = min(size)
     assert tab.page.eval_on_selector("#count", style) >= 0.16 * short  # 10 mm and more on a phone: read at two metres
-    assert tab.page.eval_on_selector("#speed .value", style) >= 0.10 * short
+    assert tab.page.eval_on_selector("#speed .value", style) >= (0.10 if name == "va12" else 0.07) * short
+    for target in tab.page.locator(".target").all():
+        box = target.bounding_box()
+        assert box["x"] + target.evaluate("e => e.scrollWidth") <= size[0]
     for id in ("#start", "#repeat"):
         assert tab.page.locator(id).bounding_box()["height"] >= 40
     seen = tab.page.evaluate(
@@ -211,7 +264,9 @@ def test_a_log_is_replayed_and_scored(
     angle = followed["theta2_rad"].to_numpy()
     wanted = TRACE.at(t)
     inside = []
-    for value, reference, tolerance in zip((speed, angle), wanted, (drive.BAND_SPEED, drive.BAND_ANGLE), strict=True):
+    for value, reference, tolerance in zip(
+        (speed, angle), (wanted[0], wanted[1][:, 0]), (drive.BAND_SPEED, drive.BAND_ANGLE), strict=True
+    ):
         low, high = drive.band(t, reference, tolerance)
         inside.append((value >= low) & (value <= high))
     tab = open_page()
@@ -222,15 +277,16 @@ def test_a_log_is_replayed_and_scored(
     tab.page.clock.run_for(5000 + 5000)
     k = round(100 * tab.seconds())
     assert tab.text("#speed .seen") == f"is {speed[k]:.1f} m/s"
-    assert tab.text("#angle .seen").endswith("left")
+    assert tab.text("#angle0 .seen").endswith("left")
     tab.page.clock.run_for(10_000)
     score = tab.page.evaluate("aid.score()")
     assert score["samples"] == 1401
     assert score["speed_percent"] == pytest.approx(100 * inside[0].mean(), abs=0.3)
-    assert score["angle_percent"] == pytest.approx(100 * inside[1].mean(), abs=0.3)
+    assert score["angle_percent"] == pytest.approx([100 * inside[1].mean()], abs=0.3)
     assert score["in_band_percent"] == pytest.approx(100 * (inside[0] & inside[1]).mean(), abs=0.3)
     assert score["speed_rms_m_s"] == pytest.approx(np.sqrt(np.mean((speed - wanted[0]) ** 2)), rel=0.01)
-    assert score["angle_rms_deg"] == pytest.approx(np.rad2deg(np.sqrt(np.mean((angle - wanted[1]) ** 2))), rel=0.01)
+    off = np.rad2deg(np.sqrt(np.mean((angle - wanted[1][:, 0]) ** 2)))
+    assert score["angle_rms_deg"] == pytest.approx([off], rel=0.01)
     assert f"{score['in_band_percent']:.0f} % of the time" in tab.text("#next")
 
 
@@ -263,7 +319,7 @@ def running(html: str) -> Iterator[tuple[str, Callable[[dict[str, float]], objec
 
     async def work() -> None:
         found["end"] = asyncio.Event()
-        async with serve.serving(html) as (server, send):
+        async with serve.serving(html, ("articulation_rad",)) as (server, send):
             found["address"] = f"127.0.0.1:{server.sockets[0].getsockname()[1]}"
             found["send"] = send
             ready.set()
@@ -284,11 +340,11 @@ def test_live_values_are_shown(browser: Any, html: str) -> None:
     with running(html) as (address, send):
         tab = Tab(browser, f"http://{address}/", fake=False)
         tab.shows("#note", "live values")
-        send({"v_m_s": 0.74, "angle_rad": -0.2})
+        send({"v_m_s": 0.74, "articulation_rad": -0.2})
         tab.shows("#speed .seen", "is 0.7 m/s")
-        assert tab.text("#angle .seen") == "is 11° left"  # what is negative turns this machine to the left
+        assert tab.text("#angle0 .seen") == "is 11° left"  # what is negative turns this machine to the left
         with connect(f"ws://{address}/live") as logger:
-            logger.send(json.dumps({"t_s": 1, "v_m_s": -0.3, "angle_rad": 0.1}))
+            logger.send(json.dumps({"t_s": 1, "v_m_s": -0.3, "articulation_rad": 0.1}))
             tab.shows("#speed .seen", "is -0.3 m/s")
         assert [s for s in tab.said if "127.0.0.1" not in s] == []
         tab.context.close()
@@ -381,7 +437,7 @@ def test_more_pages_than_are_allowed_are_refused(html: str) -> None:
         ('{"v_m_s": NaN}', 1007),
         ('{"v_m_s": 1, "evil": 2}', 1007),
         ("[1, 2]", 1007),
-        ('{"angle_rad": 1}', 1007),
+        ('{"articulation_rad": 1}', 1007),
     ],
 )
 def test_bad_messages_end_the_connection(html: str, message: str, code: int) -> None:
@@ -396,7 +452,7 @@ def test_bad_messages_end_the_connection(html: str, message: str, code: int) -> 
 def test_growing_log_becomes_values(va12: Model, followed: pd.DataFrame, tmp_path: Path) -> None:
     """Written in pieces that end anywhere, even within a number: every row counts once, nothing is misread."""
     path = tmp_path / "log.csv"
-    tail = serve.Tail(path, va12.machine)
+    tail = serve.Tail(path, va12.machine, TRACE.levers)
     assert tail.new() == []
     text = followed.to_csv(index=False)
     said = []
@@ -407,7 +463,7 @@ def test_growing_log_becomes_values(va12: Model, followed: pd.DataFrame, tmp_pat
     assert len(said) == len(followed) - 1
     turned = 0.65 * (followed["theta1_rad"] + followed["theta4_rad"]).to_numpy() / 2
     assert said[499]["v_m_s"] == pytest.approx((turned[500] - turned[480]) / 0.2)
-    assert said[499]["angle_rad"] == pytest.approx(followed["theta2_rad"][500])
+    assert said[499]["articulation_rad"] == pytest.approx(followed["theta2_rad"][500])
     path.write_text("t_s,other\n")
     assert tail.new() == []
 
