@@ -205,7 +205,7 @@ def transcribe(
 
     state_size: the typical size of every coordinate and velocity (named c and c') and of what effects remember. The
     pose is a state only where `with_pose`: nothing but the lane depends on it. weights (n_blocks, n_rows): of the
-    regressor's rows [1/SI], one information matrix for each; all 1 by default.
+    regressor's rows [1/SI], one information matrix for each; all 1 by default, none for a program without an aim.
     """
     every = limits(model, problem)
     s = symbols(model)
@@ -248,8 +248,8 @@ def transcribe(
     Phi = ca.mtimes(W, ca.diag(ca.DM(model.scale)))
     blocks = np.ones((1, n_q)) if weights is None else weights
     every_A = [ca.triu(ca.mtimes(P.T, P)) for P in (ca.mtimes(ca.diag(ca.DM(w)), Phi) for w in blocks)]
-    rows, columns = (np.array(x) for x in every_A[0].sparsity().get_triplet())
-    entries = ca.vertcat(*[x for A in every_A for x in A.nonzeros()])
+    rows, columns = (np.array(x) for x in ca.triu(ca.mtimes(Phi.T, Phi)).sparsity().get_triplet())
+    entries = ca.vertcat(*[x for A in every_A for x in A.nonzeros()], ca.SX(0, 1))
 
     n_s, n_g, n_a = 2 * n_z + n_u, g.numel(), entries.numel()
     multipliers = ca.SX.sym("m", n_z + n_g + n_a)

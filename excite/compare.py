@@ -3,9 +3,9 @@
 The usual drives know nothing of the limits on the motion, so each is brought inside them in the same way. It is scaled
 down until every limit but rest and lane holds, first the torques of the rolls alone, then the others with them. Rest at
 the end and the lane are then met by the nearest drive that keeps every limit (`interior`, no aim, least squares
-distance in the share of the torque limits), and small smooth torques land it (`continuation.land`). This moves a drive
-as little as can be and never looks at the score. A drive that still exceeds a limit by more than
-`continuation.TOLERANCE` of its range is reported with the limit that it breaks.
+distance in the share of the torque limits, by way of a machine that is softer at standstill), and small smooth torques
+land it (`continuation.land`). This moves a drive as little as can be and never looks at the score. A drive that still
+exceeds a limit by more than `continuation.TOLERANCE` of its range is reported with the limit that it breaks.
 
 Fourier series (0.05 to 0.3 Hz; Swevers et al., 1997) are searched, from a random one scaled down like that, for the
 time that the design took, with rest and lane left to the same treatment afterwards. All work runs in as many processes
@@ -28,7 +28,7 @@ import scipy
 from excite import interior, manoeuvre, objective, smoothing
 from excite.aim import aim
 from excite.collocation import UnsettledError, settle, transcribe
-from excite.continuation import MARGIN, TOLERANCE, Candidate, Track, land, typical_sizes, verdict
+from excite.continuation import MARGIN, TOLERANCE, Candidate, Track, land, soften, typical_sizes, verdict
 from excite.design import design, processes
 from excite.driver import follow
 from excite.limit import check, limits, symbols
@@ -41,6 +41,9 @@ from model.prediction import Model
 SLOW = 0.08  # Hz, top of the band of slow multisines
 SHRINK = 0.9  # from one scale that is tried to the next
 ATTEMPTS = 4  # at the nearest drive that keeps every limit
+# The way to the first of them: transitions of friction and slip wider, and knots further apart, by these factors. With
+# sharp ones Newton's method creeps for as long as rest at the end is far.
+WAY = ((10.0, 3.0, 2), (3.0, 1.5, 1), (1.0, 1.0, 1))
 FUNDAMENTAL, HARMONICS = 0.05, 6  # of the Fourier series [Hz]
 DIFFERENCE = 1e-4  # of a coefficient, for finite differences: well above the integrator's error
 OURS = "designed"
@@ -332,7 +335,7 @@ def within(model: Model, problem: Problem, wish: Manoeuvre) -> Candidate:
     for attempt in range(ATTEMPTS):
         if track.latest.feasible:
             break
-        moved = _nearest(model, problem, track, small, margins, elements=1 if attempt == 0 else 3)
+        moved = _nearest(model, problem, track, small, margins, attempt)
         if moved is None:
             break
         track = land(model, problem, aim(model, "cond"), moved, lambda: False)
@@ -349,38 +352,57 @@ def judge(model: Model, problem: Problem, drive: Manoeuvre) -> tuple[Candidate, 
 
 
 def _nearest(
-    model: Model, problem: Problem, track: Track, wish: Manoeuvre, margins: dict[str, float], elements: int
+    model: Model, problem: Problem, track: Track, wish: Manoeuvre, margins: dict[str, float], attempt: int
 ) -> Track | None:
     """From where the track stands, the drive nearest to the wish that keeps every limit, moved in by margins (of the
-    ranges). None where no motion follows the torques."""
+    ranges). None where no motion follows the torques. The first attempt goes the whole WAY, later ones refine."""
     off_lane = any(v > 0 for name, v in track.latest.violations.items() if name.startswith("lane"))
     on_lane = model.machine.planar and (track.pose is not None or off_lane)
-    times = manoeuvre.knots(problem)
-    intervals = len(times) - 1
-    tr = transcribe(model, problem, track.sizes, intervals, elements=elements, with_pose=on_lane)
+    times, known = manoeuvre.knots(problem), track.motion.t
     names = [*model.coordinates, *[c + "'" for c in model.coordinates], *model.memory]
-    every = np.hstack([track.motion.q, track.motion.nu, track.motion.memory])
-    nodes = (np.arange(intervals)[:, None] + tr.place) * tr.knot
-    columns = [every[:, names.index(c)] / size for c, size in zip(tr.state_names, tr.state_scale, strict=True)]
-    Z = np.stack([np.interp(nodes, track.motion.t, x) for x in columns], axis=-1)
-    start = np.array([x[0] for x in columns])
-    U, goal = (d.at(times) / tr.torque_scale for d in (track.latest.manoeuvre, wish))
-    U[0] = U[-1] = goal[0] = goal[-1] = 0.0
-    moved_in = np.array([MARGIN + 2 * margins.get(name, 0.0) for name in tr.limit_names])
-    task = interior.Task(
-        None,
-        np.tile(moved_in, (intervals, tr.nodes, 1)),
-        np.tile([1e-4 + 2 * margins.get(name, 0.0) for name in tr.control_names], (intervals, 1)),
-        np.array([name.startswith("lane") for name in tr.limit_names], bool),
-        1.0,
-        goal,
-    )
-    try:
-        point = interior.begin(tr, task, start, settle(tr, start, U, Z), U, 1e-3, 0.05)
+    every = dict(zip(names, np.hstack([track.motion.q, track.motion.nu, track.motion.memory]).T, strict=True))
+    moved = Manoeuvre(times, track.latest.manoeuvre.at(times) - wish.at(times))
+    states: np.ndarray | None = None
+    for friction, slip, coarse in WAY if attempt == 0 else WAY[-1:]:
+        tr = transcribe(
+            soften(model, friction, slip),
+            problem,
+            track.sizes,
+            max(4, round((len(times) - 1) / coarse)),
+            elements=1 if attempt == 0 else 3,
+            with_pose=on_lane,
+            rest=2 * friction if friction > 1 else 1.0,
+            weights=np.empty((0, len(model.coordinates))),  # information isn't looked at
+        )
+        if states is None:
+            states = np.column_stack([every[c] / size for c, size in zip(tr.state_names, tr.state_scale, strict=True)])
+            start = states[0]
+        at = np.linspace(0.0, times[-1], tr.intervals + 1)
+        nodes = ((np.arange(tr.intervals)[:, None] + tr.place) * tr.knot).ravel()
+        goal, change = (d.at(at) / tr.torque_scale for d in (wish, moved))
+        U = goal + change
+        U[0] = U[-1] = goal[0] = goal[-1] = 0.0
+        Z = np.column_stack([np.interp(nodes, known, x) for x in states.T]).reshape(tr.intervals, tr.nodes, tr.n_z)
+        moved_in = np.array([MARGIN + 2 * margins.get(name, 0.0) for name in tr.limit_names])
+        task = interior.Task(
+            None,
+            np.tile(moved_in, (tr.intervals, tr.nodes, 1)),
+            np.tile([1e-4 + 2 * margins.get(name, 0.0) for name in tr.control_names], (tr.intervals, 1)),
+            np.array([name.startswith("lane") for name in tr.limit_names], bool),
+            coarse,  # knots in one: the distance stays the same
+            goal,
+        )
         levels = (interior.Level(1.0, 1e-3, 1e-2, 40), interior.Level(1.0, 1e-4, 1e-3, 20))
-        point, _ = interior.minimise(tr, task, point, levels)
-        found, motion = judge(model, problem, Manoeuvre(times, point.U * tr.torque_scale))
-    except (UnsettledError, SimulationError):
+        try:
+            point = interior.begin(tr, task, start, settle(tr, start, U, Z), U, 1e-3, 0.05)
+            point, _ = interior.minimise(tr, task, point, levels if friction == 1 else levels[:1])
+        except UnsettledError:
+            return None
+        known, states, start = nodes, point.Z.reshape(-1, tr.n_z), point.start
+        moved = Manoeuvre(at, (point.U - goal) * tr.torque_scale)
+    try:
+        found, motion = judge(model, problem, Manoeuvre(at, point.U * tr.torque_scale))
+    except SimulationError:
         return None
     pose = found.start if on_lane else None
     return replace(track, latest=found, best=found, motion=motion, pose=pose)

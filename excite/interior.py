@@ -253,8 +253,8 @@ def _linearise(tr: Transcription, task: Task, point: Point, level: Level) -> Qua
     back = flat.transpose(0, 2, 1)
     Q = np.matmul(back, np.matmul(H.reshape(K, J, tr.n_s, tr.n_s), LT).reshape(K, -1, n_r))
     h = np.matmul(back, node.reshape(K, -1, 1))[:, :, 0]
-    moves = (as_ * tr.weight[:, None, None]).reshape(K, J, n_a, -1).transpose(0, 1, 3, 2).reshape(K, -1, n_a)
-    border = np.matmul(back, moves)
+    counted = (as_ * tr.weight[:, None, None]).reshape(K, J, n_a, tr.n_s)
+    border = np.matmul(back, counted.transpose(0, 1, 3, 2).reshape(K, J * tr.n_s, n_a))
     Q[:, n_z:, n_z:] += np.matmul(tr.control.T * sigmac[:, None], tr.control)
     h[:, n_z:] += (forcec + sigmac * (state.gc - point.tc)) @ tr.control
     if task.goal is not None:

@@ -84,6 +84,19 @@ def test_what_cannot_be_brought_inside_says_what_it_breaks(straight: Model, prob
     assert max(found.violations, key=lambda name: found.violations[name]).startswith("lane x")
 
 
+def test_a_drive_that_ends_far_from_rest_is_brought_inside(va12: Model) -> None:
+    whole = va12.machine.problems["R60"]
+    wish = multisine(va12, whole, 2)
+    small = shrunk(va12, whole, wish)
+    before, _ = judge(va12, whole, small)
+    assert before.excess > 20
+    found = within(va12, whole, wish)
+    assert found.feasible
+    full = [float(b.limit.torque or 1.0) for b in va12.machine.actuated]
+    moved = (found.manoeuvre.torque - small.torque) / full
+    assert np.sqrt((moved**2).mean()) < 0.05
+
+
 def test_scaling_down_keeps_shape_and_limits(straight: Model, problem: Problem) -> None:
     wish = multisine(straight, problem, 2)
     small = shrunk(straight, problem, wish)
