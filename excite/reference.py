@@ -29,10 +29,12 @@ ADDRESS = re.compile(r"<(?:function |bound method |built-in function )?_?(\S+?)(
 WORDS: Mapping[type, str] = {str: "text", int: "whole number", float: "number", bool: "true or false"}
 FORMULA = re.compile(r"\S*[_=()]")  # no sentence begins with a capital letter here
 PLACES = {
-    "joints": "each driven joint",
-    "contacts": "each driven roll or wheel",
-    "drive": "all driven rolls or wheels together",
-    "articulation": "each driven joint that is no roll or wheel",
+    "joints": "each joint with friction",
+    "drives": "each driven joint",
+    "contacts": "each contact with the ground",
+    "driven_contacts": "each driven contact",
+    "drive": "all driven contacts together; where it is the ground that changes, all contacts",
+    "articulation": "each driven joint without a contact",
     "wheels": "each measuring wheel",
     "yaw_rate": "the gyro",
     "lateral_speed": "the lateral speed sensor",

@@ -227,9 +227,9 @@ def _same(signature: np.ndarray, pairs: Sequence[tuple[int, int]]) -> set[tuple[
 def _by_place(machine: Machine, a: Placed, b: Placed) -> str | None:
     """What separates two causes that answer alike because they differ in place alone, or not even in that."""
     if a.where != b.where and machine.planar:
-        rolling = {x.index for x in machine.contacts}
+        pulling = {x.index for x in machine.actuated if x.contact is not None}
         pulls = [bool(e.effect.torque or e.effect.soil or e.effect.channel) for e in (a, b)]
-        if not all(pulls) or not {*a.bodies, *b.bodies} <= rolling:
+        if not all(pulls) or not {*a.bodies, *b.bodies} <= pulling:
             return "tight turns to both sides"
         first, second = sorted((a, b), key=lambda e: len(e.bodies))
         other = "the others" if len(second.bodies) > 1 else f"{_words(second.where)} alone"

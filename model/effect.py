@@ -125,11 +125,12 @@ class Memory:
 class Effect:
     """One entry of the catalogue.
 
-    `places`: joints, contacts (driven ones), drive (all of these together), articulation, wheels (measuring ones),
-    yaw_rate, lateral_speed, machine. `amount`: a typical one [unit] at a site, `grid`: shares of it that are tried
-    where the signature isn't proportional to the amount. `positive`: a negative amount makes no sense; `inverse`: the
-    smaller the amount, the larger the effect; `angular`: a reading's error that only a sensor of an angle has, none of
-    a rate. Hooks take the scene, the body they act on, and the values.
+    `places`: joints (with friction), drives (driven joints), contacts, driven_contacts, drive (all of these together,
+    of soil all contacts), articulation (driven joints without contact), wheels (measuring ones), yaw_rate,
+    lateral_speed, machine. `amount`: a typical one [unit] at a site, `grid`: shares of it that are tried where the
+    signature isn't proportional to the amount. `positive`: a negative amount makes no sense; `inverse`: the smaller the
+    amount, the larger the effect; `angular`: a reading's error that only a sensor of an angle has, none of a rate.
+    Hooks take the scene, the body they act on, and the values.
     """
 
     name: str

@@ -186,7 +186,7 @@ _declare(
     ),
     Effect(
         "load_dependent_friction",
-        ("joints",),
+        ("drives",),
         "-",
         "friction grows by A times the delivered torque's size",
         "friction larger where the torque is large, at the same speed",
@@ -239,7 +239,7 @@ _declare(
     # ---------------------------------------------------------------- drives and torque channels
     Effect(
         "actuator_lag",
-        ("joints",),
+        ("drives",),
         "s",
         "the delivered torque follows the measured one with a first-order lag of time constant A",
         "torque errors proportional to the torque's rate of change",
@@ -252,7 +252,7 @@ _declare(
     ),
     Effect(
         "channel_delay",
-        ("joints",),
+        ("drives",),
         "s",
         "the torque channel is late by A: u_measured(t) = u(t - A) + u0",
         "torque errors proportional to the torque's rate of change, with the sign of a torque that comes early",
@@ -263,7 +263,7 @@ _declare(
     ),
     Effect(
         "torque_gain",
-        ("joints",),
+        ("drives",),
         "-",
         "u_measured = (1 + A) u + u0",
         "one joint's parameters scaled against the rest of the machine",
@@ -273,7 +273,7 @@ _declare(
     ),
     Effect(
         "torque_offset_drift",
-        ("joints",),
+        ("drives",),
         "N m/s",
         "the torque sensor's offset drifts by A a second",
         "a torque error that grows steadily with time",
@@ -284,7 +284,7 @@ _declare(
     ),
     Effect(
         "torque_deadband",
-        ("contacts",),
+        ("driven_contacts",),
         "N m",
         "delivered sgn(u) max(abs(u) - A, 0), u measured",
         "a loss of torque with the sign of the torque, also at standstill",
@@ -306,7 +306,7 @@ _declare(
     ),
     Effect(
         "relief_valve",
-        ("joints",),
+        ("drives",),
         "-",
         "of the torque beyond a valve's opening the share A is not delivered",
         "torque missing at the largest torques alone",
@@ -341,7 +341,7 @@ _declare(
     ),
     Effect(
         "torque_ripple",
-        ("contacts",),
+        ("driven_contacts",),
         "N m",
         "the delivered torque ripples several times per turn: A sin(order theta + phase)",
         "a torque error periodic in the contact's angle, several times per turn",
@@ -576,21 +576,21 @@ _declare(
 
 def places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...], str | None]]:
     """Where an effect may sit on a machine: name of the place -> bodies, sensor."""
-    free = list(machine.actuated)
-    rolling = [b for b in free if b.contact is not None]
-    plain = [b for b in free if b.contact is None]
+    driven = list(machine.actuated)
+    rubbing = [b for b in machine.body if b.friction is not None and b.coordinates[0] in machine.coordinates]
+    pulling = [b for b in driven if b.contact is not None]
+    together = machine.contacts if effect.soil else pulling
+    each = {"joints": rubbing, "drives": driven, "contacts": machine.contacts, "driven_contacts": pulling}
+    if machine.planar:
+        each["articulation"] = [b for b in driven if b.contact is None]
     sensors = [s for s in machine.sensors("full") if not (effect.angular and s.is_rate)]
     root = machine.body[0].index
     found: dict[str, tuple[tuple[int, ...], str | None]] = {}
     for place in effect.places:
-        if place == "joints":
-            found |= {b.where: ((b.index,), _angle(sensors, b)) for b in free}
-        elif place == "contacts":
-            found |= {b.where: ((b.index,), _angle(sensors, b)) for b in rolling}
-        elif place == "drive" and len(rolling) > 1:
-            found["drive"] = tuple(b.index for b in rolling), None
-        elif place == "articulation" and machine.planar:
-            found |= {b.where: ((b.index,), _angle(sensors, b)) for b in plain}
+        if place in each:
+            found |= {b.where: ((b.index,), _angle(sensors, b)) for b in each[place]}
+        elif place == "drive" and len(together) > 1:
+            found["drive"] = tuple(b.index for b in together), None
         elif place == "wheels":
             found |= {s.place or s.name: ((s.body,), s.name) for s in sensors if s.kind == "wheel"}
         elif place in ("yaw_rate", "lateral_speed"):

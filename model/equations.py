@@ -212,13 +212,14 @@ def _acting(s: Sample, placed: Sequence[Placed]) -> tuple[tuple[str, ...], ca.SX
 
 def _scene(s: Sample, time: ca.SX) -> Scene:
     """A sample as every effect sees it."""
-    turning = [b for b in s.machine.body if b.coordinates and b.joint != "planar" and b.friction is not None]
+    turning = [b for b in s.machine.body if b.coordinates and b.joint != "planar"]
+    rubbing = [b for b in turning if b.friction is not None]
     return Scene(
         {b.index: s.at[b.coordinates[0]] for b in turning},
         {b.index: s.rate[b.coordinates[0]] for b in turning},
         dict(zip([b.index for b in s.machine.actuated], ca.vertsplit(s.u), strict=True)),
-        {b.index: _friction(s, b) for b in turning},
-        {b.index: float(b.friction.smoothing) for b in turning if b.friction is not None},
+        {b.index: _friction(s, b) for b in rubbing},
+        {b.index: float(b.friction.smoothing) for b in rubbing if b.friction is not None},
         {b.index: _rolling(s, b)[0] for b in s.machine.contacts},
         {b.index: s.frames[b.index].velocity[0] for b in s.machine.body},
         time,

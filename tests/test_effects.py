@@ -245,6 +245,42 @@ def test_effects_of_one_contact_on_others_need_a_drive() -> None:
     assert not effects.places(machine.load("va12_straight"), CATALOGUE["payload_shift"])
 
 
+THREE = machine.load("three_wheel")
+TOWED = {e.name: e for e in CATALOGUE.values() if any(4 in bodies for bodies, _ in effects.places(THREE, e).values())}
+
+
+def test_what_needs_no_motor_may_sit_at_a_contact_that_has_none() -> None:
+    """The steered front roll of the three-wheel roller: its soil, its bearing, its encoder, but no motor's torque."""
+    needing = {e.name for e in CATALOGUE.values() if {"drives", "driven_contacts"} & set(e.places)} | {"pump_coupling"}
+    possible = {e.name for e in CATALOGUE.values() if {"joints", "contacts"} & set(e.places)}
+    assert set(TOWED) == possible | {"compaction_per_pass"}
+    assert not set(TOWED) & needing
+    assert {e.name for e in CATALOGUE.values() if e.soil or e.push} <= set(TOWED)
+    assert effects.places(THREE, CATALOGUE["compaction_per_pass"]) == {"drive": ((1, 2, 4), None)}
+    with pytest.raises(MachineError, match="where must be one of left_roll, right_roll"):
+        effects.parse("torque_deadband@front_roll=100", THREE, 10.0)
+
+
+@pytest.mark.parametrize("effect", TOWED.values(), ids=list(TOWED))
+def test_at_a_towed_contact_prediction_is_dynamics(effect: Effect) -> None:
+    """No torque acts on its joint, whatever the effect does there; and the effect does something."""
+    place = next(w for w, (bodies, _) in effects.places(THREE, effect).items() if 4 in bodies)
+    amount = effect.amount(Site(THREE, THREE.find(4), 10.0))
+    model = build(effects.extended(THREE, effects.parse(f"{effect.name}@{place}={amount}", THREE, 10.0)))
+    plain, rng, n = build(THREE), np.random.default_rng(2), 40
+    q, nu = rng.uniform(-1, 1, (2, len(model.coordinates), n))
+    u, z = rng.uniform(-2000, 2000, (3, n)), rng.uniform(0.1, 0.5, (len(model.memory), n))
+    z[[m == "time" for m in model.memory]] = 5.0
+    X = model.nominal
+    a = model.acceleration(q, nu, u, z, X).full()
+    Y = model.predict(q, nu, a, model.expand @ X, u, z).full()
+    towed = model.coordinates.index("theta4")
+    assert np.abs(Y[towed]).max() < 1e-7 * np.abs(Y).max()
+    read = [m.read(q, nu, np.ones((2, n)), u, *x).full() for m, x in ((model, (z, X)), (plain, (z[:0], plain.nominal)))]
+    moved = np.abs(a - plain.acceleration(q, nu, u, plain.nominal).full()).max()
+    assert moved > 1e-6 or np.abs(read[0] - read[1]).max() > 1e-6
+
+
 # ------------------------------------------------------------------------------------------------ noise is no effect
 
 

@@ -365,6 +365,22 @@ def test_a_diagnosis_names_what_a_robot_has(biased: tuple[Motion, Diagnosis]) ->
         assert np.quantile(np.abs(own - slip), 0.99) < 0.1 * np.ptp(slip)  # not at rest, where a log says little
 
 
+@pytest.mark.parametrize("cause", ["rolling_resistance@front_roll=300", "shear_saturation@front_roll=0.2"])
+def test_a_diagnosis_names_what_a_roll_has_that_nothing_drives(cause: str) -> None:
+    """On the three-wheel roller's designed drive, by the right name, place and amount."""
+    model = model_of("three_wheel")
+    drawn = json.loads((ROOT / "results" / "machines" / "three_wheel" / "drive.json").read_text())
+    torque = manoeuvre.Manoeuvre(np.array(drawn["times_s"]), np.array(drawn["torque"])).sample(100.0)
+    wrong = build(effects.extended(model.machine, effects.parse(cause, model.machine, 20.0)))
+    motion = simulate(wrong, torque, q0=np.array(drawn["start"]))
+    found = diagnose.diagnose(
+        model, [log.check(sensors.measure(wrong, motion, seed=1), model.machine)], model.machine.filter
+    )
+    name, _, amount = cause.partition("=")
+    assert (found.verdict, [f.name for f in found.findings]) == ("named", [name])
+    assert abs(found.findings[0].amount - float(amount)) < 4 * found.findings[0].amount_std < 0.2 * float(amount)
+
+
 @pytest.mark.parametrize(
     ("cause", "rival", "said"),
     [
