@@ -318,7 +318,7 @@ def shrunk(model: Model, problem: Problem, wish: Manoeuvre) -> Manoeuvre:
     for left, group in enumerate(groups, 1 - len(groups)):
         low, high = 0, 50
         while low < high:
-            middle = (low + high) // 2
+            middle = min(2 * low + 1, (low + high) // 2)  # most drives are not far outside
             factor[group] = SHRINK**middle
             low, high = (low, middle) if holds() else (middle + 1, high)
         factor[group] = SHRINK ** (high + (left < 0))  # room for what the others add
