@@ -22,7 +22,8 @@ from model.prediction import Model
 ACCURACY = 1e-5  # of a speed over an interval [rad/s, m/s]: what a sample's torque noise does is far more
 BATCH = 1000  # samples at a time: their intermediate results stay in the processor's cache
 MANY, FEW = 80, 20  # from how many samples on a block pays; samples in one call of CasADi otherwise
-FINE = 16  # steps for an interval in which friction turns
+FINE, FINEST = 4, 16  # steps for an interval in which friction turns, and where it turns all at once
+ABRUPT = 1.5  # of the speed that friction takes to turn: a change within an interval from which it does so at once
 SPLITS = 6  # an interval is halved at most this often
 
 
@@ -401,44 +402,62 @@ def differentiate(chart: Chart, s: np.ndarray, u: np.ndarray, X: np.ndarray, for
     """How the ends of the K intervals between states s (K + 1, n) under torques u (K + 1, n_u) move, to about 1 %.
 
     F is filled with `force` only. Where a joint reverses, its friction turns within a sample and leaves a mark on
-    everything that came before: these intervals are taken in FINE steps along the straight line between their ends.
+    everything that came before: these intervals are taken in fine steps along the straight line between their ends.
     """
     h = 1 / float(chart.model.machine.sampling_hz)
     slopes = _radau(chart, chart.slopes(s, u, X), slice(0, -1), slice(1, None), h, force)
-    turning = np.flatnonzero(_reversals(chart, s))
-    if len(turning) == 0:
-        return slopes
-    share = np.linspace(0, 1, FINE + 1)[:, None]
-    path = s[turning, None] + share * (s[turning + 1] - s[turning])[:, None]
-    push = u[turning, None] + share * (u[turning + 1] - u[turning])[:, None]
-    nodes = np.arange(len(turning) * (FINE + 1)).reshape(len(turning), FINE + 1)
-    local = chart.slopes(path.reshape(-1, chart.n), push.reshape(-1, u.shape[1]), X)
-    fine = _radau(chart, local, nodes[:, :-1].ravel(), nodes[:, 1:].ravel(), h / FINE, force)
-    shape = (len(turning), FINE)
-    A, B, BX, F = (e.reshape(*shape, *e.shape[1:]) for e in (fine.A, fine.B, fine.X, fine.F))
-    for part, own in ((slopes.B, B), (slopes.X, BX), (slopes.F, F)):
-        total = own[:, 0]
-        for k in range(1, FINE):
-            total = A[:, k] @ total + own[:, k]
-        part[turning] = total
-    through = A[:, 0]
-    for k in range(1, FINE):
-        through = A[:, k] @ through
-    slopes.A[turning] = through
+    steps = _reversals(chart, s)
+    for fine in (FINE, FINEST):
+        turning = np.flatnonzero(steps == fine)
+        if len(turning):
+            _refine(chart, slopes, turning, fine, s, u, X, force)
     return slopes
 
 
+def _refine(
+    chart: Chart,
+    slopes: Slopes,
+    turning: np.ndarray,
+    fine: int,
+    s: np.ndarray,
+    u: np.ndarray,
+    X: np.ndarray,
+    force: bool,
+) -> None:
+    """Puts slopes of the intervals `turning` in place, taken in so many fine steps."""
+    share = np.linspace(0, 1, fine + 1)[:, None]
+    path = s[turning, None] + share * (s[turning + 1] - s[turning])[:, None]
+    push = u[turning, None] + share * (u[turning + 1] - u[turning])[:, None]
+    nodes = np.arange(len(turning) * (fine + 1)).reshape(len(turning), fine + 1)
+    local = chart.slopes(path.reshape(-1, chart.n), push.reshape(-1, u.shape[1]), X)
+    h = 1 / float(chart.model.machine.sampling_hz) / fine
+    by = _radau(chart, local, nodes[:, :-1].ravel(), nodes[:, 1:].ravel(), h, force)
+    A, B, BX, F = (e.reshape(len(turning), fine, *e.shape[1:]) for e in (by.A, by.B, by.X, by.F))
+    for part, own in ((slopes.B, B), (slopes.X, BX), (slopes.F, F)):
+        total = own[:, 0]
+        for k in range(1, fine):
+            total = A[:, k] @ total + own[:, k]
+        part[turning] = total
+    through = A[:, 0]
+    for k in range(1, fine):
+        through = A[:, k] @ through
+    slopes.A[turning] = through
+
+
 def _reversals(chart: Chart, s: np.ndarray) -> np.ndarray:
-    """Which of the intervals between states s (K + 1, n) friction turns in, (K,)."""
+    """In how many fine steps each of the intervals between states s (K + 1, n) is taken (K,): 0 where friction doesn't
+    turn in it."""
     model = chart.model
-    found = np.zeros(len(s) - 1, bool)
+    found = np.zeros(len(s) - 1, int)
     first = chart.core - len(model.coordinates) - len(model.memory)
     for body in model.machine.body:
         if body.friction is None or body.coordinates[0] not in model.coordinates:
             continue
         w = s[:, first + model.coordinates.index(body.coordinates[0])] / float(body.friction.smoothing)
         nearest = np.where(w[:-1] * w[1:] <= 0, 0.0, np.minimum(np.abs(w[:-1]), np.abs(w[1:])))
-        found |= (nearest < 4) & (np.abs(np.diff(w)) > 0.3)
+        change = np.abs(np.diff(w))
+        steps = np.where(change > ABRUPT, FINEST, np.where(change > 0.3, FINE, 0))
+        found = np.maximum(found, np.where(nearest < 4, steps, 0))
     return found
 
 

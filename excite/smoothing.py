@@ -49,6 +49,7 @@ UNSEEN = 1.0  # a parameter that a log tells less than this well, in its scale, 
 DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's scale, and its share from pass to pass
 RESUMED = DAMPING[0] * DAMPING[1] ** 2  # damping of a fit that goes on from another
 HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
+LATELY = 4  # passes whose steps tell how small the last one will be
 NEARLY = 1.0  # a step, in standard deviations, at which a fit that runs out of passes is as good as found
 TOLERABLE = 0.1  # a step, in standard deviations, at which a fit that runs out of passes is an estimate
 CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviations
@@ -429,6 +430,7 @@ def iterate(
     """
     model = c.model
     step, before = np.inf, np.inf
+    sizes: list[float] = []
     shorter, here = 0, (list(points), X)
     there = here
     whole, last = 1.0, np.zeros(len(X))
@@ -456,8 +458,11 @@ def iterate(
                 covariance, move, left, cost = _parameters(c, records, linear, points, X, prior, damping)
         damping *= DAMPING[1]
         before, step = step, left
-        if k >= HOPELESS[0] and step > HOPELESS[1]:
-            break
+        sizes.append(step)
+        if k >= HOPELESS[0]:
+            shrinking = min((step / sizes[-1 - LATELY]) ** (1 / LATELY), 1.0) if len(sizes) > LATELY else 0.0
+            if step > HOPELESS[1] or step * shrinking ** (passes - 1 - k) > NEARLY:
+                break
         # Where Gauss-Newton swings about the answer, shorter steps end it.
         turned = move[0][: len(X)] / np.sqrt(np.diag(covariance))[: len(X)]
         swings = turned @ last < 0 and step > SLOW * before
