@@ -186,7 +186,8 @@ class Placed:
         assert self.effect.channel is not None
         time = ca.SX.sym("t")
         own = self.effect.channel(time, {k: ca.SX(v) for k, v in self.values.items()})
-        read = ca.Function("channel", [time], [ca.SX(x) for x in (own.gain, own.offset, own.delay)])
-        at = t[None] if self.effect.timed else 0.0
+        told = [ca.SX(x) for x in (own.gain, own.offset, own.delay)]
+        read = ca.Function("channel", [time], told)
+        at = t[None] if ca.depends_on(ca.vertcat(*told), time) else 0.0
         gain, offset, delay = (np.broadcast_to(x.full()[0], t.shape) for x in read(at))
         return gain, offset, delay
