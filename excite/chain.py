@@ -15,7 +15,7 @@ care. b and eta have columns: the first is the data, the others how they move wi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -87,6 +87,11 @@ class Solved:
     Z: np.ndarray
     top: Section
     parts: tuple[Section, ...]
+
+    @property
+    def closed(self) -> Solved:
+        """Without the way back to the states, which is most of its memory."""
+        return Solved(self.Z, replace(self.top, levels=()), tuple(replace(p, levels=()) for p in self.parts))
 
     def states(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The most likely states and slopes (K - 1, n) between the stages for parameter steps p (c - 1,).

@@ -12,6 +12,7 @@ from excite.brief import Brief
 from excite.diagnose import diagnose
 from excite.limit import InfeasibleError
 from excite.separate import Rivals
+from excite.sidebyside import forked
 from excite.simulate import SimulationError
 from model.machine import Machine, MachineError
 from model.prediction import Model, build
@@ -51,8 +52,8 @@ def write(
     def tell(begin: float, end: float) -> Callable[[float, str], None]:
         return lambda share, what: advance(round(1000 * (begin + share * (end - begin))), 1000, None)
 
-    found = diagnose(model, mended, chosen, tell(0.0, PARTS))
-    account = findings.account(found, tell(PARTS, 1.0))
+    found = diagnose(model, mended, chosen, tell(0.0, PARTS), forked)
+    account = findings.account(found, tell(PARTS, 1.0), forked)
     text = findings.machine_file(machine, model.machine, found)
     if text is not None:
         (place / MACHINE).write_text(text, encoding="utf-8")

@@ -8,8 +8,9 @@ well are given together. What no name explains is said to be unexplained.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.stats
@@ -20,6 +21,7 @@ from excite.innovations import innovation_sizes
 from excite.linearise import Chart, chart
 from excite.log import Log
 from excite.record import Point, Record, carried, common_sensors, first_point, origins, record
+from excite.sidebyside import Together, in_turn
 from excite.smoothing import Fit, NotConverged
 from model import effects
 from model.machine import EffectEntry, Filter, Machine, Quantity
@@ -30,8 +32,10 @@ WORTH = 15.0  # a first-order gain below which a candidate isn't fitted
 HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
 STRONG = 1.3  # misfit over readings from which first-order gains are rough
 PASSES = 14  # of a candidate's fit
-LESS = 0.3, 0.1  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
+LESS = 0.1, 0.3  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
 TRIED = 5  # candidates that are fitted, of different names
+PAIR = 2  # candidates that are fitted side by side
+OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
 ROUGHLY = 2  # the same where not even the model without them was fitted
 MOST = 4  # effects that are looked for
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
@@ -68,12 +72,14 @@ class Prepared:
 @dataclass(frozen=True)
 class Stage:
     """A model with the effects found so far, fitted. `exact`: without disturbing forces. Not `settled`: no fit was
-    found that the log agrees to, this is how far it came."""
+    found that the log agrees to, this is how far it came. loose: the same model with the larger disturbing forces that
+    this fit came from, if it did."""
 
     machine: Machine
     prepared: Prepared
     fit: Fit
     settled: bool = True
+    loose: Stage | None = None
 
     @property
     def model(self) -> Model:
@@ -154,9 +160,12 @@ class Diagnosis:
     nearest: tuple[str, float] | None = None
 
 
-def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance | None = None) -> Diagnosis:
-    """What these logs show that the model doesn't know. Raises NotConverged where not even disturbing forces let the
-    model follow a log, NotIdentifiable where a torque is missing."""
+def diagnose(
+    model: Model, logs: Sequence[Log], filter: Filter, advance: Advance | None = None, together: Together = in_turn
+) -> Diagnosis:
+    """What these logs show that the model doesn't know. together: how what is independent is computed; the answer is
+    the same. Raises NotConverged where not even disturbing forces let the model follow a log, NotIdentifiable where a
+    torque is missing."""
     tell = advance or (lambda share, what: None)
     tell(0.0, "fitting the model")
     before = fitted(model.machine, logs, filter)
@@ -166,32 +175,39 @@ def diagnose(model: Model, logs: Sequence[Log], filter: Filter, advance: Advance
         scores = _scores(stage)
         first = first or scores
         explained = sum(x.gain for x in chosen)
-        choice = _choose(stage, scores, explained, tell, 0.2 + 0.2 * turn)
+        choice = _choose(stage, scores, explained, together, tell, 0.2 + 0.2 * turn)
         if choice is None:
             left = max(0.0, scores[0].gain - LEVEL) if scores else 0.0
             break
         chosen.append(choice)
         stage = choice.stage
+    chosen, odd, nearest = weighed(before, chosen)
     if len(chosen) > 1:
         tell(0.9, "judging each given the others")
-        chosen = reviewed(before, chosen)
-        stage = chosen[-1].stage
-    tell(0.95, "weighing")
-    # A name that leaves most of the misfit where it was is none, unless with what came after it nothing is left.
-    odd, nearest = _odd(stage), None
-    while chosen and (odd or not stage.exact):
-        share = SHARE if len(chosen) == 1 else FURTHER
-        explained = chosen[-1].gain / (chosen[-1].gain + stage.excess)
-        if explained >= share:
-            break
-        nearest = chosen.pop().name, explained
-        stage = chosen[-1].stage if chosen else before
-        odd = _odd(stage)
+        chosen, odd, nearest = weighed(before, reviewed(before, chosen, together))
+    stage = chosen[-1].stage if chosen else before
     answer = _verdict(before, stage, chosen, first, odd, left)
     return answer if answer.findings else replace(answer, nearest=nearest)
 
 
-def reviewed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
+def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tuple[str, ...], tuple[str, float] | None]:
+    """Effects without the last ones that are no names: one that leaves most of the misfit where it was is none, unless
+    with what came after it nothing is left. Also what is odd beside those that stay, and the last one that doesn't,
+    with the share that it explains."""
+    kept, nearest = list(chosen), None
+    while True:
+        stage = kept[-1].stage if kept else before
+        odd = _odd(stage)
+        if not kept or (stage.exact and not odd):
+            break
+        explained = kept[-1].gain / (kept[-1].gain + stage.excess)
+        if explained >= (SHARE if len(kept) == 1 else FURTHER):
+            break
+        nearest = kept.pop().name, explained
+    return kept, odd, nearest
+
+
+def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_turn) -> list[Choice]:
     """Each of several effects again, given all that came after it as well, so that their order doesn't count: one that
     the others make good for is dropped, one that another name suits better gets that name, rivals are those beside the
     others. What came first stays where nothing better was found."""
@@ -203,7 +219,8 @@ def reviewed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
         except NotConverged:
             queue = [*rest, replace(first, stage=whole)]  # nothing fits without it
             continue
-        choice = _choose(stage, _scores(stage), sum(x.gain for x in rest), lambda share, what: None, 0.0)
+        explained = sum(x.gain for x in rest)
+        choice = _choose(stage, _scores(stage), explained, together, lambda share, what: None, 0.0)
         queue = [*rest, choice] if choice is not None else [*rest[:-1], replace(rest[-1], stage=stage)]
     whole, judged = queue[-1].stage, {x.name: x for x in queue}
     same = judged.keys() == {x.name for x in chosen}
@@ -239,14 +256,17 @@ def _without(name: str, stage: Stage) -> Stage:
     try:
         return refitted(machine, stage, stage.fit.disturbed)
     except NotConverged:
-        return refitted(machine, stage, max(stage.fit.disturbed, LESS[-1] * smoothing.DISTURBED[0]))
+        return refitted(machine, stage, max(stage.fit.disturbed, LESS[0] * smoothing.DISTURBED[0]))
 
 
 def _scores(stage: Stage) -> tuple[evidence.Score, ...]:
     """What every effect that a model does not have promises, best first."""
     known = [e.name for e in stage.model.effects]
     sensors = [s.name for s in stage.prepared.c.sensors]
-    found = evidence.candidates(stage.machine, sensors, _duration(stage.prepared.logs), known)
+    return _scanned(stage, evidence.candidates(stage.machine, sensors, _duration(stage.prepared.logs), known))
+
+
+def _scanned(stage: Stage, found: Sequence[evidence.Candidate]) -> tuple[evidence.Score, ...]:
     return evidence.scan(stage.prepared.c, stage.prepared.records, stage.fit, found).scores
 
 
@@ -280,50 +300,89 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
     take up, the plainer the cause. Raises NotConverged where not even large ones let the model follow.
     """
     prepared = _prepared(machine, logs, filter)
-    c, starts = prepared.c, prepared.starts
+    starts, nominal = prepared.starts, prepared.c.model.nominal
     try:
-        fit = smoothing.iterate(c, prepared.records, starts, c.model.nominal, starts, 0.0, prepared.held)
-        return Stage(machine, prepared, fit)
+        return Stage(machine, prepared, light(_iterated(prepared, starts, nominal, 0.0)))
     except NotConverged:
         pass
     stood: Fit | None = None
     for disturbed in smoothing.DISTURBED:
         try:
-            fit = smoothing.iterate(c, prepared.records, starts, c.model.nominal, starts, disturbed, prepared.held)
+            fit = _iterated(prepared, starts, nominal, disturbed)
         except NotConverged as failed:
             stood, trouble = failed.fit or stood, failed
             if failed.nearly is None:
                 continue
             fit = failed.nearly
-        stage = Stage(machine, prepared, fit)
+        first = Stage(machine, prepared, light(fit))
         for less in LESS:
             try:
-                stage = refitted(machine, stage, less * disturbed)
+                return replace(refitted(machine, first, less * disturbed), loose=first)
             except NotConverged:
-                break
-        return stage
+                continue
+        return first
     if stood is None:
         raise trouble
-    return Stage(machine, prepared, stood, settled=False)
+    return Stage(machine, prepared, light(stood), settled=False)
 
 
 def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
     """The model of a machine with other effects fitted to the logs of a stage, from its fit, with so large disturbing
     forces. Raises NotConverged."""
     prepared = _resumed(machine, of)
+    return Stage(machine, prepared, _resume(prepared, of, disturbed))
+
+
+Wish = tuple[Machine, Stage, float]  # what `refitted` is called with
+
+
+def refits(wishes: Sequence[Wish], together: Together) -> Iterator[Stage | None]:
+    """Several refitted, side by side; None where no fit is found."""
+    prepared = [_resumed(machine, of) for machine, of, _ in wishes]
+    calls = [partial(_resumable, p, of, disturbed) for p, (_, of, disturbed) in zip(prepared, wishes, strict=True)]
+    for p, (machine, _, _), fit in zip(prepared, wishes, together(calls), strict=True):
+        yield None if fit is None else Stage(machine, p, fit)
+
+
+def _resumable(prepared: Prepared, of: Stage, disturbed: float) -> Fit | None:
+    try:
+        return _resume(prepared, of, disturbed)
+    except NotConverged:
+        return None
+
+
+def _resume(prepared: Prepared, of: Stage, disturbed: float) -> Fit:
+    """The fit of a stage gone on with, for logs made ready for another model. Raises NotConverged."""
     c = prepared.c
     old = dict(zip(of.model.base.names, of.fit.X, strict=True))
     X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, c.model.nominal, strict=True)])
     points = [carried(c, r, p, of.prepared.c, X) for r, p in zip(prepared.records, of.fit.points, strict=True)]
     try:
-        fit = smoothing.iterate(
-            c, prepared.records, points, X, prepared.starts, disturbed, prepared.held, smoothing.RESUMED, PASSES
-        )
+        fit = _iterated(prepared, points, X, disturbed, smoothing.RESUMED, PASSES)
     except NotConverged as failed:
         if failed.nearly is None:
             raise
         fit = failed.nearly
-    return Stage(machine, prepared, fit)
+    return light(fit)
+
+
+def _iterated(
+    prepared: Prepared,
+    points: Sequence[Point],
+    X: np.ndarray,
+    disturbed: float,
+    damping: float = smoothing.DAMPING[0],
+    passes: int = smoothing.PASSES,
+) -> Fit:
+    """A fit from points and X. With disturbing forces it is found as soon as it is nearly: gains are larger by far than
+    what another pass would change. Raises NotConverged."""
+    p = prepared
+    return smoothing.iterate(p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, smoothing.NEARLY)
+
+
+def light(fit: Fit) -> Fit:
+    """A fit without what only its own iteration needs."""
+    return replace(fit, linear=tuple(replace(x, solved=x.solved.closed) for x in fit.linear))
 
 
 def _charted(machine: Machine, logs: Sequence[Log]) -> Chart:
@@ -381,11 +440,12 @@ def _identified(effect: str, where: str, amount: float, shapes: Mapping[str, flo
     )
 
 
-def _shortlist(stage: Stage, scores: Sequence[evidence.Score]) -> list[evidence.Score]:
+def _shortlist(stage: Stage, scores: Sequence[evidence.Score], explained: float) -> list[evidence.Score]:
     """The best candidate of each name, best first, as far as worth a fit."""
     best: dict[str, evidence.Score] = {}
+    least = max(WORTH, _least(stage, explained) / OVER)
     for s in scores:
-        if s.gain >= max(WORTH, HOPE[stage.rough] * scores[0].gain) and s.values["A"] != 0:
+        if s.gain >= max(least, HOPE[stage.rough] * scores[0].gain) and s.values["A"] != 0:
             best.setdefault(s.candidate.name, s)
     return list(best.values())[: TRIED if stage.settled else ROUGHLY]
 
@@ -404,52 +464,65 @@ def _choose(
     stage: Stage,
     scores: Sequence[evidence.Score],
     explained: float,
+    together: Together,
     tell: Advance,
     done: float,
 ) -> Choice | None:
     """The effect that the logs like best beside those that are in the model; None if none is worth it. explained: how
     much those in the model have gained."""
-    likely = _shortlist(stage, scores)
+    likely = _shortlist(stage, scores, explained)
     if not likely:
         return None
     for reach in CLOSER:
         nearby = evidence.finer(likely, stage.machine, _duration(stage.prepared.logs), reach)
         if len(nearby) > len(likely):
-            closer = evidence.scan(stage.prepared.c, stage.prepared.records, stage.fit, nearby).scores
-            likely = _shortlist(stage, sorted([*likely, *closer], key=lambda s: -s.gain))
-    tries = _tries(stage, likely, lambda k: tell(done + 0.03 * k, f"fitting {likely[k].candidate.name}"))
+            likely = _shortlist(stage, sorted([*likely, *_scanned(stage, nearby)], key=lambda s: -s.gain), explained)
+    tries = _tries(stage, likely, together, lambda k: tell(done + 0.03 * k, f"fitting {likely[k].candidate.name}"))
     if stage.exact and likely[0].candidate.name not in {s.candidate.name for s, _ in tries}:
         # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
         try:
-            stage = refitted(stage.machine, stage, LESS[-1] * smoothing.DISTURBED[0])
+            stage = refitted(stage.machine, stage, LESS[0] * smoothing.DISTURBED[0])
         except NotConverged:
             return None
-        tries = _tries(stage, likely, lambda k: None)
+        found = evidence.renumbered([s.candidate for s in likely])
+        likely = _shortlist(stage, _scanned(stage, found), explained)
+        tries = _tries(stage, likely, together, lambda k: None)
     if not tries:
         return None
     tries.sort(key=lambda x: x[1].fit.cost)
     score, best = tries[0]
     gain = stage.fit.cost - best.fit.cost
     spread = max(1.0, best.fit.cost / best.prepared.readings)
-    least = max(LEAST[stage.rough] * stage.excess, SHAPE[0] * explained, min(SHAPE[1] * _sureness(stage), BESIDE))
-    if gain < max(LEVEL * spread, least):
+    if gain < max(LEVEL * spread, _least(stage, explained)):
         return None
-    tries = _close(_without_forces(_close(tries, gain)), gain)
+    tries = _close(_without_forces(_close(tries, gain), together), gain)
     score, best = tries[0]
     rivals = tuple(_fitted(other, s.candidate.name) for s, other in tries[1:])
     return Choice(score.candidate.name, best, gain, spread, len(scores), rivals)
 
 
-def _tries(stage: Stage, likely: Sequence[evidence.Score], tell: Callable[[int], None]) -> list[_Try]:
-    """The candidates whose fits were found, as the model without them was fitted."""
+def _least(stage: Stage, explained: float) -> float:
+    """What an effect must gain to be worth a place beside those in a model, which have gained `explained`."""
+    return max(LEAST[stage.rough] * stage.excess, SHAPE[0] * explained, min(SHAPE[1] * _sureness(stage), BESIDE))
+
+
+def _tries(
+    stage: Stage, likely: Sequence[evidence.Score], together: Together, tell: Callable[[int], None]
+) -> list[_Try]:
+    """The candidates whose fits were found, as the model without them was fitted: PAIR at a time, best first, as long
+    as the next may come near what was gained."""
     tries: list[_Try] = []
-    for k, score in enumerate(likely):
-        tell(k)
-        machine = effects.extended(stage.machine, _entry(score))
-        try:
-            tries.append((score, refitted(machine, stage, stage.fit.disturbed)))
-        except NotConverged:
-            continue
+    gained = 0.0
+    for at in range(0, len(likely), PAIR):
+        pair = likely[at : at + PAIR]
+        if gained > OVER * pair[0].gain:
+            break
+        tell(at)
+        wishes = [(effects.extended(stage.machine, _entry(s)), stage, stage.fit.disturbed) for s in pair]
+        for score, found in zip(pair, refits(wishes, together), strict=True):
+            if found is not None:
+                tries.append((score, found))
+                gained = max(gained, stage.fit.cost - found.fit.cost)
     return tries
 
 
@@ -461,16 +534,13 @@ def _close(tries: Sequence[_Try], gain: float) -> list[_Try]:
     return [x for x in tries if x[1].fit.cost - best.fit.cost < near]
 
 
-def _without_forces(tries: Sequence[_Try]) -> list[_Try]:
+def _without_forces(tries: Sequence[_Try], together: Together) -> list[_Try]:
     """Those that need no disturbing forces any more, best first; all, best first as they are, where none does."""
-    exact: list[_Try] = []
-    for score, stage in tries:
-        if stage.fit.cost > STRONG * stage.prepared.readings and not stage.exact:
-            continue  # what forces don't make good, none makes worse
-        try:
-            exact.append((score, stage if stage.exact else refitted(stage.machine, stage, 0.0)))
-        except NotConverged:
-            continue
+    # What forces don't make good, none makes worse.
+    good = [x for x in tries if x[1].exact or x[1].fit.cost <= STRONG * x[1].prepared.readings]
+    freed = refits([(s.machine, s, 0.0) for _, s in good if not s.exact], together)
+    stages = [s if s.exact else next(freed) for _, s in good]
+    exact = [(score, s) for (score, _), s in zip(good, stages, strict=True) if s is not None]
     return sorted(exact, key=lambda x: x[1].fit.cost) or list(tries)
 
 

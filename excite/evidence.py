@@ -10,7 +10,7 @@ structure, is accounted for. The test is Rao's score test (Rao, 1948) of each ef
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import casadi as ca
@@ -131,6 +131,12 @@ def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
         grids[name] = [float(value + x * (value - below if x < 0 else above - value)) for x in shares]
     every = [dict(zip(grids, values, strict=True)) for values in product(*grids.values())]
     return [{**placed.values, **values} for values in every if min(values.values(), default=1.0) >= 0]
+
+
+def renumbered(found: Sequence[Candidate]) -> list[Candidate]:
+    """Candidates of other lists as one."""
+    ends = np.cumsum([len(x.columns) for x in found])
+    return [replace(x, columns=tuple(range(end - len(x.columns), end))) for x, end in zip(found, ends, strict=True)]
 
 
 class Signatures:

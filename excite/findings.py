@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -14,6 +15,7 @@ from excite import gain, misfit, separate
 from excite.diagnose import Advance, Diagnosis, Finding
 from excite.gain import Gain
 from excite.misfit import Course
+from excite.sidebyside import Together, in_turn
 from model.machine import EffectEntry, Machine, shipped
 
 DIGITS = 8  # of amounts in a machine file
@@ -38,15 +40,16 @@ class Account:
     run: str | None
 
 
-def account(d: Diagnosis, advance: Advance | None = None) -> Account:
+def account(d: Diagnosis, advance: Advance | None = None, together: Together = in_turn) -> Account:
     """Measures gains and locates the misfit. Each finding's gain is that of the model with it over the model with those
     found before it."""
     tell = advance or (lambda share, what: None)
     stages = [d.before, *d.stages]
     held = []
-    for k, stage in enumerate(stages):
-        tell(k / len(stages), "measuring the gain")
-        held.append(gain.withheld(stage))
+    tell(0.0, "measuring the gain")
+    for k, found in enumerate(together([partial(gain.withheld, s) for s in stages])):
+        tell((k + 1) / (len(stages) + 1), "measuring the gain")
+        held.append(found)
     single = tuple(gain.gain(a, b) if a is not None and b is not None else None for a, b in pairwise(held))
     first, last = held[0], held[-1]
     whole = gain.gain(first, last) if first is not None and last is not None else None
@@ -55,7 +58,8 @@ def account(d: Diagnosis, advance: Advance | None = None) -> Account:
     missing = before, after
     if d.before.exact != d.after.exact:
         # Forces that the one needs must be shown for the other too.
-        missing = misfit.courses(misfit.loosened(d.before)), misfit.courses(misfit.loosened(d.after))
+        loose_before, loose_after = misfit.loosened((d.before, d.after), together)
+        missing = misfit.courses(loose_before), misfit.courses(loose_after)
     located = misfit.located(d.after) if d.verdict == "unexplained" else ()
     return Account(
         d, whole, single, before, after, missing, tuple(dict.fromkeys((*located, *d.located))), separate.run(d)

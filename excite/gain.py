@@ -81,7 +81,15 @@ def withheld(stage: Stage) -> Withheld | None:
     for disturbed in (fit.disturbed, *(x for x in LOOSER if x > fit.disturbed)):
         try:
             rest = smoothing.iterate(
-                c, masked, fit.points, fit.X, prepared.starts, disturbed, prepared.held | fit.unseen, smoothing.RESUMED
+                c,
+                masked,
+                fit.points,
+                fit.X,
+                prepared.starts,
+                disturbed,
+                prepared.held | fit.unseen,
+                smoothing.RESUMED,
+                enough=smoothing.NEARLY,
             )
         except NotConverged as failed:
             rest = failed.nearly

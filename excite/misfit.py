@@ -14,9 +14,10 @@ import numpy as np
 import scipy
 
 from excite import smoothing
-from excite.diagnose import Stage, refitted
+from excite.diagnose import Stage, refits
 from excite.linearise import advance, differentiate
-from excite.smoothing import NotConverged, state_scale
+from excite.sidebyside import Together
+from excite.smoothing import Linear, state_scale
 
 BLOCK_S = 0.25  # [s] over which slow errors are means
 BINS = 24  # of a quantity
@@ -32,8 +33,7 @@ class Course:
 
     missing: torque of each driven joint, and with disturbing forces each force, by label: (N,), unit, standard
     deviation that noise gives a sample (NaN where unknown). quantities: what the machine does, by label: unit, and the
-    values (N,) for each of the missing ones. innovations (N, m): of the sensors, over their deviation, NaN where a
-    sensor tells nothing.
+    values (N,) for each of the missing ones. linear: the log about the fit.
     """
 
     source: str
@@ -41,7 +41,12 @@ class Course:
     missing: Mapping[str, tuple[np.ndarray, str, float]]
     quantities: Mapping[str, tuple[str, Mapping[str, np.ndarray]]]
     sensors: tuple[str, ...]
-    innovations: np.ndarray
+    linear: Linear
+
+    @property
+    def innovations(self) -> np.ndarray:
+        """Of the sensors (N, m), over their deviation, NaN where a sensor tells nothing."""
+        return self.linear.innovations
 
     @property
     def rate(self) -> float:
@@ -68,14 +73,12 @@ class Size:
         return 100 * (1 - 1 / worst) if worst > EXCESS else 0.0
 
 
-def loosened(stage: Stage) -> Stage:
-    """The same model with disturbing forces of some size; as it is where those find no fit."""
-    if stage.fit.disturbed >= smoothing.DISTURBED[0]:
-        return stage
-    try:
-        return refitted(stage.machine, stage, smoothing.DISTURBED[0])
-    except NotConverged:
-        return stage
+def loosened(stages: Sequence[Stage], together: Together) -> list[Stage]:
+    """The same models with disturbing forces of some size; as they are where those find no fit."""
+    least = smoothing.DISTURBED[0]
+    known = [s if s.fit.disturbed >= least else s.loose for s in stages]
+    found = refits([(s.machine, s, least) for s, k in zip(stages, known, strict=True) if k is None], together)
+    return [k or next(found) or s for s, k in zip(stages, known, strict=True)]
 
 
 def courses(stage: Stage) -> tuple[Course, ...]:
@@ -110,7 +113,7 @@ def _course(stage: Stage, k: int) -> Course:
         missing,
         _quantities(stage, q, nu, u, own),
         tuple(s.name for s in c.sensors),
-        fit.linear[k].innovations,
+        fit.linear[k],
     )
 
 

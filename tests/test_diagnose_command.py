@@ -12,6 +12,7 @@ from conftest import Excite
 
 from excite import checkup, diagnose, log, sensors
 from excite.separate import Rivals
+from excite.sidebyside import forked, in_turn
 from excite.simulate import Motion, simulate
 from model import effects, machine, prediction
 from model.machine import EffectEntry
@@ -180,14 +181,17 @@ def test_what_is_found_stands_beside_what_the_file_has(
 
 @pytest.mark.slow
 def test_the_order_in_which_several_are_found_does_not_count(straight: Model, straight_motion: Motion) -> None:
-    """Two at once; found the other way round they stay, and a wrong name that came before or between them goes."""
+    """Two at once; found the other way round they stay, and a wrong name that came before or between them goes. Side by
+    side or in turn, the numbers are the same."""
     true = [
         effects.parse(text, straight.machine, 40.0) for text in ("ground_slope=0.004", "torque_deadband@rear_roll=60")
     ]
     both = prediction.build(effects.extended(straight.machine, *true))
     motion = simulate(both, straight_motion.u)
     one = log.check(sensors.measure(both, motion, seed=4), straight.machine)
-    found = diagnose.diagnose(straight, [one], straight.machine.filter)
+    found, same = (diagnose.diagnose(straight, [one], straight.machine.filter, together=t) for t in (forked, in_turn))
+    assert found.findings == same.findings
+    np.testing.assert_array_equal(found.after.fit.X, same.after.fit.X)
     names = [f"{e.name}@{e.where}" for e in true]
     assert (found.verdict, sorted(f.name for f in found.findings)) == ("named", sorted(names))
     for f, e in zip(sorted(found.findings, key=lambda f: f.name), true, strict=True):
