@@ -118,10 +118,10 @@ def verdict(played: Score, person: Score, objective: str = "accuracy") -> str:
 def _warnings(model: Model, problem: Problem, trace: Trace, motions: tuple[Motion, ...], room: drive.Room) -> list[str]:
     free = (np.ceil(room.length + 2 * sheet.AHEAD), np.ceil(room.width + 2 * sheet.AHEAD))
     lines = [
-        f"Keep everybody off {free[0]:.0f} m x {free[1]:.0f} m: the {_rolling(model)} touch {room.length:.1f} m x"
-        f" {room.width:.1f} m, {sheet.AHEAD:g} m are left all around for overhangs and for stopping. Stop at once if"
-        " anybody comes near.",
-        "Vibration off, engine speed and drive settings the same all along, ground level and firm.",
+        f"Keep everybody off {free[0]:.0f} m x {free[1]:.0f} m: the machine touches {room.length:.1f} m x"
+        f" {room.width:.1f} m of ground, {sheet.AHEAD:g} m are left all around for overhangs and for stopping. Stop at"
+        " once if anybody comes near.",
+        "Engine speed and drive settings the same all along, whatever else shakes or moves off; ground level and firm.",
     ]
     turns = len(drive.reversals(trace))
     if turns:
@@ -152,11 +152,6 @@ def _warnings(model: Model, problem: Problem, trace: Trace, motions: tuple[Motio
         named = ", ".join(f"{n.replace('_', ' ')} by {100 * v:.0f} %" for n, v in over.items())
         lines.append(f"In a person's hands these limits are exceeded: {named} of their range.")
     return lines
-
-
-def _rolling(model: Model) -> str:
-    """What touches the ground, in a word: narrow contacts are wheels."""
-    return "wheels" if all(float(b.contact.width) == 0 for b in model.machine.contacts if b.contact) else "rolls"
 
 
 def summary(made: Sheet) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """A designed drive against the usual ones: same machine, problem, limits and time.
 
 The usual drives know nothing of the limits on the motion, so each is brought inside them in the same way. It is scaled
-down until every limit but rest and lane holds, first the torques of the rolls alone, then the others with them. Rest at
-the end and the lane are then met by the nearest drive that keeps every limit (`interior`, no aim, least squares
+down until every limit but rest and lane holds, first the torques of the contacts alone, then the others with them. Rest
+at the end and the lane are then met by the nearest drive that keeps every limit (`interior`, no aim, least squares
 distance in the share of the torque limits, by way of a machine that is softer at standstill), and small smooth torques
 land it (`continuation.land`). This moves a drive as little as can be and never looks at the score. A drive that still
 exceeds a limit by more than `continuation.TOLERANCE` of its range is reported with the limit that it breaks.
@@ -130,7 +130,7 @@ def hand_made(model: Model, problem: Problem, seed: int, seconds: float) -> Mano
     and to the right, braking at its end; the torques of the driver model at the knots.
 
     Joints that steer from both ends turn against each other; a machine that has none to steer with has its sides driven
-    at different torques. Machines without driven rolls get the joints swept to two thirds of their range instead.
+    at different torques. Machines without driven contacts get the joints swept to two thirds of their range instead.
     """
     times = manoeuvre.knots(problem)
     rate = float(model.machine.sampling_hz)
@@ -155,7 +155,7 @@ def hand_made(model: Model, problem: Problem, seed: int, seconds: float) -> Mano
 
 
 def _leftward(model: Model, joints: Sequence[Body]) -> list[int]:
-    """Which way each joint turns the machine when it rolls forward, against the first one's: 1 the same way, -1 the
+    """Which way each joint turns the machine when it goes forward, against the first one's: 1 the same way, -1 the
     other. From pure rolling: the lateral speeds of all contacts vanish, which is linear in the chassis' speeds."""
     rows = [k for k, s in enumerate(model.slips) if s.startswith("gy")]
     if len(joints) < 2 or len(rows) < 2:
@@ -302,10 +302,10 @@ class _Search:
 
 
 def shrunk(model: Model, problem: Problem, wish: Manoeuvre) -> Manoeuvre:
-    """The wish scaled down until every limit but rest and lane holds: the rolls alone first, then the others too."""
-    rolls = np.array([b.contact is not None for b in model.machine.actuated])
-    groups = [g for g in (rolls, ~rolls) if g.any()]
-    factor = np.zeros(len(rolls))
+    """The wish scaled down until every limit but rest and lane holds: the contacts alone first, then the others too."""
+    pulling = np.array([b.contact is not None for b in model.machine.actuated])
+    groups = [g for g in (pulling, ~pulling) if g.any()]
+    factor = np.zeros(len(pulling))
 
     def holds() -> bool:
         try:

@@ -245,7 +245,7 @@ def repair(model: Model, problem: Problem, aim: Aim, track: Track, over: Callabl
 def land(model: Model, problem: Problem, aim: Aim, track: Track, over: Callable[[], bool]) -> Track:
     """The same drive with small smooth torques added that bring the fresh simulation to rest where it should end.
 
-    What the forces integrate, an articulation say, drifts in open loop by what the collocation neglects; Newton's
+    What the forces integrate, a steered joint say, drifts in open loop by what the collocation neglects; Newton's
     method on the end of the motion, least in the share of the torque limits, takes that out. Kept where it helps.
     """
     rate = float(model.machine.sampling_hz)

@@ -102,7 +102,7 @@ class Room:
 def levers(model: Model) -> tuple[Lever, ...]:
     """The joints that a person steers, none on a straight lane. Raises DriveError where nobody drives: no wheels."""
     if not model.machine.planar or not model.machine.contacts:
-        raise DriveError(f"{model.machine.name}: has no rolls or wheels on the ground, so there is nobody to drive it")
+        raise DriveError(f"{model.machine.name}: touches the ground nowhere, so there is nobody to drive it")
     return tuple(Lever(b, _turns_left(model, b)) for b in model.machine.actuated if b.contact is None)
 
 
@@ -375,7 +375,7 @@ def broken(model: Model, problem: Problem, motion: Motion, least: float = 0.02) 
 
 
 def edges(model: Model, motion: Motion) -> np.ndarray:
-    """Ground tracks of the edges of every roll (n_rolls, 2, N, 2) [m]: right and left end of its line of contact."""
+    """Ground tracks of every contact's edges (n_contacts, 2, N, 2) [m]: right and left end of its line of contact."""
     machine = model.machine
     places = model.kinematics(motion.q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), len(machine.body))
     heading = _headings(model, motion)
@@ -400,14 +400,14 @@ def _headings(model: Model, motion: Motion) -> np.ndarray:
         own = at.get(f"theta{b.index}", still)
         if isinstance(b.antecedent, str):
             heading[b.index] = own
-        else:  # a roll spins about its axle, not about the vertical
+        else:  # what touches the ground spins about its axle, not about the vertical
             spins = b.contact is not None or b.joint != "revolute"
             heading[b.index] = heading[b.antecedent] + (0.0 if spins else own)
     return np.array([heading[b.index] for b in machine.body])
 
 
 def room(model: Model, motions: Sequence[Motion]) -> Room:
-    """The ground that the rolls' edges touch in any of the drives."""
+    """The ground that the contacts' edges touch in any of the drives."""
     points = np.concatenate([edges(model, m).reshape(-1, 2) for m in motions])
     low, high = points.min(axis=0), points.max(axis=0)
     return Room(float(high[0] - low[0]), float(high[1] - low[1]), (float(low[0]), float(low[1])))

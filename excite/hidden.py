@@ -117,11 +117,11 @@ def advice(model: Model, logs: Sequence[Samples], names: Sequence[str]) -> dict[
 def changes(model: Model, still: np.ndarray) -> list[Change]:
     """What can be done with a machine, simple things first: driving, steering, moving each joint, all of it."""
     machine, at = model.machine, model.coordinates.index
-    rolls = [at(b.coordinates[0]) for b in machine.contacts if b.coordinates[0] in model.coordinates]
+    spins = [at(b.coordinates[0]) for b in machine.contacts if b.coordinates[0] in model.coordinates]
     joints = [b for b in machine.actuated if b.contact is None]
     along = [at(c) for c in machine.body[0].coordinates[:1] if machine.planar and c in model.coordinates]
     across = [at(c) for c in machine.body[0].coordinates[1:] if machine.planar and c in model.coordinates]
-    drive = tuple(along + rolls)
+    drive = tuple(along + spins)
     found: list[Change] = []
     if drive:
         if still[list(drive)].all():
@@ -141,8 +141,10 @@ def changes(model: Model, still: np.ndarray) -> list[Change]:
             found.append(Change(f"move the {where} both ways", own, "reverse"))
     if drive and across and not joints:
         found.append(Change("turn (drive its sides at different speeds)", (*across, *drive), "move"))
-    if drive:
-        found.append(Change("let one roll drive against the other", drive, "move"))
+    driven = [b.where.replace("_", " ") for b in machine.actuated if b.contact is not None]
+    if len(driven) > 1:
+        against = " against ".join(driven) if len(driven) == 2 else f"{', '.join(driven)} against each other"
+        found.append(Change(f"drive {against}", drive, "move"))
     found.append(Change("move everything at once", tuple(range(len(still))), "move"))
     return found
 

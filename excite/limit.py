@@ -236,7 +236,7 @@ def resting(model: Model) -> tuple[int, ...]:
 
 
 def rest_tolerances(model: Model) -> np.ndarray:
-    """(n_q,) what counts as standing still: 0.02 m/s (of a roll, at its rim), 0.01 rad/s."""
+    """(n_q,) what counts as standing still: 0.02 m/s (of a contact, at its rim), 0.01 rad/s."""
     tolerance = np.empty(len(model.coordinates))
     for body in model.machine.body:
         for c in body.coordinates:

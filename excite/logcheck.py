@@ -21,7 +21,7 @@ T = TypeVar("T")
 SHOWN = 5  # places named of a fault that is there many times
 STUCK = 50  # equal extreme readings in a row that look like the end of a range
 ALIKE = 0.6  # share of a machine's columns that makes a log look like one of its
-AGAINST = -0.5  # correlation of two rolls' speeds that says one is wired the other way round
+AGAINST = -0.5  # correlation of two contacts' speeds that says one is wired the other way round
 
 
 @dataclass(frozen=True)
@@ -218,25 +218,27 @@ def _oddities(sensor: Sensor, values: np.ndarray) -> list[str]:
 
 
 def _wiring(machine: Machine, readings: dict[str, np.ndarray]) -> list[str]:
-    """Rolls that turn against each other: one of them counts the wrong way.
+    """Contacts that turn against each other: the sensor of one of them counts the wrong way.
 
     A machine with no joint to steer with turns its sides against each other: there only those of one side are compared.
     """
-    rolls = [s for s in machine.sensors("full") if s.kind == "angle" and machine.find(s.body).contact is not None]
-    rolls = [s for s in rolls if s.name in readings]
+    spins = [s for s in machine.sensors("full") if s.kind == "angle" and machine.find(s.body).contact is not None]
+    spins = [s for s in spins if s.name in readings]
     places = tree.poses(machine, {})
     steers = any(b.contact is None for b in machine.actuated)
-    side = {s.name: 0.0 if steers else np.sign(places[s.body][1][1].round(6)) for s in rolls}
-    rolls = sorted(rolls, key=lambda s: side[s.name])
+    side = {s.name: 0.0 if steers else np.sign(places[s.body][1][1].round(6)) for s in spins}
+    spins = sorted(spins, key=lambda s: side[s.name])
     lines = []
-    for one, other in itertools.pairwise(rolls):
+    for one, other in itertools.pairwise(spins):
         if side[one.name] != side[other.name]:
             continue
         a, b = (readings[s.name][::10] if s.is_rate else np.diff(readings[s.name][::10]) for s in (one, other))
         a, b = a[: len(b)], b[: len(a)]
         if len(a) > 10 and np.ptp(a) > 0 and np.ptp(b) > 0 and np.corrcoef(a, b)[0, 1] < AGAINST:
+            first, second = (machine.find(s.body).where.replace("_", " ") for s in (one, other))
             lines.append(
-                f"columns {one.column}, {other.column}: the rolls turn against each other; give one a negative factor"
+                f"columns {one.column}, {other.column}: {first} and {second} turn against each other;"
+                " give one a negative factor"
             )
     return lines
 

@@ -15,7 +15,7 @@ from model.machine import Body, Machine, Quantity
 from model.prediction import Model
 
 SCENARIO = 3  # stream of random numbers
-HOLD = 5.0  # 1/s: how fast an articulation that is off comes back
+HOLD = 5.0  # 1/s: how fast a steered joint that is off comes back
 FIRM = 5.0  # times the gain of the driver model's hydrostatic drive: a steady hand
 
 
@@ -67,7 +67,7 @@ def varied(machine: Machine, spread: float, rng: np.random.Generator, corner: bo
 
 
 def followed(machine: Model, nominal: Model, motion: Motion) -> Motion:
-    """What another machine does when someone makes it follow the speeds and articulation of the nominal one's motion.
+    """What another machine does when someone makes it follow the speeds and steering of the nominal one's motion.
 
     The nominal torques, corrected by what the driven joints are off, within torque and torque-rate limits: an attentive
     driver without delay. Raises SimulationError.

@@ -23,7 +23,7 @@ from model.prediction import Model
 A4 = (8.27, 11.69)
 LEFT, RIGHT = 0.08, 0.95
 SI = {"torque": "N m", "yaw_rate": "rad/s", "lateral_speed": "m/s", "x": "m", "y": "m", "angle": "rad", "wheel": "rad"}
-AHEAD = 3.0  # m of free ground around what the rolls touch: overhangs, and a person who has to stop
+AHEAD = 3.0  # m of free ground around what the machine touches: overhangs, and a person who has to stop
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def _head(figure: Figure, sheet: Sheet, page: int) -> None:
 
 
 def _lane(ax: Axes, sheet: Sheet) -> None:
-    """The lane from above: what the rolls touch, the way of the first roll, start, turning points, end."""
+    """The lane from above: what is touched, the way of the first contact, start, turning points, end."""
     motion, model = sheet.motions[0], sheet.model
     edges = drive.edges(model, motion)
     for right, left in edges:
@@ -134,7 +134,7 @@ def _lane(ax: Axes, sheet: Sheet) -> None:
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * half
     ax.plot(*corners.T, color="black", linestyle=":", linewidth=1, label=lane)
     ax.plot([], [], "D", color="white", markeredgecolor="black", markersize=5, label="change of direction A, B, ...")
-    ax.plot([], [], color="0.8", linewidth=6, label="ground under the rolls")
+    ax.plot([], [], color="0.8", linewidth=6, label="ground that is touched")
     (x, y), margin = sheet.room.corner, 0.7 * AHEAD
     half_x, half_y = sheet.room.length / 2, sheet.room.width / 2
     width, height = ax.get_position().width * A4[0], ax.get_position().height * A4[1]

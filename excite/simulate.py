@@ -180,7 +180,7 @@ def _step(model: Model) -> tuple[ca.Function, int]:
     """One step (state, u, du/dt, h, X) -> state after h, its error over the tolerance.
 
     Rosenbrock for the speeds, what effects remember, and the coordinates that the forces depend on. The others (pose,
-    angles of rolls and measuring wheels) are integrals of these, by the Hermite quadrature
+    angles of contacts and measuring wheels) are integrals of these, by the Hermite quadrature
     h/2 (f0 + f1) + h^2/12 (f0' - f1').
     """
     n_q, n_u = len(model.coordinates), len(model.inputs)

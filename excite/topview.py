@@ -65,7 +65,7 @@ def steered(machine: Machine) -> list[Body]:
 
 
 def footprints(machine: Machine, q: Mapping[str, float]) -> list[np.ndarray]:
-    """(4, 2) corners [m] of every roll and wheel as it stands on the ground at coordinates q, those of the root too.
+    """(4, 2) corners [m] of every contact as it stands on the ground at coordinates q, those of the root too.
 
     As long as it is high; a contact that is a point is drawn NARROW.
     """
@@ -85,7 +85,7 @@ def footprints(machine: Machine, q: Mapping[str, float]) -> list[np.ndarray]:
 
 
 def _contacts(ax: Axes, machine: Machine, q: Mapping[str, float], ghost: bool) -> None:
-    """Rolls and wheels as rectangles, as long as they are high, their names beside them."""
+    """Contacts as rectangles, as long as they are high, their names beside them."""
     poses, still = tree.poses(machine, q), footprints(machine, {})
     for b, shape, before in zip(machine.contacts, footprints(machine, q), still, strict=True):
         place = poses[b.index][1]

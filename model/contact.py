@@ -1,4 +1,4 @@
-"""Roll and soil: slips, forces, the linear law and the exponential one.
+"""A contact, roll or wheel, and the ground: slips, forces, the linear law and the exponential one.
 
 Slips divide by v_n = sqrt((R_c w)^2 + v_eps^2). The paper's (17) divides by R_c w: that changes sign in reverse, where
 the soil would push instead of resist, and is singular at rest. With v_n driving backward mirrors driving forward.
@@ -14,14 +14,14 @@ import numpy as np
 
 from model.machine import Contact
 
-# Gauss-Legendre points on 0..1, for the exponential law on either side of the point where the roll doesn't slip.
+# Gauss-Legendre points on 0..1, for the exponential law on either side of the point where nothing slips.
 _GAUSS, _WEIGHTS = (v / 2 for v in np.polynomial.legendre.leggauss(6))
 _POINTS = _GAUSS + 0.5
 
 
 @dataclass(frozen=True)
 class Wrench:
-    """Forces [N] along and across the roll at its centre, and moment T_z [N m]: the soil turns the roll by -T_z."""
+    """Forces [N] along and across the contact at its centre, and moment T_z [N m]: the soil turns it by -T_z."""
 
     Sx: ca.SX
     Sy: ca.SX
@@ -30,7 +30,7 @@ class Wrench:
 
 @dataclass(frozen=True)
 class Slip:
-    """Slips at the middle of the roll, longitudinal and lateral [-], and v_n [m/s]."""
+    """Slips at the middle of the contact, longitudinal and lateral [-], and v_n [m/s]."""
 
     gx: ca.SX
     gy: ca.SX
@@ -38,7 +38,7 @@ class Slip:
 
 
 def slip(contact: Contact, Vx: ca.SX, Vy: ca.SX, spin: ca.SX) -> Slip:
-    """Slips of a roll whose centre moves at Vx, Vy [m/s] in its chassis' axes and which spins at `spin` [rad/s]."""
+    """Slips of a contact whose centre moves at Vx, Vy [m/s] in its chassis' axes and which spins at `spin` [rad/s]."""
     rim = float(contact.radius) * spin
     vn = ca.sqrt(rim**2 + float(contact.v_eps) ** 2)
     return Slip((Vx - rim) / vn, Vy / vn, vn)
@@ -53,7 +53,7 @@ def wrench(
     saturation: ca.SX | None = None,
     lateral: ca.SX | None = None,
 ) -> Wrench:
-    """What the soil does to the roll; yaw_rate [rad/s] of its chassis; Kx, Ky [N] < 0.
+    """What the soil does to a contact; yaw_rate [rad/s] of its chassis; Kx, Ky [N] < 0.
 
     Linear (24, 25), or with `saturation` = K / xi_s the exponential law (18) integrated over the patch. `lateral`: the
     same for the lateral force alone, as a factor on it.
@@ -74,9 +74,9 @@ def wrench(
 
 
 def _across(contact: Contact, s: Slip, yaw_rate: ca.SX) -> Iterator[tuple[ca.SX, ca.SX]]:
-    """Points y [m] across the roll and their shares of its width (they add up to 1).
+    """Points y [m] across the contact and their shares of its width (they add up to 1).
 
-    |g| has a kink where g_x(y) = 0, when the roll turns on the spot: the points meet there, denser towards it
+    |g| has a kink where g_x(y) = 0, when the contact turns on the spot: the points meet there, denser towards it
     (y - y0 = h p^2). Relative error of the force below 1e-5 for |g| <= 0.15, K / xi_s >= 0.15; 5e-5 for 0.05.
     """
     edge = float(contact.width) / 2

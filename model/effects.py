@@ -22,6 +22,7 @@ from model.machine import Body, EffectEntry, Machine, MachineError, Quantity, Se
 GRAVITY = 9.81
 SMOOTH_SLIP = 0.005  # slip over which driving turns into braking
 SMOOTH_SPEED = 0.02  # [m/s] over which a force against the motion turns
+SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
 
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
 
@@ -41,8 +42,17 @@ def _stop(site: Site) -> float:
     return float(site.body.limit.position) if site.body.limit.position is not None else 0.6
 
 
+def full_torque(machine: Machine, body: Body) -> float:
+    """What counts as a large torque [N m] at a joint: its limit, the machine's largest, or what friction suggests."""
+    if body.limit.torque is not None:
+        return float(body.limit.torque)
+    stated = [float(b.limit.torque) for b in machine.body if b.limit.torque is not None]
+    rubbing = [30 * float(b.friction.Fs) for b in machine.body if b.friction is not None]
+    return max(stated or rubbing, default=0.0) or 1.0
+
+
 def _full_torque(site: Site) -> float:
-    return float(site.body.limit.torque) if site.body.limit.torque is not None else 5000.0
+    return full_torque(site.machine, site.body)
 
 
 # ------------------------------------------------------------------------------------------------ the hooks
@@ -54,7 +64,7 @@ def _softplus(x: ca.SX, width: float | ca.SX) -> ca.SX:
 
 
 def _deadband(s: Scene, k: int, p: Values) -> ca.SX:
-    u, A, width = s.u[k], p["A"], 20.0
+    u, A, width = s.u[k], p["A"], SMOOTH_TORQUE * s.full[k]
     return _softplus(u - A, width) - _softplus(-u - A, width) - u + 0 * A
 
 
@@ -113,7 +123,8 @@ def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
 
 def _clipped(s: Scene, k: int, p: Values) -> ca.SX:
     """A relief valve: what is above its torque is lost, to the share A."""
-    over = _softplus(s.u[k] - p["valve"], 50.0) - _softplus(-s.u[k] - p["valve"], 50.0)
+    width = 2.5 * SMOOTH_TORQUE * s.full[k]
+    over = _softplus(s.u[k] - p["valve"], width) - _softplus(-s.u[k] - p["valve"], width)
     return -p["A"] * over
 
 
@@ -145,9 +156,17 @@ def _viscous(share: float, power: float = 0.0) -> Callable[[Site], float]:
     return size
 
 
+def _mass(machine: Machine) -> float:
+    return sum(float(b.inertia.mass) for b in machine.body if b.inertia is not None)
+
+
+def _weighing(share: float) -> Callable[[Site], float]:
+    """A share of the machine's weight [N]."""
+    return lambda site: share * GRAVITY * _mass(site.machine)
+
+
 def _load_moment(site: Site) -> float:
-    total = sum(float(b.inertia.mass) for b in site.machine.body if b.inertia is not None)
-    return 0.05 * total
+    return 0.05 * _mass(site.machine)
 
 
 def _one_over_torque(site: Site) -> float:
@@ -192,7 +211,7 @@ _declare(
         "friction larger where the torque is large, at the same speed",
         "Dohring et al. 1993; Linderoth et al. 2013, load-dependent Coulomb friction",
         _constant(0.05),
-        torque=lambda s, k, p: -p["A"] * ca.sqrt(s.u[k] ** 2 + 20.0**2) * s.sign(k),
+        torque=lambda s, k, p: -p["A"] * ca.sqrt(s.u[k] ** 2 + (SMOOTH_TORQUE * s.full[k]) ** 2) * s.sign(k),
     ),
     Effect(
         "asymmetric_coulomb",
@@ -289,7 +308,7 @@ _declare(
         "delivered sgn(u) max(abs(u) - A, 0), u measured",
         "a loss of torque with the sign of the torque, also at standstill",
         "overlap of proportional valves, Merritt, Hydraulic Control Systems, 1967, ch. 5",
-        _constant(100.0),
+        _of(_full_torque, 0.02),
         grid=(1.0, 4.0),
         positive=True,
         torque=_deadband,
@@ -323,7 +342,7 @@ _declare(
         "a torque once per turn of the contact: A sin(theta + phase)",
         "a torque error periodic in the contact's angle",
         "eccentric mass or bearing of a roll or wheel",
-        _constant(100.0),
+        _of(_full_torque, 0.02),
         {"phase": PHASE},
         torque=lambda s, k, p: p["A"] * ca.sin(s.q[k] + p["phase"]),
     ),
@@ -346,7 +365,7 @@ _declare(
         "the delivered torque ripples several times per turn: A sin(order theta + phase)",
         "a torque error periodic in the contact's angle, several times per turn",
         "piston motors, Ivantysyn, Hydrostatic Pumps and Motors, 2001",
-        _constant(100.0),
+        _of(_full_torque, 0.02),
         {
             "order": Shape("1/turn", 5.0, tuple(float(n) for n in range(2, 21)), whole=True),
             "phase": PHASE,
@@ -426,12 +445,12 @@ _declare(
         "-",
         "for a while Kx and Ky are smaller by the factor 1 - A, the contact vibrates",
         "more slip at the same force between two instants",
-        "vibratory rollers, Forssblad 1981",
+        "Forssblad, Vibratory Soil and Rock Fill Compaction, 1981",
         _constant(0.3),
         {
             "begin": Shape("s", 0.4, (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), _duration),
             "length": Shape("s", 0.25, (0.125, 0.25, 0.5), _duration),
-            "shake": Shape("N m", 100.0, (0.0,), whole=True),
+            "shake": Shape("N m", 0.02, (0.0,), _full_torque, whole=True),
             "frequency": Shape("Hz", 27.0, (27.0,), whole=True),
         },
         soil=lambda s, k, p, soil: _scaled(soil, 1 - p["A"] * _window(s.time, p)),
@@ -446,7 +465,7 @@ _declare(
         "a force against the motion at the contact's centre",
         "a force that turns with the direction of travel",
         "Bekker, Introduction to Terrain-Vehicle Systems, 1969",
-        _constant(200.0),
+        _weighing(0.002),
         push=_resistance,
     ),
     Effect(

@@ -109,7 +109,7 @@ def sample_of(machine: Machine, standard: tuple[str, ...]) -> Sample:
 
 
 def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Placed]) -> Equations:
-    """The functions of a machine with effects. Raises MachineError for a contact that can't roll as the law has it."""
+    """The functions of a machine with effects. Raises MachineError for a contact that can't turn as the law has it."""
     for body in machine.contacts:
         _check_axis(machine, body)
     s = sample_of(machine, standard)
@@ -220,6 +220,7 @@ def _scene(s: Sample, time: ca.SX) -> Scene:
         dict(zip([b.index for b in s.machine.actuated], ca.vertsplit(s.u), strict=True)),
         {b.index: _friction(s, b) for b in rubbing},
         {b.index: float(b.friction.smoothing) for b in rubbing if b.friction is not None},
+        {b.index: catalogue.full_torque(s.machine, b) for b in s.machine.actuated},
         {b.index: _rolling(s, b)[0] for b in s.machine.contacts},
         {b.index: s.frames[b.index].velocity[0] for b in s.machine.body},
         time,
@@ -263,7 +264,7 @@ def _balance(s: Sample, acting: Sequence[Acting]) -> tuple[ca.SX, dict[str, ca.S
 
 
 def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
-    """Generalised force (n_q,) of an effect that isn't the soil's: torques, forces at rolls, gravity, inertia."""
+    """Generalised force (n_q,) of an effect that isn't the soil's: torques, forces at contacts, gravity, inertia."""
     effect, machine = e.placed.effect, s.machine
     force = ca.SX.zeros(len(s.names))
     for k in e.placed.bodies:
@@ -289,21 +290,21 @@ def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
 
 
 def _rolling(s: Sample, body: Body) -> tuple[Rolling, ca.SX]:
-    """How a roll moves, and how (Vx, Vy, spin, yaw) follow from the velocities (4, n_q)."""
+    """How a contact moves, and how (Vx, Vy, spin, yaw) follow from the velocities (4, n_q)."""
     assert body.contact is not None
     assert not isinstance(body.antecedent, str)
-    carrier, roll = s.frames[body.antecedent], s.frames[body.index]
+    carrier, own = s.frames[body.antecedent], s.frames[body.index]
     R, _ = tree.place(body, {c: ca.SX(0) for c in body.coordinates})
-    turn = carrier.rotation.T @ roll.rotation
-    centre = turn @ roll.velocity
-    spin = (R[:, 2].T @ turn) @ roll.omega
+    turn = carrier.rotation.T @ own.rotation
+    centre = turn @ own.velocity
+    spin = (R[:, 2].T @ turn) @ own.omega
     yaw = carrier.omega[2]
     lever = ca.jacobian(ca.vertcat(centre[0], centre[1], spin, yaw), s.nu)
     return Rolling(body.contact, centre[0], centre[1], spin, yaw), lever
 
 
 def _soil(s: Sample, body: Body, rolling: Rolling) -> Soil:
-    """The soil under a roll as the machine file has it."""
+    """The soil under a contact as the machine file has it."""
     law = rolling.contact
     saturation = None
     if law.law == "exponential":
@@ -314,7 +315,7 @@ def _soil(s: Sample, body: Body, rolling: Rolling) -> Soil:
 
 
 def _pushed(body: Body, soil: Soil, lever: ca.SX) -> ca.SX:
-    """Generalised contact force (n_q,) of a roll (11), by virtual power."""
+    """Generalised force (n_q,) of a contact (11), by virtual power."""
     assert body.contact is not None
     w = contact.wrench(body.contact, soil.slip, soil.yaw, soil.Kx, soil.Ky, soil.saturation, soil.lateral)
     return lever.T @ ca.vertcat(w.Sx, w.Sy, -float(body.contact.radius) * w.Sx, -w.Tz)

@@ -1,7 +1,7 @@
 """The machine file (TOML) as frozen, checked records.
 
 A machine is a tree of bodies given by its modified Denavit-Hartenberg table (Khalil and Kleinfinger, 1986), with
-inertias, joint friction, roll-soil contacts, sensors, limits and the design problems that it is used for.
+inertias, joint friction, contacts with the ground, sensors, limits and the design problems that it is used for.
 Every number carries where it comes from. All values are SI.
 """
 
@@ -165,7 +165,7 @@ class Friction(Record):
 
 
 class Contact(Record):
-    """A roll or wheel on the soil (11, 17, 24, 25). Frame: the chassis that carries the roll, at the roll's centre.
+    """A roll or wheel on the soil (11, 17, 24, 25). Frame: the chassis that carries it, at its own centre.
 
     `law = "exponential"` is (18) integrated over the patch; it needs `saturation_slip` = K / xi_s, the slip at which
     the shear displacement reaches K at the rear of the patch.
@@ -188,7 +188,7 @@ class Contact(Record):
 
 
 class JointLimit(Record):
-    """What the drive of a joint allows. `rim_speed` is |radius x rate| of a roll [m/s]."""
+    """What the drive of a joint allows. `rim_speed` is |radius x rate| of a contact [m/s]."""
 
     torque: Positive | None = None
     torque_rate: Positive | None = None
@@ -532,7 +532,7 @@ class Machine(Record):
             if names & {body.name, body.where}:
                 raise ValueError(f"body[{k}].name: {body.where} is given twice, every body and place needs its own")
             if body.contact and (body.antecedent == "ground" or not self.planar):
-                raise ValueError(f"body[{k}].contact: needs a chassis on a planar root to carry the roll")
+                raise ValueError(f"body[{k}].contact: needs a chassis on a planar root to carry it")
             seen.add(body.index)
             names |= {body.name, body.where}
 
@@ -547,7 +547,7 @@ class Machine(Record):
                 raise ValueError(f"locked: {x} and {y} can only be held where {heading} is held too")
         for body in self.contacts:
             if body.coordinates[0] in self.locked:
-                raise ValueError(f"locked: {body.coordinates[0]} turns a roll on the soil, take its contact out first")
+                raise ValueError(f"locked: {body.coordinates[0]} has a contact that must turn, take that out first")
         if not self.coordinates:
             raise ValueError("locked: nothing is left to move")
         if not self.actuated:

@@ -179,7 +179,7 @@ class Model:
 
     @cached_property
     def felt(self) -> tuple[str, ...]:
-        """Coordinates that the equations depend on, found by numbers: a balanced roll's angle drops out only as
+        """Coordinates that the equations depend on, found by numbers: a balanced wheel's angle drops out only as
         cos^2 + sin^2 = 1, which no look at the expressions tells.
         """
         q, nu, a = self.symbols()

@@ -61,7 +61,7 @@ def edit(name: str, row: int, value: object) -> Callable[[pd.DataFrame], pd.Data
         (lambda t: t.iloc[::4], ["sampled at 25 Hz"], []),
         (lambda t: pd.concat([t.iloc[:50], t.iloc[20:]]), ["goes back or stands still 1 times (rows 51)"], []),
         (lambda t: t.assign(theta2_rad=np.rad2deg(t["theta2_rad"])), ["theta2_rad", "degrees"], []),
-        (lambda t: t.assign(theta4_rad=-t["theta4_rad"]), ["theta1_rad, theta4_rad: the rolls turn against"], []),
+        (lambda t: t.assign(theta4_rad=-t["theta4_rad"]), ["theta4_rad: front roll and rear roll turn against"], []),
         (lambda t: t.assign(u2_Nm=3.0), [], ["column u2_Nm: never changes (3)"]),
         (lambda t: t.assign(u1_Nm=t["u1_Nm"].clip(-700, 700)), [], ["u1_Nm: stands at its highest value"]),
         (edit("vy_m_s", 3000, 4.0), [], ["column vy_m_s: 1 spikes of a single row, the first in row 3001"]),

@@ -386,7 +386,7 @@ BROKEN: dict[str, tuple[str | bytes, str, str]] = {
     "locked unknown": (top('locked = ["theta9"]'), "locked", "no coordinate theta9, allowed: x0, y0, theta0, theta1"),
     "everything locked": (top('locked = ["q1"]', EMPS), "locked", "nothing is left to move"),
     "a side held while the heading turns": (top('locked = ["y0"]'), "locked", "only be held where theta0"),
-    "a roll held on the soil": (top('locked = ["theta1"]'), "locked", "theta1 turns a roll on the soil"),
+    "a roll held on the soil": (top('locked = ["theta1"]'), "locked", "theta1 has a contact that must turn"),
     # sensors
     "sensor on an unknown body": (edit("body = 4", "body = 9"), "sensor[1].body", "no body 9, allowed: .0, 1, 2, 3, 4"),
     "encoder on a fixed frame": (

@@ -6,7 +6,11 @@ compared from its file alone.
 
 from __future__ import annotations
 
+import io
 import json
+import re
+import tokenize
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -30,12 +34,14 @@ from excite import (
     misfit,
     sensors,
     separate,
+    sheet,
     topview,
 )
 from excite.diagnose import Diagnosis
 from excite.limit import InfeasibleError
 from excite.simulate import Motion, simulate
 from model import effects
+from model.effect import Site
 from model.machine import Machine, Problem, Quantity, load, shipped
 from model.prediction import Model, build, standard_parameters
 
@@ -325,7 +331,89 @@ def test_sides_of_a_skid_steered_robot_may_turn_against_each_other() -> None:
     assert wired() == []
     signs["rear_left"] = 1
     assert len(wired()) == 1
-    assert "front_left_rad, rear_left_rad" in wired()[0]
+    assert wired()[0].startswith("columns front_left_rad, rear_left_rad: front left and rear left turn against")
+
+
+FOREIGN = re.compile(r"(?i)\b(compactors?|drums?|rollers?|rolls?)\b")
+KINDS = re.compile(r"(?i)\brolls?( or|,? and|, a|, or a| or a) wheels?\b")  # what a contact may be
+
+
+def said(path: Path) -> Iterator[tuple[int, str]]:
+    """What a file of the program says in code and in words, line by line; comments only explain. Names of effects and
+    what other packages call theirs are no words of ours."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix != ".py":
+        yield from enumerate(text.splitlines(), 1)
+        return
+    before = ""
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type != tokenize.COMMENT and before != ".":
+            yield token.start[0], token.string.replace("_", " ") if token.type == tokenize.NAME else token.string
+        before = token.string
+
+
+SPOKEN = [
+    path
+    for folder, pattern in (("model", "*.py"), ("excite", "*.py"), ("excite/templates", "*.html"))
+    for path in sorted((ROOT / folder).glob(pattern))
+]
+
+
+@pytest.mark.parametrize("path", SPOKEN, ids=lambda path: path.name)
+def test_no_code_and_no_message_speaks_of_one_kind_of_machine(path: Path) -> None:
+    """Contacts have the machine file's names; what steers, too: an articulation is but a place of some effects."""
+    steering = re.compile(r"(?i)\barticulations?\b")
+    found = []
+    for line, text in said(path):
+        for name in effects.CATALOGUE:
+            text = text.replace(name, "")
+        words = FOREIGN.findall(KINDS.sub("", text))
+        if path.parent.name == "excite" and text != '"articulation"':
+            words += steering.findall(text)
+        found += [(line, word) for word in words]
+    assert found == []
+
+
+def test_words_of_one_kind_of_machine_would_be_found(tmp_path: Path) -> None:
+    """In a message, a name, a docstring; not in a comment, not as one of two kinds, not as what numpy does."""
+    path = tmp_path / "x.py"
+    text = '"the rolls turn"\ndrum_speed = 1\n"""A roller."""\n# a roll\n"roll or wheel"\nnp.roll(x)\nenroll\n'
+    path.write_text(text, encoding="utf-8")
+    found = {line for line, text in said(path) if FOREIGN.search(KINDS.sub("", text))}
+    assert found == {1, 2, 3}
+
+
+@pytest.mark.parametrize("name", [*FREE, "emps"])
+def test_torques_that_effects_take_are_of_the_machines_own_size(name: str) -> None:
+    """At full torque a dead band takes its amount, a valve half of what is beyond it, friction its share, whether the
+    motor gives 15 N m or 15 kN m."""
+    plain = model_of(name)
+    still, p = np.zeros(len(plain.coordinates)), plain.expand @ plain.nominal
+    for k, (row, body) in enumerate(zip(plain.actuated, plain.machine.actuated, strict=True)):
+        full, nu = effects.full_torque(plain.machine, body), np.zeros(len(still))
+        u, nu[row] = full * np.eye(len(plain.inputs))[k], 1.0
+        for cause, share in (("torque_deadband", 1.0), ("relief_valve", 0.4 * full), ("load_dependent_friction", full)):
+            effect = effects.CATALOGUE[cause]
+            if body.where not in effects.places(plain.machine, effect):
+                continue
+            amount = effect.amount(Site(plain.machine, body, 10.0))
+            entry = effects.parse(f"{cause}@{body.where}={amount}", plain.machine, 10.0)
+            model = build(effects.extended(plain.machine, entry))
+            more = model.balance(still, nu, still, model.expand @ model.nominal, u, [])
+            assert 0.01 * full < amount * share < 0.5 * full
+            assert float((more - plain.balance(still, nu, still, p))[row]) == pytest.approx(amount * share, rel=0.02)
+
+
+@pytest.mark.parametrize("own", ["skid_robot", "double_loader"])
+def test_what_is_advised_has_the_machines_names(own: str) -> None:
+    """A robot and a loader have no rolls: neither in what a log hides, nor in what separates causes, nor in the cab."""
+    model = model_of(own)
+    texts = [c.text for c in hidden.changes(model, np.zeros(len(model.coordinates), bool))]
+    texts += [separate._said(run, model.machine) for run in separate.RUNS]
+    texts += sheet.set_up(model.machine)
+    contacts = [b.where.replace("_", " ") for b in model.machine.contacts]
+    assert any(f"drive {contacts[0]}" in text and contacts[-1] in text for text in texts)
+    assert [text for text in texts if FOREIGN.search(text)] == []
 
 
 def test_what_a_straight_log_of_a_skid_steered_robot_hides_is_seen_by_turning() -> None:
