@@ -34,7 +34,7 @@ STRONG = 1.3  # misfit over readings from which first-order gains are rough
 PASSES = 14  # of a candidate's fit
 LESS = 0.1, 0.3  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
 TRIED = 5  # candidates that are fitted, of different names
-PAIR = 2  # candidates that are fitted side by side
+PAIR = 2  # candidates that are fitted in any case, side by side
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
 ROUGHLY = 2  # the same where not even the model without them was fitted
 MOST = 4  # effects that are looked for
@@ -486,6 +486,8 @@ def _choose(
             return None
         found = evidence.renumbered([s.candidate for s in likely])
         likely = _shortlist(stage, _scanned(stage, found), explained)
+        if not likely:
+            return None
         tries = _tries(stage, likely, together, lambda k: None)
     if not tries:
         return None
@@ -509,20 +511,20 @@ def _least(stage: Stage, explained: float) -> float:
 def _tries(
     stage: Stage, likely: Sequence[evidence.Score], together: Together, tell: Callable[[int], None]
 ) -> list[_Try]:
-    """The candidates whose fits were found, as the model without them was fitted: PAIR at a time, best first, as long
-    as the next may come near what was gained."""
+    """The candidates whose fits were found, as the model without them was fitted. Those that promise far less than the
+    best come last, and only where they may still come near what was gained."""
     tries: list[_Try] = []
-    gained = 0.0
-    for at in range(0, len(likely), PAIR):
-        pair = likely[at : at + PAIR]
-        if gained > OVER * pair[0].gain:
+    near = max(PAIR, sum(OVER * s.gain >= likely[0].gain for s in likely))
+    for at, batch in ((0, likely[:near]), (near, likely[near:])):
+        gained = max((stage.fit.cost - found.fit.cost for _, found in tries), default=0.0)
+        if not batch or gained > OVER * batch[0].gain:
             break
+        wishes = [(effects.extended(stage.machine, _entry(s)), stage, stage.fit.disturbed) for s in batch]
         tell(at)
-        wishes = [(effects.extended(stage.machine, _entry(s)), stage, stage.fit.disturbed) for s in pair]
-        for score, found in zip(pair, refits(wishes, together), strict=True):
+        for k, (score, found) in enumerate(zip(batch, refits(wishes, together), strict=True)):
+            tell(min(at + k + 1, len(likely) - 1))
             if found is not None:
                 tries.append((score, found))
-                gained = max(gained, stage.fit.cost - found.fit.cost)
     return tries
 
 
