@@ -1,10 +1,10 @@
 """The driver's page over this machine's own network alone, with live values: `excite drive --serve`.
 
 One small server gives the page and passes on what is measured: from a log that grows, or from any program on this
-machine that sends `{"v_m_s": 1.2, "steering_rad": 0.1}` to ws://127.0.0.1:PORT/live, with the names that the
-machine file gives its steered joints. It listens on the loopback address,
-takes no connection that a page from elsewhere asks for (Origin and Host are checked: a web site in the same browser
-must neither read nor fake measurements) and no message longer than MESSAGE bytes.
+machine that sends `{"v_m_s": 1.2, "JOINT_rad": 0.1}` to ws://127.0.0.1:PORT/live, JOINT being the machine file's name
+of a steered joint. It listens on the loopback address, takes no connection that a page from elsewhere asks for (Origin
+and Host are checked: a web site in the same browser must neither read nor fake measurements) and no message longer than
+MESSAGE bytes.
 """
 
 from __future__ import annotations
