@@ -180,7 +180,7 @@ class Signatures:
         reading = np.empty((N, len(c.sensors), self.columns), np.float32)
         for at in range(0, N - 1, BATCH):
             until = min(at + BATCH, N - 1)
-            by = differentiate(c, p.s[at : until + 1], u[at : until + 1], X, force=True)
+            by = differentiate(c, p.s[at : until + 1], u[at:until], u[at + 1 : until + 1], X, force=True)
             held = tuple(x[at : until + 1] for x in self.samples)
             force = self.force(*held, self.p)[0]
             torque = self.torque[at : until + 1]

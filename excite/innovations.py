@@ -43,16 +43,34 @@ def innovations(linear: Linear) -> np.ndarray:
 
 
 def innovation_sizes(linear: Linear) -> np.ndarray:
-    """Mean square of the normalised innovations of every sensor, and of their means over blocks, times the block, both
+    """Mean square of the normalised innovations of every sensor, and of their sums over blocks in deviations, both
     1 where model and noise are right; and the number of blocks: (m, 3)."""
-    z = linear.innovations
+    z, allowed = linear.innovations, 1 + linear.excess
     sizes = np.zeros((z.shape[1], 3))
     for j, column in enumerate(z.T):
-        own = column[np.isfinite(column)]
-        if len(own) >= SLOW:
-            sums = own[: len(own) // SLOW * SLOW].reshape(-1, SLOW).sum(axis=1)
-            sizes[j] = np.mean(own**2), np.mean(sums**2) / SLOW, len(sums)
+        told = np.flatnonzero(np.isfinite(column))
+        blocks = told[: len(told) // SLOW * SLOW].reshape(-1, SLOW)
+        if blocks.size:
+            slow = column[blocks].sum(axis=1) ** 2 / allowed[blocks, j].sum(axis=1)
+            sizes[j] = np.mean(column[told] ** 2), np.mean(slow), len(slow)
     return sizes
+
+
+def excess(linear: Linear) -> np.ndarray:
+    """By how much the variance of whitened innovations (N, m) exceeds one where encoders beat."""
+    N, m = linear.residual.shape
+    out = np.zeros((N, m))
+    for step in linear.filter:
+        more = (linear.beats[step.at] - 1) / np.where(step.used, linear.weight[step.at], np.inf)
+        whitens = np.linalg.solve(step.root, np.broadcast_to(np.eye(m), step.root.shape))
+        out[step.at] = (whitens**2 @ more[:, :, None])[:, :, 0]
+    return out
+
+
+def sensitivity(linear: Linear, flawed: tuple[int, ...]) -> np.ndarray:
+    """How whitened innovations move with parameters and offsets, (N m, n_p + n_o), but for the sign."""
+    N, m, n = linear.H.shape
+    return whitened(linear, flawed, np.zeros((N - 1, n, 0)), np.zeros((N, m, 0)))[:, 1:]
 
 
 def whitened(linear: Linear, flawed: tuple[int, ...], push: np.ndarray, reading: np.ndarray) -> np.ndarray:

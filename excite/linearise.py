@@ -398,50 +398,39 @@ def _intervals(
     return end
 
 
-def differentiate(chart: Chart, s: np.ndarray, u: np.ndarray, X: np.ndarray, force: bool = False) -> Slopes:
-    """How the ends of the K intervals between states s (K + 1, n) under torques u (K + 1, n_u) move, to about 1 %.
+def differentiate(
+    chart: Chart, s: np.ndarray, left: np.ndarray, right: np.ndarray, X: np.ndarray, force: bool = False
+) -> Slopes:
+    """How the ends of the K intervals between states s (K + 1, n) move, to about 1 %, under torques from left to right
+    (K, n_u) [N m].
 
+    Slopes are those of an interval's middle.
     F is filled with `force` only. Where a joint reverses, its friction turns within a sample and leaves a mark on
     everything that came before: these intervals are taken in fine steps along the straight line between their ends.
     """
     h = 1 / float(chart.model.machine.sampling_hz)
-    slopes = _radau(chart, chart.slopes(s, u, X), slice(0, -1), slice(1, None), h, force)
+    slopes = _radau(chart, chart.slopes((s[:-1] + s[1:]) / 2, (left + right) / 2, X), h, force)
     steps = _reversals(chart, s)
     for fine in (FINE, FINEST):
         turning = np.flatnonzero(steps == fine)
-        if len(turning):
-            _refine(chart, slopes, turning, fine, s, u, X, force)
-    return slopes
-
-
-def _refine(
-    chart: Chart,
-    slopes: Slopes,
-    turning: np.ndarray,
-    fine: int,
-    s: np.ndarray,
-    u: np.ndarray,
-    X: np.ndarray,
-    force: bool,
-) -> None:
-    """Puts slopes of the intervals `turning` in place, taken in so many fine steps."""
-    share = np.linspace(0, 1, fine + 1)[:, None]
-    path = s[turning, None] + share * (s[turning + 1] - s[turning])[:, None]
-    push = u[turning, None] + share * (u[turning + 1] - u[turning])[:, None]
-    nodes = np.arange(len(turning) * (fine + 1)).reshape(len(turning), fine + 1)
-    local = chart.slopes(path.reshape(-1, chart.n), push.reshape(-1, u.shape[1]), X)
-    h = 1 / float(chart.model.machine.sampling_hz) / fine
-    by = _radau(chart, local, nodes[:, :-1].ravel(), nodes[:, 1:].ravel(), h, force)
-    A, B, BX, F = (e.reshape(len(turning), fine, *e.shape[1:]) for e in (by.A, by.B, by.X, by.F))
-    for part, own in ((slopes.B, B), (slopes.X, BX), (slopes.F, F)):
-        total = own[:, 0]
+        if len(turning) == 0:
+            continue
+        share = ((np.arange(fine) + 0.5) / fine)[:, None]
+        path = s[turning, None] + share * (s[turning + 1] - s[turning])[:, None]
+        push = left[turning, None] + share * (right[turning] - left[turning])[:, None]
+        local = chart.slopes(path.reshape(-1, chart.n), push.reshape(-1, left.shape[1]), X)
+        by = _radau(chart, local, h / fine, force)
+        A, B, BX, F = (e.reshape(len(turning), fine, *e.shape[1:]) for e in (by.A, by.B, by.X, by.F))
+        for part, own in ((slopes.B, B), (slopes.X, BX), (slopes.F, F)):
+            total = own[:, 0]
+            for k in range(1, fine):
+                total = A[:, k] @ total + own[:, k]
+            part[turning] = total
+        through = A[:, 0]
         for k in range(1, fine):
-            total = A[:, k] @ total + own[:, k]
-        part[turning] = total
-    through = A[:, 0]
-    for k in range(1, fine):
-        through = A[:, k] @ through
-    slopes.A[turning] = through
+            through = A[:, k] @ through
+        slopes.A[turning] = through
+    return slopes
 
 
 def _reversals(chart: Chart, s: np.ndarray) -> np.ndarray:
@@ -461,38 +450,19 @@ def _reversals(chart: Chart, s: np.ndarray) -> np.ndarray:
     return found
 
 
-def _radau(
-    chart: Chart,
-    local: list[np.ndarray],
-    left: slice | np.ndarray,
-    right: slice | np.ndarray,
-    h: float,
-    force: bool,
-) -> Slopes:
-    """One step of Radau IIA over each interval of length h, from slopes at its two ends, linear in between."""
+def _radau(chart: Chart, local: list[np.ndarray], h: float, force: bool) -> Slopes:
+    """One step of Radau IIA over each of K intervals of length h, with slopes that don't change in it."""
     J, B, JX, JF, R = local
     n, c, n_u, n_p = chart.n, chart.core, B.shape[2], JX.shape[2]
-    direct = np.concatenate([B, JX, JF] if force else [B, JX], axis=2)
-
-    def between(e: np.ndarray) -> np.ndarray:
-        """One third into the interval."""
-        third: np.ndarray = e[left] * (2 / 3) + e[right] * (1 / 3)
-        return third
-
-    # The two inner states Y1, Y2 by elimination: Y1 = P (k1 - h/12 J2 Y2), and what is left for Y2.
-    J1, J2 = between(J), J[right]
-    K, eye = len(J1), np.eye(c)
-    P = np.linalg.inv(eye - J1 * (h * 5 / 12))
-    first, second = between(direct), direct[right]
-    # Columns: the start (k1 = k2 = 1), then what acts directly.
-    k1 = first * (h * 5 / 12) - second * (h / 12)
-    start = P @ np.concatenate([np.broadcast_to(eye, (K, c, c)), k1], axis=2)
-    known = start * (9 / 5)
-    known[:, :, :c] -= eye * (4 / 5)
-    known[:, :, c:] += first * (h * 3 / 4) + second * (h / 4) - k1 * (9 / 5)
-    Y2 = np.linalg.inv(eye - J2 * (h * 2 / 5) + P @ J2 * (h * 3 / 20)) @ known
-    Y1 = start - P @ (J2 @ Y2) * (h / 12)
-    moved = np.concatenate([Y2, h * (0.75 * between(R) @ Y1 + 0.25 * R[right] @ Y2)], axis=1)
+    direct = h * np.concatenate([B, JX, JF] if force else [B, JX], axis=2)
+    K, eye, J = len(J), np.eye(c), h * J
+    # Columns: the start, then what acts directly. The mean over the interval leads to the end.
+    known = np.concatenate([eye - J / 6, direct / 2 - J @ direct / 6], axis=2)
+    mean = np.linalg.inv(eye - J * (2 / 3) + J @ J / 6) @ known
+    end = J @ mean
+    end[:, :, :c] += eye
+    end[:, :, c:] += direct
+    moved = np.concatenate([end, h * (R @ mean)], axis=1)
     A = np.zeros((K, n, n))
     A[:, :, :c] = moved[:, :, :c]
     A[:, range(c, n), range(c, n)] = 1.0

@@ -121,7 +121,7 @@ def _forces(stage: Stage, s: np.ndarray, u: np.ndarray) -> list[tuple[str, np.nd
     """The smoothed disturbing forces: label, values (N,), unit, driven body or None."""
     c, X, model = stage.prepared.c, stage.fit.X, stage.model
     defect = (s[1:] - advance(c, s[:-1], u[:-1], u[1:], X)) / state_scale(c)
-    F = differentiate(c, s, u, X, force=True).F / state_scale(c)[:, None]
+    F = differentiate(c, s, u[:-1], u[1:], X, force=True).F / state_scale(c)[:, None]
     square = F.transpose(0, 2, 1) @ F
     square += 1e-12 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(F.shape[2])
     force = np.linalg.solve(square, F.transpose(0, 2, 1) @ np.nan_to_num(defect)[:, :, None])[:, :, 0]

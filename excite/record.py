@@ -41,7 +41,11 @@ class Record:
     """A log as the smoother sees it: torque (N, n_u) as measured, reading (N, m) of the chart's sensors.
 
     used (N, m): which samples tell something; counts (m,): encoders read at their edges. origin (m_o,): sensors
-    whose absolute value matters and whose count starts anywhere.
+    whose absolute value matters and whose count starts anywhere. unbiased: torques' and encoders' noise are set against
+    each other as they are, or what a dull drive shows poorly would be off by half a deviation and more. An error of
+    the torques acts on its own interval alone; and readings weigh alike whether an encoder beats with the clock or
+    not, as noise that beats is white on average over a drive (how sure an estimate is counts the beats all the same).
+    Else each reading weighs by what it tells, and weak directions are drawn in a little: steadier, for evidence.
     """
 
     torque: np.ndarray
@@ -50,6 +54,7 @@ class Record:
     counts: np.ndarray
     origin: tuple[int, ...]
     noise: Noise
+    unbiased: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,7 +80,7 @@ def common_sensors(model: Model, logs: Sequence[Log]) -> tuple[str, ...]:
     return tuple(s.name for s in model.machine.sensors("full") if s.name in common)
 
 
-def record(c: Chart, log: Log) -> Record:
+def record(c: Chart, log: Log, unbiased: bool = False) -> Record:
     """A log prepared: encoder edges found, noise of the others estimated from the log itself."""
     model = c.model
     torques = [torque_sensor(model, body.index) for body in model.machine.actuated]
@@ -101,7 +106,7 @@ def record(c: Chart, log: Log) -> Record:
         reading[:, j] = (n + (change < 0)) * step
         used[:, j] = change != 0
     level = np.array([max(white_noise(u), 1e-3 * float(s.noise or 1)) for u, s in zip(torque.T, torques, strict=True)])
-    return Record(torque, reading, used.astype(float), counts, origins(c, counts), Noise(level, sigma))
+    return Record(torque, reading, used.astype(float), counts, origins(c, counts), Noise(level, sigma), unbiased)
 
 
 def origins(c: Chart, counts: np.ndarray) -> tuple[int, ...]:
@@ -171,9 +176,10 @@ def one_count(c: Chart, r: Record) -> np.ndarray:
 
 def readings(
     c: Chart, r: Record, p: Point, u: np.ndarray, X: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Expected readings (N, m) under torques u (N, n_u), their slopes (N, m, n), weights (N, m) = 1 / variance, offset
-    columns (m, m_o), and how readings move with the chart's `flawed` parameters (N, m, n_f).
+    columns (m, m_o), how readings move with the chart's `flawed` parameters (N, m, n_f), and by how much the noise
+    exceeds that variance where it beats, as far as the weights don't say so (N, m).
 
     Right after a count the angle is past the edge by half of what it travels in a sample, at most half a step.
     """
@@ -185,13 +191,15 @@ def readings(
     h -= np.where(r.counts, np.clip(travel, -step, step) / 2, 0.0)
     H[slow] -= Hrate[slow] * (sample / 2)
     width = np.where(r.counts, np.maximum(np.minimum(np.abs(travel), step) / np.sqrt(12), EDGE * step), step)
-    width = np.where(r.counts, width * np.sqrt(beating(travel / step, sample)), width)
+    beats = np.where(r.counts, beating(travel / step, sample), 1.0)
+    if not r.unbiased:
+        width, beats = width * np.sqrt(beats), np.ones_like(beats)
     width = np.hypot(width, _through(c, r, p, u, X))
     D = np.zeros((len(c.sensors), len(r.origin)))
     for k, j in enumerate(r.origin):
         D[j, k] = 1.0
     by = flaws[0] if flaws else np.zeros((*h.shape, 0))
-    return h + D @ p.offset, H, r.used / width**2, D, by
+    return h + D @ p.offset, H, r.used / width**2, D, by, beats
 
 
 def beating(counts: np.ndarray, sample: float) -> np.ndarray:
@@ -199,8 +207,9 @@ def beating(counts: np.ndarray, sample: float) -> np.ndarray:
 
     Where a multiple k of them is nearly whole, the k-th harmonic of the error (a sawtooth's: 6 / (pi k)^2 of its power)
     is as slow as the machine, and a hundred readings tell no more than one: white noise that tells as little is larger
-    by half a period of the beat in readings, or by as many as it lasts. Of an encoder with less than one count per
-    sample only its edges are read, and it is the clock's samples per edge that count.
+    by half a period of the beat in readings, or by as many as it lasts. Between beats the error counts as white. Of an
+    encoder with less than one count per sample only its edges are read, and it is the clock's samples per edge that
+    count.
     """
     speed = np.abs(counts)
     change = np.abs(np.gradient(speed, axis=0)) if len(speed) > 1 else np.zeros_like(speed)
@@ -211,8 +220,8 @@ def beating(counts: np.ndarray, sample: float) -> np.ndarray:
     for k in range(1, HARMONICS + 1):
         off = np.abs(k * turns - np.round(k * turns))
         lasts = 0.5 / np.sqrt(off**2 + k * change / 4 + (0.5 / LONGEST) ** 2)
-        more += 6 / (np.pi * k) ** 2 * np.where(slow < 0.5, lasts / (1 + (off / slow) ** 4), 0.0)
-    return more
+        more += 6 / (np.pi * k) ** 2 * np.where(slow < 0.5, lasts / (1 + (off / slow) ** 4) - 1, 0.0)
+    return np.maximum(more, 1.0)
 
 
 def _through(c: Chart, r: Record, p: Point, u: np.ndarray, X: np.ndarray) -> np.ndarray | float:

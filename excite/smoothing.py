@@ -11,14 +11,14 @@ problem); Bock, "Recent advances in parameter identification techniques for O.D.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from excite import chain, hidden
 from excite.estimate import Estimate, NoEstimate, NotIdentifiable
-from excite.innovations import Step, innovation_sizes, innovations, steps
+from excite.innovations import Step, excess, innovation_sizes, innovations, sensitivity, steps
 from excite.linearise import BATCH, Chart, advance, chart, differentiate
 from excite.log import Log
 from excite.processing import decimate, derivative
@@ -68,6 +68,10 @@ DOUBT = (
     "the log shows something that the model doesn't know, so the intervals do not hold: these values allow for"
     " disturbing forces, and are right as far as it is forces that disturb; run `excite diagnose`"
 )
+DRAWN = (
+    "what this log shows poorly may be off by a deviation more than its interval says, as no estimate without that bias"
+    " was found: a drive that moves more tells more"
+)
 PART = 200  # samples at a time: their chain stays in the processor's cache
 # Of the first state about the filtered log. Not wider: where the contact is stiff, at standstill, nothing is seen of
 # the first speeds, which are gone within milliseconds, and an iteration would play with them for ever.
@@ -95,7 +99,8 @@ class Linear:
     Z: twice the negative log-likelihood is [1 p]' Z [1 p] for steps p of parameters and offsets, scaled. gain
     (N - 1, n, n_u): what a torque error of one standard deviation does to the scaled state. stages: by part of the
     log. H (N, m, n), weight, residual (N, m): the readings; direct (N, m, n_f + n_o): how they move with flaws of
-    sensors and offsets. noise (n_u,): standard deviation of the delivered torques' errors [N m].
+    sensors and offsets. noise (n_u,): standard deviation of the delivered torques' errors [N m]. beats (N, m): how many
+    times larger than their weights say the readings' variance is.
     """
 
     solved: chain.Solved
@@ -107,11 +112,17 @@ class Linear:
     residual: np.ndarray
     direct: np.ndarray
     noise: np.ndarray
+    beats: np.ndarray
 
     @cached_property
     def innovations(self) -> np.ndarray:
         """Of every reading (N, m), normalised; NaN where unused."""
         return innovations(self)
+
+    @cached_property
+    def excess(self) -> np.ndarray:
+        """By how much the whitened innovations' variance (N, m) exceeds one, for beats."""
+        return excess(self)
 
     @cached_property
     def filter(self) -> list[Step]:
@@ -145,7 +156,8 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     NotConverged where that fails too, NotIdentifiable where a torque is missing.
     """
     c = chart(model, common_sensors(model, logs))
-    records = [record(c, log) for log in logs]
+    records = [record(c, log, unbiased=True) for log in logs]
+    steady = [replace(r, unbiased=False) for r in records]
     starts = [first_point(c, r, log, filter) for r, log in zip(records, logs, strict=True)]
     notes = noise_notes(c, records)
     held = hidden.unmoved(model, logs, filter, slow=False)
@@ -167,17 +179,15 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     for free, further in ways():
         try:
             if further:
-                loose = loosely(c, logs, records, starts, model.nominal, starts, free)
+                loose = loosely(c, logs, steady, starts, model.nominal, starts, free)
             points, X = (starts, model.nominal) if loose is None else (loose.points, loose.X)
-            fit = iterate(c, records, points, X, starts, 0.0, free)
+            fit, drawn = _exact(c, records, steady, points, X, starts, free)
         except NotConverged as failed:
             trouble = trouble or failed
-            if failed.fit is None or failed.fit.disturbed or failed.step > TOLERABLE:
-                continue
-            fit = failed.fit
+            continue
         found = suspects(c, logs, fit)
         if not found:
-            return _estimate(c, records, fit, filter, notes)
+            return _estimate(c, records, fit, filter, (*notes, *drawn))
         if doubted is None or fit.cost < doubted[0].cost:
             doubted = fit, free, found
         if free is held:
@@ -187,13 +197,35 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         fit, free, found = doubted
         said = "; ".join(found)
         try:
-            loose = loosely(c, logs, records, fit.points, fit.X, starts, free)
+            loose = loosely(c, logs, steady, fit.points, fit.X, starts, free)
         except NotConverged as failed:
             trouble = failed
     if loose is None:
         assert trouble is not None
         raise trouble
     return _estimate(c, records, loose, filter, (*notes, said, DOUBT))
+
+
+def _exact(
+    c: Chart,
+    records: Sequence[Record],
+    steady: Sequence[Record],
+    points: Sequence[Point],
+    X: np.ndarray,
+    starts: Sequence[Point],
+    held: np.ndarray,
+) -> tuple[Fit, tuple[str, ...]]:
+    """The fit with exact dynamics, unbiased where the log determines it, and what to say of it. Raises NotConverged."""
+    trouble: NotConverged | None = None
+    for own, said in ((records, ()), (steady, (DRAWN,))):
+        try:
+            return iterate(c, own, points, X, starts, 0.0, held), said
+        except NotConverged as failed:
+            if failed.fit is not None and failed.step < TOLERABLE:
+                return failed.fit, said
+            trouble = trouble or failed
+    assert trouble is not None
+    raise trouble
 
 
 def loosely(
@@ -327,14 +359,17 @@ def linearise(
     """
     delivered, behind = c.delivered(r.torque, X, p.errors)
     noise = c.felt(r.noise.torque, X)
+    left, right = delivered[:-1] + p.w, delivered[1:] + p.w
     if exact:
         defect = np.zeros_like(p.s[1:])
     else:
-        defect = advance(c, p.s[:-1], delivered[:-1] + p.w, delivered[1:] + p.w, X) - p.s[1:]
+        defect = advance(c, p.s[:-1], left, right, X) - p.s[1:]
         if not np.isfinite(defect).all():
             return None
     u = delivered + p.errors
-    h, H, weight, D, flaws = readings(c, r, p, u, X)
+    if not r.unbiased:
+        left, right = u[:-1], u[1:]
+    h, H, weight, D, flaws, beats = readings(c, r, p, u, X)
     residual = np.zeros_like(h) if exact else np.where(r.used > 0, r.reading - h, 0.0)
     flaws = flaws * c.model.scale[list(c.flawed)]
     scale, n_p, n_o = state_scale(c), len(X), len(r.origin)
@@ -343,7 +378,7 @@ def linearise(
     N = len(p.s)
     for at in range(0, N - 1, BATCH):
         until = min(at + BATCH, N - 1)
-        by = differentiate(c, p.s[at : until + 1], u[at : until + 1], X, disturbed > 0)
+        by = differentiate(c, p.s[at : until + 1], left[at:until], right[at:until], X, disturbed > 0)
         gain = by.B * noise / scale[:, None]
         C = gain @ gain.transpose(0, 2, 1)
         if disturbed > 0:
@@ -373,7 +408,7 @@ def linearise(
     Z = solved.Z.copy()
     place = np.concatenate([[0], 1 + np.array(c.flawed, int), np.arange(1 + n_p, 1 + n_p + n_o)])
     Z[np.ix_(place, place)] += flat.T @ flat
-    return Linear(solved, Z, np.concatenate(gains), tuple(stages), S, weight, residual, direct, noise)
+    return Linear(solved, Z, np.concatenate(gains), tuple(stages), S, weight, residual, direct, noise, beats)
 
 
 def _known_before(c: Chart, p: Point, first: np.ndarray, columns: int) -> chain.Section:
@@ -484,11 +519,11 @@ def iterate(
         # What this step will have left undone, if steps go on shrinking as they do.
         ratio = min(max(step / before, 1 - whole), 0.9)
         if (step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED) or (disturbed > 0 and step < enough):
-            base = covariance[: len(X), : len(X)] * np.outer(model.scale, model.scale)
+            base = _base(c, records, linear, covariance)
             return Fit(there[1], base, unseen, tuple(there[0]), tuple(linear), cost, disturbed)
     stood = None
     if linear is not None:
-        base = covariance[: len(X), : len(X)] * np.outer(model.scale, model.scale)
+        base = _base(c, records, linear, covariance)
         stood = Fit(X, base, unseen, tuple(points), tuple(linear), cost, disturbed)
     raise NotConverged(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
@@ -560,6 +595,24 @@ def _parameters(
     information[range(n), range(n)] += damping
     step = -np.linalg.solve(information, slope)
     return covariance, [step[place] for place in places], left, cost
+
+
+def _base(c: Chart, records: Sequence[Record], linear: Sequence[Linear], covariance: np.ndarray) -> np.ndarray:
+    """Covariance (n_base, n_base) [SI] of an estimate from that of all parameters and offsets as the weights have it.
+
+    With weights that don't count beats, what these add to the noise goes through the estimate as it was weighed:
+    the sandwich of White, Econometrica 48 (1980) 817.
+    """
+    n = size = len(c.model.scale)
+    added = np.zeros_like(covariance)
+    for found, r in zip(linear, records, strict=True):
+        place = np.concatenate([np.arange(n), np.arange(size, size + len(r.origin))])
+        size += len(r.origin)
+        if r.unbiased:
+            E = sensitivity(found, c.flawed)
+            added[np.ix_(place, place)] += E.T @ (E * found.excess.reshape(-1, 1))
+    whole = covariance + covariance @ added @ covariance
+    return np.asarray(whole[:n, :n] * np.outer(c.model.scale, c.model.scale))
 
 
 def _moved(c: Chart, r: Record, p: Point, linear: Linear, move: np.ndarray) -> Point:

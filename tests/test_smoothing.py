@@ -132,7 +132,7 @@ def test_where_samples_lead_and_how_that_moves(va12: Model) -> None:
     s = np.hstack([motion.q, motion.nu, motion.wheels])[:, c.index]
     end = advance(c, s[:-1], motion.u[:-1], motion.u[1:], X)
     assert np.abs(end - s[1:]).max() < 2e-6
-    by = differentiate(c, s, motion.u, X, force=True)
+    by = differentiate(c, s, motion.u[:-1], motion.u[1:], X, force=True)
     rng = np.random.default_rng(0)
     ds, du, dX = rng.normal(size=c.n) * 1e-5, rng.normal(size=3) * 10, rng.normal(size=len(X)) * 1e-4 * va12.scale
     for a, b, d, moved in (
@@ -182,8 +182,9 @@ def test_errors_are_as_large_as_it_says(va12: Model, drive: str, kit: str) -> No
     assert 0.7 < np.sqrt(np.mean(z**2)) < 1.35
     assert np.abs(z).max() < 4.5
     assert np.median(np.sqrt(np.mean(percent**2, axis=0))) < 0.6
-    # The noise is estimated and the encoders' counts are random: the bound knows both on average.
-    assert np.abs(over - 1).max() < 0.15
+    # The noise is estimated, the encoders' counts are random, and the estimate weighs readings that beat as others.
+    assert over.min() > 0.85
+    assert over.max() < 1.3
 
 
 @pytest.mark.slow
@@ -198,6 +199,24 @@ def test_coverage(va12: Model, drive: str, kit: str, middle: float) -> None:
     assert 0.9 < np.sqrt(np.mean(z**2)) < 1.15
     assert 0.93 < inside.mean() < 0.97
     assert inside.min() >= 0.84  # of 22 parameters in 50 runs the least falls below that by chance in 2 % of tests
+
+
+@pytest.mark.slow
+def test_a_dull_drive_is_not_biased(straight: Model) -> None:
+    """What a drive shows poorly, mass against inertias here, has large deviations and no more: errors that average out
+    where torques' and encoders' noise are set against each other as they are."""
+    t = np.arange(12001) / 100
+    legs = [(-1) ** k * np.clip(np.minimum(t - 30 * k - 0.5, 30 * k + 28.5 - t) / 6, 0, 1) for k in range(4)]
+    smooth = scipy.signal.butter(2, 3 / 50)
+    z = []
+    for seed in range(32):
+        X = perturbed(straight, seed)
+        by_hand = follow(straight, np.sum(legs, axis=0), np.zeros((len(t), 0)), seed=seed).u
+        motion = simulate(straight, scipy.signal.filtfilt(*smooth, by_hand, axis=0), X)
+        estimate = identify(straight, [measured(straight, motion, X, "paper", 70000 + seed)], "joint")
+        z.append((estimate.value - X) / estimate.std)
+    assert np.abs(np.mean(z, axis=0)).max() < 0.45
+    assert 0.9 < np.mean(np.abs(z) < 1.96) < 0.98
 
 
 def test_bound_is_what_linear_least_squares_gives(va12: Model) -> None:
