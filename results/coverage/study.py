@@ -9,10 +9,11 @@ from __future__ import annotations
 # ruff: noqa: E402  (threads are set before numpy loads)
 import argparse
 import json
+import multiprocessing
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -20,7 +21,6 @@ from pathlib import Path
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import joblib
 import numpy as np
 import pandas as pd
 import scipy.signal
@@ -139,6 +139,10 @@ def run(s: Set, seed: int) -> dict[str, object]:
         "doubt": DOUBT in e.notes,
         "seconds": seconds,
     }
+
+
+def _run(job: tuple[Set, int]) -> dict[str, object]:
+    return run(*job)
 
 
 def done() -> list[dict[str, object]]:
@@ -291,10 +295,9 @@ def main() -> None:
     # Sets grow together: whatever there is when it is stopped says something of each.
     todo.sort(key=lambda x: x[1] / x[0].runs)
     if options.jobs:
-        task: Callable[..., object] = joblib.delayed(run)
-        work = joblib.Parallel(n_jobs=options.jobs, return_as="generator_unordered")(task(*t) for t in todo)
-        with RUNS.open("a") as out:
-            for row in work:
+        # Forked workers keep the models that this file has built.
+        with multiprocessing.get_context("fork").Pool(options.jobs) as pool, RUNS.open("a") as out:
+            for row in pool.imap_unordered(_run, todo):
                 out.write(json.dumps(row) + "\n")
                 out.flush()
     rows = {s: [r for r in done() if r["set"] == s.name and int(str(r["seed"])) < s.runs] for s in sets}
