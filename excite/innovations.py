@@ -60,6 +60,8 @@ def excess(linear: Linear) -> np.ndarray:
     """By how much the variance of whitened innovations (N, m) exceeds one where encoders beat."""
     N, m = linear.residual.shape
     out = np.zeros((N, m))
+    if (linear.beats == 1).all():
+        return out
     for step in linear.filter:
         more = (linear.beats[step.at] - 1) / np.where(step.used, linear.weight[step.at], np.inf)
         whitens = np.linalg.solve(step.root, np.broadcast_to(np.eye(m), step.root.shape))

@@ -151,6 +151,8 @@ class Fit:
 def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     """Base parameters by joint smoothing of all logs, from the machine file's values.
 
+    Encoders that beat with the clock weigh as others do, which keeps the estimate unbiased, and widen its intervals. A
+    log that tells too little for that has an estimate that is drawn in, with a note.
     Where the innovations say that the machine does something that the model doesn't know, or the exact dynamics find
     no estimate, the answer is that of a model with white disturbing forces, as large as it takes, with a note. Raises
     NotConverged where that fails too, NotIdentifiable where a torque is missing.
