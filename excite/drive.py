@@ -277,13 +277,15 @@ def table(trace: Trace) -> list[dict[str, Any]]:
 
 
 def from_table(model: Model, rows: Sequence[Mapping[str, Any]]) -> Trace:
-    """The trace that `table` was made of. Raises DriveError for a table that is damaged."""
+    """The trace that `table` was made of. Raises DriveError for one of another version or machine, or damaged."""
     joints = levers(model)
     try:
         ends = [(r["end_s"], r["speed_m_s"][1], *(r[j.column][1] for j in joints)) for r in rows]
         times, speed, *angle = np.array([(0.0,) * (2 + len(joints)), *ends], float).T
-    except (KeyError, IndexError, TypeError, ValueError):
-        raise DriveError("summary.json: the design's phases are damaged, design again") from None
+    except (KeyError, IndexError, TypeError, ValueError) as err:
+        other = isinstance(err, KeyError) and err.args[0] in [j.column for j in joints]
+        why = f"of another version or machine (no column {err.args[0]})" if other else "damaged"
+        raise DriveError(f"summary.json: the design's phases are {why}, design again") from None
     if len(times) < 2 or not (np.diff(times) > 0).all():
         raise DriveError("summary.json: the design's phases are damaged, design again")
     return Trace(times, speed, np.reshape(angle, (len(joints), len(times))).T, joints)

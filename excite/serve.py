@@ -157,7 +157,6 @@ class Tail:
                 if s.is_rate and self.rows:
                     number = self.rows[-1][1] + number * (t - self.rows[-1][0])
                 ways.append(number)
-            angles = {key: s.gain * float(cells[s.column]) for key, s in self.angles}
         except (KeyError, ValueError):
             return None
         if not ways or not math.isfinite(t + sum(ways)):
@@ -168,7 +167,15 @@ class Tail:
         before = self.rows[0]
         if t <= before[0]:
             return None
-        return {TIME: t, SPEED: (self.rows[-1][1] - before[1]) / (t - before[0]), **angles}
+        return {TIME: t, SPEED: (self.rows[-1][1] - before[1]) / (t - before[0]), **self._angles(cells)}
+
+    def _angles(self, cells: dict[str, str]) -> dict[str, float]:
+        """The steered angles that a row has: the page keeps the last value of any other."""
+        found = {}
+        for key, s in self.angles:
+            with contextlib.suppress(KeyError, ValueError):
+                found[key] = s.gain * float(cells[s.column])
+        return {key: angle for key, angle in found.items() if math.isfinite(angle)}
 
 
 async def run(page: str, angles: Sequence[str], port: int, tail: Tail | None, ready: Callable[[str], None]) -> None:

@@ -22,6 +22,7 @@ from model.prediction import Model
 
 A4 = (8.27, 11.69)
 LEFT, RIGHT = 0.08, 0.95
+GAP = 0.02  # between columns
 SI = {"torque": "N m", "yaw_rate": "rad/s", "lateral_speed": "m/s", "x": "m", "y": "m", "angle": "rad", "wheel": "rad"}
 AHEAD = 3.0  # m of free ground around what the machine touches: overhangs, and a person who has to stop
 
@@ -230,25 +231,14 @@ def _second(sheet: Sheet) -> Figure:
     space = min(0.0165, 0.40 / max(len(trace), 1))
     size = min(9.0, 8.5 * space / 0.0145)
     several = len(trace.levers) > 1
-    angles = [f"then {lever.name}" if several else "then angle" for lever in trace.levers]
-    width = 0.17 if several else 0.10
-    last = LEFT + 0.89 - width * max(len(angles), 1)
-    columns = (LEFT, LEFT + 0.04, LEFT + 0.12, last - 0.10, *(last + width * k for k in range(len(angles))))
-    titles = ("no.", "at", "do", "then speed", *angles)
-    for x, text in zip(columns, titles, strict=True):
-        figure.text(x, y, text, fontsize=7, color="0.25")
-    y -= space
+    then = [lever.name for lever in trace.levers] if several else ["speed", *("angle" for _ in trace.levers)]
+    rows = [("no.", "at", "do", *(f"then {name}" for name in then))]
     for k in range(len(trace)):
-        cells = (
-            str(k + 1),
-            drive.clock(trace.times[k]),
-            drive.parts(trace, k, letters=True)[0] if several else drive.words(trace, k, letters=True),
-            f"{trace.speed[k + 1]:+.1f} m/s".replace("+0.0", "0").replace("-", "\N{MINUS SIGN}"),
-            *(drive.angle_words(degrees) for degrees in trace.degrees[k + 1]),
-        )
-        for x, text in zip(columns, cells, strict=True):
-            figure.text(x, y, text, fontsize=size, weight="bold" if x == columns[1] else "normal")
-        y -= space
+        turned = [drive.angle_words(degrees) for degrees in trace.degrees[k + 1]]
+        speed = f"{trace.speed[k + 1]:+.1f} m/s".replace("+0.0", "0").replace("-", "\N{MINUS SIGN}")
+        do = drive.parts(trace, k, letters=True)[0] if several else drive.words(trace, k, letters=True)
+        rows.append((str(k + 1), drive.clock(trace.times[k]), do, *(() if several else (speed,)), *turned))
+    y = _table(figure, y, rows, space, size)
     y = _title(figure, y - 0.008, "Mind")
     y = _list(figure, y, sheet.warnings)
     y = _title(figure, y - 0.008, "Set up")
@@ -256,6 +246,32 @@ def _second(sheet: Sheet) -> Figure:
     y = _title(figure, y - 0.008, "What this drive gives in a person's hands")
     y = _list(figure, y, [sheet.verdict, *(_score_line(name, score) for name, score in sheet.scores)])
     return figure
+
+
+def _table(figure: Figure, y: float, rows: Sequence[Sequence[str]], space: float, size: float) -> float:
+    """Rows of texts, titles first, each column as wide as its texts; what is left is behind the third. Where all of it
+    is wider than the page, the letters are smaller."""
+    texts = [
+        [
+            figure.text(LEFT, y - k * space, text, fontsize=size if k else 7, color="black" if k else "0.25")
+            for text in row
+        ]
+        for k, row in enumerate(rows)
+    ]
+    for row in texts[1:]:
+        row[1].set_fontweight("bold")
+    widths = np.array([[text.get_window_extent().width for text in row] for row in texts]).max(axis=0)
+    widths /= figure.bbox.width
+    room = RIGHT - LEFT - GAP * (len(widths) - 1)
+    smaller = min(1.0, room / widths.sum())
+    widths *= smaller
+    widths[2] += max(0.0, room - widths.sum())
+    starts = LEFT + np.cumsum([0.0, *widths[:-1] + GAP])
+    for row in texts:
+        for x, text in zip(starts, row, strict=True):
+            text.set_x(x)
+            text.set_fontsize(smaller * text.get_fontsize())
+    return y - len(rows) * space
 
 
 def _score_line(name: str, score: Score) -> str:

@@ -145,6 +145,20 @@ def test_words_name_each_of_several_joints() -> None:
     assert again.angle == pytest.approx(trace.angle)
 
 
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"articulation_rad": "angle_rad"}, r"another version or machine \(no column articulation_rad\), design again"),
+        ({"end_s": "end"}, "damaged, design again"),
+    ],
+)
+def test_phases_that_cannot_be_read_are_refused(va12: Model, change: dict[str, str], why: str) -> None:
+    trace = Trace(KNOTS, SPEED, ANGLE, drive.levers(va12))
+    rows = [{change.get(name, name): value for name, value in row.items()} for row in drive.table(trace)]
+    with pytest.raises(DriveError, match=why):
+        drive.from_table(va12, rows)
+
+
 @pytest.mark.parametrize("name", ["va12", "tandem", "double_loader"])
 def test_left_is_where_the_machine_goes(name: str) -> None:
     """The sign from pure rolling is what simulation does: forward, each joint alone to its left, the machine turns
@@ -243,6 +257,29 @@ def test_names_on_the_map_do_not_hide_each_other() -> None:
     boxes = [t.get_window_extent() for t in ax.texts]
     for one, other in itertools.combinations(boxes, 2):
         assert not one.overlaps(other)
+
+
+@pytest.mark.parametrize(
+    "names", [("va12",), ("tandem",), ("double_loader",), ("tandem", "double_loader"), ("skid_robot",)]
+)
+@pytest.mark.parametrize("n", [8, 30])
+def test_texts_on_the_second_page_do_not_overlap(names: tuple[str, ...], n: int) -> None:
+    """The longest words that a phase can have, with no joint to steer, one, two or four."""
+    models = [build(load(name)) for name in names]
+    levers = tuple(lever for model in models for lever in drive.levers(model))
+    speed = np.where(np.arange(n + 1) % 2, 1.1, -1.1)
+    speed[[0, -1]] = 0
+    angle = np.outer(np.where(np.arange(n + 1) % 3, -0.3, 0.35), np.ones(len(levers)))
+    trace = Trace(4.05 * np.arange(n + 1), speed, angle, levers)
+    room = drive.Room(20, 10, (0, 0))
+    figure = sheet._second(
+        sheet.Sheet("A drive", models[0], trace, (), room, (60, 10), ("Mind the gap.",), (), "Good.")
+    )
+    assert any("through a stop" in text.get_text() for text in figure.texts)
+    boxes = [text.get_window_extent() for text in figure.texts]
+    for one, other in itertools.combinations(boxes, 2):
+        assert not one.overlaps(other)
+    assert max(box.x1 for box in boxes) <= 0.96 * figure.bbox.width
 
 
 def test_band_is_the_reference_a_second_around() -> None:

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -174,6 +175,17 @@ def test_the_driver_reads_every_joint(open_page: Callable[..., Tab], two_html: s
         off = np.rad2deg(np.sqrt(np.mean((got - wanted) ** 2)))
         assert score["angle_rms_deg"][k] == pytest.approx(off, rel=0.01)
     assert ", rear steering by" in tab.text("#next")
+
+
+def test_joints_may_be_called_as_words_end(open_page: Callable[..., Tab]) -> None:
+    """What comes says the whole name, here of joints that are called front steer and rear steer."""
+    names = ("front_steer", "rear_steer")
+    bodies = [j.body.model_copy(update={"place": name}) for j, name in zip(TWO.levers, names, strict=True)]
+    levers = tuple(replace(j, body=body) for j, body in zip(TWO.levers, bodies, strict=True))
+    tab = open_page(text=page.driver_page(TANDEM, replace(TWO, levers=levers), "A drive"))
+    tab.page.tap("#start")
+    tab.page.clock.run_for(5000 + 4500)
+    assert tab.text("#next") == "then brake to a stop, rear steer to 14° left"
 
 
 def test_start_pause_and_repeat_by_touch_and_key(open_page: Callable[..., Tab]) -> None:
@@ -466,6 +478,23 @@ def test_growing_log_becomes_values(va12: Model, followed: pd.DataFrame, tmp_pat
     assert said[499]["articulation_rad"] == pytest.approx(followed["theta2_rad"][500])
     path.write_text("t_s,other\n")
     assert tail.new() == []
+
+
+def test_an_angle_that_is_missing_silences_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    tail = serve.Tail(path, TANDEM.machine, (FRONT, REAR))
+    rims, columns = [s.column for _, s in tail.rims], [s.column for _, s in tail.angles]
+    with path.open("w") as file:
+        file.write(",".join(["t_s", *rims, columns[0]]) + "\n")
+        for k, angle in enumerate(["0.1", "0.1", "nan", "", "inf", "0.2"]):
+            file.write(",".join([str(k), *["0" for _ in rims], angle]) + "\n")
+    said = tail.new()
+    assert [s["v_m_s"] for s in said] == [0] * 5
+    assert [set(s) - {"t_s", "v_m_s"} for s in said] == [{FRONT.column}, set(), set(), set(), {FRONT.column}]
+    path.write_text(
+        ",".join(["t_s", *rims, *columns]) + "\n" + "".join(f"{k},{'0,' * len(rims)}nan,0.3\n" for k in (0, 1))
+    )
+    assert [set(s) for s in tail.new()] == [{"t_s", "v_m_s", REAR.column}]
 
 
 @pytest.mark.slow
