@@ -45,7 +45,10 @@ def innovations(linear: Linear) -> np.ndarray:
 def innovation_sizes(linear: Linear) -> np.ndarray:
     """Mean square of the normalised innovations of every sensor, and of their sums over blocks in deviations, both
     1 where model and noise are right; and the number of blocks: (m, 3)."""
-    z, allowed = linear.innovations, 1 + linear.excess
+    z, allowed = linear.innovations, np.ones(linear.residual.shape)
+    for step in linear.filter if _beats(linear) else ():
+        size = np.diagonal(step.root @ step.root.transpose(0, 2, 1), axis1=1, axis2=2)
+        allowed[step.at] += _added(linear, step) / size
     sizes = np.zeros((z.shape[1], 3))
     for j, column in enumerate(z.T):
         told = np.flatnonzero(np.isfinite(column))
@@ -60,13 +63,19 @@ def excess(linear: Linear) -> np.ndarray:
     """By how much the variance of whitened innovations (N, m) exceeds one where encoders beat."""
     N, m = linear.residual.shape
     out = np.zeros((N, m))
-    if (linear.beats == 1).all():
-        return out
-    for step in linear.filter:
-        more = (linear.beats[step.at] - 1) / np.where(step.used, linear.weight[step.at], np.inf)
+    for step in linear.filter if _beats(linear) else ():
         whitens = np.linalg.solve(step.root, np.broadcast_to(np.eye(m), step.root.shape))
-        out[step.at] = (whitens**2 @ more[:, :, None])[:, :, 0]
+        out[step.at] = (whitens**2 @ _added(linear, step)[:, :, None])[:, :, 0]
     return out
+
+
+def _beats(linear: Linear) -> bool:
+    return bool((linear.beats != 1).any())
+
+
+def _added(linear: Linear, step: Step) -> np.ndarray:
+    """What beats add to the variance of a step's readings (K, m)."""
+    return (linear.beats[step.at] - 1) / np.where(step.used, linear.weight[step.at], np.inf)
 
 
 def sensitivity(linear: Linear, flawed: tuple[int, ...]) -> np.ndarray:

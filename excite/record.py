@@ -194,7 +194,8 @@ def readings(
     beats = np.where(r.counts, beating(travel / step, sample), 1.0)
     if not r.unbiased:
         width, beats = width * np.sqrt(beats), np.ones_like(beats)
-    width = np.hypot(width, _through(c, r, p, u, X))
+    own, width = width, np.hypot(width, _through(c, r, p, u, X))
+    beats = 1 + (beats - 1) * (own / width) ** 2
     D = np.zeros((len(c.sensors), len(r.origin)))
     for k, j in enumerate(r.origin):
         D[j, k] = 1.0

@@ -177,7 +177,7 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
 
     trouble: NotConverged | None = None
     loose: Fit | None = None
-    doubted: tuple[Fit, np.ndarray, list[str]] | None = None
+    doubted: tuple[tuple[bool, float], Fit, np.ndarray, list[str]] | None = None
     for free, further in ways():
         try:
             if further:
@@ -190,13 +190,14 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         found = suspects(c, logs, fit)
         if not found:
             return _estimate(c, records, fit, filter, (*notes, *drawn))
-        if doubted is None or fit.cost < doubted[0].cost:
-            doubted = fit, free, found
+        rank = bool(drawn), fit.cost  # costs of one kind of records can be compared
+        if doubted is None or rank < doubted[0]:
+            doubted = rank, fit, free, found
         if free is held:
             break  # nothing was held back: it is the machine, not the way to it
     said = str(trouble)
     if doubted is not None:
-        fit, free, found = doubted
+        _, fit, free, found = doubted
         said = "; ".join(found)
         try:
             loose = loosely(c, logs, steady, fit.points, fit.X, starts, free)
@@ -525,7 +526,10 @@ def iterate(
             return Fit(there[1], base, unseen, tuple(there[0]), tuple(linear), cost, disturbed)
     stood = None
     if linear is not None:
-        base = _base(c, records, linear, covariance)
+        if step < NEARLY:
+            base = _base(c, records, linear, covariance)
+        else:
+            base = covariance[: len(X), : len(X)] * np.outer(model.scale, model.scale)
         stood = Fit(X, base, unseen, tuple(points), tuple(linear), cost, disturbed)
     raise NotConverged(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
@@ -602,8 +606,10 @@ def _parameters(
 def _base(c: Chart, records: Sequence[Record], linear: Sequence[Linear], covariance: np.ndarray) -> np.ndarray:
     """Covariance (n_base, n_base) [SI] of an estimate from that of all parameters and offsets as the weights have it.
 
-    With weights that don't count beats, what these add to the noise goes through the estimate as it was weighed:
-    the sandwich of White, Econometrica 48 (1980) 817.
+    With weights that don't count beats, what these add to the noise goes through the estimate as it was weighed (the
+    sandwich of White, Econometrica 48 (1980) 817), every innovation on its own. Beats are slow and add more to what
+    only slow motion shows than white noise as large would: taken through the filter as white they are too few for
+    mass and inertia. On its own each is about right there; friction and offsets on steady drives come out too wide.
     """
     n = size = len(c.model.scale)
     added = np.zeros_like(covariance)

@@ -14,6 +14,7 @@ import os
 import time
 import warnings
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -31,7 +32,7 @@ from excite.identify import NoEstimate, identify
 from excite.objective import relative
 from excite.scenario import varied
 from excite.simulate import Motion, simulate
-from excite.smoothing import DOUBT, cramer_rao
+from excite.smoothing import DOUBT, DRAWN, cramer_rao
 from model import machine as machines
 from model.machine import Machine
 from model.prediction import Model, build
@@ -137,6 +138,7 @@ def run(s: Set, seed: int) -> dict[str, object]:
         "std": [float(f"{x:.6g}") for x in e.std],
         "quantile": e.quantile95,
         "doubt": DOUBT in e.notes,
+        "drawn": DRAWN in e.notes,
         "seconds": seconds,
     }
 
@@ -295,11 +297,15 @@ def main() -> None:
     # Sets grow together: whatever there is when it is stopped says something of each.
     todo.sort(key=lambda x: x[1] / x[0].runs)
     if options.jobs:
-        # Forked workers keep the models that this file has built.
-        with multiprocessing.get_context("fork").Pool(options.jobs) as pool, RUNS.open("a") as out:
-            for row in pool.imap_unordered(_run, todo):
-                out.write(json.dumps(row) + "\n")
-                out.flush()
+        # Forked workers keep the models that this file has built. One that is killed ends the study: it can go on.
+        fork = multiprocessing.get_context("fork")
+        with ProcessPoolExecutor(options.jobs, mp_context=fork) as pool, RUNS.open("a") as out:
+            try:
+                for row in as_completed([pool.submit(_run, job) for job in todo]):
+                    out.write(json.dumps(row.result()) + "\n")
+                    out.flush()
+            finally:
+                pool.shutdown(cancel_futures=True)
     rows = {s: [r for r in done() if r["set"] == s.name and int(str(r["seed"])) < s.runs] for s in sets}
     found = [judged(s, own) for s, own in rows.items() if any("value" in r for r in own)]
     if not found:
