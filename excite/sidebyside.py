@@ -7,6 +7,7 @@ all is done in this process, with the same answer.
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import signal
@@ -17,6 +18,9 @@ from multiprocessing.process import BaseProcess
 from typing import Protocol, TypeVar
 
 R = TypeVar("R")
+
+PR_SET_PDEATHSIG = 1  # <linux/prctl.h>: the signal that a process gets when its parent ends
+LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None  # loaded before any fork
 
 
 class Together(Protocol):
@@ -38,7 +42,8 @@ def in_turn(calls: Sequence[Callable[[], R]]) -> Iterator[R]:
 def forked(calls: Sequence[Callable[[], R]]) -> Iterator[R]:
     """The same from as many processes at a time as there are cores, in the order of the calls.
 
-    What a process does not finish, because the call raises or something ends it, is done again in this one.
+    What a process does not finish, because the call raises or something ends it, is done again in this one, and so is
+    what no process can be had for. However this one ends, the others end too.
     """
     at_once = cores()
     if min(at_once, len(calls)) < 2:
@@ -51,10 +56,13 @@ def forked(calls: Sequence[Callable[[], R]]) -> Iterator[R]:
         for k in range(len(calls)):
             while k not in done:
                 for number in range(begun, min(begun + at_once - len(running), len(calls))):
-                    worker, answer = _started(calls[number])
-                    running[answer] = number, worker
+                    try:
+                        worker, answer = _started(calls[number], list(running))
+                        running[answer] = number, worker
+                    except OSError:  # no memory, processes or files left
+                        done[number] = calls[number]()
                     begun += 1
-                ready = wait(list(running))
+                ready = wait(list(running)) if running else []
                 for answer in [a for a in running if a in ready]:
                     number, worker = running.pop(answer)
                     try:
@@ -71,19 +79,35 @@ def forked(calls: Sequence[Callable[[], R]]) -> Iterator[R]:
             answer.close()
 
 
-def _started(call: Callable[[], R]) -> tuple[BaseProcess, Connection]:
+def _started(call: Callable[[], R], others: Sequence[Connection]) -> tuple[BaseProcess, Connection]:
+    """A process at work and where its answer comes. others: where those of earlier processes come."""
     fork = multiprocessing.get_context("fork")
     answer, own = fork.Pipe(duplex=False)
-    worker = fork.Process(target=_carry, args=(call, own), daemon=True)
-    worker.start()
-    own.close()
+    with own:  # here it is closed in any case: the process has its own
+        worker = fork.Process(target=_carry, args=(call, own, [answer, *others], os.getpid()), daemon=True)
+        try:
+            worker.start()
+        except OSError:
+            answer.close()
+            raise
     return worker, answer
 
 
-def _carry(call: Callable[[], object], answer: Connection) -> None:
+def _carry(call: Callable[[], object], answer: Connection, others: Sequence[Connection], parent: int) -> None:
     """In the forked process. It ends without the clean-up of a Python program: files and buffers are not its own."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the process that waits, which ends this one
     try:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the process that waits, which ends this one
+        _end_with(parent)
+        for read in others:  # a pipe breaks only when nobody can read it: this process must not keep any open
+            read.close()
         answer.send(call())
     finally:
+        os._exit(0)
+
+
+def _end_with(parent: int) -> None:
+    """This process ends when its parent does, or the parent's thread that began it, whatever ends that."""
+    if LIBC is not None:
+        LIBC.prctl(PR_SET_PDEATHSIG, ctypes.c_ulong(signal.SIGKILL))
+    if os.getppid() != parent:  # it had ended before
         os._exit(0)

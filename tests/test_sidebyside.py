@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -45,14 +49,86 @@ def test_what_a_process_does_not_finish_is_done_here(tmp_path: Path) -> None:
         list(forked(calls))
 
 
+@pytest.mark.parametrize("granted", [[], [1, 4]], ids=["none", "some"])
+def test_what_no_process_can_be_had_for_is_done_here(granted: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    def refusing() -> int:
+        asked.append(len(asked))
+        if asked[-1] not in granted:
+            raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+        return fork()
+
+    fork = os.fork
+    asked: list[int] = []
+    monkeypatch.setattr(os, "fork", refusing)
+    assert list(forked([partial(int, k) for k in range(7)])) == list(range(7))
+    assert len(asked) == (7 if cores() > 1 else 0)
+
+
 def test_nothing_is_left_running_behind_an_interrupt(tmp_path: Path) -> None:
     def waits(name: str) -> None:
-        (tmp_path / name).write_text(str(os.getpid()))
+        (tmp_path / name).write_text(f"{os.getpid()}\n")
         signal.pause()
 
     answers = forked([lambda: None, partial(waits, "second"), partial(waits, "third")])
     next(answers)
+    begun = _pids(tmp_path, min(cores(), 3) - 1)
     answers.close()  # type: ignore[attr-defined]
-    for path in tmp_path.iterdir():
+    for pid in begun:
         with pytest.raises(ProcessLookupError):
-            os.kill(int(path.read_text()), 0)
+            os.kill(pid, 0)
+
+
+# The first call's answer is taken, the two others' are more than a pipe holds and never read.
+STALLED = """
+import os, pathlib, signal
+from functools import partial
+from excite import sidebyside
+
+def large(name):
+    (pathlib.Path({folder!r}) / name).write_text(f"{{os.getpid()}}\\n")
+    return bytes(10_000_000)
+
+sidebyside.cores = lambda: 3
+{also}
+answers = sidebyside.forked([int, partial(large, "second"), partial(large, "third")])
+next(answers)
+signal.pause()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
+@pytest.mark.parametrize("also", ["", "sidebyside._end_with = lambda parent: None"], ids=["signal", "pipe"])
+def test_nothing_is_left_running_behind_a_parent_that_is_killed(tmp_path: Path, also: str) -> None:
+    script = STALLED.format(folder=str(tmp_path), also=also)
+    with subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parents[1]) as parent:
+        try:
+            begun = _pids(tmp_path, 2)
+        finally:
+            parent.kill()
+    _until(lambda: not any(_runs(pid) for pid in begun), f"one of {begun} still runs")
+
+
+def _pids(folder: Path, count: int) -> list[int]:
+    """What the files of a folder hold, once that many are written."""
+
+    def told() -> list[str]:
+        return [text for path in folder.iterdir() if (text := path.read_text()).endswith("\n")]
+
+    _until(lambda: len(told()) >= count, f"fewer than {count} processes began")
+    assert len(told()) == count
+    return [int(text) for text in told()]
+
+
+def _until(holds: Callable[[], bool], otherwise: str, seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < deadline, otherwise
+        time.sleep(0.01)
+
+
+def _runs(pid: int) -> bool:
+    """Whether a process is there and not merely waiting for somebody to ask how it ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
