@@ -28,7 +28,7 @@ import scipy
 from excite import interior, manoeuvre, objective, smoothing
 from excite.aim import aim
 from excite.collocation import UnsettledError, settle, transcribe
-from excite.continuation import MARGIN, TOLERANCE, Candidate, Track, land, soften, typical_sizes, verdict
+from excite.continuation import MARGIN, TOLERANCE, Candidate, Track, land, rest_band, soften, typical_sizes, verdict
 from excite.design import design, processes
 from excite.driver import follow
 from excite.limit import check, limits, symbols
@@ -368,10 +368,10 @@ def _nearest(
             soften(model, friction, slip),
             problem,
             track.sizes,
-            max(4, round((len(times) - 1) / coarse)),
+            max(4, round((len(times) - 1) / coarse)),  # as few as knots() gives
             elements=1 if attempt == 0 else 3,
             with_pose=on_lane,
-            rest=2 * friction if friction > 1 else 1.0,
+            rest=rest_band(friction),
             weights=np.empty((0, len(model.coordinates))),  # information isn't looked at
         )
         if states is None:
@@ -389,7 +389,7 @@ def _nearest(
             np.tile(moved_in, (tr.intervals, tr.nodes, 1)),
             np.tile([1e-4 + 2 * margins.get(name, 0.0) for name in tr.control_names], (tr.intervals, 1)),
             np.array([name.startswith("lane") for name in tr.limit_names], bool),
-            coarse,  # knots in one: the distance stays the same
+            (len(times) - 1) / tr.intervals,  # knots in one: the distance stays the same
             goal,
         )
         levels = (interior.Level(1.0, 1e-3, 1e-2, 40), interior.Level(1.0, 1e-4, 1e-3, 20))
@@ -397,7 +397,9 @@ def _nearest(
             point = interior.begin(tr, task, start, settle(tr, start, U, Z), U, 1e-3, 0.05)
             point, _ = interior.minimise(tr, task, point, levels if friction == 1 else levels[:1])
         except UnsettledError:
-            return None
+            if friction == 1:
+                return None
+            continue  # a soft machine only shows the way; the sharp one may follow without it
         known, states, start = nodes, point.Z.reshape(-1, tr.n_z), point.start
         moved = Manoeuvre(at, (point.U - goal) * tr.torque_scale)
     try:

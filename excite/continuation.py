@@ -313,7 +313,6 @@ def _advance(
     knots = len(_knots(problem)) - 1
     intervals = max(4, round(knots / stage.coarse))
     softer = soften(model, stage.friction, stage.slip)
-    rest = 2 * stage.friction if stage.friction > 1 else 1.0
     tr = transcribe(
         softer,
         problem,
@@ -321,7 +320,7 @@ def _advance(
         intervals,
         elements=stage.elements,
         with_pose=track.pose is not None,
-        rest=rest,
+        rest=rest_band(stage.friction),
         weights=aim.rows,
     )
     times = np.linspace(0, float(problem.duration_s), intervals + 1)
@@ -429,6 +428,15 @@ def verdict(model: Model, problem: Problem, aim: Aim, drive: Manoeuvre) -> tuple
     if aim.sigma_max is not None:
         violations[SIGMA_MAX] = max(0.0, judged.worst_percent / aim.sigma_max - 1)
     return Candidate(drive, start, judged.score, violations), motion
+
+
+def rest_band(friction: float) -> float:
+    """How many times wider than usual the band is that counts as rest, for a machine of that friction.
+
+    Near standstill a soft machine's friction only damps, so what it is left with when the torques end grows with the
+    width of the transition. No verdict is spoken on it, so it need not leave that much of the tolerance unused: 2.
+    """
+    return 2 * friction if friction > 1 else 1.0
 
 
 def soften(model: Model, friction: float, slip: float) -> Model:

@@ -12,7 +12,8 @@ import pytest
 from conftest import Excite
 
 from excite import objective
-from excite.compare import OURS, USUAL, Comparison, _equal, _Sample, compare, judge, shrunk, within
+from excite.collocation import Transcription, UnsettledError, settle
+from excite.compare import OURS, USUAL, WAY, Comparison, _equal, _Sample, compare, judge, shrunk, within
 from excite.continuation import TOLERANCE
 from excite.design import processes
 from excite.limit import check
@@ -95,6 +96,28 @@ def test_a_drive_that_ends_far_from_rest_is_brought_inside(va12: Model) -> None:
     full = [float(b.limit.torque or 1.0) for b in va12.machine.actuated]
     moved = (found.manoeuvre.torque - small.torque) / full
     assert np.sqrt((moved**2).mean()) < 0.05
+
+
+def test_soft_machines_that_do_not_follow_leave_it_to_the_sharp_one(
+    straight: Model, problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def settled(tr: Transcription, *args: np.ndarray) -> np.ndarray:
+        asked.append(tr.intervals)
+        if len(asked) <= refused:
+            raise UnsettledError("no motion follows")
+        return settle(tr, *args)
+
+    wish = multisine(straight, problem, 2)
+    before, _ = judge(straight, problem, shrunk(straight, problem, wish))
+    assert not before.feasible
+    asked: list[int] = []
+    monkeypatch.setattr("excite.compare.settle", settled)
+    refused = len(WAY) - 1
+    assert within(straight, problem, wish).feasible
+    asked.clear()
+    refused = len(WAY)
+    assert within(straight, problem, wish).violations == before.violations
+    assert len(asked) == len(WAY)
 
 
 def test_scaling_down_keeps_shape_and_limits(straight: Model, problem: Problem) -> None:
