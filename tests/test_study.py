@@ -618,12 +618,18 @@ class Command:
         self.run = subprocess.Popen(command, cwd=file.parent, env=env, stderr=subprocess.PIPE, text=True)
 
     def midway(self, rows: int) -> int:
-        """Waits until so many rows are kept; how many there are then."""
+        """Waits until so many rows are kept; how many there are then.
+
+        The store is locked, so this looks past its lock and may see a batch that is being written: it is kept for sure
+        once another one follows."""
         begin = time.monotonic()
-        while (kept := kept_rows(self.out)) < rows:
-            assert self.run.poll() is None, f"ended with {kept} rows, too early to be disturbed"
+        kept, seen = 0, kept_rows(self.out)
+        while kept < rows:
+            assert self.run.poll() is None, f"ended with {seen} rows, too early to be disturbed"
             assert time.monotonic() - begin < 300
             time.sleep(0.02)
+            if (now := kept_rows(self.out)) > seen:
+                kept, seen = seen, now
         assert kept < RUNS
         return kept
 
