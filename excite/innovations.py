@@ -28,6 +28,11 @@ class Step:
     root: np.ndarray
     used: np.ndarray
 
+    @property
+    def variance(self) -> np.ndarray:
+        """Of the innovations before whitening (K, m)."""
+        return np.diagonal(self.root @ self.root.transpose(0, 2, 1), axis1=1, axis2=2)
+
 
 def innovations(linear: Linear) -> np.ndarray:
     """Each reading less its prediction from all before it, over its standard deviation (N, m); NaN where unused."""
@@ -35,8 +40,7 @@ def innovations(linear: Linear) -> np.ndarray:
     x = _before(linear)
     for step in linear.filter:
         e = linear.residual[step.at, :, None] - linear.H[step.at] @ x[step.going, :, None]
-        size = np.sqrt(np.diagonal(step.root @ step.root.transpose(0, 2, 1), axis1=1, axis2=2))
-        z[step.at] = np.where(step.used, e[:, :, 0] / size, np.nan)
+        z[step.at] = np.where(step.used, e[:, :, 0] / np.sqrt(step.variance), np.nan)
         A, b = _leading(linear, step)
         x[step.going] = (A @ (x[step.going, :, None] + step.gain @ e))[:, :, 0] + b[:, :, 0]
     return z
@@ -47,8 +51,7 @@ def innovation_sizes(linear: Linear) -> np.ndarray:
     1 where model and noise are right; and the number of blocks: (m, 3)."""
     z, allowed = linear.innovations, np.ones(linear.residual.shape)
     for step in linear.filter if _beats(linear) else ():
-        size = np.diagonal(step.root @ step.root.transpose(0, 2, 1), axis1=1, axis2=2)
-        allowed[step.at] += _added(linear, step) / size
+        allowed[step.at] += _added(linear, step) / step.variance
     sizes = np.zeros((z.shape[1], 3))
     for j, column in enumerate(z.T):
         told = np.flatnonzero(np.isfinite(column))
@@ -61,11 +64,9 @@ def innovation_sizes(linear: Linear) -> np.ndarray:
 
 def excess(linear: Linear) -> np.ndarray:
     """By how much the variance of whitened innovations (N, m) exceeds one where encoders beat."""
-    N, m = linear.residual.shape
-    out = np.zeros((N, m))
+    out = np.zeros_like(linear.residual)
     for step in linear.filter if _beats(linear) else ():
-        whitens = np.linalg.solve(step.root, np.broadcast_to(np.eye(m), step.root.shape))
-        out[step.at] = (whitens**2 @ _added(linear, step)[:, :, None])[:, :, 0]
+        out[step.at] = (np.linalg.inv(step.root) ** 2 @ _added(linear, step)[:, :, None])[:, :, 0]
     return out
 
 

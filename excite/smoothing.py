@@ -120,11 +120,6 @@ class Linear:
         return innovations(self)
 
     @cached_property
-    def excess(self) -> np.ndarray:
-        """By how much the whitened innovations' variance (N, m) exceeds one, for beats."""
-        return excess(self)
-
-    @cached_property
     def filter(self) -> list[Step]:
         """The Kalman filter's steps along the log."""
         return steps(self)
@@ -344,7 +339,7 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
     information[np.diag_indices(len(information))] += np.concatenate(
         [np.full(len(X), PRIOR**-2), np.ones(len(r.origin))]
     )
-    return np.asarray(np.linalg.inv(information)[: len(X), : len(X)] * np.outer(model.scale, model.scale))
+    return _base(c, np.linalg.inv(information))
 
 
 def linearise(
@@ -522,15 +517,13 @@ def iterate(
         # What this step will have left undone, if steps go on shrinking as they do.
         ratio = min(max(step / before, 1 - whole), 0.9)
         if (step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED) or (disturbed > 0 and step < enough):
-            base = _base(c, records, linear, covariance)
+            base = _base(c, _widened(c, records, linear, covariance))
             return Fit(there[1], base, unseen, tuple(there[0]), tuple(linear), cost, disturbed)
     stood = None
     if linear is not None:
         if step < NEARLY:
-            base = _base(c, records, linear, covariance)
-        else:
-            base = covariance[: len(X), : len(X)] * np.outer(model.scale, model.scale)
-        stood = Fit(X, base, unseen, tuple(points), tuple(linear), cost, disturbed)
+            covariance = _widened(c, records, linear, covariance)
+        stood = Fit(X, _base(c, covariance), unseen, tuple(points), tuple(linear), cost, disturbed)
     raise NotConverged(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
         " log with `excite diagnose`, or start from better values in the machine file",
@@ -574,11 +567,8 @@ def _parameters(
     """Covariance of all parameters and offsets (scaled), the step of those of each log, the largest of a parameter in
     standard deviations as it would be undamped, and the cost behind that step. Damping (Levenberg): what a log shows
     badly moves in small steps while the rest is still wrong. prior (n_base,): information about nominal."""
-    n = len(X)
-    places, size = [], n
-    for r in records:
-        places.append(np.concatenate([np.arange(n), np.arange(size, size + len(r.origin))]))
-        size += len(r.origin)
+    n, places = len(X), _places(c, records)
+    size = n + sum(len(r.origin) for r in records)
     information, slope = np.zeros((size, size)), np.zeros(size)
     information[range(n), range(n)] = prior
     off = (X - c.model.nominal) / c.model.scale
@@ -603,24 +593,33 @@ def _parameters(
     return covariance, [step[place] for place in places], left, cost
 
 
-def _base(c: Chart, records: Sequence[Record], linear: Sequence[Linear], covariance: np.ndarray) -> np.ndarray:
-    """Covariance (n_base, n_base) [SI] of an estimate from that of all parameters and offsets as the weights have it.
+def _places(c: Chart, records: Sequence[Record]) -> list[np.ndarray]:
+    """Where the parameters and each log's offsets stand among those of all logs."""
+    n = len(c.model.scale)
+    ends = n + np.cumsum([len(r.origin) for r in records])
+    return [np.r_[0:n, end - len(r.origin) : end] for r, end in zip(records, ends, strict=True)]
 
-    With weights that don't count beats, what these add to the noise goes through the estimate as it was weighed (the
-    sandwich of White, Econometrica 48 (1980) 817), every innovation on its own. Beats are slow and add more to what
-    only slow motion shows than white noise as large would: taken through the filter as white they are too few for
-    mass and inertia. On its own each is about right there; friction and offsets on steady drives come out too wide.
+
+def _widened(c: Chart, records: Sequence[Record], linear: Sequence[Linear], covariance: np.ndarray) -> np.ndarray:
+    """Covariance of all parameters and offsets (scaled) with what the weights don't count.
+
+    What beats add to the noise goes through the estimate as it was weighed (the sandwich of White, Econometrica 48
+    (1980) 817), every innovation on its own. Beats are slow and add more to what only slow motion shows than white
+    noise as large would: taken through the filter as white they are too few for mass and inertia. On its own each is
+    about right there; friction and offsets on steady drives come out too wide.
     """
-    n = size = len(c.model.scale)
     added = np.zeros_like(covariance)
-    for found, r in zip(linear, records, strict=True):
-        place = np.concatenate([np.arange(n), np.arange(size, size + len(r.origin))])
-        size += len(r.origin)
+    for found, r, place in zip(linear, records, _places(c, records), strict=True):
         if r.unbiased:
             E = sensitivity(found, c.flawed)
-            added[np.ix_(place, place)] += E.T @ (E * found.excess.reshape(-1, 1))
-    whole = covariance + covariance @ added @ covariance
-    return np.asarray(whole[:n, :n] * np.outer(c.model.scale, c.model.scale))
+            added[np.ix_(place, place)] += E.T @ (E * excess(found).reshape(-1, 1))
+    return np.asarray(covariance + covariance @ added @ covariance)
+
+
+def _base(c: Chart, covariance: np.ndarray) -> np.ndarray:
+    """The base parameters' part (n_base, n_base) [SI] of a scaled covariance of them and of offsets."""
+    scale = c.model.scale
+    return np.asarray(covariance[: len(scale), : len(scale)] * np.outer(scale, scale))
 
 
 def _moved(c: Chart, r: Record, p: Point, linear: Linear, move: np.ndarray) -> Point:
