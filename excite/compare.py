@@ -30,6 +30,7 @@ from excite.aim import aim
 from excite.collocation import UnsettledError, settle, transcribe
 from excite.continuation import MARGIN, TOLERANCE, Candidate, Track, land, rest_band, soften, typical_sizes, verdict
 from excite.design import design, processes
+from excite.drive import turns_left
 from excite.driver import follow
 from excite.limit import check, limits, symbols
 from excite.manoeuvre import Manoeuvre, scaled
@@ -156,17 +157,11 @@ def hand_made(model: Model, problem: Problem, seed: int, seconds: float) -> Mano
 
 def _leftward(model: Model, joints: Sequence[Body]) -> list[int]:
     """Which way each joint turns the machine when it goes forward, against the first one's: 1 the same way, -1 the
-    other. From pure rolling: the lateral speeds of all contacts vanish, which is linear in the chassis' speeds."""
-    rows = [k for k, s in enumerate(model.slips) if s.startswith("gy")]
-    if len(joints) < 2 or len(rows) < 2:
+    other."""
+    if len(joints) < 2 or sum(s.startswith("gy") for s in model.slips) < 2:
         return [1] * len(joints)
-    turns = []
-    for b in joints:
-        q = np.zeros(len(model.coordinates))
-        q[model.coordinates.index(b.coordinates[0])] = 0.1
-        lateral = [model.kinematics(q, 1e-3 * nu)[1].full()[rows, 0] for nu in np.eye(len(q))[:3]]
-        turns.append(np.linalg.lstsq(np.column_stack(lateral[1:]), -lateral[0], rcond=None)[0][1])
-    return [1 if turn * turns[0] >= 0 else -1 for turn in turns]
+    ways = [turns_left(model, b) for b in joints]
+    return [ways[0] * way for way in ways]
 
 
 def _sides(model: Model) -> np.ndarray:

@@ -103,10 +103,10 @@ def levers(model: Model) -> tuple[Lever, ...]:
     """The joints that a person steers, none on a straight lane. Raises DriveError where nobody drives: no wheels."""
     if not model.machine.planar or not model.machine.contacts:
         raise DriveError(f"{model.machine.name}: touches the ground nowhere, so there is nobody to drive it")
-    return tuple(Lever(b, _turns_left(model, b)) for b in model.machine.actuated if b.contact is None)
+    return tuple(Lever(b, turns_left(model, b)) for b in model.machine.actuated if b.contact is None)
 
 
-def _turns_left(model: Model, body: Body) -> int:
+def turns_left(model: Model, body: Body) -> int:
     """The sign of a joint's angle that, alone, turns the machine left when rolling forward.
 
     From pure rolling: the lateral speeds of all contacts vanish, which is linear in the chassis' speeds.
