@@ -15,8 +15,8 @@ import scipy.signal
 import scipy.stats
 
 from excite.log import Log
+from excite.newton import Fit
 from excite.processing import white_noise
-from excite.smoothing import Fit
 from model.machine import Machine, Sensor
 
 ALARM = 1e-4  # chance of a false alarm of each test in a log

@@ -26,6 +26,7 @@ from model.prediction import Model, build
 
 DONE, FAILED, DEFECT = STATUSES = ("done", "failed", "defect")
 Row = dict[str, Any]
+ESTIMATES = ("value", "std", "low95", "high95")  # told of every parameter
 _ALONE = threading.Lock()  # CasADi's functions are not made for the threads of a cluster's worker
 
 
@@ -104,8 +105,8 @@ def _run(work: Work, seed: int) -> Row:
     if steps & {"identify", "verify"}:
         measured = log.check(table, known.machine, identify.needed_sensors(known, work.method))
         estimate = identify.identify(known, [measured], work.method)
-        row["value"], row["std"] = _plain(estimate.value.tolist()), _plain(estimate.std.tolist())
-        row["quantile95"] = _plain(estimate.quantile95)
+        told = (estimate.value, estimate.std, *estimate.interval95)
+        row |= {name: _plain(numbers.tolist()) for name, numbers in zip(ESTIMATES, told, strict=True)}
         row["relative_error_percent"] = _plain(estimate.relative_error_percent)
     if "diagnose" in steps:
         needs = identify.needed_sensors(known, "joint")

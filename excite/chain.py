@@ -58,22 +58,21 @@ class Section:
     levels: tuple[_Level, ...]
 
     def between(self, weights: np.ndarray, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """States and slopes (K - 1, n) between the stages, for the state (n,) before the first and the slope (n,)
-        behind the last."""
-        n = len(left)
-        ins, outs = left.reshape(1, n, 1), right.reshape(1, n, 1)
+        """States and slopes (K - 1, n, w) between the stages for weights (c, w) of the columns, the state (n, w) before
+        the first and the slope (n, w) behind the last."""
+        ins, outs = left[None], right[None]
         for level in reversed(self.levels):
             pairs = len(level.G)
             i, j = level.first, level.second
-            ahead = j.A.transpose(0, 2, 1) @ outs[:pairs] + (j.eta @ weights)[:, :, None]
-            x = level.G @ (i.A @ ins[:pairs] + (i.b @ weights)[:, :, None] + i.C @ ahead)
-            before, behind = np.empty((2, level.count, n, 1))
+            ahead = j.A.transpose(0, 2, 1) @ outs[:pairs] + j.eta @ weights
+            x = level.G @ (i.A @ ins[:pairs] + i.b @ weights + i.C @ ahead)
+            before, behind = np.empty((2, level.count, *left.shape))
             before[0 : 2 * pairs : 2], before[1 : 2 * pairs : 2] = ins[:pairs], x
             behind[0 : 2 * pairs : 2], behind[1 : 2 * pairs : 2] = ahead - j.J @ x, outs[:pairs]
             if level.count % 2:
                 before[-1], behind[-1] = ins[-1], outs[-1]
             ins, outs = before, behind
-        return ins[1:, :, 0], outs[:-1, :, 0]
+        return ins[1:], outs[:-1]
 
 
 @dataclass(frozen=True)
@@ -98,10 +97,18 @@ class Solved:
 
         The random part e of a stage is C times the slope behind it.
         """
-        weights = np.concatenate([[1.0], p])
-        zero = np.zeros(self.top.whole.A.shape[1])
+        states, slopes = self._weighed(np.concatenate([[1.0], p])[:, None])
+        return states[:, :, 0], slopes[:, :, 0]
+
+    def slopes(self, of: slice) -> np.ndarray:
+        """How the most likely states move with some of the parameters (K - 1, n, w)."""
+        return self._weighed(np.eye(len(self.Z))[:, 1:][:, of])[0]
+
+    def _weighed(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Most likely states and slopes (K - 1, n, w) for weights (c, w) of the columns of b and eta."""
+        zero = np.zeros((self.top.whole.A.shape[1], weights.shape[1]))
         inner = self.top.between(weights, zero, zero)
-        before, behind = np.vstack([zero, inner[0]]), np.vstack([inner[1], zero])
+        before, behind = np.concatenate([zero[None], inner[0]]), np.concatenate([inner[1], zero[None]])
         states: list[np.ndarray] = []
         slopes: list[np.ndarray] = []
         for part, left, right in zip(self.parts, before, behind, strict=True):

@@ -15,14 +15,14 @@ from functools import partial
 import numpy as np
 import scipy.stats
 
-from excite import evidence, hidden, smoothing
+from excite import evidence, hidden, newton, smoothing
 from excite.anomaly import anomalies
 from excite.innovations import innovation_sizes
 from excite.linearise import Chart, chart
 from excite.log import Log
+from excite.newton import Fit, NotConverged
 from excite.record import Point, Record, carried, common_sensors, first_point, origins, record
 from excite.sidebyside import Together, in_turn
-from excite.smoothing import Fit, NotConverged
 from model import effects
 from model.machine import EffectEntry, Filter, Machine, Quantity
 from model.prediction import Model, build
@@ -358,7 +358,7 @@ def _resume(prepared: Prepared, of: Stage, disturbed: float) -> Fit:
     X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, c.model.nominal, strict=True)])
     points = [carried(c, r, p, of.prepared.c, X) for r, p in zip(prepared.records, of.fit.points, strict=True)]
     try:
-        fit = _iterated(prepared, points, X, disturbed, smoothing.RESUMED, PASSES)
+        fit = _iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES)
     except NotConverged as failed:
         if failed.nearly is None:
             raise
@@ -371,13 +371,13 @@ def _iterated(
     points: Sequence[Point],
     X: np.ndarray,
     disturbed: float,
-    damping: float = smoothing.DAMPING[0],
-    passes: int = smoothing.PASSES,
+    damping: float = newton.DAMPING[0],
+    passes: int = newton.PASSES,
 ) -> Fit:
     """A fit from points and X. With disturbing forces it is found as soon as it is nearly: gains are larger by far than
     what another pass would change. Raises NotConverged."""
     p = prepared
-    return smoothing.iterate(p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, smoothing.NEARLY)
+    return newton.iterate(p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, newton.NEARLY)
 
 
 def light(fit: Fit) -> Fit:

@@ -24,7 +24,8 @@ class Estimate:
     value, std (n,) [SI] by `names`; an unidentifiable parameter has NaN in both and its reason in `unidentifiable`.
     covariance (n, n). cond_w, cond_phi: condition numbers of W and W diag(value). residual (rows, N): filtered,
     decimated. degrees: of freedom of the residual. bias, bias_std (n,) [SI]: mean error of the method on simulated logs
-    of the identified machine and how well it is known, where somebody asked for it.
+    of the identified machine and how well it is known, where somebody asked for it. sides (2, n) [SI]: standard
+    deviations below and above where the likelihood is lopsided; std lies between them.
     """
 
     method: str
@@ -41,6 +42,7 @@ class Estimate:
     notes: tuple[str, ...]
     bias: np.ndarray | None = None
     bias_std: np.ndarray | None = None
+    sides: np.ndarray | None = None
 
     @property
     def std(self) -> np.ndarray:
@@ -56,6 +58,12 @@ class Estimate:
     def quantile95(self) -> float:
         """Half width of the 95 % interval in standard deviations."""
         return float(scipy.stats.t.ppf(0.975, max(self.degrees, 1)))
+
+    @property
+    def interval95(self) -> np.ndarray:
+        """Ends of the 95 % intervals (2, n) [SI]."""
+        below, above = (self.std, self.std) if self.sides is None else self.sides
+        return np.array([self.value - self.quantile95 * below, self.value + self.quantile95 * above])
 
 
 def noted(estimate: Estimate, *notes: str) -> Estimate:

@@ -16,7 +16,7 @@ from itertools import product
 import casadi as ca
 import numpy as np
 
-from excite import smoothing
+from excite import newton
 from excite.innovations import whitened
 from excite.linearise import BATCH, Batch, Chart, Slopes, differentiate
 from excite.processing import implicit
@@ -142,7 +142,7 @@ def renumbered(found: Sequence[Candidate]) -> list[Candidate]:
 class Signatures:
     """The signatures of candidates along one fitted log."""
 
-    def __init__(self, c: Chart, r: Record, fit: smoothing.Fit, log: int, found: Sequence[Candidate]) -> None:
+    def __init__(self, c: Chart, r: Record, fit: newton.Fit, log: int, found: Sequence[Candidate]) -> None:
         model, p = c.model, fit.points[log]
         self.chart, self.columns = c, sum(len(x.columns) for x in found)
         every: list[Placed] = []
@@ -175,7 +175,7 @@ class Signatures:
     def along(self, X: np.ndarray, r: Record, p: Point) -> tuple[np.ndarray, np.ndarray]:
         """What signatures do to the scaled state behind each sample (N - 1, n, C), and to readings (N, m, C)."""
         c, N = self.chart, len(p.s)
-        u, scale = self.samples[3], smoothing.state_scale(c)[:, None]
+        u, scale = self.samples[3], newton.state_scale(c)[:, None]
         push = np.empty((N - 1, c.n, self.columns), np.float32)
         reading = np.empty((N, len(c.sensors), self.columns), np.float32)
         for at in range(0, N - 1, BATCH):
@@ -224,10 +224,10 @@ def remembered(
     return implicit(flow, np.zeros(n_z), np.hstack([q, nu, u, t[:, None]]), float(t[1] - t[0]))
 
 
-def scan(c: Chart, records: Sequence[Record], fit: smoothing.Fit, found: Sequence[Candidate]) -> Scan:
+def scan(c: Chart, records: Sequence[Record], fit: newton.Fit, found: Sequence[Candidate]) -> Scan:
     """The score of every candidate along fitted logs, best first."""
     total, n = sum(len(x.columns) for x in found), len(fit.X)
-    prior = np.where(fit.unseen, smoothing.HELD**-2, smoothing.PRIOR**-2)
+    prior = np.where(fit.unseen, newton.HELD**-2, newton.PRIOR**-2)
     Z = np.zeros((1 + n + total, 1 + n + total))
     for k, (r, linear) in enumerate(zip(records, fit.linear, strict=True)):
         made = Signatures(c, r, fit, k, found)

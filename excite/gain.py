@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from excite import smoothing
+from excite import newton
 from excite.diagnose import Stage
+from excite.newton import Fit, NotConverged
 from excite.record import readings
-from excite.smoothing import Fit, NotConverged
 
 HIDDEN, PERIOD = 2.0, 6.0  # [s] withheld of every so many
 LOOSER = 0.1, 1.0, 4.0  # disturbing forces that are tried where a wrong model finds no fit to what isn't withheld
@@ -80,7 +80,7 @@ def withheld(stage: Stage) -> Withheld | None:
     rest: Fit | None = None
     for disturbed in (fit.disturbed, *(x for x in LOOSER if x > fit.disturbed)):
         try:
-            rest = smoothing.iterate(
+            rest = newton.iterate(
                 c,
                 masked,
                 fit.points,
@@ -88,8 +88,8 @@ def withheld(stage: Stage) -> Withheld | None:
                 prepared.starts,
                 disturbed,
                 prepared.held | fit.unseen,
-                smoothing.RESUMED,
-                enough=smoothing.NEARLY,
+                newton.RESUMED,
+                enough=newton.NEARLY,
             )
         except NotConverged as failed:
             rest = failed.nearly

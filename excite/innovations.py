@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from excite.smoothing import Linear
+    from excite.newton import Linear
 
 SLOW = 25  # readings whose mean counts as slow
 
@@ -62,14 +62,6 @@ def innovation_sizes(linear: Linear) -> np.ndarray:
     return sizes
 
 
-def excess(linear: Linear) -> np.ndarray:
-    """By how much the variance of whitened innovations (N, m) exceeds one where encoders beat."""
-    out = np.zeros_like(linear.residual)
-    for step in linear.filter if _beats(linear) else ():
-        out[step.at] = (np.linalg.inv(step.root) ** 2 @ _added(linear, step)[:, :, None])[:, :, 0]
-    return out
-
-
 def _beats(linear: Linear) -> bool:
     return bool((linear.beats != 1).any())
 
@@ -77,12 +69,6 @@ def _beats(linear: Linear) -> bool:
 def _added(linear: Linear, step: Step) -> np.ndarray:
     """What beats add to the variance of a step's readings (K, m)."""
     return (linear.beats[step.at] - 1) / np.where(step.used, linear.weight[step.at], np.inf)
-
-
-def sensitivity(linear: Linear, flawed: tuple[int, ...]) -> np.ndarray:
-    """How whitened innovations move with parameters and offsets, (N m, n_p + n_o), but for the sign."""
-    N, m, n = linear.H.shape
-    return whitened(linear, flawed, np.zeros((N - 1, n, 0)), np.zeros((N, m, 0)))[:, 1:]
 
 
 def whitened(linear: Linear, flawed: tuple[int, ...], push: np.ndarray, reading: np.ndarray) -> np.ndarray:

@@ -16,8 +16,8 @@ import scipy
 from excite import smoothing
 from excite.diagnose import Stage, refits
 from excite.linearise import advance, differentiate
+from excite.newton import Linear, state_scale
 from excite.sidebyside import Together
-from excite.smoothing import Linear, state_scale
 
 BLOCK_S = 0.25  # [s] over which slow errors are means
 BINS = 24  # of a quantity

@@ -52,7 +52,6 @@ ABOUT = {
     "status": pa.string(),
     "reason": pa.string(),
     "log_sha256": pa.string(),
-    "quantile95": pa.float64(),
     "relative_error_percent": pa.float64(),
     "verdict": pa.string(),
     "findings": pa.string(),
@@ -102,7 +101,7 @@ def write_table(
     track(k): drive k, None where there is none; files: each machine's name or file for the commands.
     """
     names = list(dict.fromkeys(n for names in wanted.parameters.values() for n in names))
-    estimates = {f"{kind}.{n}": pa.float64() for kind in ("value", "std", "true") for n in names}
+    estimates = {f"{kind}.{n}": pa.float64() for kind in (*cells.ESTIMATES, "true") for n in names}
     if not set(wanted.study.steps) & {"identify", "verify"}:
         estimates = {}
     schema = pa.schema(ABOUT | estimates, metadata={"study": wanted.study.name, "program": cells.program()})
@@ -167,7 +166,7 @@ def _line(wanted: Plan, number: int, cell: Cell, about: Row, row: Row, seed: int
     if "findings" in row:
         line["findings"] = json.dumps(row["findings"])
     names = wanted.parameters[cell.drive.machine]
-    for kind in ("value", "std"):
+    for kind in cells.ESTIMATES:
         line |= {f"{kind}.{n}": x for n, x in zip(names, row.get(kind, ()), strict=False)}
     model = cells.model_of(wanted.machines[cell.drive.machine].model_dump_json())
     return line | {f"true.{n}": float(x) for n, x in zip(names, model.nominal, strict=True)}
@@ -178,11 +177,10 @@ def _seen(wanted: Plan, c: int, cell: Cell, track: Any, rows: Sequence[Row]) -> 
     table: dict[str, dict[str, float | str]] = {}
     if any("value" in row for row in rows):
         nothing = [None] * len(model.base.names)
-        value, std = (np.array([row.get(k, nothing) for row in rows], float) for k in ("value", "std"))
-        quantile = np.array([row.get("quantile95", np.nan) for row in rows], float)
+        value, std, *ends = (np.array([row.get(k, nothing) for row in rows], float) for k in cells.ESTIMATES)
         v = Verification(
             *(wanted.method(cell), cell.kit, model.base.names, model.base.units, model.nominal, model.scale),
-            *(value, std, quantile, {}),
+            *(value, std, np.stack(ends, axis=1), {}),
         )
         table = verify.summary(v)
     reasons = Counter(row["reason"] for row in rows if row.get("reason"))

@@ -278,18 +278,26 @@ def _identify(s: Summary) -> Said:
         errors = ", ".join(f"{n} {v:.1f} %" for n, v in check["torque_error_percent"].items())
         remarks.append(f"On {check['log']}, which it was not fitted on, torques are off by: {errors}.")
     biased = any("bias" in r for r in rows.values())
+    columns = (("value", 6), ("std", 3), ("std_percent", 3), ("low95", 4), ("high95", 4))
     table = tuple(
         (
             n,
             r["unit"],
-            rounded(r["value"], 6),
-            rounded(r["std"], 3),
-            rounded(r["std_percent"], 3),
+            *(rounded(r[k], d) for k, d in columns),
             *((rounded(r.get("bias"), 3),) if biased else ()),
         )
         for n, r in rows.items()
     )
-    names = ("parameter", "unit", "value", "std", "std %", *(("bias of the method",) if biased else ()))
+    names = (
+        "parameter",
+        "unit",
+        "value",
+        "std",
+        "std %",
+        "95 % from",
+        "to",
+        *(("bias of the method",) if biased else ()),
+    )
     conds = f"cond(W) {s['cond_w']:.4g}, cond(Phi) {s['cond_phi']:.4g}"
     caption = f"Parameters with one standard deviation, method {s['method']}; {conds}."
     return f"Parameters of {s['machine']}", answer, remarks, [Table(caption, names, table)]

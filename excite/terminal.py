@@ -142,11 +142,10 @@ def compare_table(summary: dict[str, Any]) -> None:
 
 def identify_table(summary: dict[str, Any]) -> None:
     """An estimate, a parameter a line, with what there is to remark."""
-    rows = table("parameter", "unit", "value", "std", "std %")
+    columns = (("value", 6), ("std", 3), ("std_percent", 3), ("low95", 4), ("high95", 4))
+    rows = table("parameter", "unit", "value", "std", "std %", "95 % from", "to")
     for name, row in summary["parameters"].items():
-        rows.add_row(
-            name, row["unit"], *(rounded(row[k], d) for k, d in (("value", 6), ("std", 3), ("std_percent", 3)))
-        )
+        rows.add_row(name, row["unit"], *(rounded(row[k], digits) for k, digits in columns))
     say(rows)
     say(
         f"method {summary['method']}: relative error {summary['relative_error_percent']:.2f} %,"

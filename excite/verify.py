@@ -19,7 +19,8 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Verification:
-    """N runs of one drive: value, std (runs, n) estimates and their own standard deviations; true (n,).
+    """N runs of one drive: value, std (runs, n) estimates and their own standard deviations, interval (runs, 2, n) the
+    ends of their 95 % intervals; true (n,).
 
     A run whose identification failed has NaN; `failures` says why, by run.
     """
@@ -32,7 +33,7 @@ class Verification:
     scale: np.ndarray
     value: np.ndarray
     std: np.ndarray
-    quantile: np.ndarray
+    interval: np.ndarray
     failures: dict[int, str]
 
     @property
@@ -53,8 +54,9 @@ class Verification:
     @property
     def covered(self) -> np.ndarray:
         """(runs, n) 1 where the 95 % interval holds the truth, 0 where not, NaN where there is no estimate."""
-        inside = np.abs(self.value - self.true) <= self.quantile[:, None] * self.std
-        return np.where(np.isfinite(self.value), inside.astype(float), np.nan)
+        low, high = self.interval.transpose(1, 0, 2)
+        inside = (low <= self.true) & (self.true <= high)
+        return np.where(np.isfinite(low), inside.astype(float), np.nan)
 
 
 def verify(
@@ -81,13 +83,13 @@ def verify(
         delayed(_run)(k, true, known, motion, method, kit, int(s)) for k, s in enumerate(seeds)
     )
     n = len(model.base.names)
-    value, std, quantile = np.full((runs, n), np.nan), np.full((runs, n), np.nan), np.full(runs, np.nan)
+    value, std, interval = (np.full((runs, *shape), np.nan) for shape in ((n,), (n,), (2, n)))
     failures: dict[int, str] = {}
     for done, (k, found, reason) in enumerate(work, 1):
         if found is None:
             failures[k] = reason
         else:
-            value[k], std[k], quantile[k] = found
+            value[k], std[k], interval[k] = found
         if progress is not None:
             progress(done, runs)
     return Verification(
@@ -99,12 +101,12 @@ def verify(
         model.scale,
         value,
         std,
-        quantile,
+        interval,
         dict(sorted(failures.items())),
     )
 
 
-Found = tuple[np.ndarray, np.ndarray, float]
+Found = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _run(
@@ -117,7 +119,7 @@ def _run(
         estimate = identify.identify(assumed, [measured], method)
     except identify.NoEstimate as err:
         return k, None, str(err)
-    return k, (estimate.value, estimate.std, estimate.quantile95), ""
+    return k, (estimate.value, estimate.std, estimate.interval95), ""
 
 
 @lru_cache(maxsize=4)

@@ -217,6 +217,8 @@ def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:
             "value": estimate.value[k],
             "std": estimate.std[k],
             "std_percent": estimate.std_percent[k],
+            "low95": estimate.interval95[0, k],
+            "high95": estimate.interval95[1, k],
         }
         if estimate.bias is not None and estimate.bias_std is not None:
             rows[name] |= {"bias": estimate.bias[k], "bias_std": estimate.bias_std[k]}

@@ -36,7 +36,7 @@ def test_a_gap_makes_two_logs(straight: Model, table: pd.DataFrame) -> None:
     assert notes == ["holed.csv: a gap (1.54 s before row 1701): identified from the 2 stretches between"]
     full, both = identify(straight, whole, "joint"), identify(straight, logs, "joint")
     assert np.sqrt(np.mean(((both.value - straight.nominal) / both.std) ** 2)) < 1.6
-    assert (both.std > 0.99 * full.std).all()
+    assert (both.std > 0.95 * full.std).all()  # counts of two stretches begin anew: a little more or less harm
     assert (both.std < 1.6 * full.std).all()
 
 

@@ -50,7 +50,7 @@ def test_summary_is_what_its_names_say() -> None:
         np.array([100.0]),
         np.array([[-90.0], [-100.0], [-104.0], [np.nan]]),
         np.array([[2.0], [2.0], [2.0], [np.nan]]),
-        np.full(4, 1.96),
+        np.array([[[-94.0], [-86.0]], [[-104.0], [-96.0]], [[-108.0], [-98.0]], [[np.nan], [np.nan]]]),
         {3: "no"},
     )
     row = summary(v)["K"]
@@ -58,7 +58,7 @@ def test_summary_is_what_its_names_say() -> None:
     assert row["bias_percent"] == pytest.approx(-2)  # too small in size
     assert row["std_percent"] == pytest.approx(np.std([-10, 0, 4], ddof=1))
     assert row["predicted_std_percent"] == pytest.approx(2)
-    assert row["coverage95"] == pytest.approx(1 / 3)
+    assert row["coverage95"] == pytest.approx(2 / 3)
 
 
 def test_no_runs_is_refused(straight: Model, straight_motion: Motion) -> None:

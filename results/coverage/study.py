@@ -121,7 +121,7 @@ def moved(name: str, nature: str, seed: int) -> Motion:
 
 
 def run(s: Set, seed: int) -> dict[str, object]:
-    """One simulation and identification: value, std, quantile, notes or failure, and seconds of identification."""
+    """One simulation and identification: value, std, interval, notes or failure, and seconds of identification."""
     rng = np.random.default_rng([seed, 1999])
     start = build(varied(nominal().machine, FAR if s.start == "far" else OFF, rng, corner=s.start == "far"))
     table = sensors.measure(natural(s.nature), moved(s.drive, s.nature, seed), kit=s.kit, seed=seed)
@@ -136,7 +136,7 @@ def run(s: Set, seed: int) -> dict[str, object]:
     return row | {
         "value": [float(f"{x:.9g}") for x in e.value],
         "std": [float(f"{x:.6g}") for x in e.std],
-        "quantile": e.quantile95,
+        "interval": [[float(f"{x:.9g}") for x in end] for end in e.interval95],
         "doubt": DOUBT in e.notes,
         "drawn": DRAWN in e.notes,
         "seconds": seconds,
@@ -170,12 +170,12 @@ def judged(s: Set, rows: Sequence[Mapping[str, object]]) -> dict[str, object]:
     """What a set's runs say: coverage, errors, failures, time."""
     good = [r for r in rows if "value" in r]
     value, std = (np.array([r[k] for r in good], float).reshape(len(good), -1) for k in ("value", "std"))
-    quantile = np.array([r["quantile"] for r in good], float)
+    low, high = np.array([r["interval"] for r in good], float).reshape(len(good), 2, -1).transpose(1, 0, 2)
     error = value - nominal().nominal
     # A parameter that a log doesn't show has no value, and counts in none of these.
     warnings.simplefilter("ignore", RuntimeWarning)
     known = np.where(np.isfinite(error), 1.0, np.nan)
-    inside = 100 * np.nanmean(known * (np.abs(error) <= quantile[:, None] * std), axis=0)
+    inside = 100 * np.nanmean(known * ((low <= nominal().nominal) & (nominal().nominal <= high)), axis=0)
     rms = 100 * np.sqrt(np.nanmean(error**2, axis=0)) / relative(nominal())
     least = bound(s)
     ratio = np.sqrt(np.nanmean((error / std) ** 2, axis=0))
