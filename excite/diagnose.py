@@ -42,6 +42,7 @@ CLOSE = 10.0  # a rival that is worse by less than this is a tie
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 SHAPE = 0.005, 0.002  # of what is explained already, that a further effect must gain, as nature is never exactly the
 # formula: by the fits' gains, and by how many deviations the amounts are from none
+ALIKE = 0.03  # of an amount: what two formulas of one effect differ by where each fits the log
 FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
 BESIDE = 250.0  # a gain that by the latter no effect can be denied
 CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
@@ -184,7 +185,7 @@ def diagnose(
     chosen, odd, nearest = weighed(before, chosen)
     if len(chosen) > 1:
         tell(0.9, "judging each given the others")
-        chosen, odd, nearest = weighed(before, reviewed(before, chosen, together))
+        chosen, odd, nearest = weighed(before, needed(reviewed(before, chosen, together)))
     stage = chosen[-1].stage if chosen else before
     answer = _verdict(before, stage, chosen, first, odd, left)
     return answer if answer.findings else replace(answer, nearest=nearest)
@@ -242,6 +243,27 @@ def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_tu
         gain = old.fit.cost - new.fit.cost if old.fit.disturbed == new.fit.disturbed else x.gain
         again.append(replace(x, stage=new, gain=max(gain, x.gain), rivals=_others(x, judged)))
     return again
+
+
+def needed(chosen: Sequence[Choice]) -> list[Choice]:
+    """Several effects without those that were needed on the way only: in the last fit their amount is hardly known to
+    be any, and without it the fit is as good. Disturbing forces hide what else a right name explains."""
+    kept = list(chosen)
+    for x in chosen:
+        stage = kept[-1].stage
+        names, fit = stage.model.base.names, stage.fit
+        placed = next(e for e in stage.model.effects if e.name == x.name)
+        k = names.index(x.name)
+        if len(kept) == 1 or placed.effect.inverse or (fit.X[k] / fit.std[k]) ** 2 > LEVEL:
+            continue
+        try:
+            without = _without(x.name, stage)
+        except NotConverged:
+            continue
+        if without.fit.disturbed <= fit.disturbed and without.fit.cost - fit.cost < LEVEL:
+            kept = [y for y in kept if y.name != x.name]
+            kept[-1] = replace(kept[-1], stage=without)
+    return kept
 
 
 def _others(choice: Choice, found: Container[str]) -> tuple[EffectEntry, ...]:
@@ -571,12 +593,13 @@ def _verdict(
 
 def _finding(choice: Choice, after: Stage, left: float) -> Finding:
     """A choice with amount and shapes as the last fit has them. The amount is as unsure as what is left says of the
-    formula: where that is a part of what the effect gains, about half its root is a part of the amount."""
+    formula: where that is a part of what the effect gains, about half its root is a part of the amount; and never surer
+    than another formula of the same effect would leave it."""
     placed = next(e for e in after.model.effects if e.name == choice.name)
     std = after.fit.std * after.doubt
     values = dict(zip(after.model.base.names, zip(after.fit.X, std, strict=True), strict=True))
     amount, sure = values[placed.name]
-    sure = float(np.hypot(sure, FORMULA * amount * np.sqrt(left / max(choice.gain, left, 1.0))))
+    sure = float(np.linalg.norm([sure, ALIKE * amount, FORMULA * amount * np.sqrt(left / max(choice.gain, left, 1.0))]))
     shapes = {
         s: (*values.get(f"{placed.name}.{s}", (placed.values[s], 0.0)), shape.unit)
         for s, shape in placed.effect.shapes.items()

@@ -123,6 +123,19 @@ def torque_deadband(s: Scene, place: str, A: float, draw: DRAW) -> None:
     s.torque[JOINTS[place]].append(lambda U: U - ca.fmax(ca.fmin(U, A), -A))
 
 
+def relief_valve(s: Scene, place: str, A: float, draw: DRAW) -> None:
+    """A worn valve begins to open at a pressure below the sensor's place in the line and is open a little above it:
+    of peaks a share is not delivered."""
+    top = draw.uniform(1300, 3000)
+    width = 0.03 * top
+
+    def left(U: ca.SX) -> ca.SX:
+        over = (ca.fabs(U) - top + ca.sqrt((ca.fabs(U) - top) ** 2 + width**2)) / 2
+        return U - A * over * ca.sign(U)
+
+    s.torque[JOINTS[place]].append(left)
+
+
 def pump_coupling(s: Scene, place: str, A: float, draw: DRAW) -> None:
     """A common pump: what the one motor draws changes the other's pressure, through a hose that takes its time."""
     time = draw.uniform(0.01, 0.04)
@@ -394,6 +407,7 @@ _TABLE: tuple[tuple[Hide, tuple[str, ...], str, dict[str, tuple[float, float]], 
     (articulation_stop_spring, ("articulation",), "N m/rad", {"": (4000, 40000)}, {}),
     (vibration_on, ROLLS, "-", {"": (0.04, 0.35)}, {}),
     (payload_shift, ("machine",), "kg m", {"": (120, 1000)}, {"signed": True}),
+    (relief_valve, ROLLS, "-", {"": (0.15, 1.0)}, {}),
 )
 CAUSES: dict[str, Cause] = {
     f.__name__: Cause(places, unit, amounts, f, **more) for f, places, unit, amounts, more in _TABLE

@@ -85,13 +85,6 @@ def clock_jitter(s: Scene, size: float, draw: DRAW) -> None:
     s.sensed.append(jitter)
 
 
-def relief_valve(s: Scene, size: float, draw: DRAW) -> None:
-    """A worn valve opens at a pressure below the sensor's place in the line: peaks are not delivered."""
-    j = int(draw.choice([0, 2]))
-    top = 5000 * (1 - 0.75 * size)
-    s.torque[j].append(lambda U: ca.fmax(ca.fmin(U, top), -top))
-
-
 def hose_spring(s: Scene, size: float, draw: DRAW) -> None:
     """Hoses across the articulation: a spring that keeps a memory of where it came from (Bouc-Wen)."""
     memory, width = s.state(), draw.uniform(0.04, 0.1)
@@ -167,7 +160,6 @@ SURPRISES: dict[str, Callable[[Scene, float, DRAW], None]] = {
         stuck_bit,
         warm_gain,
         clock_jitter,
-        relief_valve,
         hose_spring,
         roll_bounce,
         tow_rope,
