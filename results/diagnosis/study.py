@@ -3,7 +3,7 @@
 python results/diagnosis/study.py [--per-cause 12] [--nothing 200] [--per-surprise 6] [--pairs 30] [--jobs 2]
 rebuilds summary.json, cases.csv, confusion.png and README.md beside this file. Each case is kept in
 results/.diagnosis/ as soon as it is done, so an interrupted study goes on where it stopped; cases of other versions of
-the program are not used again.
+the program are not used again. `--jobs 0` reports what there is.
 """
 
 from __future__ import annotations
@@ -178,8 +178,8 @@ def confusion(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def told(s: dict[str, Any]) -> str:
-    """The README: what was done and what came out."""
+def told(s: dict[str, Any], planned: int) -> str:
+    """The README: what was done and what came out, of so many cases planned."""
 
     def line(what: str, r: dict[str, Any], aim: str = "") -> str:
         if not r["of"]:
@@ -214,10 +214,15 @@ def told(s: dict[str, Any]) -> str:
         for name, c in s["surprises"].items()
     )
     walls = s["wall_s"]
+    part = (
+        f" These are {s['cases']} of its {planned} cases; the command goes on from there."
+        if s["cases"] < planned
+        else ""
+    )
     return f"""# Does the diagnosis name what was hidden?
 
 `python results/diagnosis/study.py` rebuilds this page; [summary.json](summary.json) has every rate,
-[cases.csv](cases.csv) every case.
+[cases.csv](cases.csv) every case.{part}
 
 A second roller (`tests/plant.py`) shares no code with the program: Lagrange's equations in ground coordinates by
 automatic differentiation, half-millisecond Runge-Kutta steps, a person with delay, slow hand and hydraulics at the
@@ -264,8 +269,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     kept.mkdir(parents=True, exist_ok=True)
     every = cases(given.nothing, given.per_cause, given.per_surprise, given.pairs)
     wanted = [c for c in every if c.key.startswith(given.only)]
-    joblib.Parallel(n_jobs=given.jobs, verbose=5)(joblib.delayed(judged)(c, kept) for c in wanted)
-    rows = [json.loads((kept / f"{c.key}.json").read_text()) for c in wanted]
+    if given.jobs:
+        joblib.Parallel(n_jobs=given.jobs, verbose=5)(joblib.delayed(judged)(c, kept) for c in wanted)
+    files = [kept / f"{c.key}.json" for c in wanted]
+    rows = [json.loads(file.read_text()) for file in files if file.is_file()]
     if given.only:
         shown = ("key", "visibility", "amount", "manoeuvre", "duration_s", "kit", "outcome", "named", "error", "wall_s")
         print(pd.DataFrame(rows).reindex(columns=shown).to_string(index=False))
@@ -278,7 +285,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     flat.to_csv(given.out / "cases.csv", index=False, float_format="%.6g")
     confusion(rows).savefig(given.out / "confusion.png", dpi=110, metadata={"Software": None})
     (given.out / "summary.json").write_text(json.dumps(s, indent=1) + "\n")
-    (given.out / "README.md").write_text(told(s))
+    (given.out / "README.md").write_text(told(s, len(wanted)))
 
 
 if __name__ == "__main__":
