@@ -278,7 +278,7 @@ def _identify(s: Summary) -> Said:
         errors = ", ".join(f"{n} {v:.1f} %" for n, v in check["torque_error_percent"].items())
         remarks.append(f"On {check['log']}, which it was not fitted on, torques are off by: {errors}.")
     biased = any("bias" in r for r in rows.values())
-    columns = (("value", 6), ("std", 3), ("std_percent", 3), ("low95", 4), ("high95", 4))
+    columns = (("value", 6), ("std", 3), ("std_percent", 3), ("low95", 6), ("high95", 6))
     table = tuple(
         (
             n,

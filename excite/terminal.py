@@ -142,7 +142,7 @@ def compare_table(summary: dict[str, Any]) -> None:
 
 def identify_table(summary: dict[str, Any]) -> None:
     """An estimate, a parameter a line, with what there is to remark."""
-    columns = (("value", 6), ("std", 3), ("std_percent", 3), ("low95", 4), ("high95", 4))
+    columns = (("value", 6), ("std", 3), ("std_percent", 3), ("low95", 6), ("high95", 6))
     rows = table("parameter", "unit", "value", "std", "std %", "95 % from", "to")
     for name, row in summary["parameters"].items():
         rows.add_row(name, row["unit"], *(rounded(row[k], digits) for k, digits in columns))
