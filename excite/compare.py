@@ -5,7 +5,7 @@ down until every limit but rest and lane holds, first the torques of the contact
 at the end and the lane are then met by the nearest drive that keeps every limit (`interior`, no aim, least squares
 distance in the share of the torque limits, by way of a machine that is softer at standstill), and small smooth torques
 land it (`continuation.land`). This moves a drive as little as can be and never looks at the score. A drive that still
-exceeds a limit by more than `continuation.TOLERANCE` of its range is reported with the limit that it breaks.
+exceeds a limit by more than `limit.TOLERANCE` of its range is reported with the limit that it breaks.
 
 Fourier series (0.05 to 0.3 Hz; Swevers et al., 1997) are searched, from a random one scaled down like that, for the
 time that the design took, with rest and lane left to the same treatment afterwards. All work runs in as many processes
@@ -28,11 +28,11 @@ import scipy
 from excite import interior, manoeuvre, objective, smoothing
 from excite.aim import aim
 from excite.collocation import UnsettledError, settle, transcribe
-from excite.continuation import MARGIN, TOLERANCE, Candidate, Track, land, rest_band, soften, typical_sizes, verdict
+from excite.continuation import MARGIN, Candidate, Track, land, rest_band, soften, typical_sizes, verdict
 from excite.design import design, processes
 from excite.drive import turns_left
 from excite.driver import follow
-from excite.limit import check, limits, symbols
+from excite.limit import TOLERANCE, check, limits, symbols
 from excite.manoeuvre import Manoeuvre, scaled
 from excite.simulate import Motion, SimulationError, simulate
 from model import tree

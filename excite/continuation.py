@@ -20,6 +20,7 @@ from excite.collocation import Transcription, UnsettledError, settle, transcribe
 from excite.limit import (
     REST_POSITION,
     REST_SPEED,
+    TOLERANCE,
     TRAVEL,
     check,
     directions,
@@ -35,7 +36,6 @@ from excite.simulate import Motion, SimulationError, simulate
 from model.machine import Machine, Problem
 from model.prediction import Model
 
-TOLERANCE = 1e-3  # of a limit's range: what the fresh simulation may exceed
 STUCK = 20.0  # half ranges in all that a program still exceeds: it is not going to keep its limits
 MARGIN = 2e-3  # of half a range: what the program keeps from every limit
 

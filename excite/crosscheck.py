@@ -12,7 +12,7 @@ from excite.log import Log
 from excite.processing import lowpass, samples
 from excite.sensors import signals
 from excite.simulate import Motion, respond, simulate
-from model.machine import Filter, Sensor
+from model.machine import Filter
 from model.prediction import Model
 
 Control = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
@@ -88,18 +88,11 @@ def motions(model: Model, log: Log, estimate: Estimate, filter: Filter | None = 
 
     return Comparison(
         tuple(x.name for x in chosen),
-        tuple(_unit(x) for x in chosen),
+        tuple(model.machine.si(x) for x in chosen),
         log.t,
         np.array([counted(x.name, log.values[x.name]) for x in chosen]),
         np.array([counted(x.name, exact[x.name]) for x in chosen]),
     )
-
-
-def _unit(sensor: Sensor) -> str:
-    if sensor.is_rate:
-        return "rad/s"
-    given = sensor.unit if sensor.unit in ("rad", "m") else "SI"
-    return {"yaw_rate": "rad/s", "lateral_speed": "m/s"}.get(sensor.kind, given)
 
 
 def offsets(model: Model, X: np.ndarray) -> np.ndarray:

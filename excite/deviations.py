@@ -2,8 +2,8 @@
 
 It doesn't in two ways. An encoder's errors are no noise: they follow from the motion but for where its count begins,
 and beat with the clock (`counted`). And where a drive shows a direction of the parameters poorly, the likelihood is no
-parabola as wide as it is deep: what an estimate is off by makes it look sure on one side and not on the other, so the
-likelihood itself is followed to either side (`followed`).
+parabola as wide as it is deep: an estimate that is off looks surer than it is to one side, so the likelihood itself is
+followed to either side (`followed`).
 """
 
 from __future__ import annotations
@@ -13,33 +13,49 @@ from dataclasses import replace
 
 import numpy as np
 
+from excite.innovations import Linear
 from excite.linearise import Chart
-from excite.newton import HELD, PRIOR, Fit, Linear, in_si, linearised, moved, newton_step, places
+from excite.newton import HELD, PRIOR, Fit, NotConverged, in_si, linearised, moved, newton_step, places
 from excite.record import Point, Record, readings
 
 PHASES = 64  # places between two edges at which an encoder's count may begin, to average over
 COLUMNS = 8  # parameters whose trajectories are held at a time
 WIDE = 0.03  # relative standard deviation from which a direction is followed
 FOLLOWED = 2.0  # standard deviations to either side
-LOPSIDED = 0.5, 8.0  # times the deviation at the answer that a side may be
+LOPSIDED = 0.5, 4.0  # least and most that a side may be, in deviations at the answer
+FLAT = (
+    "the likelihood of {} is nearly flat to one side, so the intervals of these are as wide as it was followed, not as"
+    " wide as they should be: a drive that shows them better tells more"
+)
+MOST = 0.5  # of the largest part in a combination of parameters, from which one is told as part of it
 
 
-def sure(c: Chart, records: Sequence[Record], starts: Sequence[Point], fit: Fit) -> Fit:
-    """A fit with exact dynamics and the deviations that it has in truth, as far as they are known."""
-    covariance, *_ = newton_step(c, records, fit.linear, fit.points, fit.X, _prior(fit), 0.0)
+def sure(
+    c: Chart, records: Sequence[Record], starts: Sequence[Point], fit: Fit
+) -> tuple[Fit, np.ndarray, tuple[str, ...]]:
+    """A fit with exact dynamics and its true covariance, as far as that can be known; standard deviations below and
+    above (2, n_base) [SI]; and what to say of them."""
+    linear = linearised(c, records, fit.points, starts, fit.X, fit.disturbed)
+    fit = fit if linear is None else replace(fit, linear=tuple(linear))  # the last step was one from elsewhere
+    covariance, _, _, cost = newton_step(c, records, fit.linear, fit.points, fit.X, _prior(fit), 0.0)
     n = len(fit.X)
     added = np.zeros_like(covariance)
     for r, p, found, place in zip(records, fit.points, fit.linear, places(c, records), strict=True):
         own, white = counted(c, r, p, fit.X, found)
         added[np.ix_(place, place)] += own - white
-    true = in_si(c, covariance + covariance @ added @ covariance)
+    true = covariance + covariance @ added @ covariance
     way = widest(c, fit, covariance)
-    below, above = followed(c, records, starts, fit, covariance, way)
-    along = in_deviations(covariance, way)[:n] * c.model.scale
+    below, above = followed(c, records, starts, replace(fit, cost=cost), covariance, way)
+    along, true = in_deviations(true, way)[:n] * c.model.scale, in_si(c, true)
     more = np.array([below**2, above**2]) - 1
     sides = np.diag(true) + np.where(along > 0, more[:, None], more[::-1, None]) * along**2
     widened = true + (((below + above) / 2) ** 2 - 1) * np.outer(along, along)
-    return replace(fit, covariance=widened, sides=np.sqrt(sides))
+    notes: tuple[str, ...] = ()
+    if max(below, above) >= LOPSIDED[1]:
+        part = np.abs(along) / np.maximum(np.abs(fit.X), c.model.scale)
+        told = [name for name, x in zip(c.model.base.names, part, strict=True) if x > MOST * part.max()]
+        notes = (FLAT.format(", ".join(told)),)
+    return replace(fit, covariance=widened), np.sqrt(sides), notes
 
 
 def counted(c: Chart, r: Record, p: Point, X: np.ndarray, found: Linear) -> tuple[np.ndarray, np.ndarray]:
@@ -90,8 +106,11 @@ def _slopes(found: Linear, flawed: tuple[int, ...], sensors: np.ndarray) -> np.n
 def widest(c: Chart, fit: Fit, covariance: np.ndarray) -> np.ndarray:
     """The combination of parameters (n_p + offsets,) whose relative deviation is largest, zero where that is small."""
     n = len(fit.X)
-    size = np.maximum(np.abs(fit.X) / c.model.scale, 1.0)
-    free = ~fit.unseen & (np.sqrt(np.diag(covariance)[:n]) < size / FOLLOWED)  # to nothing there is no way
+    value = np.abs(fit.X) / c.model.scale
+    size = np.maximum(value, 1.0)
+    reach = np.where(c.model.positive, value, size)
+    # One that may as well be nothing can't be followed there.
+    free = ~fit.unseen & (np.sqrt(np.diag(covariance)[:n]) < reach / FOLLOWED)
     relative = np.where(np.outer(free, free), covariance[:n, :n] / np.outer(size, size), 0.0)
     variances, directions = np.linalg.eigh(relative)
     way = np.zeros(len(covariance))
@@ -101,7 +120,7 @@ def widest(c: Chart, fit: Fit, covariance: np.ndarray) -> np.ndarray:
 
 
 def in_deviations(covariance: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """How all else goes when a combination of parameters is off by one standard deviation; zero for none."""
+    """How all parameters go when a combination of them is off by one standard deviation; zero where there is none."""
     return np.asarray(covariance @ way / np.sqrt(max(way @ covariance @ way, np.finfo(float).tiny)))
 
 
@@ -116,8 +135,8 @@ def followed(
     """How many times as wide as at the answer the likelihood of a combination of parameters is below and above it, all
     else as likely as it can be (profile likelihood; Venzon and Moolgavkar, Applied Statistics 37 (1988) 87).
 
-    What one linearisation at either side says, which the next ones change by a few hundredths. Once where there is
-    nothing to follow, or the motion can't be followed.
+    What one linearisation at either side says, which the next ones change by a few hundredths. 1 and 1 where there is
+    nothing to follow or the motion can't be followed.
     """
     if not way.any():
         return 1.0, 1.0
@@ -131,9 +150,14 @@ def followed(
             for r, p, found, place in zip(records, fit.points, fit.linear, places(c, records), strict=True)
         ]
         linear = linearised(c, records, points, starts, X, fit.disturbed)
-        if linear is None:
+        if linear is None or not (X[c.model.positive] > 0).all():
             return 1.0, 1.0
-        there, steps, _, cost = newton_step(c, records, linear, points, X, prior, 0.0)
+        try:
+            there, steps, _, cost = newton_step(c, records, linear, points, X, prior, 0.0)
+        except (NotConverged, np.linalg.LinAlgError):
+            return 1.0, 1.0
+        if not np.isfinite(cost):
+            return 1.0, 1.0
         back = way[:n] @ steps[0][:n]  # by which the most likely point of all lies elsewhere
         risen = cost + back**2 / (way @ there @ way) - fit.cost
         widths.append(float(np.clip(FOLLOWED / np.sqrt(max(risen, 1e-9)), *LOPSIDED)))

@@ -42,7 +42,7 @@ CLOSE = 10.0  # a rival that is worse by less than this is a tie
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 SHAPE = 0.005, 0.002  # of what is explained already, that a further effect must gain, as nature is never exactly the
 # formula: by the fits' gains, and by how many deviations the amounts are from none
-ALIKE = 0.03  # of an amount: what two formulas of one effect differ by where each fits the log
+ALIKE = 0.03  # of an amount: what two formulas of one effect differ by; those of results/diagnosis do by 1 to 6 %
 FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
 BESIDE = 250.0  # a gain that by the latter no effect can be denied
 CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
@@ -185,7 +185,7 @@ def diagnose(
     chosen, odd, nearest = weighed(before, chosen)
     if len(chosen) > 1:
         tell(0.9, "judging each given the others")
-        chosen, odd, nearest = weighed(before, needed(reviewed(before, chosen, together)))
+        chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
     stage = chosen[-1].stage if chosen else before
     answer = _verdict(before, stage, chosen, first, odd, left)
     return answer if answer.findings else replace(answer, nearest=nearest)
@@ -229,41 +229,52 @@ def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_tu
     if same or worse or whole.fit.disturbed > found.fit.disturbed:
         judged = judged if same else {x.name: x for x in chosen}
         return [replace(x, rivals=_others(judged[x.name], judged)) for x in chosen]
-    # The one that came last comes last again; gains are over those that stand before.
+    # The one that came last comes last again.
+    again = _one_by_one(before, (*queue[1:], queue[0]), whole)
+    return [replace(x, rivals=_others(x, judged)) for x in again] if again else list(chosen)
+
+
+def _one_by_one(before: Stage, chosen: Sequence[Choice], whole: Stage) -> list[Choice]:
+    """Effects that a model has, put into the one without them one after the other; gains are over those that stand
+    before. None where the logs can't be fitted on the way."""
     stages = [before]
     try:
-        for x in (*queue[1:], queue[0]):
+        for x in chosen:
             machine = effects.extended(stages[-1].machine, _fitted(whole, x.name))
             stages.append(refitted(machine, stages[-1], before.fit.disturbed))
         stages[-1] = stages[-1] if whole.fit.disturbed == before.fit.disturbed else whole
     except NotConverged:
-        return list(chosen)
-    again = []
-    for x, old, new in zip((*queue[1:], queue[0]), stages, stages[1:], strict=False):
+        return []
+    found = []
+    for x, old, new in zip(chosen, stages, stages[1:], strict=False):
         gain = old.fit.cost - new.fit.cost if old.fit.disturbed == new.fit.disturbed else x.gain
-        again.append(replace(x, stage=new, gain=max(gain, x.gain), rivals=_others(x, judged)))
-    return again
+        found.append(replace(x, stage=new, gain=max(gain, x.gain)))
+    return found
 
 
-def needed(chosen: Sequence[Choice]) -> list[Choice]:
+def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
     """Several effects without those that were needed on the way only: in the last fit their amount is hardly known to
     be any, and without it the fit is as good. Disturbing forces hide what else a right name explains."""
-    kept = list(chosen)
+    kept, whole = list(chosen), chosen[-1].stage
     for x in chosen:
-        stage = kept[-1].stage
-        names, fit = stage.model.base.names, stage.fit
-        placed = next(e for e in stage.model.effects if e.name == x.name)
-        k = names.index(x.name)
-        if len(kept) == 1 or placed.effect.inverse or (fit.X[k] / fit.std[k]) ** 2 > LEVEL:
+        if len(kept) == 1 or _surely(x.name, whole):
             continue
         try:
-            without = _without(x.name, stage)
+            without = _without(x.name, whole)
         except NotConverged:
             continue
-        if without.fit.disturbed <= fit.disturbed and without.fit.cost - fit.cost < LEVEL:
-            kept = [y for y in kept if y.name != x.name]
-            kept[-1] = replace(kept[-1], stage=without)
-    return kept
+        if without.fit.disturbed <= whole.fit.disturbed and without.fit.cost - whole.fit.cost < LEVEL:
+            kept, whole = [y for y in kept if y.name != x.name], without
+    if len(kept) == len(chosen):
+        return kept
+    return _one_by_one(before, kept, whole) or list(chosen)
+
+
+def _surely(name: str, stage: Stage) -> bool:
+    """Whether an effect's amount is surely any in a fit; one that is nothing at infinity is taken for sure."""
+    placed = next(e for e in stage.model.effects if e.name == name)
+    k = stage.model.base.names.index(name)
+    return placed.effect.inverse or float((stage.fit.X[k] / stage.fit.std[k]) ** 2) > LEVEL
 
 
 def _others(choice: Choice, found: Container[str]) -> tuple[EffectEntry, ...]:

@@ -56,7 +56,7 @@ class Estimate:
 
     @property
     def quantile95(self) -> float:
-        """Half width of the 95 % interval in standard deviations."""
+        """From the value to an end of its 95 % interval, in standard deviations to that side."""
         return float(scipy.stats.t.ppf(0.975, max(self.degrees, 1)))
 
     @property

@@ -108,7 +108,7 @@ def withheld(stage: Stage) -> Withheld | None:
             squares.append((error**2).sum(axis=0))
             counts.append(told.sum(axis=0))
             motion.append(h[a:b].var(axis=0))
-    sensors = tuple((s.name, "rad" if s.resolution is not None and s.unit == "rad" else s.unit) for s in c.sensors)
+    sensors = tuple((s.name, c.model.machine.si(s)) for s in c.sensors)
     return Withheld(sensors, np.array(squares), np.array(counts), np.mean(motion, axis=0), np.mean(noise, axis=0))
 
 

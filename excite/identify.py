@@ -11,34 +11,17 @@ import numpy as np
 
 from excite import bootstrap
 from excite.bootstrap import Find
-from excite.estimate import Estimate, NoEstimate, NotIdentifiable, noted
+from excite.estimate import Estimate, NotIdentifiable, noted
 from excite.examine import examine
 from excite.hidden import explained
 from excite.instruments import iv
 from excite.log import Log
 from excite.outputerror import oe
-from excite.processing import Samples, decimate, filtered_regression, samples
-from excite.regression import least_squares, ols, tls, wls
+from excite.processing import filtered_regression
+from excite.regression import ols, tls, wls
+from excite.smoothing import joint
 from model.machine import Filter, MachineError
 from model.prediction import Model
-
-__all__ = [
-    "METHODS",
-    "Estimate",
-    "Method",
-    "NoEstimate",
-    "NotIdentifiable",
-    "Samples",
-    "decimate",
-    "filtered_regression",
-    "identify",
-    "least_squares",
-    "needed_sensors",
-    "noted",
-    "recommended",
-    "samples",
-    "with_bias",
-]
 
 
 @dataclass(frozen=True)
@@ -151,13 +134,6 @@ def needed_sensors(model: Model, method: str) -> tuple[str, ...]:
     speed = () if METHODS[method].simulates else ("lateral_speed",)
     kinds = ("angle", "torque", "wheel", *speed)
     return tuple(s.name for s in model.machine.sensors("full") if s.kind in kinds)
-
-
-def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
-    """Joint smoothing: states, true torques and parameters together, every sensor by its noise."""
-    from excite import smoothing  # which builds on this room
-
-    return smoothing.joint(model, logs, filter)
 
 
 def possible(plain: Find) -> Find:

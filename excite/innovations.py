@@ -8,12 +8,11 @@ to them. The joined parts of the chain say what is known where each part begins,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cached_property
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from excite.newton import Linear
+from excite import chain
 
 SLOW = 25  # readings whose mean counts as slow
 
@@ -32,6 +31,39 @@ class Step:
     def variance(self) -> np.ndarray:
         """Of the innovations before whitening (K, m)."""
         return np.diagonal(self.root @ self.root.transpose(0, 2, 1), axis1=1, axis2=2)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """One log linearised about a point: its chain in scaled states, and what it reduces to.
+
+    Z: twice the negative log-likelihood is [1 p]' Z [1 p] for steps p of parameters and offsets, scaled. gain
+    (N - 1, n, n_u): what a torque error of one standard deviation does to the scaled state. stages: by part of the
+    log. H (N, m, n), weight, residual (N, m): the readings; direct (N, m, n_f + n_o): how they move with flaws of
+    sensors and offsets. noise (n_u,): standard deviation of the delivered torques' errors [N m]. beats (N, m): how many
+    times larger than their weights say the readings' variance is.
+    """
+
+    solved: chain.Solved
+    Z: np.ndarray
+    gain: np.ndarray
+    stages: tuple[chain.Stages, ...]
+    H: np.ndarray
+    weight: np.ndarray
+    residual: np.ndarray
+    direct: np.ndarray
+    noise: np.ndarray
+    beats: np.ndarray
+
+    @cached_property
+    def innovations(self) -> np.ndarray:
+        """Of every reading (N, m), normalised; NaN where unused."""
+        return innovations(self)
+
+    @cached_property
+    def filter(self) -> list[Step]:
+        """The Kalman filter's steps along the log."""
+        return steps(self)
 
 
 def innovations(linear: Linear) -> np.ndarray:

@@ -21,6 +21,7 @@ from model.prediction import Model
 
 # What counts as at rest at the ends (contract, R60): speeds [m/s], rates [rad/s] and positions [rad, m].
 REST_SPEED, REST_RATE, REST_POSITION = 0.02, 0.01, 0.01
+TOLERANCE = 1e-3  # of a limit's range: what the fresh simulation may exceed
 TRAVEL, REVERSALS = "travel", "reversals"
 TURNS = 361  # headings at which a drive is tried on the lane
 

@@ -102,7 +102,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
             signals[sensor.column] = (when, number, sensor.unit)
             continue
         readings[sensor.name] = values
-        signals[" - ".join(sensor.columns)] = (when, values, _si(sensor))
+        signals[" - ".join(sensor.columns)] = (when, values, machine.si(sensor))
         jumps: list[str] = []
         _caught(lambda s=sensor, v=values: log.check_values(s, v, rate, machine, ""), jumps)  # type: ignore[misc]
         faults += [line for line in jumps if not line.startswith(after)]  # across a gap an angle may jump
@@ -241,9 +241,3 @@ def _wiring(machine: Machine, readings: dict[str, np.ndarray]) -> list[str]:
                 " give one a negative factor"
             )
     return lines
-
-
-def _si(sensor: Sensor) -> str:
-    if sensor.is_rate:
-        return "rad/s"
-    return {"torque": "N m", "yaw_rate": "rad/s", "lateral_speed": "m/s", "x": "m", "y": "m"}.get(sensor.kind, "rad")

@@ -15,8 +15,9 @@ import scipy
 
 from excite import smoothing
 from excite.diagnose import Stage, refits
+from excite.innovations import Linear
 from excite.linearise import advance, differentiate
-from excite.newton import Linear, state_scale
+from excite.newton import state_scale
 from excite.sidebyside import Together
 
 BLOCK_S = 0.25  # [s] over which slow errors are means

@@ -9,21 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from excite import chain
 from excite.estimate import NoEstimate
-from excite.innovations import Step, innovations, steps
+from excite.innovations import Linear
 from excite.linearise import BATCH, Chart, advance, differentiate
 from excite.record import Point, Record, one_count, readings
 
 PRIOR = 3.0  # standard deviation of a parameter before any data, in its scale
 PASSES = 15  # at most
+UNSEEN = 1.0  # a parameter that a log tells less than this well, in its scale, stays at the machine file's value
 HELD = 1e-6  # standard deviation of such a parameter, in its scale
 SETTLED = 3  # passes until the states fit the dynamics well enough to tell which these are
-UNSEEN = 1.0  # a parameter that a log tells less than this well, in its scale, stays at the machine file's value
 DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's scale, and its share from pass to pass
 RESUMED = DAMPING[0] * DAMPING[1] ** 2  # damping of a fit that goes on from another
 HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
@@ -60,43 +59,9 @@ class NotConverged(NoEstimate):
 
 
 @dataclass(frozen=True)
-class Linear:
-    """One log linearised about a point: its chain in scaled states, and what it reduces to.
-
-    Z: twice the negative log-likelihood is [1 p]' Z [1 p] for steps p of parameters and offsets, scaled. gain
-    (N - 1, n, n_u): what a torque error of one standard deviation does to the scaled state. stages: by part of the
-    log. H (N, m, n), weight, residual (N, m): the readings; direct (N, m, n_f + n_o): how they move with flaws of
-    sensors and offsets. noise (n_u,): standard deviation of the delivered torques' errors [N m]. beats (N, m): how many
-    times larger than their weights say the readings' variance is.
-    """
-
-    solved: chain.Solved
-    Z: np.ndarray
-    gain: np.ndarray
-    stages: tuple[chain.Stages, ...]
-    H: np.ndarray
-    weight: np.ndarray
-    residual: np.ndarray
-    direct: np.ndarray
-    noise: np.ndarray
-    beats: np.ndarray
-
-    @cached_property
-    def innovations(self) -> np.ndarray:
-        """Of every reading (N, m), normalised; NaN where unused."""
-        return innovations(self)
-
-    @cached_property
-    def filter(self) -> list[Step]:
-        """The Kalman filter's steps along the log."""
-        return steps(self)
-
-
-@dataclass(frozen=True)
 class Fit:
     """Base parameters X (n_base,), their covariance, which were held because nothing shows them, and the trajectories
-    of the logs; twice the negative log-likelihood `cost`, and the disturbing forces in units of DISTURBANCE. sides
-    (2, n_base): standard deviations below and above, where the likelihood is known to be lopsided."""
+    of the logs; twice the negative log-likelihood `cost`, and the disturbing forces in units of DISTURBANCE."""
 
     X: np.ndarray
     covariance: np.ndarray
@@ -105,7 +70,6 @@ class Fit:
     linear: tuple[Linear, ...]
     cost: float
     disturbed: float
-    sides: np.ndarray | None = None
 
     @property
     def std(self) -> np.ndarray:

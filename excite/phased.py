@@ -45,7 +45,6 @@ WINDOWS = 12  # of the drive: every limit's extreme in each of them is a constra
 STEPS, SIZES = (0.02, 0.01, 0.005), (1.0, 0.2, 0.1)  # differences, and what a round changes at first: s, m/s, rad
 PRICE = 30.0  # of a limit's excess, a fraction of its range, against the objective
 ROOM = 0.01  # of a limit's range that is kept free at least
-TOLERANCE = 1e-3  # of a limit's range: what counts as kept, as for any design
 FINE = 0.1  # what an excess over a tolerance for rest counts against one over a limit's range
 DRIVEN = ("torque",)  # limits that hidden valves keep, whoever drives
 
@@ -157,7 +156,7 @@ def _judged(task: Task, trace: Trace, begin: Trace, designed: Motion, seed: int,
     over: dict[str, float] = {}
     for m in motions:
         for name, value in limit.check(model, task.problem, m).items():
-            if value > TOLERANCE:
+            if value > limit.TOLERANCE:
                 over[name] = max(over.get(name, 0.0), value)
 
     def worth(motion: Motion, by: Callable[[Model], Motion]) -> float:

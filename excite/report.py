@@ -178,10 +178,10 @@ def verify_figure(v: Verification, title: str) -> Figure:
     errors, cover = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
     figure.suptitle(plain(title))
     places = np.arange(n)[::-1]
-    e, s = v.error_percent, np.nanmean(v.std_percent, axis=0)
+    e = v.error_percent
+    ends = 100 * np.nanmean((v.interval - v.value[:, None]) / v.reference, axis=0)
     for k, y in enumerate(places):
-        half = 1.96 * s[k]
-        errors.plot([-half, half], [y, y], color="0.75", linewidth=9, solid_capstyle="butt", zorder=1)
+        errors.plot(ends[:, k], [y, y], color="0.75", linewidth=9, solid_capstyle="butt", zorder=1)
         errors.plot(e[:, k], y + np.linspace(-0.25, 0.25, len(e)), ".", color=COLOURS[0], markersize=3, zorder=2)
         errors.plot(np.nanmean(e[:, k]), y, "D", color=COLOURS[1], markeredgecolor="black", markersize=6, zorder=3)
     errors.axvline(0, color="black", linewidth=0.8)

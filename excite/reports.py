@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from excite import folder, log, logcheck, objective, report, tables
+from excite.limit import TOLERANCE
 from excite.page import Picture, Table, report_page
 from excite.terminal import rounded
 from model import machine as machines
@@ -118,7 +119,7 @@ Said = tuple[str, str, Sequence[str], Sequence[Table]]
 def _design(s: Summary) -> Said:
     sigma = s["sigma_percent"]
     worst = max(sigma, key=lambda n: sigma[n])
-    kept = s["max_violation"] <= 1e-3
+    kept = s["max_violation"] <= TOLERANCE
     limits = (
         "every limit is kept" if kept else f"limits are exceeded by {100 * s['max_violation']:.2f} % of their range"
     )
@@ -299,7 +300,7 @@ def _identify(s: Summary) -> Said:
         *(("bias of the method",) if biased else ()),
     )
     conds = f"cond(W) {s['cond_w']:.4g}, cond(Phi) {s['cond_phi']:.4g}"
-    caption = f"Parameters with one standard deviation, method {s['method']}; {conds}."
+    caption = f"Parameters with one standard deviation and 95 % interval, method {s['method']}; {conds}."
     return f"Parameters of {s['machine']}", answer, remarks, [Table(caption, names, table)]
 
 

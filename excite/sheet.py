@@ -23,7 +23,6 @@ from model.prediction import Model
 A4 = (8.27, 11.69)
 LEFT, RIGHT = 0.08, 0.95
 GAP = 0.02  # between columns
-SI = {"torque": "N m", "yaw_rate": "rad/s", "lateral_speed": "m/s", "x": "m", "y": "m", "angle": "rad", "wheel": "rad"}
 AHEAD = 3.0  # m of free ground around what the machine touches: overhangs, and a person who has to stop
 
 
@@ -327,6 +326,6 @@ def sensor_line(machine: Machine, sensor: Sensor) -> str:
     if sensor.counts_per_turn is not None:
         extra.append(f"{float(sensor.counts_per_turn):g} counts per turn")
     if sensor.noise is not None:
-        extra.append(f"noise below {float(sensor.noise):g} {'rad/s' if sensor.is_rate else SI[sensor.kind]}")
+        extra.append(f"noise below {float(sensor.noise):g} {machine.si(sensor)}")
     kit = "" if "paper" in sensor.kits else "; optional"
     return f"{sensor.column} [{sensor.unit}]: {what}" + (f"; {', '.join(extra)}" if extra else "") + kit

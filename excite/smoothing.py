@@ -94,7 +94,10 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
             continue
         found = suspects(c, logs, fit)
         if not found:
-            return _estimate(c, records, fit if drawn else sure(c, records, starts, fit), filter, (*notes, *drawn))
+            if drawn:
+                return _estimate(c, records, fit, filter, (*notes, *drawn))
+            fit, sides, flat = sure(c, records, starts, fit)
+            return _estimate(c, records, fit, filter, (*notes, *flat), sides)
         rank = bool(drawn), fit.cost  # costs of one kind of records can be compared
         if doubted is None or rank < doubted[0]:
             doubted = rank, fit, free, found
@@ -163,7 +166,14 @@ def loosely(
     return fit
 
 
-def _estimate(c: Chart, records: Sequence[Record], fit: Fit, filter: Filter, notes: tuple[str, ...]) -> Estimate:
+def _estimate(
+    c: Chart,
+    records: Sequence[Record],
+    fit: Fit,
+    filter: Filter,
+    notes: tuple[str, ...],
+    sides: np.ndarray | None = None,
+) -> Estimate:
     """The answer as `identify` gives it: regressor along the smoothed states, residual of the torques."""
     model = c.model
     weak = fit.unseen | (fit.std > UNSEEN * np.maximum(np.abs(fit.X), model.scale))
@@ -197,7 +207,6 @@ def _estimate(c: Chart, records: Sequence[Record], fit: Fit, filter: Filter, not
     residual = np.concatenate(errors, axis=1)
     covariance = fit.covariance.copy()
     covariance[weak], covariance[:, weak] = np.nan, np.nan
-    sides = None if fit.sides is None else np.where(weak, np.nan, fit.sides)
     return Estimate(
         "joint",
         model.base.names,
@@ -215,7 +224,7 @@ def _estimate(c: Chart, records: Sequence[Record], fit: Fit, filter: Filter, not
         int(sum(r.used.sum() for r in records)) - len(fit.X),
         reasons,
         notes,
-        sides=sides,
+        sides=None if sides is None else np.where(weak, np.nan, sides),
     )
 
 

@@ -61,14 +61,13 @@ def rounded(value: object, digits: int = 4) -> str:
 
 def design_table(summary: dict[str, Any]) -> None:
     """A design in sentences: score, limits, what accuracy it makes attainable."""
+    from excite.limit import TOLERANCE
+
     kept = (
         "all limits kept"
-        if summary["max_violation"] <= 1e-3
+        if summary["max_violation"] <= TOLERANCE
         else f"limits exceeded by {100 * summary['max_violation']:.2f} %"
     )
-    sigma = summary["sigma_percent"]
-    worst = max(sigma, key=lambda name: sigma[name])
-    middle = sorted(sigma.values())[len(sigma) // 2]
     say(
         f"{summary['machine']} {summary['problem']}: cond(Phi) = {summary['cond_phi']:.2f} (best start"
         f" {summary['cond_phi_start']:.0f}), {summary['duration_s']:g} s, {kept}, designed in {summary['wall_s']:.1f} s"
@@ -76,8 +75,8 @@ def design_table(summary: dict[str, Any]) -> None:
     if not summary["complete"]:
         say("cut short: this is the best drive so far, more time may find a better one")
     say(
-        f"attainable accuracy (Cramer-Rao, one standard deviation): worst {worst} {sigma[worst]:.2g} %,"
-        f" median {middle:.2g} %"
+        f"attainable accuracy (Cramer-Rao, one standard deviation): worst {summary['worst_parameter']}"
+        f" {summary['worst_percent']:.2g} %, median {summary['median_percent']:.2g} %"
     )
     if "driver" in summary:
         by_hand = summary["driver"]

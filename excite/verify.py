@@ -10,6 +10,7 @@ import numpy as np
 from joblib import Parallel, delayed
 
 from excite import identify, log, sensors
+from excite.estimate import NoEstimate
 from excite.simulate import Motion
 from model.machine import Machine
 from model.prediction import Model, build
@@ -117,7 +118,7 @@ def _run(
     measured = log.check(table, assumed.machine, identify.needed_sensors(assumed, method))
     try:
         estimate = identify.identify(assumed, [measured], method)
-    except identify.NoEstimate as err:
+    except NoEstimate as err:
         return k, None, str(err)
     return k, (estimate.value, estimate.std, estimate.interval95), ""
 

@@ -16,7 +16,7 @@ from excite import compare as comparisons
 from excite import verify as verification
 from excite.asked import UsageError
 from excite.brief import Brief
-from excite.identify import Estimate
+from excite.estimate import Estimate, NotIdentifiable
 from excite.log import Log
 from excite.objective import OBJECTIVES
 from excite.simulate import SimulationError
@@ -85,7 +85,7 @@ def verify(
             model, motion, method, kit, runs, seed, progress=lambda done, total: advance(done, total, None)
         )
     if len(result.failures) == runs:
-        raise identify.NotIdentifiable(f"all {runs} runs failed, the first one: {result.failures[0]}")
+        raise NotIdentifiable(f"all {runs} runs failed, the first one: {result.failures[0]}")
     parameters = verification.summary(result)
     summary = {
         "machine": model.machine.name,
@@ -123,8 +123,7 @@ def compare(
         asked.known("--against", usual, tuple(comparisons.USUAL))
     with terminal.bar("comparing") as advance:
         result = comparisons.compare(model, chosen, samples, seed, budget, advance, against)
-    inputs = zip(model.inputs, model.machine.actuated, strict=True)
-    columns = ["t_s", *[f"{u}_{'Nm' if b.joint == 'revolute' else 'N'}" for u, b in inputs]]
+    columns = ["t_s", *(log.torque_column(model, u) for u in model.inputs)]
     (place / "drives").mkdir()
     designs = []
     for row in result.rows:
@@ -211,14 +210,15 @@ def identified(
 
 def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:
     rows: dict[str, dict[str, Any]] = {}
+    low, high = estimate.interval95
     for k, (name, unit) in enumerate(zip(estimate.names, estimate.units, strict=True)):
         rows[name] = {
             "unit": unit,
             "value": estimate.value[k],
             "std": estimate.std[k],
             "std_percent": estimate.std_percent[k],
-            "low95": estimate.interval95[0, k],
-            "high95": estimate.interval95[1, k],
+            "low95": low[k],
+            "high95": high[k],
         }
         if estimate.bias is not None and estimate.bias_std is not None:
             rows[name] |= {"bias": estimate.bias[k], "bias_std": estimate.bias_std[k]}

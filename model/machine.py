@@ -487,6 +487,14 @@ class Machine(Record):
         """The sensors of a kit that measure something which is free to move."""
         return tuple(s for s in self.sensor if kit in s.kits and self._visible(s))
 
+    def si(self, sensor: Sensor) -> str:
+        """The SI unit of a sensor's values, whatever its column is in."""
+        straight = self.find(sensor.body).joint == "prismatic"
+        if sensor.kind in ("angle", "wheel"):
+            return ("m" if straight and sensor.kind == "angle" else "rad") + ("/s" if sensor.is_rate else "")
+        torque = "N" if straight else "N m"
+        return {"torque": torque, "yaw_rate": "rad/s", "lateral_speed": "m/s", "x": "m", "y": "m"}[sensor.kind]
+
     def _visible(self, sensor: Sensor) -> bool:
         free = set(self.coordinates)
         body = self.find(sensor.body)

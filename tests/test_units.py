@@ -364,3 +364,15 @@ def test_a_rate_that_is_summed_up_or_differentiated_is_the_same_motion(
     turned = [va12.coordinates.index(n) for n in ("theta1", "theta4")]
     grown = [s.q[turned] - s.q[turned][:, 200:201] for s in (one, other)]
     assert grown[1][:, inner] == pytest.approx(grown[0][:, inner], abs=5e-3)
+
+
+def test_values_are_told_in_the_unit_that_they_are_in(tmp_path: Path, va12: prediction.Model) -> None:
+    """A log is SI once it is read, whatever its columns were in; a sliding joint's angle is a length."""
+    emps = machine.load("emps")
+    assert {s.kind: emps.si(s) for s in emps.sensor} == {"angle": "m", "torque": "N"}
+    rpm = prediction.build(variant(tmp_path, RATES)).machine
+    assert {s.name: rpm.si(s) for s in rpm.sensor if s.unit == "rpm"} == dict.fromkeys(
+        ("theta1", "theta4", "thetal", "thetar"), "rad/s"
+    )
+    told = {s.kind: va12.machine.si(s) for s in va12.machine.sensor}
+    assert told == {"angle": "rad", "wheel": "rad", "torque": "N m", "yaw_rate": "rad/s", "lateral_speed": "m/s"}

@@ -28,7 +28,8 @@ import scipy.signal
 
 from excite import drive, log, sensors
 from excite.driver import Driver
-from excite.identify import NoEstimate, identify
+from excite.estimate import NoEstimate
+from excite.identify import identify
 from excite.objective import relative
 from excite.scenario import varied
 from excite.simulate import Motion, simulate
@@ -154,9 +155,11 @@ def done() -> list[dict[str, object]]:
     rows = []
     for line in RUNS.read_text().splitlines():
         try:
-            rows.append(json.loads(line))
+            row = json.loads(line)
         except json.JSONDecodeError:
             continue
+        if "value" not in row or "interval" in row:  # earlier versions told less
+            rows.append(row)
     return rows
 
 

@@ -13,7 +13,8 @@ import numpy as np
 import scipy.io
 
 from excite import crosscheck, log
-from excite.identify import METHODS, NoEstimate, identify
+from excite.estimate import NoEstimate
+from excite.identify import METHODS, identify
 from excite.processing import derivative, lowpass
 from model import machine
 from model.prediction import Model, build

@@ -26,6 +26,7 @@ from excite import aim as aims
 from excite import folder, identify, log, scenario, sensors, sequential
 from excite.design import design
 from excite.driver import follow
+from excite.estimate import NoEstimate
 from excite.limit import check
 from excite.manoeuvre import Manoeuvre
 from excite.report import COLOURS, save
@@ -127,7 +128,7 @@ def one(
                 motions = [first, driven(nominal, true, drive[1], drive[0], 2 * number + 1)]
             else:
                 motions = [driven(nominal, true, designs[kind], nominal, 2 * number + i) for i in range(2)]
-        except (SimulationError, identify.NoEstimate, ValueError) as err:
+        except (SimulationError, NoEstimate, ValueError) as err:
             row[kind] = {"failed": str(err)}
             continue
         if kind == "nominal":
