@@ -13,17 +13,18 @@ certificate most. Where <U - V, A> - m' d phi / dt <= e <a (U + V) + b I, A> eve
 (1 + e a) V + e b I holds exactly, so that t >= tr U (1 - e a) / (1 + e a + e b n). Violations e are measured with
 a = 1 / (2 tr U), b = 1 / tr sum_k w_k A_k: <U + V, A> alone vanishes at states that move a lot.
 
-What is assumed. The search for violating states is local (a random population, the best of it polished by an interior
-point method), so e is the largest violation found and the bound a numerical one, not a proof. Not used: the lane,
-torque rates, the duration and the knots, so the optimum of the relaxation may lie well below what a drive can reach.
-Samples of a motion meet E[d phi / dt] = 0 up to their sum's distance from the integral, O(sample / duration), and to
-the tolerances of rest.
+What is assumed. The search for violating states is local (every sample of the drives that it starts from, a random
+population about these and all that were found, the best of it polished by an interior point method), so e is the
+largest violation found and the bound a numerical one, not a proof. The parameters are the nominal ones. Not used: the
+lane, torque rates, the duration and the knots, so the optimum of the relaxation may lie well below what a drive can
+reach. Samples of a motion meet E[d phi / dt] = 0 up to their sum's distance from the integral, O(sample / duration),
+and to the tolerances of rest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
 
 import casadi as ca
@@ -36,6 +37,7 @@ from model.machine import Problem
 from model.prediction import Model
 
 STRIDE = 40  # samples of a drive from one state to the next, at first
+OFTEN = 100  # of all its samples, those against which a certificate is searched anew
 INSIDE = 1e-6  # of a limit's range: what a state may exceed
 SPREAD = 3e-3, 0.5  # of the population around the states that are known, log-uniform, in half ranges
 THOROUGH = 3  # times the search of the first rounds, once these find little, and against what is reported
@@ -49,27 +51,7 @@ STILL = 1e-5  # drift that is left over and counts as none, as a share of the la
 
 
 @dataclass(frozen=True)
-class Bound:
-    """How low cond(Phi) can be.
-
-    mixture: cond of the best mixture of the states found; the relaxation's optimum is not above it. certified: no drive
-    does better, by the best certificate and the largest violation of it that was found, which is `violation`. states:
-    in the last mixture. rounds: of column generation. degree: of the polynomials.
-    """
-
-    mixture: float
-    certified: float
-    violation: float
-    states: int
-    rounds: int
-    degree: int
-
-
-Progress = Callable[[Bound], bool | None]
-
-
-@dataclass(frozen=True)
-class _Certificate:
+class Certificate:
     """U, V (n, n), multipliers m (n_phi,): <U - V, A> <= m' d phi / dt. a, b: how violations are measured."""
 
     U: np.ndarray
@@ -85,6 +67,34 @@ class _Certificate:
     def proves(self, e: float) -> float:
         """The t that is proven where no state violates it by more than e."""
         return float(np.trace(self.U)) * max(0.0, 1 - e * self.a) / (1 + e * (self.a + self.b * len(self.U)))
+
+
+@dataclass(frozen=True)
+class Bound:
+    """How low cond(Phi) can be.
+
+    mixture: cond of the best mixture of the states found; the relaxation's optimum is not above it. certified: no drive
+    does better, by the best certificate and the largest violation of it that was found, which is `violation`. states:
+    in the last mixture. rounds: of column generation. degree: of the polynomials. certificate: what proves it.
+    """
+
+    mixture: float
+    certified: float
+    violation: float
+    states: int
+    rounds: int
+    degree: int
+    certificate: Certificate | None = field(default=None, compare=False, repr=False)
+
+    def along(self, model: Model, problem: Problem, motion: Motion) -> float:
+        """The largest violation of the certificate by a sample of a motion that keeps the limits."""
+        assert self.certificate is not None
+        states = _states(model, problem, self.degree)
+        Phi, drift, _ = states.columns(_visited(states, [motion], 1))
+        return float(_violation(Phi, drift, self.certificate).max(initial=0.0))
+
+
+Progress = Callable[[Bound], bool | None]
 
 
 @dataclass(frozen=True)
@@ -135,20 +145,22 @@ def bound(
     """
     states = _states(model, problem, degree)
     rng = np.random.default_rng(seed)
-    every = [np.hstack([m.q[::STRIDE, list(states.core)], m.nu[::STRIDE], m.u[::STRIDE]]) for m in motions]
-    Z = (np.vstack(every) / states.size).T
-    Z = _kept_limits(states, np.hstack([Z, -Z]))
+    Z, given = _visited(states, motions, STRIDE), _visited(states, motions, 1)
+    given_Phi, given_drift, _ = states.columns(given)
     if not Z.shape[1]:
         raise ValueError(
             "the drives to start from keep the limits nowhere: give one that was designed for this problem"
         )
     found = Bound(np.inf, 0.0, np.inf, Z.shape[1], 0, degree)
-    proofs: list[tuple[_Certificate, float]] = []
+    proofs: list[tuple[Certificate, float]] = []
     effort = 1
     for k in range(1, rounds + 1):
         Phi, drift, _ = states.columns(Z)
         t, w, certificate = _mixture(np.einsum("kri,krj->kij", Phi, Phi), drift)
-        fresh, worst = _price(states, certificate, Z, effort * population, effort * polished, rng)
+        # The drives themselves lie on the thin manifold of slips in equilibrium, which a random search leaves at once.
+        off = np.argsort(-_violation(given_Phi, given_drift, certificate))[:OFTEN]
+        around = np.hstack([Z, given[:, off]])
+        fresh, worst = _price(states, certificate, around, effort * population, effort * polished, rng)
         # what is found against one certificate counts against every one
         new_Phi, new_drift, _ = states.columns(fresh)
         proofs = [(x, float(_violation(new_Phi, new_drift, x).max(initial=e))) for x, e in proofs]
@@ -170,32 +182,41 @@ def bound(
         e = np.where(w > 1e-9 * w.max(), np.inf, _violation(Phi, drift, certificate))
         best = np.argsort(-e)[:MOST]
         Z = np.hstack([Z[:, best[e[best] > -NEAR]], fresh])
-    certified, violation = _confirmed(states, proofs, Z, THOROUGH * population, THOROUGH * polished, rng)
-    return replace(found, certified=certified, violation=violation)
+    around = np.hstack([Z, given[:, ::OFTEN]])
+    certificate, violation = _confirmed(states, proofs, around, THOROUGH * population, THOROUGH * polished, rng)
+    certified = float(np.sqrt(certificate.proves(violation)))
+    return replace(found, certified=certified, violation=violation, certificate=certificate)
+
+
+def _visited(states: _States, motions: Sequence[Motion], stride: int) -> np.ndarray:
+    """States (n_z, n_k) of motions and of their mirror images that keep the limits."""
+    every = [np.hstack([m.q[::stride, list(states.core)], m.nu[::stride], m.u[::stride]]) for m in motions]
+    Z = (np.vstack(every) / states.size).T
+    return _kept_limits(states, np.hstack([Z, -Z]))
 
 
 def _confirmed(
     states: _States,
-    proofs: list[tuple[_Certificate, float]],
+    proofs: list[tuple[Certificate, float]],
     Z: np.ndarray,
     population: int,
     polished: int,
     rng: np.random.Generator,
-) -> tuple[float, float]:
-    """The bound on cond of the certificate that proves most after a thorough search against it, and its violation.
+) -> tuple[Certificate, float]:
+    """The certificate that proves most after a thorough search against it, and its violation.
 
     The best of many certificates is likely to be one whose violations were overlooked: hence the second look.
     """
-    left, looked = list(proofs), list[tuple[float, float]]()
+    left, looked = list(proofs), list[tuple[float, float, Certificate]]()
     while left and len(looked) < 5:
         k = int(np.argmax([x.proves(e) for x, e in left]))
         x, e = left.pop(k)
-        if looked and x.proves(e) <= max(looked)[0]:
+        if looked and x.proves(e) <= max(t for t, *_ in looked):
             break
         e = max(e, _price(states, x, Z, population, polished, rng)[1])
-        looked.append((x.proves(e), e))
-    t, e = max(looked)
-    return float(np.sqrt(t)), e
+        looked.append((x.proves(e), e, x))
+    _, e, best = max(looked, key=lambda found: found[0])
+    return best, e
 
 
 def _states(model: Model, problem: Problem, degree: int) -> _States:
@@ -254,7 +275,7 @@ def _kept_limits(states: _States, Z: np.ndarray) -> np.ndarray:
     return Z[:, states.columns(Z)[2]]
 
 
-def _mixture(A: np.ndarray, c: np.ndarray) -> tuple[float, np.ndarray, _Certificate]:
+def _mixture(A: np.ndarray, c: np.ndarray) -> tuple[float, np.ndarray, Certificate]:
     """The best mixture of information matrices (n_k, n, n) with drifts (n_k, n_phi).
 
     t (inf while it drifts), weights (n_k,), certificate.
@@ -280,7 +301,7 @@ def _mixture(A: np.ndarray, c: np.ndarray) -> tuple[float, np.ndarray, _Certific
     m = np.asarray(still[0].dual_value).ravel() / spread if still else np.zeros(n_phi)
     trace = float(np.trace(V))
     a, b = trace / (2 * float(np.trace(U))), 1 / float(np.sum(w.value))
-    both = [_Certificate(U / trace, V / trace, sign * m / trace, a, b) for sign in (1, -1)]
+    both = [Certificate(U / trace, V / trace, sign * m / trace, a, b) for sign in (1, -1)]
     # the sign of an equality's multiplier is the solver's convention: the certificate must hold on its own columns
     over = [(np.einsum("kij,ij->k", A, x.U - x.V) - c @ x.m).max() for x in both]
     chosen = both[int(np.argmin(over))]
@@ -293,14 +314,14 @@ def _psd(matrix: np.ndarray) -> np.ndarray:
     return np.asarray((Q * np.maximum(e, 0)) @ Q.T)
 
 
-def _violation(Phi: np.ndarray, drift: np.ndarray, x: _Certificate) -> np.ndarray:
+def _violation(Phi: np.ndarray, drift: np.ndarray, x: Certificate) -> np.ndarray:
     """(n_k,): (<U - V, A> - m' d phi / dt) / <a (U + V) + b I, A>."""
     gain, gauge = (np.einsum("kri,kri->k", Phi @ M, Phi) for M in (x.U - x.V, x.gauge))
     return np.asarray((gain - drift @ x.m) / gauge)
 
 
 def _price(
-    states: _States, x: _Certificate, Z: np.ndarray, population: int, polished: int, rng: np.random.Generator
+    states: _States, x: Certificate, Z: np.ndarray, population: int, polished: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, float]:
     """States (n_z, n_new) that violate a certificate, and the largest violation found.
 

@@ -46,6 +46,14 @@ def test_what_drives_must_obey_raises_the_bound(
     assert tight.certified < 23.31
 
 
+def test_no_sample_of_a_drive_violates_the_certificate_by_more_than_it_says(
+    straight: Model, problem: Problem, drives: list[Motion], loose: Bound
+) -> None:
+    assert loose.certificate is not None
+    assert loose.along(straight, problem, drives[0]) <= loose.violation * (1 + 1e-9)
+    assert loose.certified == pytest.approx(np.sqrt(loose.certificate.proves(loose.violation)))
+
+
 def test_the_same_seed_gives_the_same_bound(straight: Model, problem: Problem, drives: list[Motion]) -> None:
     few = {"degree": 1, "rounds": 2, "population": 500, "polished": 2}
     assert bound(straight, problem, drives[:1], **few) == bound(straight, problem, drives[:1], **few)

@@ -36,7 +36,10 @@ def test_emps_from_the_command_line(emps_data: Path, tmp_path: Path, excite: Exc
     summary = json.loads(stdout)
     assert summary == json.loads((tmp_path / "o" / "summary.json").read_text())
     assert summary["parameters"]["M"]["value"] == pytest.approx(95.109, abs=0.1)
-    assert summary["parameters"]["M"]["std_percent"] == pytest.approx(0.114, abs=0.002)
+    row = summary["parameters"]["M"]
+    assert row["std_percent"] == pytest.approx(0.114, abs=0.002)
+    assert row["high95"] - row["value"] == pytest.approx(1.96 * row["std"], rel=0.01)
+    assert row["value"] - row["low95"] == pytest.approx(1.96 * row["std"], rel=0.01)
     assert summary["unidentifiable"] == []
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 # ruff: noqa: E402  (threads are set before numpy loads)
 import argparse
 import dataclasses
+import json
 import os
 import time
 from pathlib import Path
@@ -66,13 +67,18 @@ def main() -> None:
         "machine": "va12",
         "problem": "R60",
         "designed_cond_phi": best,
-        **dataclasses.asdict(found),
+        **{f.name: getattr(found, f.name) for f in dataclasses.fields(found) if f.name != "certificate"},
         "gap_percent": 100 * (best / found.certified - 1) if found.certified > 0 else None,
         "wall_s": time.monotonic() - begin,
         "certified_by_round": [f.certified for f in path],
         "mixture_by_round": [f.mixture for f in path],
     }
     save(figure(path, found, best), HERE / "bound.png")
+    certificate = found.certificate
+    assert certificate is not None
+    told = {k: getattr(certificate, k) for k in ("U", "V", "m", "a", "b")}
+    with folder.writing_file(HERE / "certificate.json") as place:
+        place.write_text(json.dumps(told, default=lambda x: np.asarray(x).tolist()) + "\n", encoding="utf-8")
     with folder.writing_file(HERE / "summary.json") as place:
         place.write_text(folder.dump(summary), encoding="utf-8")
 
