@@ -122,7 +122,8 @@ def scores_covariance(Z: np.ndarray, e: np.ndarray) -> np.ndarray:
 
     Every row of e is an autoregression of its innovations. What an innovation does to the sum later on is Z filtered
     backward in time by the same autoregression; the innovations then count by their squares, so that their level may
-    change along the log and go together across rows.
+    change along the log and go together across rows at the same time. What one row's noise tells another's later on is
+    not counted.
     """
     n, one = e.shape[1], np.ones(1)
     scores = np.zeros((n, Z.shape[2]))

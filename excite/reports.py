@@ -14,7 +14,7 @@ import numpy as np
 from excite import folder, log, logcheck, objective, report, tables
 from excite.limit import TOLERANCE
 from excite.page import Picture, Table, report_page
-from excite.terminal import rounded
+from excite.terminal import likely, rounded
 from model import machine as machines
 
 NAME = "report.html"
@@ -360,7 +360,7 @@ def _diagnose(s: Summary) -> Said:
                 rounded(f["amount_std"], 2),
                 f["unit"],
                 "; ".join(f"{n} {rounded(x['value'], 4)} {x['unit']}" for n, x in f["shapes"].items()) or "-",
-                "< 1e-12" if f["p_value"] < 1e-12 else rounded(f["p_value"], 2),
+                likely(f["p_value"]),
                 rounded(f["gain_percent"], 3),
                 "-" if f["gain_ci95"] is None else " to ".join(rounded(x, 3) for x in f["gain_ci95"]),
                 ", ".join(f["tied_with"]) or "-",

@@ -59,6 +59,11 @@ def rounded(value: object, digits: int = 4) -> str:
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
+def likely(p: float) -> str:
+    """A p-value, as small as it may be told."""
+    return "< 1e-12" if p < 1e-12 else rounded(p, 2)
+
+
 def design_table(summary: dict[str, Any]) -> None:
     """A design in sentences: score, limits, what accuracy it makes attainable."""
     from excite.limit import TOLERANCE
@@ -188,7 +193,7 @@ def diagnose_table(summary: dict[str, Any]) -> None:
                 rounded(f["amount"], 5),
                 rounded(f["amount_std"], 2),
                 f["unit"],
-                rounded(f["p_value"], 2),
+                likely(f["p_value"]),
                 rounded(f["gain_percent"], 3),
                 "-" if low is None else f"{rounded(low, 3)} to {rounded(high, 3)}",
                 ", ".join(f["tied_with"]) or "-",
