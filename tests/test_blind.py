@@ -210,6 +210,7 @@ PLAIN = {  # of each cause the first minute of driving in which it is ten times 
     "articulation_stop_spring": 0,
     "vibration_on": 0,
     "payload_shift": 1,
+    "relief_valve": 0,
 }
 
 
