@@ -179,7 +179,8 @@ def verify_figure(v: Verification, title: str) -> Figure:
     figure.suptitle(plain(title))
     places = np.arange(n)[::-1]
     e = v.error_percent
-    ends = 100 * np.nanmean((v.interval - v.value[:, None]) / v.reference, axis=0)
+    # An error is within its interval where the truth is: as far below the value as the interval reaches down.
+    ends = 100 * np.nanmean((v.value[:, None] - v.interval) / v.reference, axis=0)
     for k, y in enumerate(places):
         errors.plot(ends[:, k], [y, y], color="0.75", linewidth=9, solid_capstyle="butt", zorder=1)
         errors.plot(e[:, k], y + np.linspace(-0.25, 0.25, len(e)), ".", color=COLOURS[0], markersize=3, zorder=2)
