@@ -37,7 +37,8 @@ from model.machine import Problem
 from model.prediction import Model
 
 STRIDE = 40  # samples of a drive from one state to the next, at first
-OFTEN = 100  # of all its samples, those against which a certificate is searched anew
+WORST = 100  # of all its samples, those about which a round searches as well
+SPARSE = 100  # samples of a drive from one state to the next, about which the last search is
 INSIDE = 1e-6  # of a limit's range: what a state may exceed
 SPREAD = 3e-3, 0.5  # of the population around the states that are known, log-uniform, in half ranges
 THOROUGH = 3  # times the search of the first rounds, once these find little, and against what is reported
@@ -158,7 +159,7 @@ def bound(
         Phi, drift, _ = states.columns(Z)
         t, w, certificate = _mixture(np.einsum("kri,krj->kij", Phi, Phi), drift)
         # The drives themselves lie on the thin manifold of slips in equilibrium, which a random search leaves at once.
-        off = np.argsort(-_violation(given_Phi, given_drift, certificate))[:OFTEN]
+        off = np.argsort(-_violation(given_Phi, given_drift, certificate))[:WORST]
         around = np.hstack([Z, given[:, off]])
         fresh, worst = _price(states, certificate, around, effort * population, effort * polished, rng)
         # what is found against one certificate counts against every one
@@ -182,7 +183,7 @@ def bound(
         e = np.where(w > 1e-9 * w.max(), np.inf, _violation(Phi, drift, certificate))
         best = np.argsort(-e)[:MOST]
         Z = np.hstack([Z[:, best[e[best] > -NEAR]], fresh])
-    around = np.hstack([Z, given[:, ::OFTEN]])
+    around = np.hstack([Z, given[:, ::SPARSE]])
     certificate, violation = _confirmed(states, proofs, around, THOROUGH * population, THOROUGH * polished, rng)
     certified = float(np.sqrt(certificate.proves(violation)))
     return replace(found, certified=certified, violation=violation, certificate=certificate)

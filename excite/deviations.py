@@ -15,7 +15,7 @@ import numpy as np
 
 from excite.innovations import Linear
 from excite.linearise import Chart
-from excite.newton import HELD, PRIOR, Fit, NotConverged, in_si, linearised, moved, newton_step, places
+from excite.newton import Fit, NotConverged, in_si, linearised, moved, newton_step, places
 from excite.record import Point, Record, readings
 
 PHASES = 64  # places between two edges at which an encoder's count may begin, to average over
@@ -37,7 +37,7 @@ def sure(
     above (2, n_base) [SI]; and what to say of them."""
     linear = linearised(c, records, fit.points, starts, fit.X, fit.disturbed)
     fit = fit if linear is None else replace(fit, linear=tuple(linear))  # the last step was one from elsewhere
-    covariance, _, _, cost = newton_step(c, records, fit.linear, fit.points, fit.X, _prior(fit), 0.0)
+    covariance, _, _, cost = newton_step(c, records, fit.linear, fit.points, fit.X, fit.prior, 0.0)
     n = len(fit.X)
     added = np.zeros_like(covariance)
     for r, p, found, place in zip(records, fit.points, fit.linear, places(c, records), strict=True):
@@ -141,19 +141,21 @@ def followed(
     if not way.any():
         return 1.0, 1.0
     n = len(fit.X)
-    prior, step = _prior(fit), in_deviations(covariance, way)
+    step = in_deviations(covariance, way)
     widths = []
     for far in (-FOLLOWED, FOLLOWED):
         X = fit.X + far * step[:n] * c.model.scale
+        if not (X[c.model.positive] > 0).all():
+            return 1.0, 1.0
         points = [
             moved(c, r, p, found, far * step[place])
             for r, p, found, place in zip(records, fit.points, fit.linear, places(c, records), strict=True)
         ]
         linear = linearised(c, records, points, starts, X, fit.disturbed)
-        if linear is None or not (X[c.model.positive] > 0).all():
+        if linear is None:
             return 1.0, 1.0
         try:
-            there, steps, _, cost = newton_step(c, records, linear, points, X, prior, 0.0)
+            there, steps, _, cost = newton_step(c, records, linear, points, X, fit.prior, 0.0)
         except (NotConverged, np.linalg.LinAlgError):
             return 1.0, 1.0
         if not np.isfinite(cost):
@@ -162,7 +164,3 @@ def followed(
         risen = cost + back**2 / (way @ there @ way) - fit.cost
         widths.append(float(np.clip(FOLLOWED / np.sqrt(max(risen, 1e-9)), *LOPSIDED)))
     return widths[0], widths[1]
-
-
-def _prior(fit: Fit) -> np.ndarray:
-    return np.where(fit.unseen, HELD**-2, PRIOR**-2)

@@ -238,7 +238,7 @@ def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_tu
 
 def _one_by_one(before: Stage, chosen: Sequence[Choice], whole: Stage) -> list[Choice]:
     """Effects that a model has, put into the one without them one after the other; gains are over those that stand
-    before. None where the logs can't be fitted on the way."""
+    before. None of them where the logs can't be fitted on the way."""
     stages = [before]
     try:
         for x in chosen:

@@ -227,7 +227,7 @@ def remembered(
 def scan(c: Chart, records: Sequence[Record], fit: newton.Fit, found: Sequence[Candidate]) -> Scan:
     """The score of every candidate along fitted logs, best first."""
     total, n = sum(len(x.columns) for x in found), len(fit.X)
-    prior = np.where(fit.unseen, newton.HELD**-2, newton.PRIOR**-2)
+    prior = fit.prior
     Z = np.zeros((1 + n + total, 1 + n + total))
     for k, (r, linear) in enumerate(zip(records, fit.linear, strict=True)):
         made = Signatures(c, r, fit, k, found)

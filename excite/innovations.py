@@ -82,8 +82,9 @@ def innovation_sizes(linear: Linear) -> np.ndarray:
     """Mean square of the normalised innovations of every sensor, and of their sums over blocks in deviations, both
     1 where model and noise are right; and the number of blocks: (m, 3)."""
     z, allowed = linear.innovations, np.ones(linear.residual.shape)
-    for step in linear.filter if _beats(linear) else ():
-        allowed[step.at] += _added(linear, step) / step.variance
+    for step in linear.filter if (linear.beats != 1).any() else ():
+        beats = (linear.beats[step.at] - 1) / np.where(step.used, linear.weight[step.at], np.inf)
+        allowed[step.at] += beats / step.variance
     sizes = np.zeros((z.shape[1], 3))
     for j, column in enumerate(z.T):
         told = np.flatnonzero(np.isfinite(column))
@@ -92,15 +93,6 @@ def innovation_sizes(linear: Linear) -> np.ndarray:
             slow = column[blocks].sum(axis=1) ** 2 / allowed[blocks, j].sum(axis=1)
             sizes[j] = np.mean(column[told] ** 2), np.mean(slow), len(slow)
     return sizes
-
-
-def _beats(linear: Linear) -> bool:
-    return bool((linear.beats != 1).any())
-
-
-def _added(linear: Linear, step: Step) -> np.ndarray:
-    """What beats add to the variance of a step's readings (K, m)."""
-    return (linear.beats[step.at] - 1) / np.where(step.used, linear.weight[step.at], np.inf)
 
 
 def whitened(linear: Linear, flawed: tuple[int, ...], push: np.ndarray, reading: np.ndarray) -> np.ndarray:

@@ -75,6 +75,15 @@ class Fit:
     def std(self) -> np.ndarray:
         return np.sqrt(np.diag(self.covariance))
 
+    @property
+    def prior(self) -> np.ndarray:
+        """Information (n_base,) about the machine file's values that stands before any data."""
+        return _prior(self.unseen)
+
+
+def _prior(held: np.ndarray) -> np.ndarray:
+    return np.where(held, HELD**-2, PRIOR**-2)
+
 
 def linearise(
     c: Chart,
@@ -201,7 +210,7 @@ def iterate(
     shorter, here = 0, (list(points), X)
     there = here
     whole, last = 1.0, np.zeros(len(X))
-    prior = np.where(held, HELD**-2, PRIOR**-2)
+    prior = _prior(held)
     unseen = held.copy()
     for k in range(passes):
         linear = linearised(c, records, there[0], starts, there[1], disturbed)
@@ -221,7 +230,7 @@ def iterate(
             unseen |= sigma > UNSEEN * np.maximum(np.abs(X) / model.scale, 1.0)
             if unseen.any():
                 # Left free they would go anywhere, and take the mass matrix and the slips with them.
-                prior[unseen] = HELD**-2
+                prior = _prior(unseen)
                 covariance, move, left, cost = newton_step(c, records, linear, points, X, prior, damping)
         damping *= DAMPING[1]
         before, step = step, left

@@ -14,7 +14,7 @@ import numpy as np
 from excite import folder, log, logcheck, objective, report, tables
 from excite.limit import TOLERANCE
 from excite.page import Picture, Table, report_page
-from excite.terminal import likely, rounded
+from excite.terminal import ESTIMATE, likely, rounded
 from model import machine as machines
 
 NAME = "report.html"
@@ -279,12 +279,11 @@ def _identify(s: Summary) -> Said:
         errors = ", ".join(f"{n} {v:.1f} %" for n, v in check["torque_error_percent"].items())
         remarks.append(f"On {check['log']}, which it was not fitted on, torques are off by: {errors}.")
     biased = any("bias" in r for r in rows.values())
-    columns = (("value", 6), ("std", 3), ("std_percent", 3), ("low95", 6), ("high95", 6))
     table = tuple(
         (
             n,
             r["unit"],
-            *(rounded(r[k], d) for k, d in columns),
+            *(rounded(r[k], d) for _, k, d in ESTIMATE),
             *((rounded(r.get("bias"), 3),) if biased else ()),
         )
         for n, r in rows.items()
@@ -292,11 +291,7 @@ def _identify(s: Summary) -> Said:
     names = (
         "parameter",
         "unit",
-        "value",
-        "std",
-        "std %",
-        "95 % from",
-        "to",
+        *(heading for heading, *_ in ESTIMATE),
         *(("bias of the method",) if biased else ()),
     )
     conds = f"cond(W) {s['cond_w']:.4g}, cond(Phi) {s['cond_phi']:.4g}"

@@ -12,6 +12,13 @@ from typing import Any
 SHOWN = 40  # cells of a study in the terminal
 PAUSE = 30.0  # s between lines of progress
 TELLING = 10  # runs before the time left can be told
+ESTIMATE = (  # what is told of a parameter: heading, key, digits
+    ("value", "value", 6),
+    ("std", "std", 3),
+    ("std %", "std_percent", 3),
+    ("95 % from", "low95", 6),
+    ("to", "high95", 6),
+)
 
 
 def say(thing: object) -> None:
@@ -146,10 +153,9 @@ def compare_table(summary: dict[str, Any]) -> None:
 
 def identify_table(summary: dict[str, Any]) -> None:
     """An estimate, a parameter a line, with what there is to remark."""
-    columns = (("value", 6), ("std", 3), ("std_percent", 3), ("low95", 6), ("high95", 6))
-    rows = table("parameter", "unit", "value", "std", "std %", "95 % from", "to")
+    rows = table("parameter", "unit", *(heading for heading, *_ in ESTIMATE))
     for name, row in summary["parameters"].items():
-        rows.add_row(name, row["unit"], *(rounded(row[k], digits) for k, digits in columns))
+        rows.add_row(name, row["unit"], *(rounded(row[k], digits) for _, k, digits in ESTIMATE))
     say(rows)
     say(
         f"method {summary['method']}: relative error {summary['relative_error_percent']:.2f} %,"
