@@ -36,14 +36,18 @@ STRONG = 1.3  # misfit over readings from which first-order gains are rough
 PASSES = 14  # of a candidate's fit
 LESS = 0.1, 0.3  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
 TRIED = 5  # candidates that are fitted, of different names
+LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
 PAIR = 2  # candidates that are fitted in any case, side by side
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
-ROUGHLY = 2  # the same where not even the model without them was fitted
 MOST = 4  # effects that are looked for
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 SHAPE = 0.005, 0.002  # of what is explained already, that a further effect must gain, as nature is never exactly the
 # formula: by the fits' gains, and by how many deviations the amounts are from none
+VAGUE = (
+    0.1,
+    0.25,
+)  # the former for what acts at some time only, and where disturbing forces hide how good the formula is
 ALIKE = 0.03  # of an amount: what two formulas of one effect differ by; those of results/diagnosis do by 1 to 6 %
 FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
 BESIDE = 250.0  # a gain that by the latter no effect can be denied
@@ -75,7 +79,7 @@ class Prepared:
 @dataclass(frozen=True)
 class Stage:
     """A model with the effects found so far, fitted. `exact`: without disturbing forces. Not `settled`: no fit was
-    found that the log agrees to, this is how far it came. loose: the same model with the larger disturbing forces that
+    found, parameters are the file's. loose: the same model with the larger disturbing forces that
     this fit came from, if it did."""
 
     machine: Machine
@@ -98,9 +102,14 @@ class Stage:
         return max(0.0, self.fit.cost - (1 + SLACK) * self.prepared.readings)
 
     @property
+    def near(self) -> bool:
+        """Whether the misfit is not far from what noise makes."""
+        return self.fit.cost <= STRONG * self.prepared.readings
+
+    @property
     def rough(self) -> bool:
         """Whether first-order gains are."""
-        return not self.exact or self.fit.cost > STRONG * self.prepared.readings
+        return not self.exact or not self.near
 
     @property
     def doubt(self) -> float:
@@ -203,8 +212,15 @@ def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tupl
         odd = _odd(stage)
         if not kept or (stage.exact and not odd):
             break
-        explained = kept[-1].gain / (kept[-1].gain + stage.excess)
-        if explained >= (SHARE if len(kept) == 1 else FURTHER):
+        enough = SHARE if len(kept) == 1 else FURTHER
+        explained = kept[-1].share(stage)
+        if explained >= enough:
+            break
+        loose = kept[-1].loose
+        if loose is not None and kept[-1].share(loose) >= enough:
+            # Exact dynamics make a large misfit of a formula that is nearly right; it was judged with forces.
+            kept[-1] = replace(kept[-1], stage=loose)
+            odd = _odd(loose)
             break
         nearest = kept.pop().name, explained
     return kept, odd, nearest
@@ -318,7 +334,8 @@ def _odd(stage: Stage) -> tuple[str, ...]:
 @dataclass(frozen=True)
 class Choice:
     """An effect that was added, the model with it, and the rivals that the log likes about as well. gain: of twice the
-    log-likelihood, which what is left of the misfit makes `spread` times less sure."""
+    log-likelihood, which what is left of the misfit makes `spread` times less sure. loose: the model with it and the
+    disturbing forces that it was judged with, where it needs none."""
 
     name: str
     stage: Stage
@@ -326,39 +343,53 @@ class Choice:
     spread: float
     tried: int
     rivals: tuple[EffectEntry, ...]
+    loose: Stage | None = None
+
+    def share(self, stage: Stage) -> float:
+        """Of the misfit, how much the effect explains, by what is left of it in a stage."""
+        return self.gain / (self.gain + stage.excess)
 
 
 def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
     """A machine's model fitted to logs, with shapes of effects free.
 
     Where exact dynamics find no estimate, with disturbing forces as small as the log lets them be: the less they may
-    take up, the plainer the cause. Raises NotConverged where not even large ones let the model follow.
+    take up, the plainer the cause. Where not even large ones let the model follow, with the file's parameters: what
+    these leave shows where to look. Raises NotConverged where those don't either.
     """
     prepared = _prepared(machine, logs, filter)
-    starts, nominal = prepared.starts, prepared.c.model.nominal
+    found = _begun(machine, prepared)
+    if found is not None:
+        return found
+    asis = replace(prepared, held=np.ones_like(prepared.held))
     try:
-        return Stage(machine, prepared, light(_iterated(prepared, starts, nominal, 0.0)))
-    except NotConverged:
-        pass
-    stood: Fit | None = None
-    for disturbed in smoothing.DISTURBED:
+        fit = _iterated(asis, prepared.starts, prepared.c.model.nominal, smoothing.DISTURBED[0])
+    except NotConverged as failed:
+        if failed.fit is None:
+            raise
+        fit = failed.fit
+    return Stage(machine, prepared, light(replace(fit, unseen=prepared.held)), settled=False)
+
+
+def _begun(machine: Machine, prepared: Prepared) -> Stage | None:
+    """A machine's model fitted to logs from their first guesses, with disturbing forces as small as they can be; None
+    where no fit is found."""
+    starts, nominal = prepared.starts, prepared.c.model.nominal
+    for disturbed in (0.0, *smoothing.DISTURBED):
         try:
             fit = _iterated(prepared, starts, nominal, disturbed)
         except NotConverged as failed:
-            stood, trouble = failed.fit or stood, failed
-            if failed.nearly is None:
+            if failed.nearly is None or disturbed == 0:
                 continue
             fit = failed.nearly
-        first = Stage(machine, prepared, light(fit))
-        for less in LESS:
+        stage = Stage(machine, prepared, light(fit))
+        for less in LESS if disturbed > 0 else ():
             try:
-                return replace(refitted(machine, first, less * disturbed), loose=first)
+                return replace(refitted(machine, stage, less * disturbed), loose=stage)
             except NotConverged:
                 continue
-        return first
-    if stood is None:
-        raise trouble
-    return Stage(machine, prepared, light(stood), settled=False)
+        return stage
+    return None
 
 
 def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
@@ -476,13 +507,16 @@ def _identified(effect: str, where: str, amount: float, shapes: Mapping[str, flo
 
 
 def _shortlist(stage: Stage, scores: Sequence[evidence.Score], explained: float) -> list[evidence.Score]:
-    """The best candidate of each name, best first, as far as worth a fit."""
-    best: dict[str, evidence.Score] = {}
-    least = max(WORTH, _least(stage, explained) / OVER)
+    """The best candidate of each name, best first, as far as worth a fit; another variant where it scores alike."""
+    best: dict[tuple[str, ...], evidence.Score] = {}
+    most: dict[str, float] = {}
+    hope = max(WORTH, HOPE[stage.rough] * scores[0].gain) if scores else 0.0
     for s in scores:
-        if s.gain >= max(least, HOPE[stage.rough] * scores[0].gain) and s.values["A"] != 0:
-            best.setdefault(s.candidate.name, s)
-    return list(best.values())[: TRIED if stage.settled else ROUGHLY]
+        least = _least(stage, explained, s.candidate) / OVER if stage.settled else 0.0
+        worth = s.gain >= max(least, hope) and s.values["A"] != 0
+        if worth and s.gain >= LIKE * most.setdefault(s.candidate.name, s.gain):
+            best.setdefault(s.candidate.variant, s)
+    return list(best.values())[:TRIED]
 
 
 _Try = tuple[evidence.Score, Stage]
@@ -512,6 +546,9 @@ def _choose(
         nearby = evidence.finer(likely, stage.machine, _duration(stage.prepared.logs), reach)
         if len(nearby) > len(likely):
             likely = _shortlist(stage, sorted([*likely, *_scanned(stage, nearby)], key=lambda s: -s.gain), explained)
+    if not stage.settled:
+        tell(done, "fitting effects from the beginning")
+        return _beginning(stage, likely, len(scores), together)
     tries = _tries(stage, likely, together, lambda k: tell(done + 0.03 * k, f"fitting {likely[k].candidate.name}"))
     if stage.exact and likely[0].candidate.name not in {s.candidate.name for s, _ in tries}:
         # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
@@ -526,21 +563,52 @@ def _choose(
         tries = _tries(stage, likely, together, lambda k: None)
     if not tries:
         return None
-    tries.sort(key=lambda x: x[1].fit.cost)
     score, best = tries[0]
     gain = stage.fit.cost - best.fit.cost
     spread = max(1.0, best.fit.cost / best.prepared.readings)
-    if gain < max(LEVEL * spread, _least(stage, explained)):
+    if gain < max(LEVEL * spread, _least(stage, explained, score.candidate)):
         return None
-    tries = _close(_without_forces(_close(tries, gain), together), gain)
-    score, best = tries[0]
+    return _chosen(_close(tries, gain), gain, spread, len(scores), together)
+
+
+def _chosen(tries: Sequence[_Try], gain: float, spread: float, tried: int, together: Together) -> Choice:
+    """The best of close tries without disturbing forces where that can be, and the rest as its rivals."""
+    hidden = {s.candidate.name: stage for s, stage in tries if not stage.exact}
+    tries = _close(_without_forces(tries, together), gain)
+    name, best = tries[0][0].candidate.name, tries[0][1]
     rivals = tuple(_fitted(other, s.candidate.name) for s, other in tries[1:])
-    return Choice(score.candidate.name, best, gain, spread, len(scores), rivals)
+    return Choice(name, best, gain, spread, tried, rivals, hidden.get(name) if best.exact else None)
 
 
-def _least(stage: Stage, explained: float) -> float:
+def _beginning(stage: Stage, likely: Sequence[evidence.Score], tried: int, together: Together) -> Choice | None:
+    """The effect with which the model can follow logs that it can't follow without any; None where there is none."""
+    machines = [effects.extended(stage.machine, _entry(s)) for s in likely]
+    found = together([partial(_followed, m, stage) for m in machines])
+    tries = _one_each([(s, x) for s, x in zip(likely, found, strict=True) if x is not None and x.near])
+    if not tries:
+        return None
+    best = tries[0][1]
+    gain = stage.fit.cost - best.fit.cost
+    alike = _close([x for x in tries if x[1].fit.disturbed == best.fit.disturbed], gain)
+    return _chosen(alike, gain, 1.0, tried, together)
+
+
+def _followed(machine: Machine, of: Stage) -> Stage | None:
+    """A machine's model fitted to the logs of a stage from their first guesses, with so much of disturbing forces that
+    it comes near."""
+    stage = _begun(machine, _resumed(machine, of))
+    if stage is None or stage.near or not stage.exact:
+        return stage
+    try:
+        return refitted(machine, stage, LESS[0] * smoothing.DISTURBED[0])
+    except NotConverged:
+        return stage
+
+
+def _least(stage: Stage, explained: float, candidate: evidence.Candidate) -> float:
     """What an effect must gain to be worth a place beside those in a model, which have gained `explained`."""
-    return max(LEAST[stage.rough] * stage.excess, SHAPE[0] * explained, min(SHAPE[1] * _sureness(stage), BESIDE))
+    share = max(SHAPE[0], VAGUE[0] * candidate.placed.effect.timed, VAGUE[1] * (not stage.exact))
+    return max(LEAST[stage.rough] * stage.excess, share * explained, min(SHAPE[1] * _sureness(stage), BESIDE))
 
 
 def _tries(
@@ -560,7 +628,15 @@ def _tries(
             tell(min(at + k + 1, len(likely) - 1))
             if found is not None:
                 tries.append((score, found))
-    return tries
+    return _one_each(tries)
+
+
+def _one_each(tries: Sequence[_Try]) -> list[_Try]:
+    """The best variant of each name, best first: with as small disturbing forces as can be."""
+    best: dict[str, _Try] = {}
+    for x in sorted(tries, key=lambda x: (x[1].fit.disturbed, x[1].fit.cost)):
+        best.setdefault(x[0].candidate.name, x)
+    return list(best.values())
 
 
 def _close(tries: Sequence[_Try], gain: float) -> list[_Try]:
@@ -574,7 +650,7 @@ def _close(tries: Sequence[_Try], gain: float) -> list[_Try]:
 def _without_forces(tries: Sequence[_Try], together: Together) -> list[_Try]:
     """Those that need no disturbing forces any more, best first; all, best first as they are, where none does."""
     # What forces don't make good, none makes worse.
-    good = [x for x in tries if x[1].exact or x[1].fit.cost <= STRONG * x[1].prepared.readings]
+    good = [x for x in tries if x[1].exact or x[1].near]
     freed = refits([(s.machine, s, 0.0) for _, s in good if not s.exact], together)
     stages = [s if s.exact else next(freed) for _, s in good]
     exact = [(score, s) for (score, _), s in zip(good, stages, strict=True) if s is not None]

@@ -44,6 +44,13 @@ class Candidate:
     def name(self) -> str:
         return self.placed.name
 
+    @property
+    def variant(self) -> tuple[str, ...]:
+        """The name, and which shapes it has that are nothing by default: another way for the same cause to act."""
+        p = self.placed
+        more = [n for n, s in p.effect.shapes.items() if s.signed and not s.circular and p.values[n]]
+        return (self.name, *more)
+
 
 @dataclass(frozen=True)
 class Score:
@@ -96,7 +103,7 @@ def _grid(effect: Effect, site: Site) -> list[tuple[dict[str, float], int]]:
             if "begin" in values and values["begin"] + values["length"] > site.duration:
                 continue
             tried.append((values | ({circular: 0.0} if circular else {}), 2 if circular else 1))
-    return tried
+    return tried + [({"A": effect.amount(site), **shapes}, 1) for shapes in effect.beside(site)]
 
 
 def finer(scores: Sequence[Score], machine: Machine, duration: float, reach: float = 1.0) -> list[Candidate]:

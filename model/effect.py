@@ -95,6 +95,10 @@ def one(site: Site) -> float:
     return 1.0
 
 
+def nothing(site: Site) -> list[dict[str, float]]:
+    return []
+
+
 @dataclass(frozen=True)
 class Shape:
     """What an effect's amount leaves open: default and grid in units of `size`, which belongs to the site.
@@ -130,8 +134,10 @@ class Effect:
     `places`: joints (with friction), drives (driven joints), contacts, driven_contacts, drive (all of these together,
     of soil all contacts), articulation (driven joints without contact), wheels (measuring ones), yaw_rate,
     lateral_speed, machine. `amount`: a typical one [unit] at a site, `grid`: shares of it that are tried where the
-    signature isn't proportional to the amount. `positive`: a negative amount makes no sense; `inverse`: the smaller the
-    amount, the larger the effect; `angular`: a reading's error that only a sensor of an angle has, none of a rate.
+    signature isn't proportional to the amount; `beside`: shapes [unit] that are tried beside their grids. `positive`: a
+    negative amount makes no sense; `inverse`: the smaller the amount, the larger the effect; `angular`: a reading's
+    error that only a sensor of an angle has, none of a rate. `recoil`: the share of a changing `inertia` that comes of
+    a load sliding on its body, which pushes it back.
     Hooks take the scene, the body they act on, and the values.
     """
 
@@ -144,6 +150,7 @@ class Effect:
     amount: Callable[[Site], float]
     shapes: Mapping[str, Shape] = field(default_factory=dict)
     grid: tuple[float, ...] = (1.0,)
+    beside: Callable[[Site], list[dict[str, float]]] = nothing
     positive: bool = False
     inverse: bool = False
     torque: Callable[[Scene, int, Values], ca.SX] | None = None
@@ -151,6 +158,7 @@ class Effect:
     push: Callable[[Scene, int, Values], tuple[ca.SX, ca.SX]] | None = None
     gravity: Callable[[Scene, Values], tuple[ca.SX, ca.SX]] | None = None
     inertia: Callable[[Scene, Values], dict[str, ca.SX]] | None = None
+    recoil: Callable[[Scene, Values], ca.SX] | None = None
     reading: Callable[[Scene, ca.SX, int, Values], ca.SX] | None = None
     channel: Callable[[ca.SX, Values], Channel] | None = None
     memory: Mapping[str, Memory] = field(default_factory=dict)

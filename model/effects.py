@@ -24,6 +24,9 @@ SMOOTH_SLIP = 0.005  # slip over which driving turns into braking
 SMOOTH_SPEED = 0.02  # [m/s] over which a force against the motion turns
 SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
 
+BACK = 0.1  # [m] of way back from which a reversal counts
+LANE = 10.0  # [m] of way that a reversal is worth where these are counted
+
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
 
 
@@ -103,6 +106,22 @@ def _scaled(soil: Soil, factor: ca.SX) -> Soil:
     return replace(soil, Kx=soil.Kx * factor, Ky=soil.Ky * factor)
 
 
+def _way(s: Scene, k: int) -> ca.SX:
+    """Speed of a contact's centre, forward or back; nothing at standstill."""
+    Vx = s.rolling[k].Vx
+    return Vx * ca.tanh(Vx / SMOOTH_SPEED)
+
+
+def _turning(s: Scene, k: int, p: Values) -> ca.SX:
+    """How fast the direction that a contact remembers, 1 or -1, follows the one that it goes."""
+    return (s.rolling[k].Vx - _way(s, k) * s.z["facing"]) / BACK
+
+
+def _compacted(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
+    way = (1 - p["counted"]) * s.z["distance"] + p["counted"] * LANE * s.z["reversals"]
+    return _scaled(soil, 1 + p["A"] * (1 - ca.exp(-way / p["pass"])))
+
+
 def _between(t: ca.SX, begin: ca.SX, end: ca.SX, width: float) -> ca.SX:
     return (ca.tanh((t - begin) / width) - ca.tanh((t - end) / width)) / 2
 
@@ -117,8 +136,15 @@ def _resistance(s: Scene, k: int, p: Values) -> tuple[ca.SX, ca.SX]:
 
 
 def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
-    q = s.q[k]
+    q = s.q[k] - p["centre"]
     return -p["A"] * (_softplus(q - p["stop"], 0.01) - _softplus(-q - p["stop"], 0.01))
+
+
+def _one_sided(site: Site) -> list[dict[str, float]]:
+    """Stops so far from the middle that only one of them is reached."""
+    limit = _stop(site)
+    stops = [x * limit for x in (0.15, 0.35, 0.55, 0.75)]
+    return [{"stop": (limit + x) / 2, "centre": side * (limit - x) / -2} for x in stops for side in (1.0, -1.0)]
 
 
 def _clipped(s: Scene, k: int, p: Values) -> ca.SX:
@@ -167,6 +193,11 @@ def _weighing(share: float) -> Callable[[Site], float]:
 
 def _load_moment(site: Site) -> float:
     return 0.05 * _mass(site.machine)
+
+
+def _sliding(site: Site) -> list[dict[str, float]]:
+    """A load that slides within a second, at every second: its recoil is short and would be missed between others."""
+    return [{"instant": float(t), "takes": 0.5, "arm": 0.0, "recoil": 1.0} for t in range(1, int(site.duration))]
 
 
 def _one_over_torque(site: Site) -> float:
@@ -417,9 +448,17 @@ _declare(
         "less slip at the same force, the longer the drive on the same lane",
         "soil compaction by passes, Forssblad, Vibratory Soil and Rock Fill Compaction, 1981",
         _constant(0.3),
-        {"pass": Shape("m", 15.0, (5.0, 15.0, 50.0))},
-        soil=lambda s, k, p, soil: _scaled(soil, 1 + p["A"] * (1 - ca.exp(-s.z["distance"] / p["pass"]))),
-        memory={"distance": Memory(lambda s, k, p: ca.sqrt(s.rolling[k].Vx ** 2 + 1e-4), 1e-6)},
+        {
+            "pass": Shape("m", 15.0, (5.0, 15.0, 50.0)),
+            "counted": Shape("-", 0.0, (0.0,), whole=True),  # 1: passes are counted by reversals, each worth LANE
+        },
+        soil=_compacted,
+        memory={
+            "distance": Memory(lambda s, k, p: _way(s, k), 1e-6),
+            "facing": Memory(_turning, 1e-6),
+            "reversals": Memory(lambda s, k, p: ca.fabs(_turning(s, k, p)) / 2, 1e-6),
+        },
+        beside=lambda site: [{"pass": x, "counted": 1.0} for x in (5.0, 15.0, 50.0)],
     ),
     Effect(
         "slip_relaxation",
@@ -495,8 +534,13 @@ _declare(
             "instant": Shape("s", 0.5, (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), _duration),
             "takes": Shape("s", 0.2, (0.2,)),
             "arm": Shape("m", 0.0, (0.0,)),  # the yaw inertia about the joint changes by A times this
+            "recoil": Shape(
+                "-", 0.0, (0.0,), whole=True
+            ),  # 1: a load slides on the chassis, 0: it is put on or taken away
         },
         inertia=_slid,
+        recoil=lambda s, p: p["recoil"],
+        beside=_sliding,
         timed=True,
     ),
     # ---------------------------------------------------------------- articulation
@@ -533,8 +577,9 @@ _declare(
         "a torque that grows with the angle beyond a limit",
         "rubber stops of articulated frames",
         lambda site: _full_torque(site),
-        {"stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), _stop)},
+        {"stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), _stop), "centre": Shape("rad", 0.0, (0.0,))},
         torque=_stopped,
+        beside=_one_sided,
     ),
     # ---------------------------------------------------------------- sensors
     Effect(
@@ -614,7 +659,7 @@ def places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...],
             found |= {s.place or s.name: ((s.body,), s.name) for s in sensors if s.kind == "wheel"}
         elif place in ("yaw_rate", "lateral_speed"):
             found |= {s.place or place: ((s.body,), s.name) for s in sensors if s.kind == place}
-        elif place == "machine" and machine.planar and (effect.gravity or _shifting(machine) is not None):
+        elif place == "machine" and machine.planar and (effect.gravity or shifting(machine) is not None):
             found["machine"] = (root,), None
     if effect.soil or effect.push:
         found = {w: at for w, at in found.items() if all(machine.find(k).contact for k in at[0])}
@@ -627,7 +672,7 @@ def _angle(sensors: Sequence[Sensor], body: Body) -> str | None:
     return next((s.name for s in sensors if s.kind == "angle" and s.body == body.index), None)
 
 
-def _shifting(machine: Machine) -> int | None:
+def shifting(machine: Machine) -> int | None:
     """The body whose load may move: the last chassis of those that turn, as a moment that never turns shows nowhere."""
     chassis = [b for b in machine.body if b.inertia is not None and not b.inertia.axisymmetric and b.contact is None]
     turning = [b.index for b in chassis if _turns(machine, b)]
@@ -644,7 +689,7 @@ def _turns(machine: Machine, body: Body) -> bool:
 
 def shifted(machine: Machine, change: Mapping[str, ca.SX]) -> dict[str, ca.SX]:
     """What an `inertia` hook changes, by standard parameter of the body whose load may move."""
-    return {f"{name}{_shifting(machine)}": value for name, value in change.items()}
+    return {f"{name}{shifting(machine)}": value for name, value in change.items()}
 
 
 def parse(text: str, machine: Machine, duration: float) -> EffectEntry:

@@ -281,12 +281,27 @@ def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
         rows = tree.generalised_forces(machine, s.at, frames, dict(inertia))
         force -= ca.vertcat(*[rows[c] for c in s.names])
     if effect.inertia is not None:
-        moved = catalogue.shifted(machine, effect.inertia(e.scene, e.values))
+        told = effect.inertia(e.scene, e.values)
+        moved = catalogue.shifted(machine, told)
         none = {n: ca.SX(0) for n in s.by_name}
         change = {b.index: tree.inertial_vector(b, {**none, **moved}) for b in machine.body}
         rows = tree.generalised_forces(machine, s.at, s.frames, change)
         force -= ca.vertcat(*[rows[c] for c in s.names])
+        if effect.recoil is not None:
+            force += effect.recoil(e.scene, e.values) * _recoil(s, e, told)
     return force
+
+
+def _recoil(s: Sample, e: Acting, change: Mapping[str, ca.SX]) -> ca.SX:
+    """Generalised force (n_q,) on a body along whose x axis a load slides: the first moment MX and the inertia ZZ of it
+    change with time. -MX'' along, the Coriolis force -2 omega MX' across, the moment -omega ZZ' about the origin."""
+    body = catalogue.shifting(s.machine)
+    assert body is not None
+    frame = s.frames[body]
+    lever = ca.jacobian(ca.vertcat(frame.velocity[:2], frame.omega[2]), s.nu)
+    MX, ZZ = (ca.jacobian(change[name], e.scene.time) for name in ("MX", "ZZ"))
+    yaw = frame.omega[2]
+    return lever.T @ ca.vertcat(-ca.jacobian(MX, e.scene.time), -2 * yaw * MX, -yaw * ZZ)
 
 
 def _rolling(s: Sample, body: Body) -> tuple[Rolling, ca.SX]:
