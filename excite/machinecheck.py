@@ -17,7 +17,7 @@ import jinja2
 import numpy as np
 from pydantic import ValidationError
 
-from excite import folder, identify, limit, manoeuvre, page, report, reports, smoothing, terminal, topview
+from excite import figures, folder, identify, limit, manoeuvre, page, reports, smoothing, terminal, topview
 from excite.page import Picture, Table
 from excite.simulate import SimulationError, simulate
 from excite.terminal import rounded
@@ -340,7 +340,7 @@ def write(place: Path, path: Path, versions: dict[str, str]) -> dict[str, Any]:
         "versions": versions,
     }
     if model is not None and model.machine.planar:
-        report.save(topview.figure(model.machine), place / PICTURE)
+        figures.save(topview.figure(model.machine), place / PICTURE)
     (place / "report.html").write_text(_page(summary, place), encoding="utf-8")
     folder.keep(place, summary)
     return summary

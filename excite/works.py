@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from excite import asked, crosscheck, examine, gaps, identify, log, report, reports, sensors, stored, terminal
+from excite import asked, crosscheck, examine, figures, gaps, identify, log, reports, sensors, stored, terminal
 from excite import brief as briefs
 from excite import compare as comparisons
 from excite import verify as verification
@@ -61,8 +61,8 @@ def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief
         "versions": asked.versions(),
     }
     title = f"{model.machine.title}: {name}, cond(Phi) = {found.design.cond_phi:.2f}"
-    report.save(report.design_figure(found.model, chosen, found.design.motion, title), place / "design.png")
-    report.save(report.sigma_figure(summary["sigma_percent"], title), place / "sigma.png")
+    figures.save(figures.design_figure(found.model, chosen, found.design.motion, title), place / "design.png")
+    figures.save(figures.sigma_figure(summary["sigma_percent"], title), place / "sigma.png")
     reports.finish(place, "design", summary)
     return summary
 
@@ -102,7 +102,7 @@ def verify(
         "versions": asked.versions(),
     }
     title = f"{model.machine.title}: {runs} simulated runs, {method}, kit {kit}"
-    report.save(report.verify_figure(result, title), place / "verify.png")
+    figures.save(figures.verify_figure(result, title), place / "verify.png")
     reports.finish(place, "verify", summary)
     return summary
 
@@ -159,7 +159,7 @@ def compare(
         "versions": asked.versions(),
     }
     title = f"{model.machine.title}: {name}, the designed drive and the usual ones"
-    report.save(report.compare_figure(result.rows, title), place / "compare.png")
+    figures.save(figures.compare_figure(result.rows, title), place / "compare.png")
     reports.finish(place, "compare", summary)
     return summary
 
@@ -202,8 +202,8 @@ def identified(
     for kind, several in (("fit", read), ("validation", fresh)):
         for k, one in enumerate(several):
             title = f"{model.machine.title}: {one.source}"
-            figure = report.comparison_figure(model, crosscheck.torques(model, one, estimate, chosen), title)
-            report.save(figure, place / (f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png"))
+            figure = figures.comparison_figure(model, crosscheck.torques(model, one, estimate, chosen), title)
+            figures.save(figure, place / (f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png"))
     reports.finish(place, "identify", summary)
     return summary
 

@@ -26,9 +26,9 @@ from matplotlib.figure import Figure
 from excite import log, sensors
 from excite.design import design
 from excite.driver import follow
+from excite.figures import COLOURS, save
 from excite.manoeuvre import Manoeuvre
 from excite.processing import decimate, samples
-from excite.report import COLOURS, save
 from excite.simulate import Motion, simulate
 from excite.smoothing import cramer_rao
 from excite.verify import summary as verified

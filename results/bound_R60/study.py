@@ -21,9 +21,9 @@ from matplotlib.figure import Figure
 
 from excite import folder, log, objective
 from excite.bound import Bound, bound
+from excite.figures import COLOURS, save
 from excite.limit import placed
 from excite.manoeuvre import Manoeuvre
-from excite.report import COLOURS, save
 from excite.simulate import Motion, simulate
 from model import machine, prediction
 from model.prediction import Model

@@ -22,9 +22,9 @@ from excite import aim as aims
 from excite import folder, log, objective
 from excite.continuation import verdict
 from excite.design import design
+from excite.figures import COLOURS, save
 from excite.limit import InfeasibleError
 from excite.manoeuvre import Manoeuvre, knots
-from excite.report import COLOURS, save
 from model import machine, prediction
 from model.machine import Problem
 from model.prediction import Model

@@ -28,9 +28,9 @@ from matplotlib.ticker import LogLocator, NullLocator
 from scipy.stats import binom
 
 from excite import compare, design, folder, identify, manoeuvre, objective, smoothing
+from excite.figures import COLOURS, save
 from excite.machinecheck import grouping
 from excite.manoeuvre import Manoeuvre
-from excite.report import COLOURS, save
 from excite.simulate import Motion, simulate
 from excite.terminal import rounded
 from excite.topview import outline

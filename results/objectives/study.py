@@ -23,8 +23,8 @@ from matplotlib.figure import Figure
 from excite import aim as aims
 from excite import compare, folder, log, objective
 from excite.design import design
+from excite.figures import COLOURS, save
 from excite.manoeuvre import Manoeuvre, knots
-from excite.report import COLOURS, save
 from excite.simulate import Motion, simulate
 from excite.smoothing import cramer_rao
 from excite.verify import verify

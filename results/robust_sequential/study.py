@@ -27,9 +27,9 @@ from excite import folder, identify, log, scenario, sensors, sequential
 from excite.design import design
 from excite.driver import follow
 from excite.estimate import NoEstimate
+from excite.figures import COLOURS, save
 from excite.limit import check
 from excite.manoeuvre import Manoeuvre
-from excite.report import COLOURS, save
 from excite.simulate import Motion, SimulationError, simulate
 from excite.smoothing import cramer_rao
 from model import machine, prediction

@@ -22,7 +22,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.optimize import least_squares
 
-from excite.report import COLOURS, STYLES, save
+from excite.figures import COLOURS, STYLES, save
 from model import contact
 from model.effect import Rolling, Scene, Soil
 from model.effects import CATALOGUE

@@ -12,7 +12,7 @@ import pytest
 from conftest import Excite
 from matplotlib.figure import Figure
 
-from excite import log, page, report, reports
+from excite import figures, log, page, reports
 from excite.page import Picture, Table
 from excite.simulate import Motion
 from model.prediction import Model
@@ -25,7 +25,7 @@ VERSIONS = {"excite": "1", "numpy": "2"}
 def picture(tmp_path: Path) -> Path:
     figure = Figure(figsize=(6, 3))
     figure.subplots().plot([0, 1], [0, 1])
-    report.save(figure, tmp_path / "design.png")
+    figures.save(figure, tmp_path / "design.png")
     return tmp_path / "design.png"
 
 
@@ -127,7 +127,7 @@ def test_identify_reports_what_was_found(
 def _figures(model: Model, motion: Motion) -> list[Figure]:
     problem = model.machine.problems[str(model.machine.problem)]
     sigma = dict(zip(model.base.names, np.linspace(0.1, 5, len(model.base.names)), strict=True))
-    return [report.design_figure(model, problem, motion, "t"), report.sigma_figure(sigma, "t")]
+    return [figures.design_figure(model, problem, motion, "t"), figures.sigma_figure(sigma, "t")]
 
 
 def test_figures_have_units_and_line_styles_of_their_own(va12: Model, va12_motion: Motion) -> None:
@@ -151,7 +151,7 @@ def test_colours_differ_for_the_colour_blind() -> None:
         "protan": np.array([[0, 2.02344, -2.52581], [0, 1, 0], [0, 0, 1]]),
         "deutan": np.array([[1, 0, 0], [0.494207, 0, 1.24827], [0, 0, 1]]),
     }
-    rgb = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in report.COLOURS[:4]]) / 255.0
+    rgb = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in figures.COLOURS[:4]]) / 255.0
     for matrix in blind.values():
         seen = rgb**2.2 @ to_lms.T @ matrix.T @ np.linalg.inv(to_lms).T
         seen = np.clip(seen, 0, 1) ** (1 / 2.2)
