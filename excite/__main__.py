@@ -298,7 +298,7 @@ def simulate(
     json: JsonOption = False,
 ) -> None:
     """Drives a profile in simulation and writes the log that the sensors would write."""
-    from excite import folder, log, sensors
+    from excite import folder, profiles, sensors
     from excite.simulate import simulate as drive
     from model import effects
     from model.prediction import build
@@ -309,7 +309,7 @@ def simulate(
     writers = {".csv": lambda t, p: t.to_csv(p, index=False), ".parquet": lambda t, p: t.to_parquet(p, index=False)}
     asked.known("--out: ending", out.suffix.lower(), tuple(writers))
     model = asked.model(machine)
-    torque, q0, nu0 = log.read_profile(profile, model)
+    torque, q0, nu0 = profiles.read(profile, model)
     if effect:
         seconds = (len(torque) - 1) / float(model.machine.sampling_hz)
         entries = [effects.parse(text, model.machine, seconds) for text in effect]

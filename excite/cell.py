@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from excite import brief, identify, interrupt, log, sensors
+from excite import brief, identify, interrupt, log, profiles, sensors
 from excite.brief import Brief
 from excite.estimate import NoEstimate
 from excite.examine import examine
@@ -183,7 +183,7 @@ def _designed(order: Order) -> Designed:
         "duration_s": float(order.problem.duration_s),
         **brief.summary(asked, answer),
     }
-    return Designed(log.profile(answer.model, answer.design.motion).to_csv(index=False), summary)
+    return Designed(profiles.of(answer.model, answer.design.motion).to_csv(index=False), summary)
 
 
 @lru_cache(maxsize=1)

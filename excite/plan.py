@@ -39,7 +39,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
 
-from excite import asked, identify, log
+from excite import asked, identify, profiles
 from excite.asked import UsageError
 from excite.limit import KINDS
 from excite.log import LogError
@@ -394,7 +394,7 @@ def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:
 
     if fresh(d):
         if d.profile is not None:
-            log.read_profile(plan.base / d.profile, prediction.build(machine))
+            profiles.read(plan.base / d.profile, prediction.build(machine))
         else:
             asked.known("--objective", d.objective, tuple(OBJECTIVES))
             asked.problem(plan.designed(d), d.problem, d.duration_s)

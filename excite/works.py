@@ -10,7 +10,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from excite import asked, crosscheck, examine, figures, gaps, identify, log, reports, sensors, stored, terminal
+from excite import (
+    asked,
+    crosscheck,
+    examine,
+    figures,
+    gaps,
+    identify,
+    log,
+    profiles,
+    reports,
+    sensors,
+    stored,
+    terminal,
+)
 from excite import brief as briefs
 from excite import compare as comparisons
 from excite import verify as verification
@@ -50,7 +63,7 @@ def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief
                 " effect outside of what the drive can reach?"
             ) from None
     wall = time.perf_counter() - begin
-    log.profile(found.model, found.design.motion).to_csv(place / "profile.csv", index=False)
+    profiles.of(found.model, found.design.motion).to_csv(place / "profile.csv", index=False)
     (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
     summary: dict[str, Any] = {
         "machine": model.machine.name,
@@ -123,7 +136,7 @@ def compare(
         asked.known("--against", usual, tuple(comparisons.USUAL))
     with terminal.bar("comparing") as advance:
         result = comparisons.compare(model, chosen, samples, seed, budget, advance, against)
-    columns = ["t_s", *(log.torque_column(model, u) for u in model.inputs)]
+    columns = ["t_s", *(profiles.torque_column(model, u) for u in model.inputs)]
     (place / "drives").mkdir()
     designs = []
     for row in result.rows:

@@ -12,7 +12,7 @@ import pytest
 from conftest import Excite
 from matplotlib.figure import Figure
 
-from excite import figures, log, page, reports
+from excite import figures, page, profiles, reports
 from excite.page import Picture, Table
 from excite.simulate import Motion
 from model.prediction import Model
@@ -109,7 +109,7 @@ def test_identify_reports_what_was_found(
     excite: Excite, straight: Model, straight_motion: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     profile, out = tmp_path / "profile.csv", tmp_path / "o"
-    log.profile(straight, straight_motion).to_csv(profile, index=False)
+    profiles.of(straight, straight_motion).to_csv(profile, index=False)
     excite("simulate", "va12_straight", profile, "--noise", "off", "--out", tmp_path / "log.csv")
     code, _, _ = excite("identify", "va12_straight", tmp_path / "log.csv", "--method", "ols", "--out", out)
     assert code == 0

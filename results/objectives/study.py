@@ -21,7 +21,7 @@ import scipy.stats
 from matplotlib.figure import Figure
 
 from excite import aim as aims
-from excite import compare, folder, log, objective
+from excite import compare, folder, objective, profiles
 from excite.design import design
 from excite.figures import COLOURS, save
 from excite.manoeuvre import Manoeuvre, knots
@@ -137,7 +137,7 @@ def usual(model: Model, problem: Problem, kind: str, seed: int) -> Manoeuvre:
 
 
 def stored(model: Model, problem: Problem, place: Path) -> Manoeuvre:
-    torque, _, _ = log.read_profile(place / "profile.csv", model)
+    torque, _, _ = profiles.read(place / "profile.csv", model)
     times = knots(problem)
     return Manoeuvre(times, torque[np.rint(times * float(model.machine.sampling_hz)).astype(int)])
 
