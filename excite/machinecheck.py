@@ -302,8 +302,7 @@ def _trial(model: Model) -> dict[str, float]:
                 motion = simulate(model, manoeuvre.scaled(wish, share).sample(float(model.machine.sampling_hz)))
             except SimulationError:
                 continue
-            over = limit.check(model, TRIAL, motion)
-            if all(v == 0 for n, v in over.items() if not n.startswith(("rest", "lane"))):
+            if limit.in_motion(limit.check(model, TRIAL, motion)):
                 break
         else:
             continue
