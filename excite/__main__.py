@@ -356,7 +356,7 @@ def identify(
     model = asked.model(machine)
     out = out or Path(f"results/identify-{model.machine.name}")
     folder.claim(out, [*logs, *(validate or [])])
-    _once(logs)
+    _had(logs, filtering)
     with folder.writing(out) as place:
         summary = works.identified(place, model, logs, method, filtering, validate or [])
     terminal.finish(summary, out, json, terminal.identify_table)
@@ -381,8 +381,7 @@ def diagnose(
     model = asked.model(machine)
     out = out or Path(f"results/diagnose-{model.machine.name}")
     folder.claim(out, logs)
-    _once(logs)
-    asked.known("--filter", filtering, ("machine", "auto"))
+    _had(logs, filtering)
     with folder.writing(out) as place:
         with terminal.bar("diagnosing") as advance:
             summary, tied = checkup.write(place, machine, model, logs, filtering, advance)
@@ -411,7 +410,11 @@ def check_log(
     )
 
 
-def _once(logs: Sequence[Path]) -> None:
+def _had(logs: Sequence[Path], filtering: str) -> None:
+    """Raises UsageError for logs or a filter that can't be had."""
+    from excite import examine
+
+    asked.known("--filter", filtering, tuple(examine.FILTERS))
     if len({path.resolve() for path in logs}) < len(logs):
         raise UsageError("LOG: the same file is given twice, which would count it twice")
 

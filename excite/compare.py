@@ -357,11 +357,12 @@ def _nearest(
     moved = Manoeuvre(times, track.latest.manoeuvre.at(times) - wish.at(times))
     states: np.ndarray | None = None
     for friction, slip, coarse in WAY if attempt == 0 else WAY[-1:]:
+        at = manoeuvre.knots(problem, coarse)
         tr = transcribe(
             soften(model, friction, slip),
             problem,
             track.sizes,
-            max(4, round((len(times) - 1) / coarse)),  # as few as knots() gives
+            len(at) - 1,
             elements=1 if attempt == 0 else 3,
             with_pose=with_pose,
             rest=rest_band(friction),
@@ -370,7 +371,6 @@ def _nearest(
         if states is None:
             states = np.column_stack([every[c] / size for c, size in zip(tr.state_names, tr.state_scale, strict=True)])
             start = states[0]
-        at = np.linspace(0.0, times[-1], tr.intervals + 1)
         nodes = ((np.arange(tr.intervals)[:, None] + tr.place) * tr.knot).ravel()
         goal, change = (d.at(at) / tr.torque_scale for d in (wish, moved))
         U = goal + change

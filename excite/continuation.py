@@ -34,8 +34,7 @@ from excite.limit import (
     rest_tolerances,
     resting,
 )
-from excite.manoeuvre import Manoeuvre, multisine, scaled
-from excite.manoeuvre import knots as _knots
+from excite.manoeuvre import Manoeuvre, knots, multisine, scaled
 from excite.scenario import followed
 from excite.simulate import Motion, SimulationError, simulate
 from model.machine import Machine, Problem
@@ -314,8 +313,8 @@ def _advance(
             careful = _careful(seen, track.optimism)
             track, wanted = replace(track, optimism=careful), aims.calibrated(aim, careful)
     wanted = aims.lowered(wanted, margins.get(SIGMA_MAX, 0.0))
-    knots = len(_knots(problem)) - 1
-    intervals = max(4, round(knots / stage.coarse))
+    times = knots(problem, stage.coarse)
+    intervals = len(times) - 1
     softer = soften(model, stage.friction, stage.slip)
     tr = transcribe(
         softer,
@@ -327,7 +326,6 @@ def _advance(
         rest=rest_band(stage.friction),
         weights=aim.rows,
     )
-    times = np.linspace(0, float(problem.duration_s), intervals + 1)
     nodes = (np.arange(intervals)[:, None] + tr.place) * tr.knot
     U = track.latest.manoeuvre.at(times) / tr.torque_scale
     U[0] = U[-1] = 0.0

@@ -25,6 +25,7 @@ from excite.page import Picture, Table, report_page
 from excite.plan import Cell, Plan
 from excite.terminal import rounded
 from excite.verify import Verification
+from model.prediction import built
 
 TABLE, FIGURE = "runs.parquet", "study.png"
 GROUP = 2000  # rows that are in memory at a time
@@ -169,12 +170,12 @@ def _line(wanted: Plan, number: int, cell: Cell, about: Row, row: Row, seed: int
     names = wanted.parameters[cell.drive.machine]
     for kind in cells.ESTIMATES:
         line |= {f"{kind}.{n}": x for n, x in zip(names, row.get(kind, ()), strict=False)}
-    model = cells.model_of(wanted.machines[cell.drive.machine].model_dump_json())
+    model = built(wanted.machines[cell.drive.machine].model_dump_json())
     return line | {f"true.{n}": float(x) for n, x in zip(names, model.nominal, strict=True)}
 
 
 def _seen(wanted: Plan, c: int, cell: Cell, track: Any, rows: Sequence[Row]) -> Seen:
-    model = cells.model_of(wanted.machines[cell.drive.machine].model_dump_json())
+    model = built(wanted.machines[cell.drive.machine].model_dump_json())
     table: dict[str, dict[str, float | str]] = {}
     if any("value" in row for row in rows):
         nothing = [None] * len(model.base.names)

@@ -185,15 +185,13 @@ def identified(
     filtering: str,
     validate: Sequence[Path],
 ) -> dict[str, Any]:
-    """Parameters from logs. filtering: machine or auto; validate: logs that the result is to predict."""
+    """Parameters from logs. filtering: a name of `examine.FILTERS`; validate: logs that the result is to predict."""
     method = asked.method(method, model)
-    asked.known("--filter", filtering, ("machine", "auto"))
     needs = identify.needed_sensors(model, method)
-    parts = [gaps.read(path, model.machine, needs) for path in logs]
-    read, cut = [one for some, _ in parts for one in some], [note for _, notes in parts for note in notes]
+    read, cut = gaps.read(logs, model.machine, needs)
     fresh = [log.read(path, model.machine, needs) for path in validate]
     with terminal.busy("identifying"):
-        chosen, reason = examine.choose(model, read) if filtering == "auto" else (model.machine.filter, "")
+        chosen, reason = examine.FILTERS[filtering](model, read)
         estimate = identify.identify(model, read, method, chosen)
         if model.slips and identify.METHODS[method].biased:
             estimate = identify.with_bias(model, read, estimate, chosen)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
@@ -308,6 +308,12 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
         flaws,
         shapes,
     )
+
+
+@lru_cache(maxsize=8)
+def built(machine: str) -> Model:
+    """The model of a machine as JSON, built once in a process: CasADi functions are cheaper to build than to send."""
+    return build(Machine.model_validate_json(machine))
 
 
 def _shown(found: Equations) -> set[str]:
