@@ -507,7 +507,7 @@ def _rows(model: Model, name: str, samples: Sequence[_Sample], ours: float) -> l
 
 def _row(model: Model, name: str, c: Candidate, kept: int, samples: int, wall_s: float, equal_s: float | None) -> Row:
     motion = simulate(model, c.manoeuvre.sample(float(model.machine.sampling_hz)), q0=c.start)
-    spread = 100 * np.sqrt(np.diag(smoothing.cramer_rao(model, motion))) / objective.relative(model)
+    spread = objective.percent(model, smoothing.cramer_rao(model, motion))
     breaks = None if c.feasible else max(c.violations, key=lambda limit: c.violations[limit])
     return Row(
         name,

@@ -354,8 +354,7 @@ def driven(model: Model, trace: Trace, who: driver.Driver | None, seed: int, q0:
 
 def score(model: Model, motion: Motion) -> Score:
     """cond(Phi) and what accuracy a motion makes attainable (Cramer-Rao, kit full), whoever drives it."""
-    covariance = smoothing.cramer_rao(model, motion, "full")
-    sigma = 100 * np.sqrt(np.diag(covariance)) / objective.relative(model)
+    sigma = objective.percent(model, smoothing.cramer_rao(model, motion))
     worst = int(np.argmax(sigma))
     return Score(
         objective.cond_phi(model, motion), float(sigma[worst]), model.base.names[worst], float(np.median(sigma))

@@ -241,7 +241,7 @@ def _bodies(model: Model) -> Iterator[str]:
 
 def _noise(model: Model) -> Iterator[str]:
     for s in model.machine.sensors("full"):
-        if s.noise is None and s.counts_per_turn is None:
+        if not s.graded:
             yield f"sensor {s.name}: neither noise nor counts_per_turn: what accuracy is attainable can't be said"
 
 
@@ -292,7 +292,10 @@ def _standard(model: Model) -> list[float]:
 
 
 def _trial(model: Model) -> dict[str, float]:
-    """One standard deviation [%] of every parameter after the best of some random drives; {} where there is none."""
+    """One standard deviation [%] of every parameter after the best of some random drives; {} where there is none.
+
+    Of the nominal value or the scale, whichever is larger: per cent of what is nearly zero mean little.
+    """
     best: dict[str, float] = {}
     size = np.maximum(np.abs(model.nominal), model.scale)
     for seed in TRIED:

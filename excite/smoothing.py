@@ -240,7 +240,7 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
     X = model.nominal if X is None else np.asarray(X, float)
     sensors = [s for s in model.machine.sensors(kit) if s.kind not in ("x", "y")]
     for s in sensors:
-        if s.noise is None and s.counts_per_turn is None:
+        if not s.graded:
             raise ValueError(
                 f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file"
             )

@@ -329,6 +329,11 @@ class Sensor(Record):
         return None if self.counts_per_turn is None else 2 * math.pi / self.counts_per_turn.value
 
     @property
+    def graded(self) -> bool:
+        """Whether it is said how well it measures, by noise or by counts."""
+        return self.noise is not None or self.counts_per_turn is not None
+
+    @property
     def gain(self) -> float:
         """SI value of one in the column; of a motor's pressures the torque [N m], of cylinders' the pressure [Pa]."""
         one = float(self.factor) if self.factor is not None else units.UNITS[self.unit][1]

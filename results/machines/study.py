@@ -167,7 +167,7 @@ def multisine(model: Model, problem: Problem, seed: int) -> dict[str, Any]:
 
 def sigma(model: Model, motion: Motion) -> np.ndarray:
     """(n_base,) Cramer-Rao bound, one standard deviation [%] of the nominal value."""
-    return 100 * np.sqrt(np.diag(smoothing.cramer_rao(model, motion))) / np.abs(model.nominal)
+    return objective.percent(model, smoothing.cramer_rao(model, motion))
 
 
 # ------------------------------------------------------------------------------------------------ the page

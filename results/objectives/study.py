@@ -97,7 +97,7 @@ def torque_noise(model: Model, motion: Motion) -> float:
 
 def bound(model: Model, motion: Motion) -> float:
     """Worst relative standard deviation [%] of the Cramer-Rao bound."""
-    return float((100 * np.sqrt(np.diag(cramer_rao(model, motion))) / np.abs(model.nominal)).max())
+    return float(objective.percent(model, cramer_rao(model, motion)).max())
 
 
 CRITERIA: dict[str, Callable[[Model, Motion], float]] = {
