@@ -77,7 +77,7 @@ def motions(model: Model, log: Log, estimate: Estimate, filter: Filter | None = 
         raise ValueError(f"a simulation needs every parameter, unknown: {', '.join(unknown)}")
     s = samples(model, log, filter)
     X = estimate.value
-    torque = s.Y[list(model.actuated)].T - offsets(model, X)
+    torque = s.Y[list(model.actuated)].T - model.offsets @ X
     motion = simulate(model, torque, X, s.q[:, 0], s.nu[:, 0])
     exact = signals(model, motion, X)
     chosen = [x for x in model.machine.sensors("full") if x.name in log.values and x.kind not in ("torque", "x", "y")]
@@ -95,12 +95,6 @@ def motions(model: Model, log: Log, estimate: Estimate, filter: Filter | None = 
     )
 
 
-def offsets(model: Model, X: np.ndarray) -> np.ndarray:
-    """Offsets (n_u,) of the torque channels."""
-    standard = dict(zip(model.base.standard, model.expand @ X, strict=True))
-    return np.array([standard[f"u{b.index}0"] for b in model.machine.actuated])
-
-
 def closed_loop(
     model: Model, X: np.ndarray, samples: int, control: Control, q0: np.ndarray, nu0: np.ndarray | None = None
 ) -> Motion:
@@ -110,7 +104,7 @@ def closed_loop(
     Commands are joined by straight lines, and the state at k is the one before, carried on at its speed.
     """
     n_q, h = len(model.coordinates), 1 / float(model.machine.sampling_hz)
-    offset = offsets(model, X)
+    offset = model.offsets @ X
 
     def torque(k: int, state: np.ndarray) -> np.ndarray:
         q, nu = state[:n_q], state[n_q : 2 * n_q]

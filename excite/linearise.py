@@ -331,7 +331,6 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     known = np.full(len(index), np.nan)
     known[len(core) - len(model.memory) : len(core)] = model.remembered
     mass = ca.Function("mass", [q, u, z, X], [ca.diag(M)])(0, 0, 0, model.nominal).full()[:, 0]
-    table = np.array([model.base.standard.index(f"u{b.index}0") for b in machine.actuated])
     return Chart(
         model,
         sensors,
@@ -339,7 +338,7 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
         np.array(index),
         full.numel(),
         tuple(angle),
-        model.expand[table],
+        model.offsets,
         pushed,
         mass[list(pushed)],
         flawed,

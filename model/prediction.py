@@ -155,6 +155,11 @@ class Model:
         return self.base.expand
 
     @cached_property
+    def offsets(self) -> np.ndarray:
+        """(n_u, n_base): takes the offsets u0 of the torque channels [N m, N] out of the base parameters X."""
+        return self.expand[[self.base.standard.index(f"u{b.index}0") for b in self.machine.actuated]]
+
+    @cached_property
     def regressor(self) -> ca.Function:
         """(q, nu, a) -> W (n_rows, n_base): the exact Jacobian of the prediction, so that Y = W X.
 

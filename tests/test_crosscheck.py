@@ -70,7 +70,7 @@ def test_emps_in_closed_loop(emps: Model, emps_data: Path) -> None:
     gain = float(raw["gtau"][0])
     control = crosscheck.cascade(raw["qg"], 160.18, 243.45, gain, 10.0, 1000.0)
     motion = crosscheck.closed_loop(emps, estimate.value, len(one), control, raw["qm"][:1])
-    force = motion.u[:, 0] + crosscheck.offsets(emps, estimate.value)
+    force = motion.u[:, 0] + emps.offsets @ estimate.value
     position = 100 * np.linalg.norm(raw["qm"] - motion.q[:, 0]) / np.linalg.norm(raw["qm"])
     error = 100 * np.linalg.norm(gain * raw["vir"] - force) / np.linalg.norm(gain * raw["vir"])
     assert position < 0.0138

@@ -47,7 +47,7 @@ def closed_loop(model: Model, raw: dict[str, np.ndarray], X: np.ndarray, late: b
         "position": relative(raw["qm"], motion.q[:, 0]),
         "velocity": relative(speed[settled], motion.nu[settled, 0]),
         "acceleration": relative(derivative(speed, rate)[settled], motion.a[settled, 0]),
-        "force": relative(gain * raw["vir"], motion.u[:, 0] + crosscheck.offsets(model, X)),
+        "force": relative(gain * raw["vir"], motion.u[:, 0] + model.offsets @ X),
     }
 
 
