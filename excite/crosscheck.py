@@ -1,8 +1,7 @@
-"""Does it hold on other data? Predicted torques, simulated signals and closed loops against what was measured."""
+"""Does it hold on other data? Predicted torques and simulated signals against what was measured."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +10,9 @@ from excite.estimate import Estimate
 from excite.log import Log
 from excite.processing import lowpass, samples
 from excite.sensors import signals
-from excite.simulate import Motion, respond, simulate
+from excite.simulate import simulate
 from model.machine import Filter
 from model.prediction import Model
-
-Control = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -93,41 +90,3 @@ def motions(model: Model, log: Log, estimate: Estimate, filter: Filter | None = 
         np.array([counted(x.name, log.values[x.name]) for x in chosen]),
         np.array([counted(x.name, exact[x.name]) for x in chosen]),
     )
-
-
-def closed_loop(
-    model: Model, X: np.ndarray, samples: int, control: Control, q0: np.ndarray, nu0: np.ndarray | None = None
-) -> Motion:
-    """The machine X (n_base,) under its own controller: control(k, q, nu) commands the torques (n_u,) at sample k
-    from coordinates and velocities (n_q,) there. What is delivered is the command less the channel's offset.
-
-    Commands are joined by straight lines, and the state at k is the one before, carried on at its speed.
-    """
-    n_q, h = len(model.coordinates), 1 / float(model.machine.sampling_hz)
-    offset = model.offsets @ X
-
-    def torque(k: int, state: np.ndarray) -> np.ndarray:
-        q, nu = state[:n_q], state[n_q : 2 * n_q]
-        return control(k, q + h * nu if k else q, nu) - offset
-
-    return respond(model, samples, torque, X, q0, nu0)
-
-
-def cascade(reference: np.ndarray, kp: float, kv: float, gain: float, limit: float, rate: float) -> Control:
-    """A position loop around a speed loop on one coordinate: gain (kp kv (reference - q) - kv dq), the bracket held
-    within `limit`; dq is the backward difference of the mean of the last two positions, as in EMPS.
-
-    reference (N,) [m]; kp [1/s], kv [V s/m], gain [N/V], limit [V], rate [Hz]. A controller remembers: make a new one
-    for every run.
-    """
-    last: list[float] = []
-
-    def control(k: int, q: np.ndarray, nu: np.ndarray) -> np.ndarray:
-        now = float(q[0])
-        before = last[-1] if last else now
-        earlier = last[-2] if len(last) > 1 else before
-        last.append(now)
-        speed = (now - earlier) / 2 * rate
-        return np.array([gain * float(np.clip(kp * kv * (reference[k] - now) - kv * speed, -limit, limit))])
-
-    return control
