@@ -19,9 +19,11 @@ from excite import figures, folder, identify, limit, manoeuvre, page, reports, s
 from excite.page import Picture, Table
 from excite.simulate import SimulationError, simulate
 from excite.terminal import rounded
+from model import file as files
 from model import machine as machines
 from model import tree
-from model.machine import Machine, MachineError, Problem, Quantity
+from model.file import Quantity
+from model.machine import Machine, MachineError, Problem
 from model.prediction import Model, build, standard_parameters
 
 PICTURE = "machine.png"
@@ -80,7 +82,7 @@ def complaints(path: Path) -> list[str]:
     except MachineError as err:
         if not isinstance(err.__context__, ValidationError):
             raise
-        return machines.complaints(path, err.__context__, Machine)
+        return files.complaints(path, err.__context__, Machine)
     return []
 
 

@@ -48,7 +48,8 @@ from model import effects as catalogue
 from model import machine as machines
 from model import prediction
 from model.effect import DURATION
-from model.machine import Machine, MachineError, Number, Record
+from model.file import Number, Record, one_line
+from model.machine import Machine, MachineError
 
 STEPS = ("design", "simulate", "identify", "diagnose", "verify")
 MOST = 1_000_000  # runs of a study
@@ -340,7 +341,7 @@ def read(path: str | Path) -> Plan:
     try:
         study = Study.model_validate(raw)
     except ValidationError as err:
-        raise StudyError(machines.one_line(path, err, Study)) from None
+        raise StudyError(one_line(path, err, Study)) from None
     try:
         return ready(study, path.parent)
     except UsageError as err:

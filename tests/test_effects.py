@@ -13,7 +13,8 @@ from model import effects, machine
 from model.effect import DURATION, Effect, Placed, Site
 from model.effects import CATALOGUE
 from model.equations import signatures
-from model.machine import EffectEntry, MachineError, Quantity
+from model.file import Quantity
+from model.machine import EffectEntry, MachineError
 from model.prediction import Model, build
 
 CONTRACT = (  # CONTRACT.md section 4: the names that others rely on, and their units
