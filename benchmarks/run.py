@@ -36,7 +36,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 import numpy as np
 from joblib.externals.loky import get_reusable_executor
 
-from excite import asked, brief, cell, diagnose, identify, log, plan, sensors, study
+from excite import asked, brief, cell, diagnose, identify, log, plan, profiles, sensors, study
 from excite.simulate import Motion, simulate
 from model import machine, prediction
 from model.prediction import Model
@@ -105,7 +105,7 @@ def worker() -> None:
 def simulated() -> None:
     """A short command that computes: 2.5 s of driving, a log of 250 rows."""
     with tempfile.TemporaryDirectory() as folder:
-        log.profile(straight(), drive(2.5)).to_csv(f"{folder}/drive.csv", index=False)
+        profiles.of(straight(), drive(2.5)).to_csv(f"{folder}/drive.csv", index=False)
         started("simulate", "va12_straight", f"{folder}/drive.csv", "--out", f"{folder}/log.csv")
 
 
@@ -122,7 +122,7 @@ def diagnosed() -> None:
 def studied(runs: int, jobs: int = 1) -> None:
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        log.profile(straight(), drive(2.5)).to_csv(place / "drive.csv", index=False)
+        profiles.of(straight(), drive(2.5)).to_csv(place / "drive.csv", index=False)
         (place / "study.toml").write_text(STUDY.format(runs=runs))
         study.carry(plan.read(place / "study.toml"), place / "out", jobs=jobs)
 
@@ -239,7 +239,7 @@ def one(runs: int, jobs: int, alone: float) -> None:
     bare(1)
     with tempfile.TemporaryDirectory() as folder:
         place, workers, looked, size = Path(folder), 0.0, 0.0, "-"
-        log.profile(straight(), drive(2.5)).to_csv(place / "drive.csv", index=False)
+        profiles.of(straight(), drive(2.5)).to_csv(place / "drive.csv", index=False)
         (place / "study.toml").write_text(STUDY.format(runs=runs))
 
         def look(*_: object) -> None:

@@ -298,7 +298,7 @@ def simulate(
     json: JsonOption = False,
 ) -> None:
     """Drives a profile in simulation and writes the log that the sensors would write."""
-    from excite import folder, log, sensors
+    from excite import folder, profiles, sensors
     from excite.simulate import simulate as drive
     from model import effects
     from model.prediction import build
@@ -309,7 +309,7 @@ def simulate(
     writers = {".csv": lambda t, p: t.to_csv(p, index=False), ".parquet": lambda t, p: t.to_parquet(p, index=False)}
     asked.known("--out: ending", out.suffix.lower(), tuple(writers))
     model = asked.model(machine)
-    torque, q0, nu0 = log.read_profile(profile, model)
+    torque, q0, nu0 = profiles.read(profile, model)
     if effect:
         seconds = (len(torque) - 1) / float(model.machine.sampling_hz)
         entries = [effects.parse(text, model.machine, seconds) for text in effect]
@@ -356,7 +356,7 @@ def identify(
     model = asked.model(machine)
     out = out or Path(f"results/identify-{model.machine.name}")
     folder.claim(out, [*logs, *(validate or [])])
-    _once(logs)
+    _had(logs, filtering)
     with folder.writing(out) as place:
         summary = works.identified(place, model, logs, method, filtering, validate or [])
     terminal.finish(summary, out, json, terminal.identify_table)
@@ -381,8 +381,7 @@ def diagnose(
     model = asked.model(machine)
     out = out or Path(f"results/diagnose-{model.machine.name}")
     folder.claim(out, logs)
-    _once(logs)
-    asked.known("--filter", filtering, ("machine", "auto"))
+    _had(logs, filtering)
     with folder.writing(out) as place:
         with terminal.bar("diagnosing") as advance:
             summary, tied = checkup.write(place, machine, model, logs, filtering, advance)
@@ -411,7 +410,11 @@ def check_log(
     )
 
 
-def _once(logs: Sequence[Path]) -> None:
+def _had(logs: Sequence[Path], filtering: str) -> None:
+    """Raises UsageError for logs or a filter that can't be had."""
+    from excite import examine
+
+    asked.known("--filter", filtering, tuple(examine.FILTERS))
     if len({path.resolve() for path in logs}) < len(logs):
         raise UsageError("LOG: the same file is given twice, which would count it twice")
 
@@ -453,13 +456,13 @@ def new_machine(
     json: JsonOption = False,
 ) -> None:
     """Writes a commented machine file to start from."""
-    from excite import machinecheck
+    from excite import template
     from model import machine
 
     if like is not None:
         asked.known("--like", like, machine.shipped())
     out = out or Path(f"{name}.toml")
-    machinecheck.start(name, out, like)
+    template.start(name, out, like)
     if json:
         terminal.show_json({"machine": name, "file": str(out)})
     else:

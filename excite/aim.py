@@ -19,7 +19,7 @@ import numpy as np
 
 from excite import objective as objectives
 from excite import smoothing
-from excite.objective import EXACT, OBJECTIVES, Local, relative
+from excite.objective import EXACT, OBJECTIVES, Local, percent, relative
 from excite.simulate import Motion, beside
 from model.prediction import Model
 
@@ -186,7 +186,7 @@ def covariance(aim: Aim, model: Model, motion: Motion) -> np.ndarray:
 
 def sigma_percent(aim: Aim, model: Model, motion: Motion) -> np.ndarray:
     """(n_base,) attainable relative standard deviations [%] after the drive."""
-    return np.asarray(100 * np.sqrt(np.diag(covariance(aim, model, motion))) / relative(model))
+    return percent(model, covariance(aim, model, motion))
 
 
 @dataclass(frozen=True)

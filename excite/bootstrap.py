@@ -104,9 +104,7 @@ def replay(model: Model, log: Log, X: np.ndarray, filter: Filter) -> Motion:
     so that small errors of torques don't lead elsewhere. Raises SimulationError."""
     s = samples(model, log, filter)
     rows, n_q = list(model.actuated), len(model.coordinates)
-    standard = dict(zip(model.base.standard, model.expand @ X, strict=True))
-    offset = np.array([standard[f"u{b.index}0"] for b in model.machine.actuated])
-    torque = lowpass(s.Y[rows], float(model.machine.sampling_hz), filter).T - offset
+    torque = lowpass(s.Y[rows], float(model.machine.sampling_hz), filter).T - model.offsets @ X
     wanted = s.nu[rows].T
     gain = _inertia(model, s, X, rows) / HOLD
 

@@ -93,7 +93,7 @@ def answer(
     if brief.driver:
         phased.check(model, problem, brief.phase_min_s)
     for s in model.machine.sensors("full"):
-        if s.kind not in ("x", "y") and s.noise is None and s.counts_per_turn is None:
+        if s.kind not in ("x", "y") and not s.graded:
             raise MachineError(
                 f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file, a design"
                 " states the accuracy that it makes attainable"

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from excite import brief, identify, interrupt, log, sensors
+from excite import brief, identify, interrupt, log, profiles, sensors
 from excite.brief import Brief
 from excite.estimate import NoEstimate
 from excite.examine import examine
@@ -22,7 +22,7 @@ from excite.log import LogError
 from excite.simulate import Motion, SimulationError, simulate
 from model import machine as machines
 from model.machine import Machine, Problem
-from model.prediction import Model, build
+from model.prediction import Model, build, built
 
 DONE, FAILED, DEFECT = STATUSES = ("done", "failed", "defect")
 Row = dict[str, Any]
@@ -54,16 +54,10 @@ class Work:
     runs: tuple[tuple[int, int], ...]
 
 
-@lru_cache(maxsize=8)
-def model_of(machine: str) -> Model:
-    """A worker builds each machine's model once; CasADi functions are cheaper to build than to send."""
-    return build(Machine.model_validate_json(machine))
-
-
 @lru_cache(maxsize=4)
 def _motion(machine: str, driven: Driven) -> Motion:
     torque = np.frombuffer(driven.torque).reshape(-1, driven.inputs)
-    return simulate(model_of(machine), torque, q0=np.array(driven.q0), nu0=np.array(driven.nu0))
+    return simulate(built(machine), torque, q0=np.array(driven.q0), nu0=np.array(driven.nu0))
 
 
 def carry(work: Work) -> tuple[str, list[tuple[int, Row]]]:
@@ -96,11 +90,11 @@ def _said(err: Exception) -> str:
 
 
 def _run(work: Work, seed: int) -> Row:
-    known, steps = model_of(work.known), set(work.steps)
+    known, steps = built(work.known), set(work.steps)
     row: Row = {}
     if not steps & {"simulate", "identify", "verify", "diagnose"}:
         return row
-    table = sensors.measure(model_of(work.true), _motion(work.true, work.driven), kit=work.kit, seed=seed)
+    table = sensors.measure(built(work.true), _motion(work.true, work.driven), kit=work.kit, seed=seed)
     row["log_sha256"] = hashlib.sha256(table.to_numpy(float).tobytes()).hexdigest()[:16]
     if steps & {"identify", "verify"}:
         measured = log.check(table, known.machine, identify.needed_sensors(known, work.method))
@@ -183,7 +177,7 @@ def _designed(order: Order) -> Designed:
         "duration_s": float(order.problem.duration_s),
         **brief.summary(asked, answer),
     }
-    return Designed(log.profile(answer.model, answer.design.motion).to_csv(index=False), summary)
+    return Designed(profiles.of(answer.model, answer.design.motion).to_csv(index=False), summary)
 
 
 @lru_cache(maxsize=1)

@@ -35,19 +35,16 @@ def write(
     """Diagnoses logs and fills the folder: figures, and machine.toml where something is named. Its summary, and what a
     drive could be designed to tell apart.
 
-    machine: as it was asked for, a shipped name or a path. filtering: machine or auto. Raises LogError, MachineError,
-    NoEstimate.
+    machine: as it was asked for, a shipped name or a path. filtering: a name of `examine.FILTERS`. Raises LogError,
+    MachineError, NoEstimate.
     """
     needs = identify.needed_sensors(model, "joint")
-    parts = [gaps.read(path, model.machine, needs) for path in logs]
-    notes = [note for _, some in parts for note in some]
-    examined = [examine.examine(model, one) for several, _ in parts for one in several]
+    read, notes = gaps.read(logs, model.machine, needs)
+    examined = [examine.examine(model, one) for one in read]
     mended = [e.log for e in examined]
     notes += [note for e in examined for note in e.notes]
-    chosen = model.machine.filter
-    if filtering == "auto":
-        chosen, reason = examine.choose(model, mended)
-        notes.append(reason)
+    chosen, reason = examine.FILTERS[filtering](model, mended)
+    notes += [reason] if reason else []
 
     def tell(begin: float, end: float) -> Callable[[float, str], None]:
         return lambda share, what: advance(round(1000 * (begin + share * (end - begin))), 1000, None)

@@ -32,7 +32,7 @@ from excite.continuation import MARGIN, Candidate, Track, land, rest_band, softe
 from excite.design import design, processes
 from excite.drive import turns_left
 from excite.driver import follow
-from excite.limit import TOLERANCE, check, limits, symbols
+from excite.limit import TOLERANCE, check, in_motion, limits, off_lane, on_lane, symbols
 from excite.manoeuvre import Manoeuvre, scaled
 from excite.simulate import Motion, SimulationError, simulate
 from model import tree
@@ -241,7 +241,7 @@ class _Search:
         fade = np.clip(np.minimum(self._times, self._times[-1] - self._times) / 0.5, 0, 1)
         self._waves = np.hstack([np.sin(phase), np.cos(phase)]) * fade[:, None]
         self._size = np.ones(len(model.inputs))
-        every = [g for g in limits(model, problem) if not g.name.startswith("lane")]
+        every = [g for g in limits(model, problem) if not on_lane(g.name)]
         s = symbols(model)
         room = [1 - ca.fabs(g.expression(s.q, s.nu, s.u, s.du) - g.centre) * (2 / g.range) for g in every]
         self._room = ca.Function("room", [s.q, s.nu, s.u, s.du], [ca.vertcat(*room)])
@@ -307,8 +307,7 @@ def shrunk(model: Model, problem: Problem, wish: Manoeuvre) -> Manoeuvre:
             motion = simulate(model, scaled(wish, factor).sample(float(model.machine.sampling_hz)))
         except SimulationError:
             return False
-        over = check(model, problem, motion)
-        return all(v == 0 for name, v in over.items() if not name.startswith(("rest", "lane")))
+        return in_motion(check(model, problem, motion))
 
     for left, group in enumerate(groups, 1 - len(groups)):
         low, high = 0, 50
@@ -351,28 +350,27 @@ def _nearest(
 ) -> Track | None:
     """From where the track stands, the drive nearest to the wish that keeps every limit, moved in by margins (of the
     ranges). None where no motion follows the torques. The first attempt goes the whole WAY, later ones refine."""
-    off_lane = any(v > 0 for name, v in track.latest.violations.items() if name.startswith("lane"))
-    on_lane = model.machine.planar and (track.pose is not None or off_lane)
+    with_pose = model.machine.planar and (track.pose is not None or off_lane(track.latest.violations) > 0)
     times, known = manoeuvre.knots(problem), track.motion.t
     names = [*model.coordinates, *[c + "'" for c in model.coordinates], *model.memory]
     every = dict(zip(names, np.hstack([track.motion.q, track.motion.nu, track.motion.memory]).T, strict=True))
     moved = Manoeuvre(times, track.latest.manoeuvre.at(times) - wish.at(times))
     states: np.ndarray | None = None
     for friction, slip, coarse in WAY if attempt == 0 else WAY[-1:]:
+        at = manoeuvre.knots(problem, coarse)
         tr = transcribe(
             soften(model, friction, slip),
             problem,
             track.sizes,
-            max(4, round((len(times) - 1) / coarse)),  # as few as knots() gives
+            len(at) - 1,
             elements=1 if attempt == 0 else 3,
-            with_pose=on_lane,
+            with_pose=with_pose,
             rest=rest_band(friction),
             weights=np.empty((0, len(model.coordinates))),  # information isn't looked at
         )
         if states is None:
             states = np.column_stack([every[c] / size for c, size in zip(tr.state_names, tr.state_scale, strict=True)])
             start = states[0]
-        at = np.linspace(0.0, times[-1], tr.intervals + 1)
         nodes = ((np.arange(tr.intervals)[:, None] + tr.place) * tr.knot).ravel()
         goal, change = (d.at(at) / tr.torque_scale for d in (wish, moved))
         U = goal + change
@@ -383,7 +381,7 @@ def _nearest(
             None,
             np.tile(moved_in, (tr.intervals, tr.nodes, 1)),
             np.tile([1e-4 + 2 * margins.get(name, 0.0) for name in tr.control_names], (tr.intervals, 1)),
-            np.array([name.startswith("lane") for name in tr.limit_names], bool),
+            np.array([on_lane(name) for name in tr.limit_names], bool),
             (len(times) - 1) / tr.intervals,  # knots in one: the distance stays the same
             goal,
         )
@@ -401,7 +399,7 @@ def _nearest(
         found, motion = judge(model, problem, Manoeuvre(at, point.U * tr.torque_scale))
     except SimulationError:
         return None
-    pose = found.start if on_lane else None
+    pose = found.start if with_pose else None
     return replace(track, latest=found, best=found, motion=motion, pose=pose)
 
 
@@ -509,7 +507,7 @@ def _rows(model: Model, name: str, samples: Sequence[_Sample], ours: float) -> l
 
 def _row(model: Model, name: str, c: Candidate, kept: int, samples: int, wall_s: float, equal_s: float | None) -> Row:
     motion = simulate(model, c.manoeuvre.sample(float(model.machine.sampling_hz)), q0=c.start)
-    spread = 100 * np.sqrt(np.diag(smoothing.cramer_rao(model, motion))) / objective.relative(model)
+    spread = objective.percent(model, smoothing.cramer_rao(model, motion))
     breaks = None if c.feasible else max(c.violations, key=lambda limit: c.violations[limit])
     return Row(
         name,

@@ -22,15 +22,19 @@ from excite.limit import (
     REST_SPEED,
     TOLERANCE,
     TRAVEL,
+    at_ends,
     check,
     directions,
+    free,
+    in_motion,
     limits,
+    off_lane,
+    on_lane,
     placed,
     rest_tolerances,
     resting,
 )
-from excite.manoeuvre import Manoeuvre, multisine, scaled
-from excite.manoeuvre import knots as _knots
+from excite.manoeuvre import Manoeuvre, knots, multisine, scaled
 from excite.scenario import followed
 from excite.simulate import Motion, SimulationError, simulate
 from model.machine import Machine, Problem
@@ -145,7 +149,7 @@ def depart(model: Model, problem: Problem, aim: Aim, number: int, seed: int) -> 
             motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
         except SimulationError:
             continue
-        if all(v == 0 for k, v in check(model, problem, motion).items() if not k.startswith(("rest", "lane"))):
+        if in_motion(check(model, problem, motion)):
             break
     found, motion = verdict(model, problem, aim, drive)
     sizes = typical_sizes(model, problem, motion)
@@ -197,8 +201,7 @@ def search(
         if moved is None:
             break
         track = moved
-        lane = max((v for limit, v in track.latest.violations.items() if limit.startswith("lane")), default=0.0)
-        if track.pose is not None or (stage.friction <= 4 and lane > 0):
+        if track.pose is not None or (stage.friction <= 4 and off_lane(track.latest.violations) > 0):
             track = replace(track, pose=track.latest.start)
         tell(track)
     return track
@@ -251,7 +254,7 @@ def land(model: Model, problem: Problem, aim: Aim, track: Track, over: Callable[
     rate = float(model.machine.sampling_hz)
     scale = np.array([float(b.limit.torque) if b.limit.torque is not None else 1.0 for b in model.machine.actuated])
     for _ in range(4):
-        late = [name for name, v in track.latest.violations.items() if v > 0 and name.startswith("rest")]
+        late = [name for name, v in track.latest.violations.items() if v > 0 and at_ends(name)]
         if not late or over():
             break
         drive, x0 = track.latest.manoeuvre, _end(model, track.motion)
@@ -310,8 +313,8 @@ def _advance(
             careful = _careful(seen, track.optimism)
             track, wanted = replace(track, optimism=careful), aims.calibrated(aim, careful)
     wanted = aims.lowered(wanted, margins.get(SIGMA_MAX, 0.0))
-    knots = len(_knots(problem)) - 1
-    intervals = max(4, round(knots / stage.coarse))
+    times = knots(problem, stage.coarse)
+    intervals = len(times) - 1
     softer = soften(model, stage.friction, stage.slip)
     tr = transcribe(
         softer,
@@ -323,7 +326,6 @@ def _advance(
         rest=rest_band(stage.friction),
         weights=aim.rows,
     )
-    times = np.linspace(0, float(problem.duration_s), intervals + 1)
     nodes = (np.arange(intervals)[:, None] + tr.place) * tr.knot
     U = track.latest.manoeuvre.at(times) / tr.torque_scale
     U[0] = U[-1] = 0.0
@@ -344,7 +346,7 @@ def _advance(
         wanted,
         np.tile(moved_in, (intervals, tr.nodes, 1)),
         np.tile([1e-4 + 2 * margins.get(name, 0.0) for name in tr.control_names], (intervals, 1)),
-        np.array([name.startswith("lane") for name in tr.limit_names], bool),
+        np.array([on_lane(name) for name in tr.limit_names], bool),
     )
     if track.going is not None and TRAVEL in tr.limit_names:
         above, below = _one_way(tr, nodes, model, problem, track.going)
@@ -422,7 +424,7 @@ def verdict(model: Model, problem: Problem, aim: Aim, drive: Manoeuvre) -> tuple
     motions = [(model, motion), *((m, followed(m, model, motion)) for m in aim.machines[1:])]
     for m, other in motions[1:]:  # what people see to themselves, where the machine goes, is left out
         for name, excess in check(m, problem, other).items():
-            if not name.startswith(("rest", "lane")):
+            if not free(name):
                 violations[name] = max(violations[name], excess)
     judged = aims.judge(aim, motions)
     if aim.sigma_max is not None:

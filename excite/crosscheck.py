@@ -1,8 +1,7 @@
-"""Does it hold on other data? Predicted torques, simulated signals and closed loops against what was measured."""
+"""Does it hold on other data? Predicted torques and simulated signals against what was measured."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +10,9 @@ from excite.estimate import Estimate
 from excite.log import Log
 from excite.processing import lowpass, samples
 from excite.sensors import signals
-from excite.simulate import Motion, respond, simulate
+from excite.simulate import simulate
 from model.machine import Filter
 from model.prediction import Model
-
-Control = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,7 @@ def motions(model: Model, log: Log, estimate: Estimate, filter: Filter | None = 
         raise ValueError(f"a simulation needs every parameter, unknown: {', '.join(unknown)}")
     s = samples(model, log, filter)
     X = estimate.value
-    torque = s.Y[list(model.actuated)].T - offsets(model, X)
+    torque = s.Y[list(model.actuated)].T - model.offsets @ X
     motion = simulate(model, torque, X, s.q[:, 0], s.nu[:, 0])
     exact = signals(model, motion, X)
     chosen = [x for x in model.machine.sensors("full") if x.name in log.values and x.kind not in ("torque", "x", "y")]
@@ -93,47 +90,3 @@ def motions(model: Model, log: Log, estimate: Estimate, filter: Filter | None = 
         np.array([counted(x.name, log.values[x.name]) for x in chosen]),
         np.array([counted(x.name, exact[x.name]) for x in chosen]),
     )
-
-
-def offsets(model: Model, X: np.ndarray) -> np.ndarray:
-    """Offsets (n_u,) of the torque channels."""
-    standard = dict(zip(model.base.standard, model.expand @ X, strict=True))
-    return np.array([standard[f"u{b.index}0"] for b in model.machine.actuated])
-
-
-def closed_loop(
-    model: Model, X: np.ndarray, samples: int, control: Control, q0: np.ndarray, nu0: np.ndarray | None = None
-) -> Motion:
-    """The machine X (n_base,) under its own controller: control(k, q, nu) commands the torques (n_u,) at sample k
-    from coordinates and velocities (n_q,) there. What is delivered is the command less the channel's offset.
-
-    Commands are joined by straight lines, and the state at k is the one before, carried on at its speed.
-    """
-    n_q, h = len(model.coordinates), 1 / float(model.machine.sampling_hz)
-    offset = offsets(model, X)
-
-    def torque(k: int, state: np.ndarray) -> np.ndarray:
-        q, nu = state[:n_q], state[n_q : 2 * n_q]
-        return control(k, q + h * nu if k else q, nu) - offset
-
-    return respond(model, samples, torque, X, q0, nu0)
-
-
-def cascade(reference: np.ndarray, kp: float, kv: float, gain: float, limit: float, rate: float) -> Control:
-    """A position loop around a speed loop on one coordinate: gain (kp kv (reference - q) - kv dq), the bracket held
-    within `limit`; dq is the backward difference of the mean of the last two positions, as in EMPS.
-
-    reference (N,) [m]; kp [1/s], kv [V s/m], gain [N/V], limit [V], rate [Hz]. A controller remembers: make a new one
-    for every run.
-    """
-    last: list[float] = []
-
-    def control(k: int, q: np.ndarray, nu: np.ndarray) -> np.ndarray:
-        now = float(q[0])
-        before = last[-1] if last else now
-        earlier = last[-2] if len(last) > 1 else before
-        last.append(now)
-        speed = (now - earlier) / 2 * rate
-        return np.array([gain * float(np.clip(kp * kv * (reference[k] - now) - kv * speed, -limit, limit))])
-
-    return control

@@ -24,7 +24,8 @@ from excite.newton import Fit, NotConverged
 from excite.record import Point, Record, carried, common_sensors, first_point, origins, record
 from excite.sidebyside import Together, in_turn
 from model import effects
-from model.machine import EffectEntry, Filter, Machine, Quantity
+from model.file import Quantity
+from model.machine import EffectEntry, Filter, Machine
 from model.prediction import Model, build
 
 # Of twice the log-likelihood that an effect must gain; logs without any stayed below 16. For all candidates of va12

@@ -354,8 +354,7 @@ def driven(model: Model, trace: Trace, who: driver.Driver | None, seed: int, q0:
 
 def score(model: Model, motion: Motion) -> Score:
     """cond(Phi) and what accuracy a motion makes attainable (Cramer-Rao, kit full), whoever drives it."""
-    covariance = smoothing.cramer_rao(model, motion, "full")
-    sigma = 100 * np.sqrt(np.diag(covariance)) / objective.relative(model)
+    sigma = objective.percent(model, smoothing.cramer_rao(model, motion))
     worst = int(np.argmax(sigma))
     return Score(
         objective.cond_phi(model, motion), float(sigma[worst]), model.base.names[worst], float(np.median(sigma))
@@ -370,7 +369,7 @@ def middle(scores: Sequence[Score]) -> Score:
 def broken(model: Model, problem: Problem, motion: Motion, least: float = 0.02) -> dict[str, float]:
     """Limits of machine and lane that a motion exceeds by more than `least` of their range, with the excess."""
     over = limit.check(model, problem, motion)
-    return {name: value for name, value in over.items() if value > least and not name.startswith("rest")}
+    return {name: value for name, value in over.items() if value > least and not limit.at_ends(name)}
 
 
 # ------------------------------------------------------------------------------------------------ room
@@ -421,7 +420,7 @@ def placed(model: Model, problem: Problem, motions: Sequence[Motion]) -> tuple[M
     What a machine does on flat ground doesn't depend on where it starts. A drive that keeps the lane stays.
     """
     first = motions[0]
-    if not any(name.startswith("lane") for name in broken(model, problem, first, 0.0)):
+    if limit.off_lane(limit.check(model, problem, first)) == 0:
         return tuple(motions)
     return tuple(moved(model, m, limit.placed(model, problem, first)) for m in motions)
 

@@ -21,6 +21,7 @@ from excite.innovations import whitened
 from excite.linearise import BATCH, Batch, Chart, Slopes, differentiate
 from excite.processing import implicit
 from excite.record import Point, Record, smoothed
+from excite.sensors import torque_behind
 from model import effects
 from model.effect import Effect, Placed, Site
 from model.effects import CATALOGUE
@@ -214,7 +215,7 @@ def _misread(c: Chart, e: Placed, u: np.ndarray, t: np.ndarray) -> np.ndarray:
     more = np.zeros_like(u)
     for k, body in enumerate(c.model.machine.actuated):
         if body.index in e.bodies:
-            more[:, k] = (np.interp(t + delay, t, u[:, k]) - offset) / gain - u[:, k]
+            more[:, k] = torque_behind(t, u[:, k], gain, offset, delay) - u[:, k]
     return more
 
 

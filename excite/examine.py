@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -223,3 +223,12 @@ def choose(model: Model, logs: Sequence[Log]) -> tuple[Filter, str]:
         f" (Hz: {listed}); one row in {factor} kept, which passes {ROOM * rate / 2 / factor:.2g} Hz"
     )
     return machine.filter.model_copy(update={"cutoff_hz": quantity, "decimation": factor}), reason
+
+
+def stated(model: Model, logs: Sequence[Log]) -> tuple[Filter, str]:
+    """The machine file's own, for which there is nothing to say."""
+    return model.machine.filter, ""
+
+
+# How a filter is chosen, by what `--filter` calls it: the filter and the reason in a sentence.
+FILTERS: dict[str, Callable[[Model, Sequence[Log]], tuple[Filter, str]]] = {"machine": stated, "auto": choose}

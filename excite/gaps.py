@@ -17,16 +17,17 @@ LONG = 5.0  # s that a stretch must last: a start and some seconds of motion
 MOST = 10  # gaps: a file with more has a fault that cutting does not mend
 
 
-def read(path: str | Path, machine: Machine, needs: Sequence[str] = ()) -> tuple[list[Log], list[str]]:
-    """The logs in a file, one stretch after another, with a note where it was cut. Raises LogError as `log.read`:
+def read(paths: Sequence[Path], machine: Machine, needs: Sequence[str] = ()) -> tuple[list[Log], list[str]]:
+    """The logs in files, one stretch after another, with a note for each that was cut. Raises LogError as `log.read`:
     also for a gap beside which too little is left, and for more than MOST of them."""
-    return split(log.table_of(path, machine), machine, needs, str(path))
+    parts = [split(log.table_of(path, machine), machine, needs, str(path)) for path in paths]
+    return [one for logs, _ in parts for one in logs], [note for _, notes in parts for note in notes]
 
 
 def split(
     table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log"
 ) -> tuple[list[Log], list[str]]:
-    """The same from a table of columns."""
+    """The same of one table of columns."""
     cuts = _gaps(table, machine, source)
     rate = float(machine.sampling_hz)
     rows = [0, *cuts, len(table)]

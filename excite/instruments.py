@@ -138,9 +138,7 @@ def observe(
     stretch = max(1, round(STRETCH * rate))
     gain = np.full(len(s.q), 1 - np.exp(-stretch / rate / pull))
     gain[list(unseen)] = 0.0
-    standard = dict(zip(model.base.standard, model.expand @ x, strict=True))
-    offset = np.array([standard[f"u{b.index}0"] for b in model.machine.actuated])
-    torque = lowpass(s.Y[list(model.actuated)], rate, filter).T - offset
+    torque = lowpass(s.Y[list(model.actuated)], rate, filter).T - model.offsets @ x
     q, nu = s.q[:, 0].copy(), s.nu[:, 0].copy()
     N = s.q.shape[1]
     places, speeds, slopes = np.empty((3, *s.q.shape))

@@ -2,13 +2,12 @@
 
 One plain function per kind of limit, in the table KINDS; each yields the limits of its kind that the machine file and
 the problem state, or has bounds of its own. Their scale comes from their bounds: an excess is a fraction of the range,
-high - low. A design, its check, comparisons and reports take every limit of the table. A limit's name that begins with
-`lane` says that it depends on where the machine stands on the ground.
+high - low. A design, its check, comparisons and reports take every limit of the table.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -41,7 +40,7 @@ class InfeasibleError(ValueError):
 class Limit:
     """low <= expression(q, nu, u, du) <= high, one number per sample; low may be -inf.
 
-    q, nu (n_q,) coordinates and velocities, u, du (n_u,) torques [N m] and their rates [N m/s].
+    q, nu (n_q,) coordinates and velocities, u, du (n_u,) torques [N m] and their rates [N m/s]. kind: its key in KINDS.
     """
 
     name: str
@@ -49,6 +48,7 @@ class Limit:
     low: float
     high: float
     unit: str
+    kind: str
 
     @property
     def range(self) -> float:
@@ -219,11 +219,45 @@ def symbols(model: Model) -> Symbols:
 def limits(model: Model, problem: Problem) -> tuple[Limit, ...]:
     """Every limit that the machine and the problem state, in the order of KINDS."""
     s = symbols(model)
+    sample, names = [s.q, s.nu, s.u, s.du], ["q", "nu", "u", "du"]
     return tuple(
-        Limit(name, ca.Function("limit", [s.q, s.nu, s.u, s.du], [e], ["q", "nu", "u", "du"], ["g"]), low, high, unit)
-        for kind in KINDS.values()
-        for name, e, low, high, unit in kind.bounds(model, problem, s)
+        Limit(name, ca.Function("limit", sample, [e], names, ["g"]), low, high, unit, kind)
+        for kind, stated in KINDS.items()
+        for name, e, low, high, unit in stated.bounds(model, problem, s)
     )
+
+
+def stacked(model: Model, every: Sequence[Limit]) -> ca.Function:
+    """(q, nu, u, du) -> the values of several limits, one under the other."""
+    s = symbols(model)
+    sample = [s.q, s.nu, s.u, s.du]
+    return ca.Function("limits", sample, [ca.vertcat(*[g.expression(*sample) for g in every])])
+
+
+def on_lane(name: str) -> bool:
+    """Whether a limit of that name depends on where the machine stands on the ground: its name begins with `lane`."""
+    return name.startswith("lane")
+
+
+def at_ends(name: str) -> bool:
+    """Whether a limit of that name is about rest at both ends."""
+    return name.startswith("rest")
+
+
+def free(name: str) -> bool:
+    """Whether a limit of that name leaves the motion between free: the lane, on which a drive can still be placed, and
+    rest at its ends."""
+    return on_lane(name) or at_ends(name)
+
+
+def in_motion(excess: Mapping[str, float]) -> bool:
+    """Whether every limit but the free ones is kept, by name the excess that `check` finds."""
+    return all(v == 0 for name, v in excess.items() if not free(name))
+
+
+def off_lane(excess: Mapping[str, float]) -> float:
+    """The largest excess over any limit of the lane, 0 where there is none."""
+    return max((v for name, v in excess.items() if on_lane(name)), default=0.0)
 
 
 def resting(model: Model) -> tuple[int, ...]:
@@ -259,11 +293,7 @@ def check(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
     every = limits(model, problem)
     du = np.diff(motion.u, axis=0) / np.diff(motion.t)[:, None]
     du = np.vstack([du, du[-1:]])
-    s = symbols(model)
-    stacked = ca.Function(
-        "limits", [s.q, s.nu, s.u, s.du], [ca.vertcat(*[g.expression(s.q, s.nu, s.u, s.du) for g in every])]
-    )
-    values = stacked(motion.q.T, motion.nu.T, motion.u.T, du.T).full()
+    values = stacked(model, every)(motion.q.T, motion.nu.T, motion.u.T, du.T).full()
     excess = {
         g.name: max(0.0, float(v.max() - g.high), float(g.low - v.min())) / g.range
         for g, v in zip(every, values, strict=True)

@@ -15,6 +15,7 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
+from excite.sensors import torque_behind
 from excite.simulate import _A, _C, _GAMMA, _SLOPES, _TIMES, _lu, _solve
 from model.machine import Sensor
 from model.prediction import Model
@@ -203,10 +204,9 @@ class Chart:
         step = 1 / float(self.model.machine.sampling_hz)
         t = np.arange(N) * step
         out = [e.full() for e in self.channels(t[None], X)]
-        gain, offset, delay = (e.T for e in out[:3])
+        gain, offset = (e.T for e in out[:2])
         by = [e.reshape(n_u, N, len(X)).transpose(1, 0, 2) for e in out[3:]]
-        early = np.column_stack([np.interp(t + delay[:, k], t, torque[:, k]) for k in range(n_u)])
-        u = (early - offset) / gain
+        u = np.column_stack([torque_behind(t, *each) for each in zip(torque.T, *out[:3], strict=True)])
         true = u + errors
         rise = np.gradient(gain * true + offset, step, axis=0)
         slope = (rise[:, :, None] * by[2] - by[1] - true[:, :, None] * by[0]) / gain[:, :, None]
@@ -218,14 +218,6 @@ class Chart:
             return noise
         gain: np.ndarray = self.model.channels(0.0, X)[0].full()[:, 0]
         return noise / np.abs(gain)
-
-    def measured(self, u: np.ndarray, X: np.ndarray) -> np.ndarray:
-        """What torque sensors read of delivered torques (N, n_u)."""
-        step = 1 / float(self.model.machine.sampling_hz)
-        t = np.arange(len(u)) * step
-        gain, offset, delay = (e.full().T for e in self.model.channels(t[None], X))
-        late = np.column_stack([np.interp(t - delay[:, k], t, u[:, k]) for k in range(u.shape[1])])
-        return np.asarray(gain * late + offset)
 
 
 @dataclass(frozen=True)
@@ -331,7 +323,6 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     known = np.full(len(index), np.nan)
     known[len(core) - len(model.memory) : len(core)] = model.remembered
     mass = ca.Function("mass", [q, u, z, X], [ca.diag(M)])(0, 0, 0, model.nominal).full()[:, 0]
-    table = np.array([model.base.standard.index(f"u{b.index}0") for b in machine.actuated])
     return Chart(
         model,
         sensors,
@@ -339,7 +330,7 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
         np.array(index),
         full.numel(),
         tuple(angle),
-        model.expand[table],
+        model.offsets,
         pushed,
         mass[list(pushed)],
         flawed,

@@ -1,8 +1,7 @@
-"""Logs and profiles: reading, checking, naming what is wrong in one line."""
+"""Logs: reading, checking, naming what is wrong in one line."""
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,13 +11,11 @@ import numpy as np
 import pandas as pd
 
 from excite import tables
-from excite.simulate import Motion
 from excite.tables import MDF_TIME
 from excite.tables import LogError as LogError
 from model import hydraulics
 from model import machine as machines
 from model.machine import Machine, Sensor
-from model.prediction import Model
 from model.units import UNITS
 
 SHORTEST = 100  # samples: below this no filter and no estimate makes sense
@@ -60,12 +57,12 @@ def check(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sour
     known = [s for s in wanted if set(s.columns) <= set(table.columns)]
     if machine.time_column not in table.columns:
         raise LogError(
-            f"{source}: no column {machine.time_column} (time), {_columns(table)}{looks_like(table, machine)}"
+            f"{source}: no column {machine.time_column} (time), {columns_of(table)}{looks_like(table, machine)}"
         )
     missing = [s for s in wanted if s.name in needs and s not in known]
     if missing:
         names = ", ".join(f"{c} ({what_of(s, machine)})" for s in missing for c in s.columns if c not in table.columns)
-        raise LogError(f"{source}: no column {names}, {_columns(table)}{looks_like(table, machine)}")
+        raise LogError(f"{source}: no column {names}, {columns_of(table)}{looks_like(table, machine)}")
     t = times(table, machine, source)
     least = max(SHORTEST, sum(machine.filter.drop) + 12 * machine.filter.decimation)
     if len(t) < least:
@@ -225,7 +222,8 @@ def what_of(sensor: Sensor, machine: Machine) -> str:
     return f"{kind} of {where.replace('_', ' ')}"
 
 
-def _columns(table: pd.DataFrame) -> str:
+def columns_of(table: pd.DataFrame) -> str:
+    """What a file holds instead of a column that it lacks."""
     names = [str(c) for c in table.columns]
     shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
     return f"the file has {shown}"
@@ -248,71 +246,3 @@ def looks_like(table: pd.DataFrame, machine: Machine) -> str:
         f"; is this a log of {machine.name}? The machine file names each sensor's column: `excite machine new NAME"
         f" --like {machine.name}` writes one with columns and units to change"
     )
-
-
-def profile(model: Model, motion: Motion) -> pd.DataFrame:
-    """A drive as a table: the torques to deliver, then the motion that is expected (contract, section 2)."""
-    columns: dict[str, np.ndarray] = {"t_s": motion.t}
-    for k, name in enumerate(model.inputs):
-        columns[torque_column(model, name)] = motion.u[:, k]
-    names = motion_columns(model)
-    columns |= {place: motion.q[:, k] for k, (place, _) in enumerate(names)}
-    columns |= {rate: motion.nu[:, k] for k, (_, rate) in enumerate(names)}
-    return pd.DataFrame(columns)
-
-
-def torque_column(model: Model, name: str) -> str:
-    """Column of an input in a profile: u1_Nm, of a prismatic joint u1_N."""
-    body = model.machine.find(int(name[1:]))
-    return f"{name}_{'Nm' if body.joint == 'revolute' else 'N'}"
-
-
-def motion_columns(model: Model) -> list[tuple[str, str]]:
-    """Columns of each coordinate and its velocity in a profile; a planar root's are along its own axes."""
-    own = (
-        dict(zip(model.machine.body[0].coordinates, ("v_m_s", "vy_m_s"), strict=False)) if model.machine.planar else {}
-    )
-    names = []
-    for c in model.coordinates:
-        unit = "rad" if c.startswith("theta") else "m"
-        names.append((f"{c}_{unit}", own.get(c, f"d{c}_{unit}_s")))
-    return names
-
-
-def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Torques (N, n_u) [N m] of a profile and the state (n_q,), (n_q,) it starts from, zero where it gives none.
-
-    Raises LogError as for a log.
-    """
-    table = tables.read(path)
-    source = str(path)
-    needed = ["t_s", *(torque_column(model, n) for n in model.inputs)]
-    missing = [c for c in needed if c not in table.columns]
-    alien = [c for c in table.columns if re.fullmatch(r"u\d+_Nm?", str(c)) and c not in needed]
-    if alien and not missing:
-        raise LogError(f"{source}: column {alien[0]}: {model.machine.name} has no such drive; is it another's profile?")
-    if missing:
-        raise LogError(
-            f"{source}: no column {', '.join(missing)}, {_columns(table)}; is this a profile of {model.machine.name}?"
-        )
-    t = numbers(table, "t_s", source)
-    if len(t) < 2:
-        raise LogError(f"{source}: only {len(t)} row, a profile needs at least 2")
-    rate = float(model.machine.sampling_hz)
-    check_time(t, rate, "t_s", source)
-    torque = np.column_stack([numbers(table, c, source) for c in needed[1:]])
-    for k, name in enumerate(model.inputs):
-        limit = model.machine.find(int(name[1:])).limit.torque
-        top = float(np.abs(torque[:, k]).max())
-        if limit is not None and top > 10 * float(limit):
-            raise LogError(
-                f"{source}: column {needed[k + 1]}: up to {top:.3g}, more than ten times the drive's limit"
-                f" {float(limit):g}; is the unit right?"
-            )
-    start, speed = np.zeros(len(model.coordinates)), np.zeros(len(model.coordinates))
-    for k, (place, rate_column) in enumerate(motion_columns(model)):
-        if place in table.columns:
-            start[k] = numbers(table, place, source)[0]
-        if rate_column in table.columns:
-            speed[k] = numbers(table, rate_column, source)[0]
-    return torque, start, speed

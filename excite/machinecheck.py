@@ -1,4 +1,4 @@
-"""What is wrong or doubtful in a machine file, and a file to start from.
+"""What is wrong or doubtful in a machine file.
 
 One plain function per kind of complaint, in the tables FAULTS (the machine can't be as the file says, or nothing can be
 done with it) and DOUBTS (it can, but hardly is); each takes a model and yields lines.
@@ -6,28 +6,27 @@ done with it) and DOUBTS (it can, but hardly is); each takes a model and yields 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
-import jinja2
 import numpy as np
 from pydantic import ValidationError
 
-from excite import folder, identify, limit, manoeuvre, page, report, reports, smoothing, terminal, topview
+from excite import figures, folder, identify, limit, manoeuvre, page, reports, smoothing, terminal, topview
 from excite.page import Picture, Table
 from excite.simulate import SimulationError, simulate
 from excite.terminal import rounded
+from model import file as files
 from model import machine as machines
 from model import tree
-from model.machine import Machine, MachineError, Problem, Quantity
+from model.file import Quantity
+from model.machine import Machine, MachineError, Problem
 from model.prediction import Model, build, standard_parameters
 
 PICTURE = "machine.png"
-TEMPLATE = "machine.toml"
 LINEAR = 0.15  # slip up to which the linear law holds, where a contact gives no limit
 CRAWL = 0.05  # m/s2: a machine that can't be accelerated so much hardly moves
 LOADS = (0.3, 50.0)  # stiffness of a contact over the load on it
@@ -83,7 +82,7 @@ def complaints(path: Path) -> list[str]:
     except MachineError as err:
         if not isinstance(err.__context__, ValidationError):
             raise
-        return machines.complaints(path, err.__context__, Machine)
+        return files.complaints(path, err.__context__, Machine)
     return []
 
 
@@ -244,7 +243,7 @@ def _bodies(model: Model) -> Iterator[str]:
 
 def _noise(model: Model) -> Iterator[str]:
     for s in model.machine.sensors("full"):
-        if s.noise is None and s.counts_per_turn is None:
+        if not s.graded:
             yield f"sensor {s.name}: neither noise nor counts_per_turn: what accuracy is attainable can't be said"
 
 
@@ -295,7 +294,10 @@ def _standard(model: Model) -> list[float]:
 
 
 def _trial(model: Model) -> dict[str, float]:
-    """One standard deviation [%] of every parameter after the best of some random drives; {} where there is none."""
+    """One standard deviation [%] of every parameter after the best of some random drives; {} where there is none.
+
+    Of the nominal value or the scale, whichever is larger: per cent of what is nearly zero mean little.
+    """
     best: dict[str, float] = {}
     size = np.maximum(np.abs(model.nominal), model.scale)
     for seed in TRIED:
@@ -305,8 +307,7 @@ def _trial(model: Model) -> dict[str, float]:
                 motion = simulate(model, manoeuvre.scaled(wish, share).sample(float(model.machine.sampling_hz)))
             except SimulationError:
                 continue
-            over = limit.check(model, TRIAL, motion)
-            if all(v == 0 for n, v in over.items() if not n.startswith(("rest", "lane"))):
+            if limit.in_motion(limit.check(model, TRIAL, motion)):
                 break
         else:
             continue
@@ -340,7 +341,7 @@ def write(place: Path, path: Path, versions: dict[str, str]) -> dict[str, Any]:
         "versions": versions,
     }
     if model is not None and model.machine.planar:
-        report.save(topview.figure(model.machine), place / PICTURE)
+        figures.save(topview.figure(model.machine), place / PICTURE)
     (place / "report.html").write_text(_page(summary, place), encoding="utf-8")
     folder.keep(place, summary)
     return summary
@@ -418,62 +419,3 @@ def show(summary: dict[str, Any]) -> None:
         for line in lines:
             terminal.say(f"{word}{line}")
     terminal.say(answer(summary))
-
-
-def start(name: str, file: Path, like: str | None = None) -> None:
-    """Writes a file to start from, or a shipped machine's with its columns to change.
-
-    Raises MachineError where there is one already, or for a name that can't be one.
-    """
-    text = fresh(name, file) if like is None else renamed(name, file, machines.load(like))
-    if file.exists():
-        raise MachineError(f"{file}: is there already, give another --out")
-    with folder.writing_file(file) as place:
-        place.write_text(text, encoding="utf-8")
-
-
-def fresh(name: str, file: Path) -> str:
-    """A commented machine file to start from. Raises MachineError for a name that can't be one."""
-    _named(name)
-    text = jinja2.Environment(
-        loader=jinja2.PackageLoader("excite", "templates"), keep_trailing_newline=True, undefined=jinja2.StrictUndefined
-    ).get_template(TEMPLATE)
-    return text.render(name=name, title=name.replace("_", " ").replace("-", " "), file=file)
-
-
-def renamed(name: str, file: Path, like: Machine) -> str:
-    """A shipped machine's file with its columns to change. Raises MachineError for a name that can't be one."""
-    _named(name)
-    lines = [
-        f"# {name}: the machine {like.name} with a logger of its own. Change columns and units to those of the log,",
-        "# leave out sensors that are not there, then",
-        f"#     excite log check LOG --machine {file}",
-        "# says what is still wrong. Noise and sizes are in SI units, whatever the columns are in; `excite docs` lists",
-        "# the units and every other key. Give here as well what else differs.",
-        "",
-        f'extends = "{like.name}"',
-        f'name = "{name}"',
-        f"sampling_hz = {_toml(like.sampling_hz.model_dump(exclude_defaults=True))} # of the logs",
-        f'time_column = "{like.time_column}"',
-        f'time_unit = "{like.time_unit}"',
-    ]
-    for sensor in like.sensor:
-        keys = sensor.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
-        lines += ["", "[[sensor]]", *(f"{key} = {_toml(value)}" for key, value in keys.items())]
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    """A value on one line of a TOML file."""
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_toml(inner)}" for key, inner in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(_toml(inner) for inner in value) + "]"
-    return json.dumps(value, ensure_ascii=False)
-
-
-def _named(name: str) -> None:
-    if not name.replace("_", "").replace("-", "").isalnum() or not name[0].isalpha() or not name.isascii():
-        raise MachineError(f"{name}: a machine's name has letters, digits, _ and -, and begins with a letter")
-    if name in machines.shipped():
-        raise MachineError(f"{name}: is the name of a shipped machine, choose another")

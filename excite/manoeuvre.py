@@ -39,11 +39,11 @@ class Manoeuvre:
         return self.at(self.times[0] + np.arange(round(self.duration * rate) + 1) / rate)
 
 
-def knots(problem: Problem) -> np.ndarray:
-    """Knot times (K,) [s] of a problem, at least its knot spacing apart."""
+def knots(problem: Problem, coarse: int = 1) -> np.ndarray:
+    """Knot times (K,) [s] of a problem, at least its knot spacing apart, or `coarse` times that; five knots or more."""
     duration, spacing = float(problem.duration_s), float(problem.knot_s)
     count = max(4, int(duration / spacing + 1e-9))
-    return np.linspace(0.0, duration, count + 1)
+    return np.linspace(0.0, duration, max(4, round(count / coarse)) + 1)
 
 
 def _bounds(model: Model) -> tuple[np.ndarray, np.ndarray]:

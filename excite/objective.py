@@ -228,6 +228,11 @@ def relative(model: Model) -> np.ndarray:
     return np.where(model.nominal != 0, np.abs(model.nominal), model.scale)
 
 
+def percent(model: Model, covariance: np.ndarray) -> np.ndarray:
+    """(n_base,) relative standard deviations [%] of a covariance (n_base, n_base) [SI^2]."""
+    return np.asarray(100 * np.sqrt(np.diag(covariance)) / relative(model))
+
+
 def weights(model: Model, objective: str) -> tuple[np.ndarray, np.ndarray]:
     """(n_rows,), (n_base,): what an objective multiplies the rows and the columns of W with.
 

@@ -18,12 +18,14 @@ import pyarrow.parquet as pq
 from matplotlib.figure import Figure
 
 from excite import cell as cells
-from excite import report, reports, verify
+from excite import figures, reports, verify
 from excite.cell import DEFECT, DONE, Row
+from excite.figures import COLOURS
 from excite.page import Picture, Table, report_page
 from excite.plan import Cell, Plan
 from excite.terminal import rounded
 from excite.verify import Verification
+from model.prediction import built
 
 TABLE, FIGURE = "runs.parquet", "study.png"
 GROUP = 2000  # rows that are in memory at a time
@@ -168,12 +170,12 @@ def _line(wanted: Plan, number: int, cell: Cell, about: Row, row: Row, seed: int
     names = wanted.parameters[cell.drive.machine]
     for kind in cells.ESTIMATES:
         line |= {f"{kind}.{n}": x for n, x in zip(names, row.get(kind, ()), strict=False)}
-    model = cells.model_of(wanted.machines[cell.drive.machine].model_dump_json())
+    model = built(wanted.machines[cell.drive.machine].model_dump_json())
     return line | {f"true.{n}": float(x) for n, x in zip(names, model.nominal, strict=True)}
 
 
 def _seen(wanted: Plan, c: int, cell: Cell, track: Any, rows: Sequence[Row]) -> Seen:
-    model = cells.model_of(wanted.machines[cell.drive.machine].model_dump_json())
+    model = built(wanted.machines[cell.drive.machine].model_dump_json())
     table: dict[str, dict[str, float | str]] = {}
     if any("value" in row for row in rows):
         nothing = [None] * len(model.base.names)
@@ -257,15 +259,15 @@ def figure(seen: Sequence[Seen], title: str) -> Figure:
     """Cell by cell: errors of the parameters and how often intervals hold, verdicts, or else the drives' scores."""
     names, n = label(seen), len(seen)
     shown = Figure(figsize=(11.5, 1.6 + 0.3 * min(n, NAMED) + (2.5 if n > NAMED else 0)), layout="constrained")
-    shown.suptitle(report.plain(title))
+    shown.suptitle(figures.plain(title))
     y = np.arange(n)
     if any(s.parameters for s in seen):
         left, right = shown.subplots(1, 2, sharey=True, width_ratios=(2, 1))
         for k, s in enumerate(seen):
             if s.parameters:
-                left.plot(list(s.rms.values()), [k] * len(s.rms), "o", color=report.COLOURS[0], markersize=3, alpha=0.5)
-                left.plot(np.median(list(s.rms.values())), k, "D", color=report.COLOURS[1], markersize=5)
-                right.plot(100 * s.coverage, k, "D", color=report.COLOURS[1], markersize=5)
+                left.plot(list(s.rms.values()), [k] * len(s.rms), "o", color=COLOURS[0], markersize=3, alpha=0.5)
+                left.plot(np.median(list(s.rms.values())), k, "D", color=COLOURS[1], markersize=5)
+                right.plot(100 * s.coverage, k, "D", color=COLOURS[1], markersize=5)
         left.set_xscale("log")
         left.set_xlabel("error of each parameter, rms over the runs [%]; diamond: median parameter")
         right.axvline(95, color="black", linewidth=0.8, linestyle=(0, (2, 3)))
@@ -278,7 +280,7 @@ def figure(seen: Sequence[Seen], title: str) -> Figure:
         for k, kind in enumerate(kinds):
             share = np.array([100 * s.verdicts.get(kind, 0) / max(1, sum(s.statuses.values())) for s in seen])
             hatch = ("", "//", "..", "xx")[k]
-            only.barh(y, share, left=base, color=report.COLOURS[k], hatch=hatch, edgecolor="white", label=kind)
+            only.barh(y, share, left=base, color=COLOURS[k], hatch=hatch, edgecolor="white", label=kind)
             base += share
         only.set_xlabel("verdicts [% of the runs]")
         only.legend(ncols=4, fontsize=8, frameon=False, loc="lower right", bbox_to_anchor=(1, 1))
@@ -286,13 +288,13 @@ def figure(seen: Sequence[Seen], title: str) -> Figure:
     else:
         only = shown.subplots()
         score = [np.nan if s.cond_phi is None else s.cond_phi for s in seen]
-        only.barh(y, score, color=report.COLOURS[0], height=0.6)
+        only.barh(y, score, color=COLOURS[0], height=0.6)
         only.set_xlabel("cond(Phi) of the drive")
         axes = [only]
     for ax in axes:
         ax.grid(alpha=0.3)
     if n <= NAMED:
-        axes[0].set_yticks(y, [report.plain(name) for name in names], fontsize=8)
+        axes[0].set_yticks(y, [figures.plain(name) for name in names], fontsize=8)
     else:
         axes[0].set_ylabel("cell")
     axes[0].invert_yaxis()
@@ -302,7 +304,7 @@ def figure(seen: Sequence[Seen], title: str) -> Figure:
 def draw(wanted: Plan, seen: Sequence[Seen], said: Mapping[str, Any], place: Path) -> None:
     """Figure and report of a study's folder."""
     title = wanted.study.title or wanted.study.name
-    report.save(figure(seen, f"{title}: {said['runs']} runs"), place / FIGURE)
+    figures.save(figure(seen, f"{title}: {said['runs']} runs"), place / FIGURE)
     (place / reports.NAME).write_text(page(title, said, place / FIGURE), encoding="utf-8")
 
 

@@ -46,7 +46,7 @@ STEPS, SIZES = (0.02, 0.01, 0.005), (1.0, 0.2, 0.1)  # differences, and what a r
 PRICE = 30.0  # of a limit's excess, a fraction of its range, against the objective
 ROOM = 0.01  # of a limit's range that is kept free at least
 FINE = 0.1  # what an excess over a tolerance for rest counts against one over a limit's range
-DRIVEN = ("torque",)  # limits that hidden valves keep, whoever drives
+DRIVEN = ("torque", "torque_rate")  # limits that hidden valves keep, whoever drives
 
 Report = Callable[[int, int, float], None]
 
@@ -343,17 +343,15 @@ def _information(task: Task, motion: Motion) -> list[np.ndarray]:
 
 @lru_cache(maxsize=2)
 def _limits(task: Task) -> tuple[ca.Function, np.ndarray, np.ndarray, np.ndarray]:
-    """Every limit that driving can break, stacked: values of (q, nu, u), low, high, range."""
-    s = limit.symbols(task.model)
-    every = [g for g in limit.limits(task.model, task.problem) if not g.name.startswith(DRIVEN)]
-    values = [g.expression(s.q, s.nu, s.u, s.du) for g in every]
+    """Every limit that driving can break, stacked: values of (q, nu, u, du), low, high, range."""
+    every = [g for g in limit.limits(task.model, task.problem) if g.kind not in DRIVEN]
     low, high, size = np.array([(g.low, g.high, g.range) for g in every]).reshape(-1, 3).T
-    return ca.Function("within", [s.q, s.nu, s.u], [ca.vertcat(*values)]), low, high, size
+    return limit.stacked(task.model, every), low, high, size
 
 
 def _over(task: Task, motion: Motion) -> np.ndarray:
     within, low, high, size = _limits(task)
-    values = within(motion.q.T, motion.nu.T, motion.u.T).full()
+    values = within(motion.q.T, motion.nu.T, motion.u.T, 0).full()
     above = np.maximum(values - high[:, None], low[:, None] - values) / size[:, None]
     found = np.column_stack([part.max(axis=1) for part in np.array_split(above, WINDOWS, axis=1)])
     if task.problem.rest:

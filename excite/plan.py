@@ -39,7 +39,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
 
-from excite import asked, identify, log
+from excite import asked, identify, profiles
 from excite.asked import UsageError
 from excite.limit import KINDS
 from excite.log import LogError
@@ -48,7 +48,8 @@ from model import effects as catalogue
 from model import machine as machines
 from model import prediction
 from model.effect import DURATION
-from model.machine import Machine, MachineError, Number, Record
+from model.file import Number, Record, one_line
+from model.machine import Machine, MachineError
 
 STEPS = ("design", "simulate", "identify", "diagnose", "verify")
 MOST = 1_000_000  # runs of a study
@@ -340,7 +341,7 @@ def read(path: str | Path) -> Plan:
     try:
         study = Study.model_validate(raw)
     except ValidationError as err:
-        raise StudyError(machines.one_line(path, err, Study)) from None
+        raise StudyError(one_line(path, err, Study)) from None
     try:
         return ready(study, path.parent)
     except UsageError as err:
@@ -394,7 +395,7 @@ def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:
 
     if fresh(d):
         if d.profile is not None:
-            log.read_profile(plan.base / d.profile, prediction.build(machine))
+            profiles.read(plan.base / d.profile, prediction.build(machine))
         else:
             asked.known("--objective", d.objective, tuple(OBJECTIVES))
             asked.problem(plan.designed(d), d.problem, d.duration_s)

@@ -12,9 +12,9 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from excite import misfit
+from excite.figures import COLOURS, plain, save
 from excite.findings import Account
 from excite.misfit import Course
-from excite.report import COLOURS, plain, save
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 SHOWN, WIDE = 3, 4  # torques and forces in a figure, panels side by side

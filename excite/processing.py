@@ -106,9 +106,7 @@ def _beside(model: Model, q: np.ndarray, nu: np.ndarray, Y: np.ndarray) -> tuple
     """Torques as far as the machine file's offsets tell, and what effects remember, along measured motion."""
     if model.plain:
         return ()
-    nominal = dict(zip(model.base.standard, model.expand @ model.nominal, strict=True))
-    offset = np.array([nominal[f"u{b.index}0"] for b in model.machine.actuated])
-    u = Y[list(model.actuated)] - offset[:, None]
+    u = Y[list(model.actuated)] - (model.offsets @ model.nominal)[:, None]
     return u, remember(model, q.T, nu.T, u.T, model.nominal).T
 
 

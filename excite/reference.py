@@ -21,7 +21,8 @@ from excite import asked, compare, handbook, identify, limit, objective, plan, s
 from model import effects, units
 from model import machine as machines
 from model.effect import DURATION, Effect, Shape, Site, one
-from model.machine import Machine, Record
+from model.file import Record
+from model.machine import Machine
 
 HIDDEN = ("__main__",)
 PLAIN = (str, int, float, tuple, type(None))  # defaults that read as they are

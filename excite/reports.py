@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from excite import folder, log, logcheck, objective, report, tables
+from excite import figures, folder, log, logcheck, objective, tables
 from excite.limit import TOLERANCE
 from excite.page import Picture, Table, report_page
 from excite.terminal import ESTIMATE, likely, rounded
@@ -108,7 +108,7 @@ def check_log(place: Path, path: Path, machine: str | None, versions: Mapping[st
         "versions": dict(versions),
     }
     if found.signals:
-        report.save(report.log_figure(found.signals, found.gaps, str(path)), place / "log.png")
+        figures.save(figures.log_figure(found.signals, found.gaps, str(path)), place / "log.png")
     finish(place, "log", summary)
     return summary
 

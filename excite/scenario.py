@@ -11,7 +11,8 @@ import numpy as np
 
 from excite.driver import gains
 from excite.simulate import Motion, respond
-from model.machine import Body, Machine, Quantity
+from model.file import Quantity
+from model.machine import Body, Machine
 from model.prediction import Model
 
 SCENARIO = 3  # stream of random numbers

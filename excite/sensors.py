@@ -66,13 +66,25 @@ def signals(model: Model, motion: Motion, X: np.ndarray | None = None) -> dict[s
     X = model.nominal if X is None else X
     arrays = (motion.q, motion.nu, motion.wheels, motion.u, motion.memory)
     values = dict(zip(model.readable, model.read(*(x.T for x in arrays), X).full(), strict=True))
-    gain, offset, delay = (x.full() for x in model.channels(motion.t[None], X))
+    torques = torques_read(model, motion.t, motion.u, X)
     for sensor in model.machine.sensors("full"):
         if sensor.kind == "torque":
-            k = model.inputs.index(f"u{sensor.body}")
-            late = np.interp(motion.t - delay[k], motion.t, motion.u[:, k])
-            values[sensor.name] = gain[k] * late + offset[k]
+            values[sensor.name] = torques[:, model.inputs.index(f"u{sensor.body}")]
     return values
+
+
+def torques_read(model: Model, t: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """What torque channels read (N, n_u) of delivered torques u (N, n_u) [N m] at times t (N,) [s]."""
+    channels = (x.full() for x in model.channels(t[None], X))
+    each = zip(u.T, *channels, strict=True)
+    return np.column_stack([gain * np.interp(t - delay, t, one) + offset for one, gain, offset, delay in each])
+
+
+def torque_behind(
+    t: np.ndarray, read: np.ndarray, gain: np.ndarray, offset: np.ndarray, delay: np.ndarray
+) -> np.ndarray:
+    """The reverse of one channel: the torque (N,) [N m] behind what is read (N,); gain, offset, delay [s] (N,)."""
+    return np.asarray((np.interp(t + delay, t, read) - offset) / gain)
 
 
 def _flawed(sensor: Sensor, exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:

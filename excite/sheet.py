@@ -15,7 +15,7 @@ from matplotlib.patches import Polygon
 
 from excite import drive, topview
 from excite.drive import Room, Score, Trace
-from excite.report import COLOURS
+from excite.figures import COLOURS
 from excite.simulate import Motion
 from model.machine import Machine, Sensor
 from model.prediction import Model

@@ -35,6 +35,7 @@ from excite.record import (
     smoothed,
     torque_sensor,
 )
+from excite.sensors import torques_read
 from excite.simulate import Motion
 from model.machine import Filter
 from model.prediction import Model
@@ -240,7 +241,7 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
     X = model.nominal if X is None else np.asarray(X, float)
     sensors = [s for s in model.machine.sensors(kit) if s.kind not in ("x", "y")]
     for s in sensors:
-        if s.noise is None and s.counts_per_turn is None:
+        if not s.graded:
             raise ValueError(
                 f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file"
             )
@@ -252,7 +253,7 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
         np.array([s.resolution or float(s.noise or 0) for s in c.sensors]),
     )
     none = np.zeros((len(state), len(c.sensors)))
-    r = Record(c.measured(motion.u, X), none, none, counts, origins(c, counts), noise)
+    r = Record(torques_read(model, motion.t, motion.u, X), none, none, counts, origins(c, counts), noise)
     p = Point(state, np.zeros_like(motion.u[1:]), np.zeros(len(r.origin)))
     linear = linearise(c, expected(c, r, p, motion.u, X), p, state[0], X, 0.0, exact=True)
     assert linear is not None

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from excite import folder, log
+from excite import folder, profiles
 from excite.simulate import Motion, simulate
 from model.machine import Machine, Problem
 from model.prediction import Model, build
@@ -61,7 +61,7 @@ def read(design_dir: Path) -> Stored:
     if "nominal" in before:  # designed for what logs told of the machine, not for the machine file's values
         nominal = np.array([float(before["nominal"][n]) for n in model.base.names])
         model = replace(model, nominal=nominal)
-    torque, q0, nu0 = log.read_profile(design_dir / "profile.csv", model)
+    torque, q0, nu0 = profiles.read(design_dir / "profile.csv", model)
     if len(torque) != round(before["duration_s"] * float(model.machine.sampling_hz)) + 1:
         raise StoredError(
             f"{design_dir / 'profile.csv'}: {len(torque)} rows do not make {before['duration_s']:g} s, design again"

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from excite import asked, engine, folder, log, overview, store
+from excite import asked, engine, folder, overview, profiles, store
 from excite import cell as cells
 from excite.cell import DEFECT, FAILED, Designed, Driven, Order, Work
 from excite.engine import EngineError, Pool
@@ -30,6 +30,7 @@ from excite.store import Store, StoreError
 from model import effects
 from model import machine as machines
 from model.machine import Machine
+from model.prediction import built
 
 __all__ = ["EngineError", "StoreError", "StudyError", "carry", "place_of"]
 
@@ -173,8 +174,8 @@ class Track:
 
 def _track(wanted: Plan, place: Path, number: int) -> Track:
     drive = wanted.drives[number]
-    model = cells.model_of(wanted.machines[drive.machine].model_dump_json())
-    torque, q0, nu0 = log.read_profile(place / _name(number) / "profile.csv", model)
+    model = built(wanted.machines[drive.machine].model_dump_json())
+    torque, q0, nu0 = profiles.read(place / _name(number) / "profile.csv", model)
     driven = Driven(np.ascontiguousarray(torque, float).tobytes(), torque.shape[1], tuple(q0), tuple(nu0))
     path = place / _name(number) / folder.SUMMARY
     summary = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from excite.report import COLOURS, plain
+from excite.figures import COLOURS, plain
 from model import tree
 from model.machine import Body, Machine
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -12,8 +11,7 @@ from joblib import Parallel, delayed
 from excite import identify, log, sensors
 from excite.estimate import NoEstimate
 from excite.simulate import Motion
-from model.machine import Machine
-from model.prediction import Model, build
+from model.prediction import Model, built
 
 Progress = Callable[[int, int], None]
 
@@ -113,7 +111,7 @@ Found = tuple[np.ndarray, np.ndarray, np.ndarray]
 def _run(
     k: int, true: str, known: str, motion: Motion, method: str, kit: str, seed: int
 ) -> tuple[int, Found | None, str]:
-    model, assumed = _built(true), _built(known)
+    model, assumed = built(true), built(known)
     table = sensors.measure(model, motion, kit=kit, seed=seed)
     measured = log.check(table, assumed.machine, identify.needed_sensors(assumed, method))
     try:
@@ -121,12 +119,6 @@ def _run(
     except NoEstimate as err:
         return k, None, str(err)
     return k, (estimate.value, estimate.std, estimate.interval95), ""
-
-
-@lru_cache(maxsize=4)
-def _built(machine: str) -> Model:
-    """A worker builds each machine's model once; CasADi functions are cheaper to build than to send."""
-    return build(Machine.model_validate_json(machine))
 
 
 def summary(v: Verification) -> dict[str, dict[str, float | str]]:

@@ -10,7 +10,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from excite import asked, crosscheck, examine, gaps, identify, log, report, reports, sensors, stored, terminal
+from excite import (
+    asked,
+    crosscheck,
+    examine,
+    figures,
+    gaps,
+    identify,
+    log,
+    profiles,
+    reports,
+    sensors,
+    stored,
+    terminal,
+)
 from excite import brief as briefs
 from excite import compare as comparisons
 from excite import verify as verification
@@ -50,7 +63,7 @@ def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief
                 " effect outside of what the drive can reach?"
             ) from None
     wall = time.perf_counter() - begin
-    log.profile(found.model, found.design.motion).to_csv(place / "profile.csv", index=False)
+    profiles.of(found.model, found.design.motion).to_csv(place / "profile.csv", index=False)
     (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
     summary: dict[str, Any] = {
         "machine": model.machine.name,
@@ -61,8 +74,8 @@ def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief
         "versions": asked.versions(),
     }
     title = f"{model.machine.title}: {name}, cond(Phi) = {found.design.cond_phi:.2f}"
-    report.save(report.design_figure(found.model, chosen, found.design.motion, title), place / "design.png")
-    report.save(report.sigma_figure(summary["sigma_percent"], title), place / "sigma.png")
+    figures.save(figures.design_figure(found.model, chosen, found.design.motion, title), place / "design.png")
+    figures.save(figures.sigma_figure(summary["sigma_percent"], title), place / "sigma.png")
     reports.finish(place, "design", summary)
     return summary
 
@@ -102,7 +115,7 @@ def verify(
         "versions": asked.versions(),
     }
     title = f"{model.machine.title}: {runs} simulated runs, {method}, kit {kit}"
-    report.save(report.verify_figure(result, title), place / "verify.png")
+    figures.save(figures.verify_figure(result, title), place / "verify.png")
     reports.finish(place, "verify", summary)
     return summary
 
@@ -123,7 +136,7 @@ def compare(
         asked.known("--against", usual, tuple(comparisons.USUAL))
     with terminal.bar("comparing") as advance:
         result = comparisons.compare(model, chosen, samples, seed, budget, advance, against)
-    columns = ["t_s", *(log.torque_column(model, u) for u in model.inputs)]
+    columns = ["t_s", *(profiles.torque_column(model, u) for u in model.inputs)]
     (place / "drives").mkdir()
     designs = []
     for row in result.rows:
@@ -159,7 +172,7 @@ def compare(
         "versions": asked.versions(),
     }
     title = f"{model.machine.title}: {name}, the designed drive and the usual ones"
-    report.save(report.compare_figure(result.rows, title), place / "compare.png")
+    figures.save(figures.compare_figure(result.rows, title), place / "compare.png")
     reports.finish(place, "compare", summary)
     return summary
 
@@ -172,15 +185,13 @@ def identified(
     filtering: str,
     validate: Sequence[Path],
 ) -> dict[str, Any]:
-    """Parameters from logs. filtering: machine or auto; validate: logs that the result is to predict."""
+    """Parameters from logs. filtering: a name of `examine.FILTERS`; validate: logs that the result is to predict."""
     method = asked.method(method, model)
-    asked.known("--filter", filtering, ("machine", "auto"))
     needs = identify.needed_sensors(model, method)
-    parts = [gaps.read(path, model.machine, needs) for path in logs]
-    read, cut = [one for some, _ in parts for one in some], [note for _, notes in parts for note in notes]
+    read, cut = gaps.read(logs, model.machine, needs)
     fresh = [log.read(path, model.machine, needs) for path in validate]
     with terminal.busy("identifying"):
-        chosen, reason = examine.choose(model, read) if filtering == "auto" else (model.machine.filter, "")
+        chosen, reason = examine.FILTERS[filtering](model, read)
         estimate = identify.identify(model, read, method, chosen)
         if model.slips and identify.METHODS[method].biased:
             estimate = identify.with_bias(model, read, estimate, chosen)
@@ -202,8 +213,8 @@ def identified(
     for kind, several in (("fit", read), ("validation", fresh)):
         for k, one in enumerate(several):
             title = f"{model.machine.title}: {one.source}"
-            figure = report.comparison_figure(model, crosscheck.torques(model, one, estimate, chosen), title)
-            report.save(figure, place / (f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png"))
+            figure = figures.comparison_figure(model, crosscheck.torques(model, one, estimate, chosen), title)
+            figures.save(figure, place / (f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png"))
     reports.finish(place, "identify", summary)
     return summary
 

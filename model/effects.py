@@ -17,7 +17,8 @@ import casadi as ca
 
 from model import contact as law
 from model.effect import DURATION, Channel, Effect, Memory, Placed, Rolling, Scene, Shape, Site, Soil, Values
-from model.machine import Body, EffectEntry, Machine, MachineError, Quantity, Sensor
+from model.file import Quantity
+from model.machine import Body, EffectEntry, Machine, MachineError, Sensor
 
 GRAVITY = 9.81
 SMOOTH_SLIP = 0.005  # slip over which driving turns into braking

@@ -8,118 +8,27 @@ Every number carries where it comes from. All values are SI.
 from __future__ import annotations
 
 import math
-import re
-import reprlib
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    ValidatorFunctionWrapHandler,
-    WrapValidator,
-    model_validator,
-)
-from pydantic_core import ErrorDetails
+from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
 from model import hydraulics, units
+from model.file import Flag, Negative, NotNegative, Number, Point, Positive, Quantity, Record, Source, Vector3, one_line
 
 MACHINES = Path(__file__).parent / "machines"
-Source = Literal["paper", "data sheet", "measured", "published", "identified", "assumed", "definition"]
-
-_PI = re.compile(r"^\s*([+-]?)\s*(?:(\d+(?:\.\d+)?)\s*\*\s*)?pi\s*(?:/\s*(\d+(?:\.\d+)?))?\s*$")
+Index = Annotated[int, Field(strict=True, ge=0, le=99)]
 
 
 class MachineError(ValueError):
     """A machine file that can't be used: the message is one line with file, key, what is wrong and what is allowed."""
 
 
-def _number(value: Any) -> Any:
-    """Angles may be written as a multiple of pi, "-pi/2": the exact table entry, not a rounded one."""
-    if isinstance(value, bool):
-        raise ValueError("must be a number, not true/false")
-    if isinstance(value, str):
-        match = _PI.match(value)
-        if not match:
-            raise ValueError('must be a number, or a multiple of pi such as "-pi/2"')
-        sign, factor, divisor = match.groups()
-        if divisor and float(divisor) == 0:
-            raise ValueError("must be a finite number, not pi/0")
-        return (-1.0 if sign == "-" else 1.0) * float(factor or 1) * math.pi / float(divisor or 1)
-    return value
-
-
-def _finite(value: float) -> float:
-    if not math.isfinite(value):
-        raise ValueError(f"must be a finite number (got {value})")
-    if value and not 1e-12 <= abs(value) <= 1e12:
-        raise ValueError(f"must be 0 or of a size between 1e-12 and 1e12, in SI units (got {value:g})")
-    return value
-
-
-def _positive(q: Quantity) -> Quantity:
-    if not q.value > 0:
-        raise ValueError(f"must be > 0 (got {q.value:g})")
-    return q
-
-
-def _not_negative(q: Quantity) -> Quantity:
-    if q.value < 0:
-        raise ValueError(f"must be >= 0 (got {q.value:g})")
-    return q
-
-
-def _negative(q: Quantity) -> Quantity:
-    if not q.value < 0:
-        raise ValueError(f"must be < 0 (got {q.value:g}): the soil resists slip")
-    return q
-
-
-class Record(BaseModel):
-    """Frozen, and refuses keys that it doesn't know: a misspelt key must not be silently ignored."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-Number = Annotated[float, BeforeValidator(_number), AfterValidator(_finite)]
-Index = Annotated[int, Field(strict=True, ge=0, le=99)]
-Flag = Annotated[bool, Field(strict=True)]
-
-
-class Quantity(Record):
-    """A value [SI] and where it comes from."""
-
-    value: Number
-    source: Source
-    note: str = ""
-
-    def __float__(self) -> float:
-        return self.value
-
-
 def _zero() -> Quantity:
     return Quantity(value=0.0, source="definition")
-
-
-Positive = Annotated[Quantity, AfterValidator(_positive)]
-NotNegative = Annotated[Quantity, AfterValidator(_not_negative)]
-Negative = Annotated[Quantity, AfterValidator(_negative)]
-Vector3 = tuple[Number, Number, Number]
-
-
-class Point(Record):
-    """A point [m] in the body's frame."""
-
-    value: Vector3
-    source: Source
-    note: str = ""
 
 
 class Inertia(Record):
@@ -329,6 +238,11 @@ class Sensor(Record):
         return None if self.counts_per_turn is None else 2 * math.pi / self.counts_per_turn.value
 
     @property
+    def graded(self) -> bool:
+        """Whether it is said how well it measures, by noise or by counts."""
+        return self.noise is not None or self.counts_per_turn is not None
+
+    @property
     def gain(self) -> float:
         """SI value of one in the column; of a motor's pressures the torque [N m], of cylinders' the pressure [Pa]."""
         one = float(self.factor) if self.factor is not None else units.UNITS[self.unit][1]
@@ -420,7 +334,7 @@ class EffectEntry(Record):
     where: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
     amount: Quantity
     std: NotNegative | None = None
-    shape: dict[str, Quantity] = {}
+    shape: dict[str, Quantity] = Field({})
 
 
 def _convex(corners: Sequence[tuple[float, float]]) -> bool:
@@ -452,9 +366,9 @@ class Machine(Record):
     sensor: tuple[Sensor, ...]
     filter: Filter
     problem: str | None = None
-    problems: dict[str, Problem] = {}
-    parameter_names: dict[str, str] = {}
-    scale: dict[str, Positive] = {}
+    problems: dict[str, Problem] = Field({})
+    parameter_names: dict[str, str] = Field({})
+    scale: dict[str, Positive] = Field({})
     effect: tuple[EffectEntry, ...] = ()
 
     def find(self, index: int) -> Body:
@@ -666,58 +580,3 @@ def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
         merged[key] = _merge(merged[key], value) if both else value
     return merged
-
-
-def one_line(path: Path | str, err: ValidationError, root: type[Record]) -> str:
-    """What is wrong with a file that holds a `root` record: file, key, what is wrong, what is allowed, in a line."""
-    first, *more = complaints(path, err, root)
-    return f"{first} (and {len(more)} more)" if more else first
-
-
-def complaints(path: Path | str, err: ValidationError, root: type[Record]) -> list[str]:
-    """All that is wrong with a file that holds a `root` record, a line each."""
-    return [_complaint(path, one, root) for one in err.errors(include_url=False)]
-
-
-def _complaint(path: Path | str, one: ErrorDetails, root: type[Record]) -> str:
-    key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in one["loc"]).lstrip(".")
-    kind, message, got = one["type"], one["msg"], one.get("input")
-    if kind == "extra_forbidden":
-        message = f"no such key here, allowed: {', '.join(_record(one['loc'][:-1], root).model_fields)}"
-    elif kind == "missing":
-        message = "is missing"
-    elif kind == "model_type":
-        record = _record(one["loc"], root)
-        number = record in (Quantity, Point)
-        table = '{ value = ..., source = "..." }' if number else f"with keys {', '.join(record.model_fields)}"
-        message = f"must be a table {table} (got {reprlib.repr(got)})"
-    elif kind == "value_error":
-        message = message.removeprefix("Value error, ")
-        inner, _, rest = message.partition(": ")
-        if inner in _record(one["loc"], root).model_fields:
-            key, message = f"{key}.{inner}".lstrip("."), rest
-    elif kind == "too_short":
-        message = f"must have at least {one['ctx']['min_length']} (got {one['ctx']['actual_length']})"
-    elif kind == "too_long":
-        message = f"must have at most {one['ctx']['max_length']} (got {one['ctx']['actual_length']})"
-    else:
-        message = message.replace("Input should be", "must be").replace("String should", "must")
-        message = message.replace("a valid tuple", "a list in brackets") + f" (got {reprlib.repr(got)})"
-    return " ".join(f"{path}: {key + ': ' if key else ''}{message}".split())
-
-
-def _record(where: tuple[int | str, ...], root: type[Record]) -> type[Record]:
-    """The record that the file holds at this key."""
-    record = root
-    for step in where:
-        field = record.model_fields.get(str(step))
-        if field is not None:
-            inside = _record_in(field.annotation)
-            record = inside or record
-    return record
-
-
-def _record_in(annotation: Any) -> type[Record] | None:
-    if isinstance(annotation, type) and issubclass(annotation, Record):
-        return annotation
-    return next((r for a in get_args(annotation) if (r := _record_in(a)) is not None), None)

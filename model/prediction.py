@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
@@ -153,6 +153,11 @@ class Model:
     def expand(self) -> np.ndarray:
         """(n_standard, n_base): standard parameters with the same motions as the base parameters X (the rest zero)."""
         return self.base.expand
+
+    @cached_property
+    def offsets(self) -> np.ndarray:
+        """(n_u, n_base): takes the offsets u0 of the torque channels [N m, N] out of the base parameters X."""
+        return self.expand[[self.base.standard.index(f"u{b.index}0") for b in self.machine.actuated]]
 
     @cached_property
     def regressor(self) -> ca.Function:
@@ -308,6 +313,12 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
         flaws,
         shapes,
     )
+
+
+@lru_cache(maxsize=8)
+def built(machine: str) -> Model:
+    """The model of a machine as JSON, built once in a process: CasADi functions are cheaper to build than to send."""
+    return build(Machine.model_validate_json(machine))
 
 
 def _shown(found: Equations) -> set[str]:

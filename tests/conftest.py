@@ -7,9 +7,12 @@ import os
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+import importlib.util
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,6 +23,7 @@ from model import machine, prediction
 from model.prediction import Model
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
+RESULTS = Path(__file__).parents[1] / "results"
 
 
 def drive(model: Model, duration: float, seed: int, amplitude: dict[str, float]) -> np.ndarray:
@@ -31,6 +35,17 @@ def drive(model: Model, duration: float, seed: int, amplitude: dict[str, float])
         for frequency in (0.05, 0.08, 0.13, 0.2, 0.3):
             torque[:, k] += amplitude[name] * np.sin(2 * np.pi * frequency * t + rng.uniform(0, 2 * np.pi))
     return torque * np.minimum(1, np.minimum(t, duration - t) / 2)[:, None]
+
+
+def study(name: str) -> ModuleType:
+    """The script of a study in results/, as a module."""
+    spec = importlib.util.spec_from_file_location(f"study_{name}", RESULTS / name / "study.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import Excite
 
-from excite import log, sensors, stored
+from excite import profiles, sensors, stored
 from excite.brief import POOR, Brief, advice
 from excite.simulate import Motion
 from excite.smoothing import cramer_rao
@@ -59,7 +59,7 @@ def test_after_a_log_the_next_drive_is_for_the_estimated_machine(
     found = stored.read(out)
     assert list(summary["nominal"].values()) == pytest.approx(found.model.nominal.tolist())
     assert not np.array_equal(found.model.nominal, straight.nominal)
-    profile, _, _ = log.read_profile(out / "profile.csv", found.model)
+    profile, _, _ = profiles.read(out / "profile.csv", found.model)
     assert np.abs(found.motion.nu[-1]).max() < 0.04  # at rest for the machine that the log told of
     assert len(profile) == 1201
     # both drives together: never worse than the one that was there

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from conftest import Excite
 
-from excite import log
+from excite import profiles
 from excite.simulate import Motion
 from model.prediction import Model
 
@@ -20,7 +20,7 @@ from model.prediction import Model
 @pytest.fixture
 def profile(straight: Model, straight_motion: Motion, tmp_path: Path) -> Path:
     path = tmp_path / "profile.csv"
-    log.profile(straight, straight_motion).to_csv(path, index=False)
+    profiles.of(straight, straight_motion).to_csv(path, index=False)
     return path
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
-from conftest import drive
+from conftest import drive, study
 
 from excite import crosscheck, identify, log, sensors
 from excite.estimate import Estimate
@@ -67,11 +67,6 @@ def test_emps_in_closed_loop(emps: Model, emps_data: Path) -> None:
     one = log.read(emps_data, emps.machine)
     estimate = identify.identify(emps, [one], "ols")
     raw = {k: np.ravel(v) for k, v in scipy.io.loadmat(emps_data).items() if not k.startswith("__")}
-    gain = float(raw["gtau"][0])
-    control = crosscheck.cascade(raw["qg"], 160.18, 243.45, gain, 10.0, 1000.0)
-    motion = crosscheck.closed_loop(emps, estimate.value, len(one), control, raw["qm"][:1])
-    force = motion.u[:, 0] + crosscheck.offsets(emps, estimate.value)
-    position = 100 * np.linalg.norm(raw["qm"] - motion.q[:, 0]) / np.linalg.norm(raw["qm"])
-    error = 100 * np.linalg.norm(gain * raw["vir"] - force) / np.linalg.norm(gain * raw["vir"])
-    assert position < 0.0138
-    assert error == pytest.approx(5.848, rel=0.1)
+    error = study("emps").closed_loop(emps, raw, estimate.value)
+    assert error["position"] < 0.0138
+    assert error["force"] == pytest.approx(5.848, rel=0.1)

@@ -20,7 +20,8 @@ from excite.limit import InfeasibleError, check, directions, limits, placed, rev
 from excite.manoeuvre import Manoeuvre, chirp, multisine, scaled, steps
 from excite.simulate import simulate
 from model import machine, prediction
-from model.machine import Problem, Quantity
+from model.file import Quantity
+from model.machine import Problem
 from model.prediction import Model
 
 

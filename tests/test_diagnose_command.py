@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import Excite
 
-from excite import checkup, diagnose, log, sensors
+from excite import checkup, diagnose, log, profiles, sensors
 from excite.separate import Rivals
 from excite.sidebyside import forked, in_turn
 from excite.simulate import Motion, simulate
@@ -116,7 +116,7 @@ def test_a_drive_is_designed_for_what_is_tied(straight: Model, tmp_path: Path) -
     assert said["sigma_percent"] == max(drawn["sigma_percent"][t.partition("=")[0]] for t in told[:2]) < 20
 
     # Driven with the one, the log prefers it to the other by what the design promises.
-    torque, q0, nu0 = log.read_profile(tmp_path / said["folder"] / "profile.csv", straight)
+    torque, q0, nu0 = profiles.read(tmp_path / said["folder"] / "profile.csv", straight)
     both = [prediction.build(effects.extended(machine, e)) for e in (deadband, coulomb)]
     motion = simulate(both[0], torque, q0=q0, nu0=nu0)
     one = log.check(sensors.measure(both[0], motion, seed=2), machine)

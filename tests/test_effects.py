@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from excite import diagnose, evidence, log, sensors
+from excite import diagnose, evidence, log, profiles, sensors
 from excite.simulate import simulate
 from model import effects, machine
 from model.effect import DURATION, Effect, Placed, Site
 from model.effects import CATALOGUE
 from model.equations import signatures
-from model.machine import EffectEntry, MachineError, Quantity
+from model.file import Quantity
+from model.machine import EffectEntry, MachineError
 from model.prediction import Model, build
 
 CONTRACT = (  # CONTRACT.md section 4: the names that others rely on, and their units
@@ -288,7 +289,7 @@ def test_noise_of_torques_is_no_gain_and_no_delay() -> None:
     """Along a drive that asks little of the articulation, whose torque sensor's noise is a good part of its reading:
     taken from noisy torques, what a gain or a delay would do follows that noise (z of 5.7, gain of 27 on this log)."""
     known = build(VA12)
-    torque, q0, nu0 = log.read_profile(ROOT / "results" / "R60" / "design" / "profile.csv", known)
+    torque, q0, nu0 = profiles.read(ROOT / "results" / "R60" / "design" / "profile.csv", known)
     measured = log.check(sensors.measure(known, simulate(known, torque, q0=q0, nu0=nu0), seed=3), VA12)
     plain = diagnose.fitted(VA12, [measured], VA12.filter)
     entry = EffectEntry(name="torque_gain", where="articulation", amount=Quantity(value=0.005, source="assumed"))

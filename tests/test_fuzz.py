@@ -34,7 +34,7 @@ from conftest import Excite
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from excite import identify, log, logcheck, plan, sensors, serve, stored, tables
+from excite import identify, log, logcheck, plan, profiles, sensors, serve, stored, tables
 from excite.estimate import NoEstimate
 from excite.limit import InfeasibleError
 from excite.log import LogError
@@ -240,7 +240,7 @@ def ground(tmp_path_factory: pytest.TempPathFactory, straight: Model) -> dict[st
     table = sensors.measure(straight, motion, seed=1)
     table.to_parquet(place / "log.parquet", index=False)
     scipy.io.savemat(place / "log.mat", {c: table[c].to_numpy()[:, None] for c in table})
-    profile = log.profile(straight, motion).to_csv(index=False)
+    profile = profiles.of(straight, motion).to_csv(index=False)
     design = place / "design"
     design.mkdir()
     (design / "profile.csv").write_text(profile)
@@ -380,7 +380,7 @@ def test_profiles(ground: dict[str, Any], straight: Model, tmp_path: Path, count
         with patience(f"profile {seed + k}", faults), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
-                torque, q0, nu0 = log.read_profile(path, straight)
+                torque, q0, nu0 = profiles.read(path, straight)
                 assert np.isfinite(torque).all()
                 motion = simulate(straight, torque, q0=q0, nu0=nu0)
                 assert np.isfinite(motion.q).all()

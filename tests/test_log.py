@@ -11,7 +11,7 @@ import pytest
 import scipy.io
 from conftest import Excite
 
-from excite import log, sensors
+from excite import log, profiles, sensors
 from excite.simulate import Motion
 from model.prediction import Model
 
@@ -160,8 +160,8 @@ def test_columns_have_the_names_of_the_machine_file(va12: Model, table: pd.DataF
 
 def test_profile_goes_round(va12: Model, va12_motion: Motion, tmp_path: Path) -> None:
     path = tmp_path / "profile.csv"
-    log.profile(va12, va12_motion).to_csv(path, index=False)
-    torque, q0, nu0 = log.read_profile(path, va12)
+    profiles.of(va12, va12_motion).to_csv(path, index=False)
+    torque, q0, nu0 = profiles.read(path, va12)
     assert np.array_equal(torque, va12_motion.u)
     assert np.array_equal(q0, va12_motion.q[0])
     assert np.array_equal(nu0, va12_motion.nu[0])
@@ -171,12 +171,12 @@ def test_profile_has_the_contracts_columns(
     va12: Model, va12_motion: Motion, straight: Model, straight_motion: Motion
 ) -> None:
     assert (
-        list(log.profile(va12, va12_motion))
+        list(profiles.of(va12, va12_motion))
         == (
             "t_s u1_Nm u2_Nm u4_Nm x0_m y0_m theta0_rad theta1_rad theta2_rad theta4_rad v_m_s vy_m_s dtheta0_rad_s"
             " dtheta1_rad_s dtheta2_rad_s dtheta4_rad_s"
         ).split()
     )
-    assert list(log.profile(straight, straight_motion)) == (
+    assert list(profiles.of(straight, straight_motion)) == (
         "t_s u1_Nm u4_Nm x0_m theta1_rad theta4_rad v_m_s dtheta1_rad_s dtheta4_rad_s".split()
     )

@@ -35,6 +35,7 @@ from excite import (
     machinecheck,
     objective,
     plan,
+    profiles,
     reference,
     regression,
 )
@@ -100,7 +101,7 @@ def problem(straight: Model) -> Problem:
 def profile(straight: Model, tmp_path: Path) -> Path:
     torque = drive(straight, 12, 1, {"u1": 1500, "u4": 1500})
     path = tmp_path / "profile.csv"
-    log.profile(straight, simulate(straight, torque)).to_csv(path, index=False)
+    profiles.of(straight, simulate(straight, torque)).to_csv(path, index=False)
     return path
 
 

@@ -42,7 +42,8 @@ from excite.limit import InfeasibleError
 from excite.simulate import Motion, simulate
 from model import effects
 from model.effect import Site
-from model.machine import Machine, Problem, Quantity, load, shipped
+from model.file import Quantity
+from model.machine import Machine, Problem, load, shipped
 from model.prediction import Model, build, standard_parameters
 
 ROOT = Path(__file__).parents[1]

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from excite import sensors
 from excite.simulate import Motion, SimulationError, simulate
 from model import machine, prediction
-from model.machine import Quantity
+from model.file import Quantity
 from model.prediction import Model
 
 

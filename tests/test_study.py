@@ -21,7 +21,7 @@ import pandas as pd
 import pytest
 from conftest import Excite
 
-from excite import cell, engine, log, plan, store, stored, study
+from excite import cell, engine, plan, profiles, store, stored, study
 from excite import verify as verification
 from excite.folder import FolderError
 from excite.limit import InfeasibleError
@@ -57,7 +57,7 @@ def short(straight: Model) -> Motion:
 @pytest.fixture
 def tiny(tmp_path: Path, straight: Model, short: Motion) -> Callable[..., Plan]:
     """A study of two cells on a drive of 2.5 s."""
-    log.profile(straight, short).to_csv(tmp_path / "drive.csv", index=False)
+    profiles.of(straight, short).to_csv(tmp_path / "drive.csv", index=False)
 
     def make(runs: int = 3, text: str = TINY) -> Plan:
         (tmp_path / "tiny.toml").write_text(text.replace("{runs}", str(runs)))
@@ -650,7 +650,7 @@ def whole(
 ) -> Command:
     """The study as one process computes it, undisturbed."""
     place = tmp_path_factory.mktemp("whole")
-    log.profile(straight, short).to_csv(place / "drive.csv", index=False)
+    profiles.of(straight, short).to_csv(place / "drive.csv", index=False)
     (place / "tiny.toml").write_text(TINY.replace("{runs}", str(RUNS // 2)))
     command = Command(place / "tiny.toml", place / "out", snapshot, "--jobs", "1")
     command.said()

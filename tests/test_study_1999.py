@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
-from pathlib import Path
 from types import ModuleType
 
+import conftest
 import numpy as np
 import pytest
-
-FOLDER = Path(__file__).parents[1] / "results" / "1999"
 
 
 @pytest.fixture(scope="module")
 def study() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("study_1999", FOLDER / "study.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return conftest.study("1999")
 
 
 def truth(study: ModuleType) -> dict[str, float]:
@@ -87,7 +77,7 @@ def test_least_squares_agrees_with_the_library(study: ModuleType) -> None:
 
 
 def test_written_results_hold_what_the_readme_says(study: ModuleType) -> None:
-    result = json.loads((FOLDER / "summary.json").read_text())
+    result = json.loads((conftest.RESULTS / "1999" / "summary.json").read_text())
     assert result["grid"]["fits_with_pattern"] > 0
     assert result["grid"]["fits_with_all"] == 0
     assert result["grid"]["scaled_fits_with_all"] == 3

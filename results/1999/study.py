@@ -26,9 +26,10 @@ from matplotlib.figure import Figure
 from excite import log, sensors
 from excite.design import design
 from excite.driver import follow
+from excite.figures import COLOURS, save
 from excite.manoeuvre import Manoeuvre
+from excite.objective import percent
 from excite.processing import decimate, samples
-from excite.report import COLOURS, save
 from excite.simulate import Motion, simulate
 from excite.smoothing import cramer_rao
 from excite.verify import summary as verified
@@ -509,7 +510,7 @@ def instead(jobs: int, designs: dict[str, Manoeuvre]) -> dict[str, object]:
             print(f"  {method} on {name}", flush=True)
             v = verify(model, moved, method, kit="paper", runs=RUNS, seed=5, start=known, jobs=jobs)
             out[f"{method}, {name}"] = {"failures": len(v.failures), "parameters": verified(v)}
-        bound = 100 * np.sqrt(np.diag(cramer_rao(model, moved, "paper"))) / np.abs(model.nominal)
+        bound = percent(model, cramer_rao(model, moved, "paper"))
         out[f"bound, {name}"] = dict(zip(model.base.names, map(float, bound), strict=True))
     return out
 

@@ -19,11 +19,11 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 import numpy as np
 from matplotlib.figure import Figure
 
-from excite import folder, log, objective
+from excite import folder, objective, profiles
 from excite.bound import Bound, bound
+from excite.figures import COLOURS, save
 from excite.limit import placed
 from excite.manoeuvre import Manoeuvre
-from excite.report import COLOURS, save
 from excite.simulate import Motion, simulate
 from model import machine, prediction
 from model.prediction import Model
@@ -91,7 +91,7 @@ def drives(model: Model) -> list[Motion]:
     start = placed(model, model.machine.problems["R60"], simulate(model, torque))
     found = [simulate(model, torque, q0=start)]
     for place in DESIGNS:
-        torque, q0, nu0 = log.read_profile(place / "profile.csv", model)
+        torque, q0, nu0 = profiles.read(place / "profile.csv", model)
         found.append(simulate(model, torque, q0=q0, nu0=nu0))
     return found
 

@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 from excite import aim as aims
 from excite import folder
 from excite.continuation import PLAN, depart, repair, search
-from excite.report import COLOURS, STYLES, save
+from excite.figures import COLOURS, STYLES, save
 from model import machine, prediction
 
 HERE = Path(__file__).parent

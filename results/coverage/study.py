@@ -30,7 +30,7 @@ from excite import drive, log, sensors
 from excite.driver import Driver
 from excite.estimate import NoEstimate
 from excite.identify import identify
-from excite.objective import relative
+from excite.objective import percent, relative
 from excite.scenario import varied
 from excite.simulate import Motion, simulate
 from excite.smoothing import DOUBT, DRAWN, cramer_rao
@@ -166,7 +166,7 @@ def done() -> list[dict[str, object]]:
 def bound(s: Set) -> np.ndarray:
     """Cramer-Rao bound (n,) [%] along the first drive of a set."""
     motion = moved(s.drive, "model", 0)
-    return 100 * np.sqrt(np.diag(cramer_rao(nominal(), motion, s.kit))) / relative(nominal())
+    return percent(nominal(), cramer_rao(nominal(), motion, s.kit))
 
 
 def judged(s: Set, rows: Sequence[Mapping[str, object]]) -> dict[str, object]:

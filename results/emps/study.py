@@ -7,20 +7,23 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import scipy.io
 
-from excite import crosscheck, log
+from excite import log
 from excite.estimate import NoEstimate
 from excite.identify import METHODS, identify
 from excite.processing import derivative, lowpass
+from excite.simulate import Motion, respond
 from model import machine
 from model.prediction import Model, build
 
 HERE = Path(__file__).parent
 DATA = HERE.parents[1] / ".." / "shared" / "data" / "emps" / "DATA_EMPS.mat"
+Control = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
 KP, KV, TOP = 160.18, 243.45, 10.0  # 1/s, V/(m/s), V: the rig's controller, from its authors
 PUBLISHED = {
     "value": {"M": 95.1089, "Fv": 203.5034, "Fc": 20.3935, "offset": -3.1648},
@@ -35,23 +38,58 @@ def relative(measured: np.ndarray, simulated: np.ndarray) -> float:
     return float(100 * np.linalg.norm(measured - simulated) / np.linalg.norm(measured))
 
 
+def controlled(model: Model, X: np.ndarray, samples: int, control: Control, q0: np.ndarray) -> Motion:
+    """The machine X (n_base,) under its own controller: control(k, q, nu) commands the torques (n_u,) at sample k
+    from coordinates and velocities (n_q,) there. What is delivered is the command less the channel's offset.
+
+    Commands are joined by straight lines, and the state at k is the one before, carried on at its speed.
+    """
+    n_q, h = len(model.coordinates), 1 / float(model.machine.sampling_hz)
+    offset = model.offsets @ X
+
+    def torque(k: int, state: np.ndarray) -> np.ndarray:
+        q, nu = state[:n_q], state[n_q : 2 * n_q]
+        return control(k, q + h * nu if k else q, nu) - offset
+
+    return respond(model, samples, torque, X, q0)
+
+
+def cascade(reference: np.ndarray, gain: float, rate: float) -> Control:
+    """A position loop around a speed loop: gain (KP KV (reference - q) - KV dq), the bracket held within TOP; dq is the
+    backward difference of the mean of the last two positions.
+
+    reference (N,) [m]; gain [N/V], rate [Hz]. A controller remembers: make a new one for every run.
+    """
+    last: list[float] = []
+
+    def control(k: int, q: np.ndarray, nu: np.ndarray) -> np.ndarray:
+        now = float(q[0])
+        before = last[-1] if last else now
+        earlier = last[-2] if len(last) > 1 else before
+        last.append(now)
+        speed = (now - earlier) / 2 * rate
+        return np.array([gain * float(np.clip(KP * KV * (reference[k] - now) - KV * speed, -TOP, TOP))])
+
+    return control
+
+
 def closed_loop(model: Model, raw: dict[str, np.ndarray], X: np.ndarray, late: bool = False) -> dict[str, float]:
     """Simulation errors [%] from the reference alone. Speed and acceleration are compared with those of the filtered
     position, from where the filter has settled. `late`: the controller acts one sample later."""
     gain, rate, filter = float(raw["gtau"][0]), float(model.machine.sampling_hz), model.machine.filter
-    control = crosscheck.cascade(raw["qg"], KP, KV, gain, TOP, rate)
-    motion = crosscheck.closed_loop(model, X, len(raw["qm"]), delayed(control) if late else control, raw["qm"][:1])
+    control = cascade(raw["qg"], gain, rate)
+    motion = controlled(model, X, len(raw["qm"]), delayed(control) if late else control, raw["qm"][:1])
     settled = slice(filter.drop[0], None)
     speed = derivative(lowpass(raw["qm"], rate, filter), rate)
     return {
         "position": relative(raw["qm"], motion.q[:, 0]),
         "velocity": relative(speed[settled], motion.nu[settled, 0]),
         "acceleration": relative(derivative(speed, rate)[settled], motion.a[settled, 0]),
-        "force": relative(gain * raw["vir"], motion.u[:, 0] + crosscheck.offsets(model, X)),
+        "force": relative(gain * raw["vir"], motion.u[:, 0] + model.offsets @ X),
     }
 
 
-def delayed(control: crosscheck.Control) -> crosscheck.Control:
+def delayed(control: Control) -> Control:
     waiting = [np.zeros(1)]
 
     def later(k: int, q: np.ndarray, nu: np.ndarray) -> np.ndarray:

@@ -19,12 +19,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from excite import aim as aims
-from excite import folder, log, objective
+from excite import folder, objective, profiles
 from excite.continuation import verdict
 from excite.design import design
+from excite.figures import COLOURS, save
 from excite.limit import InfeasibleError
 from excite.manoeuvre import Manoeuvre, knots
-from excite.report import COLOURS, save
 from model import machine, prediction
 from model.machine import Problem
 from model.prediction import Model
@@ -69,7 +69,7 @@ def main() -> None:
 
 def stored(model: Model, problem: Problem, place: Path) -> Manoeuvre:
     """The knots of a design folder."""
-    torque, _, _ = log.read_profile(place / "profile.csv", model)
+    torque, _, _ = profiles.read(place / "profile.csv", model)
     times = knots(problem)
     return Manoeuvre(times, torque[np.rint(times * float(model.machine.sampling_hz)).astype(int)])
 

@@ -28,9 +28,9 @@ from matplotlib.ticker import LogLocator, NullLocator
 from scipy.stats import binom
 
 from excite import compare, design, folder, identify, manoeuvre, objective, smoothing
+from excite.figures import COLOURS, save
 from excite.machinecheck import grouping
 from excite.manoeuvre import Manoeuvre
-from excite.report import COLOURS, save
 from excite.simulate import Motion, simulate
 from excite.terminal import rounded
 from excite.topview import outline
@@ -167,7 +167,7 @@ def multisine(model: Model, problem: Problem, seed: int) -> dict[str, Any]:
 
 def sigma(model: Model, motion: Motion) -> np.ndarray:
     """(n_base,) Cramer-Rao bound, one standard deviation [%] of the nominal value."""
-    return 100 * np.sqrt(np.diag(smoothing.cramer_rao(model, motion))) / np.abs(model.nominal)
+    return objective.percent(model, smoothing.cramer_rao(model, motion))
 
 
 # ------------------------------------------------------------------------------------------------ the page

@@ -21,10 +21,10 @@ import scipy.stats
 from matplotlib.figure import Figure
 
 from excite import aim as aims
-from excite import compare, folder, log, objective
+from excite import compare, folder, objective, profiles
 from excite.design import design
+from excite.figures import COLOURS, save
 from excite.manoeuvre import Manoeuvre, knots
-from excite.report import COLOURS, save
 from excite.simulate import Motion, simulate
 from excite.smoothing import cramer_rao
 from excite.verify import verify
@@ -97,7 +97,7 @@ def torque_noise(model: Model, motion: Motion) -> float:
 
 def bound(model: Model, motion: Motion) -> float:
     """Worst relative standard deviation [%] of the Cramer-Rao bound."""
-    return float((100 * np.sqrt(np.diag(cramer_rao(model, motion))) / np.abs(model.nominal)).max())
+    return float(objective.percent(model, cramer_rao(model, motion)).max())
 
 
 CRITERIA: dict[str, Callable[[Model, Motion], float]] = {
@@ -137,7 +137,7 @@ def usual(model: Model, problem: Problem, kind: str, seed: int) -> Manoeuvre:
 
 
 def stored(model: Model, problem: Problem, place: Path) -> Manoeuvre:
-    torque, _, _ = log.read_profile(place / "profile.csv", model)
+    torque, _, _ = profiles.read(place / "profile.csv", model)
     times = knots(problem)
     return Manoeuvre(times, torque[np.rint(times * float(model.machine.sampling_hz)).astype(int)])
 

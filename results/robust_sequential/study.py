@@ -27,9 +27,9 @@ from excite import folder, identify, log, scenario, sensors, sequential
 from excite.design import design
 from excite.driver import follow
 from excite.estimate import NoEstimate
-from excite.limit import check
+from excite.figures import COLOURS, save
+from excite.limit import check, free
 from excite.manoeuvre import Manoeuvre
-from excite.report import COLOURS, save
 from excite.simulate import Motion, SimulationError, simulate
 from excite.smoothing import cramer_rao
 from model import machine, prediction
@@ -40,7 +40,6 @@ HERE = Path(__file__).parent
 SECONDS = 30.0  # of each of two drives
 SPREAD, SCENARIOS = 0.2, 5
 KINDS = ("nominal", "robust", "sequential")
-FREE = ("lane", "rest")  # what people see to themselves
 
 
 def main() -> None:
@@ -169,7 +168,7 @@ def told(true: Model, motions: Sequence[Motion]) -> dict[str, object]:
     by = np.outer(true.scale, true.scale)
     information = sum(np.linalg.inv(cramer_rao(true, m) / by) for m in motions)
     spread = 100 * np.sqrt(np.diag(np.linalg.inv(information) * by)) / np.abs(true.nominal)
-    broken = [(v, n) for m in motions for n, v in check(true, short(true), m).items() if not n.startswith(FREE)]
+    broken = [(v, n) for m in motions for n, v in check(true, short(true), m).items() if not free(n)]
     return {
         "limit": max(broken)[1],
         "excess": max(broken)[0],

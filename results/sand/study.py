@@ -22,11 +22,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.optimize import least_squares
 
-from excite.report import COLOURS, STYLES, save
+from excite.figures import COLOURS, STYLES, save
 from model import contact
 from model.effect import Rolling, Scene, Soil
 from model.effects import CATALOGUE
-from model.machine import Contact, Quantity
+from model.file import Quantity
+from model.machine import Contact
 
 HERE = Path(__file__).parent
 DATA = HERE.parents[2] / "shared" / "data" / "cmu_single_wheel" / "smooth_wheel.csv"

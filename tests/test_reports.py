@@ -12,7 +12,7 @@ import pytest
 from conftest import Excite
 from matplotlib.figure import Figure
 
-from excite import log, page, report, reports
+from excite import figures, page, profiles, reports
 from excite.page import Picture, Table
 from excite.simulate import Motion
 from model.prediction import Model
@@ -25,7 +25,7 @@ VERSIONS = {"excite": "1", "numpy": "2"}
 def picture(tmp_path: Path) -> Path:
     figure = Figure(figsize=(6, 3))
     figure.subplots().plot([0, 1], [0, 1])
-    report.save(figure, tmp_path / "design.png")
+    figures.save(figure, tmp_path / "design.png")
     return tmp_path / "design.png"
 
 
@@ -109,7 +109,7 @@ def test_identify_reports_what_was_found(
     excite: Excite, straight: Model, straight_motion: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     profile, out = tmp_path / "profile.csv", tmp_path / "o"
-    log.profile(straight, straight_motion).to_csv(profile, index=False)
+    profiles.of(straight, straight_motion).to_csv(profile, index=False)
     excite("simulate", "va12_straight", profile, "--noise", "off", "--out", tmp_path / "log.csv")
     code, _, _ = excite("identify", "va12_straight", tmp_path / "log.csv", "--method", "ols", "--out", out)
     assert code == 0
@@ -127,7 +127,7 @@ def test_identify_reports_what_was_found(
 def _figures(model: Model, motion: Motion) -> list[Figure]:
     problem = model.machine.problems[str(model.machine.problem)]
     sigma = dict(zip(model.base.names, np.linspace(0.1, 5, len(model.base.names)), strict=True))
-    return [report.design_figure(model, problem, motion, "t"), report.sigma_figure(sigma, "t")]
+    return [figures.design_figure(model, problem, motion, "t"), figures.sigma_figure(sigma, "t")]
 
 
 def test_figures_have_units_and_line_styles_of_their_own(va12: Model, va12_motion: Motion) -> None:
@@ -151,7 +151,7 @@ def test_colours_differ_for_the_colour_blind() -> None:
         "protan": np.array([[0, 2.02344, -2.52581], [0, 1, 0], [0, 0, 1]]),
         "deutan": np.array([[1, 0, 0], [0.494207, 0, 1.24827], [0, 0, 1]]),
     }
-    rgb = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in report.COLOURS[:4]]) / 255.0
+    rgb = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in figures.COLOURS[:4]]) / 255.0
     for matrix in blind.values():
         seen = rgb**2.2 @ to_lms.T @ matrix.T @ np.linalg.inv(to_lms).T
         seen = np.clip(seen, 0, 1) ** (1 / 2.2)

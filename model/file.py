@@ -1,0 +1,150 @@
+"""What files hold: numbers that say where they come from, in records that refuse what they don't know.
+
+And what is wrong with a file that holds such a record, in a line.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import reprlib
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+Source = Literal["paper", "data sheet", "measured", "published", "identified", "assumed", "definition"]
+
+_PI = re.compile(r"^\s*([+-]?)\s*(?:(\d+(?:\.\d+)?)\s*\*\s*)?pi\s*(?:/\s*(\d+(?:\.\d+)?))?\s*$")
+
+
+def _number(value: Any) -> Any:
+    """Angles may be written as a multiple of pi, "-pi/2": the exact table entry, not a rounded one."""
+    if isinstance(value, bool):
+        raise ValueError("must be a number, not true/false")
+    if isinstance(value, str):
+        match = _PI.match(value)
+        if not match:
+            raise ValueError('must be a number, or a multiple of pi such as "-pi/2"')
+        sign, factor, divisor = match.groups()
+        if divisor and float(divisor) == 0:
+            raise ValueError("must be a finite number, not pi/0")
+        return (-1.0 if sign == "-" else 1.0) * float(factor or 1) * math.pi / float(divisor or 1)
+    return value
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError(f"must be a finite number (got {value})")
+    if value and not 1e-12 <= abs(value) <= 1e12:
+        raise ValueError(f"must be 0 or of a size between 1e-12 and 1e12, in SI units (got {value:g})")
+    return value
+
+
+def _positive(q: Quantity) -> Quantity:
+    if not q.value > 0:
+        raise ValueError(f"must be > 0 (got {q.value:g})")
+    return q
+
+
+def _not_negative(q: Quantity) -> Quantity:
+    if q.value < 0:
+        raise ValueError(f"must be >= 0 (got {q.value:g})")
+    return q
+
+
+def _negative(q: Quantity) -> Quantity:
+    if not q.value < 0:
+        raise ValueError(f"must be < 0 (got {q.value:g}): the soil resists slip")
+    return q
+
+
+class Record(BaseModel):
+    """Frozen, and refuses keys that it doesn't know: a misspelt key must not be silently ignored."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+Number = Annotated[float, BeforeValidator(_number), AfterValidator(_finite)]
+Flag = Annotated[bool, Field(strict=True)]
+
+
+class Quantity(Record):
+    """A value [SI] and where it comes from."""
+
+    value: Number
+    source: Source
+    note: str = ""
+
+    def __float__(self) -> float:
+        return self.value
+
+
+Positive = Annotated[Quantity, AfterValidator(_positive)]
+NotNegative = Annotated[Quantity, AfterValidator(_not_negative)]
+Negative = Annotated[Quantity, AfterValidator(_negative)]
+Vector3 = tuple[Number, Number, Number]
+
+
+class Point(Record):
+    """A point [m] in the body's frame."""
+
+    value: Vector3
+    source: Source
+    note: str = ""
+
+
+def one_line(path: Path | str, err: ValidationError, root: type[Record]) -> str:
+    """What is wrong with a file that holds a `root` record: file, key, what is wrong, what is allowed, in a line."""
+    first, *more = complaints(path, err, root)
+    return f"{first} (and {len(more)} more)" if more else first
+
+
+def complaints(path: Path | str, err: ValidationError, root: type[Record]) -> list[str]:
+    """All that is wrong with a file that holds a `root` record, a line each."""
+    return [_complaint(path, one, root) for one in err.errors(include_url=False)]
+
+
+def _complaint(path: Path | str, one: ErrorDetails, root: type[Record]) -> str:
+    key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in one["loc"]).lstrip(".")
+    kind, message, got = one["type"], one["msg"], one.get("input")
+    if kind == "extra_forbidden":
+        message = f"no such key here, allowed: {', '.join(_record(one['loc'][:-1], root).model_fields)}"
+    elif kind == "missing":
+        message = "is missing"
+    elif kind == "model_type":
+        record = _record(one["loc"], root)
+        number = record in (Quantity, Point)
+        table = '{ value = ..., source = "..." }' if number else f"with keys {', '.join(record.model_fields)}"
+        message = f"must be a table {table} (got {reprlib.repr(got)})"
+    elif kind == "value_error":
+        message = message.removeprefix("Value error, ")
+        inner, _, rest = message.partition(": ")
+        if inner in _record(one["loc"], root).model_fields:
+            key, message = f"{key}.{inner}".lstrip("."), rest
+    elif kind == "too_short":
+        message = f"must have at least {one['ctx']['min_length']} (got {one['ctx']['actual_length']})"
+    elif kind == "too_long":
+        message = f"must have at most {one['ctx']['max_length']} (got {one['ctx']['actual_length']})"
+    else:
+        message = message.replace("Input should be", "must be").replace("String should", "must")
+        message = message.replace("a valid tuple", "a list in brackets") + f" (got {reprlib.repr(got)})"
+    return " ".join(f"{path}: {key + ': ' if key else ''}{message}".split())
+
+
+def _record(where: tuple[int | str, ...], root: type[Record]) -> type[Record]:
+    """The record that the file holds at this key."""
+    record = root
+    for step in where:
+        field = record.model_fields.get(str(step))
+        if field is not None:
+            inside = _record_in(field.annotation)
+            record = inside or record
+    return record
+
+
+def _record_in(annotation: Any) -> type[Record] | None:
+    if isinstance(annotation, type) and issubclass(annotation, Record):
+        return annotation
+    return next((r for a in get_args(annotation) if (r := _record_in(a)) is not None), None)
