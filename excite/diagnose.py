@@ -375,22 +375,24 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
 def _begun(machine: Machine, prepared: Prepared) -> Stage | None:
     """A machine's model fitted to logs from their first guesses, with disturbing forces as small as they can be; None
     where no fit is found."""
-    starts, nominal = prepared.starts, prepared.c.model.nominal
-    for disturbed in (0.0, *smoothing.DISTURBED):
+    return next((s for d in (0.0, *smoothing.DISTURBED) if (s := _begun_with(d, machine, prepared))), None)
+
+
+def _begun_with(disturbed: float, machine: Machine, prepared: Prepared) -> Stage | None:
+    """The same with disturbing forces of this size, and then with smaller ones."""
+    try:
+        fit = _iterated(prepared, prepared.starts, prepared.c.model.nominal, disturbed)
+    except NotConverged as failed:
+        if failed.nearly is None or disturbed == 0:
+            return None
+        fit = failed.nearly
+    stage = Stage(machine, prepared, light(fit))
+    for less in LESS if disturbed > 0 else ():
         try:
-            fit = _iterated(prepared, starts, nominal, disturbed)
-        except NotConverged as failed:
-            if failed.nearly is None or disturbed == 0:
-                continue
-            fit = failed.nearly
-        stage = Stage(machine, prepared, light(fit))
-        for less in LESS if disturbed > 0 else ():
-            try:
-                return replace(refitted(machine, stage, less * disturbed), loose=stage)
-            except NotConverged:
-                continue
-        return stage
-    return None
+            return replace(refitted(machine, stage, less * disturbed), loose=stage)
+        except NotConverged:
+            continue
+    return stage
 
 
 def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
@@ -582,22 +584,24 @@ def _chosen(tries: Sequence[_Try], gain: float, spread: float, tried: int, toget
 
 
 def _beginning(stage: Stage, likely: Sequence[evidence.Score], tried: int, together: Together) -> Choice | None:
-    """The effect with which the model can follow logs that it can't follow without any; None where there is none."""
+    """The effect with which the model can follow logs that it can't follow without any, with as small disturbing forces
+    as one can be found; None where there is none."""
     machines = [effects.extended(stage.machine, _entry(s)) for s in likely]
-    found = together([partial(_followed, m, stage) for m in machines])
-    tries = _one_each([(s, x) for s, x in zip(likely, found, strict=True) if x is not None and x.near])
-    if not tries:
-        return None
-    best = tries[0][1]
-    gain = stage.fit.cost - best.fit.cost
-    alike = _close([x for x in tries if x[1].fit.disturbed == best.fit.disturbed], gain)
-    return _chosen(alike, gain, 1.0, tried, together)
+    prepared = [_resumed(m, stage) for m in machines]
+    for disturbed in (0.0, smoothing.DISTURBED[0], smoothing.DISTURBED[-1]):
+        calls = [partial(_coming_near, disturbed, m, p) for m, p in zip(machines, prepared, strict=True)]
+        tries = [(s, x) for s, x in zip(likely, together(calls), strict=True) if x is not None and x.near]
+        if tries:
+            tries = _one_each(tries)
+            gain = stage.fit.cost - tries[0][1].fit.cost
+            alike = [x for x in tries if x[1].fit.disturbed == tries[0][1].fit.disturbed]
+            return _chosen(_close(alike, gain), gain, 1.0, tried, together)
+    return None
 
 
-def _followed(machine: Machine, of: Stage) -> Stage | None:
-    """A machine's model fitted to the logs of a stage from their first guesses, with so much of disturbing forces that
-    it comes near."""
-    stage = _begun(machine, _resumed(machine, of))
+def _coming_near(disturbed: float, machine: Machine, prepared: Prepared) -> Stage | None:
+    """A model fitted from first guesses; where exact dynamics leave much, with small disturbing forces after all."""
+    stage = _begun_with(disturbed, machine, prepared)
     if stage is None or stage.near or not stage.exact:
         return stage
     try:
