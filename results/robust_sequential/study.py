@@ -257,7 +257,7 @@ values that are up to 20 % off breaks limits when a person drives it on the true
 them. A second drive designed for what the first log leaves is worth more than the first one driven twice, but keeps the
 limits no better: it is designed for the machine that the log told of, played back, not for people.
 
-`python results/robust_sequential/study.py --sequential 20` draws 100 machines whose bodies, friction and contacts are up to 20 % off
+`python results/robust_sequential/study.py` draws 100 machines whose bodies, friction and contacts are up to 20 % off
 (each value on its own, uniform), has each driven by the driver model, who follows the designed speed and articulation
 late, slowly and not quite, and compares at equal time, two drives of 30 s each, designed with `--objective accuracy`:
 
@@ -267,7 +267,7 @@ late, slowly and not quite, and compares at equal time, two drives of 30 s each,
 
 Told: cond(Phi) of both drives together and the Cramer-Rao bound, at the true machine; the limit that the true machine
 exceeds most (lane and rest, which people see to themselves, left out), kept up to 0.1 % of its range; and for six machines the
-errors of `--method joint` from both logs over the bound, rms over all parameters. 26 minutes of one core. Machines are written to
+errors of `--method joint` from both logs over the bound, rms over all parameters. An hour of one core. Machines are written to
 `runs/` as they are done, and a study that was stopped goes on from there.
 """  # noqa: E501
 
