@@ -228,6 +228,19 @@ def test_most_plain_causes_are_named_and_hardly_any_wrongly(half: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [("articulation_backlash", 1), ("articulation_stop_spring", 1), ("payload_shift", 0), ("compaction_per_pass", 2)],
+)
+def test_what_is_so_strong_that_nothing_follows_the_log_is_named(name: str, number: int) -> None:
+    """Without the cause no model fits these logs at all, or none without large disturbing forces."""
+    one = case("cause", name, number)
+    said = ask(blind(one).log)
+    assert score(one, said).outcome in ("right", "tied"), said["answer"]
+    assert score(one, said).gain_sure, said["answer"]
+
+
+@pytest.mark.slow
 def test_hardly_any_clean_log_is_accused() -> None:
     told = {k: score(case("nothing", "", k), ask(blind(case("nothing", "", k)).log)).outcome for k in range(12)}
     assert sum(o != "clean" for o in told.values()) <= 1, told

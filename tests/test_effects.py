@@ -212,6 +212,45 @@ def test_a_load_slides_on_the_last_chassis(name: str, body: int) -> None:
     assert np.abs(want - plain.balance(q, nu, a, p).full()).max() > 0.1
 
 
+def test_compaction_counts_reversals_or_the_way(straight: Model) -> None:
+    """Six ways forth and back: the first counts for half, as nothing is known of what was before."""
+    known = straight.machine
+    t = np.arange(0, 24, 1 / 100)
+    torque = np.column_stack([1500 * np.sign(np.sin(2 * np.pi * t / 8 + 0.7))] * 2)
+    model = build(effects.extended(known, effects.parse("compaction_per_pass=0.3", known, 24.0)))
+    motion = simulate(model, torque)
+    speed = motion.nu[:, 0]
+    memory = dict(zip(model.memory, motion.memory.T, strict=True))
+    turns = np.flatnonzero(np.diff(np.sign(speed[np.abs(speed) > 0.05])))
+    assert len(turns) == 5
+    assert memory["compaction_per_pass@drive.reversals"][-1] == pytest.approx(5.5, abs=0.05)
+    way = np.trapezoid(np.abs(speed), t)
+    assert memory["compaction_per_pass@drive.distance"][-1] == pytest.approx(way, rel=0.02)
+
+
+def test_stops_may_be_out_of_the_middle() -> None:
+    """A stop that only one side reaches pushes back there alone."""
+    shape = {"stop": Quantity(value=0.4, source="assumed"), "centre": Quantity(value=-0.2, source="assumed")}
+    entry = EffectEntry(
+        name="articulation_stop_spring",
+        where="articulation",
+        amount=Quantity(value=1e4, source="assumed"),
+        shape=shape,
+    )
+    plain, sprung = build(VA12), build(effects.extended(VA12, entry))
+    still = np.zeros(len(plain.coordinates))
+
+    def more(angle: float) -> float:
+        q = still.copy()
+        q[4] = angle
+        u = np.zeros(3)
+        own = sprung.balance(q, still, still, sprung.expand @ sprung.nominal, u, []).full()
+        return float((own - plain.balance(q, still, still, plain.expand @ plain.nominal).full())[4, 0])
+
+    assert more(0.3) == pytest.approx(1e3, rel=0.01)
+    assert abs(more(-0.3)) < 5
+
+
 def test_a_rate_has_no_errors_of_an_angle() -> None:
     """The front roll, the articulation and the left measuring wheel logged as rates: no encoder that is eccentric, no
     play beside it; what a wrong radius does stays."""
