@@ -36,19 +36,18 @@ HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate i
 STRONG = 1.3  # misfit over readings from which first-order gains are rough
 PASSES = 14  # of a candidate's fit
 LESS = 0.1, 0.3  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
-TRIED = 5  # candidates that are fitted, of different names
+TRIED = 5  # candidates that are fitted
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
 PAIR = 2  # candidates that are fitted in any case, side by side
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
 MOST = 4  # effects that are looked for
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
-SHAPE = 0.005, 0.002  # of what is explained already, that a further effect must gain, as nature is never exactly the
-# formula: by the fits' gains, and by how many deviations the amounts are from none
-VAGUE = (
-    0.1,
-    0.25,
-)  # the former for what acts at some time only, and where disturbing forces hide how good the formula is
+# Of what is explained already, that a further effect must gain, as nature is never exactly the formula: by the fits'
+# gains, and by how many deviations the amounts are from none; the more where parameters absorb most of an effect, as
+# they absorb none of its formula's error; for what acts at some time only; where forces hide how good the formula is.
+SHAPE = 0.005, 0.002
+ABSORBED, TIMED, HIDDEN = 0.1, 0.1, 0.25
 ALIKE = 0.03  # of an amount: what two formulas of one effect differ by; those of results/diagnosis do by 1 to 6 %
 FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
 BESIDE = 250.0  # a gain that by the latter no effect can be denied
@@ -177,19 +176,24 @@ def diagnose(
     model: Model, logs: Sequence[Log], filter: Filter, advance: Advance | None = None, together: Together = in_turn
 ) -> Diagnosis:
     """What these logs show that the model doesn't know. together: how what is independent is computed; the answer is
-    the same. Raises NotConverged where not even disturbing forces let the model follow a log, NotIdentifiable where a
+    the same. Raises NotConverged where the machine file's parameters give no motion at all, NotIdentifiable where a
     torque is missing."""
     tell = advance or (lambda share, what: None)
     tell(0.0, "fitting the model")
     before = fitted(model.machine, logs, filter)
-    stage, chosen, first, left = before, list[Choice](), tuple[evidence.Score, ...](), 0.0
-    for turn in range(MOST):
+    chosen, first, left = list[Choice](), tuple[evidence.Score, ...](), 0.0
+    if not before.settled:
+        tell(0.15, "fitting effects from the beginning")
+        first = _scores(before)
+        before, chosen = begun(before, first, together)
+    stage = chosen[-1].stage if chosen else before
+    while stage.settled and len(chosen) < MOST:
+        turn = len(chosen)
         tell(0.15 + 0.2 * turn, "scoring effects")
         scores = _scores(stage)
         first = first or scores
-        explained = sum(x.gain for x in chosen)
-        choice = _choose(stage, scores, explained, together, tell, 0.2 + 0.2 * turn)
-        if choice is None:
+        choice = _choose(stage, scores, chosen, together, tell, 0.2 + 0.2 * turn)
+        if choice is None or _makes_good(choice, chosen):
             left = max(0.0, scores[0].gain - LEVEL) if scores else 0.0
             break
         chosen.append(choice)
@@ -205,8 +209,8 @@ def diagnose(
 
 def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tuple[str, ...], tuple[str, float] | None]:
     """Effects without the last ones that are no names: one that leaves most of the misfit where it was is none, unless
-    with what came after it nothing is left. Also what is odd beside those that stay, and the last one that doesn't,
-    with the share that it explains."""
+    with what came after it nothing is left, or with the disturbing forces that it was judged with. Also what is odd
+    beside those that stay, and the last one that doesn't, with the share that it explains."""
     kept, nearest = list(chosen), None
     while True:
         stage = kept[-1].stage if kept else before
@@ -237,11 +241,10 @@ def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_tu
         try:
             stage = _without(first.name, whole)
         except NotConverged:
-            queue = [*rest, replace(first, stage=whole)]  # nothing fits without it
+            queue = [*rest, replace(first, stage=whole, loose=None)]  # nothing fits without it
             continue
-        explained = sum(x.gain for x in rest)
-        choice = _choose(stage, _scores(stage), explained, together, lambda share, what: None, 0.0)
-        queue = [*rest, choice] if choice is not None else [*rest[:-1], replace(rest[-1], stage=stage)]
+        choice = _choose(stage, _scores(stage), rest, together, lambda share, what: None, 0.0)
+        queue = [*rest, choice] if choice is not None else [*rest[:-1], replace(rest[-1], stage=stage, loose=None)]
     whole, judged = queue[-1].stage, {x.name: x for x in queue}
     same = judged.keys() == {x.name for x in chosen}
     worse = whole.fit.cost - found.fit.cost > LEVEL * max(1.0, found.fit.cost / found.prepared.readings)
@@ -267,7 +270,7 @@ def _one_by_one(before: Stage, chosen: Sequence[Choice], whole: Stage) -> list[C
     found = []
     for x, old, new in zip(chosen, stages, stages[1:], strict=False):
         gain = old.fit.cost - new.fit.cost if old.fit.disturbed == new.fit.disturbed else x.gain
-        found.append(replace(x, stage=new, gain=max(gain, x.gain)))
+        found.append(replace(x, stage=new, gain=max(gain, x.gain), loose=None))
     return found
 
 
@@ -292,8 +295,19 @@ def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
 def _surely(name: str, stage: Stage) -> bool:
     """Whether an effect's amount is surely any in a fit; one that is nothing at infinity is taken for sure."""
     placed = next(e for e in stage.model.effects if e.name == name)
+    return placed.effect.inverse or _wald(name, stage) > LEVEL
+
+
+def _wald(name: str, stage: Stage) -> float:
+    """By how many deviations an effect's amount is from none in a fit, squared (Wald's statistic)."""
     k = stage.model.base.names.index(name)
-    return placed.effect.inverse or float((stage.fit.X[k] / stage.fit.std[k]) ** 2) > LEVEL
+    return float((stage.fit.X[k] / stage.fit.std[k]) ** 2)
+
+
+def _makes_good(choice: Choice, chosen: Sequence[Choice]) -> bool:
+    """Whether a choice takes the place of an effect that explains more: then it is but a piece of another explanation,
+    which needs several names for what one explains."""
+    return any(choice.gain < x.gain and not _surely(x.name, choice.stage) for x in chosen)
 
 
 def _others(choice: Choice, found: Container[str]) -> tuple[EffectEntry, ...]:
@@ -335,8 +349,9 @@ def _odd(stage: Stage) -> tuple[str, ...]:
 @dataclass(frozen=True)
 class Choice:
     """An effect that was added, the model with it, and the rivals that the log likes about as well. gain: of twice the
-    log-likelihood, which what is left of the misfit makes `spread` times less sure. loose: the model with it and the
-    disturbing forces that it was judged with, where it needs none."""
+    log-likelihood, which what is left of the misfit makes `spread` times less sure. left: the share of the effect that
+    parameters don't absorb. loose: the model with it and the disturbing forces that it was judged with, where it needs
+    none."""
 
     name: str
     stage: Stage
@@ -344,6 +359,7 @@ class Choice:
     spread: float
     tried: int
     rivals: tuple[EffectEntry, ...]
+    left: float
     loose: Stage | None = None
 
     def share(self, stage: Stage) -> float:
@@ -359,7 +375,7 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
     these leave shows where to look. Raises NotConverged where those don't either.
     """
     prepared = _prepared(machine, logs, filter)
-    found = _begun(machine, prepared)
+    found = _from_first(machine, prepared)
     if found is not None:
         return found
     asis = replace(prepared, held=np.ones_like(prepared.held))
@@ -369,17 +385,19 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
         if failed.fit is None:
             raise
         fit = failed.fit
-    return Stage(machine, prepared, light(replace(fit, unseen=prepared.held)), settled=False)
+    unknown = np.full_like(fit.covariance, np.nan)
+    return Stage(machine, prepared, light(replace(fit, unseen=prepared.held, covariance=unknown)), settled=False)
 
 
-def _begun(machine: Machine, prepared: Prepared) -> Stage | None:
+def _from_first(machine: Machine, prepared: Prepared) -> Stage | None:
     """A machine's model fitted to logs from their first guesses, with disturbing forces as small as they can be; None
     where no fit is found."""
-    return next((s for d in (0.0, *smoothing.DISTURBED) if (s := _begun_with(d, machine, prepared))), None)
+    return next((s for d in (0.0, *smoothing.DISTURBED) if (s := _fitted_with(d, machine, prepared))), None)
 
 
-def _begun_with(disturbed: float, machine: Machine, prepared: Prepared) -> Stage | None:
-    """The same with disturbing forces of this size, and then with smaller ones."""
+def _fitted_with(disturbed: float, machine: Machine, prepared: Prepared) -> Stage | None:
+    """A machine's model fitted to logs from their first guesses with disturbing forces of this size, and then with
+    smaller ones; None where no fit is found."""
     try:
         fit = _iterated(prepared, prepared.starts, prepared.c.model.nominal, disturbed)
     except NotConverged as failed:
@@ -509,13 +527,13 @@ def _identified(effect: str, where: str, amount: float, shapes: Mapping[str, flo
     )
 
 
-def _shortlist(stage: Stage, scores: Sequence[evidence.Score], explained: float) -> list[evidence.Score]:
+def _shortlist(stage: Stage, scores: Sequence[evidence.Score], chosen: Sequence[Choice]) -> list[evidence.Score]:
     """The best candidate of each name, best first, as far as worth a fit; another variant where it scores alike."""
     best: dict[tuple[str, ...], evidence.Score] = {}
     most: dict[str, float] = {}
     hope = max(WORTH, HOPE[stage.rough] * scores[0].gain) if scores else 0.0
     for s in scores:
-        least = _least(stage, explained, s.candidate) / OVER if stage.settled else 0.0
+        least = _least(stage, chosen, s.candidate) / OVER if stage.settled else 0.0
         worth = s.gain >= max(least, hope) and s.values["A"] != 0
         if worth and s.gain >= LIKE * most.setdefault(s.candidate.name, s.gain):
             best.setdefault(s.candidate.variant, s)
@@ -526,32 +544,32 @@ _Try = tuple[evidence.Score, Stage]
 
 
 def _sureness(stage: Stage) -> float:
-    """By how many deviations the amounts of the effects in a model are from none, squared (Wald's statistic)."""
-    names = stage.model.base.names
-    at = [names.index(e.name) for e in stage.model.effects if not e.effect.inverse]
-    return float(((stage.fit.X[at] / stage.fit.std[at]) ** 2).sum())
+    """The same of all the amounts in a model together."""
+    return sum(_wald(e.name, stage) for e in stage.model.effects if not e.effect.inverse)
+
+
+def _likely(stage: Stage, scores: Sequence[evidence.Score], chosen: Sequence[Choice]) -> list[evidence.Score]:
+    """What is worth a fit, with shapes between the grid's points."""
+    likely = _shortlist(stage, scores, chosen)
+    for reach in CLOSER if likely else ():
+        nearby = evidence.finer(likely, stage.machine, _duration(stage.prepared.logs), reach)
+        if len(nearby) > len(likely):
+            likely = _shortlist(stage, sorted([*likely, *_scanned(stage, nearby)], key=lambda s: -s.gain), chosen)
+    return likely
 
 
 def _choose(
     stage: Stage,
     scores: Sequence[evidence.Score],
-    explained: float,
+    chosen: Sequence[Choice],
     together: Together,
     tell: Advance,
     done: float,
 ) -> Choice | None:
-    """The effect that the logs like best beside those that are in the model; None if none is worth it. explained: how
-    much those in the model have gained."""
-    likely = _shortlist(stage, scores, explained)
+    """The effect that the logs like best beside those that were chosen; None if none is worth it."""
+    likely = _likely(stage, scores, chosen)
     if not likely:
         return None
-    for reach in CLOSER:
-        nearby = evidence.finer(likely, stage.machine, _duration(stage.prepared.logs), reach)
-        if len(nearby) > len(likely):
-            likely = _shortlist(stage, sorted([*likely, *_scanned(stage, nearby)], key=lambda s: -s.gain), explained)
-    if not stage.settled:
-        tell(done, "fitting effects from the beginning")
-        return _beginning(stage, likely, len(scores), together)
     tries = _tries(stage, likely, together, lambda k: tell(done + 0.03 * k, f"fitting {likely[k].candidate.name}"))
     if stage.exact and likely[0].candidate.name not in {s.candidate.name for s, _ in tries}:
         # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
@@ -560,7 +578,7 @@ def _choose(
         except NotConverged:
             return None
         found = evidence.renumbered([s.candidate for s in likely])
-        likely = _shortlist(stage, _scanned(stage, found), explained)
+        likely = _shortlist(stage, _scanned(stage, found), chosen)
         if not likely:
             return None
         tries = _tries(stage, likely, together, lambda k: None)
@@ -569,39 +587,52 @@ def _choose(
     score, best = tries[0]
     gain = stage.fit.cost - best.fit.cost
     spread = max(1.0, best.fit.cost / best.prepared.readings)
-    if gain < max(LEVEL * spread, _least(stage, explained, score.candidate)):
+    if gain < max(LEVEL * spread, _least(stage, chosen, score.candidate)):
         return None
-    return _chosen(_close(tries, gain), gain, spread, len(scores), together)
+    return _chosen(_close(tries, gain), gain, len(scores), together)
 
 
-def _chosen(tries: Sequence[_Try], gain: float, spread: float, tried: int, together: Together) -> Choice:
+def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) -> Choice:
     """The best of close tries without disturbing forces where that can be, and the rest as its rivals."""
-    hidden = {s.candidate.name: stage for s, stage in tries if not stage.exact}
+    best = tries[0][1]
+    spread = max(1.0, best.fit.cost / best.prepared.readings)
+    judged = {s.candidate.name: stage for s, stage in tries if not stage.exact}
     tries = _close(_without_forces(tries, together), gain)
-    name, best = tries[0][0].candidate.name, tries[0][1]
+    score, best = tries[0]
     rivals = tuple(_fitted(other, s.candidate.name) for s, other in tries[1:])
-    return Choice(name, best, gain, spread, tried, rivals, hidden.get(name) if best.exact else None)
+    loose = judged.get(score.candidate.name) if best.exact else None
+    return Choice(score.candidate.name, best, gain, spread, tried, rivals, score.left, loose)
 
 
-def _beginning(stage: Stage, likely: Sequence[evidence.Score], tried: int, together: Together) -> Choice | None:
-    """The effect with which the model can follow logs that it can't follow without any, with as small disturbing forces
-    as one can be found; None where there is none."""
+def begun(stage: Stage, scores: Sequence[evidence.Score], together: Together = in_turn) -> tuple[Stage, list[Choice]]:
+    """Where no fit was found: the effect with which the model can follow the logs, with as small disturbing forces as
+    there is one. With it there may be a fit without it after all, which then is what it is compared with, and may be as
+    good: the model began too far off. The stage as it was and no effect where nothing helps."""
+    likely = _likely(stage, scores, ())
     machines = [effects.extended(stage.machine, _entry(s)) for s in likely]
     prepared = [_resumed(m, stage) for m in machines]
-    for disturbed in (0.0, smoothing.DISTURBED[0], smoothing.DISTURBED[-1]):
+    for disturbed in (0.0, smoothing.DISTURBED[0], smoothing.DISTURBED[-1]) if likely else ():
         calls = [partial(_coming_near, disturbed, m, p) for m, p in zip(machines, prepared, strict=True)]
-        tries = [(s, x) for s, x in zip(likely, together(calls), strict=True) if x is not None and x.near]
-        if tries:
-            tries = _one_each(tries)
-            gain = stage.fit.cost - tries[0][1].fit.cost
-            alike = [x for x in tries if x[1].fit.disturbed == tries[0][1].fit.disturbed]
-            return _chosen(_close(alike, gain), gain, 1.0, tried, together)
-    return None
+        near = [(s, x) for s, x in zip(likely, together(calls), strict=True) if x is not None and x.near]
+        if not near:
+            continue
+        tries = _one_each(near)
+        score, best = tries[0]
+        tries = [x for x in tries if x[1].fit.disturbed == best.fit.disturbed]
+        try:
+            stage = refitted(stage.machine, best, best.fit.disturbed)
+            gain = stage.fit.cost - best.fit.cost
+        except NotConverged:
+            gain = _wald(score.candidate.name, best)
+        if gain < LEVEL:
+            return stage, []
+        return stage, [_chosen(_close(tries, gain), gain, len(scores), together)]
+    return stage, []
 
 
 def _coming_near(disturbed: float, machine: Machine, prepared: Prepared) -> Stage | None:
     """A model fitted from first guesses; where exact dynamics leave much, with small disturbing forces after all."""
-    stage = _begun_with(disturbed, machine, prepared)
+    stage = _fitted_with(disturbed, machine, prepared)
     if stage is None or stage.near or not stage.exact:
         return stage
     try:
@@ -610,10 +641,11 @@ def _coming_near(disturbed: float, machine: Machine, prepared: Prepared) -> Stag
         return stage
 
 
-def _least(stage: Stage, explained: float, candidate: evidence.Candidate) -> float:
-    """What an effect must gain to be worth a place beside those in a model, which have gained `explained`."""
-    share = max(SHAPE[0], VAGUE[0] * candidate.placed.effect.timed, VAGUE[1] * (not stage.exact))
-    return max(LEAST[stage.rough] * stage.excess, share * explained, min(SHAPE[1] * _sureness(stage), BESIDE))
+def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate) -> float:
+    """What an effect must gain to be worth a place beside those that were chosen."""
+    part = max(SHAPE[0], TIMED * candidate.placed.effect.timed, HIDDEN * (not stage.exact))
+    shape = sum(max(part, min(ALIKE**2 / x.left, ABSORBED)) * x.gain for x in chosen)
+    return max(LEAST[stage.rough] * stage.excess, shape, min(SHAPE[1] * _sureness(stage), BESIDE))
 
 
 def _tries(

@@ -48,9 +48,11 @@ class Candidate:
     @property
     def variant(self) -> tuple[str, ...]:
         """The name, and which shapes it has that are nothing by default: another way for the same cause to act."""
-        p = self.placed
-        more = [n for n, s in p.effect.shapes.items() if s.signed and not s.circular and p.values[n]]
-        return (self.name, *more)
+        return (self.name, *_unusual(self.placed.effect, self.placed.values))
+
+
+def _unusual(effect: Effect, values: Mapping[str, float]) -> list[str]:
+    return [n for n, s in effect.shapes.items() if s.signed and not s.circular and values[n]]
 
 
 @dataclass(frozen=True)
@@ -124,14 +126,17 @@ def finer(scores: Sequence[Score], machine: Machine, duration: float, reach: flo
 
 
 def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
-    """Values near those of a candidate: shapes up to two thirds of the way to the grid's next points."""
+    """Values near those of a candidate: shapes up to two thirds of the way to the next points that are tried."""
     grids: dict[str, list[float]] = {}
     if len(placed.effect.grid) > 1:
         grids["A"] = [placed.values["A"] * f**reach for f in NEARBY]
+    unusual = _unusual(placed.effect, placed.values)
+    alike = [b for b in placed.effect.beside(site) if unusual and _unusual(placed.effect, b) == unusual]
     for name, shape in placed.effect.shapes.items():
-        if shape.circular or shape.whole or len(shape.grid) == 1:
+        points = sorted({b[name] for b in alike} or {g * shape.size(site) for g in shape.grid})
+        if shape.circular or shape.whole or len(points) == 1 or name in unusual:
             continue
-        points, value = sorted(g * shape.size(site) for g in shape.grid), placed.values[name]
+        value = placed.values[name]
         k = int(np.argmin(np.abs(np.array(points) - value)))
         step = points[k] - points[k - 1] if k else points[1] - points[0]
         below, above = max(points[k] - step, 0.0), points[k + 1] if k + 1 < len(points) else points[k] + step

@@ -136,8 +136,8 @@ class Effect:
     lateral_speed, machine. `amount`: a typical one [unit] at a site, `grid`: shares of it that are tried where the
     signature isn't proportional to the amount; `beside`: shapes [unit] that are tried beside their grids. `positive`: a
     negative amount makes no sense; `inverse`: the smaller the amount, the larger the effect; `angular`: a reading's
-    error that only a sensor of an angle has, none of a rate. `recoil`: the share of a changing `inertia` that comes of
-    a load sliding on its body, which pushes it back.
+    error that only a sensor of an angle has, none of a rate. `recoil`: the shape that says which share of a changing
+    `inertia`, of MX and ZZ, comes of a load that slides along x on its body and pushes it back.
     Hooks take the scene, the body they act on, and the values.
     """
 
@@ -158,7 +158,7 @@ class Effect:
     push: Callable[[Scene, int, Values], tuple[ca.SX, ca.SX]] | None = None
     gravity: Callable[[Scene, Values], tuple[ca.SX, ca.SX]] | None = None
     inertia: Callable[[Scene, Values], dict[str, ca.SX]] | None = None
-    recoil: Callable[[Scene, Values], ca.SX] | None = None
+    recoil: str | None = None
     reading: Callable[[Scene, ca.SX, int, Values], ca.SX] | None = None
     channel: Callable[[ca.SX, Values], Channel] | None = None
     memory: Mapping[str, Memory] = field(default_factory=dict)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from math import pi
+from math import log, pi
 
 import casadi as ca
 
@@ -25,7 +25,8 @@ SMOOTH_SLIP = 0.005  # slip over which driving turns into braking
 SMOOTH_SPEED = 0.02  # [m/s] over which a force against the motion turns
 SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
 
-BACK = 0.1  # [m] of way back from which a reversal counts
+BACK = 0.1  # [m] of way back, within which a reversal counts
+MOMENTS = 120  # at which a load is looked for that slides
 LANE = 10.0  # [m] of way that a reversal is worth where these are counted
 
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
@@ -107,15 +108,23 @@ def _scaled(soil: Soil, factor: ca.SX) -> Soil:
     return replace(soil, Kx=soil.Kx * factor, Ky=soil.Ky * factor)
 
 
-def _way(s: Scene, k: int) -> ca.SX:
-    """Speed of a contact's centre, forward or back; nothing at standstill."""
+def _way(s: Scene, k: int) -> tuple[ca.SX, ca.SX]:
+    """Speed of a contact's centre, forward or back, nothing at standstill, and which way it goes, 1 or -1."""
     Vx = s.rolling[k].Vx
-    return Vx * ca.tanh(Vx / SMOOTH_SPEED)
+    ahead = ca.tanh(Vx / SMOOTH_SPEED)
+    return Vx * ahead, ahead
 
 
-def _turning(s: Scene, k: int, p: Values) -> ca.SX:
-    """How fast the direction that a contact remembers, 1 or -1, follows the one that it goes."""
-    return (s.rolling[k].Vx - _way(s, k) * s.z["facing"]) / BACK
+def _facing(s: Scene, k: int, p: Values) -> ca.SX:
+    """How fast the direction that a contact remembers follows the one that it goes."""
+    way, ahead = _way(s, k)
+    return way * (ahead - s.z["facing"]) / BACK
+
+
+def _reversing(s: Scene, k: int, p: Values) -> ca.SX:
+    """One for each reversal: against the direction that it remembers, which is 0 before any and turns 2 exp(-x) - 1."""
+    way, ahead = _way(s, k)
+    return ca.fmax(-way * ahead * s.z["facing"], 0) / (BACK * (1 - log(2)))
 
 
 def _compacted(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
@@ -145,7 +154,7 @@ def _one_sided(site: Site) -> list[dict[str, float]]:
     """Stops so far from the middle that only one of them is reached."""
     limit = _stop(site)
     stops = [x * limit for x in (0.15, 0.35, 0.55, 0.75)]
-    return [{"stop": (limit + x) / 2, "centre": side * (limit - x) / -2} for x in stops for side in (1.0, -1.0)]
+    return [{"stop": (limit + x) / 2, "centre": side * (x - limit) / 2} for x in stops for side in (1.0, -1.0)]
 
 
 def _clipped(s: Scene, k: int, p: Values) -> ca.SX:
@@ -197,8 +206,10 @@ def _load_moment(site: Site) -> float:
 
 
 def _sliding(site: Site) -> list[dict[str, float]]:
-    """A load that slides within a second, at every second: its recoil is short and would be missed between others."""
-    return [{"instant": float(t), "takes": 0.5, "arm": 0.0, "recoil": 1.0} for t in range(1, int(site.duration))]
+    """A load that slides within a second, at every second, in long logs at MOMENTS: its recoil is short."""
+    step = max(1.0, site.duration / MOMENTS)
+    times = [k * step for k in range(1, int(site.duration / step))]
+    return [{"instant": t, "takes": 0.5, "arm": 0.0, "recoil": 1.0} for t in times]
 
 
 def _one_over_torque(site: Site) -> float:
@@ -455,9 +466,9 @@ _declare(
         },
         soil=_compacted,
         memory={
-            "distance": Memory(lambda s, k, p: _way(s, k), 1e-6),
-            "facing": Memory(_turning, 1e-6),
-            "reversals": Memory(lambda s, k, p: ca.fabs(_turning(s, k, p)) / 2, 1e-6),
+            "distance": Memory(lambda s, k, p: _way(s, k)[0], 1e-6),
+            "facing": Memory(_facing, 1e-6),
+            "reversals": Memory(_reversing, 1e-6),
         },
         beside=lambda site: [{"pass": x, "counted": 1.0} for x in (5.0, 15.0, 50.0)],
     ),
@@ -540,7 +551,7 @@ _declare(
             ),  # 1: a load slides on the chassis, 0: it is put on or taken away
         },
         inertia=_slid,
-        recoil=lambda s, p: p["recoil"],
+        recoil="recoil",
         beside=_sliding,
         timed=True,
     ),
@@ -574,7 +585,7 @@ _declare(
         "articulation_stop_spring",
         ("articulation",),
         "N m/rad",
-        "a spring beyond some angle to both sides",
+        "a spring beyond some angle, to both sides of a middle that may be off",
         "a torque that grows with the angle beyond a limit",
         "rubber stops of articulated frames",
         lambda site: _full_torque(site),

@@ -288,7 +288,7 @@ def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
         rows = tree.generalised_forces(machine, s.at, s.frames, change)
         force -= ca.vertcat(*[rows[c] for c in s.names])
         if effect.recoil is not None:
-            force += effect.recoil(e.scene, e.values) * _recoil(s, e, told)
+            force += e.values[effect.recoil] * _recoil(s, e, told)
     return force
 
 

@@ -205,13 +205,32 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
         ([name, *names], more),
         ([names[0], name, names[1]], more),
     ):
-        chosen = [diagnose.Choice(n, stage, 1000.0, 1.0, 100, ()) for n in order]
+        chosen = [diagnose.Choice(n, stage, 1000.0, 1.0, 100, (), 1.0) for n in order]
         again = diagnose.reviewed(found.before, chosen)
         assert [x.name for x in again] == [n for n in order if n in names]
         assert again[-1].stage.fit.cost == pytest.approx(found.after.fit.cost, abs=0.1)
     # One whose amount comes out as nothing goes, and the others stand as if it had never been there.
-    chosen = [diagnose.Choice(n, more, 1000.0, 1.0, 100, ()) for n in (name, *names)]
+    chosen = [diagnose.Choice(n, more, 1000.0, 1.0, 100, (), 1.0) for n in (name, *names)]
     left = diagnose.needed(found.before, chosen)
     assert [x.name for x in left] == names
     assert [e.name for e in left[0].stage.machine.effect] == [names[0].split("@")[0]]
     assert [x.name for x in diagnose.needed(found.before, left)] == names
+
+
+@pytest.mark.parametrize("share", [0.2, 0.4, 3.0])
+def test_a_file_that_is_far_off_is_no_cause(straight: Model, share: float) -> None:
+    """A clean log, the file's contacts at so large a share of the true ones."""
+    t = np.arange(0, 20.01, 0.01)
+    slow = np.minimum(1, np.minimum(t, 20 - t) / 2)
+    motion = simulate(straight, np.column_stack([1500 * np.sin(1.7 * t) * slow, 1200 * np.sin(2.6 * t) * slow]))
+    one = log.check(sensors.measure(straight, motion, seed=3), straight.machine)
+    bodies = []
+    for b in straight.machine.body:
+        if b.contact is not None:
+            Kx = b.contact.Kx.model_copy(update={"value": share * float(b.contact.Kx)})
+            b = b.model_copy(update={"contact": b.contact.model_copy(update={"Kx": Kx})})
+        bodies.append(b)
+    far = prediction.build(straight.machine.model_copy(update={"body": tuple(bodies)}))
+    found = diagnose.diagnose(far, [one], straight.machine.filter)
+    assert not found.findings
+    assert found.verdict == "clean"

@@ -212,20 +212,45 @@ def test_a_load_slides_on_the_last_chassis(name: str, body: int) -> None:
     assert np.abs(want - plain.balance(q, nu, a, p).full()).max() > 0.1
 
 
-def test_compaction_counts_reversals_or_the_way(straight: Model) -> None:
-    """Six ways forth and back: the first counts for half, as nothing is known of what was before."""
-    known = straight.machine
+def compacting(known: machine.Machine, counted: float) -> Model:
+    entry = effects.parse("compaction_per_pass=0.3", known, 24.0)
+    told = {**entry.shape, "counted": Quantity(value=counted, source="assumed")}
+    return build(effects.extended(known, entry.model_copy(update={"shape": told})))
+
+
+def test_compaction_counts_the_way_and_reversals(straight: Model) -> None:
+    """Six ways forth and back, with five reversals between them."""
     t = np.arange(0, 24, 1 / 100)
-    torque = np.column_stack([1500 * np.sign(np.sin(2 * np.pi * t / 8 + 0.7))] * 2)
-    model = build(effects.extended(known, effects.parse("compaction_per_pass=0.3", known, 24.0)))
-    motion = simulate(model, torque)
-    speed = motion.nu[:, 0]
+    model = compacting(straight.machine, 1.0)
+    motion = simulate(model, np.column_stack([1500 * np.sign(np.sin(2 * np.pi * t / 8 + 0.7))] * 2))
     memory = dict(zip(model.memory, motion.memory.T, strict=True))
-    turns = np.flatnonzero(np.diff(np.sign(speed[np.abs(speed) > 0.05])))
-    assert len(turns) == 5
-    assert memory["compaction_per_pass@drive.reversals"][-1] == pytest.approx(5.5, abs=0.05)
+    speed = motion.nu[:, 0]
+    assert np.count_nonzero(np.diff(np.sign(speed[np.abs(speed) > 0.05]))) == 5
+    assert memory["compaction_per_pass@drive.reversals"][-1] == pytest.approx(5, abs=0.1)
     way = np.trapezoid(np.abs(speed), t)
     assert memory["compaction_per_pass@drive.distance"][-1] == pytest.approx(way, rel=0.02)
+
+
+@pytest.mark.parametrize(("counted", "each"), [(0.0, 1.0), (1.0, 10.0)])
+def test_soil_is_as_stiff_as_what_is_counted_says(straight: Model, counted: float, each: float) -> None:
+    """By the way 15 m, by reversals ten metres each, make 1 - 1/e of what comes; the other memory does nothing."""
+    model, names = compacting(straight.machine, counted), ("distance", "reversals")
+    n = len(model.coordinates)
+    nu = np.array([1.0, *[1.02 / 0.65] * (n - 1)])
+
+    def push(passes: float, other: float) -> np.ndarray:
+        of = dict(zip(names, (passes, other) if counted == 0 else (other, passes), strict=True))
+        z = np.array([of.get(m.rpartition(".")[2], 0.0) for m in model.memory])
+        p = model.expand @ model.nominal
+        return model.balance(np.zeros(n), nu, np.zeros(n), p, np.zeros(2), z).full()[:, 0]
+
+    bare = straight.balance(np.zeros(n), nu, np.zeros(n), straight.expand @ straight.nominal).full()[:, 0]
+    soft = straight.expand @ straight.nominal
+    soft[[k for k, name in enumerate(straight.base.standard) if name.startswith("K")]] = 0
+    free = straight.balance(np.zeros(n), nu, np.zeros(n), soft).full()[:, 0]
+    assert push(0.0, 7.0) == pytest.approx(bare, rel=1e-9)
+    stiff = free + (bare - free) * (1 + 0.3 * (1 - np.exp(-1)))
+    assert push(15.0 / each, 7.0) == pytest.approx(stiff, rel=1e-6)
 
 
 def test_stops_may_be_out_of_the_middle() -> None:
