@@ -46,7 +46,7 @@ def version() -> str:
     """Eight digits that change when the program or the second roller does."""
     files = sorted([*(ROOT / "model").rglob("*.py"), *(ROOT / "model").rglob("*.toml")])
     names = ("diagnose", "misfit", "findings", "evidence", "innovations", "smoothing", "newton", "linearise", "chain")
-    names += ("record", "gain", "hidden", "processing")
+    names += ("record", "gain", "hidden", "processing", "sensors", "anomaly", "log", "estimate")
     files += [ROOT / "excite" / f"{n}.py" for n in names]
     files += [ROOT / "tests" / n for n in ("plant.py", "causes.py", "surprises.py", "blind.py", "visibility.py")]
     seen = hashlib.sha1()
