@@ -456,13 +456,13 @@ def new_machine(
     json: JsonOption = False,
 ) -> None:
     """Writes a commented machine file to start from."""
-    from excite import template
+    from excite import scaffold
     from model import machine
 
     if like is not None:
         asked.known("--like", like, machine.shipped())
     out = out or Path(f"{name}.toml")
-    template.start(name, out, like)
+    scaffold.start(name, out, like)
     if json:
         terminal.show_json({"machine": name, "file": str(out)})
     else:

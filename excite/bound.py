@@ -251,7 +251,7 @@ def _states(model: Model, problem: Problem, degree: int) -> _States:
     slope = ca.Function("slope", [x], [ca.jacobian(ca.vertcat(*monomials, ca.SX(0, 1)), x)])
     drift = slope(z[:n_x]) @ flow
     phi = model.regressor(q, nu, a) @ ca.diag(ca.DM(model.scale))
-    kept = [g for g in limit.limits(model, problem) if not limit.on_lane(g.name) and g.kind != "torque_rate"]
+    kept = [g for g in limit.limits(model, problem) if not limit.of_lane(g.name) and g.kind != "torque_rate"]
     g = ca.vertcat(*[k.expression(q, nu, u, ca.SX(len(model.inputs), 1)) / k.range for k in kept])
     low, high = np.array([k.low / k.range for k in kept]), np.array([k.high / k.range for k in kept])
 

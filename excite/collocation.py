@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from excite.limit import REST_POSITION, Limit, Symbols, limits, on_lane, rest_tolerances, resting, symbols
+from excite.limit import REST_POSITION, Limit, Symbols, limits, of_lane, rest_tolerances, resting, symbols
 from model.machine import Problem
 from model.prediction import Model
 
@@ -210,7 +210,7 @@ def transcribe(
     every = limits(model, problem)
     s = symbols(model)
     moved = _depends(every, s, ca.vertcat(s.q, s.nu))
-    deferred = set() if with_pose else {g.name for g in every if on_lane(g.name)}
+    deferred = set() if with_pose else {g.name for g in every if of_lane(g.name)}
     staged = [g for g in every if g.name in moved and g.name not in deferred]
     steered = [g for g in every if g.name not in moved and g.name not in deferred]
     pose = model.machine.body[0].coordinates if with_pose else ()

@@ -32,7 +32,7 @@ from excite.continuation import MARGIN, Candidate, Track, land, rest_band, softe
 from excite.design import design, processes
 from excite.drive import turns_left
 from excite.driver import follow
-from excite.limit import TOLERANCE, check, in_motion, limits, off_lane, on_lane, symbols
+from excite.limit import TOLERANCE, check, kept_between, lane_excess, limits, of_lane, symbols
 from excite.manoeuvre import Manoeuvre, scaled
 from excite.simulate import Motion, SimulationError, simulate
 from model import tree
@@ -241,7 +241,7 @@ class _Search:
         fade = np.clip(np.minimum(self._times, self._times[-1] - self._times) / 0.5, 0, 1)
         self._waves = np.hstack([np.sin(phase), np.cos(phase)]) * fade[:, None]
         self._size = np.ones(len(model.inputs))
-        every = [g for g in limits(model, problem) if not on_lane(g.name)]
+        every = [g for g in limits(model, problem) if not of_lane(g.name)]
         s = symbols(model)
         room = [1 - ca.fabs(g.expression(s.q, s.nu, s.u, s.du) - g.centre) * (2 / g.range) for g in every]
         self._room = ca.Function("room", [s.q, s.nu, s.u, s.du], [ca.vertcat(*room)])
@@ -307,7 +307,7 @@ def shrunk(model: Model, problem: Problem, wish: Manoeuvre) -> Manoeuvre:
             motion = simulate(model, scaled(wish, factor).sample(float(model.machine.sampling_hz)))
         except SimulationError:
             return False
-        return in_motion(check(model, problem, motion))
+        return kept_between(check(model, problem, motion))
 
     for left, group in enumerate(groups, 1 - len(groups)):
         low, high = 0, 50
@@ -350,7 +350,7 @@ def _nearest(
 ) -> Track | None:
     """From where the track stands, the drive nearest to the wish that keeps every limit, moved in by margins (of the
     ranges). None where no motion follows the torques. The first attempt goes the whole WAY, later ones refine."""
-    with_pose = model.machine.planar and (track.pose is not None or off_lane(track.latest.violations) > 0)
+    with_pose = model.machine.planar and (track.pose is not None or lane_excess(track.latest.violations) > 0)
     times, known = manoeuvre.knots(problem), track.motion.t
     names = [*model.coordinates, *[c + "'" for c in model.coordinates], *model.memory]
     every = dict(zip(names, np.hstack([track.motion.q, track.motion.nu, track.motion.memory]).T, strict=True))
@@ -381,7 +381,7 @@ def _nearest(
             None,
             np.tile(moved_in, (tr.intervals, tr.nodes, 1)),
             np.tile([1e-4 + 2 * margins.get(name, 0.0) for name in tr.control_names], (tr.intervals, 1)),
-            np.array([on_lane(name) for name in tr.limit_names], bool),
+            np.array([of_lane(name) for name in tr.limit_names], bool),
             (len(times) - 1) / tr.intervals,  # knots in one: the distance stays the same
             goal,
         )

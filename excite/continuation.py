@@ -22,14 +22,14 @@ from excite.limit import (
     REST_SPEED,
     TOLERANCE,
     TRAVEL,
-    at_ends,
     check,
     directions,
     free,
-    in_motion,
+    kept_between,
+    lane_excess,
     limits,
-    off_lane,
-    on_lane,
+    of_lane,
+    of_rest,
     placed,
     rest_tolerances,
     resting,
@@ -149,7 +149,7 @@ def depart(model: Model, problem: Problem, aim: Aim, number: int, seed: int) -> 
             motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
         except SimulationError:
             continue
-        if in_motion(check(model, problem, motion)):
+        if kept_between(check(model, problem, motion)):
             break
     found, motion = verdict(model, problem, aim, drive)
     sizes = typical_sizes(model, problem, motion)
@@ -201,7 +201,7 @@ def search(
         if moved is None:
             break
         track = moved
-        if track.pose is not None or (stage.friction <= 4 and off_lane(track.latest.violations) > 0):
+        if track.pose is not None or (stage.friction <= 4 and lane_excess(track.latest.violations) > 0):
             track = replace(track, pose=track.latest.start)
         tell(track)
     return track
@@ -254,7 +254,7 @@ def land(model: Model, problem: Problem, aim: Aim, track: Track, over: Callable[
     rate = float(model.machine.sampling_hz)
     scale = np.array([float(b.limit.torque) if b.limit.torque is not None else 1.0 for b in model.machine.actuated])
     for _ in range(4):
-        late = [name for name, v in track.latest.violations.items() if v > 0 and at_ends(name)]
+        late = [name for name, v in track.latest.violations.items() if v > 0 and of_rest(name)]
         if not late or over():
             break
         drive, x0 = track.latest.manoeuvre, _end(model, track.motion)
@@ -346,7 +346,7 @@ def _advance(
         wanted,
         np.tile(moved_in, (intervals, tr.nodes, 1)),
         np.tile([1e-4 + 2 * margins.get(name, 0.0) for name in tr.control_names], (intervals, 1)),
-        np.array([on_lane(name) for name in tr.limit_names], bool),
+        np.array([of_lane(name) for name in tr.limit_names], bool),
     )
     if track.going is not None and TRAVEL in tr.limit_names:
         above, below = _one_way(tr, nodes, model, problem, track.going)

@@ -369,7 +369,7 @@ def middle(scores: Sequence[Score]) -> Score:
 def broken(model: Model, problem: Problem, motion: Motion, least: float = 0.02) -> dict[str, float]:
     """Limits of machine and lane that a motion exceeds by more than `least` of their range, with the excess."""
     over = limit.check(model, problem, motion)
-    return {name: value for name, value in over.items() if value > least and not limit.at_ends(name)}
+    return {name: value for name, value in over.items() if value > least and not limit.of_rest(name)}
 
 
 # ------------------------------------------------------------------------------------------------ room
@@ -420,7 +420,7 @@ def placed(model: Model, problem: Problem, motions: Sequence[Motion]) -> tuple[M
     What a machine does on flat ground doesn't depend on where it starts. A drive that keeps the lane stays.
     """
     first = motions[0]
-    if limit.off_lane(limit.check(model, problem, first)) == 0:
+    if limit.lane_excess(limit.check(model, problem, first)) == 0:
         return tuple(motions)
     return tuple(moved(model, m, limit.placed(model, problem, first)) for m in motions)
 

@@ -234,12 +234,12 @@ def stacked(model: Model, every: Sequence[Limit]) -> ca.Function:
     return ca.Function("limits", sample, [ca.vertcat(*[g.expression(*sample) for g in every])])
 
 
-def on_lane(name: str) -> bool:
+def of_lane(name: str) -> bool:
     """Whether a limit of that name depends on where the machine stands on the ground: its name begins with `lane`."""
     return name.startswith("lane")
 
 
-def at_ends(name: str) -> bool:
+def of_rest(name: str) -> bool:
     """Whether a limit of that name is about rest at both ends."""
     return name.startswith("rest")
 
@@ -247,17 +247,17 @@ def at_ends(name: str) -> bool:
 def free(name: str) -> bool:
     """Whether a limit of that name leaves the motion between free: the lane, on which a drive can still be placed, and
     rest at its ends."""
-    return on_lane(name) or at_ends(name)
+    return of_lane(name) or of_rest(name)
 
 
-def in_motion(excess: Mapping[str, float]) -> bool:
+def kept_between(excess: Mapping[str, float]) -> bool:
     """Whether every limit but the free ones is kept, by name the excess that `check` finds."""
     return all(v == 0 for name, v in excess.items() if not free(name))
 
 
-def off_lane(excess: Mapping[str, float]) -> float:
+def lane_excess(excess: Mapping[str, float]) -> float:
     """The largest excess over any limit of the lane, 0 where there is none."""
-    return max((v for name, v in excess.items() if on_lane(name)), default=0.0)
+    return max((v for name, v in excess.items() if of_lane(name)), default=0.0)
 
 
 def resting(model: Model) -> tuple[int, ...]:

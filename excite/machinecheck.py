@@ -307,7 +307,7 @@ def _trial(model: Model) -> dict[str, float]:
                 motion = simulate(model, manoeuvre.scaled(wish, share).sample(float(model.machine.sampling_hz)))
             except SimulationError:
                 continue
-            if limit.in_motion(limit.check(model, TRIAL, motion)):
+            if limit.kept_between(limit.check(model, TRIAL, motion)):
                 break
         else:
             continue

@@ -89,7 +89,12 @@ def effects_page() -> str:
         if typical:
             lines += [f"On va12, at a typical size: {', '.join(typical)}", ""]
         if e.shapes:
-            lines += _table("shape | unit | default | looked for at", (_shape(*s) for s in e.shapes.items()))
+            (first, *_), _ = next(iter(sites.values()), ((1,), None))
+            beside = e.beside(Site(va12, va12.find(first), DURATION))
+            lines += _table(
+                "shape | unit | default | looked for at | meaning",
+                (_shape(n, s, [b[n] for b in beside]) for n, s in e.shapes.items()),
+            )
     return _page(*lines)
 
 
@@ -103,9 +108,13 @@ def _amount(e: Effect) -> str:
     return f"Amount {unit}{sign}."
 
 
-def _shape(name: str, shape: Shape) -> tuple[str, str, str, str]:
+def _shape(name: str, shape: Shape, beside: Sequence[float]) -> tuple[str, str, str, str, str]:
+    """A row; beside: values of it that are tried beside its grid, told where they make the effect another one."""
     of = "" if shape.size is one else " of the site's size"
-    return name, shape.unit, f"{shape.default:.3g}{of}", ", ".join(f"{x:.3g}" for x in shape.grid) + of
+    tried = ", ".join(f"{x:.3g}" for x in shape.grid) + of
+    more = sorted({float(f"{x:.3g}") for x in beside} - set(shape.grid)) if shape.signed else []
+    found = "; ".join([tried, *([", ".join(f"{x:.3g}" for x in more)] if more else [])])
+    return name, shape.unit, f"{shape.default:.3g}{of}", found, shape.meaning
 
 
 # ------------------------------------------------------------------------------------------------ files

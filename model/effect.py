@@ -103,7 +103,8 @@ def nothing(site: Site) -> list[dict[str, float]]:
 class Shape:
     """What an effect's amount leaves open: default and grid in units of `size`, which belongs to the site.
 
-    `circular`: a phase, found by its sine and cosine; `whole`: an integer, not refined. What is zero by default may
+    `circular`: a phase, found by its sine and cosine; `whole`: an integer, not refined; `meaning`: what a name leaves
+    open. What is zero by default may
     have either sign.
     """
 
@@ -113,6 +114,7 @@ class Shape:
     size: Callable[[Site], float] = one
     circular: bool = False
     whole: bool = False
+    meaning: str = ""
 
     @property
     def signed(self) -> bool:

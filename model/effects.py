@@ -462,7 +462,9 @@ _declare(
         _constant(0.3),
         {
             "pass": Shape("m", 15.0, (5.0, 15.0, 50.0)),
-            "counted": Shape("-", 0.0, (0.0,), whole=True),  # 1: passes are counted by reversals, each worth LANE
+            "counted": Shape(
+                "-", 0.0, (0.0,), whole=True, meaning="1: a pass is counted by reversals, each worth 10 m of way"
+            ),
         },
         soil=_compacted,
         memory={
@@ -545,10 +547,10 @@ _declare(
         {
             "instant": Shape("s", 0.5, (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), _duration),
             "takes": Shape("s", 0.2, (0.2,)),
-            "arm": Shape("m", 0.0, (0.0,)),  # the yaw inertia about the joint changes by A times this
+            "arm": Shape("m", 0.0, (0.0,), meaning="the yaw inertia about the joint changes by A times this"),
             "recoil": Shape(
-                "-", 0.0, (0.0,), whole=True
-            ),  # 1: a load slides on the chassis, 0: it is put on or taken away
+                "-", 0.0, (0.0,), whole=True, meaning="1: a load slides and pushes back; 0: it is put on or taken away"
+            ),
         },
         inertia=_slid,
         recoil="recoil",
@@ -589,7 +591,10 @@ _declare(
         "a torque that grows with the angle beyond a limit",
         "rubber stops of articulated frames",
         lambda site: _full_torque(site),
-        {"stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), _stop), "centre": Shape("rad", 0.0, (0.0,))},
+        {
+            "stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), _stop),
+            "centre": Shape("rad", 0.0, (0.0,), meaning="the angle in the middle between the stops"),
+        },
         torque=_stopped,
         beside=_one_sided,
     ),

@@ -12,13 +12,13 @@ import pytest
 import tomli_w
 from conftest import Excite
 
-from excite import log, machinecheck, sensors, template, topview
+from excite import log, machinecheck, scaffold, sensors, topview
 from excite.simulate import Motion
 from model import tree
 from model.machine import Machine, MachineError, load, shipped
 from model.prediction import Model, build
 
-FRESH = template.fresh("mine", Path("mine.toml"))
+FRESH = scaffold.fresh("mine", Path("mine.toml"))
 
 
 def spoilt(tmp_path: Path, *changes: tuple[str, Any]) -> Path:
@@ -54,7 +54,7 @@ def test_the_file_to_start_from_is_beyond_doubt(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["", "2wd", "my machine", "va12", "../x", "röller"])
 def test_a_name_that_cannot_be_one_is_refused(name: str) -> None:
     with pytest.raises(MachineError):
-        template.fresh(name, Path("x.toml"))
+        scaffold.fresh(name, Path("x.toml"))
 
 
 # ------------------------------------------------------------------------------------------------- wrong, doubtful

@@ -23,7 +23,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from excite import aim as aims
-from excite import folder, identify, log, scenario, sensors, sequential
+from excite import folder, identify, log, objective, scenario, sensors, sequential
 from excite.design import design
 from excite.driver import follow
 from excite.estimate import NoEstimate
@@ -167,7 +167,7 @@ def told(true: Model, motions: Sequence[Motion]) -> dict[str, object]:
     W = np.concatenate([true.stacked(m.q.T, m.nu.T, m.a.T).reshape(-1, len(true.scale)) for m in motions])
     by = np.outer(true.scale, true.scale)
     information = sum(np.linalg.inv(cramer_rao(true, m) / by) for m in motions)
-    spread = 100 * np.sqrt(np.diag(np.linalg.inv(information) * by)) / np.abs(true.nominal)
+    spread = objective.percent(true, np.linalg.inv(information) * by)
     broken = [(v, n) for m in motions for n, v in check(true, short(true), m).items() if not free(n)]
     return {
         "limit": max(broken)[1],
