@@ -104,8 +104,7 @@ class Shape:
     """What an effect's amount leaves open: default and grid in units of `size`, which belongs to the site.
 
     `circular`: a phase, found by its sine and cosine; `whole`: an integer, not refined; `meaning`: what a name leaves
-    open. What is zero by default may
-    have either sign.
+    open. What is zero by default may have either sign.
     """
 
     unit: str
