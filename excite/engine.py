@@ -21,6 +21,7 @@ import joblib
 AHEAD = 2  # pieces in flight per worker: one at work, one at hand
 TRIES = 2  # deaths of a worker that had a piece alone, before the piece is to blame
 LOGGERS = ("distributed", "distributed.client")  # of Dask, with levels of their own
+GONE = "the cluster's scheduler is gone; start it and repeat the command"
 THREADS = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 T = TypeVar("T")
@@ -139,10 +140,22 @@ class Cluster:
 
     @property
     def size(self) -> int:
-        return max(1, sum(self._client.nthreads().values()))
+        with self._asked():
+            return max(1, sum(self._client.nthreads().values()))
 
     def submit(self, call: Callable[..., Any], *args: Any) -> Future[Any]:
-        return self._executor.submit(call, *args)
+        with self._asked():
+            return self._executor.submit(call, *args)
+
+    @contextmanager
+    def _asked(self) -> Iterator[None]:
+        """What is asked of the scheduler fails in several ways once that is gone. Raises EngineError."""
+        try:
+            yield
+        except Exception as err:
+            if isinstance(err, OSError) or self._client.status != "running":
+                raise EngineError(GONE) from None
+            raise
 
     def died(self, err: BaseException) -> bool:
         from distributed import KilledWorker
@@ -230,7 +243,7 @@ def spread(
             try:
                 value, seconds = future.result()
             except CancelledError:
-                raise EngineError("the cluster's scheduler is gone; start it and repeat the command") from None
+                raise EngineError(GONE) from None
             except Exception as err:
                 if not workers.died(err):
                     raise

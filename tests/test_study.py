@@ -774,6 +774,22 @@ def test_a_killed_scheduler_is_said_and_the_study_goes_on(
     assert third.results() == whole.results()
 
 
+@pytest.mark.slow
+def test_a_scheduler_that_is_gone_is_said_whatever_is_asked(dask: Dask) -> None:
+    """While the client still tries to reach it, and after it gave up."""
+    dask.worker()
+    with engine.pool(cluster=dask.address) as workers:
+        assert workers.size == 1
+        assert workers.submit(abs, -1).result(timeout=60) == 1
+        dask.close()
+        for _ in range(2):
+            with pytest.raises(engine.EngineError, match="repeat the command"):
+                assert workers.size
+        time.sleep(5)
+        with pytest.raises(engine.EngineError, match="repeat the command"):
+            workers.submit(abs, -1)
+
+
 def workers_of(driver: int) -> list[int]:
     """The processes that compute for a driver, the oldest first."""
     children = Path(f"/proc/{driver}/task/{driver}/children").read_text().split()
