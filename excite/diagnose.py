@@ -9,41 +9,34 @@ be fitted, effects are scored along the file's parameters and fitted from the lo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import scipy.stats
 
-from excite import evidence, hidden, newton, smoothing
+from excite import evidence, smoothing, stages
 from excite.anomaly import anomalies
-from excite.innovations import innovation_sizes
-from excite.linearise import Chart, chart
 from excite.log import Log
-from excite.newton import Fit, NotConverged
-from excite.record import Point, Record, carried, common_sensors, first_point, origins, record
+from excite.newton import NotConverged
 from excite.sidebyside import Together, in_turn
+from excite.stages import Stage, fitted, refits, refitted
 from model import effects
 from model.file import Quantity
-from model.machine import EffectEntry, Filter, Machine
-from model.prediction import Model, build
+from model.machine import EffectEntry, Filter
+from model.prediction import Model
 
 # Of twice the log-likelihood that an effect must gain; logs without any stayed below 16. For all candidates of va12
 # together chi-squared gives 0.8 % of logs of a minute above it, 1 % of longer ones, whatever their number of shapes.
 LEVEL = 22.0
 WORTH = 15.0  # a first-order gain below which a candidate isn't fitted
 HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
-STRONG = 1.3  # misfit over readings from which first-order gains are rough
-PASSES = 14  # of a candidate's fit
-LESS = 0.1, 0.3  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
 TRIED = 5  # candidates that are fitted
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
 PAIR = 2  # candidates that are fitted in any case, side by side
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
 MOST = 4  # effects that are looked for
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
-SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 # Of what is explained already, that a further effect must gain, as nature is never exactly the formula: by the fits'
 # gains, and by how many deviations the amounts are from none; the more where parameters absorb most of an effect, as
 # they absorb none of its formula's error; for what acts at some time only; where forces hide how good the formula is.
@@ -59,69 +52,6 @@ FURTHER = 0.8  # the same for names after the first: what nature has beside its 
 NEAR = 0.3  # of what the best name leaves unexplained, by which a rival may be worse and still is a tie
 
 Advance = Callable[[float, str], None]
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """Logs made ready for a model: chart, records, first guesses, parameters that they don't show."""
-
-    c: Chart
-    logs: tuple[Log, ...]
-    records: tuple[Record, ...]
-    starts: tuple[Point, ...]
-    held: np.ndarray
-
-    @property
-    def readings(self) -> float:
-        """How many readings the logs have: what twice the negative log-likelihood of a right model is about."""
-        return float(sum(r.used.sum() for r in self.records))
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A model with the effects found so far, fitted. `exact`: without disturbing forces. Not `settled`: no fit was
-    found, parameters are the file's. loose: the same model with the larger disturbing forces that
-    this fit came from, if it did."""
-
-    machine: Machine
-    prepared: Prepared
-    fit: Fit
-    settled: bool = True
-    loose: Stage | None = None
-
-    @property
-    def model(self) -> Model:
-        return self.prepared.c.model
-
-    @property
-    def exact(self) -> bool:
-        return self.fit.disturbed == 0
-
-    @property
-    def excess(self) -> float:
-        """How much more misfit there is than noise may make."""
-        return max(0.0, self.fit.cost - (1 + SLACK) * self.prepared.readings)
-
-    @property
-    def near(self) -> bool:
-        """Whether the misfit is not far from what noise makes."""
-        return self.fit.cost <= STRONG * self.prepared.readings
-
-    @property
-    def rough(self) -> bool:
-        """Whether first-order gains are."""
-        return not self.exact or not self.near
-
-    @property
-    def doubt(self) -> float:
-        """How much larger deviations are than the fit has them, for what it leaves unexplained: slow innovations."""
-        sizes = np.concatenate([innovation_sizes(linear) for linear in self.fit.linear])
-        told = sizes[:, 2] > 0
-        return float(np.sqrt(max(1.0, sizes[told, 1].mean()))) if told.any() else 1.0
-
-    @property
-    def suspects(self) -> list[str]:
-        return smoothing.suspects(self.prepared.c, self.prepared.logs, self.fit)
 
 
 @dataclass(frozen=True)
@@ -248,7 +178,7 @@ def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_tu
         queue = [*rest, choice] if choice is not None else [*rest[:-1], replace(rest[-1], stage=stage, loose=None)]
     whole, judged = queue[-1].stage, {x.name: x for x in queue}
     same = judged.keys() == {x.name for x in chosen}
-    worse = whole.fit.cost - found.fit.cost > LEVEL * max(1.0, found.fit.cost / found.prepared.readings)
+    worse = whole.fit.cost - found.fit.cost > LEVEL * found.spread
     if same or worse or whole.fit.disturbed > found.fit.disturbed:
         judged = judged if same else {x.name: x for x in chosen}
         return [replace(x, rivals=_others(judged[x.name], judged)) for x in chosen]
@@ -323,7 +253,7 @@ def _without(name: str, stage: Stage) -> Stage:
     try:
         return refitted(machine, stage, stage.fit.disturbed)
     except NotConverged:
-        return refitted(machine, stage, max(stage.fit.disturbed, LESS[0] * smoothing.DISTURBED[0]))
+        return refitted(machine, stage, max(stage.fit.disturbed, stages.SMALL))
 
 
 def _scores(stage: Stage) -> tuple[evidence.Score, ...]:
@@ -366,134 +296,6 @@ class Choice:
     def share(self, stage: Stage) -> float:
         """Of the misfit, how much the effect explains, by what is left of it in a stage."""
         return self.gain / (self.gain + stage.excess)
-
-
-def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
-    """A machine's model fitted to logs, with shapes of effects free.
-
-    Where exact dynamics find no estimate, with disturbing forces as small as the log lets them be: the less they may
-    take up, the plainer the cause. Where not even large ones let the model follow, with the file's parameters: what
-    these leave shows where to look. Raises NotConverged where those don't either.
-    """
-    prepared = _prepared(machine, logs, filter)
-    found = _from_first(machine, prepared)
-    if found is not None:
-        return found
-    asis = replace(prepared, held=np.ones_like(prepared.held))
-    try:
-        fit = _iterated(asis, prepared.starts, prepared.c.model.nominal, smoothing.DISTURBED[0])
-    except NotConverged as failed:
-        if failed.fit is None:
-            raise
-        fit = failed.fit
-    unknown = np.full_like(fit.covariance, np.nan)
-    return Stage(machine, prepared, light(replace(fit, unseen=prepared.held, covariance=unknown)), settled=False)
-
-
-def _from_first(machine: Machine, prepared: Prepared) -> Stage | None:
-    """A machine's model fitted to logs from their first guesses, with disturbing forces as small as they can be; None
-    where no fit is found."""
-    return next((s for d in (0.0, *smoothing.DISTURBED) if (s := _fitted_with(d, machine, prepared))), None)
-
-
-def _fitted_with(disturbed: float, machine: Machine, prepared: Prepared) -> Stage | None:
-    """A machine's model fitted to logs from their first guesses with disturbing forces of this size, and then with
-    smaller ones; None where no fit is found."""
-    try:
-        fit = _iterated(prepared, prepared.starts, prepared.c.model.nominal, disturbed)
-    except NotConverged as failed:
-        if failed.nearly is None or disturbed == 0:
-            return None
-        fit = failed.nearly
-    stage = Stage(machine, prepared, light(fit))
-    for less in LESS if disturbed > 0 else ():
-        try:
-            return replace(refitted(machine, stage, less * disturbed), loose=stage)
-        except NotConverged:
-            continue
-    return stage
-
-
-def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
-    """The model of a machine with other effects fitted to the logs of a stage, from its fit, with so large disturbing
-    forces. Raises NotConverged."""
-    prepared = _resumed(machine, of)
-    return Stage(machine, prepared, _resume(prepared, of, disturbed))
-
-
-Wish = tuple[Machine, Stage, float]  # what `refitted` is called with
-
-
-def refits(wishes: Sequence[Wish], together: Together) -> Iterator[Stage | None]:
-    """Several refitted, side by side; None where no fit is found."""
-    prepared = [_resumed(machine, of) for machine, of, _ in wishes]
-    calls = [partial(_resumable, p, of, disturbed) for p, (_, of, disturbed) in zip(prepared, wishes, strict=True)]
-    for p, (machine, _, _), fit in zip(prepared, wishes, together(calls), strict=True):
-        yield None if fit is None else Stage(machine, p, fit)
-
-
-def _resumable(prepared: Prepared, of: Stage, disturbed: float) -> Fit | None:
-    try:
-        return _resume(prepared, of, disturbed)
-    except NotConverged:
-        return None
-
-
-def _resume(prepared: Prepared, of: Stage, disturbed: float) -> Fit:
-    """The fit of a stage gone on with, for logs made ready for another model. Raises NotConverged."""
-    c = prepared.c
-    old = dict(zip(of.model.base.names, of.fit.X, strict=True))
-    X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, c.model.nominal, strict=True)])
-    points = [carried(c, r, p, of.prepared.c, X) for r, p in zip(prepared.records, of.fit.points, strict=True)]
-    try:
-        fit = _iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES)
-    except NotConverged as failed:
-        if failed.nearly is None:
-            raise
-        fit = failed.nearly
-    return light(fit)
-
-
-def _iterated(
-    prepared: Prepared,
-    points: Sequence[Point],
-    X: np.ndarray,
-    disturbed: float,
-    damping: float = newton.DAMPING[0],
-    passes: int = newton.PASSES,
-) -> Fit:
-    """A fit from points and X. With disturbing forces it is found as soon as it is nearly: gains are larger by far than
-    what another pass would change. Raises NotConverged."""
-    p = prepared
-    return newton.iterate(p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, newton.NEARLY)
-
-
-def light(fit: Fit) -> Fit:
-    """A fit without what only its own iteration needs."""
-    return replace(fit, linear=tuple(replace(x, solved=x.solved.closed) for x in fit.linear))
-
-
-def _charted(machine: Machine, logs: Sequence[Log]) -> Chart:
-    model = build(machine, shapes=True)
-    return chart(model, common_sensors(model, logs))
-
-
-def _prepared(machine: Machine, logs: Sequence[Log], filter: Filter) -> Prepared:
-    c = _charted(machine, logs)
-    records = tuple(record(c, log) for log in logs)
-    starts = tuple(first_point(c, r, log, filter) for r, log in zip(records, logs, strict=True))
-    return Prepared(c, tuple(logs), records, starts, hidden.unmoved(c.model, logs, filter, slow=False))
-
-
-def _resumed(machine: Machine, of: Stage) -> Prepared:
-    """The logs of a stage made ready for a machine with other effects, or for the same one again."""
-    before = of.prepared
-    c = before.c if machine is of.machine else _charted(machine, before.logs)
-    model = c.model
-    records = tuple(replace(r, origin=origins(c, r.counts)) for r in before.records)
-    starts = tuple(carried(c, r, p, before.c, model.nominal) for r, p in zip(records, before.starts, strict=True))
-    held = dict(zip(of.model.base.names, before.held, strict=True))
-    return Prepared(c, before.logs, records, starts, np.array([held.get(n, False) for n in model.base.names]))
 
 
 def _duration(logs: Sequence[Log]) -> float:
@@ -575,7 +377,7 @@ def _choose(
     if stage.exact and likely[0].candidate.name not in {s.candidate.name for s, _ in tries}:
         # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
         try:
-            stage = refitted(stage.machine, stage, LESS[0] * smoothing.DISTURBED[0])
+            stage = refitted(stage.machine, stage, stages.SMALL)
         except NotConverged:
             return None
         found = evidence.renumbered([s.candidate for s in likely])
@@ -587,16 +389,14 @@ def _choose(
         return None
     score, best = tries[0]
     gain = stage.fit.cost - best.fit.cost
-    spread = max(1.0, best.fit.cost / best.prepared.readings)
-    if gain < max(LEVEL * spread, _least(stage, chosen, score.candidate)):
+    if gain < max(LEVEL * best.spread, _least(stage, chosen, score.candidate)):
         return None
     return _chosen(_close(tries, gain), gain, len(scores), together)
 
 
 def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) -> Choice:
     """The best of close tries without disturbing forces where that can be, and the rest as its rivals."""
-    best = tries[0][1]
-    spread = max(1.0, best.fit.cost / best.prepared.readings)
+    spread = tries[0][1].spread
     judged = {s.candidate.name: stage for s, stage in tries if not stage.exact}
     tries = _close(_without_forces(tries, together), gain)
     score, best = tries[0]
@@ -611,10 +411,9 @@ def begun(stage: Stage, scores: Sequence[evidence.Score], together: Together = i
     good: the model began too far off. The stage as it was and no effect where nothing helps."""
     likely = _likely(stage, scores, ())
     machines = [effects.extended(stage.machine, _entry(s)) for s in likely]
-    prepared = [_resumed(m, stage) for m in machines]
-    for disturbed in (0.0, smoothing.DISTURBED[0], smoothing.DISTURBED[-1]) if likely else ():
-        calls = [partial(_coming_near, disturbed, m, p) for m, p in zip(machines, prepared, strict=True)]
-        near = [(s, x) for s, x in zip(likely, together(calls), strict=True) if x is not None and x.near]
+    for disturbed in (0.0, smoothing.DISTURBED[-1]) if likely else ():
+        found = stages.begun(machines, stage, disturbed, together)
+        near = [(s, x) for s, x in zip(likely, found, strict=True) if x is not None and x.near]
         if not near:
             continue
         tries = _one_each(near)
@@ -629,17 +428,6 @@ def begun(stage: Stage, scores: Sequence[evidence.Score], together: Together = i
             return stage, []
         return stage, [_chosen(_close(tries, gain), gain, len(scores), together)]
     return stage, []
-
-
-def _coming_near(disturbed: float, machine: Machine, prepared: Prepared) -> Stage | None:
-    """A model fitted from first guesses; where exact dynamics leave much, with small disturbing forces after all."""
-    stage = _fitted_with(disturbed, machine, prepared)
-    if stage is None or stage.near or not stage.exact:
-        return stage
-    try:
-        return refitted(machine, stage, LESS[0] * smoothing.DISTURBED[0])
-    except NotConverged:
-        return stage
 
 
 def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate) -> float:
@@ -681,7 +469,7 @@ def _close(tries: Sequence[_Try], gain: float) -> list[_Try]:
     """The best of sorted tries and those that the logs like about as well: no difference counts that is a matter of the
     formula, of an effect that gains so much."""
     best = tries[0][1]
-    near = max(CLOSE * max(1.0, best.fit.cost / best.prepared.readings), NEAR * best.excess, SHAPE[1] * gain)
+    near = max(CLOSE * best.spread, NEAR * best.excess, SHAPE[1] * gain)
     return [x for x in tries if x[1].fit.cost - best.fit.cost < near]
 
 

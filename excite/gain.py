@@ -16,9 +16,9 @@ import numpy as np
 import scipy.stats
 
 from excite import newton
-from excite.diagnose import Stage
 from excite.newton import Fit, NotConverged
 from excite.record import readings
+from excite.stages import Stage
 
 HIDDEN, PERIOD = 2.0, 6.0  # [s] withheld of every so many
 LOOSER = 0.1, 1.0, 4.0  # disturbing forces that are tried where a wrong model finds no fit to what isn't withheld

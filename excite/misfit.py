@@ -14,11 +14,11 @@ import numpy as np
 import scipy
 
 from excite import smoothing
-from excite.diagnose import Stage, refits
 from excite.innovations import Linear
 from excite.linearise import advance, differentiate
 from excite.newton import state_scale
 from excite.sidebyside import Together
+from excite.stages import Stage, refits
 
 BLOCK_S = 0.25  # [s] over which slow errors are means
 BINS = 24  # of a quantity

@@ -197,10 +197,12 @@ def iterate(
     damping: float = DAMPING[0],
     passes: int = PASSES,
     enough: float = ENOUGH,
+    most: float = np.inf,
 ) -> Fit:
     """Gauss-Newton from points and X; the prior stands about the machine file's values and the states of `starts`.
     Parameters `held` (n_base,) stay at their values. damping: of the first step; passes: at most; enough: a step, in
-    standard deviations, at which a fit with disturbing forces is found.
+    standard deviations, at which a fit with disturbing forces is found; most: cost above which a fit is given up once
+    the states fit the dynamics.
 
     Raises NotConverged.
     """
@@ -239,6 +241,8 @@ def iterate(
             shrinking = min((step / sizes[-1 - LATELY]) ** (1 / LATELY), 1.0) if len(sizes) > LATELY else 0.0
             if step > HOPELESS[1] or step * shrinking ** (passes - 1 - k) > NEARLY:
                 break
+        if k >= SETTLED and cost > most and step > NEARLY:
+            break
         # Where Gauss-Newton swings about the answer, shorter steps end it.
         turned = move[0][: len(X)] / np.sqrt(np.diag(covariance))[: len(X)]
         swings = turned @ last < 0 and step > SLOW * before

@@ -13,9 +13,10 @@ from itertools import combinations
 
 import numpy as np
 
-from excite.diagnose import Diagnosis, Stage
+from excite.diagnose import Diagnosis
 from excite.evidence import remembered
 from excite.record import smoothed
+from excite.stages import Stage
 from model import effects
 from model.effect import Placed, Site
 from model.equations import Signatures, signatures

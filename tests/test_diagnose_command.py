@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import pickle
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 from conftest import Excite
 
-from excite import checkup, diagnose, log, profiles, sensors
+from excite import checkup, diagnose, log, profiles, sensors, stages
 from excite.separate import Rivals
 from excite.sidebyside import forked, in_turn
 from excite.simulate import Motion, simulate
@@ -120,7 +122,7 @@ def test_a_drive_is_designed_for_what_is_tied(straight: Model, tmp_path: Path) -
     both = [prediction.build(effects.extended(machine, e)) for e in (deadband, coulomb)]
     motion = simulate(both[0], torque, q0=q0, nu0=nu0)
     one = log.check(sensors.measure(both[0], motion, seed=2), machine)
-    right, wrong = (diagnose.fitted(m.machine, [one], machine.filter).fit for m in both)
+    right, wrong = (stages.fitted(m.machine, [one], machine.filter).fit for m in both)
     assert wrong.cost - right.cost > diagnose.CLOSE
 
 
@@ -198,7 +200,7 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
         assert abs(f.amount - float(e.amount)) < 4 * f.amount_std
 
     wrong = effects.parse("asymmetric_coulomb@rear_roll=60", straight.machine, 40.0)
-    more = diagnose.refitted(effects.extended(found.after.machine, wrong), found.after, 0.0)
+    more = stages.refitted(effects.extended(found.after.machine, wrong), found.after, 0.0)
     name = f"{wrong.name}@{wrong.where}"
     for order, stage in (
         (names[::-1], found.after),
@@ -215,6 +217,24 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
     assert [x.name for x in left] == names
     assert [e.name for e in left[0].stage.machine.effect] == [names[0].split("@")[0]]
     assert [x.name for x in diagnose.needed(found.before, left)] == names
+
+
+def test_what_a_process_found_can_be_sent_back(straight: Model, straight_motion: Motion) -> None:
+    """An answer that can't be sent would be computed again in silence."""
+
+    def sent(calls: Sequence[Callable[[], Any]]) -> Iterator[Any]:
+        return (pickle.loads(pickle.dumps(call())) for call in calls)
+
+    one = log.check(sensors.measure(straight, straight_motion, seed=3), straight.machine)
+    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    slope = effects.extended(straight.machine, effects.parse("ground_slope=0.001", straight.machine, 10.0))
+    for disturbed in (0.0, 1.0):
+        (found,) = stages.begun([slope], stage, disturbed, sent)
+        assert found is not None
+        assert found.fit.disturbed < max(disturbed, 0.01)
+        assert (found.loose is None) == found.exact
+    (found,) = stages.refits([(slope, stage, 0.0)], sent)
+    assert found is not None
 
 
 @pytest.mark.parametrize("share", [0.2, 0.4, 3.0])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from excite import diagnose, evidence, log, profiles, sensors
+from excite import evidence, log, profiles, sensors, stages
 from excite.simulate import simulate
 from model import effects, machine
 from model.effect import DURATION, Effect, Placed, Site
@@ -355,9 +355,9 @@ def test_noise_of_torques_is_no_gain_and_no_delay() -> None:
     known = build(VA12)
     torque, q0, nu0 = profiles.read(ROOT / "results" / "R60" / "design" / "profile.csv", known)
     measured = log.check(sensors.measure(known, simulate(known, torque, q0=q0, nu0=nu0), seed=3), VA12)
-    plain = diagnose.fitted(VA12, [measured], VA12.filter)
+    plain = stages.fitted(VA12, [measured], VA12.filter)
     entry = EffectEntry(name="torque_gain", where="articulation", amount=Quantity(value=0.005, source="assumed"))
-    found = diagnose.refitted(effects.extended(VA12, entry), plain, 0.0)
+    found = stages.refitted(effects.extended(VA12, entry), plain, 0.0)
     at = found.model.base.names.index("torque_gain@articulation")
     assert abs(found.fit.X[at]) < 3.5 * found.fit.std[at]
     assert found.fit.cost < plain.fit.cost + 1  # both are found to so much

@@ -1,0 +1,264 @@
+"""A machine's model fitted to logs, and fitted again with other effects.
+
+Exact dynamics come first; where these find no estimate, disturbing forces as small as the logs let them be. Fits that
+have nothing to do with each other are computed side by side: what is sent back from there is fits alone, as charts and
+effects know their code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from excite import hidden, newton, smoothing
+from excite.innovations import innovation_sizes
+from excite.linearise import Chart, chart
+from excite.log import Log
+from excite.newton import Fit, NotConverged
+from excite.record import Point, Record, carried, common_sensors, first_point, origins, record
+from excite.sidebyside import Together
+from model.machine import Filter, Machine
+from model.prediction import Model, build
+
+STRONG = 1.3  # misfit over readings from which first-order gains are rough
+FAR = 10.0  # misfit over readings, a few passes after the beginning, from which no fit comes near
+SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
+PASSES = 14  # of a fit that goes on from another
+LESS = 0.1, 0.3  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
+SMALL = LESS[0] * smoothing.DISTURBED[0]  # the smallest that are tried
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Logs made ready for a model: chart, records, first guesses, parameters that they don't show."""
+
+    c: Chart
+    logs: tuple[Log, ...]
+    records: tuple[Record, ...]
+    starts: tuple[Point, ...]
+    held: np.ndarray
+
+    @property
+    def readings(self) -> float:
+        """How many readings the logs have: what twice the negative log-likelihood of a right model is about."""
+        return float(sum(r.used.sum() for r in self.records))
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A model with the effects found so far, fitted. `exact`: without disturbing forces. Not `settled`: no fit was
+    found, parameters are the file's. loose: the same model with the larger disturbing forces that
+    this fit came from, if it did."""
+
+    machine: Machine
+    prepared: Prepared
+    fit: Fit
+    settled: bool = True
+    loose: Stage | None = None
+
+    @property
+    def model(self) -> Model:
+        return self.prepared.c.model
+
+    @property
+    def exact(self) -> bool:
+        return self.fit.disturbed == 0
+
+    @property
+    def excess(self) -> float:
+        """How much more misfit there is than noise may make."""
+        return max(0.0, self.fit.cost - (1 + SLACK) * self.prepared.readings)
+
+    @property
+    def near(self) -> bool:
+        """Whether the misfit is not far from what noise makes."""
+        return self.fit.cost <= STRONG * self.prepared.readings
+
+    @property
+    def spread(self) -> float:
+        """How many times less sure gains are than without what is left of the misfit."""
+        return max(1.0, self.fit.cost / self.prepared.readings)
+
+    @property
+    def rough(self) -> bool:
+        """Whether first-order gains are."""
+        return not self.exact or not self.near
+
+    @property
+    def doubt(self) -> float:
+        """How much larger deviations are than the fit has them, for what it leaves unexplained: slow innovations."""
+        sizes = np.concatenate([innovation_sizes(linear) for linear in self.fit.linear])
+        told = sizes[:, 2] > 0
+        return float(np.sqrt(max(1.0, sizes[told, 1].mean()))) if told.any() else 1.0
+
+    @property
+    def suspects(self) -> list[str]:
+        return smoothing.suspects(self.prepared.c, self.prepared.logs, self.fit)
+
+
+Fits = tuple[Fit, Fit | None]  # of a stage and of the one with larger disturbing forces that it came from, if it did
+
+
+def _stage(machine: Machine, prepared: Prepared, fits: Fits) -> Stage:
+    fit, loose = fits
+    return Stage(machine, prepared, fit, loose=None if loose is None else Stage(machine, prepared, loose))
+
+
+def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
+    """A machine's model fitted to logs, with shapes of effects free.
+
+    Where exact dynamics find no estimate, with disturbing forces as small as the log lets them be: the less they may
+    take up, the plainer the cause. Where not even large ones let the model follow, with the file's parameters: what
+    these leave shows where to look. Raises NotConverged where those don't either.
+    """
+    prepared = _prepared(machine, logs, filter)
+    exact = _from_first(prepared, 0.0)
+    if exact is not None:
+        return Stage(machine, prepared, exact)
+    found = next((fits for d in smoothing.DISTURBED if (fits := _freed(machine, prepared, d))), None)
+    if found is not None:
+        return _stage(machine, prepared, found)
+    asis = replace(prepared, held=np.ones_like(prepared.held))
+    try:
+        fit = _iterated(asis, prepared.starts, prepared.c.model.nominal, smoothing.DISTURBED[0])
+    except NotConverged as failed:
+        if failed.fit is None:
+            raise
+        fit = failed.fit
+    unknown = np.full_like(fit.covariance, np.nan)
+    return Stage(machine, prepared, light(replace(fit, unseen=prepared.held, covariance=unknown)), settled=False)
+
+
+def begun(machines: Sequence[Machine], of: Stage, disturbed: float, together: Together) -> Iterator[Stage | None]:
+    """Machines with other effects, each fitted to the logs of a stage from the beginning, with so large disturbing
+    forces or smaller ones, side by side; None where no fit is found. Where exact dynamics leave much, with small
+    disturbing forces after all."""
+    prepared = [_resumed(machine, of) for machine in machines]
+    fit = _freed if disturbed > 0 else _near
+    calls = [partial(fit, m, p, disturbed) for m, p in zip(machines, prepared, strict=True)]
+    for m, p, fits in zip(machines, prepared, together(calls), strict=True):
+        yield _stage(m, p, fits) if fits else None
+
+
+def _from_first(prepared: Prepared, disturbed: float, most: float = np.inf) -> Fit | None:
+    """A fit from first guesses; None where none is found, or where it still costs more than `most` after a while."""
+    try:
+        return light(_iterated(prepared, prepared.starts, prepared.c.model.nominal, disturbed, most=most))
+    except NotConverged as failed:
+        return light(failed.nearly) if failed.nearly is not None and disturbed > 0 else None
+
+
+def _freed(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
+    """A fit from first guesses with disturbing forces, and from there with smaller ones."""
+    fit = _from_first(prepared, disturbed)
+    if fit is None:
+        return None
+    stage = Stage(machine, prepared, fit)
+    for less in LESS:
+        try:
+            return refitted(machine, stage, less * disturbed).fit, fit
+        except NotConverged:
+            continue
+    return fit, None
+
+
+def _near(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
+    """The same, with small disturbing forces where much is left."""
+    fit = _from_first(prepared, disturbed, FAR * prepared.readings)
+    if fit is None:
+        return None
+    stage = Stage(machine, prepared, fit)
+    if stage.near:
+        return fit, None
+    try:
+        return refitted(machine, stage, SMALL).fit, None
+    except NotConverged:
+        return fit, None
+
+
+def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
+    """The model of a machine with other effects fitted to the logs of a stage, from its fit, with so large disturbing
+    forces. Raises NotConverged."""
+    prepared = _resumed(machine, of)
+    return Stage(machine, prepared, _resume(prepared, of, disturbed))
+
+
+Wish = tuple[Machine, Stage, float]  # what `refitted` is called with
+
+
+def refits(wishes: Sequence[Wish], together: Together) -> Iterator[Stage | None]:
+    """Several refitted, side by side; None where no fit is found."""
+    prepared = [_resumed(machine, of) for machine, of, _ in wishes]
+    calls = [partial(_resumable, p, of, disturbed) for p, (_, of, disturbed) in zip(prepared, wishes, strict=True)]
+    for p, (machine, _, _), fit in zip(prepared, wishes, together(calls), strict=True):
+        yield None if fit is None else Stage(machine, p, fit)
+
+
+def _resumable(prepared: Prepared, of: Stage, disturbed: float) -> Fit | None:
+    try:
+        return _resume(prepared, of, disturbed)
+    except NotConverged:
+        return None
+
+
+def _resume(prepared: Prepared, of: Stage, disturbed: float) -> Fit:
+    """The fit of a stage gone on with, for logs made ready for another model. Raises NotConverged."""
+    c = prepared.c
+    old = dict(zip(of.model.base.names, of.fit.X, strict=True))
+    X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, c.model.nominal, strict=True)])
+    points = [carried(c, r, p, of.prepared.c, X) for r, p in zip(prepared.records, of.fit.points, strict=True)]
+    try:
+        fit = _iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES)
+    except NotConverged as failed:
+        if failed.nearly is None:
+            raise
+        fit = failed.nearly
+    return light(fit)
+
+
+def _iterated(
+    prepared: Prepared,
+    points: Sequence[Point],
+    X: np.ndarray,
+    disturbed: float,
+    damping: float = newton.DAMPING[0],
+    passes: int = newton.PASSES,
+    most: float = np.inf,
+) -> Fit:
+    """A fit from points and X. With disturbing forces it is found as soon as it is nearly: gains are larger by far than
+    what another pass would change. Raises NotConverged."""
+    p = prepared
+    return newton.iterate(p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, newton.NEARLY, most)
+
+
+def light(fit: Fit) -> Fit:
+    """A fit without what only its own iteration needs."""
+    return replace(fit, linear=tuple(replace(x, solved=x.solved.closed) for x in fit.linear))
+
+
+def _charted(machine: Machine, logs: Sequence[Log]) -> Chart:
+    model = build(machine, shapes=True)
+    return chart(model, common_sensors(model, logs))
+
+
+def _prepared(machine: Machine, logs: Sequence[Log], filter: Filter) -> Prepared:
+    c = _charted(machine, logs)
+    records = tuple(record(c, log) for log in logs)
+    starts = tuple(first_point(c, r, log, filter) for r, log in zip(records, logs, strict=True))
+    return Prepared(c, tuple(logs), records, starts, hidden.unmoved(c.model, logs, filter, slow=False))
+
+
+def _resumed(machine: Machine, of: Stage) -> Prepared:
+    """The logs of a stage made ready for a machine with other effects."""
+    before = of.prepared
+    if machine is of.machine:
+        return before
+    c = _charted(machine, before.logs)
+    model = c.model
+    records = tuple(replace(r, origin=origins(c, r.counts)) for r in before.records)
+    starts = tuple(carried(c, r, p, before.c, model.nominal) for r, p in zip(records, before.starts, strict=True))
+    held = dict(zip(of.model.base.names, before.held, strict=True))
+    return Prepared(c, before.logs, records, starts, np.array([held.get(n, False) for n in model.base.names]))
