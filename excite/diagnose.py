@@ -20,7 +20,7 @@ from excite.anomaly import anomalies
 from excite.log import Log
 from excite.newton import NotConverged
 from excite.sidebyside import Together, in_turn
-from excite.stages import Stage, fitted, refits, refitted
+from excite.stages import Stage, fitted, freed, refits, refitted
 from model import effects
 from model.file import Quantity
 from model.machine import EffectEntry, Filter
@@ -112,7 +112,7 @@ def diagnose(
     tell = advance or (lambda share, what: None)
     tell(0.0, "fitting the model")
     before = fitted(model.machine, logs, filter)
-    chosen, first, left = list[Choice](), tuple[evidence.Score, ...](), 0.0
+    chosen, first, left, unnamed = list[Choice](), tuple[evidence.Score, ...](), 0.0, 0.0
     if not before.settled:
         tell(0.15, "fitting effects from the beginning")
         first = _scores(before)
@@ -124,12 +124,13 @@ def diagnose(
         scores = _scores(stage)
         first = first or scores
         choice = _choose(stage, scores, chosen, together, tell, 0.2 + 0.2 * turn)
-        if choice is None or _makes_good(choice, chosen):
+        if choice is None or _makes_good(choice, chosen) or _outgrows(choice, chosen):
             left = max(0.0, scores[0].gain - LEVEL) if scores else 0.0
+            unnamed = choice.gain if choice is not None and _outgrows(choice, chosen) else 0.0
             break
         chosen.append(choice)
         stage = choice.stage
-    chosen, odd, nearest = weighed(before, chosen)
+    chosen, odd, nearest = weighed(before, chosen, unnamed)
     if len(chosen) > 1:
         tell(0.9, "judging each given the others")
         chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
@@ -138,10 +139,13 @@ def diagnose(
     return answer if answer.findings else replace(answer, nearest=nearest)
 
 
-def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tuple[str, ...], tuple[str, float] | None]:
+def weighed(
+    before: Stage, chosen: Sequence[Choice], unnamed: float = 0.0
+) -> tuple[list[Choice], tuple[str, ...], tuple[str, float] | None]:
     """Effects without the last ones that are no names: one that leaves most of the misfit where it was is none, unless
     with what came after it nothing is left, or with the disturbing forces that it was judged with. Also what is odd
-    beside those that stay, and the last one that doesn't, with the share that it explains."""
+    beside those that stay, and the last one that doesn't, with the share that it explains. unnamed: what another effect
+    gains beside the last one that forces make good for."""
     kept, nearest = list(chosen), None
     while True:
         stage = kept[-1].stage if kept else before
@@ -149,16 +153,17 @@ def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tupl
         if not kept or (stage.exact and not odd):
             break
         enough = SHARE if len(kept) == 1 else FURTHER
-        explained = kept[-1].share(stage)
+        explained = kept[-1].share(stage, unnamed)
         if explained >= enough:
             break
         loose = kept[-1].loose
-        if loose is not None and kept[-1].share(loose) >= enough:
+        if loose is not None and kept[-1].share(loose, unnamed) >= enough:
             # Exact dynamics make a large misfit of a formula that is nearly right; it was judged with forces.
             kept[-1] = replace(kept[-1], stage=loose)
             odd = _odd(loose)
             break
-        nearest = kept.pop().name, explained
+        nearest = kept[-1].name, explained
+        unnamed += kept.pop().gain
     return kept, odd, nearest
 
 
@@ -220,7 +225,7 @@ def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
             kept, whole = [y for y in kept if y.name != x.name], without
     if len(kept) == len(chosen):
         return kept
-    return _one_by_one(before, kept, whole) or list(chosen)
+    return _one_by_one(before, kept, whole) or [replace(x, stage=whole, loose=None) for x in kept]
 
 
 def _surely(name: str, stage: Stage) -> bool:
@@ -239,6 +244,12 @@ def _makes_good(choice: Choice, chosen: Sequence[Choice]) -> bool:
     """Whether a choice takes the place of an effect that explains more: then it is but a piece of another explanation,
     which needs several names for what one explains."""
     return any(choice.gain < x.gain and not _surely(x.name, choice.stage) for x in chosen)
+
+
+def _outgrows(choice: Choice, chosen: Sequence[Choice]) -> bool:
+    """Whether a choice gains more, under disturbing forces, than all that came before it: then these forces hide how
+    little the first ones explain, and one after the other would get a name."""
+    return bool(chosen) and not choice.stage.exact and choice.gain > sum(x.gain for x in chosen)
 
 
 def _others(choice: Choice, found: Container[str]) -> tuple[EffectEntry, ...]:
@@ -293,9 +304,9 @@ class Choice:
     left: float
     loose: Stage | None = None
 
-    def share(self, stage: Stage) -> float:
-        """Of the misfit, how much the effect explains, by what is left of it in a stage."""
-        return self.gain / (self.gain + stage.excess)
+    def share(self, stage: Stage, unnamed: float = 0.0) -> float:
+        """Of the misfit, how much the effect explains, by what is left of it in a stage, or known to be."""
+        return self.gain / (self.gain + max(stage.excess, unnamed))
 
 
 def _duration(logs: Sequence[Log]) -> float:
@@ -477,8 +488,8 @@ def _without_forces(tries: Sequence[_Try], together: Together) -> list[_Try]:
     """Those that need no disturbing forces any more, best first; all, best first as they are, where none does."""
     # What forces don't make good, none makes worse.
     good = [x for x in tries if x[1].exact or x[1].near]
-    freed = refits([(s.machine, s, 0.0) for _, s in good if not s.exact], together)
-    stages = [s if s.exact else next(freed) for _, s in good]
+    without = freed([s for _, s in good if not s.exact], together)
+    stages = [s if s.exact else next(without) for _, s in good]
     exact = [(score, s) for (score, _), s in zip(good, stages, strict=True) if s is not None]
     return sorted(exact, key=lambda x: x[1].fit.cost) or list(tries)
 

@@ -17,8 +17,9 @@ from excite.estimate import NoEstimate
 from excite.innovations import Linear
 from excite.linearise import BATCH, Chart, advance, differentiate
 from excite.record import Point, Record, one_count, readings
+from model.prediction import Model
 
-PRIOR = 3.0  # standard deviation of a parameter before any data, in its scale
+PRIOR = 3.0  # standard deviation of a parameter before any data, in its scale; of one that is further off, its size
 PASSES = 15  # at most
 UNSEEN = 1.0  # a parameter that a log tells less than this well, in its scale, stays at the machine file's value
 HELD = 1e-6  # standard deviation of such a parameter, in its scale
@@ -60,12 +61,14 @@ class NotConverged(NoEstimate):
 
 @dataclass(frozen=True)
 class Fit:
-    """Base parameters X (n_base,), their covariance, which were held because nothing shows them, and the trajectories
-    of the logs; twice the negative log-likelihood `cost`, and the disturbing forces in units of DISTURBANCE."""
+    """Base parameters X (n_base,), their covariance, which were held because nothing shows them, the prior information
+    about the machine file's values (n_base,), and the trajectories of the logs; twice the negative log-likelihood
+    `cost`, and the disturbing forces in units of DISTURBANCE."""
 
     X: np.ndarray
     covariance: np.ndarray
     unseen: np.ndarray
+    prior: np.ndarray
     points: tuple[Point, ...]
     linear: tuple[Linear, ...]
     cost: float
@@ -75,14 +78,13 @@ class Fit:
     def std(self) -> np.ndarray:
         return np.sqrt(np.diag(self.covariance))
 
-    @property
-    def prior(self) -> np.ndarray:
-        """Information (n_base,) about the machine file's values that stands before any data."""
-        return _prior(self.unseen)
 
-
-def _prior(held: np.ndarray) -> np.ndarray:
-    return np.where(held, HELD**-2, PRIOR**-2)
+def prior(model: Model, held: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """Information (n_base,) about the machine file's values that stands before any data, where parameters are X. A file
+    that is far off must not pull: its error would be evidence of another cause. Effects have no such values."""
+    added = {name for e in model.effects for name in e.parameters}
+    own = np.array([n not in added for n in model.base.names])
+    return np.where(held, HELD**-2, np.maximum(own * np.abs(X) / model.scale, PRIOR) ** -2)
 
 
 def linearise(
@@ -212,7 +214,6 @@ def iterate(
     shorter, here = 0, (list(points), X)
     there = here
     whole, last = 1.0, np.zeros(len(X))
-    prior = _prior(held)
     unseen = held.copy()
     for k in range(passes):
         linear = linearised(c, records, there[0], starts, there[1], disturbed)
@@ -225,15 +226,16 @@ def iterate(
             continue
         here, shorter = there, 0
         points, X = here
-        covariance, move, left, cost = newton_step(c, records, linear, points, X, prior, damping)
+        known = prior(model, unseen, X)
+        covariance, move, left, cost = newton_step(c, records, linear, points, X, known, damping)
         if k == SETTLED:
             # Against the estimate as well: a file's value that is far too small must not make a parameter unseen.
             sigma = np.sqrt(np.diag(covariance))[: len(X)]
             unseen |= sigma > UNSEEN * np.maximum(np.abs(X) / model.scale, 1.0)
             if unseen.any():
                 # Left free they would go anywhere, and take the mass matrix and the slips with them.
-                prior = _prior(unseen)
-                covariance, move, left, cost = newton_step(c, records, linear, points, X, prior, damping)
+                known = prior(model, unseen, X)
+                covariance, move, left, cost = newton_step(c, records, linear, points, X, known, damping)
         damping *= DAMPING[1]
         before, step = step, left
         sizes.append(step)
@@ -264,10 +266,10 @@ def iterate(
         # What this step will have left undone, if steps go on shrinking as they do.
         ratio = min(max(step / before, 1 - whole), 0.9)
         if (step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED) or (disturbed > 0 and step < enough):
-            return Fit(there[1], in_si(c, covariance), unseen, tuple(there[0]), tuple(linear), cost, disturbed)
+            return Fit(there[1], in_si(c, covariance), unseen, known, tuple(there[0]), tuple(linear), cost, disturbed)
     stood = None
     if linear is not None:
-        stood = Fit(X, in_si(c, covariance), unseen, tuple(points), tuple(linear), cost, disturbed)
+        stood = Fit(X, in_si(c, covariance), unseen, known, tuple(points), tuple(linear), cost, disturbed)
     raise NotConverged(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
         " log with `excite diagnose`, or start from better values in the machine file",

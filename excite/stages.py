@@ -19,7 +19,7 @@ from excite.linearise import Chart, chart
 from excite.log import Log
 from excite.newton import Fit, NotConverged
 from excite.record import Point, Record, carried, common_sensors, first_point, origins, record
-from excite.sidebyside import Together
+from excite.sidebyside import Together, in_turn
 from model.machine import Filter, Machine
 from model.prediction import Model, build
 
@@ -110,17 +110,18 @@ def _stage(machine: Machine, prepared: Prepared, fits: Fits) -> Stage:
 def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
     """A machine's model fitted to logs, with shapes of effects free.
 
-    Where exact dynamics find no estimate, with disturbing forces as small as the log lets them be: the less they may
-    take up, the plainer the cause. Where not even large ones let the model follow, with the file's parameters: what
-    these leave shows where to look. Raises NotConverged where those don't either.
+    Where exact dynamics find no estimate, not even from one with disturbing forces, with such forces as small as the
+    log lets them be: the less they may take up, the plainer the cause. Where not even large ones let the model follow,
+    with the file's parameters: what these leave shows where to look. Raises NotConverged where those don't either.
     """
     prepared = _prepared(machine, logs, filter)
     exact = _from_first(prepared, 0.0)
     if exact is not None:
         return Stage(machine, prepared, exact)
-    found = next((fits for d in smoothing.DISTURBED if (fits := _freed(machine, prepared, d))), None)
+    found = next((fits for d in smoothing.DISTURBED if (fits := _loosened(machine, prepared, d))), None)
     if found is not None:
-        return _stage(machine, prepared, found)
+        stage = _stage(machine, prepared, found)
+        return next(freed([stage], in_turn)) or stage
     asis = replace(prepared, held=np.ones_like(prepared.held))
     try:
         fit = _iterated(asis, prepared.starts, prepared.c.model.nominal, smoothing.DISTURBED[0])
@@ -129,7 +130,9 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
             raise
         fit = failed.fit
     unknown = np.full_like(fit.covariance, np.nan)
-    return Stage(machine, prepared, light(replace(fit, unseen=prepared.held, covariance=unknown)), settled=False)
+    known = newton.prior(prepared.c.model, prepared.held, fit.X)
+    fit = replace(fit, unseen=prepared.held, prior=known, covariance=unknown)
+    return Stage(machine, prepared, light(fit), settled=False)
 
 
 def begun(machines: Sequence[Machine], of: Stage, disturbed: float, together: Together) -> Iterator[Stage | None]:
@@ -137,7 +140,7 @@ def begun(machines: Sequence[Machine], of: Stage, disturbed: float, together: To
     forces or smaller ones, side by side; None where no fit is found. Where exact dynamics leave much, with small
     disturbing forces after all."""
     prepared = [_resumed(machine, of) for machine in machines]
-    fit = _freed if disturbed > 0 else _near
+    fit = _loosened if disturbed > 0 else _plain
     calls = [partial(fit, m, p, disturbed) for m, p in zip(machines, prepared, strict=True)]
     for m, p, fits in zip(machines, prepared, together(calls), strict=True):
         yield _stage(m, p, fits) if fits else None
@@ -151,7 +154,7 @@ def _from_first(prepared: Prepared, disturbed: float, most: float = np.inf) -> F
         return light(failed.nearly) if failed.nearly is not None and disturbed > 0 else None
 
 
-def _freed(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
+def _loosened(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
     """A fit from first guesses with disturbing forces, and from there with smaller ones."""
     fit = _from_first(prepared, disturbed)
     if fit is None:
@@ -159,22 +162,20 @@ def _freed(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | Non
     stage = Stage(machine, prepared, fit)
     for less in LESS:
         try:
-            return refitted(machine, stage, less * disturbed).fit, fit
+            return _resume(prepared, stage, less * disturbed), fit
         except NotConverged:
             continue
     return fit, None
 
 
-def _near(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
+def _plain(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
     """The same, with small disturbing forces where much is left."""
     fit = _from_first(prepared, disturbed, FAR * prepared.readings)
     if fit is None:
         return None
     stage = Stage(machine, prepared, fit)
-    if stage.near:
-        return fit, None
     try:
-        return refitted(machine, stage, SMALL).fit, None
+        return (fit if stage.near else _resume(prepared, stage, SMALL)), None
     except NotConverged:
         return fit, None
 
@@ -197,6 +198,21 @@ def refits(wishes: Sequence[Wish], together: Together) -> Iterator[Stage | None]
         yield None if fit is None else Stage(machine, p, fit)
 
 
+def freed(found: Sequence[Stage], together: Together) -> Iterator[Stage | None]:
+    """Stages without their disturbing forces, side by side; None where exact dynamics don't come near the logs: they
+    make a large misfit of a formula that is nearly right."""
+    for stage, fit in zip(found, together([partial(_exact, x) for x in found]), strict=True):
+        yield None if fit is None else replace(stage, fit=fit, loose=None)
+
+
+def _exact(stage: Stage) -> Fit | None:
+    try:
+        fit = _resume(stage.prepared, stage, 0.0, STRONG * stage.prepared.readings)
+    except NotConverged:
+        return None
+    return fit if replace(stage, fit=fit).near else None
+
+
 def _resumable(prepared: Prepared, of: Stage, disturbed: float) -> Fit | None:
     try:
         return _resume(prepared, of, disturbed)
@@ -204,14 +220,14 @@ def _resumable(prepared: Prepared, of: Stage, disturbed: float) -> Fit | None:
         return None
 
 
-def _resume(prepared: Prepared, of: Stage, disturbed: float) -> Fit:
+def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.inf) -> Fit:
     """The fit of a stage gone on with, for logs made ready for another model. Raises NotConverged."""
     c = prepared.c
     old = dict(zip(of.model.base.names, of.fit.X, strict=True))
     X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, c.model.nominal, strict=True)])
     points = [carried(c, r, p, of.prepared.c, X) for r, p in zip(prepared.records, of.fit.points, strict=True)]
     try:
-        fit = _iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES)
+        fit = _iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES, most)
     except NotConverged as failed:
         if failed.nearly is None:
             raise
