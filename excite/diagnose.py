@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from excite import evidence, smoothing, stages
+from excite import evidence, smoothing
 from excite.anomaly import anomalies
 from excite.log import Log
 from excite.newton import NotConverged
 from excite.sidebyside import Together, in_turn
-from excite.stages import Stage, fitted, freed, refits, refitted
+from excite.stages import SMALL, Stage, begun, fitted, freed, refits, refitted
 from model import effects
 from model.file import Quantity
 from model.machine import EffectEntry, Filter
@@ -112,11 +112,11 @@ def diagnose(
     tell = advance or (lambda share, what: None)
     tell(0.0, "fitting the model")
     before = fitted(model.machine, logs, filter)
-    chosen, first, left, unnamed = list[Choice](), tuple[evidence.Score, ...](), 0.0, 0.0
+    chosen, first, left = list[Choice](), tuple[evidence.Score, ...](), 0.0
     if not before.settled:
         tell(0.15, "fitting effects from the beginning")
         first = _scores(before)
-        before, chosen = begun(before, first, together)
+        before, chosen = _unfollowed(before, first, together)
     stage = chosen[-1].stage if chosen else before
     while stage.settled and len(chosen) < MOST:
         turn = len(chosen)
@@ -124,13 +124,15 @@ def diagnose(
         scores = _scores(stage)
         first = first or scores
         choice = _choose(stage, scores, chosen, together, tell, 0.2 + 0.2 * turn)
-        if choice is None or _makes_good(choice, chosen) or _outgrows(choice, chosen):
+        if choice is not None and before.settled and _outgrows(choice, chosen):
+            chosen = []
+            break
+        if choice is None or _makes_good(choice, chosen):
             left = max(0.0, scores[0].gain - LEVEL) if scores else 0.0
-            unnamed = choice.gain if choice is not None and _outgrows(choice, chosen) else 0.0
             break
         chosen.append(choice)
         stage = choice.stage
-    chosen, odd, nearest = weighed(before, chosen, unnamed)
+    chosen, odd, nearest = weighed(before, chosen)
     if len(chosen) > 1:
         tell(0.9, "judging each given the others")
         chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
@@ -139,13 +141,10 @@ def diagnose(
     return answer if answer.findings else replace(answer, nearest=nearest)
 
 
-def weighed(
-    before: Stage, chosen: Sequence[Choice], unnamed: float = 0.0
-) -> tuple[list[Choice], tuple[str, ...], tuple[str, float] | None]:
+def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tuple[str, ...], tuple[str, float] | None]:
     """Effects without the last ones that are no names: one that leaves most of the misfit where it was is none, unless
     with what came after it nothing is left, or with the disturbing forces that it was judged with. Also what is odd
-    beside those that stay, and the last one that doesn't, with the share that it explains. unnamed: what another effect
-    gains beside the last one that forces make good for."""
+    beside those that stay, and the last one that doesn't, with the share that it explains."""
     kept, nearest = list(chosen), None
     while True:
         stage = kept[-1].stage if kept else before
@@ -153,17 +152,16 @@ def weighed(
         if not kept or (stage.exact and not odd):
             break
         enough = SHARE if len(kept) == 1 else FURTHER
-        explained = kept[-1].share(stage, unnamed)
+        explained = kept[-1].share(stage)
         if explained >= enough:
             break
         loose = kept[-1].loose
-        if loose is not None and kept[-1].share(loose, unnamed) >= enough:
+        if loose is not None and kept[-1].share(loose) >= enough:
             # Exact dynamics make a large misfit of a formula that is nearly right; it was judged with forces.
             kept[-1] = replace(kept[-1], stage=loose)
             odd = _odd(loose)
             break
-        nearest = kept[-1].name, explained
-        unnamed += kept.pop().gain
+        nearest = kept.pop().name, explained
     return kept, odd, nearest
 
 
@@ -195,17 +193,18 @@ def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_tu
 def _one_by_one(before: Stage, chosen: Sequence[Choice], whole: Stage) -> list[Choice]:
     """Effects that a model has, put into the one without them one after the other; gains are over those that stand
     before. None of them where the logs can't be fitted on the way."""
-    stages = [before]
+    made = [before]
     try:
         for x in chosen:
-            machine = effects.extended(stages[-1].machine, _fitted(whole, x.name))
-            stages.append(refitted(machine, stages[-1], before.fit.disturbed))
-        stages[-1] = stages[-1] if whole.fit.disturbed == before.fit.disturbed else whole
+            machine = effects.extended(made[-1].machine, _fitted(whole, x.name))
+            made.append(refitted(machine, made[-1], before.fit.disturbed))
+        made[-1] = made[-1] if whole.fit.disturbed == before.fit.disturbed else whole
     except NotConverged:
         return []
     found = []
-    for x, old, new in zip(chosen, stages, stages[1:], strict=False):
-        gain = old.fit.cost - new.fit.cost if old.fit.disturbed == new.fit.disturbed else x.gain
+    for x, old, new in zip(chosen, made, made[1:], strict=False):
+        alike = old.settled and old.fit.disturbed == new.fit.disturbed
+        gain = old.fit.cost - new.fit.cost if alike else x.gain
         found.append(replace(x, stage=new, gain=max(gain, x.gain), loose=None))
     return found
 
@@ -230,14 +229,19 @@ def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
 
 def _surely(name: str, stage: Stage) -> bool:
     """Whether an effect's amount is surely any in a fit; one that is nothing at infinity is taken for sure."""
-    placed = next(e for e in stage.model.effects if e.name == name)
-    return placed.effect.inverse or _wald(name, stage) > LEVEL
+    return stage.placed(name).effect.inverse or _wald(name, stage) > LEVEL
 
 
 def _wald(name: str, stage: Stage) -> float:
-    """By how many deviations an effect's amount is from none in a fit, squared (Wald's statistic)."""
-    k = stage.model.base.names.index(name)
-    return float((stage.fit.X[k] / stage.fit.std[k]) ** 2)
+    """By how many deviations an effect's amount is from none in a fit, squared (Wald's statistic); 0 of one that was
+    held, as nothing shows it."""
+    k, fit = stage.model.base.names.index(name), stage.fit
+    return 0.0 if fit.unseen[k] else float((fit.X[k] / fit.std[k]) ** 2)
+
+
+def _sureness(stage: Stage) -> float:
+    """Wald's statistic of all the amounts in a model together."""
+    return sum(_wald(e.name, stage) for e in stage.model.effects if not e.effect.inverse)
 
 
 def _makes_good(choice: Choice, chosen: Sequence[Choice]) -> bool:
@@ -248,7 +252,7 @@ def _makes_good(choice: Choice, chosen: Sequence[Choice]) -> bool:
 
 def _outgrows(choice: Choice, chosen: Sequence[Choice]) -> bool:
     """Whether a choice gains more, under disturbing forces, than all that came before it: then these forces hide how
-    little the first ones explain, and one after the other would get a name."""
+    little the first ones explain, and one after the other would get a name. None has one then."""
     return bool(chosen) and not choice.stage.exact and choice.gain > sum(x.gain for x in chosen)
 
 
@@ -264,7 +268,7 @@ def _without(name: str, stage: Stage) -> Stage:
     try:
         return refitted(machine, stage, stage.fit.disturbed)
     except NotConverged:
-        return refitted(machine, stage, max(stage.fit.disturbed, stages.SMALL))
+        return refitted(machine, stage, max(stage.fit.disturbed, SMALL))
 
 
 def _scores(stage: Stage) -> tuple[evidence.Score, ...]:
@@ -275,7 +279,7 @@ def _scores(stage: Stage) -> tuple[evidence.Score, ...]:
 
 
 def _scanned(stage: Stage, found: Sequence[evidence.Candidate]) -> tuple[evidence.Score, ...]:
-    return evidence.scan(stage.prepared.c, stage.prepared.records, stage.fit, found).scores
+    return evidence.scan(stage.prepared.c, stage.prepared.records, stage.fit, found)
 
 
 def _odd(stage: Stage) -> tuple[str, ...]:
@@ -290,10 +294,12 @@ def _odd(stage: Stage) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Choice:
-    """An effect that was added, the model with it, and the rivals that the log likes about as well. gain: of twice the
-    log-likelihood, which what is left of the misfit makes `spread` times less sure. left: the share of the effect that
-    parameters don't absorb. loose: the model with it and the disturbing forces that it was judged with, where it needs
-    none."""
+    """An effect that was added, the model with it, and the rivals that the log likes about as well.
+
+    gain: of twice the log-likelihood (Wald's statistic where no model without it could be fitted), which what is left
+    of the misfit makes `spread` times less sure. left: the share of the effect that parameters don't absorb. loose: the
+    model with it and the disturbing forces that it was judged with, where it needs none.
+    """
 
     name: str
     stage: Stage
@@ -304,9 +310,9 @@ class Choice:
     left: float
     loose: Stage | None = None
 
-    def share(self, stage: Stage, unnamed: float = 0.0) -> float:
-        """Of the misfit, how much the effect explains, by what is left of it in a stage, or known to be."""
-        return self.gain / (self.gain + max(stage.excess, unnamed))
+    def share(self, stage: Stage) -> float:
+        """Of the misfit, how much the effect explains, by what is left of it in a stage."""
+        return self.gain / (self.gain + stage.excess)
 
 
 def _duration(logs: Sequence[Log]) -> float:
@@ -326,7 +332,7 @@ def _entry(score: evidence.Score) -> EffectEntry:
 
 def _fitted(stage: Stage, name: str) -> EffectEntry:
     """An effect with amount and shapes as a stage's fit has them."""
-    placed = next(e for e in stage.model.effects if e.name == name)
+    placed = stage.placed(name)
     fitted = dict(zip(stage.model.base.names, stage.fit.X, strict=True))
     values = {key: float(fitted.get(p, placed.values[key])) for p, (key, _) in placed.parameters.items()}
     return _identified(placed.effect.name, placed.where, values.pop("A"), values)
@@ -357,11 +363,6 @@ def _shortlist(stage: Stage, scores: Sequence[evidence.Score], chosen: Sequence[
 _Try = tuple[evidence.Score, Stage]
 
 
-def _sureness(stage: Stage) -> float:
-    """The same of all the amounts in a model together."""
-    return sum(_wald(e.name, stage) for e in stage.model.effects if not e.effect.inverse)
-
-
 def _likely(stage: Stage, scores: Sequence[evidence.Score], chosen: Sequence[Choice]) -> list[evidence.Score]:
     """What is worth a fit, with shapes between the grid's points."""
     likely = _shortlist(stage, scores, chosen)
@@ -388,7 +389,7 @@ def _choose(
     if stage.exact and likely[0].candidate.name not in {s.candidate.name for s, _ in tries}:
         # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
         try:
-            stage = refitted(stage.machine, stage, stages.SMALL)
+            stage = refitted(stage.machine, stage, SMALL)
         except NotConverged:
             return None
         found = evidence.renumbered([s.candidate for s in likely])
@@ -416,14 +417,14 @@ def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) 
     return Choice(score.candidate.name, best, gain, spread, tried, rivals, score.left, loose)
 
 
-def begun(stage: Stage, scores: Sequence[evidence.Score], together: Together = in_turn) -> tuple[Stage, list[Choice]]:
+def _unfollowed(stage: Stage, scores: Sequence[evidence.Score], together: Together) -> tuple[Stage, list[Choice]]:
     """Where no fit was found: the effect with which the model can follow the logs, with as small disturbing forces as
     there is one. With it there may be a fit without it after all, which then is what it is compared with, and may be as
     good: the model began too far off. The stage as it was and no effect where nothing helps."""
     likely = _likely(stage, scores, ())
     machines = [effects.extended(stage.machine, _entry(s)) for s in likely]
     for disturbed in (0.0, smoothing.DISTURBED[-1]) if likely else ():
-        found = stages.begun(machines, stage, disturbed, together)
+        found = begun(machines, stage, disturbed, together)
         near = [(s, x) for s, x in zip(likely, found, strict=True) if x is not None and x.near]
         if not near:
             continue
@@ -434,9 +435,9 @@ def begun(stage: Stage, scores: Sequence[evidence.Score], together: Together = i
             stage = refitted(stage.machine, best, best.fit.disturbed)
             gain = stage.fit.cost - best.fit.cost
         except NotConverged:
-            gain = _wald(score.candidate.name, best)
-        if gain < LEVEL:
-            return stage, []
+            gain = _wald(score.candidate.name, best)  # of the same kind, and smaller where much is gained
+        if gain < LEVEL * best.spread:
+            return stage if stage.exact else next(freed([stage], together)) or stage, []
         return stage, [_chosen(_close(tries, gain), gain, len(scores), together)]
     return stage, []
 
@@ -521,7 +522,7 @@ def _finding(choice: Choice, after: Stage, left: float) -> Finding:
     """A choice with amount and shapes as the last fit has them. The amount is as unsure as what is left says of the
     formula: where that is a part of what the effect gains, about half its root is a part of the amount; and never surer
     than another formula of the same effect would leave it."""
-    placed = next(e for e in after.model.effects if e.name == choice.name)
+    placed = after.placed(choice.name)
     std = after.fit.std * after.doubt
     values = dict(zip(after.model.base.names, zip(after.fit.X, std, strict=True), strict=True))
     amount, sure = values[placed.name]

@@ -59,22 +59,13 @@ def _unusual(effect: Effect, values: Mapping[str, float]) -> list[str]:
 class Score:
     """A candidate's evidence: `gain` is how much twice the log-likelihood would rise with it, to first order.
 
-    values: amount and shapes that it would get. direction (C,): its unit signature among the columns, what parameters
-    absorb projected out, whitened by nothing; `left`: the share of the signature that they don't absorb.
+    values: amount and shapes that it would get. left: the share of the signature that parameters don't absorb.
     """
 
     candidate: Candidate
     gain: float
     values: Mapping[str, float]
     left: float
-
-
-@dataclass(frozen=True)
-class Scan:
-    """Scores of all candidates, best first; covariances of their evidence (C, C) in `information`."""
-
-    scores: tuple[Score, ...]
-    information: np.ndarray
 
 
 def candidates(machine: Machine, sensors: Sequence[str], duration: float, known: Sequence[str] = ()) -> list[Candidate]:
@@ -126,24 +117,39 @@ def finer(scores: Sequence[Score], machine: Machine, duration: float, reach: flo
 
 
 def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
-    """Values near those of a candidate: shapes up to two thirds of the way to the next points that are tried."""
-    grids: dict[str, list[float]] = {}
-    if len(placed.effect.grid) > 1:
-        grids["A"] = [placed.values["A"] * f**reach for f in NEARBY]
-    unusual = _unusual(placed.effect, placed.values)
-    alike = [b for b in placed.effect.beside(site) if unusual and _unusual(placed.effect, b) == unusual]
-    for name, shape in placed.effect.shapes.items():
-        points = sorted({b[name] for b in alike} or {g * shape.size(site) for g in shape.grid})
-        if shape.circular or shape.whole or len(points) == 1 or name in unusual:
-            continue
-        value = placed.values[name]
-        k = int(np.argmin(np.abs(np.array(points) - value)))
-        step = points[k] - points[k - 1] if k else points[1] - points[0]
-        below, above = max(points[k] - step, 0.0), points[k + 1] if k + 1 < len(points) else points[k] + step
-        shares = np.array([-2, -1, 0, 1, 2]) / 3 * reach
-        grids[name] = [float(value + x * (value - below if x < 0 else above - value)) for x in shares]
-    every = [dict(zip(grids, values, strict=True)) for values in product(*grids.values())]
-    return [{**placed.values, **values} for values in every if min(values.values(), default=1.0) >= 0]
+    """Values near those of a candidate: shapes up to two thirds of the way to the next points that are tried. What is
+    tried beside the grid are points on a line of shapes that go together."""
+    effect, own = placed.effect, placed.values
+    families: list[list[dict[str, float]]] = []
+    if len(effect.grid) > 1:
+        families.append([{"A": own["A"] * f**reach} for f in NEARBY])
+    unusual = _unusual(effect, own)
+    alike = [b for b in effect.beside(site) if unusual and _unusual(effect, b) == unusual]
+    alike = [b for b in alike if all(b[n] * own[n] > 0 for n in unusual)]
+    if alike:
+        varying = [n for n, s in effect.shapes.items() if not s.whole and len({b[n] for b in alike}) > 1]
+        families.append(_next_to(own, [{n: b[n] for n in varying} for b in alike], reach))
+    for name, shape in effect.shapes.items() if not alike else ():
+        if len(shape.grid) > 1 and not (shape.circular or shape.whole or name in unusual):
+            families.append(_next_to(own, [{name: g * shape.size(site)} for g in shape.grid], reach))
+    every = [{name: x for part in parts for name, x in part.items()} for parts in product(*families)]
+    return [{**own, **values} for values in every if all(x >= 0 for n, x in values.items() if n not in unusual)]
+
+
+def _next_to(own: Mapping[str, float], points: Sequence[Mapping[str, float]], reach: float) -> list[dict[str, float]]:
+    """Values on the way from those of a candidate to the points before and behind the one that is nearest."""
+    names = list(points[0])
+    line = np.array(sorted([p[n] for n in names] for p in points))
+    here = np.array([own[n] for n in names])
+    k = int(np.argmin(np.abs(line - here).sum(axis=1)))
+    step = line[k] - line[k - 1] if k else line[1] - line[0]
+    below, above = line[k] - step, line[k + 1] if k + 1 < len(line) else line[k] + step
+    if len(names) == 1:
+        below = np.maximum(below, 0.0)
+    shares = np.array([-2, -1, 0, 1, 2]) / 3 * reach
+    return [
+        dict(zip(names, map(float, here + x * (here - below if x < 0 else above - here)), strict=True)) for x in shares
+    ]
 
 
 def renumbered(found: Sequence[Candidate]) -> list[Candidate]:
@@ -237,7 +243,7 @@ def remembered(
     return implicit(flow, np.zeros(n_z), np.hstack([q, nu, u, t[:, None]]), float(t[1] - t[0]))
 
 
-def scan(c: Chart, records: Sequence[Record], fit: newton.Fit, found: Sequence[Candidate]) -> Scan:
+def scan(c: Chart, records: Sequence[Record], fit: newton.Fit, found: Sequence[Candidate]) -> tuple[Score, ...]:
     """The score of every candidate along fitted logs, best first."""
     total, n = sum(len(x.columns) for x in found), len(fit.X)
     prior = fit.prior
@@ -259,7 +265,7 @@ def scan(c: Chart, records: Sequence[Record], fit: newton.Fit, found: Sequence[C
     S = Z[own, own] - cross.T @ solved[:, :-1]
     g = Z[own, 0] - cross.T @ solved[:, -1]
     scores = [_score(x, S, g, Z[own, own]) for x in found]
-    return Scan(tuple(sorted((s for s in scores if s is not None), key=lambda s: -s.gain)), S)
+    return tuple(sorted((s for s in scores if s is not None), key=lambda s: -s.gain))
 
 
 def _square(E: np.ndarray) -> np.ndarray:

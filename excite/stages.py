@@ -20,6 +20,7 @@ from excite.log import Log
 from excite.newton import Fit, NotConverged
 from excite.record import Point, Record, carried, common_sensors, first_point, origins, record
 from excite.sidebyside import Together, in_turn
+from model.effect import Placed
 from model.machine import Filter, Machine
 from model.prediction import Model, build
 
@@ -46,6 +47,11 @@ class Prepared:
         """How many readings the logs have: what twice the negative log-likelihood of a right model is about."""
         return float(sum(r.used.sum() for r in self.records))
 
+    @property
+    def strong(self) -> float:
+        """The misfit from which it is strong."""
+        return STRONG * self.readings
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -63,6 +69,10 @@ class Stage:
     def model(self) -> Model:
         return self.prepared.c.model
 
+    def placed(self, name: str) -> Placed:
+        """An effect that the model has."""
+        return next(e for e in self.model.effects if e.name == name)
+
     @property
     def exact(self) -> bool:
         return self.fit.disturbed == 0
@@ -75,7 +85,7 @@ class Stage:
     @property
     def near(self) -> bool:
         """Whether the misfit is not far from what noise makes."""
-        return self.fit.cost <= STRONG * self.prepared.readings
+        return self.fit.cost <= self.prepared.strong
 
     @property
     def spread(self) -> float:
@@ -110,9 +120,10 @@ def _stage(machine: Machine, prepared: Prepared, fits: Fits) -> Stage:
 def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
     """A machine's model fitted to logs, with shapes of effects free.
 
-    Where exact dynamics find no estimate, not even from one with disturbing forces, with such forces as small as the
-    log lets them be: the less they may take up, the plainer the cause. Where not even large ones let the model follow,
-    with the file's parameters: what these leave shows where to look. Raises NotConverged where those don't either.
+    Where exact dynamics find no estimate, nor one near the logs from that with disturbing forces, with such forces as
+    small as the log lets them be: the less they may take up, the plainer the cause. Where not even large ones let the
+    model follow, with the file's parameters: what these leave shows where to look. Raises NotConverged where those
+    don't either.
     """
     prepared = _prepared(machine, logs, filter)
     exact = _from_first(prepared, 0.0)
@@ -140,14 +151,14 @@ def begun(machines: Sequence[Machine], of: Stage, disturbed: float, together: To
     forces or smaller ones, side by side; None where no fit is found. Where exact dynamics leave much, with small
     disturbing forces after all."""
     prepared = [_resumed(machine, of) for machine in machines]
-    fit = _loosened if disturbed > 0 else _plain
-    calls = [partial(fit, m, p, disturbed) for m, p in zip(machines, prepared, strict=True)]
+    made = partial(_loosened, disturbed=disturbed) if disturbed > 0 else _plain
+    calls = [partial(made, m, p) for m, p in zip(machines, prepared, strict=True)]
     for m, p, fits in zip(machines, prepared, together(calls), strict=True):
         yield _stage(m, p, fits) if fits else None
 
 
 def _from_first(prepared: Prepared, disturbed: float, most: float = np.inf) -> Fit | None:
-    """A fit from first guesses; None where none is found, or where it still costs more than `most` after a while."""
+    """A fit from first guesses; None where none is found or it is given up, as it still costs more than `most`."""
     try:
         return light(_iterated(prepared, prepared.starts, prepared.c.model.nominal, disturbed, most=most))
     except NotConverged as failed:
@@ -168,9 +179,9 @@ def _loosened(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | 
     return fit, None
 
 
-def _plain(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
-    """The same, with small disturbing forces where much is left."""
-    fit = _from_first(prepared, disturbed, FAR * prepared.readings)
+def _plain(machine: Machine, prepared: Prepared) -> Fits | None:
+    """A fit from first guesses by exact dynamics, or by small disturbing forces from there where much is left."""
+    fit = _from_first(prepared, 0.0, FAR * prepared.readings)
     if fit is None:
         return None
     stage = Stage(machine, prepared, fit)
@@ -202,12 +213,12 @@ def freed(found: Sequence[Stage], together: Together) -> Iterator[Stage | None]:
     """Stages without their disturbing forces, side by side; None where exact dynamics don't come near the logs: they
     make a large misfit of a formula that is nearly right."""
     for stage, fit in zip(found, together([partial(_exact, x) for x in found]), strict=True):
-        yield None if fit is None else replace(stage, fit=fit, loose=None)
+        yield None if fit is None else replace(stage, fit=fit)
 
 
 def _exact(stage: Stage) -> Fit | None:
     try:
-        fit = _resume(stage.prepared, stage, 0.0, STRONG * stage.prepared.readings)
+        fit = _resume(stage.prepared, stage, 0.0, stage.prepared.strong)
     except NotConverged:
         return None
     return fit if replace(stage, fit=fit).near else None

@@ -208,7 +208,7 @@ def _load_moment(site: Site) -> float:
 def _sliding(site: Site) -> list[dict[str, float]]:
     """A load that slides within a second, at every second, in long logs at MOMENTS: its recoil is short."""
     step = max(1.0, site.duration / MOMENTS)
-    times = [k * step for k in range(1, int(site.duration / step))]
+    times = [k * step for k in range(1, round(site.duration / step))]
     return [{"instant": t, "takes": 0.5, "arm": 0.0, "recoil": 1.0} for t in times]
 
 
@@ -463,7 +463,7 @@ _declare(
         {
             "pass": Shape("m", 15.0, (5.0, 15.0, 50.0)),
             "counted": Shape(
-                "-", 0.0, (0.0,), whole=True, meaning="1: a pass is counted by reversals, each worth 10 m of way"
+                "-", 0.0, (0.0,), whole=True, meaning=f"1: a pass is counted by reversals, each worth {LANE:g} m of way"
             ),
         },
         soil=_compacted,

@@ -85,7 +85,7 @@ def judged(one: Case, kept: Path) -> None:
     try:
         said = ask(seen.log)
         row |= {"error": None, "verdict": said["verdict"], "findings": said["findings"], **asdict(score(one, said))}
-        row |= {f"error_{k}_percent": said[f"error_{k}_percent"] for k in ("before", "after")}
+        row |= {k: said[k] for k in ("error_before_percent", "error_after_percent", "share_explained", "nearest")}
     except RuntimeError as err:
         row |= {"error": str(err), "verdict": None, "findings": [], "outcome": "failed", "named": "failed"}
     row["wall_s"] = time.perf_counter() - begin
