@@ -24,6 +24,7 @@ from model.effect import DURATION, Effect, Shape, Site, one
 from model.file import Record
 from model.machine import Machine
 
+SETS = 8  # shapes that go together, from which not all are told
 HIDDEN = ("__main__",)
 PLAIN = (str, int, float, tuple, type(None))  # defaults that read as they are
 ADDRESS = re.compile(r"<(?:function |bound method |built-in function )?_?(\S+?)(?: object)? at 0x[0-9a-f]+>")
@@ -93,8 +94,9 @@ def effects_page() -> str:
             beside = e.beside(Site(va12, va12.find(first), DURATION))
             lines += _table(
                 "shape | unit | default | looked for at | meaning",
-                (_shape(n, s, [b[n] for b in beside]) for n, s in e.shapes.items()),
+                (_shape(n, s) for n, s in e.shapes.items()),
             )
+            lines += [f"Looked for as well, on va12 in a log of {DURATION:g} s: {_sets(beside)}.", ""] if beside else []
     return _page(*lines)
 
 
@@ -108,13 +110,16 @@ def _amount(e: Effect) -> str:
     return f"Amount {unit}{sign}."
 
 
-def _shape(name: str, shape: Shape, beside: Sequence[float]) -> tuple[str, str, str, str, str]:
-    """A row; beside: values of it that are tried beside its grid, told where they make the effect another one."""
+def _shape(name: str, shape: Shape) -> tuple[str, str, str, str, str]:
     of = "" if shape.size is one else " of the site's size"
     tried = ", ".join(f"{x:.3g}" for x in shape.grid) + of
-    more = sorted({float(f"{x:.3g}") for x in beside} - set(shape.grid)) if shape.signed else []
-    found = "; ".join([tried, *([", ".join(f"{x:.3g}" for x in more)] if more else [])])
-    return name, shape.unit, f"{shape.default:.3g}{of}", found, shape.meaning
+    return name, shape.unit, f"{shape.default:.3g}{of}", tried, shape.meaning
+
+
+def _sets(beside: Sequence[Mapping[str, float]]) -> str:
+    """Shapes that go together; of many the first and the last."""
+    told = ["`" + ",".join(f"{name}={x:.3g}" for name, x in shapes.items()) + "`" for shapes in beside]
+    return "; ".join(told) if len(told) <= SETS else f"{told[0]}; {told[1]}; and so on to {told[-1]}"
 
 
 # ------------------------------------------------------------------------------------------------ files
