@@ -60,10 +60,10 @@ def account(d: Diagnosis, advance: Advance | None = None, together: Together = i
         # Forces that the one needs must be shown for the other too.
         loose_before, loose_after = misfit.loosened((d.before, d.after), together)
         missing = misfit.courses(loose_before), misfit.courses(loose_after)
-    located = misfit.located(d.after) if d.verdict == "unexplained" else ()
-    return Account(
-        d, whole, single, before, after, missing, tuple(dict.fromkeys((*located, *d.located))), separate.run(d)
-    )
+    located = d.located
+    if d.verdict == "unexplained":  # which signals, and how much more than noise there is in them, is in these lines
+        located = (*misfit.located(d.after), *(line for line in d.located if line not in d.after.suspects))
+    return Account(d, whole, single, before, after, missing, tuple(dict.fromkeys(located)), separate.run(d))
 
 
 def summary(a: Account) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 from excite import figures, folder, log, logcheck, objective, tables
 from excite.limit import TOLERANCE
 from excite.page import Picture, Table, report_page
-from excite.terminal import ESTIMATE, likely, rounded
+from excite.terminal import ESTIMATE, likely, rounded, some
 from model import machine as machines
 
 NAME = "report.html"
@@ -339,7 +339,7 @@ def _diagnose(s: Summary) -> Said:
         remarks.append(f"To tell apart what is tied, drive: {s['separating_run']}.")
     if s["separating_drive"]:
         remarks.append(_designed(s["separating_drive"]))
-    remarks += [f"What is left: {line}." for line in s["located"]]
+    remarks += [f"What is left: {line}." for line in some(s["located"])]
     if s["machine_file"]:
         remarks.append(
             f"{s['machine_file']} beside this page is the machine with what was found: `excite design`, `verify`,"

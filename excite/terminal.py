@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 SHOWN = 40  # cells of a study in the terminal
+LINES = 8  # of what is left of a misfit, that are told at once
 PAUSE = 30.0  # s between lines of progress
 TELLING = 10  # runs before the time left can be told
 ESTIMATE = (  # what is told of a parameter: heading, key, digits
@@ -57,6 +58,13 @@ def table(*names: str) -> Any:
     for k, name in enumerate(names):
         table.add_column(name, justify="left" if k == 0 or name == "what it is" else "right")
     return table
+
+
+def some(lines: Sequence[str]) -> list[str]:
+    """The first of many lines, and where the rest is."""
+    if len(lines) <= LINES + 1:
+        return list(lines)
+    return [*lines[:LINES], f"and {len(lines) - LINES} more, in summary.json under `located`"]
 
 
 def rounded(value: object, digits: int = 4) -> str:
@@ -214,7 +222,7 @@ def diagnose_table(summary: dict[str, Any]) -> None:
             *(rounded(row[f"systematic_{k}_percent"], 2) for k in ("before", "after")),
         )
     say(rows)
-    for line in summary["located"]:
+    for line in some(summary["located"]):
         say(line)
     if summary["separating_run"]:
         say(f"to tell them apart, drive: {summary['separating_run']}")
