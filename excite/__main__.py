@@ -22,7 +22,6 @@ from excite.asked import UsageError  # noqa: E402
 
 app = typer.Typer(
     name="excite",
-    help="Designs test drives that make a machine tell you its parameters, verifies them, and identifies from a log.",
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -84,6 +83,23 @@ RunsOption = Annotated[int, typer.Option("--runs", min=1, help="simulated test d
 
 
 INTERRUPTED = 130  # exit code of Ctrl-C, as shells have it
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        terminal.say(f"excite {version('excite')}")
+        raise typer.Exit
+
+
+@app.callback()
+def every(
+    version: Annotated[
+        bool, typer.Option("--version", help="print the version and end", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Designs test drives that make a machine tell you its parameters, verifies them, and identifies from a log."""
 
 
 @app.command()

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import pandas as pd
@@ -36,6 +37,10 @@ def test_without_a_command_help_is_shown(excite: Excite) -> None:
     assert code == 0
     for command in ("machines", "design", "verify", "run", "simulate", "identify"):
         assert command in stdout
+
+
+def test_the_version_is_told(excite: Excite) -> None:
+    assert excite("--version") == (0, f"excite {version('excite')}\n", "")
 
 
 def test_machines_are_listed(excite: Excite) -> None:
