@@ -14,7 +14,7 @@ import numpy as np
 from excite import figures, folder, log, logcheck, objective, tables
 from excite.limit import TOLERANCE
 from excite.page import Picture, Table, report_page
-from excite.terminal import ESTIMATE, likely, rounded
+from excite.terminal import ESTIMATE, likely, percent, rounded
 from model import machine as machines
 
 NAME = "report.html"
@@ -125,8 +125,8 @@ def _design(s: Summary) -> Said:
     )
     driven = "Followed by a steady person" if s.get("driver") else "Driven as designed"
     answer = (
-        f"{driven}, these {s['duration_s']:g} s can tell every parameter to {sigma[worst]:.2g} % or better"
-        f" (one standard deviation; worst {worst}, median {np.median(list(sigma.values())):.2g} %); {limits}."
+        f"{driven}, these {s['duration_s']:g} s can tell every parameter to {percent(sigma[worst])} or better"
+        f" (one standard deviation; worst {worst}, median {percent(np.median(list(sigma.values())))}); {limits}."
     )
     remarks = [
         f"Condition number of Phi {s['cond_phi']:.4g}, of W {s['cond_w']:.4g}; best start {s['cond_phi_start']:.4g}."
@@ -166,15 +166,15 @@ def kept(s: Summary) -> str:
     free, hand = d["played_back"], d["by_hand"]
     return (
         f"In people's hands these {len(d['phases'])} phases give {objective.titled(s['objective'], hand['score'])},"
-        f" torques played back {free['score']:.4g}; the worst parameter can be told to {hand['worst_percent']:.2g} %"
-        f" ({hand['worst_parameter']}) instead of {free['worst_percent']:.2g} %, the median one to"
-        f" {hand['median_percent']:.2g} % instead of {free['median_percent']:.2g} %"
+        f" torques played back {free['score']:.4g}; the worst parameter can be told to {percent(hand['worst_percent'])}"
+        f" ({hand['worst_parameter']}) instead of {percent(free['worst_percent'])}, the median one to"
+        f" {percent(hand['median_percent'])} instead of {percent(free['median_percent'])}"
     )
 
 
 def _by_hand(s: Summary) -> tuple[list[str], list[Table]]:
     d = s["driver"]
-    over = ", ".join(f"{name} by {100 * value:.2g} %" for name, value in d["limits_broken"].items())
+    over = ", ".join(f"{name} by {percent(100 * value)}" for name, value in d["limits_broken"].items())
     remarks = [
         f"{kept(s)}.",
         f"In the hands of {d['people']} simulated people these limits are exceeded: {over} of their range."
@@ -199,8 +199,8 @@ def _verify(s: Summary) -> Said:
     cover = 100 * float(np.mean([r["coverage95"] for r in rows.values()]))
     median = float(np.median(list(errors.values())))
     answer = (
-        f"In {s['runs']} simulated test days the parameters came out within {median:.2g} % of the truth (median; worst"
-        f" {worst}, {errors[worst]:.2g} %), and the 95 % intervals held it in {cover:.0f} % of cases."
+        f"In {s['runs']} simulated test days the parameters came out within {percent(median)} of the truth (median;"
+        f" worst {worst}, {percent(errors[worst])}), and the 95 % intervals held it in {cover:.0f} % of cases."
     )
     remarks = [f"Biased, the intervals do not hold: {', '.join(s['biased'])}."] if s["biased"] else []
     if s["failed"]:
@@ -242,7 +242,7 @@ def _compare(s: Summary) -> Said:
             d["name"],
             *(rounded(d[k], 4) for k in ("cond_phi", "cond_w", "worst_std_percent", "median_std_percent")),
             f"{d['kept']}/{d['samples']}",
-            "-" if d["breaks"] is None else f"{d['breaks']} by {100 * d['max_violation']:.2g} %",
+            "-" if d["breaks"] is None else f"{d['breaks']} by {percent(100 * d['max_violation'])}",
             f"{d['wall_s']:.1f}",
         )
         for d in s["designs"]
@@ -271,8 +271,8 @@ def _identify(s: Summary) -> Said:
     logs = "one log" if len(s["logs"]) == 1 else f"{len(s['logs'])} logs"
     median, rest = float(np.median(list(known.values()))), float(s["relative_error_percent"])
     answer = (
-        f"From {logs}, {count} are found to {median:.2g} % (median, one standard deviation; worst {worst},"
-        f" {known[worst]:.2g} %); the prediction leaves {rest:.2g} % of what was measured."
+        f"From {logs}, {count} are found to {percent(median)} (median, one standard deviation; worst {worst},"
+        f" {percent(known[worst])}); the prediction leaves {percent(rest)} of what was measured."
     )
     remarks = [f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()] + list(s["notes"])
     for check in s["validation"]:
@@ -328,7 +328,7 @@ def _designed(drive: Mapping[str, Any]) -> str:
     return (
         f"{drive['folder']}/ beside this page is a drive designed to tell {first} from {second} (`profile.csv`; `excite"
         f" drive` makes a sheet of it): from its log the amount of each can be found within"
-        f" {rounded(drive['sigma_percent'], 2)} % beside the other."
+        f" {percent(drive['sigma_percent'])} beside the other."
         + ("" if drive["complete"] else " Its search was stopped early.")
     )
 
