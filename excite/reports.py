@@ -42,7 +42,12 @@ LOGGED = {
     "when": "Left, when and in which signal the model is off in {}; right, at which speed and steering angle (or"
     " torque). The error of one step ahead in units of noise: 1 is noise alone.",
 }
-FIT = "Measured and predicted drive torques, and what is left between them, over time, for {}."
+FIT = (
+    "Measured and predicted drive torques, and what is left between them, over time, for {}. Each torque is predicted"
+    " from the motion that the log shows, by filtered derivatives: the noise of the sensors, of slips above all, comes"
+    " on top of what the parameters leave. So more may be left here than the first sentence says, which is of the"
+    " method's own prediction."
+)
 
 
 def write(place: Path, kind: str, summary: Summary) -> None:

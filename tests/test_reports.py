@@ -120,6 +120,7 @@ def test_identify_reports_what_was_found(
         cells = (name, re.escape(row["unit"]), f"{row['value']:.6g}")
         assert re.search("".join(f"<td[^>]*>{cell}</td>" for cell in cells), text)
     assert text.count("data:image/png;base64,") == 1
+    assert f"for {tmp_path / 'log.csv'}. Each torque is predicted from the motion that the log shows" in text
     code, _, _ = excite("identify", "va12_straight", tmp_path / "log.csv", "--method", "ols", "--out", out)
     assert code == 0  # a folder with a report in it is ours and may be replaced
 
