@@ -121,6 +121,15 @@ def check_log(place: Path, path: Path, machine: str | None, versions: Mapping[st
 Said = tuple[str, str, Sequence[str], Sequence[Table]]
 
 
+def _meaning(s: Summary) -> tuple[str, ...]:
+    """The column that says what parameters are, where a summary does."""
+    return ("what it is",) if s.get("meanings") else ()
+
+
+def _meant(s: Summary, name: str) -> tuple[str, ...]:
+    return (s["meanings"].get(name, "-"),) if s.get("meanings") else ()
+
+
 def _design(s: Summary) -> Said:
     sigma = s["sigma_percent"]
     worst = max(sigma, key=lambda n: sigma[n])
@@ -140,8 +149,10 @@ def _design(s: Summary) -> Said:
         remarks.append("Cut short: the best drive so far, more time may find a better one.")
     if s.get("advice"):
         remarks.append(s["advice"])
-    rows = tuple((name, rounded(value, 3)) for name, value in sorted(sigma.items(), key=lambda x: -x[1]))
-    tables = [Table("Attainable standard deviation of each parameter, the worst first.", ("parameter", "%"), rows)]
+    ordered = sorted(sigma.items(), key=lambda x: -x[1])
+    rows = tuple((name, *_meant(s, name), rounded(value, 3)) for name, value in ordered)
+    names = ("parameter", *_meaning(s), "%")
+    tables = [Table("Attainable standard deviation of each parameter, the worst first.", names, rows)]
     if s.get("driver"):
         said, more = _by_hand(s)
         remarks = [*said, *remarks]
@@ -213,6 +224,7 @@ def _verify(s: Summary) -> Said:
     table = tuple(
         (
             n,
+            *_meant(s, n),
             r["unit"],
             rounded(r["true"], 6),
             rounded(r["mean"], 6),
@@ -221,7 +233,7 @@ def _verify(s: Summary) -> Said:
         )
         for n, r in rows.items()
     )
-    names = ("parameter", "unit", "true", "mean", "bias %", "spread %", "predicted %", "coverage %")
+    names = ("parameter", *_meaning(s), "unit", "true", "mean", "bias %", "spread %", "predicted %", "coverage %")
     marked = tuple(k for k, n in enumerate(rows) if n in s["biased"])
     caption = "True and estimated parameters; biased ones are set off."
     return f"Verification of a drive for {s['machine']}", answer, remarks, [Table(caption, names, table, marked)]
@@ -287,6 +299,7 @@ def _identify(s: Summary) -> Said:
     table = tuple(
         (
             n,
+            *_meant(s, n),
             r["unit"],
             *(rounded(r[k], d) for _, k, d in ESTIMATE),
             *((rounded(r.get("bias"), 3),) if biased else ()),
@@ -295,6 +308,7 @@ def _identify(s: Summary) -> Said:
     )
     names = (
         "parameter",
+        *_meaning(s),
         "unit",
         *(heading for heading, *_ in ESTIMATE),
         *(("bias of the method",) if biased else ()),
