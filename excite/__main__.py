@@ -22,7 +22,6 @@ from excite.asked import UsageError  # noqa: E402
 
 app = typer.Typer(
     name="excite",
-    help="Designs test drives that make a machine tell you its parameters, verifies them, and identifies from a log.",
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -86,6 +85,33 @@ RunsOption = Annotated[int, typer.Option("--runs", min=1, help="simulated test d
 INTERRUPTED = 130  # exit code of Ctrl-C, as shells have it
 
 
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        terminal.say(f"excite {version('excite')}")
+        raise typer.Exit
+
+
+@app.callback()
+def every(
+    version: Annotated[
+        bool, typer.Option("--version", help="print the version and end", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Designs test drives that make a machine tell you its parameters, verifies them, and identifies from a log."""
+
+
+def _claim(out: Path, json: bool, inputs: Sequence[Path] = ()) -> None:
+    """Checks before the work that a folder can be written, and says which result it will replace."""
+    from excite import folder
+
+    folder.claim(out, inputs)
+    before = folder.former(out)
+    if before is not None and not json:
+        terminal.say(f"{out}/ will be replaced, what is there is of {before}; --out keeps both")
+
+
 @app.command()
 def machines(json: JsonOption = False) -> None:
     """Lists the machines that come with excite."""
@@ -141,7 +167,7 @@ def design(
     from excite.brief import Brief
 
     out = out or Path(f"results/design-{asked.stem(machine)}")
-    folder.claim(out, after or [])
+    _claim(out, json, after or [])
     if between:
         if len(between) != 2 or objective not in ("cond", "discrimination"):
             raise UsageError("--between: give it twice, two effects, and no other --objective")
@@ -170,7 +196,7 @@ def verify(
 
     name = stored.summary(design_dir)["machine"]
     out = out or Path(f"results/verify-{name}")
-    folder.claim(out, [design_dir])
+    _claim(out, json, [design_dir])
     with folder.writing(out) as place:
         summary = works.verify(place, design_dir, runs, method, kit, seed)
     terminal.finish(summary, out, json, terminal.verify_table)
@@ -196,7 +222,7 @@ def compare(
     from excite import folder, works
 
     out = out or Path(f"results/compare-{asked.stem(machine)}")
-    folder.claim(out)
+    _claim(out, json)
     with folder.writing(out) as place:
         summary = works.compare(place, machine, problem, samples, tuple(against or ()), seed, budget)
     terminal.finish(summary, out, json, terminal.compare_table)
@@ -224,7 +250,7 @@ def run(
     from excite.brief import Brief
 
     out = out or Path(f"results/run-{asked.stem(machine)}")
-    folder.claim(out)
+    _claim(out, json)
     with folder.writing(out) as place:
         designed = place / "design"
         designed.mkdir()
@@ -267,7 +293,7 @@ def drive(
 
     name = stored.summary(design_dir)["machine"]
     out = out or Path(f"results/drive-{name}")
-    folder.claim(out, [design_dir])
+    _claim(out, json, [design_dir])
     with folder.writing(out) as place:
         with terminal.bar("driving") as advance:
             made = cab.prepare(stored.read(design_dir), phases, shortest, seed, advance)
@@ -355,7 +381,7 @@ def identify(
 
     model = asked.model(machine)
     out = out or Path(f"results/identify-{model.machine.name}")
-    folder.claim(out, [*logs, *(validate or [])])
+    _claim(out, json, [*logs, *(validate or [])])
     _had(logs, filtering)
     with folder.writing(out) as place:
         summary = works.identified(place, model, logs, method, filtering, validate or [])
@@ -380,7 +406,7 @@ def diagnose(
 
     model = asked.model(machine)
     out = out or Path(f"results/diagnose-{model.machine.name}")
-    folder.claim(out, logs)
+    _claim(out, json, logs)
     _had(logs, filtering)
     with folder.writing(out) as place:
         with terminal.bar("diagnosing") as advance:
@@ -429,7 +455,7 @@ def _checked(
     """What is wrong with a file, as a folder and on the terminal; exit code 1 where anything is."""
     from excite import folder
 
-    folder.claim(out, [file])
+    _claim(out, json, [file])
     with folder.writing(out) as place:
         summary = work(place)
     terminal.finish(summary, out, json, show)
@@ -488,7 +514,7 @@ def docs(out: OutOption = None, json: JsonOption = False) -> None:
     from excite import folder, reference
 
     out = out or Path("results/docs-excite")
-    folder.claim(out)
+    _claim(out, json)
     with folder.writing(out) as place:
         summary = {"pages": reference.write(place), "versions": asked.versions()}
         folder.keep(place, summary)

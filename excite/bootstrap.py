@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from excite import terminal
 from excite.estimate import Estimate, NotIdentifiable, noted
 from excite.log import Log
 from excite.noise import reread
@@ -76,7 +77,9 @@ def _remark(model: Model, estimate: Estimate, bias: np.ndarray, std: np.ndarray,
         return f"{estimate.method}: no bias found on {runs} simulated logs of the identified machine"
     order = [k for k in np.argsort(-np.abs(bias) / size) if matters[k]]
     listed = ", ".join(
-        f"{estimate.names[k]} {100 * bias[k] / size[k]:+.2g} % (+-{100 * std[k] / size[k]:.1g})" for k in order
+        f"{estimate.names[k]} {'+' if bias[k] > 0 else ''}{terminal.percent(100 * bias[k] / size[k])}"
+        f" (+-{terminal.rounded(float(100 * std[k] / size[k]), 1)})"
+        for k in order
     )
     return (
         f"{estimate.method}: biased on {runs} simulated logs of the identified machine: {listed}; its intervals do not"

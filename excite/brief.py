@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from excite import aim as aims
-from excite import drive, identify, log, phased, scenario, sequential
+from excite import drive, identify, log, phased, scenario, sequential, terminal
 from excite import objective as objectives
 from excite.aim import Aim
 from excite.design import Design, design
@@ -25,7 +25,7 @@ from model import effects
 from model.machine import EffectEntry, MachineError, Problem
 from model.prediction import Model, build
 
-POOR = 5.0  # attainable standard deviation [%] that a low condition number should not hide
+POOR = 5.0  # attainable standard deviation [%] beyond which a design says what to do
 SCENARIOS, SPREAD = 5, 0.2  # machines of a robust design, and how far their values are from the nominal ones
 
 
@@ -183,10 +183,10 @@ def advice(brief: Brief, worst: str, percent: float) -> str | None:
     if percent <= POOR:
         return None
     blind = objectives.conditions(brief.objective) and brief.sigma_max is None
-    text = f"a low cond(Phi) hides poor accuracy: {worst} can't be found better than {percent:.2g} %"
+    poor = f"{worst} can't be found better than {terminal.percent(percent)}"
     if not blind:
-        return f"poor accuracy: {worst} can't be found better than {percent:.2g} %; drive longer, or on more room"
+        return f"poor accuracy: {poor}; drive longer, or on more room"
     return (
-        f"{text}; --objective accuracy designs for small errors (run it to see how small),"
-        f" --sigma-max PERCENT for the lowest cond(Phi) among drives that are accurate enough"
+        f"cond(Phi) says nothing of accuracy here: {poor}; --objective accuracy designs for small errors"
+        " (run it to see how small), --sigma-max PERCENT for the lowest cond(Phi) among drives that are accurate enough"
     )

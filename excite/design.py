@@ -22,6 +22,7 @@ import numpy as np
 
 from excite import aim as aims
 from excite import objective as objectives
+from excite import terminal
 from excite.aim import SIGMA_MAX, Aim
 from excite.continuation import PLAN, SCOUTS, Candidate, Track, depart, promise, rank, refine, repair, resume, search
 from excite.limit import InfeasibleError
@@ -137,8 +138,9 @@ def _infeasible(aim: Aim, best: Candidate, complete: bool) -> InfeasibleError:
     cut = "the search was cut short, give more time"
     if name == SIGMA_MAX and aim.sigma_max is not None:
         return InfeasibleError(
-            f"no drive found that is accurate enough: {name} {aim.sigma_max:g} % is exceeded by {100 * excess:.2g} %,"
-            f" the worst parameter comes out at {aim.sigma_max * (1 + excess):.3g} % in the best attempt;"
+            f"no drive found that is accurate enough: {name} {aim.sigma_max:g} % is exceeded by"
+            f" {terminal.percent(100 * excess)}, the worst parameter comes out at"
+            f" {terminal.percent(aim.sigma_max * (1 + excess), 3)} in the best attempt;"
             f" {'allow more, or give a longer duration or more starts' if complete else cut}",
             name,
             excess,

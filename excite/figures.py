@@ -20,6 +20,8 @@ from model.prediction import Model
 # Okabe-Ito, told apart by the colour-blind; line styles tell them apart in black and white.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
+EVEN = 5.0  # errors [%] up to which their axis is linear
+DECADES = 3  # on a logarithmic axis, up to which there are ticks between the powers of ten
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -186,10 +188,8 @@ def verify_figure(v: Verification, title: str) -> Figure:
         errors.plot(e[:, k], y + np.linspace(-0.25, 0.25, len(e)), ".", color=COLOURS[0], markersize=3, zorder=2)
         errors.plot(np.nanmean(e[:, k]), y, "D", color=COLOURS[1], markeredgecolor="black", markersize=6, zorder=3)
     errors.axvline(0, color="black", linewidth=0.8)
-    errors.set_xscale("symlog", linthresh=1.0, linscale=1.2)
-    errors.xaxis.set_major_formatter("{x:g}")
+    _error_axis(errors, float(max(np.nanmax(np.abs(x), initial=0.0) for x in (e, ends))))
     errors.set_yticks(places, v.names)
-    errors.set_xlabel("error [% of the true value]")
     errors.grid(axis="x", alpha=0.3)
     errors.plot([], [], color="0.75", linewidth=9, label="95 % interval as predicted")
     errors.plot([], [], ".", color=COLOURS[0], label="one run")
@@ -200,6 +200,23 @@ def verify_figure(v: Verification, title: str) -> Figure:
     cover.set_xlim(0, 100)
     cover.set_xlabel("truth within the\n95 % interval [% of runs]")
     return figure
+
+
+def _error_axis(ax: Axes, reach: float) -> None:
+    """Errors [%] up to `reach`: evenly where they are alike, otherwise by decades, with ticks that show it."""
+    label, top = "error [% of the true value]", reach or 1.0
+    if reach >= EVEN:
+        heads = (1, 2, 5) if reach < 10**DECADES else (1,)
+        ticks = [float(f"{head}e{k}") for k in range(int(np.log10(reach)) + 2) for head in heads]
+        top = next(tick for tick in ticks if tick >= reach)
+        ticks = [tick for tick in ticks if tick <= top]
+        ax.set_xscale("symlog", linthresh=1.0, linscale=0.6)
+        ax.set_xticks([-tick for tick in ticks[::-1]] + [0.0, *ticks])
+        ax.tick_params(axis="x", labelsize=7)
+        label += ", logarithmic beyond 1 %"
+    ax.set_xlim(-1.1 * top, 1.1 * top)
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.set_xlabel(label)
 
 
 def comparison_figure(model: Model, c: Comparison, title: str) -> Figure:

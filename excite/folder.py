@@ -10,12 +10,14 @@ import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 SUMMARY = "summary.json"
+ASKED = ("objective", "duration_s", "method", "runs", "samples", "starts", "seed")  # what tells a result from another
 OURS = re.compile(
     r"summary\.json|machine\.(json|toml)|(profile|phases)\.csv|README\.md|[a-z0-9-]+\.(png|pdf|html|md)|design|verify|next"
     r"|drives|runs\.parquet|study\.json|machines"
@@ -53,6 +55,31 @@ def claim(out: Path, inputs: Iterable[Path] = ()) -> None:
         if not os.access(out, os.W_OK):
             raise FolderError(f"{out}: can't be replaced, it may not be written to")
     _writable(out)
+
+
+def former(out: Path) -> str | None:
+    """When what is in a folder of ours was made and, as far as its summary says, how; None where nothing is there."""
+    path = out / SUMMARY
+    if not path.is_file():
+        return None
+    made = f"{datetime.fromtimestamp(path.stat().st_mtime):%Y-%m-%d %H:%M}"
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return made
+    if isinstance(found, dict) and isinstance(found.get("design"), dict):  # of `excite run`
+        found = found["design"]
+    known = [(key, found.get(key)) for key in ASKED] if isinstance(found, dict) else []
+    told = [
+        f"{key.removesuffix('_s')} {_short(value)}{' s' * key.endswith('_s')}"
+        for key, value in known
+        if value is not None
+    ]
+    return f"{made} ({', '.join(told)})" if told else made
+
+
+def _short(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _writable(out: Path) -> None:

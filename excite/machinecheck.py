@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from excite import figures, folder, identify, limit, manoeuvre, page, reports, smoothing, terminal, topview
+from excite.meaning import meanings
 from excite.page import Picture, Table
 from excite.simulate import SimulationError, simulate
 from excite.terminal import rounded
@@ -348,8 +349,10 @@ def write(place: Path, path: Path, versions: dict[str, str]) -> dict[str, Any]:
 
 
 def _parameters(model: Model, sigma: dict[str, float]) -> dict[str, dict[str, Any]]:
+    what = meanings(model)
     return {
         name: {
+            "what": what[name],
             "unit": unit,
             "value": float(value),
             "stands_for": model.base.grouping(name),
@@ -382,14 +385,17 @@ def grouping(parts: dict[str, float]) -> str:
 
 
 def rows(summary: dict[str, Any]) -> list[tuple[str, ...]]:
-    """The table of parameters: name, what it stands for, value, unit, what random drives leave uncertain [%]."""
+    """The table of parameters: name, what it is, what it stands for, value, unit, what random drives leave [%]."""
     return [
-        (n, grouping(r["stands_for"]), rounded(r["value"]), r["unit"], rounded(r["random_drive_percent"], 2))
+        (
+            *(n, r["what"], grouping(r["stands_for"]), rounded(r["value"]), r["unit"]),
+            rounded(r["random_drive_percent"], 2),
+        )
         for n, r in summary["parameters"].items()
     ]
 
 
-COLUMNS = ("parameter", "stands for", "value", "unit", "random drives: std %")
+COLUMNS = ("parameter", "what it is", "stands for", "value", "unit", "random drives: std %")
 
 
 def _page(summary: dict[str, Any], place: Path) -> str:

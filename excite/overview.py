@@ -23,12 +23,13 @@ from excite.cell import DEFECT, DONE, Row
 from excite.figures import COLOURS
 from excite.page import Picture, Table, report_page
 from excite.plan import Cell, Plan
-from excite.terminal import rounded
+from excite.terminal import percent, rounded
 from excite.verify import Verification
 from model.prediction import built
 
 TABLE, FIGURE = "runs.parquet", "study.png"
 GROUP = 2000  # rows that are in memory at a time
+REPEAT = f"{TABLE} has a row a run; what its column `command` says repeats the run, from within this folder"
 NAMED = 30  # cells that a figure or report names one by one
 
 ABOUT = {
@@ -326,13 +327,23 @@ def page(title: str, said: Mapping[str, Any], picture: Path) -> str:
     ]
     answer = f"{said['done']} of {said['runs']} runs gave a result, {said['failed']} could not give one"
     answer += f", {said['defects']} showed a defect of the program." if said["defects"] else "."
+    told = [r for r in said["cells"] if np.isfinite(r.get("worst_rms_percent") or np.nan)]
+    if len(told) > 1:
+        best, worst = (pick(told, key=lambda r: r["worst_rms_percent"]) for pick in (min, max))
+        answer += f" By the error of its worst parameter, {_erring(best)} is the best of {len(told)} cells,"
+        answer += f" {_erring(worst)} the worst."
     how = {
         "command": reports.how({"versions": said["versions"]})["command"],
         "steps": ", ".join(said["steps"]),
         "computed in": f"{said['compute_s']:.0f} s of the workers' time",
         "versions": ", ".join(f"{n} {v}" for n, v in said["versions"].items()),
+        "program": f"{said['program']} (changes when the program does)",
     }
     caption = "Cell by cell: each parameter's error, root mean square over the cell's runs [%], and how often the 95 %"
     caption += " intervals hold; or the verdicts of diagnosis; or the drives' condition numbers."
     table = Table("What each cell comes to.", columns, tuple(lines))
-    return report_page(title, answer, [Picture(picture, caption)], [table], how)
+    return report_page(title, answer, [Picture(picture, caption)], [table], how, [REPEAT])
+
+
+def _erring(row: Mapping[str, Any]) -> str:
+    return f"{row['cell']} ({row['worst_parameter']} {percent(row['worst_rms_percent'])} rms)"

@@ -14,7 +14,7 @@ import numpy as np
 from excite import figures, folder, log, logcheck, objective, tables
 from excite.limit import TOLERANCE
 from excite.page import Picture, Table, report_page
-from excite.terminal import ESTIMATE, likely, rounded, some
+from excite.terminal import ESTIMATE, likely, percent, rounded, some
 from model import machine as machines
 
 NAME = "report.html"
@@ -42,7 +42,12 @@ LOGGED = {
     "when": "Left, when and in which signal the model is off in {}; right, at which speed and steering angle (or"
     " torque). The error of one step ahead in units of noise: 1 is noise alone.",
 }
-FIT = "Measured and predicted drive torques, and what is left between them, over time, for {}."
+FIT = (
+    "Measured and predicted drive torques, and what is left between them, over time, for {}. Each torque is predicted"
+    " from the motion that the log shows, by filtered derivatives: the noise of the sensors, of slips above all, comes"
+    " on top of what the parameters leave. So more may be left here than the first sentence says, which is of the"
+    " method's own prediction."
+)
 
 
 def write(place: Path, kind: str, summary: Summary) -> None:
@@ -116,6 +121,15 @@ def check_log(place: Path, path: Path, machine: str | None, versions: Mapping[st
 Said = tuple[str, str, Sequence[str], Sequence[Table]]
 
 
+def _meaning(s: Summary) -> tuple[str, ...]:
+    """The column that says what parameters are, where a summary does."""
+    return ("what it is",) if s.get("meanings") else ()
+
+
+def _meant(s: Summary, name: str) -> tuple[str, ...]:
+    return (s["meanings"].get(name, "-"),) if s.get("meanings") else ()
+
+
 def _design(s: Summary) -> Said:
     sigma = s["sigma_percent"]
     worst = max(sigma, key=lambda n: sigma[n])
@@ -125,8 +139,8 @@ def _design(s: Summary) -> Said:
     )
     driven = "Followed by a steady person" if s.get("driver") else "Driven as designed"
     answer = (
-        f"{driven}, these {s['duration_s']:g} s can tell every parameter to {sigma[worst]:.2g} % or better"
-        f" (one standard deviation; worst {worst}, median {np.median(list(sigma.values())):.2g} %); {limits}."
+        f"{driven}, these {s['duration_s']:g} s can tell every parameter to {percent(sigma[worst])} or better"
+        f" (one standard deviation; worst {worst}, median {percent(np.median(list(sigma.values())))}); {limits}."
     )
     remarks = [
         f"Condition number of Phi {s['cond_phi']:.4g}, of W {s['cond_w']:.4g}; best start {s['cond_phi_start']:.4g}."
@@ -135,8 +149,10 @@ def _design(s: Summary) -> Said:
         remarks.append("Cut short: the best drive so far, more time may find a better one.")
     if s.get("advice"):
         remarks.append(s["advice"])
-    rows = tuple((name, rounded(value, 3)) for name, value in sorted(sigma.items(), key=lambda x: -x[1]))
-    tables = [Table("Attainable standard deviation of each parameter, the worst first.", ("parameter", "%"), rows)]
+    ordered = sorted(sigma.items(), key=lambda x: -x[1])
+    rows = tuple((name, *_meant(s, name), rounded(value, 3)) for name, value in ordered)
+    names = ("parameter", *_meaning(s), "%")
+    tables = [Table("Attainable standard deviation of each parameter, the worst first.", names, rows)]
     if s.get("driver"):
         said, more = _by_hand(s)
         remarks = [*said, *remarks]
@@ -166,15 +182,15 @@ def kept(s: Summary) -> str:
     free, hand = d["played_back"], d["by_hand"]
     return (
         f"In people's hands these {len(d['phases'])} phases give {objective.titled(s['objective'], hand['score'])},"
-        f" torques played back {free['score']:.4g}; the worst parameter can be told to {hand['worst_percent']:.2g} %"
-        f" ({hand['worst_parameter']}) instead of {free['worst_percent']:.2g} %, the median one to"
-        f" {hand['median_percent']:.2g} % instead of {free['median_percent']:.2g} %"
+        f" torques played back {free['score']:.4g}; the worst parameter can be told to {percent(hand['worst_percent'])}"
+        f" ({hand['worst_parameter']}) instead of {percent(free['worst_percent'])}, the median one to"
+        f" {percent(hand['median_percent'])} instead of {percent(free['median_percent'])}"
     )
 
 
 def _by_hand(s: Summary) -> tuple[list[str], list[Table]]:
     d = s["driver"]
-    over = ", ".join(f"{name} by {100 * value:.2g} %" for name, value in d["limits_broken"].items())
+    over = ", ".join(f"{name} by {percent(100 * value)}" for name, value in d["limits_broken"].items())
     remarks = [
         f"{kept(s)}.",
         f"In the hands of {d['people']} simulated people these limits are exceeded: {over} of their range."
@@ -199,8 +215,8 @@ def _verify(s: Summary) -> Said:
     cover = 100 * float(np.mean([r["coverage95"] for r in rows.values()]))
     median = float(np.median(list(errors.values())))
     answer = (
-        f"In {s['runs']} simulated test days the parameters came out within {median:.2g} % of the truth (median; worst"
-        f" {worst}, {errors[worst]:.2g} %), and the 95 % intervals held it in {cover:.0f} % of cases."
+        f"In {s['runs']} simulated test days the parameters came out within {percent(median)} of the truth (median;"
+        f" worst {worst}, {percent(errors[worst])}), and the 95 % intervals held it in {cover:.0f} % of cases."
     )
     remarks = [f"Biased, the intervals do not hold: {', '.join(s['biased'])}."] if s["biased"] else []
     if s["failed"]:
@@ -208,6 +224,7 @@ def _verify(s: Summary) -> Said:
     table = tuple(
         (
             n,
+            *_meant(s, n),
             r["unit"],
             rounded(r["true"], 6),
             rounded(r["mean"], 6),
@@ -216,7 +233,7 @@ def _verify(s: Summary) -> Said:
         )
         for n, r in rows.items()
     )
-    names = ("parameter", "unit", "true", "mean", "bias %", "spread %", "predicted %", "coverage %")
+    names = ("parameter", *_meaning(s), "unit", "true", "mean", "bias %", "spread %", "predicted %", "coverage %")
     marked = tuple(k for k, n in enumerate(rows) if n in s["biased"])
     caption = "True and estimated parameters; biased ones are set off."
     return f"Verification of a drive for {s['machine']}", answer, remarks, [Table(caption, names, table, marked)]
@@ -242,7 +259,7 @@ def _compare(s: Summary) -> Said:
             d["name"],
             *(rounded(d[k], 4) for k in ("cond_phi", "cond_w", "worst_std_percent", "median_std_percent")),
             f"{d['kept']}/{d['samples']}",
-            "-" if d["breaks"] is None else f"{d['breaks']} by {100 * d['max_violation']:.2g} %",
+            "-" if d["breaks"] is None else f"{d['breaks']} by {percent(100 * d['max_violation'])}",
             f"{d['wall_s']:.1f}",
         )
         for d in s["designs"]
@@ -271,8 +288,8 @@ def _identify(s: Summary) -> Said:
     logs = "one log" if len(s["logs"]) == 1 else f"{len(s['logs'])} logs"
     median, rest = float(np.median(list(known.values()))), float(s["relative_error_percent"])
     answer = (
-        f"From {logs}, {count} are found to {median:.2g} % (median, one standard deviation; worst {worst},"
-        f" {known[worst]:.2g} %); the prediction leaves {rest:.2g} % of what was measured."
+        f"From {logs}, {count} are found to {percent(median)} (median, one standard deviation; worst {worst},"
+        f" {percent(known[worst])}); the prediction leaves {percent(rest)} of what was measured."
     )
     remarks = [f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()] + list(s["notes"])
     for check in s["validation"]:
@@ -282,6 +299,7 @@ def _identify(s: Summary) -> Said:
     table = tuple(
         (
             n,
+            *_meant(s, n),
             r["unit"],
             *(rounded(r[k], d) for _, k, d in ESTIMATE),
             *((rounded(r.get("bias"), 3),) if biased else ()),
@@ -290,6 +308,7 @@ def _identify(s: Summary) -> Said:
     )
     names = (
         "parameter",
+        *_meaning(s),
         "unit",
         *(heading for heading, *_ in ESTIMATE),
         *(("bias of the method",) if biased else ()),
@@ -328,7 +347,7 @@ def _designed(drive: Mapping[str, Any]) -> str:
     return (
         f"{drive['folder']}/ beside this page is a drive designed to tell {first} from {second} (`profile.csv`; `excite"
         f" drive` makes a sheet of it): from its log the amount of each can be found within"
-        f" {rounded(drive['sigma_percent'], 2)} % beside the other."
+        f" {percent(drive['sigma_percent'])} beside the other."
         + ("" if drive["complete"] else " Its search was stopped early.")
     )
 

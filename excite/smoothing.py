@@ -46,7 +46,8 @@ DISTURBED = (1.0, 4.0, 16.0)
 SUSPECT = 2.5  # mean square of innovations, all or slow ones, that the model can't explain; null logs stay below 1.6
 DOUBT = (
     "the log shows something that the model doesn't know, so the intervals do not hold: these values allow for"
-    " disturbing forces, and are right as far as it is forces that disturb; run `excite diagnose`"
+    " disturbing forces, and may be off by more than their intervals, much more where the cause is no such force (a"
+    " sensor, a torque channel); run `excite diagnose`"
 )
 DRAWN = (
     "what this log shows poorly may be off by a deviation more than its interval says, as no estimate without that bias"

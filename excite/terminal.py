@@ -68,10 +68,18 @@ def some(lines: Sequence[str]) -> list[str]:
 
 
 def rounded(value: object, digits: int = 4) -> str:
-    """A number to so many digits, a dash where there is none."""
+    """A number to so many digits, a dash where there is none; 170, not 1.7e+02, where it is below a million."""
     if value is None or (isinstance(value, float) and value != value):
         return "-"
-    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    text = f"{value:.{digits}g}"
+    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
+
+
+def percent(value: float, digits: int = 2) -> str:
+    """A number of per cent as it stands in a sentence."""
+    return f"{rounded(float(value), digits)} %"
 
 
 def likely(p: float) -> str:
@@ -96,7 +104,7 @@ def design_table(summary: dict[str, Any]) -> None:
         say("cut short: this is the best drive so far, more time may find a better one")
     say(
         f"attainable accuracy (Cramer-Rao, one standard deviation): worst {summary['worst_parameter']}"
-        f" {summary['worst_percent']:.2g} %, median {summary['median_percent']:.2g} %"
+        f" {percent(summary['worst_percent'])}, median {percent(summary['median_percent'])}"
     )
     if "driver" in summary:
         by_hand = summary["driver"]
@@ -105,10 +113,11 @@ def design_table(summary: dict[str, Any]) -> None:
 
         say(
             f"in people's hands, {len(by_hand['phases'])} phases: {titled(summary['objective'], hand['score'])}"
-            f" (torques played back {free['score']:.4g}), worst {hand['worst_parameter']} {hand['worst_percent']:.2g} %"
-            f" ({free['worst_percent']:.2g} %), median {hand['median_percent']:.2g} % ({free['median_percent']:.2g} %)"
+            f" (torques played back {free['score']:.4g}), worst {hand['worst_parameter']}"
+            f" {percent(hand['worst_percent'])} ({percent(free['worst_percent'])}), median"
+            f" {percent(hand['median_percent'])} ({percent(free['median_percent'])})"
         )
-        broken = ", ".join(f"{name} by {100 * over:.2g} %" for name, over in by_hand["limits_broken"].items())
+        broken = ", ".join(f"{name} by {percent(100 * over)}" for name, over in by_hand["limits_broken"].items())
         say(f"people exceed {broken} of the range" if broken else "people keep all limits")
     if summary["advice"] is not None:
         say(summary["advice"])
@@ -146,7 +155,7 @@ def compare_table(summary: dict[str, Any]) -> None:
             row["name"],
             *(rounded(row[k], 4) for k in ("cond_phi", "cond_w", "worst_std_percent", "median_std_percent")),
             f"{row['kept']}/{row['samples']}",
-            "-" if row["breaks"] is None else f"{row['breaks']} by {100 * row['max_violation']:.2g} %",
+            "-" if row["breaks"] is None else f"{row['breaks']} by {percent(100 * row['max_violation'])}",
             f"{row['wall_s']:.1f}",
             f"not in {row['wall_s']:.0f}" if row["equal_score_s"] is None else f"{row['equal_score_s']:.0f}",
         )

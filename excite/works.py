@@ -31,6 +31,7 @@ from excite.asked import UsageError
 from excite.brief import Brief
 from excite.estimate import Estimate, NotIdentifiable
 from excite.log import Log
+from excite.meaning import meanings
 from excite.objective import OBJECTIVES
 from excite.simulate import SimulationError
 from model.machine import Filter, MachineError, Problem
@@ -70,6 +71,7 @@ def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief
         "problem": name,
         "duration_s": float(chosen.duration_s),
         **briefs.summary(brief, found),
+        "meanings": meanings(found.model),
         "wall_s": wall,
         "versions": asked.versions(),
     }
@@ -111,6 +113,7 @@ def verify(
         "failed": len(result.failures),
         "failures": result.failures,
         "parameters": parameters,
+        "meanings": meanings(model),
         "biased": verification.biased(parameters),
         "versions": asked.versions(),
     }
@@ -201,6 +204,7 @@ def identified(
         "logs": [one.source for one in read],
         "method": estimate.method,
         "parameters": _parameters(estimate),
+        "meanings": meanings(model),
         "cond_w": estimate.cond_w,
         "cond_phi": estimate.cond_phi,
         "relative_error_percent": estimate.relative_error_percent,

@@ -20,13 +20,14 @@ def test_advice_names_what_to_do() -> None:
     assert advice(Brief(), "Kx1", POOR) is None
     text = advice(Brief(), "Kx1", 3 * POOR)
     assert text is not None
-    assert "hides poor accuracy: Kx1 can't be found better than 15 %" in text
+    assert "cond(Phi) says nothing of accuracy here: Kx1 can't be found better than 15 %" in text
+    assert "170 %" in str(advice(Brief(), "Kx1", 171.0))
     assert "--objective accuracy" in text
     assert "--sigma-max" in text
     for brief in (Brief("accuracy"), Brief("cond", sigma_max=20.0)):
         said = advice(brief, "Kx1", 3 * POOR)
         assert said is not None
-        assert "hides" not in said
+        assert "cond(Phi) says nothing" not in said
 
 
 def test_a_design_says_score_and_accuracy(excite: Excite, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import time
+from importlib.metadata import version
 from pathlib import Path
 
 import pandas as pd
@@ -36,6 +37,23 @@ def test_without_a_command_help_is_shown(excite: Excite) -> None:
     assert code == 0
     for command in ("machines", "design", "verify", "run", "simulate", "identify"):
         assert command in stdout
+
+
+def test_a_result_that_is_replaced_is_said(excite: Excite, tmp_path: Path) -> None:
+    asked = ("design", "va12_straight", "--duration", 12, "--starts", 1, "--out", tmp_path / "d")
+    _, first, _ = excite(*asked, "--seed", 3)
+    assert "will be replaced" not in first
+    code, second, _ = excite(*asked, "--seed", 4)
+    assert code == 0
+    said, *_ = second.splitlines()
+    assert said.startswith(f"{tmp_path / 'd'}/ will be replaced")
+    assert "(objective cond, duration 12 s, starts 1, seed 3)" in said
+    _, third, _ = excite(*asked, "--json")
+    json.loads(third)
+
+
+def test_the_version_is_told(excite: Excite) -> None:
+    assert excite("--version") == (0, f"excite {version('excite')}\n", "")
 
 
 def test_machines_are_listed(excite: Excite) -> None:

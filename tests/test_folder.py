@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,23 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path: Pat
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(folder.FolderError):
             folder.claim(out)
+
+
+@pytest.mark.parametrize(
+    ("summary", "told"),
+    [
+        ({"objective": "cond", "duration_s": 40.0, "seed": 0}, r" \(objective cond, duration 40 s, seed 0\)"),
+        ({"design": {"seed": 3}, "verify": {"seed": 4}}, r" \(seed 3\)"),
+        ({"design": "d", "method": "ols", "runs": 20}, r" \(method ols, runs 20\)"),
+        ({}, ""),
+        ([], ""),
+        (None, ""),
+    ],
+)
+def test_a_former_result_is_told(tmp_path: Path, summary: object, told: str) -> None:
+    assert folder.former(tmp_path) is None
+    (tmp_path / folder.SUMMARY).write_text("{" if summary is None else json.dumps(summary))
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d" + told, folder.former(tmp_path) or "")
 
 
 def test_json_is_strict() -> None:

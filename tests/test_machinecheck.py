@@ -195,6 +195,7 @@ def test_new_then_check(tmp_path: Path, excite: Excite) -> None:
     summary = json.loads(stdout)
     assert code == 0
     assert summary["usable"] is True
+    assert summary["parameters"]["MX0R"]["what"] == "regrouped first moment x, front frame"
     assert summary["parameters"]["MX0R"]["stands_for"] == {"MX0": 1, "M2": -1.2, "M3": -1.2}
     assert {p.name for p in out.iterdir()} == {"machine.png", "report.html", "summary.json"}
     code, _, stderr = excite("machine", "new", "my_loader", "--out", path)

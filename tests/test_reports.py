@@ -117,9 +117,11 @@ def test_identify_reports_what_was_found(
     summary = json.loads((out / "summary.json").read_text())
     assert f"<code>excite identify va12_straight {tmp_path / 'log.csv'} --method ols --out {out}</code>" in text
     for name, row in summary["parameters"].items():
-        cells = (name, re.escape(row["unit"]), f"{row['value']:.6g}")
+        cells = (name, summary["meanings"][name], re.escape(row["unit"]), f"{row['value']:.6g}")
         assert re.search("".join(f"<td[^>]*>{cell}</td>" for cell in cells), text)
+    assert summary["meanings"]["u10"] == "torque offset, front roll"
     assert text.count("data:image/png;base64,") == 1
+    assert f"for {tmp_path / 'log.csv'}. Each torque is predicted from the motion that the log shows" in text
     code, _, _ = excite("identify", "va12_straight", tmp_path / "log.csv", "--method", "ols", "--out", out)
     assert code == 0  # a folder with a report in it is ours and may be replaced
 

@@ -303,6 +303,8 @@ def test_what_the_model_does_not_know_is_seen_in_the_innovations(
     real = nature(va12, amount)
     estimate = identify(va12, [measured(real, simulate(real, energetic(), X), X)], "joint")
     assert smoothing.DOUBT in estimate.notes
+    assert "more than their intervals" in smoothing.DOUBT
+    assert "excite diagnose" in smoothing.DOUBT
     assert any("innovations" in note or "no estimate" in note for note in estimate.notes)
     assert (estimate.std > undisturbed).all()
     assert np.median(np.abs(estimate.value - X) / np.maximum(np.abs(X), va12.scale)) < 0.03

@@ -21,7 +21,7 @@ import pandas as pd
 import pytest
 from conftest import Excite
 
-from excite import cell, engine, plan, profiles, store, stored, study
+from excite import cell, engine, overview, plan, profiles, store, stored, study
 from excite import verify as verification
 from excite.folder import FolderError
 from excite.limit import InfeasibleError
@@ -195,6 +195,28 @@ def test_runs_are_those_of_verify(tiny: Callable[..., Plan], tmp_path: Path, str
     assert summary["cells"][0]["worst_rms_percent"] == max(rms.values())
     other = table[table["cell"] == 1]
     assert (other["log_sha256"] != first["log_sha256"].to_numpy()).all()  # 300 N more to push: another log
+
+
+RANKED = (
+    ("cond, 40 s", "u20", 171.0),
+    ("cond, 20 s", "Ky1", 0.81),
+    ("accuracy, 20 s", "Fs1", 3.0),
+    ("accuracy, 40 s", "Fs1", float("nan")),  # all of its runs failed
+)
+
+
+def test_the_page_says_which_cell_is_best_and_what_made_it(tmp_path: Path) -> None:
+    picture = tmp_path / "study.png"
+    picture.touch()
+    row = {"done": 5, "failed": 0, "defect": 0, "median_rms_percent": 0.5, "coverage95": 0.95}
+    cells = [row | {"cell": c, "worst_parameter": n, "worst_rms_percent": x} for c, n, x in RANKED]
+    said = {"done": 20, "failed": 0, "runs": 20, "defects": 0, "steps": ["verify"], "compute_s": 1.0}
+    said |= {"cells": cells, "program": "0123456789abcdef", "versions": {"excite": "0"}}
+    text = overview.page("Study", said, picture)
+    assert "cond, 20 s (Ky1 0.81 % rms) is the best of 3 cells, cond, 40 s (u20 170 % rms) the worst." in text
+    assert "0123456789abcdef" in text
+    assert "repeats the run, from within this folder" in text
+    assert "the best" not in overview.page("Study", said | {"cells": cells[:1]}, picture)
 
 
 def test_each_row_tells_how_to_repeat_it(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from excite import figures
 from excite.simulate import Motion
 from excite.verify import Verification, summary, verify
 from model.prediction import Model
@@ -59,6 +60,33 @@ def test_summary_is_what_its_names_say() -> None:
     assert row["std_percent"] == pytest.approx(np.std([-10, 0, 4], ddof=1))
     assert row["predicted_std_percent"] == pytest.approx(2)
     assert row["coverage95"] == pytest.approx(2 / 3)
+
+
+def spread(percent: float) -> Verification:
+    """Two parameters of 100 units, their errors in three runs up to so many per cent; one run failed."""
+    value = 100 + percent * np.array([[-1.0, 0.1], [0.2, 0.0], [1.0, -0.1], [np.nan, np.nan]])
+    ends = np.stack([value - percent / 2, value + percent / 2], axis=1)
+    names, units, true = ("A", "B"), ("kg", "kg"), np.array([100.0, 100.0])
+    return Verification("m", "full", names, units, true, true, value, np.full((4, 2), percent / 4), ends, {3: "no"})
+
+
+def test_small_errors_have_an_even_axis() -> None:
+    axis = figures.verify_figure(spread(1.4), "t").axes[0]
+    assert axis.get_xscale() == "linear"
+    assert axis.get_xlim()[1] > 1.4
+    assert axis.get_xlabel() == "error [% of the true value]"
+
+
+@pytest.mark.parametrize("percent", [7.0, 40.0, 350.0, 9e4])
+def test_large_errors_have_an_axis_that_says_that_it_is_logarithmic(percent: float) -> None:
+    axis = figures.verify_figure(spread(percent), "t").axes[0]
+    assert "logarithmic beyond 1 %" in axis.get_xlabel()
+    low, high = axis.get_xlim()
+    ticks = axis.get_xticks()
+    assert (np.sort(-ticks) == ticks).all()
+    assert percent <= ticks.max() <= high  # the ends of bars lie between two of them
+    assert (ticks > 1).sum() >= 2
+    assert low == -high < -percent
 
 
 def test_no_runs_is_refused(straight: Model, straight_motion: Motion) -> None:
