@@ -22,6 +22,7 @@ MANY = 0.005  # share of a channel's samples that may be repaired
 HELD = 8  # equal readings in a row that make a drop-out
 LATE = 4.0  # standard deviations that make a delay worth a remark
 FLOOR = 4.0  # times the noise floor where a spectrum counts as sunk
+NEEDED = ("angle", "torque", "wheel")  # kinds of sensor that no method does without
 ROOM = 0.8  # of the Nyquist frequency after decimation is passed (see `decimate`)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from excite import bootstrap
 from excite.bootstrap import Find
 from excite.estimate import Estimate, NotIdentifiable, noted
-from excite.examine import examine
+from excite.examine import NEEDED, examine
 from excite.hidden import explained
 from excite.instruments import iv
 from excite.log import Log
@@ -132,7 +132,7 @@ def recommended(model: Model) -> str:
 def needed_sensors(model: Model, method: str) -> tuple[str, ...]:
     """Names of the sensors without which a method can't work on this machine."""
     speed = () if METHODS[method].simulates else ("lateral_speed",)
-    kinds = ("angle", "torque", "wheel", *speed)
+    kinds = (*NEEDED, *speed)
     return tuple(s.name for s in model.machine.sensors("full") if s.kind in kinds)
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import itertools
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -11,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from excite import log
-from excite.examine import find_dropouts, find_spikes
+from excite.examine import NEEDED, find_dropouts, find_spikes
 from excite.log import LogError
 from model import machine as machines
 from model import tree
@@ -88,12 +90,16 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
     readings: dict[str, np.ndarray] = {}
     rate = float(machine.sampling_hz)
     after = tuple(f"row {int(np.searchsorted(t, gap)) + 2}," for gap in gaps)
+    absent: list[str] = []
     for sensor in machine.sensors("full"):
         missing = [c for c in sensor.columns if c not in table.columns]
         if missing:
-            needed = "paper" in sensor.kits
             line = f"no column {', '.join(missing)} ({log.what_of(sensor, machine)})"
-            remarks.append(line + ("; some methods need it" if needed else "; optional"))
+            line += lookalike(missing, table, machine)
+            if sensor.kind in NEEDED:
+                absent.append(f"{line}; no method does without it")
+            else:
+                remarks.append(line + ("; some methods need it" if "paper" in sensor.kits else "; optional"))
             continue
         values = _caught(lambda s=sensor: log.values_of(s, machine, table, ""), None)  # type: ignore[misc]
         when = t if len(t) else np.arange(len(table)) / rate
@@ -108,7 +114,9 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         faults += [line for line in jumps if not line.startswith(after)]  # across a gap an angle may jump
         remarks += _oddities(sensor, values)
     faults += _wiring(machine, readings)
-    if not readings:
+    if readings:
+        faults += absent
+    else:
         own = f": `excite machine new NAME --like {machine.name}` writes a machine file to name them in"
         faults.append(
             f"none of the columns of {machine.name} is there; is it a log of another machine, or with columns"
@@ -136,6 +144,42 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         signals,
         gaps,
     )
+
+
+def refuse(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> None:
+    """Raises LogError for what `log.check` refuses as well, where it can be told what to write instead: a column of
+    another name. needs: names of sensors that must be there."""
+    lacking = [
+        (f"{', '.join(missing)} ({log.what_of(s, machine)})", lookalike(missing, table, machine))
+        for s in machine.sensors("full")
+        if s.name in needs and (missing := [c for c in s.columns if c not in table.columns])
+    ]
+    if any(hint for _, hint in lacking):
+        raise LogError(f"{source}: no column {', '.join(name + hint for name, hint in lacking)}")
+
+
+def lookalike(missing: Sequence[str], table: pd.DataFrame, machine: Machine) -> str:
+    """A question after the first of the columns that a sensor lacks: whether one that nothing uses is meant, "" where
+    none has a name like it. Numbers in a name say which joint it is: they must be the same."""
+    used = {machine.time_column, *(c for s in machine.sensor for c in s.columns)}
+    free = [c for c in map(str, table.columns) if c not in used and _digits(c) == _digits(missing[0])]
+    like = difflib.get_close_matches(missing[0], free, n=1)
+    if not like:
+        return ""
+    key = "column" if any(s.column == missing[0] for s in machine.sensor) else "return_column"
+    line = f'{key} = "{like[0]}"'
+    return f": is {like[0]} this column? rename it, or {_write(line, machine)}"
+
+
+def _digits(name: str) -> list[str]:
+    return re.findall(r"\d+", name)
+
+
+def _write(line: str, machine: Machine) -> str:
+    """What to do to have a line in the machine file."""
+    if machine.name not in machines.shipped():
+        return f"write {line} in the machine file"
+    return f"write {line} in a machine file (`excite machine new NAME --like {machine.name}` makes one)"
 
 
 def _caught(work: Callable[[], T], faults: list[str] | None) -> T | None:

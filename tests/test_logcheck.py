@@ -49,7 +49,12 @@ def edit(name: str, row: int, value: object) -> Callable[[pd.DataFrame], pd.Data
     [
         (edit("u1_Nm", 40, None), ["column u1_Nm: a cell is empty or no number (row 41)"], []),
         (edit("u1_Nm", 40, "error"), ["column u1_Nm: a cell"], []),
-        (lambda t: t.drop(columns="u4_Nm"), [], ["no column u4_Nm (torque of rear roll); some methods need it"]),
+        (lambda t: t.drop(columns="u4_Nm"), ["no column u4_Nm (torque of rear roll); no method does without it"], []),
+        (
+            lambda t: t.rename(columns={"theta4_rad": "theta_4"}),
+            ['theta4_rad (angle of rear roll): is theta_4 this column? rename it, or write column = "theta_4" in'],
+            ["not used: theta_4"],
+        ),
         (lambda t: t.drop(columns="vy_m_s"), [], ["no column vy_m_s (lateral speed of front chassis); optional"]),
         (lambda t: t.drop(columns="t_s"), ["no column t_s (time)"], []),
         (lambda t: t.drop(index=range(100, 150)), ["a gap of 0.51 s in row 101 (from 0.99 s to 1.5 s)"], []),
@@ -83,6 +88,25 @@ def test_what_is_wrong_is_said(
         assert any(words in line for line in found.remarks), found.remarks
     assert found.usable == (not faults)
     assert all(len(t) == len(values) for t, values, _ in found.signals.values())
+
+
+def test_a_column_of_another_name_is_found_by_every_command(
+    va12: Model, table: pd.DataFrame, tmp_path: Path, excite: Excite
+) -> None:
+    path = tmp_path / "log.csv"
+    table.rename(columns={"theta4_rad": "theta_4", "u1_Nm": "Nm_u1"}).to_csv(path, index=False)
+    for command in ("identify", "diagnose"):
+        code, _, stderr = excite(command, "va12", path, "--out", tmp_path / command)
+        assert (code, stderr.count("\n")) == (2, 1)
+        assert "no column theta4_rad (angle of rear roll): is theta_4 this column?" in stderr
+        assert "u1_Nm (torque of front roll)" in stderr
+        assert "--like va12" in stderr
+
+
+def test_a_column_of_another_joint_is_no_lookalike(va12: Model, table: pd.DataFrame) -> None:
+    lacking = table.drop(columns="theta1_rad").rename(columns={"theta4_rad": "theta_4"})
+    assert logcheck.lookalike(["theta1_rad"], lacking, va12.machine) == ""
+    assert "theta_4" in logcheck.lookalike(["theta4_rad"], lacking, va12.machine)
 
 
 def test_every_fault_at_once(va12: Model, table: pd.DataFrame) -> None:
