@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from excite import log
+from excite.doubts import doubts, own_file
 from excite.examine import NEEDED, find_dropouts, find_spikes
 from excite.log import LogError
 from model import machine as machines
@@ -40,7 +41,8 @@ class Column:
 
 @dataclass(frozen=True)
 class Inspection:
-    """faults make the log unusable as it is, remarks don't. signals: by column what can be drawn, (t, values [SI])."""
+    """faults make the log unusable as it is, doubts and remarks don't. signals: by column what can be drawn, (t, values
+    [SI])."""
 
     source: str
     machine: str | None
@@ -49,6 +51,7 @@ class Inspection:
     rate_hz: float
     columns: tuple[Column, ...]
     faults: tuple[str, ...]
+    doubts: tuple[str, ...]
     remarks: tuple[str, ...]
     signals: dict[str, tuple[np.ndarray, np.ndarray, str]]
     gaps: tuple[float, ...]
@@ -84,7 +87,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
             remarks.append(fault)
     if machine is None:
         remarks.append("no shipped machine has these columns: name yours with --machine to have them checked")
-        return Inspection(source, None, len(table), np.nan, np.nan, tuple(columns), (), tuple(remarks), {}, ())
+        return Inspection(source, None, len(table), np.nan, np.nan, tuple(columns), (), (), tuple(remarks), {}, ())
     t, gaps = _time(table, machine, faults)
     signals: dict[str, tuple[np.ndarray, np.ndarray, str]] = {}
     readings: dict[str, np.ndarray] = {}
@@ -140,6 +143,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         typical,
         tuple(columns),
         tuple(dict.fromkeys(faults)),
+        () if faults else doubts(machine, readings),
         tuple(remarks),
         signals,
         gaps,
@@ -168,18 +172,11 @@ def lookalike(missing: Sequence[str], table: pd.DataFrame, machine: Machine) -> 
         return ""
     key = "column" if any(s.column == missing[0] for s in machine.sensor) else "return_column"
     line = f'{key} = "{like[0]}"'
-    return f": is {like[0]} this column? rename it, or {_write(line, machine)}"
+    return f": is {like[0]} this column? rename it, or write {line} in {own_file(machine)}"
 
 
 def _digits(name: str) -> list[str]:
     return re.findall(r"\d+", name)
-
-
-def _write(line: str, machine: Machine) -> str:
-    """What to do to have a line in the machine file."""
-    if machine.name not in machines.shipped():
-        return f"write {line} in the machine file"
-    return f"write {line} in a machine file (`excite machine new NAME --like {machine.name}` makes one)"
 
 
 def _caught(work: Callable[[], T], faults: list[str] | None) -> T | None:

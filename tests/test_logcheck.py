@@ -26,6 +26,7 @@ def test_a_good_log_has_nothing_wrong(
 ) -> None:
     found = logcheck.inspect(table, va12.machine)
     assert found.faults == ()
+    assert found.doubts == ()
     assert found.remarks == ()
     assert (found.rows, found.duration_s, found.rate_hz) == (6001, 60, pytest.approx(100))
     by_name = {c.name: c for c in found.columns}
