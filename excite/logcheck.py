@@ -19,11 +19,13 @@ from excite.log import LogError
 from model import machine as machines
 from model import tree
 from model.machine import Machine, Sensor
+from model.units import UNITS
 
 T = TypeVar("T")
 SHOWN = 5  # places named of a fault that is there many times
 STUCK = 50  # equal extreme readings in a row that look like the end of a range
 ALIKE = 0.6  # share of a machine's columns that makes a log look like one of its
+CLOSE = 0.05  # of a unit's size, when a wrong rate of sampling is taken for time in that unit
 AGAINST = -0.5  # correlation of two contacts' speeds that says one is wired the other way round
 
 
@@ -152,7 +154,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
 
 def refuse(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> None:
     """Raises LogError for what `log.check` refuses as well, where it can be told what to write instead: a column of
-    another name. needs: names of sensors that must be there."""
+    another name, time in another unit. needs: names of sensors that must be there."""
     lacking = [
         (f"{', '.join(missing)} ({log.what_of(s, machine)})", lookalike(missing, table, machine))
         for s in machine.sensors("full")
@@ -160,6 +162,27 @@ def refuse(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sou
     ]
     if any(hint for _, hint in lacking):
         raise LogError(f"{source}: no column {', '.join(name + hint for name, hint in lacking)}")
+    if lacking or machine.time_column not in table.columns:
+        return
+    t = _caught(lambda: log.times(table, machine, source), None)
+    if t is not None and (clock := _clock(t, machine)):
+        raise LogError(f"{source}: {clock}")
+
+
+def _clock(t: np.ndarray, machine: Machine) -> str:
+    """What is wrong with times (N,) [s] that are in another unit than the machine file says, "" where they aren't."""
+    typical, rate = float(np.median(np.diff(t))) if len(t) > 1 else 0.0, float(machine.sampling_hz)
+    if typical <= 0:
+        return ""
+    for unit in ("s", "ms", "us", "min"):
+        ratio = UNITS[unit][1] / UNITS[machine.time_unit][1]
+        if unit != machine.time_unit and abs(typical * rate * ratio - 1) <= CLOSE:
+            line = f'time_unit = "{unit}"'
+            return (
+                f"column {machine.time_column}: sampled at {1 / typical:.4g} Hz, the machine file says {rate:g} Hz:"
+                f" is it in {unit}? then write {line} in {own_file(machine)}"
+            )
+    return ""
 
 
 def lookalike(missing: Sequence[str], table: pd.DataFrame, machine: Machine) -> str:
@@ -233,6 +256,8 @@ def _time(table: pd.DataFrame, machine: Machine, faults: list[str]) -> tuple[np.
             faults.append(f"column {name}: a gap of {dt[k]:.4g} s in row {k + 2} (from {t[k]:g} s to {t[k + 1]:g} s)")
         if len(wide) > SHOWN:
             faults.append(f"column {name}: {len(wide) - SHOWN} more gaps")
+    elif clock := _clock(t, machine):
+        faults.append(clock)
     elif typical > 0:
         _caught(lambda: log.check_time(t, rate, name, ""), faults)
     return t, tuple(float(t[k]) for k in wide)

@@ -65,6 +65,12 @@ def edit(name: str, row: int, value: object) -> Callable[[pd.DataFrame], pd.Data
             [],
         ),
         (lambda t: t.iloc[::4], ["sampled at 25 Hz"], []),
+        (
+            lambda t: t.assign(t_s=1e3 * t["t_s"]),
+            ['t_s: sampled at 0.1 Hz, the machine file says 100 Hz: is it in ms? then write time_unit = "ms" in a'],
+            [],
+        ),
+        (lambda t: t.assign(t_s=1e6 * t["t_s"]), ['write time_unit = "us"'], []),
         (lambda t: pd.concat([t.iloc[:50], t.iloc[20:]]), ["goes back or stands still 1 times (rows 51)"], []),
         (lambda t: t.assign(theta2_rad=np.rad2deg(t["theta2_rad"])), ["theta2_rad", "degrees"], []),
         (lambda t: t.assign(theta4_rad=-t["theta4_rad"]), ["theta4_rad: front roll and rear roll turn against"], []),
