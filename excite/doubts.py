@@ -21,6 +21,8 @@ CLEAR = 2.5  # standard deviations
 AGAINST = 0.3  # correlation, or share of the acceleration that the machine file's masses promise, below zero
 ALIKE = 0.1  # of the largest singular value: torques that differ by less can't be told apart
 FRICTION = 2.0  # times that of the joints: in a bend the rolls rub on the ground as well
+CLEARER = 0.8  # times what is left of the torque otherwise: beyond doubt a speed
+SHARE = 0.1  # of the highest speed: below, dry friction fades
 SLOW = 0.1  # rad/s: below, friction fades in an average over a span
 MOVED = 0.05  # rad or m: a joint that moves less says nothing of its drive
 SMALL, LARGE, REFUSED = 0.01, 3.0, 10.0  # times the drive's limit; more than the last `log.check` refuses
@@ -59,6 +61,27 @@ def doubts(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[str, ...
                 " a tow, another drive)"
             )
     return tuple(lines)
+
+
+def is_speed(values: np.ndarray, torque: np.ndarray, rate: float) -> bool:
+    """Whether readings (N,) of an angle, in any unit, are rather its speed: what they do goes with the torque (N,), by
+    inertia and friction, better if they are taken for one."""
+    half = max(1, round(SPAN * rate))
+    if len(values) < 2 * half * LEAST:
+        return False
+    u = _mean(torque, half)
+    first, second = _motion(values, half, rate)
+    return _unexplained(u, _mean(values, half), first) < CLEARER * _unexplained(u, first, second)
+
+
+def _unexplained(torque: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) -> float:
+    """What a speed (N,) and its change leave of a torque (N,) by least squares, as a share."""
+    dry = np.tanh(speed / (SHARE * np.abs(speed).max() or 1.0))
+    A, y = np.column_stack([speed, acceleration, dry]), torque - torque.mean()
+    A -= A.mean(axis=0)
+    A /= np.maximum(A.std(axis=0), 1e-300)
+    left = y - A @ (np.linalg.pinv(A) @ y)
+    return float(left @ left / max(y @ y, 1e-300))
 
 
 @contextmanager

@@ -13,13 +13,13 @@ import numpy as np
 import pandas as pd
 
 from excite import log
-from excite.doubts import doubts, own_file
+from excite.doubts import doubts, is_speed, own_file
 from excite.examine import NEEDED, find_dropouts, find_spikes
 from excite.log import LogError
 from model import machine as machines
 from model import tree
 from model.machine import Machine, Sensor
-from model.units import UNITS
+from model.units import TURN, UNITS
 
 T = TypeVar("T")
 SHOWN = 5  # places named of a fault that is there many times
@@ -116,6 +116,8 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         signals[" - ".join(sensor.columns)] = (when, values, machine.si(sensor))
         jumps: list[str] = []
         _caught(lambda s=sensor, v=values: log.check_values(s, v, rate, machine, ""), jumps)  # type: ignore[misc]
+        speed = _speed(sensor, values, table, machine) if jumps else ""
+        jumps = [speed] if speed else jumps
         faults += [line for line in jumps if not line.startswith(after)]  # across a gap an angle may jump
         remarks += _oddities(sensor, values)
     faults += _wiring(machine, readings)
@@ -154,7 +156,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
 
 def refuse(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> None:
     """Raises LogError for what `log.check` refuses as well, where it can be told what to write instead: a column of
-    another name, time in another unit. needs: names of sensors that must be there."""
+    another name, time in another unit, a speed for an angle. needs: names of sensors that must be there."""
     lacking = [
         (f"{', '.join(missing)} ({log.what_of(s, machine)})", lookalike(missing, table, machine))
         for s in machine.sensors("full")
@@ -167,6 +169,43 @@ def refuse(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sou
     t = _caught(lambda: log.times(table, machine, source), None)
     if t is not None and (clock := _clock(t, machine)):
         raise LogError(f"{source}: {clock}")
+    for sensor in machine.sensors("full"):
+        if sensor.kind != "angle" or not set(sensor.columns) <= set(table.columns):
+            continue
+        values = _caught(lambda s=sensor: log.values_of(s, machine, table, source), None)  # type: ignore[misc]
+        if values is not None and len(values) > 1 and (speed := _speed(sensor, values, table, machine)):
+            raise LogError(f"{source}: {speed}")
+
+
+def _speed(sensor: Sensor, values: np.ndarray, table: pd.DataFrame, machine: Machine) -> str:
+    """What is wrong with an angle (N,) [SI] that its joint can't follow but that could be its speed, and goes with the
+    torques as if it were; "" otherwise."""
+    body, rate = machine.find(sensor.body), float(machine.sampling_hz)
+    if sensor.kind != "angle" or sensor.is_rate or sensor.factor is not None or body.joint != "revolute":
+        return ""
+    if _possible(sensor, values, machine) or np.abs(np.diff(values)).max() > TURN / 2:
+        return ""  # not unwrapped, say
+    rates = {unit: sensor.model_copy(update={"unit": unit, "counts_per_turn": None}) for unit in ("rpm", "rad/s")}
+    units = [u for u, s in rates.items() if _possible(s, values * (s.gain / sensor.gain), machine)]
+    # What moves a roll is the torque of all of them.
+    pulling = [b.index for b in machine.actuated if b.contact is not None] if body.contact else [body.index]
+    drives = [s for s in machine.sensors("full") if s.kind == "torque" and s.body in pulling]
+    torques = [_caught(lambda s=s: log.values_of(s, machine, table, ""), None) for s in drives if s.column in table]  # type: ignore[misc]
+    known = [u for u in torques if u is not None]
+    if not units or not known or not is_speed(values, np.sum(known, axis=0), rate):
+        return ""
+    line = " or ".join(f'unit = "{unit}"' for unit in units)
+    return (
+        f"column {sensor.column}: changes faster than the joint can turn, as its speed would: is it one? then write"
+        f" {line} for it in {own_file(machine)}, with its noise [rad/s] instead of counts_per_turn"
+    )
+
+
+def _possible(sensor: Sensor, values: np.ndarray, machine: Machine) -> bool:
+    """Whether a joint can do what readings (N,) [SI] say."""
+    said: list[str] = []
+    _caught(lambda: log.check_values(sensor, values, float(machine.sampling_hz), machine, ""), said)
+    return not said
 
 
 def _clock(t: np.ndarray, machine: Machine) -> str:

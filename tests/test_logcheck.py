@@ -110,6 +110,26 @@ def test_a_column_of_another_name_is_found_by_every_command(
         assert "--like va12" in stderr
 
 
+def test_a_speed_for_an_angle_is_told_from_degrees(
+    va12: Model, table: pd.DataFrame, tmp_path: Path, excite: Excite
+) -> None:
+    """By its torque: a speed changes with it. In degrees, not unwrapped: as before."""
+    noise = 0.15 * np.random.default_rng(0).standard_normal(len(table))
+    rpm = np.convolve(np.gradient(table["theta1_rad"], 0.01) * 60 / (2 * np.pi), np.ones(5) / 5, "same") + noise
+    (line,) = logcheck.inspect(table.assign(theta1_rad=rpm), va12.machine).faults
+    assert "column theta1_rad: changes faster than the joint can turn, as its speed would" in line
+    assert 'write unit = "rpm"' in line
+    table.assign(theta1_rad=rpm).to_csv(tmp_path / "log.csv", index=False)
+    code, _, stderr = excite("identify", "va12", tmp_path / "log.csv", "--out", tmp_path / "out")
+    assert (code, stderr.count("\n"), 'unit = "rpm"' in stderr) == (2, 1, True)
+    for name in ("theta1_rad", "theta2_rad", "theta4_rad"):
+        faults = logcheck.inspect(table.assign(**{name: np.rad2deg(table[name])}), va12.machine).faults
+        assert any("degrees" in line for line in faults), faults
+        assert not any("speed" in line for line in faults), faults
+    wrapped = table.assign(theta1_rad=(table["theta1_rad"] + 3) % (2 * np.pi))
+    assert "unwrap" in logcheck.inspect(wrapped, va12.machine).faults[0]
+
+
 def test_a_column_of_another_joint_is_no_lookalike(va12: Model, table: pd.DataFrame) -> None:
     lacking = table.drop(columns="theta1_rad").rename(columns={"theta4_rad": "theta_4"})
     assert logcheck.lookalike(["theta1_rad"], lacking, va12.machine) == ""
