@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from excite import asked, brief, examine, findings, gaps, identify, portrait, separate, works
+from excite import asked, brief, doubts, examine, findings, gaps, identify, portrait, separate, works
 from excite.brief import Brief
 from excite.diagnose import diagnose
 from excite.limit import InfeasibleError
@@ -42,14 +42,16 @@ def write(
     read, notes = gaps.read(logs, model.machine, needs)
     examined = [examine.examine(model, one) for one in read]
     mended = [e.log for e in examined]
-    notes += [note for e in examined for note in e.notes]
+    doubtful = [line for e in examined for line in e.doubts]
+    notes += [note for e in examined for note in e.notes] + doubtful
     chosen, reason = examine.FILTERS[filtering](model, mended)
     notes += [reason] if reason else []
 
     def tell(begin: float, end: float) -> Callable[[float, str], None]:
         return lambda share, what: advance(round(1000 * (begin + share * (end - begin))), 1000, None)
 
-    found = diagnose(model, mended, chosen, tell(0.0, PARTS), forked)
+    with doubts.told(doubtful):
+        found = diagnose(model, mended, chosen, tell(0.0, PARTS), forked)
     account = findings.account(found, tell(PARTS, 1.0), forked)
     text = findings.machine_file(machine, model.machine, found)
     if text is not None:

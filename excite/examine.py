@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from excite.doubts import doubts
 from excite.log import Log, LogError
 from excite.noise import spread, whitener
 from excite.processing import decimate, derivative, lowpass, regression, samples
@@ -22,17 +23,20 @@ MANY = 0.005  # share of a channel's samples that may be repaired
 HELD = 8  # equal readings in a row that make a drop-out
 LATE = 4.0  # standard deviations that make a delay worth a remark
 FLOOR = 4.0  # times the noise floor where a spectrum counts as sunk
+NEEDED = ("angle", "torque", "wheel")  # kinds of sensor that no method does without
 ROOM = 0.8  # of the Nyquist frequency after decimation is passed (see `decimate`)
 
 
 @dataclass(frozen=True)
 class Examination:
-    """A log repaired, and what was found: notes; spikes {sensor: rows}; drop-outs {sensor: [(first, last) row]}."""
+    """A log repaired, and what was found: notes; spikes {sensor: rows}; drop-outs {sensor: [(first, last) row]}; and
+    what else is doubtful about it, a line each."""
 
     log: Log
     notes: tuple[str, ...]
     spikes: dict[str, tuple[int, ...]]
     dropouts: dict[str, tuple[tuple[int, int], ...]]
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,8 @@ def examine(model: Model, log: Log) -> Examination:
             if sensor.resolution is not None or last - first > 100 * HELD:
                 raise LogError(f"{text}; give the stretches before and after as two logs")
             notes.append(f"{text}: what is in between counts as measured")
-    return Examination(Log(log.source, log.t, values), tuple(notes), spikes, dropouts)
+    doubtful = tuple(f"{log.source}: {line}" for line in doubts(model.machine, values))
+    return Examination(Log(log.source, log.t, values), tuple(notes), spikes, dropouts, doubtful)
 
 
 def find_spikes(sensor: Sensor, x: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from excite import log
+from excite import log, logcheck
 from excite.log import Log, LogError
 from model.machine import Machine
 
@@ -28,6 +28,7 @@ def split(
     table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log"
 ) -> tuple[list[Log], list[str]]:
     """The same of one table of columns."""
+    logcheck.refuse(table, machine, needs, source)
     cuts = _gaps(table, machine, source)
     rate = float(machine.sampling_hz)
     rows = [0, *cuts, len(table)]

@@ -9,10 +9,10 @@ from typing import Literal
 
 import numpy as np
 
-from excite import bootstrap
+from excite import bootstrap, doubts
 from excite.bootstrap import Find
 from excite.estimate import Estimate, NotIdentifiable, noted
-from excite.examine import examine
+from excite.examine import NEEDED, examine
 from excite.hidden import explained
 from excite.instruments import iv
 from excite.log import Log
@@ -40,8 +40,9 @@ class Method:
 
 
 def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Filter | None = None) -> Estimate:
-    """Base parameters from one log or several; single spikes are repaired, with a note (see `examine`), and
-    a parameter that the logs don't show comes with the drive that would (see `hidden`).
+    """Base parameters from one log or several; single spikes are repaired, with a note (see `examine`), what
+    is doubtful about a log is said, and a parameter that the logs don't show comes with the drive that would (see
+    `hidden`).
 
     Raises ValueError for an unknown method, NotIdentifiable, LogError for a log that can't be repaired.
     """
@@ -55,14 +56,16 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     mended, filter = [e.log for e in examined], filter or model.machine.filter
     if not any(v.any() for log in mended for v in log.values.values()):
         raise NotIdentifiable(f"{mended[0].source}: every signal is zero: is the log empty of measurements?")
-    try:
-        estimate = explained(model, mended, METHODS[method].find(model, mended, filter), filter)
-    except np.linalg.LinAlgError:
-        raise NotIdentifiable(
-            f"{mended[0].source}: the equations of {method} are singular along this log: check the sign and unit of"
-            " every column, and that the machine moves"
-        ) from None
-    return noted(estimate, *(note for e in examined for note in e.notes))
+    doubtful = [line for e in examined for line in e.doubts]
+    with doubts.told(doubtful):
+        try:
+            estimate = explained(model, mended, METHODS[method].find(model, mended, filter), filter)
+        except np.linalg.LinAlgError:
+            raise NotIdentifiable(
+                f"{mended[0].source}: the equations of {method} are singular along this log: check the sign and unit of"
+                " every column, and that the machine moves"
+            ) from None
+    return noted(estimate, *(note for e in examined for note in e.notes), *doubtful)
 
 
 def measurable(model: Model) -> None:
@@ -132,7 +135,7 @@ def recommended(model: Model) -> str:
 def needed_sensors(model: Model, method: str) -> tuple[str, ...]:
     """Names of the sensors without which a method can't work on this machine."""
     speed = () if METHODS[method].simulates else ("lateral_speed",)
-    kinds = ("angle", "torque", "wheel", *speed)
+    kinds = (*NEEDED, *speed)
     return tuple(s.name for s in model.machine.sensors("full") if s.kind in kinds)
 
 

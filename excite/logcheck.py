@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import itertools
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -11,16 +13,19 @@ import numpy as np
 import pandas as pd
 
 from excite import log
-from excite.examine import find_dropouts, find_spikes
+from excite.doubts import doubts, is_speed, own_file
+from excite.examine import NEEDED, find_dropouts, find_spikes
 from excite.log import LogError
 from model import machine as machines
 from model import tree
 from model.machine import Machine, Sensor
+from model.units import TURN, UNITS
 
 T = TypeVar("T")
 SHOWN = 5  # places named of a fault that is there many times
 STUCK = 50  # equal extreme readings in a row that look like the end of a range
 ALIKE = 0.6  # share of a machine's columns that makes a log look like one of its
+CLOSE = 0.05  # of a unit's size, when a wrong rate of sampling is taken for time in that unit
 AGAINST = -0.5  # correlation of two contacts' speeds that says one is wired the other way round
 
 
@@ -38,7 +43,8 @@ class Column:
 
 @dataclass(frozen=True)
 class Inspection:
-    """faults make the log unusable as it is, remarks don't. signals: by column what can be drawn, (t, values [SI])."""
+    """faults make the log unusable as it is, doubts and remarks don't. signals: by column what can be drawn, (t, values
+    [SI])."""
 
     source: str
     machine: str | None
@@ -47,6 +53,7 @@ class Inspection:
     rate_hz: float
     columns: tuple[Column, ...]
     faults: tuple[str, ...]
+    doubts: tuple[str, ...]
     remarks: tuple[str, ...]
     signals: dict[str, tuple[np.ndarray, np.ndarray, str]]
     gaps: tuple[float, ...]
@@ -82,18 +89,22 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
             remarks.append(fault)
     if machine is None:
         remarks.append("no shipped machine has these columns: name yours with --machine to have them checked")
-        return Inspection(source, None, len(table), np.nan, np.nan, tuple(columns), (), tuple(remarks), {}, ())
+        return Inspection(source, None, len(table), np.nan, np.nan, tuple(columns), (), (), tuple(remarks), {}, ())
     t, gaps = _time(table, machine, faults)
     signals: dict[str, tuple[np.ndarray, np.ndarray, str]] = {}
     readings: dict[str, np.ndarray] = {}
     rate = float(machine.sampling_hz)
     after = tuple(f"row {int(np.searchsorted(t, gap)) + 2}," for gap in gaps)
+    absent: list[str] = []
     for sensor in machine.sensors("full"):
         missing = [c for c in sensor.columns if c not in table.columns]
         if missing:
-            needed = "paper" in sensor.kits
             line = f"no column {', '.join(missing)} ({log.what_of(sensor, machine)})"
-            remarks.append(line + ("; some methods need it" if needed else "; optional"))
+            line += lookalike(missing, table, machine)
+            if sensor.kind in NEEDED:
+                absent.append(f"{line}; no method does without it")
+            else:
+                remarks.append(line + ("; some methods need it" if "paper" in sensor.kits else "; optional"))
             continue
         values = _caught(lambda s=sensor: log.values_of(s, machine, table, ""), None)  # type: ignore[misc]
         when = t if len(t) else np.arange(len(table)) / rate
@@ -105,10 +116,14 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         signals[" - ".join(sensor.columns)] = (when, values, machine.si(sensor))
         jumps: list[str] = []
         _caught(lambda s=sensor, v=values: log.check_values(s, v, rate, machine, ""), jumps)  # type: ignore[misc]
+        speed = _speed(sensor, values, table, machine) if jumps else ""
+        jumps = [speed] if speed else jumps
         faults += [line for line in jumps if not line.startswith(after)]  # across a gap an angle may jump
         remarks += _oddities(sensor, values)
     faults += _wiring(machine, readings)
-    if not readings:
+    if readings:
+        faults += absent
+    else:
         own = f": `excite machine new NAME --like {machine.name}` writes a machine file to name them in"
         faults.append(
             f"none of the columns of {machine.name} is there; is it a log of another machine, or with columns"
@@ -132,10 +147,98 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         typical,
         tuple(columns),
         tuple(dict.fromkeys(faults)),
+        () if faults else doubts(machine, readings),
         tuple(remarks),
         signals,
         gaps,
     )
+
+
+def refuse(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> None:
+    """Raises LogError for what `log.check` refuses as well, where it can be told what to write instead: a column of
+    another name, time in another unit, a speed for an angle. needs: names of sensors that must be there."""
+    lacking = [
+        (f"{', '.join(missing)} ({log.what_of(s, machine)})", lookalike(missing, table, machine))
+        for s in machine.sensors("full")
+        if s.name in needs and (missing := [c for c in s.columns if c not in table.columns])
+    ]
+    if any(hint for _, hint in lacking):
+        raise LogError(f"{source}: no column {', '.join(name + hint for name, hint in lacking)}")
+    if lacking or machine.time_column not in table.columns:
+        return
+    t = _caught(lambda: log.times(table, machine, source), None)
+    if t is not None and (clock := _clock(t, machine)):
+        raise LogError(f"{source}: {clock}")
+    for sensor in machine.sensors("full"):
+        if sensor.kind != "angle" or not set(sensor.columns) <= set(table.columns):
+            continue
+        values = _caught(lambda s=sensor: log.values_of(s, machine, table, source), None)  # type: ignore[misc]
+        if values is not None and len(values) > 1 and (speed := _speed(sensor, values, table, machine)):
+            raise LogError(f"{source}: {speed}")
+
+
+def _speed(sensor: Sensor, values: np.ndarray, table: pd.DataFrame, machine: Machine) -> str:
+    """What is wrong with an angle (N,) [SI] that its joint can't follow but that could be its speed, and goes with the
+    torques as if it were; "" otherwise."""
+    body, rate = machine.find(sensor.body), float(machine.sampling_hz)
+    if sensor.kind != "angle" or sensor.is_rate or sensor.factor is not None or body.joint != "revolute":
+        return ""
+    if _possible(sensor, values, machine) or np.abs(np.diff(values)).max() > TURN / 2:
+        return ""  # not unwrapped, say
+    rates = {unit: sensor.model_copy(update={"unit": unit, "counts_per_turn": None}) for unit in ("rpm", "rad/s")}
+    units = [u for u, s in rates.items() if _possible(s, values * (s.gain / sensor.gain), machine)]
+    # What moves a roll is the torque of all of them.
+    pulling = [b.index for b in machine.actuated if b.contact is not None] if body.contact else [body.index]
+    drives = [s for s in machine.sensors("full") if s.kind == "torque" and s.body in pulling]
+    torques = [_caught(lambda s=s: log.values_of(s, machine, table, ""), None) for s in drives if s.column in table]  # type: ignore[misc]
+    known = [u for u in torques if u is not None]
+    if not units or not known or not is_speed(values, np.sum(known, axis=0), rate):
+        return ""
+    line = " or ".join(f'unit = "{unit}"' for unit in units)
+    return (
+        f"column {sensor.column}: changes faster than the joint can turn, as its speed would: is it one? then write"
+        f" {line} for it in {own_file(machine)}, with its noise [rad/s] instead of counts_per_turn"
+    )
+
+
+def _possible(sensor: Sensor, values: np.ndarray, machine: Machine) -> bool:
+    """Whether a joint can do what readings (N,) [SI] say."""
+    said: list[str] = []
+    _caught(lambda: log.check_values(sensor, values, float(machine.sampling_hz), machine, ""), said)
+    return not said
+
+
+def _clock(t: np.ndarray, machine: Machine) -> str:
+    """What is wrong with times (N,) [s] that are in another unit than the machine file says, "" where they aren't."""
+    typical, rate = float(np.median(np.diff(t))) if len(t) > 1 else 0.0, float(machine.sampling_hz)
+    if typical <= 0:
+        return ""
+    for unit in ("s", "ms", "us", "min"):
+        ratio = UNITS[unit][1] / UNITS[machine.time_unit][1]
+        if unit != machine.time_unit and abs(typical * rate * ratio - 1) <= CLOSE:
+            line = f'time_unit = "{unit}"'
+            return (
+                f"column {machine.time_column}: sampled at {1 / typical:.4g} Hz, the machine file says {rate:g} Hz:"
+                f" is it in {unit}? then write {line} in {own_file(machine)}"
+            )
+    return ""
+
+
+def lookalike(missing: Sequence[str], table: pd.DataFrame, machine: Machine) -> str:
+    """A question after the first of the columns that a sensor lacks: whether one that nothing uses is meant, "" where
+    none has a name like it. Numbers in a name say which joint it is: they must be the same."""
+    used = {machine.time_column, *(c for s in machine.sensor for c in s.columns)}
+    free = [c for c in map(str, table.columns) if c not in used and _digits(c) == _digits(missing[0])]
+    like = difflib.get_close_matches(missing[0], free, n=1)
+    if not like:
+        return ""
+    key = "column" if any(s.column == missing[0] for s in machine.sensor) else "return_column"
+    line = f'{key} = "{like[0]}"'
+    return f": is {like[0]} this column? rename it, or write {line} in {own_file(machine)}"
+
+
+def _digits(name: str) -> list[str]:
+    return re.findall(r"\d+", name)
 
 
 def _caught(work: Callable[[], T], faults: list[str] | None) -> T | None:
@@ -192,6 +295,8 @@ def _time(table: pd.DataFrame, machine: Machine, faults: list[str]) -> tuple[np.
             faults.append(f"column {name}: a gap of {dt[k]:.4g} s in row {k + 2} (from {t[k]:g} s to {t[k + 1]:g} s)")
         if len(wide) > SHOWN:
             faults.append(f"column {name}: {len(wide) - SHOWN} more gaps")
+    elif clock := _clock(t, machine):
+        faults.append(clock)
     elif typical > 0:
         _caught(lambda: log.check_time(t, rate, name, ""), faults)
     return t, tuple(float(t[k]) for k in wide)

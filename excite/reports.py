@@ -108,6 +108,7 @@ def check_log(place: Path, path: Path, machine: str | None, versions: Mapping[st
         "duration_s": found.duration_s if np.isfinite(found.duration_s) else None,
         "rate_hz": found.rate_hz if np.isfinite(found.rate_hz) else None,
         "faults": list(found.faults),
+        "doubts": list(found.doubts),
         "remarks": list(found.remarks),
         "columns": [asdict(c) for c in found.columns],
         "versions": dict(versions),
@@ -333,7 +334,7 @@ def _log(s: Summary) -> Said:
         for c in s["columns"]
     )
     names = ("column", "what it is", "unit", "lowest", "highest", "bad cells")
-    remarks = [*faults, *s["remarks"]]
+    remarks = [*faults, *(f"Doubtful: {x}" for x in s["doubts"]), *s["remarks"]]
     return f"The log {name}", answer, remarks, [Table("Columns as the file has them.", names, rows)]
 
 

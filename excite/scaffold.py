@@ -45,6 +45,8 @@ def renamed(name: str, file: Path, like: Machine) -> str:
         f"#     excite log check LOG --machine {file}",
         "# says what is still wrong. Noise and sizes are in SI units, whatever the columns are in; `excite docs` lists",
         "# the units and every other key. Give here as well what else differs.",
+        '# For a speed instead of an angle (unit = "rpm") delete counts_per_turn and give its noise [rad/s], say',
+        '#     noise = { value = 0.01, source = "assumed" }',
         "",
         f'extends = "{like.name}"',
         f'name = "{name}"',

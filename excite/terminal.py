@@ -197,6 +197,8 @@ def log_table(summary: dict[str, Any]) -> None:
     say(rows)
     for fault in summary["faults"]:
         say(f"wrong: {fault}")
+    for doubt in summary["doubts"]:
+        say(f"doubtful: {doubt}")
     for remark in summary["remarks"]:
         say(remark)
     if summary["machine"] is not None and not summary["faults"]:

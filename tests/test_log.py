@@ -93,7 +93,10 @@ BROKEN: dict[str, tuple[Break, list[str]]] = {
     "time stands still": (shifted(100, -0.01), ["row 100", "t_s", "stands still"]),
     "gap": (shifted(200, 0.35), ["row 200", "t_s", "gap of 0.36 s"]),
     "wrong rate": (table_as(lambda t: t.iloc[::2]), ["50 Hz", "100 Hz"]),
-    "time in milliseconds": (table_as(lambda t: t.assign(t_s=t["t_s"] * 1000)), ["0.1 Hz", "100 Hz"]),
+    "time in milliseconds": (
+        table_as(lambda t: t.assign(t_s=t["t_s"] * 1000)),
+        ["0.1 Hz", "100 Hz", 'time_unit = "ms"'],
+    ),
     "too short": (table_as(lambda t: t.head(50)), ["only 50 rows"]),
     "degrees": (table_as(lambda t: t.assign(theta2_rad=np.rad2deg(t["theta2_rad"]))), ["theta2_rad", "degrees"]),
     "angle not unwrapped": (

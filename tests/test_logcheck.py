@@ -26,6 +26,7 @@ def test_a_good_log_has_nothing_wrong(
 ) -> None:
     found = logcheck.inspect(table, va12.machine)
     assert found.faults == ()
+    assert found.doubts == ()
     assert found.remarks == ()
     assert (found.rows, found.duration_s, found.rate_hz) == (6001, 60, pytest.approx(100))
     by_name = {c.name: c for c in found.columns}
@@ -49,7 +50,12 @@ def edit(name: str, row: int, value: object) -> Callable[[pd.DataFrame], pd.Data
     [
         (edit("u1_Nm", 40, None), ["column u1_Nm: a cell is empty or no number (row 41)"], []),
         (edit("u1_Nm", 40, "error"), ["column u1_Nm: a cell"], []),
-        (lambda t: t.drop(columns="u4_Nm"), [], ["no column u4_Nm (torque of rear roll); some methods need it"]),
+        (lambda t: t.drop(columns="u4_Nm"), ["no column u4_Nm (torque of rear roll); no method does without it"], []),
+        (
+            lambda t: t.rename(columns={"theta4_rad": "theta_4"}),
+            ['theta4_rad (angle of rear roll): is theta_4 this column? rename it, or write column = "theta_4" in'],
+            ["not used: theta_4"],
+        ),
         (lambda t: t.drop(columns="vy_m_s"), [], ["no column vy_m_s (lateral speed of front chassis); optional"]),
         (lambda t: t.drop(columns="t_s"), ["no column t_s (time)"], []),
         (lambda t: t.drop(index=range(100, 150)), ["a gap of 0.51 s in row 101 (from 0.99 s to 1.5 s)"], []),
@@ -59,6 +65,12 @@ def edit(name: str, row: int, value: object) -> Callable[[pd.DataFrame], pd.Data
             [],
         ),
         (lambda t: t.iloc[::4], ["sampled at 25 Hz"], []),
+        (
+            lambda t: t.assign(t_s=1e3 * t["t_s"]),
+            ['t_s: sampled at 0.1 Hz, the machine file says 100 Hz: is it in ms? then write time_unit = "ms" in a'],
+            [],
+        ),
+        (lambda t: t.assign(t_s=1e6 * t["t_s"]), ['write time_unit = "us"'], []),
         (lambda t: pd.concat([t.iloc[:50], t.iloc[20:]]), ["goes back or stands still 1 times (rows 51)"], []),
         (lambda t: t.assign(theta2_rad=np.rad2deg(t["theta2_rad"])), ["theta2_rad", "degrees"], []),
         (lambda t: t.assign(theta4_rad=-t["theta4_rad"]), ["theta4_rad: front roll and rear roll turn against"], []),
@@ -83,6 +95,45 @@ def test_what_is_wrong_is_said(
         assert any(words in line for line in found.remarks), found.remarks
     assert found.usable == (not faults)
     assert all(len(t) == len(values) for t, values, _ in found.signals.values())
+
+
+def test_a_column_of_another_name_is_found_by_every_command(
+    va12: Model, table: pd.DataFrame, tmp_path: Path, excite: Excite
+) -> None:
+    path = tmp_path / "log.csv"
+    table.rename(columns={"theta4_rad": "theta_4", "u1_Nm": "Nm_u1"}).to_csv(path, index=False)
+    for command in ("identify", "diagnose"):
+        code, _, stderr = excite(command, "va12", path, "--out", tmp_path / command)
+        assert (code, stderr.count("\n")) == (2, 1)
+        assert "no column theta4_rad (angle of rear roll): is theta_4 this column?" in stderr
+        assert "u1_Nm (torque of front roll)" in stderr
+        assert "--like va12" in stderr
+
+
+def test_a_speed_for_an_angle_is_told_from_degrees(
+    va12: Model, table: pd.DataFrame, tmp_path: Path, excite: Excite
+) -> None:
+    """By its torque: a speed changes with it. In degrees, not unwrapped: as before."""
+    noise = 0.15 * np.random.default_rng(0).standard_normal(len(table))
+    rpm = np.convolve(np.gradient(table["theta1_rad"], 0.01) * 60 / (2 * np.pi), np.ones(5) / 5, "same") + noise
+    (line,) = logcheck.inspect(table.assign(theta1_rad=rpm), va12.machine).faults
+    assert "column theta1_rad: changes faster than the joint can turn, as its speed would" in line
+    assert 'write unit = "rpm"' in line
+    table.assign(theta1_rad=rpm).to_csv(tmp_path / "log.csv", index=False)
+    code, _, stderr = excite("identify", "va12", tmp_path / "log.csv", "--out", tmp_path / "out")
+    assert (code, stderr.count("\n"), 'unit = "rpm"' in stderr) == (2, 1, True)
+    for name in ("theta1_rad", "theta2_rad", "theta4_rad"):
+        faults = logcheck.inspect(table.assign(**{name: np.rad2deg(table[name])}), va12.machine).faults
+        assert any("degrees" in line for line in faults), faults
+        assert not any("speed" in line for line in faults), faults
+    wrapped = table.assign(theta1_rad=(table["theta1_rad"] + 3) % (2 * np.pi))
+    assert "unwrap" in logcheck.inspect(wrapped, va12.machine).faults[0]
+
+
+def test_a_column_of_another_joint_is_no_lookalike(va12: Model, table: pd.DataFrame) -> None:
+    lacking = table.drop(columns="theta1_rad").rename(columns={"theta4_rad": "theta_4"})
+    assert logcheck.lookalike(["theta1_rad"], lacking, va12.machine) == ""
+    assert "theta_4" in logcheck.lookalike(["theta4_rad"], lacking, va12.machine)
 
 
 def test_every_fault_at_once(va12: Model, table: pd.DataFrame) -> None:

@@ -235,5 +235,12 @@ def test_a_logger_of_its_own(excite: Excite, straight: Model, straight_motion: M
     path.write_text(text.replace('"theta1_rad"\nunit = "rad"', '"Front roll [deg]"\nunit = "deg"'), encoding="utf-8")
     read = log.read(tmp_path / "odd.csv", load(path))
     assert read.values["theta1"] == pytest.approx(table["theta1_rad"].to_numpy(), abs=1e-9)
+    assert 'For a speed instead of an angle (unit = "rpm")' in text
+    assert "delete counts_per_turn and give its noise [rad/s]" in text
+    speed = text.replace(
+        '"theta1_rad"\nunit = "rad"\ncounts_per_turn = { value = 8192.0', '"rpm"\nunit = "rpm"\nnoise = { value = 0.01'
+    )
+    path.write_text(speed, encoding="utf-8")
+    assert load(path).sensor[0].is_rate
     code, _, err = excite("machine", "new", "other", "--like", "va13", "--out", tmp_path / "other.toml")
     assert (code, "--like: va13 is unknown, allowed: double_loader" in err) == (2, True)

@@ -1,0 +1,176 @@
+"""What may be wrong with a log though every value is possible: a sign turned around, a torque a thousand times off.
+
+The drive of a joint that steers does more work with the joint's motion than against it, since friction takes some. A
+roll may well brake while another one pulls; but whatever the others do, more torque makes the machine faster.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from excite.estimate import NoEstimate
+from model import machine as machines
+from model.machine import Body, Machine, Sensor
+
+SPAN = 0.5  # s: half of what accelerations and torques are taken over, so that counts and noise don't matter
+LEAST = 10  # independent spans that a sign is judged by
+CLEAR = 2.5  # standard deviations
+AGAINST = 0.3  # correlation, or share of the acceleration that the machine file's masses promise, below zero
+ALIKE = 0.1  # of the largest singular value: torques that differ by less can't be told apart
+FRICTION = 2.0  # times that of the joints: in a bend the rolls rub on the ground as well
+CLEARER = 0.8  # times what is left of the torque otherwise: beyond doubt a speed
+SHARE = 0.1  # of the highest speed: below, dry friction fades
+SLOW = 0.1  # rad/s: below, friction fades in an average over a span
+MOVED = 0.05  # rad or m: a joint that moves less says nothing of its drive
+SMALL, LARGE, REFUSED = 0.01, 3.0, 10.0  # times the drive's limit; more than the last `log.check` refuses
+THOUSAND = {"N m": "kN m", "Nm": "kNm", "N": "kN", "Pa": "kPa", "kPa": "MPa"}
+
+
+def doubts(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """A line for everything that is doubtful about readings (N,) by sensor name [SI], evenly sampled."""
+    found = {(s.kind, s.body): s for s in machine.sensors("full") if s.name in values}
+    driven = [b for b in machine.actuated if ("angle", b.index) in found and ("torque", b.index) in found]
+    angles = {b.index: found["angle", b.index] for b in driven}
+    torques = {b.index: found["torque", b.index] for b in driven}
+    rate = float(machine.sampling_hz)
+    position = {i: np.cumsum(values[s.name]) / rate if s.is_rate else values[s.name] for i, s in angles.items()}
+    moved = [b for b in driven if np.ptp(position[b.index]) > MOVED]
+    scales = (_scale(torques[b.index], b, machine, values[torques[b.index].name]) for b in moved)
+    lines = [line for line in scales if line]
+    if lines:
+        return tuple(lines)  # with a torque that is too small the others seem to move the machine alone
+    half = max(1, round(SPAN * rate))
+    for b in moved:
+        if len(position[b.index]) < 2 * half * LEAST:
+            continue
+        motion = _motion(position[b.index], half, rate)
+        means = {c.index: _mean(values[torques[c.index].name], half) for c in driven}
+        turned = _pulls(machine, b, driven, motion, means, half) if b.contact else _works(motion, means[b.index], half)
+        if turned:
+            torque, angle = " - ".join(torques[b.index].columns), angles[b.index].column
+            what = (
+                f"the more torque {torque} tells, the less the machine speeds up as {angle} counts"
+                if b.contact
+                else f"the torque {torque} does more work against {angle}'s motion than with it"
+            )
+            lines.append(
+                f"{what}: is the sign of one of them turned around? (right if something else moves this joint: a slope,"
+                " a tow, another drive)"
+            )
+    return tuple(lines)
+
+
+def is_speed(values: np.ndarray, torque: np.ndarray, rate: float) -> bool:
+    """Whether readings (N,) of an angle, in any unit, are rather its speed: what they do goes with the torque (N,), by
+    inertia and friction, better if they are taken for one."""
+    half = max(1, round(SPAN * rate))
+    if len(values) < 2 * half * LEAST:
+        return False
+    u = _mean(torque, half)
+    first, second = _motion(values, half, rate)
+    return _unexplained(u, _mean(values, half), first) < CLEARER * _unexplained(u, first, second)
+
+
+def _unexplained(torque: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) -> float:
+    """What a speed (N,) and its change leave of a torque (N,) by least squares, as a share."""
+    dry = np.tanh(speed / (SHARE * np.abs(speed).max() or 1.0))
+    A, y = np.column_stack([speed, acceleration, dry]), torque - torque.mean()
+    A -= A.mean(axis=0)
+    A /= np.maximum(A.std(axis=0), 1e-300)
+    left = y - A @ (np.linalg.pinv(A) @ y)
+    return float(left @ left / max(y @ y, 1e-300))
+
+
+@contextmanager
+def told(lines: Sequence[str]) -> Iterator[None]:
+    """Where no estimate is found, the message says what is doubtful about the logs as well."""
+    try:
+        yield
+    except NoEstimate as err:
+        if lines:
+            err.args = ("; ".join((str(err), *lines)),)
+        raise
+
+
+def own_file(machine: Machine) -> str:
+    """The machine file that a line can be written in, as a message calls it."""
+    if machine.name not in machines.shipped():
+        return "the machine file"
+    return f"a machine file (`excite machine new NAME --like {machine.name}` makes one)"
+
+
+def _motion(x: np.ndarray, half: int, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Speed and acceleration (N - 2 half,) of a position (N,), averages over a span."""
+    step = half / rate
+    first, middle, last = x[: -2 * half], x[half:-half], x[2 * half :]
+    return (last - first) / (2 * step), (last - 2 * middle + first) / step**2
+
+
+def _mean(x: np.ndarray, half: int) -> np.ndarray:
+    """The average (N - 2 half,) of a signal (N,) that goes with an acceleration: weighted by a triangle."""
+    weights = np.concatenate([np.arange(1, half), np.arange(half, 0, -1)]) / half**2
+    return np.convolve(x, weights, "same")[half:-half]
+
+
+def _works(motion: tuple[np.ndarray, np.ndarray], torque: np.ndarray, half: int) -> bool:
+    """Whether a torque, but for its offset, goes clearly against the speed."""
+    speed, _ = motion
+    if np.ptp(torque) == 0 or np.ptp(speed) == 0:
+        return False
+    r = float(np.corrcoef(torque, speed)[0, 1])
+    return r < -AGAINST and r * np.sqrt(len(speed) / (2 * half)) < -CLEAR
+
+
+def _pulls(
+    machine: Machine,
+    body: Body,
+    driven: Sequence[Body],
+    motion: tuple[np.ndarray, np.ndarray],
+    means: Mapping[int, np.ndarray],
+    half: int,
+) -> bool:
+    """Whether a roll turns slower for more torque, by least squares over the torques of all rolls and friction.
+
+    As a share of what the machine's mass at the rims makes of a force. Torques that go together all along share the
+    effect equally: of one half of them turned around that half is found.
+    """
+    speed, acceleration = motion
+    rolls = [(b, float(b.contact.radius)) for b in driven if b.contact is not None]
+    columns = [means[b.index] / radius for b, radius in rolls]
+    rubbed = [(b.friction, radius) for b, radius in rolls if b.friction is not None]
+    columns.append(FRICTION * sum(float(f.Fs) / radius for f, radius in rubbed) * np.tanh(speed / SLOW))
+    columns.append(FRICTION * sum(float(f.Fv) / radius for f, radius in rubbed) * speed)
+    A = np.column_stack(columns)
+    A -= A.mean(axis=0)
+    k = next(k for k, (b, _) in enumerate(rolls) if b.index == body.index)
+    y = rolls[k][1] * (acceleration - acceleration.mean())
+    inverse = np.linalg.pinv(A, rcond=ALIKE)
+    x = inverse @ y
+    left = y - A @ x
+    deviation = float(np.sqrt(left @ left / len(y) * (inverse[k] @ inverse[k]) * 2 * half))
+    mass = sum(float(b.inertia.mass) for b in machine.body if b.inertia is not None)
+    mass += sum(
+        float(b.inertia.ZZ) / float(b.contact.radius) ** 2
+        for b in machine.contacts
+        if b.inertia is not None and b.contact is not None
+    )
+    return float(x[k]) * mass < -AGAINST and float(x[k]) < -CLEAR * deviation
+
+
+def _scale(sensor: Sensor, body: Body, machine: Machine, torque: np.ndarray) -> str:
+    """A torque far below or above what its drive can do, "" where it isn't."""
+    if body.limit.torque is None:
+        return ""
+    top, most, name = float(np.abs(torque).max()), float(body.limit.torque), " - ".join(sensor.columns)
+    said = f"column {name}: the largest torque is {top:.3g} {machine.si(sensor)}, the drive's limit {most:g}"
+    if 0 < top < SMALL * most:
+        larger = THOUSAND.get(sensor.unit) if sensor.factor is None else None
+        if larger is None:
+            return f"{said}: is its {'unit' if sensor.factor is None else 'factor'} in the machine file right?"
+        return f'{said}: is it in {larger}? then write unit = "{larger}" for it in {own_file(machine)}'
+    if LARGE * most < top <= REFUSED * most:
+        return f"{said}: is its {'unit' if sensor.factor is None else 'factor'} right?"
+    return ""
