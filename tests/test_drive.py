@@ -292,6 +292,61 @@ def test_band_is_the_reference_a_second_around() -> None:
     assert low[t > 6.05] == pytest.approx(0.9)
 
 
+PLAYED = drive.Score(100, 1.0, "M", 0.2)
+LOST = drive.Score(100, 3.0, "M", 0.2)
+
+
+@pytest.mark.parametrize("objective", ["accuracy", "cond"])
+def test_a_design_for_drivers_is_not_sent_there_again(objective: str) -> None:
+    assert "--driver" in cab.verdict(PLAYED, LOST, objective)
+    said = cab.verdict(PLAYED, LOST, objective, by_hand=True)
+    assert "too much is lost" in said
+    assert "--driver" not in said
+    assert ("--objective accuracy" in said) == (objective == "cond")
+    assert all(way in said for way in ("--duration", "--starts", "--budget", "play back the torques"))
+    assert "leave out --phases" in cab.verdict(PLAYED, LOST, objective, by_hand=True, fewer=True)
+
+
+def test_limits_that_a_person_exceeds_stand_with_the_verdict() -> None:
+    person, over = replace(PLAYED, median_percent=0.32), {"power": 0.06}
+    said = cab.verdict(PLAYED, person, over=over, slower=0.9)
+    assert said.endswith(
+        "good enough to drive. But a person exceeds limits, power by 6 % of its range: design again with --driver, or"
+        " stay 10 % below all speeds, which keeps them."
+    )
+    said = cab.verdict(PLAYED, person, by_hand=True, over={**over, "rim_speed": 0.03})
+    assert "power by 6 %, rim speed by 3 % of their range: design again with them so much tighter" in said
+    assert "--driver" not in said
+    assert "below" not in said
+
+
+@pytest.mark.parametrize(
+    ("median", "worst", "words"),
+    [
+        (1.6, 1.04, "attains 1.6 times the median error of torques played back exactly and is as good in the worst"),
+        (0.98, 1.4, "attains 0.98 times the median error and 1.4 times the worst error of torques"),
+        (1.0, 1.4, "attains 1.4 times the worst error of torques played back exactly and is as good in the median"),
+        (1.01, 1.0, "is as good as torques played back exactly: nothing that counts is lost."),
+    ],
+)
+def test_errors_that_are_the_same_are_said_to_be_so(median: float, worst: float, words: str) -> None:
+    assert words in cab.verdict(PLAYED, drive.Score(100, worst, "M", 0.2 * median))
+
+
+def test_speeds_that_keep_the_limits_are_found(va12: Model) -> None:
+    """A start that needs too much power: on speeds a tenth lower people keep it, on a twentieth they don't."""
+    problem = va12.machine.problems["R60"]
+    trace = Trace(np.array([0.0, 1.6, 8, 12]), np.array([0.0, 1.6, 1.6, 0]), np.zeros((4, 1)), drive.levers(va12))
+
+    def exceeded(share: float) -> set[str]:
+        slow = replace(trace, speed=share * trace.speed)
+        return set(cab._exceeded(va12, problem, tuple(drive.driven(va12, slow, None, k) for k in range(cab.PEOPLE))))
+
+    assert exceeded(1) == {"power"}
+    assert cab._slower(va12, problem, trace, np.zeros(len(va12.coordinates)), 0) == 0.9
+    assert [exceeded(0.95), exceeded(0.9)] == [{"power"}, set()]
+
+
 @pytest.mark.slow
 def test_what_a_person_keeps_of_the_accurate_drive() -> None:
     """The claim of the sheet: sixteen phases by hand cost at most twice the error of torques played back."""
