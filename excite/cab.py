@@ -225,6 +225,7 @@ def summary(made: Sheet) -> dict[str, Any]:
     trace = made.trace
     return {
         "duration_s": trace.duration,
+        "start": drive.start_words(made.model, made.motions[0], trace),
         "phases": drive.table(trace),
         "direction_changes_s": drive.reversals(trace),
         "room_m": [made.room.length, made.room.width],
