@@ -259,10 +259,10 @@ def write(made: Sheet, place: Path) -> dict[str, Any]:
     return summary(made)
 
 
-def serve(out: Path, made: Sheet, port: int, live: Path | None, ready: Callable[[str], None]) -> None:
-    """The page of a written folder with live values, until Ctrl-C; `ready` gets its address. Raises ServeError."""
+def serve(out: Path, made: Sheet, host: str, port: int, live: Path | None, ready: Callable[[str], None]) -> None:
+    """The page of a written folder with live values, until Ctrl-C; `ready` gets its addresses. Raises ServeError."""
     text = (out / PAGE).read_text(encoding="utf-8")
     levers = made.trace.levers
     tail = Tail(live, made.model.machine, levers) if live is not None else None
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(run(text, [lever.column for lever in levers], port, tail, ready))
+        asyncio.run(run(text, [lever.column for lever in levers], host, port, tail, ready))

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import Excite
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
@@ -325,13 +327,13 @@ def test_a_log_that_began_earlier_is_found_in_time(
 
 
 @contextmanager
-def running(html: str) -> Iterator[tuple[str, Callable[[dict[str, float]], object]]]:
+def running(html: str, host: str = serve.HOST) -> Iterator[tuple[str, Callable[[dict[str, float]], object]]]:
     loop, ready = asyncio.new_event_loop(), threading.Event()
     found: dict[str, Any] = {}
 
     async def work() -> None:
         found["end"] = asyncio.Event()
-        async with serve.serving(html, ("articulation_rad",)) as (server, send):
+        async with serve.serving(html, ("articulation_rad",), host=host) as (server, send):
             found["address"] = f"127.0.0.1:{server.sockets[0].getsockname()[1]}"
             found["send"] = send
             ready.set()
@@ -379,6 +381,55 @@ def test_pages_from_elsewhere_are_refused(html: str) -> None:
                 plain.sendall(f"GET / HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
                 answer = plain.recv(1000)
             assert answer.split()[1] == status
+
+
+def test_a_phone_on_the_network_gets_live_values(browser: Any, html: str) -> None:
+    """By another address than the loopback one of a server that listens on all; by its number alone, still."""
+    with running(html, "0.0.0.0") as (address, send):
+        port = int(address.split(":")[1])
+        tab = Tab(browser, f"http://127.0.0.2:{port}/", fake=False)
+        tab.shows("#note", "live values")
+        send({"v_m_s": 0.74, "articulation_rad": -0.2})
+        tab.shows("#speed .seen", "is 0.7 m/s")
+        tab.context.close()
+        for host, status in ((f"127.0.0.2:{port}", 200), (f"localhost:{port}", 403), (f"evil.example:{port}", 403)):
+            with socket.create_connection(("127.0.0.2", port)) as plain:
+                plain.sendall(f"GET / HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+                assert int(plain.recv(1000).split()[1]) == status
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(f"ws://127.0.0.2:{port}/live", origin=Origin("https://evil.example"))
+
+
+def test_addresses_to_open_are_numbers_of_this_machine() -> None:
+    assert serve.reached(serve.HOST) == ["127.0.0.1"]
+    assert serve.reached("192.168.1.7") == ["192.168.1.7"]
+    assert serve.reached("::1") == ["[::1]"]
+    *others, last = serve.reached("0.0.0.0")
+    assert last == "127.0.0.1"
+    for other in others:
+        with socket.socket() as listener:
+            listener.bind((other, 0))  # raises where it is another machine's
+    assert serve.reached("::")[-1] == "[::1]"
+
+
+def test_an_address_that_is_not_this_machines_is_refused(html: str, excite: Excite) -> None:
+    async def listen() -> None:
+        async with serve.serving(html, (), host="192.0.2.1"):
+            pass
+
+    # in a thread of its own, for the browser's loop runs in this one
+    with (
+        ThreadPoolExecutor() as pool,
+        pytest.raises(serve.ServeError, match=r"--host 192.0.2.1: is no address of this"),
+    ):
+        pool.submit(asyncio.run, listen()).result(20)
+    for host in ("", "roller"):
+        code, _, said = excite("drive", "nowhere", "--serve", "--host", host)
+        assert code == 2
+        assert f"--host {host}: is no address, give a number" in said
+    code, _, said = excite("drive", "nowhere", "--host", "0.0.0.0")
+    assert code == 2
+    assert "for --serve, give that too" in said
 
 
 def test_only_this_machine_reaches_the_server(html: str) -> None:
