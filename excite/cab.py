@@ -251,7 +251,8 @@ def summary(made: Sheet) -> dict[str, Any]:
 def write(made: Sheet, place: Path) -> dict[str, Any]:
     """sheet.pdf, driver.html and phases.csv into a folder; returns the numbers."""
     sheet.save(made, place / "sheet.pdf")
-    (place / PAGE).write_text(page.driver_page(made.model, made.trace, made.title), encoding="utf-8")
+    start = drive.start_words(made.model, made.motions[0], made.trace)
+    (place / PAGE).write_text(page.driver_page(made.model, made.trace, made.title, start), encoding="utf-8")
     t = made.trace.times
     angles = {lever.column: angle for lever, angle in zip(made.trace.levers, made.trace.angle.T, strict=True)}
     knots = pd.DataFrame({"t_s": t, "v_m_s": made.trace.speed, **angles})

@@ -261,6 +261,27 @@ def test_everything_fits_and_is_big(
     assert seen > 500
 
 
+@pytest.mark.parametrize("size", [(844, 390), (667, 375), (1280, 800), (390, 844)])
+@pytest.mark.parametrize(("name", "trace"), [("va12", TRACE), ("tandem", TWO)])
+def test_where_to_start_is_shown_until_the_drive_begins(
+    open_page: Callable[..., Tab], va12: Model, name: str, trace: Trace, size: tuple[int, int]
+) -> None:
+    model = {"va12": va12, "tandem": TANDEM}[name]
+    q = np.zeros((2, len(model.coordinates)))
+    q[:, :3] = [-13.1, -14.1, np.deg2rad(-142)]
+    motion = replace(drive.driven(model, trace, None, 0), t=np.arange(2) / 100, q=q, nu=np.zeros_like(q))
+    start = drive.start_words(model, motion, trace)
+    tab = open_page(size=size, text=page.driver_page(model, trace, "A drive", start))
+    tab.page.clock.run_for(100)
+    assert tab.text("#next") == start
+    for id in ("#now", "#words", "body"):
+        high, room = tab.page.evaluate(f"(e => [e.scrollHeight, e.clientHeight])(document.querySelector('{id}'))")
+        assert high <= room + 1, id
+    tab.page.tap("#start")
+    tab.page.clock.run_for(100)
+    assert "Start, seen" not in tab.text("#now")
+
+
 @pytest.fixture(scope="module")
 def followed(va12: Model) -> pd.DataFrame:
     return sensors.measure(va12, drive.driven(va12, TRACE, None, 4), seed=1)
