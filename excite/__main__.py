@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import ipaddress
 import os
 import signal
 import sys
@@ -279,17 +280,37 @@ def drive(
     ] = None,
     shortest: Annotated[float, typer.Option("--shortest", help="of a phase [s]")] = 2.0,
     seed: SeedOption = 0,
-    serve: Annotated[bool, typer.Option("--serve", help="show the page with live values until Ctrl-C")] = False,
+    serve: Annotated[
+        bool,
+        typer.Option(
+            "--serve",
+            help="show the page with live values until Ctrl-C: of --live, or of a program that sends JSON such as"
+            ' {"t_s": 3.5, "v_m_s": 1.2, "JOINT_rad": 0.1} to ws://HOST:PORT/live, JOINT the machine file\'s name of a'
+            " steered joint (columns as in phases.csv); v_m_s is needed",
+        ),
+    ] = False,
     live: Annotated[Path | None, typer.Option("--live", help="log (.csv) that grows, for --serve")] = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="for --serve; 0: any free one")] = 8765,
+    host: Annotated[
+        str,
+        typer.Option(
+            "--host",
+            help="for --serve, the address to listen on: 127.0.0.1 is for this machine alone, 0.0.0.0 lets a phone on"
+            " the same network open the page; anybody there can, and can send values",
+        ),
+    ] = "127.0.0.1",
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
     """Turns a design into a drive that a person can follow: sheet (PDF) and page (HTML) for the driver."""
     from excite import cab, folder, stored
 
-    if (live is not None or port != 8765) and not serve:
-        raise UsageError("--live and --port are for --serve, give that too")
+    if (live is not None or port != 8765 or host != "127.0.0.1") and not serve:
+        raise UsageError("--live, --host and --port are for --serve, give that too")
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        raise UsageError(f"--host {host}: is no address, give a number such as 0.0.0.0 or 192.168.1.7") from None
 
     name = stored.summary(design_dir)["machine"]
     out = out or Path(f"results/drive-{name}")
@@ -302,7 +323,7 @@ def drive(
         folder.keep(place, summary)
     terminal.finish(summary, out, json, terminal.drive_table)
     if serve:
-        cab.serve(out, made, port, live, lambda address: typer.echo(f"{address} (Ctrl-C ends)", err=True))
+        cab.serve(out, made, host, port, live, lambda address: typer.echo(f"{address} (Ctrl-C ends)", err=True))
 
 
 @app.command(cls=Choosing)

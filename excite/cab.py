@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ PAGE = "driver.html"
 PACES = (4.0, 3.0, 2.5)  # s per phase that are tried where nobody says how many phases
 ENOUGH = 1.2
 NEAR = 0.8  # of a steered joint's stop
+SLOWER = (0.95, 0.9, 0.8)  # of a trace's speeds, where people exceed limits on it
 Progress = Callable[[int, int, float | None], None]
 
 PLAYED, TRACED, PHASED = "torques played back", "a person on the design's own trace", "a person on these phases"
@@ -80,6 +82,16 @@ def prepare(
     scores.append((PHASED, drive.middle([drive.score(model, m) for m in motions])))
     room = drive.room(model, motions)
     lane = (float(problem.lane_m[0]), float(problem.lane_m[1]))
+    over = _exceeded(model, problem, motions)
+    said = verdict(
+        scores[0][1],
+        scores[-1][1],
+        str(design.summary.get("objective")),
+        by_hand=design.summary.get("driver") is not None,
+        fewer=most is not None,
+        over=over,
+        slower=_slower(model, problem, trace, motion.q[0], seed) if over else None,
+    )
     return Sheet(
         design.title,
         model,
@@ -87,9 +99,9 @@ def prepare(
         motions,
         room,
         lane,
-        tuple(_warnings(model, problem, trace, motions, room)),
+        tuple(_warnings(model, trace, motions, room)),
         tuple(scores),
-        verdict(scores[0][1], scores[-1][1], str(design.summary.get("objective"))),
+        said,
     )
 
 
@@ -98,24 +110,85 @@ def _loss(score: Score) -> float:
     return score.worst_percent * score.median_percent
 
 
-def verdict(played: Score, person: Score, objective: str = "accuracy") -> str:
-    """What a person keeps of a design, in a sentence."""
+def verdict(
+    played: Score,
+    person: Score,
+    objective: str = "accuracy",
+    *,
+    by_hand: bool = False,
+    fewer: bool = False,
+    over: Mapping[str, float] | None = None,
+    slower: float | None = None,
+) -> str:
+    """What a person keeps of a design, in a sentence, and what still helps where that is too little.
+
+    by_hand: the design was made with `--driver`; fewer: on phases of its own (`--phases`). over: limits that people
+    exceed, in their range; slower: the share of the speeds that keeps them.
+    """
     worst, median = person.worst_percent / played.worst_percent, person.median_percent / played.median_percent
     ratio = max(worst, median)
-    begin = (
-        f"A person on these phases attains {median:.2g} times the median error and {worst:.2g} times the worst error of"
-        " torques played back exactly"
-    )
+    again = _again(objectives.conditions(objective), by_hand, fewer)
     if ratio <= 1.1:
-        return f"{begin}: nothing that counts is lost."
-    if ratio <= drive.LOST:
-        return f"{begin}: good enough to drive."
-    if objectives.conditions(objective):
-        return f"{begin}: too much is lost; design again with --objective accuracy --driver, or play back the torques."
-    return f"{begin}: too much is lost; design again with --driver, or a longer drive, or play back the torques."
+        said = "nothing that counts is lost"
+    elif ratio <= drive.LOST:
+        said = "good enough to drive"
+    else:
+        said = f"too much is lost; {again}, or play back the torques"
+    text = f"A person on these phases {_attained(median, worst)}: {said}."
+    if not over:
+        return text
+    named = ", ".join(f"{n.replace('_', ' ')} by {100 * v:.0f} %" for n, v in over.items())
+    keep = "design again with --driver"
+    if by_hand:
+        keep = again if fewer else "design again with them so much tighter in the machine file"
+    below = "" if slower is None else f", or stay {100 * (1 - slower):.0f} % below all speeds, which keeps them"
+    return (
+        f"{text} But a person exceeds limits, {named} of {'its' if len(over) == 1 else 'their'} range: {keep}{below}."
+    )
 
 
-def _warnings(model: Model, problem: Problem, trace: Trace, motions: tuple[Motion, ...], room: drive.Room) -> list[str]:
+def _attained(median: float, worst: float) -> str:
+    """Errors as multiples of those with torques played back, in words."""
+    exact = "torques played back exactly"
+    factors = {name: f"{x:.2g}" for name, x in (("median", median), ("worst", worst))}
+    more = [f"{x} times the {name} error" for name, x in factors.items() if x != "1"]
+    same = [name for name, x in factors.items() if x == "1"]
+    if not more:
+        return f"is as good as {exact}"
+    return f"attains {' and '.join(more)} of {exact}" + "".join(f" and is as good in the {n} parameter" for n in same)
+
+
+def _again(conditions: bool, by_hand: bool, fewer: bool) -> str:
+    """What to ask for instead: nothing that was asked for already."""
+    if not by_hand:
+        return "design again with " + ("--objective accuracy --driver" if conditions else "--driver, or a longer drive")
+    if fewer:
+        return "leave out --phases, the design has phases for people already"
+    first = "--objective accuracy, " if conditions else ""
+    return f"design again with {first}a longer --duration, more --starts or, where there was one, a larger --budget"
+
+
+def _exceeded(model: Model, problem: Problem, motions: tuple[Motion, ...]) -> dict[str, float]:
+    """The limits that any of the drives exceeds, with the largest excess in their range."""
+    over: dict[str, float] = {}
+    for m in motions:
+        for name, value in drive.broken(model, problem, m).items():
+            over[name] = max(over.get(name, 0.0), value)
+    return over
+
+
+def _slower(model: Model, problem: Problem, trace: Trace, start: np.ndarray, seed: int) -> float | None:
+    """The largest share of the speeds at which people keep every limit, in simulation; None where none helps."""
+    for share in SLOWER:
+        slow = replace(trace, speed=share * trace.speed)
+        with contextlib.suppress(SimulationError):
+            motions = tuple(drive.driven(model, slow, None, seed + k, start) for k in range(PEOPLE))
+            if not _exceeded(model, problem, drive.placed(model, problem, motions)):
+                return share
+    return None
+
+
+def _warnings(model: Model, trace: Trace, motions: tuple[Motion, ...], room: drive.Room) -> list[str]:
     free = (np.ceil(room.length + 2 * sheet.AHEAD), np.ceil(room.width + 2 * sheet.AHEAD))
     lines = [
         f"Keep everybody off {free[0]:.0f} m x {free[1]:.0f} m: the machine touches {room.length:.1f} m x"
@@ -144,13 +217,6 @@ def _warnings(model: Model, problem: Problem, trace: Trace, motions: tuple[Motio
         stop = lever.body.limit.position
         if stop is not None and (top := float(np.abs(angle).max()) / float(stop)) > NEAR:
             lines.append(f"The {lever.name} goes to {100 * top:.0f} % of its stop: hands and feet away from the joint.")
-    over: dict[str, float] = {}
-    for m in motions:
-        for name, value in drive.broken(model, problem, m).items():
-            over[name] = max(over.get(name, 0.0), value)
-    if over:
-        named = ", ".join(f"{n.replace('_', ' ')} by {100 * v:.0f} %" for n, v in over.items())
-        lines.append(f"In a person's hands these limits are exceeded: {named} of their range.")
     return lines
 
 
@@ -159,6 +225,7 @@ def summary(made: Sheet) -> dict[str, Any]:
     trace = made.trace
     return {
         "duration_s": trace.duration,
+        "start": drive.start_words(made.model, made.motions[0], trace),
         "phases": drive.table(trace),
         "direction_changes_s": drive.reversals(trace),
         "room_m": [made.room.length, made.room.width],
@@ -184,7 +251,8 @@ def summary(made: Sheet) -> dict[str, Any]:
 def write(made: Sheet, place: Path) -> dict[str, Any]:
     """sheet.pdf, driver.html and phases.csv into a folder; returns the numbers."""
     sheet.save(made, place / "sheet.pdf")
-    (place / PAGE).write_text(page.driver_page(made.model, made.trace, made.title), encoding="utf-8")
+    start = drive.start_words(made.model, made.motions[0], made.trace)
+    (place / PAGE).write_text(page.driver_page(made.model, made.trace, made.title, start), encoding="utf-8")
     t = made.trace.times
     angles = {lever.column: angle for lever, angle in zip(made.trace.levers, made.trace.angle.T, strict=True)}
     knots = pd.DataFrame({"t_s": t, "v_m_s": made.trace.speed, **angles})
@@ -192,10 +260,10 @@ def write(made: Sheet, place: Path) -> dict[str, Any]:
     return summary(made)
 
 
-def serve(out: Path, made: Sheet, port: int, live: Path | None, ready: Callable[[str], None]) -> None:
-    """The page of a written folder with live values, until Ctrl-C; `ready` gets its address. Raises ServeError."""
+def serve(out: Path, made: Sheet, host: str, port: int, live: Path | None, ready: Callable[[str], None]) -> None:
+    """The page of a written folder with live values, until Ctrl-C; `ready` gets its addresses. Raises ServeError."""
     text = (out / PAGE).read_text(encoding="utf-8")
     levers = made.trace.levers
     tail = Tail(live, made.model.machine, levers) if live is not None else None
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(run(text, [lever.column for lever in levers], port, tail, ready))
+        asyncio.run(run(text, [lever.column for lever in levers], host, port, tail, ready))

@@ -293,14 +293,22 @@ def from_table(model: Model, rows: Sequence[Mapping[str, Any]]) -> Trace:
 
 def parts(trace: Trace, k: int, letters: bool = False) -> tuple[str, str]:
     """What to do in phase k with the speed lever and with what steers, the latter empty where nothing does."""
-    start, end = float(trace.times[k]), float(trace.times[k + 1])
-    took = end - start
+    start = float(trace.times[k])
+    took = float(trace.times[k + 1]) - start
     v0, v1 = float(trace.speed[k]), float(trace.speed[k + 1])
-    names = [letter(n) for n, t in enumerate(reversals(trace)) if letters and start < t < end]
+    names = [letter(n) for n, t in enumerate(reversals(trace)) if letters and _stopping(trace, t) == k]
     go = _speed_words(v0, v1, took, start, names[0] if names else "")
     several = len(trace.levers) > 1
     each = zip(trace.levers, trace.degrees[k], trace.degrees[k + 1], strict=True)
     return go, ", ".join(_steer_words(a0, a1, lever.name if several else "") for lever, a0, a1 in each)
+
+
+def _stopping(trace: Trace, t: float) -> int:
+    """The phase that brings the machine to the stop from which it goes the other way at time t [s]: braking, however
+    long it stands still then, or through the stop."""
+    v = trace.speed
+    stops = (trace.times[:-1] < t) & (v[:-1] != 0) & (v[:-1] * v[1:] <= 0)
+    return int(np.flatnonzero(stops)[-1])
 
 
 def _speed_words(v0: float, v1: float, took: float, start: float, name: str) -> str:
@@ -312,7 +320,7 @@ def _speed_words(v0: float, v1: float, took: float, start: float, name: str) -> 
         turn, way = clock(start + took * v0 / (v0 - v1)), "backward" if v1 < 0 else "forward"
         return f"through a stop {name + ' ' if name else ''}at {turn} to {abs(v1):.1f} m/s {way} {seconds}"
     if v1 == 0:
-        return f"brake to a stop {seconds}"
+        return f"brake to a stop {name + ' ' if name else ''}{seconds}"
     if abs(v1) > abs(v0):
         return f"accelerate{way} to {abs(v1):.1f} m/s {seconds}"
     return f"slow down to {abs(v1):.1f} m/s{way} {seconds}"
@@ -331,6 +339,31 @@ def _steer_words(a0: float, a1: float, name: str) -> str:
 def angle_words(degrees: float) -> str:
     """An angle, positive to the left, as a person reads it: 20° left."""
     return f"{abs(degrees):.0f}°" + ("" if abs(degrees) < 0.5 else " left" if degrees > 0 else " right")
+
+
+def start_words(model: Model, motion: Motion, trace: Trace) -> str:
+    """Where the first contact stands at the start, seen along the lane from its middle, and where it points; empty
+    for a machine that can't be turned on the plane."""
+    machine = model.machine
+    if not set(machine.body[0].coordinates) <= set(model.coordinates):
+        return ""
+    first = machine.contacts[0]
+    x, y = edges(model, motion)[0].mean(axis=0)[0]
+    heading = float(np.rad2deg(_headings(model, motion)[machine.body.index(first), 0]))
+    heading = (heading + 180) % 360 - 180
+    along = _beside(float(x), "ahead of the lane's middle", "behind the lane's middle", "level with the lane's middle")
+    across = _beside(float(y), "left of it", "right of it", "on its line")
+    way = {0: "ahead", 180: "back"}.get(round(abs(heading)), angle_words(heading))
+    steered = "".join(
+        f"; {lever.name} {angle_words(a) if round(abs(a)) else 'straight'}"
+        for lever, a in zip(trace.levers, trace.degrees[0], strict=True)
+    )
+    name = first.where.replace("_", " ")
+    return f"Start, seen along the lane: the middle of the {name} {along} and {across}, pointing {way}{steered}."
+
+
+def _beside(metres: float, more: str, less: str, none: str) -> str:
+    return none if abs(metres) < 0.05 else f"{abs(metres):.1f} m {more if metres > 0 else less}"
 
 
 def reversals(trace: Trace) -> list[float]:

@@ -42,12 +42,13 @@ def sentence(text: str) -> Markup:
     return Markup(COMMAND.sub(r"<code>\1</code>", str(escape(whole))))
 
 
-def driver_page(model: Model, trace: Trace, title: str) -> str:
+def driver_page(model: Model, trace: Trace, title: str, start: str = "") -> str:
     """The driver's aid: a moving reference of speed and steering, with the countdown to what comes next.
 
     It shows what was driven beside it, from a log in the machine's own columns or from `serve`, and scores it.
+    start: where to place the machine, in words, shown until the drive begins.
     """
-    return templates().get_template("driver.html").render(data=driver_data(model, trace, title))
+    return templates().get_template("driver.html").render(data={**driver_data(model, trace, title), "start": start})
 
 
 def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:

@@ -1,18 +1,21 @@
-"""The driver's page over this machine's own network alone, with live values: `excite drive --serve`.
+"""The driver's page with live values: `excite drive --serve`.
 
-One small server gives the page and passes on what is measured: from a log that grows, or from any program on this
-machine that sends `{"v_m_s": 1.2, "JOINT_rad": 0.1}` to ws://127.0.0.1:PORT/live, JOINT being the machine file's name
-of a steered joint. It listens on the loopback address, takes no connection that a page from elsewhere asks for (Origin
-and Host are checked: a web site in the same browser must neither read nor fake measurements) and no message longer than
-MESSAGE bytes.
+One small server gives the page and passes on what is measured: from a log that grows, or from any program that sends
+`{"v_m_s": 1.2, "JOINT_rad": 0.1}` to ws://127.0.0.1:PORT/live, JOINT being the machine file's name of a steered joint.
+It listens on the loopback address unless another is asked for, takes no connection that a page from elsewhere asks for
+(Origin and Host are checked: a web site in the same browser must neither read nor fake measurements) and no message
+longer than MESSAGE bytes. Whoever reaches another address may open the page and send values.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
+import ipaddress
 import json
 import math
+import socket
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from http import HTTPStatus
@@ -29,6 +32,7 @@ from model.machine import Machine
 from model.units import UNITS
 
 HOST = "127.0.0.1"
+OWN = "ws://127.0.0.1:* ws://localhost:*"  # where a page may connect to, as it says itself
 MESSAGE, REASON = 1024, 120  # bytes of a message, and of why a connection ends
 CLIENTS = 16
 TIME, SPEED = "t_s", "v_m_s"  # and the angle of each steered joint, by the machine file's name of it
@@ -42,17 +46,20 @@ class ServeError(RuntimeError):
 
 @asynccontextmanager
 async def serving(
-    page: str, angles: Sequence[str], port: int = 0
+    page: str, angles: Sequence[str], port: int = 0, host: str = HOST
 ) -> AsyncIterator[tuple[Server, Callable[[dict[str, float]], None]]]:
     """The running server and a function that sends values to every page. Port 0 takes a free one.
 
-    angles: the names of steered joints' angles in a message. Raises ServeError where the port is taken.
+    angles: the names of steered joints' angles in a message; host: the address to listen on, 0.0.0.0 for all. Raises
+    ServeError where the port is taken or the address is not this machine's.
     """
-    keys = (TIME, SPEED, *angles)
-    allowed: set[str] = set()
+    keys, at = (TIME, SPEED, *angles), str(ipaddress.ip_address(host))  # an empty one would be all addresses
     pages: set[ServerConnection] = set()
 
     def answer(connection: ServerConnection, request: Request) -> Response | None:
+        # By the number that was dialled: a name could point here from anywhere.
+        own, taken = connection.local_address[:2]
+        allowed = {f"{literal(own)}:{taken}"} | ({f"localhost:{taken}"} if own == HOST else set())
         host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
         if host not in allowed or (origin is not None and origin not in {f"http://{h}" for h in allowed}):
             return connection.respond(HTTPStatus.FORBIDDEN, "for pages of this server alone\n")
@@ -62,7 +69,7 @@ async def serving(
             return None
         if request.path != "/":
             return connection.respond(HTTPStatus.NOT_FOUND, "only / and /live are here\n")
-        body = page.encode()
+        body = page.replace(OWN, f"{OWN} ws://{host}").encode()
         headers = Headers(
             [
                 ("Content-Type", "text/html; charset=utf-8"),
@@ -89,13 +96,36 @@ async def serving(
             pages.discard(connection)
 
     try:
-        server = await serve(talk, HOST, port, process_request=answer, max_size=MESSAGE, max_queue=16, compression=None)
+        server = await serve(talk, at, port, process_request=answer, max_size=MESSAGE, max_queue=16, compression=None)
     except OSError as err:
-        raise ServeError(f"--port {port}: can't listen on {HOST}: {err.strerror}; choose another port") from None
+        if err.errno == errno.EADDRNOTAVAIL:
+            said = f"--host {host}: is no address of this machine; 0.0.0.0 listens on all that it has"
+        else:
+            said = f"--port {port}: can't listen on {host}: {err.strerror}; choose another port"
+        raise ServeError(said) from None
     async with server:
-        taken = server.sockets[0].getsockname()[1]
-        allowed |= {f"{HOST}:{taken}", f"localhost:{taken}"}
         yield server, lambda said: broadcast(set(pages), json.dumps(said))
+
+
+def literal(address: str) -> str:
+    """An address as it stands in a URL: IPv6 in brackets."""
+    return f"[{address}]" if ":" in address else address
+
+
+def reached(host: str) -> list[str]:
+    """The addresses to open a page at that listens on `host`: for 0.0.0.0 and :: those that this machine has."""
+    if not ipaddress.ip_address(host).is_unspecified:
+        return [literal(host)]
+    four = ":" not in host
+    family, outside, own = (socket.AF_INET, "192.0.2.1", HOST) if four else (socket.AF_INET6, "2001:db8::1", "::1")
+    found: list[str] = []
+    with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as udp:
+        udp.connect((outside, 9))  # sends nothing: tells which of our addresses would go out
+        found.append(str(udp.getsockname()[0]))
+    with contextlib.suppress(OSError):
+        found += [str(told[4][0]) for told in socket.getaddrinfo(socket.gethostname(), None, family)]
+    ways = {a: ipaddress.ip_address(a) for a in found}  # each once, in order
+    return [*(literal(a) for a, ip in ways.items() if not (ip.is_loopback or ip.is_link_local)), literal(own)]
 
 
 def checked(message: str | bytes, keys: Sequence[str]) -> dict[str, float] | None:
@@ -178,15 +208,18 @@ class Tail:
         return {key: angle for key, angle in found.items() if math.isfinite(angle)}
 
 
-async def run(page: str, angles: Sequence[str], port: int, tail: Tail | None, ready: Callable[[str], None]) -> None:
-    """Serves the page until Ctrl-C or a polite kill; `ready` gets its address. Raises as `serving`."""
+async def run(
+    page: str, angles: Sequence[str], host: str, port: int, tail: Tail | None, ready: Callable[[str], None]
+) -> None:
+    """Serves the page until Ctrl-C or a polite kill; `ready` gets each of its addresses. Raises as `serving`."""
     stop = asyncio.Event()
     with contextlib.suppress(RuntimeError, ValueError):  # not in the main thread: whoever started it stops it
         # A KeyboardInterrupt may be raised anywhere in the loop and get lost there.
         for number in interrupt.SIGNALS:
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    async with serving(page, angles, port) as (server, send):
-        ready(f"http://{HOST}:{server.sockets[0].getsockname()[1]}/")
+    async with serving(page, angles, port, host) as (server, send):
+        for address in reached(host):
+            ready(f"http://{address}:{server.sockets[0].getsockname()[1]}/")
         while not stop.is_set():
             for said in tail.new() if tail else ():
                 send(said)

@@ -23,6 +23,7 @@ from model.prediction import Model
 A4 = (8.27, 11.69)
 LEFT, RIGHT = 0.08, 0.95
 GAP = 0.02  # between columns
+TAKEN_IN = 1.5  # a map that shows the whole lane is at most so many times as coarse
 AHEAD = 3.0  # m of free ground around what the machine touches: overhangs, and a person who has to stop
 
 
@@ -78,19 +79,22 @@ def _first(sheet: Sheet) -> Figure:
     for x, (name, value) in zip(starts, rows, strict=True):
         figure.text(x, 0.908, value, fontsize=9, weight="bold")
         figure.text(x, 0.895, name, fontsize=7, color="0.25")
-    lane = figure.add_axes((LEFT, 0.555, RIGHT - LEFT, 0.31))
+    lane = figure.add_axes((LEFT, 0.57, RIGHT - LEFT, 0.3))
     _lane(lane, sheet)
     trace = sheet.trace
+    for k, part in enumerate(textwrap.wrap(drive.start_words(sheet.model, sheet.motions[0], trace), 108)):
+        figure.text(LEFT, 0.521 - 0.0128 * k, part, fontsize=8.5, weight="bold")
     space = 0.43 / (1 + len(trace.levers))
     bottom = figure.add_axes((LEFT, 0.48 - (space - 0.025), RIGHT - LEFT, space - 0.025))
-    _trace(bottom, sheet, "speed [m/s]\nbackward  |  forward", trace.speed, drive.BAND_SPEED, 1.0)
+    _trace(bottom, sheet, "speed [m/s]", ("forward", "backward"), trace.speed, drive.BAND_SPEED, 1.0)
     _numbers(bottom, trace)
     for k, (lever, degrees) in enumerate(zip(trace.levers, trace.degrees.T, strict=True), 1):
         bottom.tick_params(labelbottom=False)
         place = (LEFT, 0.48 - (k + 1) * space + 0.025, RIGHT - LEFT, space - 0.025)
         bottom = figure.add_axes(place, sharex=bottom)
-        label = f"{lever.name} [°]\nright  |  left"
-        _trace(bottom, sheet, label, degrees, np.rad2deg(drive.BAND_ANGLE), 5.0)
+        ends = ("left", "right")
+        _trace(bottom, sheet, f"{lever.name} [°]", ends, degrees, np.rad2deg(drive.BAND_ANGLE), 5.0)
+        bottom.yaxis.set_major_formatter(lambda degrees, _: f"{abs(degrees):g}")  # the side is said in words
     bottom.set_xlabel("time [s]; the grey band is the tolerance", fontsize=8)
     return figure
 
@@ -114,8 +118,9 @@ def _lane(ax: Axes, sheet: Sheet) -> None:
     v = sheet.trace.at(motion.t)[0]
     forward = v >= 0
     for ahead, colour, style, name in ((True, COLOURS[0], "-", "forward"), (False, COLOURS[1], "--", "backward")):
-        part = np.where((forward == ahead)[:, None], centre, np.nan)
-        ax.plot(*part.T, color=colour, linestyle=style, linewidth=1.8, label=name, zorder=3)
+        if (v > 0 if ahead else v < 0).any():
+            part = np.where((forward == ahead)[:, None], centre, np.nan)
+            ax.plot(*part.T, color=colour, linestyle=style, linewidth=1.8, label=name, zorder=3)
     start = dict(zip(model.coordinates, motion.q[0], strict=True))
     for outline in topview.footprints(model.machine, start):  # the machine as it stands at the start
         ax.add_patch(Polygon(outline, closed=True, facecolor="white", edgecolor="black", zorder=4))
@@ -130,43 +135,89 @@ def _lane(ax: Axes, sheet: Sheet) -> None:
         if np.hypot(*step) > 0.05:
             tip = centre[k] + step / np.hypot(*step) * 0.4
             ax.annotate("", tip, centre[k], arrowprops={"arrowstyle": "-|>", "color": "black"}, zorder=5)
-    half, lane = np.array(sheet.lane) / 2, f"lane {sheet.lane[0]:g} x {sheet.lane[1]:g} m"
-    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * half
-    ax.plot(*corners.T, color="black", linestyle=":", linewidth=1, label=lane)
-    ax.plot([], [], "D", color="white", markeredgecolor="black", markersize=5, label="change of direction A, B, ...")
+    scale = _view(ax, sheet)
+    half, view = np.array(sheet.lane) / 2, np.array([ax.get_xlim(), ax.get_ylim()])
+    if not (np.abs(view) < half[:, None]).all():  # some of its edge is in the picture
+        corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * half
+        lane = f"lane {sheet.lane[0]:g} x {sheet.lane[1]:g} m"
+        ax.plot(*corners.T, color="black", linestyle=":", linewidth=1.2, label=lane)
+    if len(marks) > 2:
+        ax.plot(
+            [], [], "D", color="white", markeredgecolor="black", markersize=5, label="change of direction A, B, ..."
+        )
     ax.plot([], [], color="0.8", linewidth=6, label="ground that is touched")
-    (x, y), margin = sheet.room.corner, 0.7 * AHEAD
-    half_x, half_y = sheet.room.length / 2, sheet.room.width / 2
-    width, height = ax.get_position().width * A4[0], ax.get_position().height * A4[1]
-    scale = max((half_x + margin) / width, (half_y + margin) / height)
-    ax.set_xlim(x + half_x - scale * width, x + half_x + scale * width)
-    ax.set_ylim(y + half_y - scale * height, y + half_y + scale * height)
-    ax.set_aspect("equal")
-    _mark(ax, marks, 36 / scale)  # the axis is 2 scale metres an inch
-    ax.set_xlabel("along the lane [m]", fontsize=8)
-    ax.set_ylabel("across [m]", fontsize=8)
+    metre = 36 / scale  # the axis is 2 scale metres an inch
+    rolls = [_box(outline * metre) for outline in topview.footprints(model.machine, start)]
+    _mark(ax, marks, metre, [*rolls, *((x, y, 2.0, 2.0) for x, y in centre[::25] * metre)])
+    ax.set_xlabel("along the lane, from its middle [m] →", fontsize=8, labelpad=1)
+    ax.set_ylabel("left of its middle [m] →", fontsize=8)
     ax.tick_params(labelsize=7)
     ax.grid(alpha=0.25)
     ax.legend(fontsize=7, ncols=5, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False, borderpad=0)
 
 
-def _mark(ax: Axes, marks: Sequence[tuple[str, str, np.ndarray]], metre: float) -> None:
-    """Markers with their names (marker, name, place), each name where it hides least; a metre is so many points."""
-    taken = [(*(at * metre), 7.0, 7.0) for _, _, at in marks]
+def _view(ax: Axes, sheet: Sheet) -> float:
+    """Equal axes over all that is touched, and over the lane where that isn't much more; half the metres an inch."""
+    size = np.array([ax.get_position().width, ax.get_position().height]) * A4
+    touched = np.array([sheet.room.corner, np.add(sheet.room.corner, (sheet.room.length, sheet.room.width))])
+    touched += [[-0.7 * AHEAD], [0.7 * AHEAD]]
+    half = np.array(sheet.lane) / 2 + 0.5
+    both = np.array([np.minimum(touched[0], -half), np.maximum(touched[1], half)])
+    near, far = (float((np.ptp(box, axis=0) / 2 / size).max()) for box in (touched, both))
+    box, scale = (both, far) if far <= TAKEN_IN * near else (touched, near)
+    low, high = box.mean(axis=0) - scale * size, box.mean(axis=0) + scale * size
+    ax.set_xlim(low[0], high[0])
+    ax.set_ylim(low[1], high[1])
+    ax.set_aspect("equal")
+    return scale
+
+
+def _box(points: np.ndarray) -> tuple[float, float, float, float]:
+    """The box (centre x, centre y, width, height) around points (n, 2)."""
+    return (*points.min(axis=0) / 2 + points.max(axis=0) / 2, *np.ptp(points, axis=0))
+
+
+def _merged(
+    marks: Sequence[tuple[str, str, np.ndarray]], metre: float, near: float = 7.0
+) -> list[tuple[str, str, np.ndarray]]:
+    """Marks of one kind that would hide each other, fewer than `near` points apart, as one with all their names."""
+    made: list[tuple[str, str, np.ndarray]] = []
+    for marker, text, at in marks:
+        for k, (other, names, there) in enumerate(made):
+            if other == marker and np.hypot(*(at - there)) * metre < near:
+                made[k] = (marker, f"{names}, {text}", there)
+                break
+        else:
+            made.append((marker, text, at))
+    return made
+
+
+def _mark(
+    ax: Axes,
+    marks: Sequence[tuple[str, str, np.ndarray]],
+    metre: float,
+    drawn: Sequence[tuple[float, float, float, float]] = (),
+) -> None:
+    """Markers with their names (marker, name, place), each name where it hides least; a metre is so many points.
+
+    drawn: boxes (centre x, centre y, width, height) [points] of what else names should not hide.
+    """
+    marks, turns = _merged(marks, metre), np.deg2rad(np.arange(45, 405, 30))
+    taken: list[tuple[float, float, float, float]] = [*drawn, *((*(at * metre), 7.0, 7.0) for _, _, at in marks)]
     for marker, text, at in marks:
         filled = "white" if marker == "D" else "black"
         ax.plot(*at, marker, color=filled, markeredgecolor="black", markersize=6, zorder=6)
         width, height = 6.5 * len(text), 8.0
         around = [
             (far * np.cos(turn) + np.cos(turn) * width / 2, far * np.sin(turn) + np.sin(turn) * height / 2)
-            for far in (9.0, 16.0, 25.0)
-            for turn in np.deg2rad(np.arange(45, 405, 30))
+            for far in (9.0, 16.0, 25.0, 36.0)
+            for turn in turns
         ]
         boxes = [(at[0] * metre + x, at[1] * metre + y, width, height) for x, y in around]
         hidden = [sum(_overlap(box, other) for other in taken) for box in boxes]
         k = int(np.argmin(hidden))  # the first of equals is the nearest
         taken.append(boxes[k])
-        line = {"arrowstyle": "-", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3} if k >= len(boxes) // 3 else None
+        line = {"arrowstyle": "-", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3} if k >= len(turns) else None
         ax.annotate(
             text,
             (at[0], at[1]),
@@ -187,7 +238,10 @@ def _overlap(one: tuple[float, ...], other: tuple[float, ...]) -> float:
     return wide * high
 
 
-def _trace(ax: Axes, sheet: Sheet, label: str, value: np.ndarray, band: float, least: float) -> None:
+def _trace(
+    ax: Axes, sheet: Sheet, label: str, ends: tuple[str, str], value: np.ndarray, band: float, least: float
+) -> None:
+    """A channel of the trace in its band; ends: what is up and what is down, said as on the page."""
     trace = sheet.trace
     t = np.arange(0, trace.duration + 0.005, 0.05)
     low, high = drive.band(t, np.interp(t, trace.times, value), band)
@@ -202,6 +256,9 @@ def _trace(ax: Axes, sheet: Sheet, label: str, value: np.ndarray, band: float, l
     ax.set_ylim(-top, top)
     ax.set_xlim(0, trace.duration)
     ax.set_ylabel(label, fontsize=8)
+    for word, y, side in zip(ends, (0.97, 0.03), ("top", "bottom"), strict=True):
+        edge = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1}
+        ax.text(0.994, y, word, transform=ax.transAxes, fontsize=8, weight="bold", ha="right", va=side, bbox=edge)
     ax.tick_params(labelsize=7)
     ax.grid(axis="y", alpha=0.3)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from conftest import Excite
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from excite import cab, drive, page, sheet, stored
 from excite.drive import DriveError, Trace
@@ -125,6 +126,43 @@ def test_words_say_what_to_do(va12: Model) -> None:
     assert drive.words(through, 1, letters=True).startswith("through a stop A at 0:04")
     assert drive.reversals(through) == pytest.approx([4.0], abs=0.2)
     assert drive.reversals(trace) == pytest.approx([15.0], abs=0.2)
+    named = [drive.words(trace, k, letters=True) for k in range(len(trace))]
+    assert [words for words in named if "stop A" in words] == ["brake to a stop A in 3 s, keep 20° left"]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_every_change_of_direction_on_the_map_is_in_the_table(va12: Model, seed: int) -> None:
+    """Through a stop or with a rest between, each letter stands in one row, in order."""
+    rng = np.random.default_rng(seed)
+    speed = np.array([0.0, *rng.choice([-1.2, -0.1, 0, 0.1, 1.5], 25), 0])
+    trace = Trace(3.0 * np.arange(len(speed)), speed, np.zeros((len(speed), 1)), drive.levers(va12))
+    turns = drive.reversals(trace)
+    rows = [drive.words(trace, k, letters=True) for k in range(len(trace))]
+    found = [row.partition(" stop ")[2].split()[0] for row in rows if " stop " in row]
+    assert [name for name in found if name not in ("at", "in")] == [drive.letter(k) for k in range(len(turns))]
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "degrees", "words"),
+    [
+        (-3.1, -4.1, 42.4, "3.1 m behind the lane's middle and 4.1 m right of it, pointing 42° left; articulation"),
+        (5.9, 3.5, -208, "5.9 m ahead of the lane's middle and 3.5 m left of it, pointing 152° left; articulation"),
+        (0, 0, -20, "level with the lane's middle and on its line, pointing 20° right; articulation straight."),
+        (0, 1, 180.2, "level with the lane's middle and 1.0 m left of it, pointing back; articulation straight."),
+        (2, 0, 360, "2.0 m ahead of the lane's middle and on its line, pointing ahead; articulation straight."),
+    ],
+)
+def test_where_to_start_is_said(va12: Model, x: float, y: float, degrees: float, words: str) -> None:
+    motion = motion_of(va12, np.zeros(2), np.zeros(2))
+    motion.q[:, :3] = [x, y, np.deg2rad(degrees)]
+    trace = Trace(KNOTS, SPEED, ANGLE, drive.levers(va12))
+    said = drive.start_words(va12, motion, trace)
+    assert said.startswith(f"Start, seen along the lane: the middle of the front roll {words}")
+
+
+def test_a_lane_that_can_only_be_followed_needs_no_place(straight: Model) -> None:
+    motion = motion_of(straight, np.zeros(2), np.zeros(2))
+    assert drive.start_words(straight, motion, Trace(KNOTS, SPEED, np.zeros((8, 0)), ())) == ""
 
 
 def test_words_name_each_of_several_joints() -> None:
@@ -243,6 +281,60 @@ def test_moved_motion_is_the_same_motion_elsewhere(va12: Model, va12_motion: Mot
     assert drive.moved(va12, va12_motion, start).q[:801] == pytest.approx(short.q, abs=1e-6)
 
 
+def first_page(model: Model, lane: tuple[float, float], speed: float = 1.5) -> Figure:
+    """The sheet of a drive forward and back, some metres long."""
+    levers = drive.levers(model)
+    t = np.array([0.0, 2, 6, 8, 10, 12, 14, 16])
+    v = np.array([0.0, speed, speed, 0, 0, -0.5, -0.5, 0])
+    trace = Trace(t, v, -np.deg2rad([[0.0], [0], [0], [-14], [-14], [0], [0], [0]])[:, : len(levers)], levers)
+    motions = (drive.driven(model, trace, STEADY, 0),)
+    made = sheet.Sheet("A drive", model, trace, motions, drive.room(model, motions), lane, (), (), "Good.")
+    figure = sheet._first(made)
+    figure.draw_without_rendering()
+    return figure
+
+
+@pytest.mark.parametrize(("lane", "seen"), [((20.0, 10.0), True), ((300.0, 100.0), False), ((4.0, 100.0), True)])
+def test_the_legend_names_what_the_map_shows(va12: Model, lane: tuple[float, float], seen: bool) -> None:
+    ax = first_page(va12, lane).axes[0]
+    names = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert (f"lane {lane[0]:g} x {lane[1]:g} m" in names) == seen
+    if lane[0] == 20:  # about as large as the drive: all of it
+        assert ax.get_xlim()[0] < -10 < 10 < ax.get_xlim()[1]
+        assert ax.get_ylim()[0] < -5 < 5 < ax.get_ylim()[1]
+    assert "backward" in names
+    backward = [text.get_text() for text in first_page(va12, lane, -1.0).axes[0].get_legend().get_texts()]
+    assert not {"forward", "change of direction A, B, ..."} & set(backward)
+
+
+def test_start_is_not_printed_over_the_machine(va12: Model) -> None:
+    ax = first_page(va12, (40.0, 20.0)).axes[0]
+    (start,) = [text for text in ax.texts if text.get_text() == "START"]
+    rolls = [patch for patch in ax.patches if patch.get_edgecolor()[:3] == (0, 0, 0) and patch.get_zorder() == 4]
+    assert len(rolls) == 2
+    name = Text.get_window_extent(start)  # without the line to its place
+    for roll in rolls:
+        assert not name.overlaps(roll.get_window_extent())
+
+
+def test_angles_on_the_sheet_have_sides_and_no_sign(va12: Model) -> None:
+    """As the page has them: left is up, right is down, said in words."""
+    ax = first_page(va12, (40.0, 20.0)).axes[2]
+    labels = [label.get_text() for label in ax.get_yticklabels()]
+    assert labels
+    assert all(float(label) >= 0 for label in labels)
+    up, down = (next(text for text in ax.texts if text.get_text() == side) for side in ("left", "right"))
+    assert up.get_position()[1] > down.get_position()[1]
+    assert ax.lines[0].get_ydata().min() == pytest.approx(-14)  # right
+
+
+def test_stops_at_one_place_are_one_mark() -> None:
+    place = np.array([1.0, 2.0])
+    marks = [("o", "START", place), ("D", "A", place), ("D", "B", place + 0.1), ("D", "C", place + 5)]
+    merged = sheet._merged(marks, 10.0)
+    assert [text for _, text, _ in merged] == ["START", "A, B", "C"]
+
+
 def test_names_on_the_map_do_not_hide_each_other() -> None:
     """Eight changes of direction within two metres, a metre on 11 points of paper: no name on another or on a mark."""
     rng = np.random.default_rng(1)
@@ -290,6 +382,61 @@ def test_band_is_the_reference_a_second_around() -> None:
     assert high[t > 4.05] == pytest.approx(1.1)
     assert low[t < 5.9] == pytest.approx(-0.1)
     assert low[t > 6.05] == pytest.approx(0.9)
+
+
+PLAYED = drive.Score(100, 1.0, "M", 0.2)
+LOST = drive.Score(100, 3.0, "M", 0.2)
+
+
+@pytest.mark.parametrize("objective", ["accuracy", "cond"])
+def test_a_design_for_drivers_is_not_sent_there_again(objective: str) -> None:
+    assert "--driver" in cab.verdict(PLAYED, LOST, objective)
+    said = cab.verdict(PLAYED, LOST, objective, by_hand=True)
+    assert "too much is lost" in said
+    assert "--driver" not in said
+    assert ("--objective accuracy" in said) == (objective == "cond")
+    assert all(way in said for way in ("--duration", "--starts", "--budget", "play back the torques"))
+    assert "leave out --phases" in cab.verdict(PLAYED, LOST, objective, by_hand=True, fewer=True)
+
+
+def test_limits_that_a_person_exceeds_stand_with_the_verdict() -> None:
+    person, over = replace(PLAYED, median_percent=0.32), {"power": 0.06}
+    said = cab.verdict(PLAYED, person, over=over, slower=0.9)
+    assert said.endswith(
+        "good enough to drive. But a person exceeds limits, power by 6 % of its range: design again with --driver, or"
+        " stay 10 % below all speeds, which keeps them."
+    )
+    said = cab.verdict(PLAYED, person, by_hand=True, over={**over, "rim_speed": 0.03})
+    assert "power by 6 %, rim speed by 3 % of their range: design again with them so much tighter" in said
+    assert "--driver" not in said
+    assert "below" not in said
+
+
+@pytest.mark.parametrize(
+    ("median", "worst", "words"),
+    [
+        (1.6, 1.04, "attains 1.6 times the median error of torques played back exactly and is as good in the worst"),
+        (0.98, 1.4, "attains 0.98 times the median error and 1.4 times the worst error of torques"),
+        (1.0, 1.4, "attains 1.4 times the worst error of torques played back exactly and is as good in the median"),
+        (1.01, 1.0, "is as good as torques played back exactly: nothing that counts is lost."),
+    ],
+)
+def test_errors_that_are_the_same_are_said_to_be_so(median: float, worst: float, words: str) -> None:
+    assert words in cab.verdict(PLAYED, drive.Score(100, worst, "M", 0.2 * median))
+
+
+def test_speeds_that_keep_the_limits_are_found(va12: Model) -> None:
+    """A start that needs too much power: on speeds a tenth lower people keep it, on a twentieth they don't."""
+    problem = va12.machine.problems["R60"]
+    trace = Trace(np.array([0.0, 1.6, 8, 12]), np.array([0.0, 1.6, 1.6, 0]), np.zeros((4, 1)), drive.levers(va12))
+
+    def exceeded(share: float) -> set[str]:
+        slow = replace(trace, speed=share * trace.speed)
+        return set(cab._exceeded(va12, problem, tuple(drive.driven(va12, slow, None, k) for k in range(cab.PEOPLE))))
+
+    assert exceeded(1) == {"power"}
+    assert cab._slower(va12, problem, trace, np.zeros(len(va12.coordinates)), 0) == 0.9
+    assert [exceeded(0.95), exceeded(0.9)] == [{"power"}, set()]
 
 
 @pytest.mark.slow

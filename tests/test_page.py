@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import Excite
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
@@ -259,6 +261,27 @@ def test_everything_fits_and_is_big(
     assert seen > 500
 
 
+@pytest.mark.parametrize("size", [(844, 390), (667, 375), (1280, 800), (390, 844)])
+@pytest.mark.parametrize(("name", "trace"), [("va12", TRACE), ("tandem", TWO)])
+def test_where_to_start_is_shown_until_the_drive_begins(
+    open_page: Callable[..., Tab], va12: Model, name: str, trace: Trace, size: tuple[int, int]
+) -> None:
+    model = {"va12": va12, "tandem": TANDEM}[name]
+    q = np.zeros((2, len(model.coordinates)))
+    q[:, :3] = [-13.1, -14.1, np.deg2rad(-142)]
+    motion = replace(drive.driven(model, trace, None, 0), t=np.arange(2) / 100, q=q, nu=np.zeros_like(q))
+    start = drive.start_words(model, motion, trace)
+    tab = open_page(size=size, text=page.driver_page(model, trace, "A drive", start))
+    tab.page.clock.run_for(100)
+    assert tab.text("#next") == start
+    for id in ("#now", "#words", "body"):
+        high, room = tab.page.evaluate(f"(e => [e.scrollHeight, e.clientHeight])(document.querySelector('{id}'))")
+        assert high <= room + 1, id
+    tab.page.tap("#start")
+    tab.page.clock.run_for(100)
+    assert "Start, seen" not in tab.text("#now")
+
+
 @pytest.fixture(scope="module")
 def followed(va12: Model) -> pd.DataFrame:
     return sensors.measure(va12, drive.driven(va12, TRACE, None, 4), seed=1)
@@ -325,13 +348,13 @@ def test_a_log_that_began_earlier_is_found_in_time(
 
 
 @contextmanager
-def running(html: str) -> Iterator[tuple[str, Callable[[dict[str, float]], object]]]:
+def running(html: str, host: str = serve.HOST) -> Iterator[tuple[str, Callable[[dict[str, float]], object]]]:
     loop, ready = asyncio.new_event_loop(), threading.Event()
     found: dict[str, Any] = {}
 
     async def work() -> None:
         found["end"] = asyncio.Event()
-        async with serve.serving(html, ("articulation_rad",)) as (server, send):
+        async with serve.serving(html, ("articulation_rad",), host=host) as (server, send):
             found["address"] = f"127.0.0.1:{server.sockets[0].getsockname()[1]}"
             found["send"] = send
             ready.set()
@@ -379,6 +402,55 @@ def test_pages_from_elsewhere_are_refused(html: str) -> None:
                 plain.sendall(f"GET / HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
                 answer = plain.recv(1000)
             assert answer.split()[1] == status
+
+
+def test_a_phone_on_the_network_gets_live_values(browser: Any, html: str) -> None:
+    """By another address than the loopback one of a server that listens on all; by its number alone, still."""
+    with running(html, "0.0.0.0") as (address, send):
+        port = int(address.split(":")[1])
+        tab = Tab(browser, f"http://127.0.0.2:{port}/", fake=False)
+        tab.shows("#note", "live values")
+        send({"v_m_s": 0.74, "articulation_rad": -0.2})
+        tab.shows("#speed .seen", "is 0.7 m/s")
+        tab.context.close()
+        for host, status in ((f"127.0.0.2:{port}", 200), (f"localhost:{port}", 403), (f"evil.example:{port}", 403)):
+            with socket.create_connection(("127.0.0.2", port)) as plain:
+                plain.sendall(f"GET / HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+                assert int(plain.recv(1000).split()[1]) == status
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(f"ws://127.0.0.2:{port}/live", origin=Origin("https://evil.example"))
+
+
+def test_addresses_to_open_are_numbers_of_this_machine() -> None:
+    assert serve.reached(serve.HOST) == ["127.0.0.1"]
+    assert serve.reached("192.168.1.7") == ["192.168.1.7"]
+    assert serve.reached("::1") == ["[::1]"]
+    *others, last = serve.reached("0.0.0.0")
+    assert last == "127.0.0.1"
+    for other in others:
+        with socket.socket() as listener:
+            listener.bind((other, 0))  # raises where it is another machine's
+    assert serve.reached("::")[-1] == "[::1]"
+
+
+def test_an_address_that_is_not_this_machines_is_refused(html: str, excite: Excite) -> None:
+    async def listen() -> None:
+        async with serve.serving(html, (), host="192.0.2.1"):
+            pass
+
+    # in a thread of its own, for the browser's loop runs in this one
+    with (
+        ThreadPoolExecutor() as pool,
+        pytest.raises(serve.ServeError, match=r"--host 192.0.2.1: is no address of this"),
+    ):
+        pool.submit(asyncio.run, listen()).result(20)
+    for host in ("", "roller"):
+        code, _, said = excite("drive", "nowhere", "--serve", "--host", host)
+        assert code == 2
+        assert f"--host {host}: is no address, give a number" in said
+    code, _, said = excite("drive", "nowhere", "--host", "0.0.0.0")
+    assert code == 2
+    assert "for --serve, give that too" in said
 
 
 def test_only_this_machine_reaches_the_server(html: str) -> None:
