@@ -1,7 +1,7 @@
 """What may be wrong with a log though every value is possible: a sign turned around, a torque a thousand times off.
 
 The drive of a joint that steers does more work with the joint's motion than against it, since friction takes some. A
-roll may well brake while another one pulls; but whatever the others do, more torque makes the machine faster.
+contact may well brake while another one pulls; but whatever the others do, more torque makes the machine faster.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LEAST = 10  # independent spans that a sign is judged by
 CLEAR = 2.5  # standard deviations
 AGAINST = 0.3  # correlation, or share of the acceleration that the machine file's masses promise, below zero
 ALIKE = 0.1  # of the largest singular value: torques that differ by less can't be told apart
-FRICTION = 2.0  # times that of the joints: in a bend the rolls rub on the ground as well
+FRICTION = 2.0  # times that of the joints: in a bend contacts rub on the ground as well
 CLEARER = 0.8  # times what is left of the torque otherwise: beyond doubt a speed
 SHARE = 0.1  # of the highest speed: below, dry friction fades
 SLOW = 0.1  # rad/s: below, friction fades in an average over a span
@@ -132,21 +132,21 @@ def _pulls(
     means: Mapping[int, np.ndarray],
     half: int,
 ) -> bool:
-    """Whether a roll turns slower for more torque, by least squares over the torques of all rolls and friction.
+    """Whether a contact turns slower for more torque, by least squares over the torques of all contacts and friction.
 
     As a share of what the machine's mass at the rims makes of a force. Torques that go together all along share the
     effect equally: of one half of them turned around that half is found.
     """
     speed, acceleration = motion
-    rolls = [(b, float(b.contact.radius)) for b in driven if b.contact is not None]
-    columns = [means[b.index] / radius for b, radius in rolls]
-    rubbed = [(b.friction, radius) for b, radius in rolls if b.friction is not None]
+    rolling = [(b, float(b.contact.radius)) for b in driven if b.contact is not None]
+    columns = [means[b.index] / radius for b, radius in rolling]
+    rubbed = [(b.friction, radius) for b, radius in rolling if b.friction is not None]
     columns.append(FRICTION * sum(float(f.Fs) / radius for f, radius in rubbed) * np.tanh(speed / SLOW))
     columns.append(FRICTION * sum(float(f.Fv) / radius for f, radius in rubbed) * speed)
     A = np.column_stack(columns)
     A -= A.mean(axis=0)
-    k = next(k for k, (b, _) in enumerate(rolls) if b.index == body.index)
-    y = rolls[k][1] * (acceleration - acceleration.mean())
+    k = next(k for k, (b, _) in enumerate(rolling) if b.index == body.index)
+    y = rolling[k][1] * (acceleration - acceleration.mean())
     inverse = np.linalg.pinv(A, rcond=ALIKE)
     x = inverse @ y
     left = y - A @ x

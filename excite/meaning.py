@@ -16,7 +16,7 @@ ACTING = {
 
 
 def meanings(model: Model) -> dict[str, str]:
-    """Every base parameter's name -> what it is and of which body: "torque offset, articulation". One that stands for
+    """Every base parameter's name -> what it is and of which body: "viscous friction, JOINT". One that stands for
     several is called regrouped; its sum is `model.base.grouping`."""
     words = {name: text for body in model.machine.body for name, text in _of(body).items()}
     masses = {f"M{b.index}" for b in model.machine.body if b.inertia is not None}

@@ -147,8 +147,8 @@ def _lane(ax: Axes, sheet: Sheet) -> None:
         )
     ax.plot([], [], color="0.8", linewidth=6, label="ground that is touched")
     metre = 36 / scale  # the axis is 2 scale metres an inch
-    rolls = [_box(outline * metre) for outline in topview.footprints(model.machine, start)]
-    _mark(ax, marks, metre, [*rolls, *((x, y, 2.0, 2.0) for x, y in centre[::25] * metre)])
+    prints = [_box(outline * metre) for outline in topview.footprints(model.machine, start)]
+    _mark(ax, marks, metre, [*prints, *((x, y, 2.0, 2.0) for x, y in centre[::25] * metre)])
     ax.set_xlabel("along the lane, from its middle [m] →", fontsize=8, labelpad=1)
     ax.set_ylabel("left of its middle [m] →", fontsize=8)
     ax.tick_params(labelsize=7)
