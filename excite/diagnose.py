@@ -47,7 +47,7 @@ FORMULA = 0.5  # of an amount, times the root of the share of a gain that its fo
 BESIDE = 250.0  # a gain that by the latter no effect can be denied
 CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
 LEAST = 0.05, 0.15  # of the excess misfit that an effect must explain to be worth a place: weak misfit, strong misfit
-SHARE = 0.6  # of the excess misfit that names must explain, or it is unexplained
+SHARE = 0.7  # of the excess misfit that names must explain, or it is unexplained
 FURTHER = 0.8  # the same for names after the first: what nature has beside its formula looks like many a cause
 NEAR = 0.3  # of what the best name leaves unexplained, by which a rival may be worse and still is a tie
 
@@ -423,7 +423,7 @@ def _unfollowed(stage: Stage, scores: Sequence[evidence.Score], together: Togeth
     good: the model began too far off. The stage as it was and no effect where nothing helps."""
     likely = _likely(stage, scores, ())
     machines = [effects.extended(stage.machine, _entry(s)) for s in likely]
-    for disturbed in (0.0, smoothing.DISTURBED[-1]) if likely else ():
+    for disturbed in (0.0, smoothing.DISTURBED[0], smoothing.DISTURBED[-1]) if likely else ():
         found = begun(machines, stage, disturbed, together)
         near = [(s, x) for s, x in zip(likely, found, strict=True) if x is not None and x.near]
         if not near:
@@ -437,7 +437,8 @@ def _unfollowed(stage: Stage, scores: Sequence[evidence.Score], together: Togeth
         except NotConverged:
             gain = _wald(score.candidate.name, best)  # of the same kind, and smaller where much is gained
         if gain < LEVEL * best.spread:
-            return stage if stage.exact else next(freed([stage], together)) or stage, []
+            exact = None if stage.exact else next(freed([stage], together))
+            return exact if exact is not None and exact.near else stage, []
         return stage, [_chosen(_close(tries, gain), gain, len(scores), together)]
     return stage, []
 

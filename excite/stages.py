@@ -47,11 +47,6 @@ class Prepared:
         """How many readings the logs have: what twice the negative log-likelihood of a right model is about."""
         return float(sum(r.used.sum() for r in self.records))
 
-    @property
-    def strong(self) -> float:
-        """The misfit from which it is strong."""
-        return STRONG * self.readings
-
 
 @dataclass(frozen=True)
 class Stage:
@@ -85,7 +80,7 @@ class Stage:
     @property
     def near(self) -> bool:
         """Whether the misfit is not far from what noise makes."""
-        return self.fit.cost <= self.prepared.strong
+        return self.fit.cost <= STRONG * self.prepared.readings
 
     @property
     def spread(self) -> float:
@@ -132,7 +127,8 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
     found = next((fits for d in smoothing.DISTURBED if (fits := _loosened(machine, prepared, d))), None)
     if found is not None:
         stage = _stage(machine, prepared, found)
-        return next(freed([stage], in_turn)) or stage
+        without = next(freed([stage], in_turn))
+        return without if without is not None and without.near else stage
     asis = replace(prepared, held=np.ones_like(prepared.held))
     try:
         fit = _iterated(asis, prepared.starts, prepared.c.model.nominal, smoothing.DISTURBED[0])
@@ -166,17 +162,28 @@ def _from_first(prepared: Prepared, disturbed: float, most: float = np.inf) -> F
 
 
 def _loosened(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
-    """A fit from first guesses with disturbing forces, and from there with smaller ones."""
+    """A fit from first guesses with disturbing forces, and from there with smaller ones, as long as these let the model
+    come near the logs: large ones hide what else there is."""
     fit = _from_first(prepared, disturbed)
     if fit is None:
         return None
-    stage = Stage(machine, prepared, fit)
-    for less in LESS:
-        try:
-            return _resume(prepared, stage, less * disturbed), fit
-        except NotConverged:
-            continue
-    return fit, None
+    stage = _with_less(Stage(machine, prepared, fit))
+    if stage is None:
+        return fit, None
+    while (smaller := _with_less(stage)) is not None and smaller.near:
+        stage = smaller
+    return stage.fit, fit
+
+
+def _with_less(stage: Stage) -> Stage | None:
+    """The fit of a stage gone on with with smaller disturbing forces, None where there is none."""
+    for forces in (less * stage.fit.disturbed for less in LESS):
+        if forces >= SMALL:
+            try:
+                return replace(stage, fit=_resume(stage.prepared, stage, forces))
+            except NotConverged:
+                continue
+    return None
 
 
 def _plain(machine: Machine, prepared: Prepared) -> Fits | None:
@@ -210,18 +217,19 @@ def refits(wishes: Sequence[Wish], together: Together) -> Iterator[Stage | None]
 
 
 def freed(found: Sequence[Stage], together: Together) -> Iterator[Stage | None]:
-    """Stages without their disturbing forces, side by side; None where exact dynamics don't come near the logs: they
-    make a large misfit of a formula that is nearly right."""
+    """Stages without their disturbing forces, side by side; None where exact dynamics are far from the logs: they make
+    a large misfit of a formula that is nearly right."""
     for stage, fit in zip(found, together([partial(_exact, x) for x in found]), strict=True):
         yield None if fit is None else replace(stage, fit=fit)
 
 
 def _exact(stage: Stage) -> Fit | None:
+    most = FAR * stage.prepared.readings
     try:
-        fit = _resume(stage.prepared, stage, 0.0, stage.prepared.strong)
+        fit = _resume(stage.prepared, stage, 0.0, most)
     except NotConverged:
         return None
-    return fit if replace(stage, fit=fit).near else None
+    return fit if fit.cost < most else None
 
 
 def _resumable(prepared: Prepared, of: Stage, disturbed: float) -> Fit | None:
