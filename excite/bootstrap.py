@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from excite import terminal
 from excite.estimate import Estimate, NotIdentifiable, noted
 from excite.log import Log
 from excite.noise import reread
 from excite.processing import Samples, lowpass, samples, white_noise
 from excite.sensors import signals
 from excite.simulate import Motion, SimulationError, respond
+from excite.wording import percent, rounded
 from model.machine import Filter
 from model.prediction import Model
 
@@ -77,8 +77,8 @@ def _remark(model: Model, estimate: Estimate, bias: np.ndarray, std: np.ndarray,
         return f"{estimate.method}: no bias found on {runs} simulated logs of the identified machine"
     order = [k for k in np.argsort(-np.abs(bias) / size) if matters[k]]
     listed = ", ".join(
-        f"{estimate.names[k]} {'+' if bias[k] > 0 else ''}{terminal.percent(100 * bias[k] / size[k])}"
-        f" (+-{terminal.rounded(float(100 * std[k] / size[k]), 1)})"
+        f"{estimate.names[k]} {'+' if bias[k] > 0 else ''}{percent(100 * bias[k] / size[k])}"
+        f" (+-{rounded(float(100 * std[k] / size[k]), 1)})"
         for k in order
     )
     return (

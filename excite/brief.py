@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from excite import aim as aims
-from excite import drive, identify, log, phased, scenario, sequential, terminal
+from excite import drive, identify, log, phased, scenario, sequential, wording
 from excite import objective as objectives
 from excite.aim import Aim
 from excite.design import Design, design
@@ -183,7 +183,7 @@ def advice(brief: Brief, worst: str, percent: float) -> str | None:
     if percent <= POOR:
         return None
     blind = objectives.conditions(brief.objective) and brief.sigma_max is None
-    poor = f"{worst} can't be found better than {terminal.percent(percent)}"
+    poor = f"{worst} can't be found better than {wording.percent(percent)}"
     if not blind:
         return f"poor accuracy: {poor}; drive longer, or on more room"
     return (

@@ -22,12 +22,12 @@ import numpy as np
 
 from excite import aim as aims
 from excite import objective as objectives
-from excite import terminal
 from excite.aim import SIGMA_MAX, Aim
 from excite.continuation import PLAN, SCOUTS, Candidate, Track, depart, promise, rank, refine, repair, resume, search
 from excite.limit import InfeasibleError
 from excite.manoeuvre import Manoeuvre
 from excite.simulate import Motion, simulate
+from excite.wording import percent
 from model.machine import Problem
 from model.prediction import Model
 
@@ -139,8 +139,8 @@ def _infeasible(aim: Aim, best: Candidate, complete: bool) -> InfeasibleError:
     if name == SIGMA_MAX and aim.sigma_max is not None:
         return InfeasibleError(
             f"no drive found that is accurate enough: {name} {aim.sigma_max:g} % is exceeded by"
-            f" {terminal.percent(100 * excess)}, the worst parameter comes out at"
-            f" {terminal.percent(aim.sigma_max * (1 + excess), 3)} in the best attempt;"
+            f" {percent(100 * excess)}, the worst parameter comes out at"
+            f" {percent(aim.sigma_max * (1 + excess), 3)} in the best attempt;"
             f" {'allow more, or give a longer duration or more starts' if complete else cut}",
             name,
             excess,

@@ -19,7 +19,7 @@ from excite import figures, folder, identify, limit, manoeuvre, page, reports, s
 from excite.meaning import meanings
 from excite.page import Picture, Table
 from excite.simulate import SimulationError, simulate
-from excite.terminal import rounded
+from excite.wording import rounded
 from model import file as files
 from model import machine as machines
 from model import tree

@@ -23,8 +23,8 @@ from excite.cell import DEFECT, DONE, Row
 from excite.figures import COLOURS
 from excite.page import Picture, Table, report_page
 from excite.plan import Cell, Plan
-from excite.terminal import percent, rounded
 from excite.verify import Verification
+from excite.wording import percent, rounded
 from model.prediction import built
 
 TABLE, FIGURE = "runs.parquet", "study.png"

@@ -14,7 +14,8 @@ import numpy as np
 from excite import figures, folder, log, logcheck, objective, tables
 from excite.limit import TOLERANCE
 from excite.page import Picture, Table, report_page
-from excite.terminal import ESTIMATE, likely, percent, rounded, some
+from excite.terminal import ESTIMATE
+from excite.wording import likely, percent, rounded, some
 from model import machine as machines
 
 NAME = "report.html"

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from excite.wording import likely, percent, rounded, some
+
 SHOWN = 40  # cells of a study in the terminal
-LINES = 8  # of what is left of a misfit, that are told at once
 PAUSE = 30.0  # s between lines of progress
 TELLING = 10  # runs before the time left can be told
 ESTIMATE = (  # what is told of a parameter: heading, key, digits
@@ -58,33 +59,6 @@ def table(*names: str) -> Any:
     for k, name in enumerate(names):
         table.add_column(name, justify="left" if k == 0 or name == "what it is" else "right")
     return table
-
-
-def some(lines: Sequence[str]) -> list[str]:
-    """The first of many lines, and where the rest is."""
-    if len(lines) <= LINES + 1:
-        return list(lines)
-    return [*lines[:LINES], f"and {len(lines) - LINES} more, in summary.json under `located`"]
-
-
-def rounded(value: object, digits: int = 4) -> str:
-    """A number to so many digits, a dash where there is none; 170, not 1.7e+02, where it is below a million."""
-    if value is None or (isinstance(value, float) and value != value):
-        return "-"
-    if not isinstance(value, float):
-        return str(value)
-    text = f"{value:.{digits}g}"
-    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
-
-
-def percent(value: float, digits: int = 2) -> str:
-    """A number of per cent as it stands in a sentence."""
-    return f"{rounded(float(value), digits)} %"
-
-
-def likely(p: float) -> str:
-    """A p-value, as small as it may be told."""
-    return "< 1e-12" if p < 1e-12 else rounded(p, 2)
 
 
 def design_table(summary: dict[str, Any]) -> None:

@@ -32,9 +32,9 @@ from excite.figures import COLOURS, save
 from excite.machinecheck import grouping
 from excite.manoeuvre import Manoeuvre
 from excite.simulate import Motion, simulate
-from excite.terminal import rounded
 from excite.topview import outline
 from excite.verify import summary, verify
+from excite.wording import rounded
 from model import machine, prediction
 from model.machine import Problem
 from model.prediction import Model

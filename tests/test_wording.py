@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from excite.terminal import percent, rounded
+from excite.wording import percent, rounded
 
 
 @pytest.mark.parametrize(
