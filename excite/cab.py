@@ -251,13 +251,14 @@ def summary(made: Sheet) -> dict[str, Any]:
 def write(made: Sheet, place: Path) -> dict[str, Any]:
     """sheet.pdf, driver.html and phases.csv into a folder; returns the numbers."""
     sheet.save(made, place / "sheet.pdf")
-    start = drive.start_words(made.model, made.motions[0], made.trace)
-    (place / PAGE).write_text(page.driver_page(made.model, made.trace, made.title, start), encoding="utf-8")
+    said = summary(made)
+    text = page.driver_page(made.model, made.trace, made.title, said["start"])
+    (place / PAGE).write_text(text, encoding="utf-8")
     t = made.trace.times
     angles = {lever.column: angle for lever, angle in zip(made.trace.levers, made.trace.angle.T, strict=True)}
     knots = pd.DataFrame({"t_s": t, "v_m_s": made.trace.speed, **angles})
     knots.to_csv(place / "phases.csv", index=False)
-    return summary(made)
+    return said
 
 
 def serve(out: Path, made: Sheet, host: str, port: int, live: Path | None, ready: Callable[[str], None]) -> None:
