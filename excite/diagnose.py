@@ -20,7 +20,7 @@ from excite.anomaly import anomalies
 from excite.log import Log
 from excite.newton import NotConverged
 from excite.sidebyside import Together, in_turn
-from excite.stages import SMALL, Stage, begun, fitted, freed, refits, refitted
+from excite.stages import SMALL, Stage, begun, exact_if_near, fitted, freed, refits, refitted
 from model import effects
 from model.file import Quantity
 from model.machine import EffectEntry, Filter
@@ -437,8 +437,7 @@ def _unfollowed(stage: Stage, scores: Sequence[evidence.Score], together: Togeth
         except NotConverged:
             gain = _wald(score.candidate.name, best)  # of the same kind, and smaller where much is gained
         if gain < LEVEL * best.spread:
-            exact = None if stage.exact else next(freed([stage], together))
-            return exact if exact is not None and exact.near else stage, []
+            return exact_if_near(stage), []
         return stage, [_chosen(_close(tries, gain), gain, len(scores), together)]
     return stage, []
 

@@ -127,8 +127,7 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
     found = next((fits for d in smoothing.DISTURBED if (fits := _loosened(machine, prepared, d))), None)
     if found is not None:
         stage = _stage(machine, prepared, found)
-        without = next(freed([stage], in_turn))
-        return without if without is not None and without.near else stage
+        return exact_if_near(stage)
     asis = replace(prepared, held=np.ones_like(prepared.held))
     try:
         fit = _iterated(asis, prepared.starts, prepared.c.model.nominal, smoothing.DISTURBED[0])
@@ -221,6 +220,12 @@ def freed(found: Sequence[Stage], together: Together) -> Iterator[Stage | None]:
     a large misfit of a formula that is nearly right."""
     for stage, fit in zip(found, together([partial(_exact, x) for x in found]), strict=True):
         yield None if fit is None else replace(stage, fit=fit)
+
+
+def exact_if_near(stage: Stage) -> Stage:
+    """A stage without its disturbing forces where exact dynamics come near the logs, otherwise as it is."""
+    without = None if stage.exact else next(freed([stage], in_turn))
+    return without if without is not None and without.near else stage
 
 
 def _exact(stage: Stage) -> Fit | None:
