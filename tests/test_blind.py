@@ -239,7 +239,9 @@ def test_what_is_so_strong_that_nothing_follows_the_log_is_named(name: str, numb
     judged = score(one, said)
     assert judged.outcome in ("right", "tied"), said["answer"]
     assert judged.gain is not None
-    assert judged.gain > 25, said["answer"]  # per cent; of soil by a map of the lane it is 52, and not surely any
+    assert judged.gain > 25, said["answer"]  # per cent
+    if name != "compaction_per_pass":  # by a map of the lane, which the formula isn't
+        assert judged.gain_sure, said["answer"]
 
 
 @pytest.mark.slow

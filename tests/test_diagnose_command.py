@@ -257,7 +257,7 @@ def test_an_amount_that_nothing_shows_is_not_sure(straight: Model) -> None:
     assert [x.name for x in diagnose.needed(clean, chosen)] == names[1:]
 
 
-@pytest.mark.parametrize(("share", "seed"), [(0.03, 3), (0.03, 4), (30.0, 4)])
+@pytest.mark.parametrize(("share", "seed"), [(0.03, 3), (0.03, 4), (0.2, 3), (0.4, 3), (3.0, 3), (30.0, 4)])
 def test_a_file_that_is_far_off_is_no_cause(straight: Model, share: float, seed: int) -> None:
     """A clean log, the file's contacts at so large a share of the true ones."""
     one = log.check(sensors.measure(straight, gentle(straight, 20.0), seed=seed), straight.machine)
