@@ -347,7 +347,7 @@ def simulate(
     """Drives a profile in simulation and writes the log that the sensors would write."""
     from excite import folder, profiles, sensors
     from excite.simulate import simulate as drive
-    from model import effects
+    from model import placing
     from model.prediction import build
 
     if noise not in ("on", "off"):
@@ -359,8 +359,8 @@ def simulate(
     torque, q0, nu0 = profiles.read(profile, model)
     if effect:
         seconds = (len(torque) - 1) / float(model.machine.sampling_hz)
-        entries = [effects.parse(text, model.machine, seconds) for text in effect]
-        model = build(effects.extended(model.machine, *entries))
+        entries = [placing.parse(text, model.machine, seconds) for text in effect]
+        model = build(placing.extended(model.machine, *entries))
     with folder.writing_file(out) as path:
         motion = drive(model, torque, q0=q0, nu0=nu0)
         table = sensors.measure(model, motion, kit=kit, seed=seed, noise=noise == "on")

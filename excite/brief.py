@@ -21,7 +21,7 @@ from excite import objective as objectives
 from excite.aim import Aim
 from excite.design import Design, design
 from excite.phased import Phased
-from model import effects
+from model import effects, placing
 from model.machine import EffectEntry, MachineError, Problem
 from model.prediction import Model, build
 
@@ -64,13 +64,13 @@ def rivals(model: Model, between: tuple[str, ...], duration: float) -> Model:
 
     Raises MachineError for an effect that is unknown, that the machine can't have, or that driving doesn't show.
     """
-    return beside(model, [effects.parse(text, model.machine, duration) for text in between])
+    return beside(model, [placing.parse(text, model.machine, duration) for text in between])
 
 
 def beside(model: Model, rivals: Sequence[EffectEntry]) -> Model:
     """The same for effects as a machine file has them. What they can be mistaken for may have any shape, so shapes of
     effects are parameters too, unless they are times of a log. Raises MachineError."""
-    machine = effects.extended(model.machine, *rivals)
+    machine = placing.extended(model.machine, *rivals)
     times = any(effects.CATALOGUE[e.name].timed for e in machine.effect)
     both = build(machine, model.flaws, shapes=not times)
     for e in both.effects[-2:]:

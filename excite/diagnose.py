@@ -21,7 +21,7 @@ from excite.log import Log
 from excite.newton import NotConverged
 from excite.sidebyside import Together, in_turn
 from excite.stages import SMALL, Stage, begun, exact_if_near, fitted, freed, refits, refitted
-from model import effects
+from model import placing
 from model.file import Quantity
 from model.machine import EffectEntry, Filter
 from model.prediction import Model
@@ -196,7 +196,7 @@ def _one_by_one(before: Stage, chosen: Sequence[Choice], whole: Stage) -> list[C
     made = [before]
     try:
         for x in chosen:
-            machine = effects.extended(made[-1].machine, _fitted(whole, x.name))
+            machine = placing.extended(made[-1].machine, _fitted(whole, x.name))
             made.append(refitted(machine, made[-1], before.fit.disturbed))
         made[-1] = made[-1] if whole.fit.disturbed == before.fit.disturbed else whole
     except NotConverged:
@@ -422,7 +422,7 @@ def _unfollowed(stage: Stage, scores: Sequence[evidence.Score], together: Togeth
     there is one. With it there may be a fit without it after all, which then is what it is compared with, and may be as
     good: the model began too far off. The stage as it was and no effect where nothing helps."""
     likely = _likely(stage, scores, ())
-    machines = [effects.extended(stage.machine, _entry(s)) for s in likely]
+    machines = [placing.extended(stage.machine, _entry(s)) for s in likely]
     for disturbed in (0.0, smoothing.DISTURBED[0], smoothing.DISTURBED[-1]) if likely else ():
         found = begun(machines, stage, disturbed, together)
         near = [(s, x) for s, x in zip(likely, found, strict=True) if x is not None and x.near]
@@ -460,7 +460,7 @@ def _tries(
         gained = max((stage.fit.cost - found.fit.cost for _, found in tries), default=0.0)
         if not batch or gained > OVER * batch[0].gain:
             break
-        wishes = [(effects.extended(stage.machine, _entry(s)), stage, stage.fit.disturbed) for s in batch]
+        wishes = [(placing.extended(stage.machine, _entry(s)), stage, stage.fit.disturbed) for s in batch]
         tell(at)
         for k, (score, found) in enumerate(zip(batch, refits(wishes, together), strict=True)):
             tell(min(at + k + 1, len(likely) - 1))

@@ -22,7 +22,7 @@ from excite.linearise import BATCH, Batch, Chart, Slopes, differentiate
 from excite.processing import implicit
 from excite.record import Point, Record, smoothed
 from excite.sensors import torque_behind
-from model import effects
+from model import placing
 from model.effect import Effect, Placed, Site
 from model.effects import CATALOGUE
 from model.equations import Signatures as MadeSignatures
@@ -73,7 +73,7 @@ def candidates(machine: Machine, sensors: Sequence[str], duration: float, known:
     found: list[Candidate] = []
     columns = 0
     for effect in CATALOGUE.values():
-        for where, (bodies, sensor) in effects.places(machine, effect).items():
+        for where, (bodies, sensor) in placing.places(machine, effect).items():
             if f"{effect.name}@{where}" in known or (effect.reading is not None and sensor not in sensors):
                 continue
             site = Site(machine, machine.find(bodies[0]), duration)

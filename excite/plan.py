@@ -44,9 +44,8 @@ from excite.asked import UsageError
 from excite.limit import KINDS
 from excite.log import LogError
 from excite.objective import OBJECTIVES
-from model import effects as catalogue
 from model import machine as machines
-from model import prediction
+from model import placing, prediction
 from model.effect import DURATION
 from model.file import Number, Record, one_line
 from model.machine import Machine, MachineError
@@ -401,7 +400,7 @@ def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:
             asked.problem(plan.designed(d), d.problem, d.duration_s)
     if fresh(d.machine, cell.effects):
         for text in cell.effects:
-            catalogue.parse(text, machine, DURATION)
+            placing.parse(text, machine, DURATION)
         names = [t.partition("=")[0] for t in cell.effects]
         if len(set(names)) < len(names):
             raise StudyError(f"effects: {', '.join(cell.effects)}: an effect is given twice")

@@ -18,7 +18,7 @@ from pydantic import AfterValidator
 import excite
 import model
 from excite import asked, compare, handbook, identify, limit, objective, plan, sensors
-from model import effects, units
+from model import effects, placing, units
 from model import machine as machines
 from model.effect import DURATION, Effect, Shape, Site, one
 from model.file import Record
@@ -83,7 +83,7 @@ def effects_page() -> str:
         ),
     ]
     for e in catalogue:
-        sites = effects.places(va12, e)
+        sites = placing.places(va12, e)
         typical = [f"`{e.name}@{where}={_typical(va12, e, bodies):.3g}`" for where, (bodies, _) in sites.items()]
         lines += [f"## {e.name}", "", f"{_sentence(e.meaning)} {_amount(e)}", ""]
         lines += [f"Seen in a log: {e.signature.strip('.')}.", "", f"Source: {e.source.strip('.')}.", ""]

@@ -17,7 +17,7 @@ from excite.diagnose import Diagnosis
 from excite.evidence import remembered
 from excite.record import smoothed
 from excite.stages import Stage
-from model import effects
+from model import effects, placing
 from model.effect import Placed, Site
 from model.equations import Signatures, signatures
 from model.machine import EffectEntry, Machine
@@ -84,7 +84,7 @@ def rivals(d: Diagnosis) -> list[Rivals]:
         tied = [_placed(d.after, name) for name in (f.name, *f.tied_with)]
         pairs = [(0, k) for k in range(1, len(tied))]
         apart = set(pairs) - _same(_Asked(d.after, tied)(_stirred(_motion(d.after))), pairs)
-        machine = effects.extended(d.before.machine, *(x.entry for x in d.findings if x is not f))
+        machine = placing.extended(d.before.machine, *(x.entry for x in d.findings if x is not f))
         found += [Rivals(machine, (f.entry, f.rivals[k - 1])) for _, k in sorted(apart)]
     return found
 
@@ -141,7 +141,7 @@ def _placed(stage: Stage, name: str) -> Placed:
         return known
     name, _, where = name.partition("@")
     effect = effects.CATALOGUE[name]
-    bodies, sensor = effects.places(stage.machine, effect)[where]
+    bodies, sensor = placing.places(stage.machine, effect)[where]
     log = stage.prepared.logs[0]
     site = Site(stage.machine, stage.machine.find(bodies[0]), float(log.t[-1] - log.t[0]))
     shapes = {n: s.default * s.size(site) for n, s in effect.shapes.items()}

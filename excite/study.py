@@ -27,8 +27,8 @@ from excite.engine import EngineError, Pool
 from excite.folder import FolderError
 from excite.plan import Cell, Drive, Plan, StudyError
 from excite.store import Store, StoreError
-from model import effects
 from model import machine as machines
+from model import placing
 from model.machine import Machine
 from model.prediction import built
 
@@ -253,8 +253,8 @@ def _work(wanted: Plan, cell: Cell, track: Track) -> Work:
     machine = wanted.machines[cell.drive.machine]
     true: Machine = machine
     if cell.effects:
-        entries = [effects.parse(text, machine, track.duration_s) for text in cell.effects]
-        true = effects.extended(machine, *entries)
+        entries = [placing.parse(text, machine, track.duration_s) for text in cell.effects]
+        true = placing.extended(machine, *entries)
     known = machine.model_dump_json()
     return Work(known, true.model_dump_json(), track.driven, wanted.study.steps, cell.kit, wanted.method(cell), ())
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from model import contact, tree
+from model import contact, placing, tree
 from model import effects as catalogue
 from model.effect import Placed, Rolling, Scene, Soil, Values
 from model.machine import Body, Machine, MachineError
@@ -282,7 +282,7 @@ def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
         force -= ca.vertcat(*[rows[c] for c in s.names])
     if effect.inertia is not None:
         told = effect.inertia(e.scene, e.values)
-        moved = catalogue.shifted(machine, told)
+        moved = placing.shifted(machine, told)
         none = {n: ca.SX(0) for n in s.by_name}
         change = {b.index: tree.inertial_vector(b, {**none, **moved}) for b in machine.body}
         rows = tree.generalised_forces(machine, s.at, s.frames, change)
@@ -295,7 +295,7 @@ def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
 def _recoil(s: Sample, e: Acting, change: Mapping[str, ca.SX]) -> ca.SX:
     """Generalised force (n_q,) on a body along whose x axis a load slides: the first moment MX and the inertia ZZ of it
     change with time. -MX'' along, the Coriolis force -2 omega MX' across, the moment -omega ZZ' about the origin."""
-    body = catalogue.shifting(s.machine)
+    body = placing.shifting(s.machine)
     assert body is not None
     frame = s.frames[body]
     lever = ca.jacobian(ca.vertcat(frame.velocity[:2], frame.omega[2]), s.nu)

@@ -15,8 +15,7 @@ from functools import cached_property, lru_cache
 import casadi as ca
 import numpy as np
 
-from model import effects as catalogue
-from model import tree
+from model import placing, tree
 from model.effect import DURATION, Placed, Site
 from model.equations import Equations, equations, kinematics
 from model.machine import Machine, MachineError
@@ -265,7 +264,7 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
     """
     table = standard_parameters(machine)
     _check_names(machine, tuple(table))
-    placed = tuple(catalogue.placed(machine, entry) for entry in machine.effect)
+    placed = tuple(placing.placed(machine, entry) for entry in machine.effect)
     twice = sorted({e.name for e in placed if [f.name for f in placed].count(e.name) > 1})
     if twice:
         raise MachineError(f"{machine.name}: effect: given twice at one place: {', '.join(twice)}")

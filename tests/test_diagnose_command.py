@@ -16,15 +16,15 @@ from excite import checkup, diagnose, log, profiles, sensors, stages
 from excite.separate import Rivals
 from excite.sidebyside import forked, in_turn
 from excite.simulate import Motion, simulate
-from model import effects, machine, prediction
+from model import machine, placing, prediction
 from model.machine import EffectEntry
 from model.prediction import Model
 
 
 def logged(model: Model, motion: Motion, path: Path, seed: int, *texts: str) -> Path:
     """The log of a motion's torques on a machine with effects, as the sensors write it."""
-    entries = [effects.parse(text, model.machine, float(motion.t[-1])) for text in texts]
-    extended = prediction.build(effects.extended(model.machine, *entries)) if entries else model
+    entries = [placing.parse(text, model.machine, float(motion.t[-1])) for text in texts]
+    extended = prediction.build(placing.extended(model.machine, *entries)) if entries else model
     driven = simulate(extended, motion.u, q0=motion.q[0], nu0=motion.nu[0])
     sensors.measure(extended, driven, seed=seed).to_csv(path, index=False)
     return path
@@ -69,13 +69,13 @@ def test_a_slope_from_log_to_extended_machine(
 
     extended = prediction.build(machine.load(out / "machine.toml"))
     assert extended.effects[0].values["A"] == pytest.approx(0.01, rel=0.01)
-    again = simulate(prediction.build(effects.extended(straight.machine, _slope(straight))), straight_motion.u)
+    again = simulate(prediction.build(placing.extended(straight.machine, _slope(straight))), straight_motion.u)
     right, wrong = (simulate(m, straight_motion.u) for m in (extended, straight))
     assert np.abs(right.q - again.q).max() < 0.05 * np.abs(wrong.q - again.q).max()
 
 
 def _slope(straight: Model) -> EffectEntry:
-    return effects.parse("ground_slope=0.01", straight.machine, 40.0)
+    return placing.parse("ground_slope=0.01", straight.machine, 40.0)
 
 
 def test_bad_input_is_refused_before_the_work(sloping: Path, tmp_path: Path, excite: Excite) -> None:
@@ -100,7 +100,7 @@ def test_a_drive_is_designed_for_what_is_tied(straight: Model, tmp_path: Path) -
     )
     machine = straight.machine.model_copy(update={"problems": {"S40": short}, "problem": "S40"})
     told = ("torque_deadband@rear_roll=80", "asymmetric_coulomb@rear_roll=60", "encoder_eccentricity@rear_roll=0.01")
-    deadband, coulomb, eccentric = (effects.parse(text, machine, 12.0) for text in told)
+    deadband, coulomb, eccentric = (placing.parse(text, machine, 12.0) for text in told)
     pairs = [Rivals(machine, (deadband, eccentric)), Rivals(machine, (deadband, coulomb))]
     assert checkup.separating(tmp_path, machine, pairs[:1], True) is None
     nowhere = machine.model_copy(update={"problem": None})
@@ -119,7 +119,7 @@ def test_a_drive_is_designed_for_what_is_tied(straight: Model, tmp_path: Path) -
 
     # Driven with the one, the log prefers it to the other by what the design promises.
     torque, q0, nu0 = profiles.read(tmp_path / said["folder"] / "profile.csv", straight)
-    both = [prediction.build(effects.extended(machine, e)) for e in (deadband, coulomb)]
+    both = [prediction.build(placing.extended(machine, e)) for e in (deadband, coulomb)]
     motion = simulate(both[0], torque, q0=q0, nu0=nu0)
     one = log.check(sensors.measure(both[0], motion, seed=2), machine)
     right, wrong = (stages.fitted(m.machine, [one], machine.filter).fit for m in both)
@@ -186,9 +186,9 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
     """Two at once; found the other way round they stay, and a wrong name that came before or between them goes. Side by
     side or in turn, the numbers are the same."""
     true = [
-        effects.parse(text, straight.machine, 40.0) for text in ("ground_slope=0.004", "torque_deadband@rear_roll=60")
+        placing.parse(text, straight.machine, 40.0) for text in ("ground_slope=0.004", "torque_deadband@rear_roll=60")
     ]
-    both = prediction.build(effects.extended(straight.machine, *true))
+    both = prediction.build(placing.extended(straight.machine, *true))
     motion = simulate(both, straight_motion.u)
     one = log.check(sensors.measure(both, motion, seed=4), straight.machine)
     found, same = (diagnose.diagnose(straight, [one], straight.machine.filter, together=t) for t in (forked, in_turn))
@@ -199,8 +199,8 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
     for f, e in zip(sorted(found.findings, key=lambda f: f.name), true, strict=True):
         assert abs(f.amount - float(e.amount)) < 4 * f.amount_std
 
-    wrong = effects.parse("asymmetric_coulomb@rear_roll=60", straight.machine, 40.0)
-    more = stages.refitted(effects.extended(found.after.machine, wrong), found.after, 0.0)
+    wrong = placing.parse("asymmetric_coulomb@rear_roll=60", straight.machine, 40.0)
+    more = stages.refitted(placing.extended(found.after.machine, wrong), found.after, 0.0)
     name = f"{wrong.name}@{wrong.where}"
     for order, stage in (
         (names[::-1], found.after),
@@ -227,7 +227,7 @@ def test_what_a_process_found_can_be_sent_back(straight: Model, straight_motion:
 
     one = log.check(sensors.measure(straight, straight_motion, seed=3), straight.machine)
     stage = stages.fitted(straight.machine, [one], straight.machine.filter)
-    slope = effects.extended(straight.machine, effects.parse("ground_slope=0.001", straight.machine, 10.0))
+    slope = placing.extended(straight.machine, placing.parse("ground_slope=0.001", straight.machine, 10.0))
     for disturbed in (0.0, 1.0):
         (found,) = stages.begun([slope], stage, disturbed, sent)
         assert found is not None
@@ -249,8 +249,8 @@ def test_an_amount_that_nothing_shows_is_not_sure(straight: Model) -> None:
     one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
     clean = stages.fitted(straight.machine, [one], straight.machine.filter)
     told = ("compaction_per_pass=0.3", "stribeck_friction@rear_roll=9")
-    entries = [effects.parse(text, straight.machine, 12.0) for text in told]
-    both = stages.refitted(effects.extended(straight.machine, *entries), clean, 0.0)
+    entries = [placing.parse(text, straight.machine, 12.0) for text in told]
+    both = stages.refitted(placing.extended(straight.machine, *entries), clean, 0.0)
     names = [e.name for e in both.model.effects]
     assert [bool(both.fit.unseen[both.model.base.names.index(n)]) for n in names] == [True, False]
     chosen = [diagnose.Choice(n, both, 1000.0, 1.0, 100, (), 1.0) for n in names]

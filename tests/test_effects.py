@@ -9,7 +9,7 @@ import pytest
 
 from excite import evidence, log, profiles, sensors, stages
 from excite.simulate import simulate
-from model import effects, machine
+from model import machine, placing
 from model.effect import DURATION, Effect, Placed, Site
 from model.effects import CATALOGUE
 from model.equations import signatures
@@ -52,11 +52,11 @@ ROOT = Path(__file__).parents[1]
 
 
 def where(effect: Effect) -> str:
-    return next(iter(effects.places(VA12, effect)))
+    return next(iter(placing.places(VA12, effect)))
 
 
 def typical(effect: Effect) -> float:
-    bodies, _ = effects.places(VA12, effect)[where(effect)]
+    bodies, _ = placing.places(VA12, effect)[where(effect)]
     return effect.amount(Site(VA12, VA12.find(bodies[0]), DURATION))
 
 
@@ -64,7 +64,7 @@ def extended(effect: Effect, amount: float) -> Model:
     entry = EffectEntry(
         name=effect.name, where=where(effect), amount=Quantity(value=amount, source="assumed"), shape={}
     )
-    return build(effects.extended(VA12, entry))
+    return build(placing.extended(VA12, entry))
 
 
 def samples(model: Model, count: int = 40, seed: int = 0) -> list[np.ndarray]:
@@ -116,7 +116,7 @@ def test_an_effect_of_no_size_changes_nothing(effect: Effect, va12: Model) -> No
             effect_at = model.machine.effect[0].model_copy(
                 update={"shape": {s: Quantity(value=v, source="assumed") for s, v in SHAKEN.items()}}
             )
-            model = build(effects.extended(VA12, effect_at))
+            model = build(placing.extended(VA12, effect_at))
         read = sensors.signals(model, simulate(model, torque))
         return max(float(np.abs(read[n] - x).max() / np.abs(x).max()) for n, x in plain.items())
 
@@ -164,24 +164,24 @@ def test_a_signature_is_what_the_extended_model_has_more(effect: Effect, va12: M
 )
 def test_a_wrong_effect_is_one_clear_line(text: str, said: str) -> None:
     with pytest.raises(MachineError, match=said) as caught:
-        effects.parse(text, VA12, 60.0)
+        placing.parse(text, VA12, 60.0)
     assert "\n" not in str(caught.value)
 
 
 def test_an_effect_twice_at_one_place_is_refused() -> None:
-    entry = effects.parse("ground_slope=0.01", VA12, 60.0)
+    entry = placing.parse("ground_slope=0.01", VA12, 60.0)
     with pytest.raises(MachineError, match="twice"):
-        build(effects.extended(VA12, entry, entry))
+        build(placing.extended(VA12, entry, entry))
 
 
 def test_phases_and_places_follow_the_machine() -> None:
     """The straight machine has no articulation and no gyro; a machine without contacts has joints only."""
     straight, bench = machine.load("va12_straight"), machine.load("emps")
-    assert not effects.places(straight, CATALOGUE["articulation_backlash"])
-    assert not effects.places(straight, CATALOGUE["yaw_rate_bias"])
-    assert set(effects.places(bench, CATALOGUE["asymmetric_viscous"])) == {"carriage"}
-    assert not effects.places(bench, CATALOGUE["ground_slope"])
-    assert isinstance(effects.placed(bench, effects.parse("torque_gain=0.1", bench, 10.0)), Placed)
+    assert not placing.places(straight, CATALOGUE["articulation_backlash"])
+    assert not placing.places(straight, CATALOGUE["yaw_rate_bias"])
+    assert set(placing.places(bench, CATALOGUE["asymmetric_viscous"])) == {"carriage"}
+    assert not placing.places(bench, CATALOGUE["ground_slope"])
+    assert isinstance(placing.placed(bench, placing.parse("torque_gain=0.1", bench, 10.0)), Placed)
 
 
 LOADED = {
@@ -200,7 +200,7 @@ def test_a_load_slides_on_the_last_chassis(name: str, body: int) -> None:
     """Long after, the machine is one whose first moment is larger by the amount; no chassis that turns, no place."""
     known = machine.load(name)
     plain, amount = build(known), 3.0
-    shifted = build(effects.extended(known, effects.parse(f"payload_shift={amount}", known, 10.0)))
+    shifted = build(placing.extended(known, placing.parse(f"payload_shift={amount}", known, 10.0)))
     n, rng = len(plain.coordinates), np.random.default_rng(0)
     q, nu, a = rng.uniform(-1, 1, (3, n))
     u, late = np.zeros(len(plain.inputs)), np.full(len(shifted.memory), 1e3)
@@ -213,9 +213,9 @@ def test_a_load_slides_on_the_last_chassis(name: str, body: int) -> None:
 
 
 def compacting(known: machine.Machine, counted: float) -> Model:
-    entry = effects.parse("compaction_per_pass=0.3", known, 24.0)
+    entry = placing.parse("compaction_per_pass=0.3", known, 24.0)
     told = {**entry.shape, "counted": Quantity(value=counted, source="assumed")}
-    return build(effects.extended(known, entry.model_copy(update={"shape": told})))
+    return build(placing.extended(known, entry.model_copy(update={"shape": told})))
 
 
 def test_compaction_counts_the_way_and_reversals(straight: Model) -> None:
@@ -262,7 +262,7 @@ def test_stops_may_be_out_of_the_middle() -> None:
         amount=Quantity(value=1e4, source="assumed"),
         shape=shape,
     )
-    plain, sprung = build(VA12), build(effects.extended(VA12, entry))
+    plain, sprung = build(VA12), build(placing.extended(VA12, entry))
     still = np.zeros(len(plain.coordinates))
 
     def more(angle: float) -> float:
@@ -286,7 +286,7 @@ def test_a_rate_has_no_errors_of_an_angle() -> None:
     known = VA12.model_copy(update={"sensor": tuple(rated)})
 
     def offered(name: str) -> set[str]:
-        return set(effects.places(known, CATALOGUE[name]))
+        return set(placing.places(known, CATALOGUE[name]))
 
     assert offered("encoder_eccentricity") == {"rear_roll", "measuring_wheel_right"}
     assert not offered("articulation_backlash") | offered("articulation_compliance")
@@ -296,22 +296,22 @@ def test_a_rate_has_no_errors_of_an_angle() -> None:
     assert "encoder_eccentricity@rear_roll" in names
     assert not names & {"encoder_eccentricity@front_roll", "articulation_backlash@articulation"}
     with pytest.raises(MachineError, match="where must be one of rear_roll, measuring_wheel_right"):
-        effects.parse("encoder_eccentricity@front_roll=0.01", known, 60.0)
+        placing.parse("encoder_eccentricity@front_roll=0.01", known, 60.0)
 
 
 def test_effects_of_one_contact_on_others_need_a_drive() -> None:
     """Of the three-wheel roller the steered front roll is driven by nothing: nothing couples to it."""
     known = machine.load("three_wheel")
-    assert effects.places(known, CATALOGUE["pump_coupling"]) == {"drive": ((1, 2), None)}
-    model = build(effects.extended(known, effects.parse("pump_coupling=0.1", known, 10.0)))
+    assert placing.places(known, CATALOGUE["pump_coupling"]) == {"drive": ((1, 2), None)}
+    model = build(placing.extended(known, placing.parse("pump_coupling=0.1", known, 10.0)))
     still, torque = np.zeros(len(model.coordinates)), np.array([100.0, 200.0, 0.0])
     more = model.balance(still, still, still, model.expand @ model.nominal, torque, []).full()
     assert more[list(model.actuated), 0] == pytest.approx([-20, -10, 0])
-    assert not effects.places(machine.load("va12_straight"), CATALOGUE["payload_shift"])
+    assert not placing.places(machine.load("va12_straight"), CATALOGUE["payload_shift"])
 
 
 THREE = machine.load("three_wheel")
-TOWED = {e.name: e for e in CATALOGUE.values() if any(4 in bodies for bodies, _ in effects.places(THREE, e).values())}
+TOWED = {e.name: e for e in CATALOGUE.values() if any(4 in bodies for bodies, _ in placing.places(THREE, e).values())}
 
 
 def test_what_needs_no_motor_may_sit_at_a_contact_that_has_none() -> None:
@@ -321,17 +321,17 @@ def test_what_needs_no_motor_may_sit_at_a_contact_that_has_none() -> None:
     assert set(TOWED) == possible | {"compaction_per_pass"}
     assert not set(TOWED) & needing
     assert {e.name for e in CATALOGUE.values() if e.soil or e.push} <= set(TOWED)
-    assert effects.places(THREE, CATALOGUE["compaction_per_pass"]) == {"drive": ((1, 2, 4), None)}
+    assert placing.places(THREE, CATALOGUE["compaction_per_pass"]) == {"drive": ((1, 2, 4), None)}
     with pytest.raises(MachineError, match="where must be one of left_roll, right_roll"):
-        effects.parse("torque_deadband@front_roll=100", THREE, 10.0)
+        placing.parse("torque_deadband@front_roll=100", THREE, 10.0)
 
 
 @pytest.mark.parametrize("effect", TOWED.values(), ids=list(TOWED))
 def test_at_a_towed_contact_prediction_is_dynamics(effect: Effect) -> None:
     """No torque acts on its joint, whatever the effect does there; and the effect does something."""
-    place = next(w for w, (bodies, _) in effects.places(THREE, effect).items() if 4 in bodies)
+    place = next(w for w, (bodies, _) in placing.places(THREE, effect).items() if 4 in bodies)
     amount = effect.amount(Site(THREE, THREE.find(4), 10.0))
-    model = build(effects.extended(THREE, effects.parse(f"{effect.name}@{place}={amount}", THREE, 10.0)))
+    model = build(placing.extended(THREE, placing.parse(f"{effect.name}@{place}={amount}", THREE, 10.0)))
     plain, rng, n = build(THREE), np.random.default_rng(2), 40
     q, nu = rng.uniform(-1, 1, (2, len(model.coordinates), n))
     u, z = rng.uniform(-2000, 2000, (3, n)), rng.uniform(0.1, 0.5, (len(model.memory), n))
@@ -357,7 +357,7 @@ def test_noise_of_torques_is_no_gain_and_no_delay() -> None:
     measured = log.check(sensors.measure(known, simulate(known, torque, q0=q0, nu0=nu0), seed=3), VA12)
     plain = stages.fitted(VA12, [measured], VA12.filter)
     entry = EffectEntry(name="torque_gain", where="articulation", amount=Quantity(value=0.005, source="assumed"))
-    found = stages.refitted(effects.extended(VA12, entry), plain, 0.0)
+    found = stages.refitted(placing.extended(VA12, entry), plain, 0.0)
     at = found.model.base.names.index("torque_gain@articulation")
     assert abs(found.fit.X[at]) < 3.5 * found.fit.std[at]
     assert found.fit.cost < plain.fit.cost + 1  # both are found to so much

@@ -41,7 +41,7 @@ from excite.log import LogError
 from excite.plan import StudyError
 from excite.simulate import SimulationError, simulate
 from excite.stored import StoredError
-from model import effects, machine, prediction
+from model import machine, placing, prediction
 from model.machine import MachineError
 from model.prediction import Model
 
@@ -695,7 +695,7 @@ def test_titles_and_paths_are_text_in_figures_and_reports(
 @given(st.text(max_size=60))
 def test_any_text_is_an_effect_or_is_refused(text: str) -> None:
     try:
-        entry = effects.parse(text, VA12, 60.0)
+        entry = placing.parse(text, VA12, 60.0)
     except MachineError as err:
         one_line(err)
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from excite.meaning import meanings
-from model import effects, machine, prediction
+from model import machine, placing, prediction
 from model.prediction import Model
 
 
@@ -34,6 +34,6 @@ def test_every_parameter_has_words_of_its_own(name: str) -> None:
 def test_other_names_and_effects_keep_the_words(emps: Model, va12: Model) -> None:
     assert meanings(emps)["Fc"] == "dry friction, carriage"
     assert meanings(emps)["offset"] == "force offset, carriage"
-    entry = effects.parse("torque_deadband@rear_roll=80", va12.machine, 60.0)
-    said = meanings(prediction.build(effects.extended(va12.machine, entry)))
+    entry = placing.parse("torque_deadband@rear_roll=80", va12.machine, 60.0)
+    said = meanings(prediction.build(placing.extended(va12.machine, entry)))
     assert said["torque_deadband@rear_roll"] == "torque deadband, rear roll"

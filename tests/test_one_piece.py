@@ -48,7 +48,7 @@ from excite.manoeuvre import Manoeuvre, knots
 from excite.objective import Objective
 from excite.plan import Study
 from excite.simulate import simulate
-from model import effects, machine
+from model import machine, placing
 from model.effect import Effect
 from model.effects import CATALOGUE
 from model.machine import Filter, MachineError, Problem
@@ -123,7 +123,7 @@ def test_a_new_effect_is_one_declaration(
     without, sticky = (pd.read_csv(path)["theta4_rad"].to_numpy() for path in logs)
     assert np.abs(without - sticky).max() > 0.05
     # the regressor
-    model = build(effects.extended(va12.machine, effects.parse(wanted, va12.machine, 10.0)))
+    model = build(placing.extended(va12.machine, placing.parse(wanted, va12.machine, 10.0)))
     assert model.base.names[-1] == "sticky_spot@rear_roll"
     q, nu, a, u, z = test_effects.samples(model)
     assert np.abs(model.stacked(q, nu, a, u, z)[:, 5, -1]).max() > 0.9
@@ -145,7 +145,7 @@ def test_a_new_effect_is_one_declaration(
     assert "## sticky_spot" in reference.effects_page()
     assert "sticky_spot" in asked.choices("effect")
     with pytest.raises(MachineError, match=r"allowed: stribeck_friction.*sticky_spot"):
-        effects.parse("no_such_thing=1", va12.machine, 10.0)
+        placing.parse("no_such_thing=1", va12.machine, 10.0)
     assert plan.ready(study(effects=[[], wanted])).total == 2
     # tested by the same tests as every other
     for test in (
@@ -272,7 +272,7 @@ def test_a_new_method_is_one_function(
         offered(excite, command, "method", "halves")
     assert "| halves | Half of what least squares finds. | none | yes |" in reference.choices_page()
     assert plan.ready(study(method=["ols", "halves"])).total == 2
-    sloping = build(effects.extended(straight.machine, effects.parse("ground_slope=0.01", straight.machine, 9.0)))
+    sloping = build(placing.extended(straight.machine, placing.parse("ground_slope=0.01", straight.machine, 9.0)))
     with pytest.raises(MachineError, match="method halves doesn't know effects, use ols or joint"):
         identify.identify(sloping, [one], "halves")
 

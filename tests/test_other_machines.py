@@ -40,7 +40,7 @@ from excite import (
 from excite.diagnose import Diagnosis
 from excite.limit import InfeasibleError
 from excite.simulate import Motion, simulate
-from model import effects
+from model import effects, placing
 from model.effect import Site
 from model.file import Quantity
 from model.machine import Machine, Problem, load, shipped
@@ -395,11 +395,11 @@ def test_torques_that_effects_take_are_of_the_machines_own_size(name: str) -> No
         u, nu[row] = full * np.eye(len(plain.inputs))[k], 1.0
         for cause, share in (("torque_deadband", 1.0), ("relief_valve", 0.4 * full), ("load_dependent_friction", full)):
             effect = effects.CATALOGUE[cause]
-            if body.where not in effects.places(plain.machine, effect):
+            if body.where not in placing.places(plain.machine, effect):
                 continue
             amount = effect.amount(Site(plain.machine, body, 10.0))
-            entry = effects.parse(f"{cause}@{body.where}={amount}", plain.machine, 10.0)
-            model = build(effects.extended(plain.machine, entry))
+            entry = placing.parse(f"{cause}@{body.where}={amount}", plain.machine, 10.0)
+            model = build(placing.extended(plain.machine, entry))
             more = model.balance(still, nu, still, model.expand @ model.nominal, u, [])
             assert 0.01 * full < amount * share < 0.5 * full
             assert float((more - plain.balance(still, nu, still, p))[row]) == pytest.approx(amount * share, rel=0.02)
@@ -430,8 +430,8 @@ def biased() -> tuple[Motion, Diagnosis]:
     model = model_of("skid_robot")
     drawn = json.loads((ROOT / "results" / "machines" / "skid_robot" / "drive.json").read_text())
     torque = manoeuvre.Manoeuvre(np.array(drawn["times_s"]), np.array(drawn["torque"])).sample(100.0)[:801]
-    effect = effects.parse("yaw_rate_bias=0.01", model.machine, 8.0)
-    wrong = build(effects.extended(model.machine, effect))
+    effect = placing.parse("yaw_rate_bias=0.01", model.machine, 8.0)
+    wrong = build(placing.extended(model.machine, effect))
     motion = simulate(wrong, torque)
     measured = log.check(sensors.measure(wrong, motion, seed=3), model.machine)
     return motion, diagnose.diagnose(model, [measured], model.machine.filter)
@@ -460,7 +460,7 @@ def test_a_diagnosis_names_what_a_roll_has_that_nothing_drives(cause: str) -> No
     model = model_of("three_wheel")
     drawn = json.loads((ROOT / "results" / "machines" / "three_wheel" / "drive.json").read_text())
     torque = manoeuvre.Manoeuvre(np.array(drawn["times_s"]), np.array(drawn["torque"])).sample(100.0)
-    wrong = build(effects.extended(model.machine, effects.parse(cause, model.machine, 20.0)))
+    wrong = build(placing.extended(model.machine, placing.parse(cause, model.machine, 20.0)))
     motion = simulate(wrong, torque, q0=np.array(drawn["start"]))
     found = diagnose.diagnose(
         model, [log.check(sensors.measure(wrong, motion, seed=1), model.machine)], model.machine.filter
@@ -484,7 +484,7 @@ def test_the_run_that_separates_has_the_machines_names(
     """No drive tells which of two wheels of one side resists: both push along the same line."""
     effect, _, where = cause.partition("@")
     machine = biased[1].before.machine
-    tied = (effects.parse(f"{rival}=1", machine, 8.0),)
+    tied = (placing.parse(f"{rival}=1", machine, 8.0),)
     found = replace(biased[1].findings[0], effect=effect, where=where, rivals=tied)
     diagnosis = replace(biased[1], findings=(found,))
     assert separate.run(diagnosis) == said

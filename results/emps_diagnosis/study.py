@@ -15,7 +15,7 @@ import numpy as np
 
 from excite import log
 from excite.processing import filtered_regression
-from model import effects, machine
+from model import machine, placing
 from model.prediction import build
 
 HERE = Path(__file__).parent
@@ -34,7 +34,7 @@ def main(path: Path) -> None:
     found = {}
     errors = {}
     for name, texts in MODELS.items():
-        model = build(effects.extended(plain, *(effects.parse(t, plain, 25.0) for t in texts)))
+        model = build(placing.extended(plain, *(placing.parse(t, plain, 25.0) for t in texts)))
         W, Y = filtered_regression(model, log.read(path, plain), plain.filter)
         W, Y = W[0], Y[0]
         X = np.linalg.lstsq(W, Y, rcond=None)[0]
