@@ -20,7 +20,19 @@ from excite.anomaly import anomalies
 from excite.log import Log
 from excite.newton import NotConverged
 from excite.sidebyside import Together, in_turn
-from excite.stages import SMALL, Stage, begun, exact_if_near, fitted, freed, refits, refitted
+from excite.stages import (
+    SMALL,
+    Stage,
+    as_measured,
+    begun,
+    exact_if_near,
+    fitted,
+    forced,
+    freed,
+    refits,
+    refitted,
+    sharpened,
+)
 from model import placing
 from model.file import Quantity
 from model.machine import EffectEntry, Filter
@@ -47,8 +59,11 @@ FORMULA = 0.5  # of an amount, times the root of the share of a gain that its fo
 BESIDE = 250.0  # a gain that by the latter no effect can be denied
 CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
 LEAST = 0.05, 0.15  # of the excess misfit that an effect must explain to be worth a place: weak misfit, strong misfit
+SEVERAL = 2  # effects that are put together where none alone lets a model follow the logs
 SHARE = 0.7  # of the excess misfit that names must explain, or it is unexplained
 FURTHER = 0.8  # the same for names after the first: what nature has beside its formula looks like many a cause
+FORCED = 0.02  # of what is gained with disturbing forces, by which a rival is a tie: they take up part of a difference
+ODD = 50.0  # misfit that every line of what is odd beside names stands for, at least
 NEAR = 0.3  # of what the best name leaves unexplained, by which a rival may be worse and still is a tie
 
 Advance = Callable[[float, str], None]
@@ -113,7 +128,11 @@ def diagnose(
     tell(0.0, "fitting the model")
     before = fitted(model.machine, logs, filter)
     chosen, first, left = list[Choice](), tuple[evidence.Score, ...](), 0.0
-    if not before.settled:
+    if before.coarse > 1:
+        tell(0.15, "fitting effects with coarse sensors")
+        sharp = _sharp(before, together)
+        before, chosen = sharp or (forced(before), chosen)
+    if not (before.settled or chosen):
         tell(0.15, "fitting effects from the beginning")
         first = _scores(before)
         before, chosen = _unfollowed(before, first, together)
@@ -152,11 +171,11 @@ def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tupl
         if not kept or (stage.exact and not odd):
             break
         enough = SHARE if len(kept) == 1 else FURTHER
-        explained = kept[-1].share(stage)
+        explained = kept[-1].share(stage, odd)
         if explained >= enough:
             break
         loose = kept[-1].loose
-        if loose is not None and kept[-1].share(loose) >= enough:
+        if loose is not None and kept[-1].share(loose, ()) >= enough:
             # Exact dynamics make a large misfit of a formula that is nearly right; it was judged with forces.
             kept[-1] = replace(kept[-1], stage=loose)
             odd = _odd(loose)
@@ -193,6 +212,8 @@ def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_tu
 def _one_by_one(before: Stage, chosen: Sequence[Choice], whole: Stage) -> list[Choice]:
     """Effects that a model has, put into the one without them one after the other; gains are over those that stand
     before. None of them where the logs can't be fitted on the way."""
+    if before.coarse > 1:
+        return []
     made = [before]
     try:
         for x in chosen:
@@ -284,6 +305,7 @@ def _scanned(stage: Stage, found: Sequence[evidence.Candidate]) -> tuple[evidenc
 
 def _odd(stage: Stage) -> tuple[str, ...]:
     """What is left beside noise, a line each: innovations that are too large, and what stands out in them."""
+    stage = as_measured(stage)
     found = [
         a
         for k, log in enumerate(stage.prepared.logs)
@@ -310,9 +332,14 @@ class Choice:
     left: float
     loose: Stage | None = None
 
-    def share(self, stage: Stage) -> float:
+    def share(self, stage: Stage, odd: Sequence[str]) -> float:
         """Of the misfit, how much the effect explains, by what is left of it in a stage."""
-        return self.gain / (self.gain + stage.excess)
+        return _share(self.gain, stage, odd)
+
+
+def _share(gained: float, stage: Stage, odd: Sequence[str]) -> float:
+    left = max(stage.excess, ODD * len(odd))
+    return gained / (gained + left) if gained + left > 0 else 0.0
 
 
 def _duration(logs: Sequence[Log]) -> float:
@@ -417,6 +444,46 @@ def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) 
     return Choice(score.candidate.name, best, gain, spread, tried, rivals, score.left, loose)
 
 
+def _sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None:
+    """Where models follow the logs with coarse sensors only: the effects with which one follows them with sensors as
+    they are, and the stage without. Coarse sensors leave of a misfit what shows its cause and are followed by what is
+    nearly right. None where nothing comes near."""
+    found, left = list[evidence.Score](), stage
+    for _ in range(SEVERAL):
+        scores = _scores(left)
+        tries = _tries(left, _likely(left, scores, ()), together, lambda k: None)
+        if not tries:
+            return None
+        score, best = tries[0]
+        gain = left.fit.cost - best.fit.cost
+        if gain < max(LEVEL * best.spread, LEAST[1] * left.excess):
+            return None
+        alike = [x for x in tries if left.fit.cost - x[1].fit.cost >= LIKE * gain]
+        explained = stage.fit.cost - best.fit.cost
+        plain = explained >= SHARE * (explained + best.excess)
+        for disturbed in (0.0, smoothing.DISTURBED[0]) if plain else (0.0,):
+            sharp = sharpened([x for _, x in alike], disturbed, together)
+            near = [(s, x) for (s, _), x in zip(alike, sharp, strict=True) if x is not None and x.near]
+            if near:
+                return _followed(stage, found, _one_each(near), len(scores), together)
+        found, left = [*found, score], best
+    return None
+
+
+def _followed(
+    stage: Stage, others: Sequence[evidence.Score], tries: Sequence[_Try], tried: int, together: Together
+) -> tuple[Stage, list[Choice]]:
+    """The best of close tries, which all have the other effects as well; the stage without all of them as it was."""
+    score, best = tries[0]
+    gain = _wald(score.candidate.name, best)
+    last = _chosen(_close(tries, gain), gain, tried, together)
+    first = [
+        Choice(s.candidate.name, last.stage, _wald(s.candidate.name, last.stage), last.spread, tried, (), s.left)
+        for s in others
+    ]
+    return stage, [*first, last]
+
+
 def _unfollowed(stage: Stage, scores: Sequence[evidence.Score], together: Together) -> tuple[Stage, list[Choice]]:
     """Where no fit was found: the effect with which the model can follow the logs, with as small disturbing forces as
     there is one. With it there may be a fit without it after all, which then is what it is compared with, and may be as
@@ -481,7 +548,7 @@ def _close(tries: Sequence[_Try], gain: float) -> list[_Try]:
     """The best of sorted tries and those that the logs like about as well: no difference counts that is a matter of the
     formula, of an effect that gains so much."""
     best = tries[0][1]
-    near = max(CLOSE * best.spread, NEAR * best.excess, SHAPE[1] * gain)
+    near = max(CLOSE * best.spread, NEAR * best.excess, (SHAPE[1] if best.exact else FORCED) * gain)
     return [x for x in tries if x[1].fit.cost - best.fit.cost < near]
 
 
@@ -508,8 +575,7 @@ def _verdict(
     findings = tuple(_finding(x, after, left) for x in chosen)
     share = 1.0
     if odd or not after.exact:
-        gained = sum(x.gain for x in chosen)
-        share = gained / (gained + after.excess) if gained + after.excess > 0 else 0.0
+        share = _share(sum(x.gain for x in chosen), after, odd)
     verdict = "clean"
     if findings:
         verdict = "tied" if any(f.tied_with for f in findings) else "named"

@@ -18,7 +18,7 @@ from excite.innovations import Linear
 from excite.linearise import advance, differentiate
 from excite.newton import state_scale
 from excite.sidebyside import Together
-from excite.stages import Stage, refits
+from excite.stages import Stage, as_measured, refits
 
 BLOCK_S = 0.25  # [s] over which slow errors are means
 BINS = 24  # of a quantity
@@ -84,6 +84,7 @@ def loosened(stages: Sequence[Stage], together: Together) -> list[Stage]:
 
 def courses(stage: Stage) -> tuple[Course, ...]:
     """What each log of a stage shows."""
+    stage = as_measured(stage)
     return tuple(_course(stage, k) for k in range(len(stage.prepared.logs)))
 
 

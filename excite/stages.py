@@ -28,6 +28,7 @@ STRONG = 1.3  # misfit over readings from which first-order gains are rough
 FAR = 10.0  # misfit over readings, a few passes after the beginning, from which no fit comes near
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 PASSES = 14  # of a fit that goes on from another
+COARSE = 10.0  # times their noise that sensors are taken to have where nothing follows the logs
 LESS = 0.1, 0.3  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
 SMALL = LESS[0] * smoothing.DISTURBED[0]  # the smallest that are tried
 
@@ -51,14 +52,16 @@ class Prepared:
 @dataclass(frozen=True)
 class Stage:
     """A model with the effects found so far, fitted. `exact`: without disturbing forces. Not `settled`: no fit was
-    found, parameters are the file's. loose: the same model with the larger disturbing forces that
-    this fit came from, if it did."""
+    found, parameters are the file's or those of sensors taken for `coarse` times as noisy as they are. loose: the same
+    model with the larger disturbing forces that this fit came from, if it did; beside a fit with coarse sensors the one
+    with disturbing forces that leave much, if there is one."""
 
     machine: Machine
     prepared: Prepared
     fit: Fit
     settled: bool = True
     loose: Stage | None = None
+    coarse: float = 1.0
 
     @property
     def model(self) -> Model:
@@ -73,19 +76,24 @@ class Stage:
         return self.fit.disturbed == 0
 
     @property
+    def noise(self) -> float:
+        """The misfit that noise makes of a right model."""
+        return self.prepared.readings / self.coarse**2
+
+    @property
     def excess(self) -> float:
         """How much more misfit there is than noise may make."""
-        return max(0.0, self.fit.cost - (1 + SLACK) * self.prepared.readings)
+        return max(0.0, self.fit.cost - (1 + SLACK) * self.noise)
 
     @property
     def near(self) -> bool:
         """Whether the misfit is not far from what noise makes."""
-        return self.fit.cost <= STRONG * self.prepared.readings
+        return self.fit.cost <= STRONG * self.noise
 
     @property
     def spread(self) -> float:
         """How many times less sure gains are than without what is left of the misfit."""
-        return max(1.0, self.fit.cost / self.prepared.readings)
+        return max(1.0, self.fit.cost / self.noise)
 
     @property
     def rough(self) -> bool:
@@ -116,18 +124,38 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
     """A machine's model fitted to logs, with shapes of effects free.
 
     Where exact dynamics find no estimate, nor one near the logs from that with disturbing forces, with such forces as
-    small as the log lets them be: the less they may take up, the plainer the cause. Where not even large ones let the
-    model follow, with the file's parameters: what these leave shows where to look. Raises NotConverged where those
-    don't either.
+    small as the log lets them be: the less they may take up, the plainer the cause. Where not even with these the model
+    comes near, with sensors taken for much noisier than they are, which most models follow; otherwise as `forced` has
+    it. Raises NotConverged.
     """
     prepared = _prepared(machine, logs, filter)
     exact = _from_first(prepared, 0.0)
     if exact is not None:
         return Stage(machine, prepared, exact)
-    found = next((fits for d in smoothing.DISTURBED if (fits := _loosened(machine, prepared, d))), None)
-    if found is not None:
-        stage = _stage(machine, prepared, found)
+    found = _loosened(machine, prepared, smoothing.DISTURBED[0])
+    stage = None if found is None else _stage(machine, prepared, found)
+    if stage is not None and stage.near:
         return exact_if_near(stage)
+    coarse = _noisier(prepared, COARSE)
+    fit = _from_first(coarse, smoothing.DISTURBED[0])
+    if fit is not None:
+        return Stage(machine, coarse, fit, False, stage, COARSE)
+    return _forced(machine, prepared, smoothing.DISTURBED[1:]) if stage is None else exact_if_near(stage)
+
+
+def forced(stage: Stage) -> Stage:
+    """In place of a fit with coarse sensors one with disturbing forces, no matter how much they leave. Where not even
+    large ones let the model follow, with the file's parameters: what these leave shows where to look. Raises
+    NotConverged where those don't either."""
+    if stage.loose is not None:
+        return exact_if_near(stage.loose)
+    return _forced(stage.machine, _noisier(stage.prepared, 1 / stage.coarse), smoothing.DISTURBED[1:])
+
+
+def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float]) -> Stage:
+    found = next((fits for d in forces if (fits := _loosened(machine, prepared, d))), None)
+    if found is not None:
+        return exact_if_near(_stage(machine, prepared, found))
     asis = replace(prepared, held=np.ones_like(prepared.held))
     try:
         fit = _iterated(asis, prepared.starts, prepared.c.model.nominal, smoothing.DISTURBED[0])
@@ -139,6 +167,34 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
     known = newton.prior(prepared.c.model, prepared.held, fit.X)
     fit = replace(fit, unseen=prepared.held, prior=known, covariance=unknown)
     return Stage(machine, prepared, light(fit), settled=False)
+
+
+def _noisier(prepared: Prepared, times: float) -> Prepared:
+    """The same logs with sensors so many times as noisy."""
+    noises = [replace(r.noise, sensor=r.noise.sensor * times) for r in prepared.records]
+    records = tuple(replace(r, noise=noise) for r, noise in zip(prepared.records, noises, strict=True))
+    return replace(prepared, records=records)
+
+
+def as_measured(stage: Stage) -> Stage:
+    """A stage's motion and parameters against the sensors as noisy as they are."""
+    if stage.coarse == 1:
+        return stage
+    prepared, fit = _noisier(stage.prepared, 1 / stage.coarse), stage.fit
+    linear = newton.linearised(prepared.c, prepared.records, fit.points, prepared.starts, fit.X, fit.disturbed)
+    if linear is None:
+        return stage
+    cost = sum(float(x.Z[0, 0]) for x in linear)
+    return replace(stage, prepared=prepared, fit=light(replace(fit, linear=tuple(linear), cost=cost)), coarse=1.0)
+
+
+def sharpened(found: Sequence[Stage], disturbed: float, together: Together) -> Iterator[Stage | None]:
+    """Stages with coarse sensors gone on with with sensors as they are, and so large disturbing forces, side by side;
+    None where no fit is found."""
+    prepared = [_noisier(x.prepared, 1 / x.coarse) for x in found]
+    calls = [partial(_resumable, p, x, disturbed) for p, x in zip(prepared, found, strict=True)]
+    for p, x, fit in zip(prepared, found, together(calls), strict=True):
+        yield None if fit is None else Stage(x.machine, p, fit)
 
 
 def begun(machines: Sequence[Machine], of: Stage, disturbed: float, together: Together) -> Iterator[Stage | None]:
@@ -201,7 +257,7 @@ def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
     """The model of a machine with other effects fitted to the logs of a stage, from its fit, with so large disturbing
     forces. Raises NotConverged."""
     prepared = _resumed(machine, of)
-    return Stage(machine, prepared, _resume(prepared, of, disturbed))
+    return Stage(machine, prepared, _resume(prepared, of, disturbed), of.coarse == 1, coarse=of.coarse)
 
 
 Wish = tuple[Machine, Stage, float]  # what `refitted` is called with
@@ -211,8 +267,8 @@ def refits(wishes: Sequence[Wish], together: Together) -> Iterator[Stage | None]
     """Several refitted, side by side; None where no fit is found."""
     prepared = [_resumed(machine, of) for machine, of, _ in wishes]
     calls = [partial(_resumable, p, of, disturbed) for p, (_, of, disturbed) in zip(prepared, wishes, strict=True)]
-    for p, (machine, _, _), fit in zip(prepared, wishes, together(calls), strict=True):
-        yield None if fit is None else Stage(machine, p, fit)
+    for p, (machine, of, _), fit in zip(prepared, wishes, together(calls), strict=True):
+        yield None if fit is None else Stage(machine, p, fit, of.coarse == 1, coarse=of.coarse)
 
 
 def freed(found: Sequence[Stage], together: Together) -> Iterator[Stage | None]:
