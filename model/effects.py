@@ -146,14 +146,16 @@ def _resistance(s: Scene, k: int, p: Values) -> tuple[ca.SX, ca.SX]:
 
 def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
     q = s.q[k] - p["centre"]
-    return -p["A"] * (_softplus(q - p["stop"], 0.01) - _softplus(-q - p["stop"], 0.01))
+    high, low = _softplus(q - p["stop"], 0.01), _softplus(-q - p["stop"], 0.01)
+    return -p["A"] * (high - low) * (1 + p["hardening"] * (high + low))
 
 
 def _one_sided(site: Site) -> list[dict[str, float]]:
     """Stops so far from the middle that only one of them is reached."""
     limit = _stop(site)
     stops = [x * limit for x in (0.15, 0.35, 0.55, 0.75)]
-    return [{"stop": (limit + x) / 2, "centre": side * (x - limit) / 2} for x in stops for side in (1.0, -1.0)]
+    sides = [{"stop": (limit + x) / 2, "centre": side * (x - limit) / 2} for x in stops for side in (1.0, -1.0)]
+    return [{**x, "hardening": 0.0} for x in sides]
 
 
 def _clipped(s: Scene, k: int, p: Values) -> ca.SX:
@@ -505,6 +507,7 @@ _declare(
             "shake": Shape("N m", 0.02, (0.0,), _full_torque, whole=True),
             "frequency": Shape("Hz", 27.0, (27.0,), whole=True),
         },
+        positive=True,
         soil=lambda s, k, p, soil: _scaled(soil, 1 - p["A"] * _window(s.time, p)),
         channel=lambda t, p: Channel(offset=p["shake"] * _window(t, p) * ca.sin(2 * pi * p["frequency"] * t)),
         timed=True,
@@ -586,13 +589,14 @@ _declare(
         "articulation_stop_spring",
         ("articulation",),
         "N m/rad",
-        "a spring beyond some angle, to both sides of a middle that may be off",
+        "a spring beyond some angle, to both sides of a middle that may be off; rubber hardens as it is pressed",
         "a torque that grows with the angle beyond a limit",
         "rubber stops of articulated frames",
         lambda site: _full_torque(site),
         {
             "stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), _stop),
             "centre": Shape("rad", 0.0, (0.0,), meaning="the angle in the middle between the stops"),
+            "hardening": Shape("1/rad", 0.0, (0.0,), meaning="x beyond the stop gives A x (1 + hardening x)"),
         },
         torque=_stopped,
         beside=_one_sided,
