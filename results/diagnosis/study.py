@@ -85,7 +85,8 @@ def judged(one: Case, kept: Path) -> None:
     try:
         said = ask(seen.log)
         row |= {"error": None, "verdict": said["verdict"], "findings": said["findings"], **asdict(score(one, said))}
-        row |= {k: said[k] for k in ("error_before_percent", "error_after_percent", "share_explained", "nearest")}
+        kept_too = ("error_before_percent", "error_after_percent", "share_explained", "nearest", "located")
+        row |= {k: said[k] for k in kept_too}
     except RuntimeError as err:
         row |= {"error": str(err), "verdict": None, "findings": [], "outcome": "failed", "named": "failed"}
     row["wall_s"] = time.perf_counter() - begin
@@ -279,7 +280,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         return
     s = summary(rows)
     given.out.mkdir(parents=True, exist_ok=True)
-    flat = pd.DataFrame(rows).drop(columns="findings")
+    flat = pd.DataFrame(rows).drop(columns=["findings", "located"])
     for column in ("hidden", "amount"):
         flat[column] = [" ".join(map(str, values)) for values in flat[column]]
     flat.to_csv(given.out / "cases.csv", index=False, float_format="%.6g")
