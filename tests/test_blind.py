@@ -230,10 +230,17 @@ def test_most_plain_causes_are_named_and_hardly_any_wrongly(half: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "number"),
-    [("articulation_backlash", 1), ("articulation_stop_spring", 1), ("payload_shift", 0), ("compaction_per_pass", 2)],
+    [
+        ("articulation_backlash", 1),
+        ("articulation_backlash", 2),
+        ("ground_slope", 3),
+        ("articulation_stop_spring", 1),
+        ("payload_shift", 0),
+        ("compaction_per_pass", 2),
+    ],
 )
 def test_what_is_so_strong_that_nothing_follows_the_log_is_named(name: str, number: int) -> None:
-    """Without the cause no model fits these logs at all, or none without large disturbing forces."""
+    """Without the cause no model fits these logs at all, or none without large disturbing forces or coarse sensors."""
     one = case("cause", name, number)
     said = ask(blind(one).log)
     judged = score(one, said)
@@ -251,9 +258,12 @@ def test_hardly_any_clean_log_is_accused() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["soft_patch", "lost_counts", "side_wind"])
-def test_a_surprise_gets_no_name(name: str) -> None:
-    """One of each of these, which the study has seen; the study in results/diagnosis has all."""
+@pytest.mark.parametrize(
+    ("name", "number"), [("soft_patch", 0), ("lost_counts", 0), ("side_wind", 0), ("stuck_bit", 2), ("cg_drift", 2)]
+)
+def test_a_surprise_gets_no_name(name: str, number: int) -> None:
+    """The last two are so weak that a name nearly explains them, but for what stands out beside it. The study in
+    results/diagnosis has all."""
     assert name in SURPRISES
-    one = case("surprise", name, 0)
+    one = case("surprise", name, number)
     assert score(one, ask(blind(one).log)).outcome in ("unexplained", "clean")

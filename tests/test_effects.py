@@ -253,9 +253,11 @@ def test_soil_is_as_stiff_as_what_is_counted_says(straight: Model, counted: floa
     assert push(15.0 / each, 7.0) == pytest.approx(stiff, rel=1e-6)
 
 
-def test_stops_may_be_out_of_the_middle() -> None:
-    """A stop that only one side reaches pushes back there alone."""
-    shape = {"stop": Quantity(value=0.4, source="assumed"), "centre": Quantity(value=-0.2, source="assumed")}
+@pytest.mark.parametrize(("hardening", "torque"), [(0.0, 1e3), (2.0, 1.2e3)])
+def test_stops_may_be_out_of_the_middle_and_harden(hardening: float, torque: float) -> None:
+    """A stop that only one side reaches pushes back there alone, and more so the further it is pressed."""
+    told = {"stop": 0.4, "centre": -0.2, "hardening": hardening}
+    shape = {name: Quantity(value=value, source="assumed") for name, value in told.items()}
     entry = EffectEntry(
         name="articulation_stop_spring",
         where="articulation",
@@ -272,7 +274,7 @@ def test_stops_may_be_out_of_the_middle() -> None:
         own = sprung.balance(q, still, still, sprung.expand @ sprung.nominal, u, []).full()
         return float((own - plain.balance(q, still, still, plain.expand @ plain.nominal).full())[4, 0])
 
-    assert more(0.3) == pytest.approx(1e3, rel=0.01)
+    assert more(0.3) == pytest.approx(torque, rel=0.01)
     assert abs(more(-0.3)) < 5
 
 
