@@ -192,7 +192,8 @@ def identified(
     method = asked.method(method, model)
     needs = identify.needed_sensors(model, method)
     read, cut = gaps.read(logs, model.machine, needs)
-    fresh = [log.read(path, model.machine, needs) for path in validate]
+    seen = [examine.examine(model, log.read(path, model.machine, needs)) for path in validate]
+    fresh = [e.log for e in seen]
     with terminal.busy("identifying"):
         chosen, reason = examine.FILTERS[filtering](model, read)
         estimate = identify.identify(model, read, method, chosen)
@@ -210,7 +211,10 @@ def identified(
         "relative_error_percent": estimate.relative_error_percent,
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
-        "notes": [*cut, *([reason] if reason else []), *estimate.notes, *late],
+        "notes": [
+            *(*cut, *([reason] if reason else []), *estimate.notes, *late),
+            *(line for e in seen for line in (*e.notes, *e.doubts)),
+        ],
         "validation": [_check(model, one, estimate, chosen) for one in fresh],
         "versions": asked.versions(),
     }

@@ -131,6 +131,21 @@ def test_identify_says_what_is_doubtful(straight: Model, straight_motion: Motion
         identify.identify(straight, [wrong], "iv")
 
 
+def test_a_doubtful_log_to_validate_with_is_said(
+    straight: Model, straight_motion: Motion, tmp_path: Path, excite: Excite
+) -> None:
+    """It isn't fitted on, but the error that it shows is its own."""
+    table = sensors.measure(straight, straight_motion, seed=1)
+    table.to_csv(tmp_path / "good.csv", index=False)
+    table.assign(u4_Nm=-table["u4_Nm"]).to_csv(tmp_path / "turned.csv", index=False)
+    told = ("identify", "va12_straight", tmp_path / "good.csv", "--method", "ols", "--json", "--out", tmp_path / "out")
+    code, stdout, _ = excite(*told, "--validate", tmp_path / "turned.csv")
+    assert code == 0
+    said = json.loads(stdout)
+    assert [n for n in said["notes"] if "sign" in n] == [n for n in said["notes"] if "turned.csv: the more torque" in n]
+    assert any("turned.csv" in n for n in said["notes"])
+
+
 def test_diagnose_says_what_is_doubtful(
     straight: Model, straight_motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
