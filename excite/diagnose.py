@@ -3,8 +3,9 @@
 A log is smoothed with the machine's model. Where the innovations hold more than noise, every effect of the catalogue is
 scored (`evidence`), the best are fitted with amount and shapes as parameters, and the one that the log likes best is
 added to the model; then again, until nothing is left or nothing in the catalogue helps. Names that the log likes as
-well are given together. What no name explains is said to be unexplained. Where not even the model without effects can
-be fitted, effects are scored along the file's parameters and fitted from the logs' beginning.
+well are given together. What no name explains is said to be unexplained. Where the model without effects can be fitted
+to much coarser sensors only, the first effect is found with these and the fit sharpened with it; where not even that,
+effects are scored along the file's parameters and fitted from the logs' beginning.
 """
 
 from __future__ import annotations
@@ -59,7 +60,6 @@ FORMULA = 0.5  # of an amount, times the root of the share of a gain that its fo
 BESIDE = 250.0  # a gain that by the latter no effect can be denied
 CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
 LEAST = 0.05, 0.15  # of the excess misfit that an effect must explain to be worth a place: weak misfit, strong misfit
-SEVERAL = 2  # effects that are put together where none alone lets a model follow the logs
 SHARE = 0.7  # of the excess misfit that names must explain, or it is unexplained
 FURTHER = 0.8  # the same for names after the first: what nature has beside its formula looks like many a cause
 FORCED = 0.02  # of what is gained with disturbing forces, by which a rival is a tie: they take up part of a difference
@@ -128,19 +128,19 @@ def diagnose(
     tell(0.0, "fitting the model")
     before = fitted(model.machine, logs, filter)
     chosen, first, left = list[Choice](), tuple[evidence.Score, ...](), 0.0
-    if before.coarse > 1:
+    if before.prepared.coarse > 1:
         tell(0.15, "fitting effects with coarse sensors")
         sharp = _sharp(before, together)
         before, chosen = sharp or (forced(before), chosen)
     if not (before.settled or chosen):
         tell(0.15, "fitting effects from the beginning")
-        first = _scores(before)
+        first = _scores(before, together)
         before, chosen = _unfollowed(before, first, together)
     stage = chosen[-1].stage if chosen else before
     while stage.settled and len(chosen) < MOST:
         turn = len(chosen)
         tell(0.15 + 0.2 * turn, "scoring effects")
-        scores = _scores(stage)
+        scores = _scores(stage, together)
         first = first or scores
         choice = _choose(stage, scores, chosen, together, tell, 0.2 + 0.2 * turn)
         if choice is not None and before.settled and _outgrows(choice, chosen):
@@ -175,10 +175,9 @@ def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tupl
         if explained >= enough:
             break
         loose = kept[-1].loose
-        if loose is not None and kept[-1].share(loose, ()) >= enough:
+        if loose is not None and kept[-1].share(loose, odd_loose := _odd(loose)) >= enough:
             # Exact dynamics make a large misfit of a formula that is nearly right; it was judged with forces.
-            kept[-1] = replace(kept[-1], stage=loose)
-            odd = _odd(loose)
+            kept[-1], odd = replace(kept[-1], stage=loose), odd_loose
             break
         nearest = kept.pop().name, explained
     return kept, odd, nearest
@@ -196,7 +195,7 @@ def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_tu
         except NotConverged:
             queue = [*rest, replace(first, stage=whole, loose=None)]  # nothing fits without it
             continue
-        choice = _choose(stage, _scores(stage), rest, together, lambda share, what: None, 0.0)
+        choice = _choose(stage, _scores(stage, together), rest, together, lambda share, what: None, 0.0)
         queue = [*rest, choice] if choice is not None else [*rest[:-1], replace(rest[-1], stage=stage, loose=None)]
     whole, judged = queue[-1].stage, {x.name: x for x in queue}
     same = judged.keys() == {x.name for x in chosen}
@@ -212,8 +211,8 @@ def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_tu
 def _one_by_one(before: Stage, chosen: Sequence[Choice], whole: Stage) -> list[Choice]:
     """Effects that a model has, put into the one without them one after the other; gains are over those that stand
     before. None of them where the logs can't be fitted on the way."""
-    if before.coarse > 1:
-        return []
+    if before.prepared.coarse > 1:
+        return [replace(x, stage=whole, loose=None) for x in chosen]
     made = [before]
     try:
         for x in chosen:
@@ -292,15 +291,15 @@ def _without(name: str, stage: Stage) -> Stage:
         return refitted(machine, stage, max(stage.fit.disturbed, SMALL))
 
 
-def _scores(stage: Stage) -> tuple[evidence.Score, ...]:
+def _scores(stage: Stage, together: Together) -> tuple[evidence.Score, ...]:
     """What every effect that a model does not have promises, best first."""
     known = [e.name for e in stage.model.effects]
     sensors = [s.name for s in stage.prepared.c.sensors]
-    return _scanned(stage, evidence.candidates(stage.machine, sensors, _duration(stage.prepared.logs), known))
+    return _scanned(stage, evidence.candidates(stage.machine, sensors, _duration(stage.prepared.logs), known), together)
 
 
-def _scanned(stage: Stage, found: Sequence[evidence.Candidate]) -> tuple[evidence.Score, ...]:
-    return evidence.scan(stage.prepared.c, stage.prepared.records, stage.fit, found)
+def _scanned(stage: Stage, found: Sequence[evidence.Candidate], together: Together) -> tuple[evidence.Score, ...]:
+    return evidence.scan(stage.prepared.c, stage.prepared.records, stage.fit, found, together)
 
 
 def _odd(stage: Stage) -> tuple[str, ...]:
@@ -390,13 +389,17 @@ def _shortlist(stage: Stage, scores: Sequence[evidence.Score], chosen: Sequence[
 _Try = tuple[evidence.Score, Stage]
 
 
-def _likely(stage: Stage, scores: Sequence[evidence.Score], chosen: Sequence[Choice]) -> list[evidence.Score]:
+def _likely(
+    stage: Stage, scores: Sequence[evidence.Score], chosen: Sequence[Choice], together: Together
+) -> list[evidence.Score]:
     """What is worth a fit, with shapes between the grid's points."""
     likely = _shortlist(stage, scores, chosen)
     for reach in CLOSER if likely else ():
         nearby = evidence.finer(likely, stage.machine, _duration(stage.prepared.logs), reach)
         if len(nearby) > len(likely):
-            likely = _shortlist(stage, sorted([*likely, *_scanned(stage, nearby)], key=lambda s: -s.gain), chosen)
+            likely = _shortlist(
+                stage, sorted([*likely, *_scanned(stage, nearby, together)], key=lambda s: -s.gain), chosen
+            )
     return likely
 
 
@@ -409,7 +412,7 @@ def _choose(
     done: float,
 ) -> Choice | None:
     """The effect that the logs like best beside those that were chosen; None if none is worth it."""
-    likely = _likely(stage, scores, chosen)
+    likely = _likely(stage, scores, chosen, together)
     if not likely:
         return None
     tries = _tries(stage, likely, together, lambda k: tell(done + 0.03 * k, f"fitting {likely[k].candidate.name}"))
@@ -420,7 +423,7 @@ def _choose(
         except NotConverged:
             return None
         found = evidence.renumbered([s.candidate for s in likely])
-        likely = _shortlist(stage, _scanned(stage, found), chosen)
+        likely = _shortlist(stage, _scanned(stage, found, together), chosen)
         if not likely:
             return None
         tries = _tries(stage, likely, together, lambda k: None)
@@ -445,50 +448,38 @@ def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) 
 
 
 def _sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None:
-    """Where models follow the logs with coarse sensors only: the effects with which one follows them with sensors as
-    they are, and the stage without. Coarse sensors leave of a misfit what shows its cause and are followed by what is
-    nearly right. None where nothing comes near."""
-    found, left = list[evidence.Score](), stage
-    for _ in range(SEVERAL):
-        scores = _scores(left)
-        tries = _tries(left, _likely(left, scores, ()), together, lambda k: None)
-        if not tries:
-            return None
-        score, best = tries[0]
-        gain = left.fit.cost - best.fit.cost
-        if gain < max(LEVEL * best.spread, LEAST[1] * left.excess):
-            return None
-        alike = [x for x in tries if left.fit.cost - x[1].fit.cost >= LIKE * gain]
-        explained = stage.fit.cost - best.fit.cost
-        plain = explained >= SHARE * (explained + best.excess)
-        for disturbed in (0.0, smoothing.DISTURBED[0]) if plain else (0.0,):
-            sharp = sharpened([x for _, x in alike], disturbed, together)
-            near = [(s, x) for (s, _), x in zip(alike, sharp, strict=True) if x is not None and x.near]
-            if near:
-                return _followed(stage, found, _one_each(near), len(scores), together)
-        found, left = [*found, score], best
+    """Where the model follows the logs with coarse sensors only: the effect with which it follows them with sensors as
+    they are, and the stage without. Coarse sensors leave of a misfit what shows its cause, and are followed by what is
+    nearly right. No effect where the model does without after all, None where nothing comes near."""
+    plain = next(sharpened([stage], 0.0, together))
+    if plain is not None and plain.near:
+        return plain, []
+    scores = _scores(stage, together)
+    tries = _tries(stage, _likely(stage, scores, (), together), together, lambda k: None)
+    if not tries:
+        return None
+    _, best = tries[0]
+    gain = stage.fit.cost - best.fit.cost
+    if gain < max(LEVEL * best.spread, LEAST[1] * stage.excess):
+        return None
+    alike = [x for x in tries if stage.fit.cost - x[1].fit.cost >= LIKE * gain]
+    for disturbed in (0.0, smoothing.DISTURBED[0]) if gain >= SHARE * (gain + best.excess) else (0.0,):
+        sharp = zip(alike, sharpened([x for _, x in alike], disturbed, together), strict=True)
+        near = _one_each([(score, x) for (score, _), x in sharp if x is not None and x.near])
+        if near:
+            score, best = near[0]
+            sure = _wald(score.candidate.name, best)  # of the same kind as a gain, and smaller where that is large
+            if sure < LEVEL * best.spread:
+                return None
+            return stage, [_chosen(_close(near, sure), sure, len(scores), together)]
     return None
-
-
-def _followed(
-    stage: Stage, others: Sequence[evidence.Score], tries: Sequence[_Try], tried: int, together: Together
-) -> tuple[Stage, list[Choice]]:
-    """The best of close tries, which all have the other effects as well; the stage without all of them as it was."""
-    score, best = tries[0]
-    gain = _wald(score.candidate.name, best)
-    last = _chosen(_close(tries, gain), gain, tried, together)
-    first = [
-        Choice(s.candidate.name, last.stage, _wald(s.candidate.name, last.stage), last.spread, tried, (), s.left)
-        for s in others
-    ]
-    return stage, [*first, last]
 
 
 def _unfollowed(stage: Stage, scores: Sequence[evidence.Score], together: Together) -> tuple[Stage, list[Choice]]:
     """Where no fit was found: the effect with which the model can follow the logs, with as small disturbing forces as
     there is one. With it there may be a fit without it after all, which then is what it is compared with, and may be as
     good: the model began too far off. The stage as it was and no effect where nothing helps."""
-    likely = _likely(stage, scores, ())
+    likely = _likely(stage, scores, (), together)
     machines = [placing.extended(stage.machine, _entry(s)) for s in likely]
     for disturbed in (0.0, smoothing.DISTURBED[0], smoothing.DISTURBED[-1]) if likely else ():
         found = begun(machines, stage, disturbed, together)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 
 import casadi as ca
@@ -22,6 +23,7 @@ from excite.linearise import BATCH, Batch, Chart, Slopes, differentiate
 from excite.processing import implicit
 from excite.record import Point, Record, smoothed
 from excite.sensors import torque_behind
+from excite.sidebyside import Together, in_turn
 from model import placing
 from model.effect import Effect, Placed, Site
 from model.effects import CATALOGUE
@@ -30,6 +32,7 @@ from model.equations import signatures
 from model.machine import Machine
 
 NEARBY = 0.6, 0.8, 1.0, 1.3, 1.7  # amounts that are tried about the grid's, where they aren't a factor
+ALONE = 100  # columns that aren't worth a second process
 CHUNK = 20_000  # innovations whose products are summed at once
 ABSORBED = 1e-5  # share of a signature that is left, below which it is but single precision's error
 
@@ -243,8 +246,26 @@ def remembered(
     return implicit(flow, np.zeros(n_z), np.hstack([q, nu, u, t[:, None]]), float(t[1] - t[0]))
 
 
-def scan(c: Chart, records: Sequence[Record], fit: newton.Fit, found: Sequence[Candidate]) -> tuple[Score, ...]:
-    """The score of every candidate along fitted logs, best first."""
+def scan(
+    c: Chart, records: Sequence[Record], fit: newton.Fit, found: Sequence[Candidate], together: Together = in_turn
+) -> tuple[Score, ...]:
+    """The score of every candidate along fitted logs, best first. together: how its parts are computed."""
+    ends = np.cumsum([len(x.columns) for x in found])
+    middle = int(np.searchsorted(ends, ends[-1] / 2)) if len(found) and ends[-1] > ALONE else 0
+    parts = [part for part in (found[:middle], found[middle:]) if part]
+    for linear in fit.linear:
+        _ = linear.filter  # computed here, once for all parts
+    told = together([partial(_told, c, records, fit, renumbered(part)) for part in parts])
+    every = zip(found, (x for part in told for x in part), strict=True)
+    scores = [Score(x, *seen) for x, seen in every if seen is not None]
+    return tuple(sorted(scores, key=lambda s: -s.gain))
+
+
+Told = tuple[float, dict[str, float], float]  # of a score all but the candidate
+
+
+def _told(c: Chart, records: Sequence[Record], fit: newton.Fit, found: Sequence[Candidate]) -> list[Told | None]:
+    """What logs tell of candidates, each beside the parameters alone."""
     total, n = sum(len(x.columns) for x in found), len(fit.X)
     prior = fit.prior
     Z = np.zeros((1 + n + total, 1 + n + total))
@@ -264,8 +285,7 @@ def scan(c: Chart, records: Sequence[Record], fit: newton.Fit, found: Sequence[C
     solved = np.linalg.solve(base, np.column_stack([cross, g_base]))
     S = Z[own, own] - cross.T @ solved[:, :-1]
     g = Z[own, 0] - cross.T @ solved[:, -1]
-    scores = [_score(x, S, g, Z[own, own]) for x in found]
-    return tuple(sorted((s for s in scores if s is not None), key=lambda s: -s.gain))
+    return [_score(x, S, g, Z[own, own]) for x in found]
 
 
 def _square(E: np.ndarray) -> np.ndarray:
@@ -273,7 +293,7 @@ def _square(E: np.ndarray) -> np.ndarray:
     return form
 
 
-def _score(x: Candidate, S: np.ndarray, g: np.ndarray, own: np.ndarray) -> Score | None:
+def _score(x: Candidate, S: np.ndarray, g: np.ndarray, own: np.ndarray) -> Told | None:
     """The evidence of one candidate; None where the parameters absorb all of it or nothing shows it."""
     size = np.diag(own)[list(x.columns)]
     if size.max() < 1e-6:
@@ -294,5 +314,5 @@ def _score(x: Candidate, S: np.ndarray, g: np.ndarray, own: np.ndarray) -> Score
     else:
         values["A"] *= float(step[0])
     if effect.positive and step[0] <= 0 and len(shown) == 1:
-        return Score(x, 0.0, values, left)
-    return Score(x, float(-step[shown] @ g[at]), values, left)
+        return 0.0, values, left
+    return float(-step[shown] @ g[at]), values, left

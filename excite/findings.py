@@ -16,6 +16,7 @@ from excite.diagnose import Advance, Diagnosis, Finding
 from excite.gain import Gain
 from excite.misfit import Course
 from excite.sidebyside import Together, in_turn
+from excite.stages import as_measured
 from model.machine import EffectEntry, Machine, shipped
 
 DIGITS = 8  # of amounts in a machine file
@@ -62,7 +63,8 @@ def account(d: Diagnosis, advance: Advance | None = None, together: Together = i
         missing = misfit.courses(loose_before), misfit.courses(loose_after)
     located = d.located
     if d.verdict == "unexplained":  # which signals, and how much more than noise there is in them, is in these lines
-        located = (*misfit.located(d.after), *(line for line in d.located if line not in d.after.suspects))
+        after_all = as_measured(d.after)
+        located = (*misfit.located(after_all), *(line for line in d.located if line not in after_all.suspects))
     return Account(d, whole, single, before, after, missing, tuple(dict.fromkeys(located)), separate.run(d))
 
 
@@ -121,7 +123,8 @@ def signals(a: Account) -> dict[str, dict[str, Any]]:
 
 
 def parameters(d: Diagnosis) -> dict[str, dict[str, Any]]:
-    """Base parameters without and with what was found: value and deviation; `moved`: in deviations before."""
+    """Base parameters without and with what was found: value and deviation, none where no model without it followed the
+    logs; `moved`: in deviations before."""
     after = dict(zip(d.after.model.base.names, zip(d.after.fit.X, d.after.fit.std, strict=True), strict=True))
     rows = {}
     model = d.before.model
@@ -129,6 +132,7 @@ def parameters(d: Diagnosis) -> dict[str, dict[str, Any]]:
         model.base.names, model.base.units, d.before.fit.X, d.before.fit.std, strict=True
     ):
         new, new_std = after[name]
+        std = std if d.before.settled else float("nan")
         rows[name] = {
             "unit": unit,
             "before": value,

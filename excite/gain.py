@@ -70,7 +70,7 @@ def withheld(stage: Stage) -> Withheld | None:
     """How well a fitted model predicts stretches that are hidden from it, or the machine file's where none could be
     fitted, not even to coarse sensors; None where no fit to the rest is found."""
     prepared, fit = stage.prepared, stage.fit
-    held = prepared.held | fit.unseen if stage.settled or stage.coarse > 1 else np.ones_like(prepared.held)
+    held = prepared.held | fit.unseen if stage.settled or prepared.coarse > 1 else np.ones_like(prepared.held)
     c, rate = prepared.c, float(stage.machine.sampling_hz)
     stretches = [_stretches(len(r.used), rate) for r in prepared.records]
     masked = []

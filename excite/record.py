@@ -46,6 +46,7 @@ class Record:
     the torques acts on its own interval alone; and readings weigh alike whether an encoder beats with the clock or
     not, as noise that beats is white on average over a drive (how sure an estimate is counts the beats all the same).
     Else each reading weighs by what it tells, and weak directions are drawn in a little: steadier, for evidence.
+    coarse: how many times as noisy as they are the sensors are taken to be.
     """
 
     torque: np.ndarray
@@ -55,6 +56,7 @@ class Record:
     origin: tuple[int, ...]
     noise: Noise
     unbiased: bool = False
+    coarse: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -194,6 +196,7 @@ def readings(
     beats = np.where(r.counts, beating(travel / step, sample), 1.0)
     if not r.unbiased:
         width, beats = width * np.sqrt(beats), np.ones_like(beats)
+    width = width * r.coarse
     own, width = width, np.hypot(width, _through(c, r, p, u, X))
     beats = 1 + (beats - 1) * (own / width) ** 2
     D = np.zeros((len(c.sensors), len(r.origin)))

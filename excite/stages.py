@@ -1,6 +1,7 @@
 """A machine's model fitted to logs, and fitted again with other effects.
 
-Exact dynamics come first; where these find no estimate, disturbing forces as small as the logs let them be. Fits that
+Exact dynamics come first; where these find no estimate, disturbing forces as small as the logs let them be; where these
+don't bring the model near, sensors that are taken to be coarser than they are. Fits that
 have nothing to do with each other are computed side by side: what is sent back from there is fits alone, as charts and
 effects know their code.
 """
@@ -44,6 +45,11 @@ class Prepared:
     held: np.ndarray
 
     @property
+    def coarse(self) -> float:
+        """How many times as noisy as they are sensors are taken to be."""
+        return self.records[0].coarse
+
+    @property
     def readings(self) -> float:
         """How many readings the logs have: what twice the negative log-likelihood of a right model is about."""
         return float(sum(r.used.sum() for r in self.records))
@@ -52,7 +58,7 @@ class Prepared:
 @dataclass(frozen=True)
 class Stage:
     """A model with the effects found so far, fitted. `exact`: without disturbing forces. Not `settled`: no fit was
-    found, parameters are the file's or those of sensors taken for `coarse` times as noisy as they are. loose: the same
+    found, parameters are the file's or, with coarse sensors, those of sensors noisier than they are. loose: the same
     model with the larger disturbing forces that this fit came from, if it did; beside a fit with coarse sensors the one
     with disturbing forces that leave much, if there is one."""
 
@@ -61,7 +67,6 @@ class Stage:
     fit: Fit
     settled: bool = True
     loose: Stage | None = None
-    coarse: float = 1.0
 
     @property
     def model(self) -> Model:
@@ -78,7 +83,7 @@ class Stage:
     @property
     def noise(self) -> float:
         """The misfit that noise makes of a right model."""
-        return self.prepared.readings / self.coarse**2
+        return self.prepared.readings / self.prepared.coarse**2
 
     @property
     def excess(self) -> float:
@@ -124,9 +129,9 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
     """A machine's model fitted to logs, with shapes of effects free.
 
     Where exact dynamics find no estimate, nor one near the logs from that with disturbing forces, with such forces as
-    small as the log lets them be: the less they may take up, the plainer the cause. Where not even with these the model
-    comes near, with sensors taken for much noisier than they are, which most models follow; otherwise as `forced` has
-    it. Raises NotConverged.
+    small as the log lets them be: the less they may take up, the plainer the cause. Where these leave the model far
+    off, with sensors taken for much noisier than they are, which most models follow; otherwise as `forced` has it.
+    Raises NotConverged.
     """
     prepared = _prepared(machine, logs, filter)
     exact = _from_first(prepared, 0.0)
@@ -136,10 +141,10 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
     stage = None if found is None else _stage(machine, prepared, found)
     if stage is not None and stage.near:
         return exact_if_near(stage)
-    coarse = _noisier(prepared, COARSE)
+    coarse = _noisy(prepared, COARSE)
     fit = _from_first(coarse, smoothing.DISTURBED[0])
     if fit is not None:
-        return Stage(machine, coarse, fit, False, stage, COARSE)
+        return Stage(machine, coarse, fit, False, stage)
     return _forced(machine, prepared, smoothing.DISTURBED[1:]) if stage is None else exact_if_near(stage)
 
 
@@ -149,7 +154,7 @@ def forced(stage: Stage) -> Stage:
     NotConverged where those don't either."""
     if stage.loose is not None:
         return exact_if_near(stage.loose)
-    return _forced(stage.machine, _noisier(stage.prepared, 1 / stage.coarse), smoothing.DISTURBED[1:])
+    return _forced(stage.machine, _noisy(stage.prepared, 1.0), smoothing.DISTURBED[1:])
 
 
 def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float]) -> Stage:
@@ -169,30 +174,28 @@ def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float]) -> St
     return Stage(machine, prepared, light(fit), settled=False)
 
 
-def _noisier(prepared: Prepared, times: float) -> Prepared:
-    """The same logs with sensors so many times as noisy."""
-    noises = [replace(r.noise, sensor=r.noise.sensor * times) for r in prepared.records]
-    records = tuple(replace(r, noise=noise) for r, noise in zip(prepared.records, noises, strict=True))
-    return replace(prepared, records=records)
+def _noisy(prepared: Prepared, coarse: float) -> Prepared:
+    """The same logs with sensors so coarse."""
+    return replace(prepared, records=tuple(replace(r, coarse=coarse) for r in prepared.records))
 
 
 def as_measured(stage: Stage) -> Stage:
     """A stage's motion and parameters against the sensors as noisy as they are."""
-    if stage.coarse == 1:
+    if stage.prepared.coarse == 1:
         return stage
-    prepared, fit = _noisier(stage.prepared, 1 / stage.coarse), stage.fit
+    prepared, fit = _noisy(stage.prepared, 1.0), stage.fit
     linear = newton.linearised(prepared.c, prepared.records, fit.points, prepared.starts, fit.X, fit.disturbed)
     if linear is None:
         return stage
     cost = sum(float(x.Z[0, 0]) for x in linear)
-    return replace(stage, prepared=prepared, fit=light(replace(fit, linear=tuple(linear), cost=cost)), coarse=1.0)
+    return replace(stage, prepared=prepared, fit=light(replace(fit, linear=tuple(linear), cost=cost)))
 
 
 def sharpened(found: Sequence[Stage], disturbed: float, together: Together) -> Iterator[Stage | None]:
-    """Stages with coarse sensors gone on with with sensors as they are, and so large disturbing forces, side by side;
-    None where no fit is found."""
-    prepared = [_noisier(x.prepared, 1 / x.coarse) for x in found]
-    calls = [partial(_resumable, p, x, disturbed) for p, x in zip(prepared, found, strict=True)]
+    """Stages with coarse sensors gone on with, with sensors as they are and so large disturbing forces, side by side;
+    None where no fit comes anywhere near."""
+    prepared = [_noisy(x.prepared, 1.0) for x in found]
+    calls = [partial(_resumable, p, x, disturbed, FAR * p.readings) for p, x in zip(prepared, found, strict=True)]
     for p, x, fit in zip(prepared, found, together(calls), strict=True):
         yield None if fit is None else Stage(x.machine, p, fit)
 
@@ -257,7 +260,7 @@ def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
     """The model of a machine with other effects fitted to the logs of a stage, from its fit, with so large disturbing
     forces. Raises NotConverged."""
     prepared = _resumed(machine, of)
-    return Stage(machine, prepared, _resume(prepared, of, disturbed), of.coarse == 1, coarse=of.coarse)
+    return Stage(machine, prepared, _resume(prepared, of, disturbed), prepared.coarse == 1)
 
 
 Wish = tuple[Machine, Stage, float]  # what `refitted` is called with
@@ -267,8 +270,8 @@ def refits(wishes: Sequence[Wish], together: Together) -> Iterator[Stage | None]
     """Several refitted, side by side; None where no fit is found."""
     prepared = [_resumed(machine, of) for machine, of, _ in wishes]
     calls = [partial(_resumable, p, of, disturbed) for p, (_, of, disturbed) in zip(prepared, wishes, strict=True)]
-    for p, (machine, of, _), fit in zip(prepared, wishes, together(calls), strict=True):
-        yield None if fit is None else Stage(machine, p, fit, of.coarse == 1, coarse=of.coarse)
+    for p, (machine, _, _), fit in zip(prepared, wishes, together(calls), strict=True):
+        yield None if fit is None else Stage(machine, p, fit, p.coarse == 1)
 
 
 def freed(found: Sequence[Stage], together: Together) -> Iterator[Stage | None]:
@@ -293,9 +296,9 @@ def _exact(stage: Stage) -> Fit | None:
     return fit if fit.cost < most else None
 
 
-def _resumable(prepared: Prepared, of: Stage, disturbed: float) -> Fit | None:
+def _resumable(prepared: Prepared, of: Stage, disturbed: float, most: float = np.inf) -> Fit | None:
     try:
-        return _resume(prepared, of, disturbed)
+        return _resume(prepared, of, disturbed, most)
     except NotConverged:
         return None
 

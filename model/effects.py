@@ -26,6 +26,7 @@ SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on th
 
 BACK = 0.1  # [m] of way back, within which a reversal counts
 MOMENTS = 120  # at which a load is looked for that slides
+PRESSED = 0.1  # [rad] beyond a stop, at which its hardening is stated
 LANE = 10.0  # [m] of way that a reversal is worth where these are counted
 
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
@@ -147,7 +148,7 @@ def _resistance(s: Scene, k: int, p: Values) -> tuple[ca.SX, ca.SX]:
 def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
     q = s.q[k] - p["centre"]
     high, low = _softplus(q - p["stop"], 0.01), _softplus(-q - p["stop"], 0.01)
-    return -p["A"] * (high - low) * (1 + p["hardening"] * (high + low))
+    return -p["A"] * (high - low) * (1 + p["hardening"] * (high + low) / PRESSED)
 
 
 def _one_sided(site: Site) -> list[dict[str, float]]:
@@ -596,7 +597,7 @@ _declare(
         {
             "stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), _stop),
             "centre": Shape("rad", 0.0, (0.0,), meaning="the angle in the middle between the stops"),
-            "hardening": Shape("1/rad", 0.0, (0.0,), meaning="x beyond the stop gives A x (1 + hardening x)"),
+            "hardening": Shape("-", 0.0, (0.0,), meaning="x beyond the stop gives A x (1 + hardening x / 0.1 rad)"),
         },
         torque=_stopped,
         beside=_one_sided,

@@ -354,11 +354,11 @@ def articulation_compliance(s: Scene, place: str, A: float, draw: DRAW) -> None:
 
 def articulation_stop_spring(s: Scene, place: str, A: float, draw: DRAW) -> None:
     """Rubber buffers: progressive, and sometimes only one of them touches."""
-    angle, progress = draw.uniform(0.12, 0.25), draw.uniform(0, 3)
+    angle, progress = draw.uniform(0.12, 0.25), draw.uniform(0, 4)
     sides = draw.choice([(1, 1), (1, 0), (0, 1)], p=[0.6, 0.2, 0.2])
 
     def pressed(x: ca.SX) -> ca.SX:
-        return A * x * (1 + progress * x)
+        return A * x * (1 + (progress * x) ** 2)
 
     s.torque[1].append(
         lambda U: (

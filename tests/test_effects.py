@@ -253,7 +253,7 @@ def test_soil_is_as_stiff_as_what_is_counted_says(straight: Model, counted: floa
     assert push(15.0 / each, 7.0) == pytest.approx(stiff, rel=1e-6)
 
 
-@pytest.mark.parametrize(("hardening", "torque"), [(0.0, 1e3), (2.0, 1.2e3)])
+@pytest.mark.parametrize(("hardening", "torque"), [(0.0, 1e3), (0.2, 1.2e3)])
 def test_stops_may_be_out_of_the_middle_and_harden(hardening: float, torque: float) -> None:
     """A stop that only one side reaches pushes back there alone, and more so the further it is pressed."""
     told = {"stop": 0.4, "centre": -0.2, "hardening": hardening}

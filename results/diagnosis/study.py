@@ -280,7 +280,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         return
     s = summary(rows)
     given.out.mkdir(parents=True, exist_ok=True)
-    flat = pd.DataFrame(rows).drop(columns=["findings", "located"])
+    flat = pd.DataFrame(rows).drop(columns=["findings", "located"], errors="ignore")
     for column in ("hidden", "amount"):
         flat[column] = [" ".join(map(str, values)) for values in flat[column]]
     flat.to_csv(given.out / "cases.csv", index=False, float_format="%.6g")
