@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import Excite
 
-from excite import checkup, diagnose, log, profiles, sensors, stages
+from excite import checkup, diagnose, findings, log, misfit, newton, profiles, sensors, stages
 from excite.separate import Rivals
 from excite.sidebyside import forked, in_turn
 from excite.simulate import Motion, simulate
@@ -242,6 +243,62 @@ def gentle(model: Model, seconds: float) -> Motion:
     t = np.arange(0, seconds + 0.01, 0.01)
     slow = np.minimum(1, np.minimum(t, seconds - t) / 2)
     return simulate(model, np.column_stack([1500 * np.sin(1.7 * t) * slow, 1200 * np.sin(2.6 * t) * slow]))
+
+
+def unfit(monkeypatch: pytest.MonkeyPatch, refused: Callable[[Any, int], bool]) -> None:
+    """Some fits to sensors as they are find nothing: told are the chart and the number of passes."""
+    iterate = newton.iterate
+
+    def found(c: Any, records: Any, *args: Any, **more: Any) -> newton.Fit:
+        if records[0].coarse == 1 and refused(c, args[6] if len(args) > 6 else 0):
+            raise newton.NotConverged("no fit")
+        return iterate(c, records, *args, **more)
+
+    monkeypatch.setattr(newton, "iterate", found)
+
+
+def test_what_is_followed_with_coarse_sensors_only_is_named(
+    sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No model without the slope can be fitted to sensors as they are."""
+    unfit(monkeypatch, lambda c, passes: not c.model.effects)
+    d = diagnose.diagnose(straight, [log.read(sloping, straight.machine)], straight.machine.filter)
+    assert d.verdict == "named"
+    assert [f.name for f in d.findings] == ["ground_slope@machine"]
+    assert abs(d.findings[0].amount - 0.01) < 2 * d.findings[0].amount_std < 0.001
+    assert (d.before.prepared.coarse, d.before.settled) == (stages.COARSE, False)
+    assert (d.after.prepared.coarse, d.after.settled, d.after.exact) == (1, True, True)
+    told = findings.account(d)
+    assert told.whole is not None
+    assert told.whole.interval[0] > 50
+    assert told.located == ()
+    assert all(np.isnan(row["std_before"]) and row["moved"] is None for row in findings.parameters(d).values())
+    # Innovations are held against the sensors' true noise, not that of coarse ones.
+    assert max(size.slow for size in misfit.mean_sizes(told.before).values()) > 20
+    assert max(size.slow for size in misfit.mean_sizes(told.after).values()) < 3
+
+
+def test_a_model_that_coarse_sensors_lead_to_needs_no_effect(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is wrong but the first guess, from which no fit to sensors as they are is found."""
+    one = log.check(sensors.measure(straight, gentle(straight, 20.0), seed=3), straight.machine)
+    unfit(monkeypatch, lambda c, passes: passes == newton.PASSES)
+    d = diagnose.diagnose(straight, [one], straight.machine.filter)
+    assert (d.verdict, d.findings, d.before.prepared.coarse, d.before.exact) == ("clean", (), 1, True)
+
+
+def test_coarse_sensors_blur_no_estimate(straight: Model) -> None:
+    """A right model has the misfit that noise makes, and parameters are where sharp sensors have them."""
+    one = log.check(sensors.measure(straight, gentle(straight, 20.0), seed=3), straight.machine)
+    sharp = stages.fitted(straight.machine, [one], straight.machine.filter)
+    coarse = replace(sharp.prepared, records=tuple(replace(r, coarse=stages.COARSE) for r in sharp.prepared.records))
+    blurred = stages.refitted(straight.machine, replace(sharp, prepared=coarse), 0.0)
+    assert not blurred.settled
+    assert 0.5 < blurred.fit.cost / blurred.noise < 2
+    assert np.abs((blurred.fit.X - sharp.fit.X) / blurred.fit.std).max() < 0.7
+    (again,) = stages.sharpened([blurred], 0.0, in_turn)
+    assert again is not None
+    np.testing.assert_allclose(again.fit.X, sharp.fit.X, atol=0.02 * sharp.fit.std.max(), rtol=1e-3)
+    assert stages.as_measured(blurred).fit.cost == pytest.approx(sharp.fit.cost, rel=0.2)
 
 
 def test_an_amount_that_nothing_shows_is_not_sure(straight: Model) -> None:
