@@ -9,7 +9,7 @@ from typing import Any
 
 from excite import asked, brief, doubts, examine, findings, gaps, identify, portrait, separate, works
 from excite.brief import Brief
-from excite.diagnose import diagnose
+from excite.diagnose import Diagnosis, diagnose
 from excite.limit import InfeasibleError
 from excite.separate import Rivals
 from excite.sidebyside import forked
@@ -63,11 +63,20 @@ def write(
         **said,
         "machine_file": MACHINE if text is not None else None,
         "separating_drive": None,
-        "notes": notes,
+        "notes": [*notes, *_followed(found)],
         "versions": asked.versions(),
     }
     portrait.write(place, account, summary["signals"], model.machine.title)
     return summary, separate.rivals(found)
+
+
+def _followed(found: Diagnosis) -> list[str]:
+    """What is said of the model without what was found, where none follows the logs."""
+    if found.before.settled:
+        return []
+    coarse = found.before.prepared.coarse
+    other = f"fitted to sensors taken for {coarse:g} times as noisy as they are" if coarse > 1 else "the machine file's"
+    return [f"no model without what was found follows the log: what is given of the one before is {other}"]
 
 
 def separating(place: Path, machine: Machine, tied: Sequence[Rivals], onward: bool) -> dict[str, Any] | None:

@@ -258,7 +258,7 @@ def unfit(monkeypatch: pytest.MonkeyPatch, refused: Callable[[Any, int], bool]) 
 
 
 def test_what_is_followed_with_coarse_sensors_only_is_named(
-    sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
+    sloping: Path, straight: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No model without the slope can be fitted to sensors as they are."""
     unfit(monkeypatch, lambda c, passes: not c.model.effects)
@@ -273,6 +273,9 @@ def test_what_is_followed_with_coarse_sensors_only_is_named(
     assert told.whole.interval[0] > 50
     assert told.located == ()
     assert all(np.isnan(row["std_before"]) and row["moved"] is None for row in findings.parameters(d).values())
+    monkeypatch.setattr(checkup, "diagnose", lambda *args: d)
+    said, _ = checkup.write(tmp_path, "va12_straight", straight, [sloping], "machine", lambda *a: None)
+    assert any("fitted to sensors taken for 10 times as noisy" in note for note in said["notes"])
     # Innovations are held against the sensors' true noise, not that of coarse ones.
     assert max(size.slow for size in misfit.mean_sizes(told.before).values()) > 20
     assert max(size.slow for size in misfit.mean_sizes(told.after).values()) < 3
