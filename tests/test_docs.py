@@ -18,7 +18,7 @@ import pytest
 import typer
 from conftest import Excite
 
-from excite import handbook, reference
+from excite import folder, handbook, reference
 from excite.__main__ import app
 from model import effects, machine, units
 
@@ -44,9 +44,20 @@ def test_one_version_everywhere() -> None:
 
 def test_links_lead_somewhere() -> None:
     pages = [ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md"), ROOT / "results" / "README.md"]
+    pages += (ROOT / "results").glob("*/README.md")
     for page in pages:
         for link in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
             assert link.startswith("https://") or (page.parent / link).exists(), f"{page.name}: {link}"
+
+
+def test_a_study_can_be_rebuilt_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No command of the list would refuse its folder for what is in it."""
+    monkeypatch.chdir(ROOT)
+    places = re.findall(r"--out (results/[^ `]+)", (ROOT / "results" / "README.md").read_text(encoding="utf-8"))
+    assert len(places) > 8
+    for place in places:
+        folder.claim(Path(place))
+        assert (ROOT / place / "summary.json").is_file() or (ROOT / place / "design" / "summary.json").is_file()
 
 
 @pytest.mark.slow

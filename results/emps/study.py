@@ -122,7 +122,7 @@ def readme(found: dict[str, dict[str, object]], own: dict[str, float], late: dic
         "# EMPS by every method",
         "",
         "Real measurements of an electro-mechanical positioning system (Janot, Gautier, Brunot, 2019).",
-        "`summary.json` and `fit.png` are `excite identify`'s; `python results/emps/study.py` rebuilds this page and",
+        "[identify](identify) is what `excite identify` gives; `python results/emps/study.py` rebuilds this page and",
         "`methods.json`. Value and standard deviation; residual: 100 |Y - W X| / |Y|; closed loop: the rig simulated",
         "from its reference alone with its own controller, 100 |measured - simulated| / |measured|.",
         "",
