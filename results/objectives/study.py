@@ -12,6 +12,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
@@ -49,7 +50,7 @@ def main() -> None:
         (HERE / name).mkdir(exist_ok=True)
     model = prediction.build(machine.load("va12"))
     problem = model.machine.problems["R60"]
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name, make in list(drives(model, problem).items())[: options.few]:
         motion = driven(model, problem, name, make)
         said = {c: f(model, motion) for c, f in CRITERIA.items()}

@@ -59,7 +59,7 @@ def force(names: Sequence[str]) -> tuple[ca.Function, list[str], np.ndarray]:
     larger = ca.fmax(V, rim)
     soil = Soil(contact.Slip((V - rim) / larger, ca.SX(0), larger), ca.SX(0), p[0], ca.SX(-1))
     none: dict[int, ca.SX] = {}
-    scene = Scene(none, none, none, none, {}, {1: rolling}, none, ca.SX(0))
+    scene = Scene(none, none, none, none, {}, {}, {1: rolling}, none, ca.SX(0))
     pushed = ca.SX(0)
     for k, name in enumerate(names):
         effect, values = CATALOGUE[name], {"A": p[k + 1]}
@@ -120,7 +120,7 @@ def main(path: Path) -> None:
     repeat = float(np.sqrt(table.groupby("level")["F"].var().mean()))
     mean = table.groupby("level").mean()
     tried = [c for n in range(len(NAMES) + 1) for c in combinations(NAMES, n)]
-    rows = []
+    rows: list[dict[str, Any]] = []
     for names in tried:
         x, std, labels, law = fitted(names, table)
         inside = law(table["V"].to_numpy(), table["rim"].to_numpy()) - table["F"].to_numpy()
