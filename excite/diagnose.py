@@ -66,6 +66,8 @@ FORCED = 0.02  # of what is gained with disturbing forces, by which a rival is a
 ODD = 50.0  # misfit that every line of what is odd beside names stands for, at least
 NEAR = 0.3  # of what the best name leaves unexplained, by which a rival may be worse and still is a tie
 
+TINY = 1e-12  # what a machine file can't hold is nothing
+
 Advance = Callable[[float, str], None]
 
 
@@ -366,7 +368,7 @@ def _fitted(stage: Stage, name: str) -> EffectEntry:
 
 def _identified(effect: str, where: str, amount: float, shapes: Mapping[str, float]) -> EffectEntry:
     def told(value: float) -> Quantity:
-        return Quantity(value=value, source="identified")
+        return Quantity(value=value if abs(value) > TINY else 0.0, source="identified")
 
     return EffectEntry(
         name=effect, where=where, amount=told(amount), shape={name: told(x) for name, x in shapes.items()}
@@ -437,10 +439,12 @@ def _choose(
 
 
 def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) -> Choice:
-    """The best of close tries without disturbing forces where that can be, and the rest as its rivals."""
+    """The best of close tries without disturbing forces where that can be, and the rest as its rivals: those as well
+    that only with such forces are known to be as good."""
     spread = tries[0][1].spread
     judged = {s.candidate.name: stage for s, stage in tries if not stage.exact}
-    tries = _close(_without_forces(tries, together), gain)
+    exact, unknown = _without_forces(tries, together)
+    tries = [*_close(exact, gain), *unknown] if exact else tries
     score, best = tries[0]
     rivals = tuple(_fitted(other, s.candidate.name) for s, other in tries[1:])
     loose = judged.get(score.candidate.name) if best.exact else None
@@ -539,18 +543,18 @@ def _close(tries: Sequence[_Try], gain: float) -> list[_Try]:
     """The best of sorted tries and those that the logs like about as well: no difference counts that is a matter of the
     formula, of an effect that gains so much."""
     best = tries[0][1]
-    near = max(CLOSE * best.spread, NEAR * best.excess, (SHAPE[1] if best.exact else FORCED) * gain)
+    near = max(CLOSE * best.spread, NEAR * best.excess, (SHAPE[0] if best.exact else FORCED) * gain)
     return [x for x in tries if x[1].fit.cost - best.fit.cost < near]
 
 
-def _without_forces(tries: Sequence[_Try], together: Together) -> list[_Try]:
-    """Those that need no disturbing forces any more, best first; all, best first as they are, where none does."""
-    # What forces don't make good, none makes worse.
+def _without_forces(tries: Sequence[_Try], together: Together) -> tuple[list[_Try], list[_Try]]:
+    """Those that need no disturbing forces any more, best first, and as they are those for which no such fit is found;
+    what forces leave far off is neither."""
     good = [x for x in tries if x[1].exact or x[1].near]
     without = freed([s for _, s in good if not s.exact], together)
-    stages = [s if s.exact else next(without) for _, s in good]
-    exact = [(score, s) for (score, _), s in zip(good, stages, strict=True) if s is not None]
-    return sorted(exact, key=lambda x: x[1].fit.cost) or list(tries)
+    found = [(x, x[1] if x[1].exact else next(without)) for x in good]
+    exact = [(score, stage) for (score, _), stage in found if stage is not None]
+    return sorted(exact, key=lambda x: x[1].fit.cost), [x for x, stage in found if stage is None]
 
 
 def _verdict(

@@ -281,6 +281,13 @@ def test_what_is_followed_with_coarse_sensors_only_is_named(
     assert max(size.slow for size in misfit.mean_sizes(told.after).values()) < 3
 
 
+def test_a_value_that_is_nothing_can_be_written() -> None:
+    """A fit may end a hair beside zero, which no machine file holds."""
+    shapes = {"begin": (-1e-15, 0.1, "s"), "length": (5.0, 0.1, "s")}
+    found = diagnose.Finding("vibration_on", "rear_roll", (), 1e-9, 0.1, 0.01, "-", shapes, 100.0)
+    assert [float(found.entry.shape[name]) for name in shapes] == [0.0, 5.0]
+
+
 def test_a_model_that_coarse_sensors_lead_to_needs_no_effect(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is wrong but the first guess, from which no fit to sensors as they are is found."""
     one = log.check(sensors.measure(straight, gentle(straight, 20.0), seed=3), straight.machine)
