@@ -444,7 +444,7 @@ def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) 
     spread = tries[0][1].spread
     judged = {s.candidate.name: stage for s, stage in tries if not stage.exact}
     exact, unknown = _without_forces(tries, together)
-    tries = [*_close(exact, gain), *unknown] if exact else tries
+    tries = [*_close(exact, gain, SHAPE[0] if judged else SHAPE[1]), *unknown] if exact else tries
     score, best = tries[0]
     rivals = tuple(_fitted(other, s.candidate.name) for s, other in tries[1:])
     loose = judged.get(score.candidate.name) if best.exact else None
@@ -539,11 +539,12 @@ def _one_each(tries: Sequence[_Try]) -> list[_Try]:
     return list(best.values())
 
 
-def _close(tries: Sequence[_Try], gain: float) -> list[_Try]:
+def _close(tries: Sequence[_Try], gain: float, share: float | None = None) -> list[_Try]:
     """The best of sorted tries and those that the logs like about as well: no difference counts that is a matter of the
-    formula, of an effect that gains so much."""
+    formula, of an effect that gains so much. share: of the gain that is, the more where forces had to help."""
     best = tries[0][1]
-    near = max(CLOSE * best.spread, NEAR * best.excess, (SHAPE[0] if best.exact else FORCED) * gain)
+    share = share or (SHAPE[1] if best.exact else FORCED)
+    near = max(CLOSE * best.spread, NEAR * best.excess, share * gain)
     return [x for x in tries if x[1].fit.cost - best.fit.cost < near]
 
 
