@@ -22,6 +22,7 @@ from excite.log import Log
 from excite.newton import NotConverged
 from excite.sidebyside import Together, in_turn
 from excite.stages import (
+    COARSE,
     SMALL,
     Stage,
     as_measured,
@@ -214,7 +215,7 @@ def _one_by_one(before: Stage, chosen: Sequence[Choice], whole: Stage) -> list[C
     """Effects that a model has, put into the one without them one after the other; gains are over those that stand
     before. None of them where the logs can't be fitted on the way."""
     if before.prepared.coarse > 1:
-        return [replace(x, stage=whole, loose=None) for x in chosen]
+        return _one_from_another(chosen, whole)
     made = [before]
     try:
         for x in chosen:
@@ -229,6 +230,17 @@ def _one_by_one(before: Stage, chosen: Sequence[Choice], whole: Stage) -> list[C
         gain = old.fit.cost - new.fit.cost if alike else x.gain
         found.append(replace(x, stage=new, gain=max(gain, x.gain), loose=None))
     return found
+
+
+def _one_from_another(chosen: Sequence[Choice], whole: Stage) -> list[Choice]:
+    """The same from the model with all of them, where the one without any follows coarse sensors only."""
+    made = [whole]
+    try:
+        for x in reversed(chosen[1:]):
+            made.append(_without(x.name, made[-1]))
+    except NotConverged:
+        return []
+    return [replace(x, stage=stage, loose=None) for x, stage in zip(chosen, reversed(made), strict=True)]
 
 
 def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
@@ -475,6 +487,8 @@ def _sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | Non
             sure = _wald(score.candidate.name, best)  # of the same kind as a gain, and smaller where that is large
             if sure < LEVEL * best.spread:
                 return None
+            # Far from no effect Wald's statistic says too much, and further effects are measured by it.
+            sure = min(sure, COARSE * gain)
             return stage, [_chosen(_close(near, sure), sure, len(scores), together)]
     return None
 
