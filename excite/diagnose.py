@@ -22,7 +22,6 @@ from excite.log import Log
 from excite.newton import NotConverged
 from excite.sidebyside import Together, in_turn
 from excite.stages import (
-    COARSE,
     SMALL,
     Stage,
     as_measured,
@@ -105,9 +104,9 @@ class Finding:
 class Diagnosis:
     """verdict: clean, named, tied or unexplained. `before`, `after`: the model without and with what was found.
 
-    share: of the excess misfit that the names explain. scores: the first scan's, best first. located: lines that say
-    where what is unexplained sits. stages: the model with the first finding, the first two, and so on. nearest: where
-    nothing is named, the effect that explains most, and the share that it does.
+    share: of the excess misfit that the names explain. located: lines that say where what is unexplained sits. stages:
+    the model with the first finding, the first two, and so on. nearest: where nothing is named, the effect that
+    explains most, and the share that it does.
     """
 
     verdict: str
@@ -115,7 +114,6 @@ class Diagnosis:
     before: Stage
     after: Stage
     share: float
-    scores: tuple[evidence.Score, ...]
     located: tuple[str, ...]
     stages: tuple[Stage, ...]
     nearest: tuple[str, float] | None = None
@@ -130,21 +128,19 @@ def diagnose(
     tell = advance or (lambda share, what: None)
     tell(0.0, "fitting the model")
     before = fitted(model.machine, logs, filter)
-    chosen, first, left = list[Choice](), tuple[evidence.Score, ...](), 0.0
+    chosen, left = list[Choice](), 0.0
     if before.prepared.coarse > 1:
         tell(0.15, "fitting effects with coarse sensors")
         sharp = _sharp(before, together)
         before, chosen = sharp or (forced(before), chosen)
     if not (before.settled or chosen):
         tell(0.15, "fitting effects from the beginning")
-        first = _scores(before, together)
-        before, chosen = _unfollowed(before, first, together)
+        before, chosen = _unfollowed(before, together)
     stage = chosen[-1].stage if chosen else before
     while stage.settled and len(chosen) < MOST:
         turn = len(chosen)
         tell(0.15 + 0.2 * turn, "scoring effects")
         scores = _scores(stage, together)
-        first = first or scores
         choice = _choose(stage, scores, chosen, together, tell, 0.2 + 0.2 * turn)
         if choice is not None and before.settled and _outgrows(choice, chosen):
             chosen = []
@@ -159,7 +155,7 @@ def diagnose(
         tell(0.9, "judging each given the others")
         chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
     stage = chosen[-1].stage if chosen else before
-    answer = _verdict(before, stage, chosen, first, odd, left)
+    answer = _verdict(before, stage, chosen, odd, left)
     return answer if answer.findings else replace(answer, nearest=nearest)
 
 
@@ -174,11 +170,11 @@ def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tupl
         if not kept or (stage.exact and not odd):
             break
         enough = SHARE if len(kept) == 1 else FURTHER
-        explained = kept[-1].share(stage, odd)
+        explained = _share(kept[-1].gain, stage, odd)
         if explained >= enough:
             break
         loose = kept[-1].loose
-        if loose is not None and kept[-1].share(loose, odd_loose := _odd(loose)) >= enough:
+        if loose is not None and _share(kept[-1].gain, loose, odd_loose := _odd(loose)) >= enough:
             # Exact dynamics make a large misfit of a formula that is nearly right; it was judged with forces.
             kept[-1], odd = replace(kept[-1], stage=loose), odd_loose
             break
@@ -345,12 +341,9 @@ class Choice:
     left: float
     loose: Stage | None = None
 
-    def share(self, stage: Stage, odd: Sequence[str]) -> float:
-        """Of the misfit, how much the effect explains, by what is left of it in a stage."""
-        return _share(self.gain, stage, odd)
-
 
 def _share(gained: float, stage: Stage, odd: Sequence[str]) -> float:
+    """Of the misfit, how much effects explain that gained so much, by what is left of it in a stage and what is odd."""
     left = max(stage.excess, ODD * len(odd))
     return gained / (gained + left) if gained + left > 0 else 0.0
 
@@ -488,15 +481,16 @@ def _sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | Non
             if sure < LEVEL * best.spread:
                 return None
             # Far from no effect Wald's statistic says too much, and further effects are measured by it.
-            sure = min(sure, COARSE * gain)
+            sure = min(sure, stage.prepared.coarse * gain)
             return stage, [_chosen(_close(near, sure), sure, len(scores), together)]
     return None
 
 
-def _unfollowed(stage: Stage, scores: Sequence[evidence.Score], together: Together) -> tuple[Stage, list[Choice]]:
+def _unfollowed(stage: Stage, together: Together) -> tuple[Stage, list[Choice]]:
     """Where no fit was found: the effect with which the model can follow the logs, with as small disturbing forces as
     there is one. With it there may be a fit without it after all, which then is what it is compared with, and may be as
     good: the model began too far off. The stage as it was and no effect where nothing helps."""
+    scores = _scores(stage, together)
     likely = _likely(stage, scores, (), together)
     machines = [placing.extended(stage.machine, _entry(s)) for s in likely]
     for disturbed in (0.0, smoothing.DISTURBED[0], smoothing.DISTURBED[-1]) if likely else ():
@@ -576,7 +570,6 @@ def _verdict(
     before: Stage,
     after: Stage,
     chosen: Sequence[Choice],
-    scores: Sequence[evidence.Score],
     odd: tuple[str, ...],
     left: float,
 ) -> Diagnosis:
@@ -591,7 +584,7 @@ def _verdict(
         verdict = "tied" if any(f.tied_with for f in findings) else "named"
     if not after.settled or (odd and (share < SHARE or not findings)) or (not after.exact and not findings):
         verdict = "unexplained"
-    return Diagnosis(verdict, findings, before, after, share, tuple(scores), odd, tuple(x.stage for x in chosen))
+    return Diagnosis(verdict, findings, before, after, share, odd, tuple(x.stage for x in chosen))
 
 
 def _finding(choice: Choice, after: Stage, left: float) -> Finding:

@@ -63,8 +63,8 @@ def account(d: Diagnosis, advance: Advance | None = None, together: Together = i
         missing = misfit.courses(loose_before), misfit.courses(loose_after)
     located = d.located
     if d.verdict == "unexplained":  # which signals, and how much more than noise there is in them, is in these lines
-        after_all = as_measured(d.after)
-        located = (*misfit.located(after_all), *(line for line in d.located if line not in after_all.suspects))
+        measured = as_measured(d.after)
+        located = (*misfit.located(measured), *(line for line in d.located if line not in measured.suspects))
     return Account(d, whole, single, before, after, missing, tuple(dict.fromkeys(located)), separate.run(d))
 
 

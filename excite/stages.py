@@ -1,9 +1,8 @@
 """A machine's model fitted to logs, and fitted again with other effects.
 
 Exact dynamics come first; where these find no estimate, disturbing forces as small as the logs let them be; where these
-don't bring the model near, sensors that are taken to be coarser than they are. Fits that
-have nothing to do with each other are computed side by side: what is sent back from there is fits alone, as charts and
-effects know their code.
+don't bring the model near, sensors that are taken to be coarser than they are. Fits that have nothing to do with each
+other are computed side by side: what is sent back from there is fits alone, as charts and effects know their code.
 """
 
 from __future__ import annotations

@@ -193,7 +193,7 @@ def identified(
     needs = identify.needed_sensors(model, method)
     read, cut = gaps.read(logs, model.machine, needs)
     seen = [examine.examine(model, log.read(path, model.machine, needs)) for path in validate]
-    fresh = [e.log for e in seen]
+    fresh, said = [e.log for e in seen], [line for e in seen for line in (*e.notes, *e.doubts)]
     with terminal.busy("identifying"):
         chosen, reason = examine.FILTERS[filtering](model, read)
         estimate = identify.identify(model, read, method, chosen)
@@ -211,10 +211,7 @@ def identified(
         "relative_error_percent": estimate.relative_error_percent,
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
-        "notes": [
-            *(*cut, *([reason] if reason else []), *estimate.notes, *late),
-            *(line for e in seen for line in (*e.notes, *e.doubts)),
-        ],
+        "notes": [*cut, *([reason] if reason else []), *estimate.notes, *late, *said],
         "validation": [_check(model, one, estimate, chosen) for one in fresh],
         "versions": asked.versions(),
     }
