@@ -12,7 +12,8 @@ import numpy as np
 import tomli_w
 
 from excite import gain, misfit, separate
-from excite.diagnose import Advance, Diagnosis, Finding
+from excite.choosing import Advance
+from excite.diagnose import Diagnosis, Finding
 from excite.gain import Gain
 from excite.misfit import Course
 from excite.sidebyside import Together, in_turn

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import Excite
 
-from excite import checkup, diagnose, findings, log, misfit, newton, profiles, sensors, stages
+from excite import checkup, choosing, diagnose, findings, log, misfit, newton, profiles, sensors, stages
 from excite.separate import Rivals
 from excite.sidebyside import forked, in_turn
 from excite.simulate import Motion, simulate
@@ -124,7 +124,7 @@ def test_a_drive_is_designed_for_what_is_tied(straight: Model, tmp_path: Path) -
     motion = simulate(both[0], torque, q0=q0, nu0=nu0)
     one = log.check(sensors.measure(both[0], motion, seed=2), machine)
     right, wrong = (stages.fitted(m.machine, [one], machine.filter).fit for m in both)
-    assert wrong.cost - right.cost > diagnose.CLOSE
+    assert wrong.cost - right.cost > choosing.CLOSE
 
 
 @pytest.mark.slow
@@ -208,12 +208,12 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
         ([name, *names], more),
         ([names[0], name, names[1]], more),
     ):
-        chosen = [diagnose.Choice(n, stage, 1000.0, 1.0, 100, (), 1.0) for n in order]
+        chosen = [choosing.Choice(n, stage, 1000.0, 1.0, 100, (), 1.0) for n in order]
         again = diagnose.reviewed(found.before, chosen)
         assert [x.name for x in again] == [n for n in order if n in names]
         assert again[-1].stage.fit.cost == pytest.approx(found.after.fit.cost, abs=0.1)
     # One whose amount comes out as nothing goes, and the others stand as if it had never been there.
-    chosen = [diagnose.Choice(n, more, 1000.0, 1.0, 100, (), 1.0) for n in (name, *names)]
+    chosen = [choosing.Choice(n, more, 1000.0, 1.0, 100, (), 1.0) for n in (name, *names)]
     left = diagnose.needed(found.before, chosen)
     assert [x.name for x in left] == names
     assert [e.name for e in left[0].stage.machine.effect] == [names[0].split("@")[0]]
@@ -320,7 +320,7 @@ def test_an_amount_that_nothing_shows_is_not_sure(straight: Model) -> None:
     both = stages.refitted(placing.extended(straight.machine, *entries), clean, 0.0)
     names = [e.name for e in both.model.effects]
     assert [bool(both.fit.unseen[both.model.base.names.index(n)]) for n in names] == [True, False]
-    chosen = [diagnose.Choice(n, both, 1000.0, 1.0, 100, (), 1.0) for n in names]
+    chosen = [choosing.Choice(n, both, 1000.0, 1.0, 100, (), 1.0) for n in names]
     assert [x.name for x in diagnose.needed(clean, chosen)] == names[1:]
 
 

@@ -45,8 +45,8 @@ GOOD = ("right", "tied")  # a tie that holds the cause sends nobody to repair th
 def version() -> str:
     """Eight digits that change when the program or the second roller does."""
     files = sorted([*(ROOT / "model").rglob("*.py"), *(ROOT / "model").rglob("*.toml")])
-    names = ("diagnose", "stages", "misfit", "findings", "evidence", "innovations", "smoothing", "newton", "linearise")
-    names += ("chain", "record", "gain", "hidden", "processing", "sensors", "anomaly", "log", "estimate")
+    names = ("diagnose", "choosing", "stages", "misfit", "findings", "evidence", "innovations", "smoothing", "newton")
+    names += ("linearise", "chain", "record", "gain", "hidden", "processing", "sensors", "anomaly", "log", "estimate")
     files += [ROOT / "excite" / f"{n}.py" for n in names]
     files += [ROOT / "tests" / n for n in ("plant.py", "causes.py", "surprises.py", "blind.py", "visibility.py")]
     seen = hashlib.sha1()
