@@ -66,7 +66,7 @@ def write(
         "notes": [*notes, *_followed(found)],
         "versions": asked.versions(),
     }
-    portrait.write(place, account, summary["signals"], model.machine.title)
+    portrait.write(place, account, summary["signals"], model.machine.title, forked)
     return summary, separate.rivals(found)
 
 

@@ -29,6 +29,7 @@ HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate i
 TRIED = 5  # candidates that are fitted
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
 PAIR = 2  # candidates that are fitted in any case, side by side
+BEHIND = 0.5  # share of the likeliest one's gain that others must have come to after a few passes
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
 # Of what is explained already, that a further effect must gain, as nature is never exactly the formula: by the fits'
@@ -261,17 +262,19 @@ def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate
 def _tries(
     stage: Stage, likely: Sequence[evidence.Score], together: Together, tell: Callable[[int], None]
 ) -> list[_Try]:
-    """The candidates whose fits were found, as the model without them was fitted. Those that promise far less than the
-    best come last, and only where they may still come near what was gained."""
+    """The candidates whose fits were found, as the model without them was fitted: the likeliest first, the others as
+    long as they don't stay far behind what it gains. Those that promise far less than the best come last, and only
+    where they may still come near what was gained."""
     tries: list[_Try] = []
     near = max(PAIR, sum(OVER * s.gain >= likely[0].gain for s in likely))
-    for at, batch in ((0, likely[:near]), (near, likely[near:])):
+    for at, batch in ((0, likely[:1]), (1, likely[1:near]), (near, likely[near:])):
         gained = max((stage.fit.cost - found.fit.cost for _, found in tries), default=0.0)
-        if not batch or gained > OVER * batch[0].gain:
-            break
+        if not batch or (at >= near and gained > OVER * batch[0].gain):
+            continue
         wishes = [(placing.extended(stage.machine, _entry(s)), stage, stage.fit.disturbed) for s in batch]
         tell(at)
-        for k, (score, found) in enumerate(zip(batch, refits(wishes, together), strict=True)):
+        most = stage.fit.cost - BEHIND * gained if tries else np.inf
+        for k, (score, found) in enumerate(zip(batch, refits(wishes, together, most), strict=True)):
             tell(min(at + k + 1, len(likely) - 1))
             if found is not None:
                 tries.append((score, found))

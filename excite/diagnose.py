@@ -91,12 +91,12 @@ def diagnose(
     torque is missing."""
     tell = advance or (lambda share, what: None)
     tell(0.0, "fitting the model")
-    before = fitted(model.machine, logs, filter)
+    before = fitted(model.machine, logs, filter, together)
     chosen, left = list[Choice](), 0.0
     if before.prepared.coarse > 1:
         tell(0.15, "fitting effects with coarse sensors")
         sharp = choosing.sharp(before, together)
-        before, chosen = sharp or (forced(before), chosen)
+        before, chosen = sharp or (forced(before, together), chosen)
     if not (before.settled or chosen):
         tell(0.15, "fitting effects from the beginning")
         before, chosen = choosing.unfollowed(before, together)

@@ -197,7 +197,7 @@ class Signatures:
     def along(self, X: np.ndarray, r: Record, p: Point) -> tuple[np.ndarray, np.ndarray]:
         """What signatures do to the scaled state behind each sample (N - 1, n, C), and to readings (N, m, C)."""
         c, N = self.chart, len(p.s)
-        u, scale = self.samples[3], newton.state_scale(c)[:, None]
+        u, scale = self.samples[3], newton.state_scale(c)
         push = np.empty((N - 1, c.n, self.columns), np.float32)
         reading = np.empty((N, len(c.sensors), self.columns), np.float32)
         for at in range(0, N - 1, BATCH):
@@ -206,17 +206,18 @@ class Signatures:
             held = tuple(x[at : until + 1] for x in self.samples)
             force = self.force(*held, self.p)[0]
             torque = self.torque[at : until + 1]
-            push[at:until] = _pushed(c, by, (force[:-1] + force[1:]) / 2, (torque[:-1] + torque[1:]) / 2) / scale
+            push[at:until] = _pushed(c, by, force, torque, scale)
             reading[at : until + 1] = self.reading(*held, self.p)[0][:, self.rows]
         return push, reading
 
 
-def _pushed(c: Chart, by: Slopes, force: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """What forces (K, n_q, C) and delivered torques (K, n_u, C) do to the ends of K intervals (K, n, C) [SI]."""
-    moved: np.ndarray = by.B @ (force[:, list(c.model.actuated)] + torque)
-    for k, row in enumerate(c.pushed):
-        if row not in c.model.actuated:
-            moved += by.F[:, :, k : k + 1] @ force[:, row : row + 1]
+def _pushed(c: Chart, by: Slopes, force: np.ndarray, torque: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """What forces (K + 1, n_q, C) and torques (K + 1, n_u, C) do to the scaled states behind K intervals (K, n, C)."""
+    free = [k for k, row in enumerate(c.pushed) if row not in c.model.actuated]
+    slopes = np.concatenate([by.B, by.F[:, :, free]], axis=2) / (2 * scale[:, None])
+    acting = np.concatenate([force[:, list(c.model.actuated)] + torque, force[:, [c.pushed[k] for k in free]]], axis=1)
+    acting = acting.astype(np.float32)
+    moved: np.ndarray = slopes.astype(np.float32) @ (acting[:-1] + acting[1:])
     return moved
 
 

@@ -92,6 +92,7 @@ def withheld(stage: Stage) -> Withheld | None:
                 held,
                 newton.RESUMED,
                 enough=newton.NEARLY,
+                patient=False,
             )
         except NotConverged as failed:
             rest = failed.nearly

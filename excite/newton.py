@@ -28,6 +28,8 @@ DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's sca
 RESUMED = DAMPING[0] * DAMPING[1] ** 2  # damping of a fit that goes on from another
 HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
 LATELY = 4  # passes whose steps tell how small the last one will be
+IDLE = 0.5, 0.8  # share of a step two passes earlier above which it hardly shrinks: near an answer, far from any
+FALLING = 0.01  # of a cost, in two passes
 NEARLY = 1.0  # a step, in standard deviations, at which a fit that runs out of passes is as good as found
 CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviations
 ENOUGH = 0.2  # likewise with disturbing forces, whose deviations are no promise
@@ -200,17 +202,18 @@ def iterate(
     passes: int = PASSES,
     enough: float = ENOUGH,
     most: float = np.inf,
+    patient: bool = True,
 ) -> Fit:
     """Gauss-Newton from points and X; the prior stands about the machine file's values and the states of `starts`.
     Parameters `held` (n_base,) stay at their values. damping: of the first step; passes: at most; enough: a step, in
     standard deviations, at which a fit with disturbing forces is found; most: cost above which a fit is given up once
-    the states fit the dynamics.
+    the states fit the dynamics. Not `patient`: no passes are spent on steps that have ceased to shrink.
 
     Raises NotConverged.
     """
     model = c.model
     step, before = np.inf, np.inf
-    sizes: list[float] = []
+    sizes, costs = list[float](), list[float]()
     shorter, here = 0, (list(points), X)
     there = here
     whole, last = 1.0, np.zeros(len(X))
@@ -243,7 +246,10 @@ def iterate(
             shrinking = min((step / sizes[-1 - LATELY]) ** (1 / LATELY), 1.0) if len(sizes) > LATELY else 0.0
             if step > HOPELESS[1] or step * shrinking ** (passes - 1 - k) > NEARLY:
                 break
+        costs.append(cost)
         if k >= SETTLED and cost > most and step > NEARLY:
+            break
+        if not patient and _idle(sizes, costs):
             break
         # Where Gauss-Newton swings about the answer, shorter steps end it.
         turned = move[0][: len(X)] / np.sqrt(np.diag(covariance))[: len(X)]
@@ -276,6 +282,17 @@ def iterate(
         stood,
         float(step),
     )
+
+
+def _idle(steps: Sequence[float], costs: Sequence[float]) -> bool:
+    """Whether steps have ceased to shrink: swing about an answer as good as found, or far from any while costs have
+    ceased to fall."""
+    if len(steps) <= SETTLED + 1:
+        return False
+    if steps[-1] <= NEARLY:
+        return steps[-1] > IDLE[0] * steps[-3]
+    still = steps[-1] > IDLE[1] * steps[-3] and steps[-2] > IDLE[1] * steps[-4]
+    return len(steps) > SETTLED + 2 and still and costs[-1] > (1 - FALLING) * costs[-3]
 
 
 def linearised(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from excite import misfit
 from excite.figures import COLOURS, plain, save
 from excite.findings import Account
 from excite.misfit import Course
+from excite.sidebyside import Together, in_turn
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 SHOWN, WIDE = 3, 4  # torques and forces in a figure, panels side by side
@@ -22,16 +24,25 @@ CLEAR = 4.0  # strength from which a quantity is pointed out
 HIGHEST = 30.0  # mean square of innovations at which the colours end
 
 
-def write(place: Path, a: Account, signals: Mapping[str, Mapping[str, Any]], title: str) -> None:
+def write(
+    place: Path, a: Account, signals: Mapping[str, Mapping[str, Any]], title: str, together: Together = in_turn
+) -> None:
     """The figures of a diagnosis into its folder: misfit.png and when.png for each log, signals.png for all."""
     several = len(a.before) > 1
-    save(signals_figure(a, signals, title), place / "signals.png")
     found = bool(a.diagnosis.stages)
+    drawn: dict[str, Callable[[], Figure]] = {}
     for k, before in enumerate(a.before):
         name, words = f"-{k + 1}" if several else "", f"{title}: {Path(before.source).name}"
         shown = [side[k] for side in a.missing]
-        save(misfit_figure(shown[0], shown[1] if found else None, words), place / f"misfit{name}.png")
-        save(when_figure(before, a.after[k] if found else None, words), place / f"when{name}.png")
+        drawn[f"misfit{name}.png"] = partial(misfit_figure, shown[0], shown[1] if found else None, words)
+        drawn[f"when{name}.png"] = partial(when_figure, before, a.after[k] if found else None, words)
+    drawn["signals.png"] = partial(signals_figure, a, signals, title)
+    for _ in together([partial(_drawn, figure, place / name) for name, figure in drawn.items()]):
+        pass
+
+
+def _drawn(figure: Callable[[], Figure], path: Path) -> None:
+    save(figure(), path)
 
 
 def misfit_figure(before: Course, after: Course | None, title: str) -> Figure:

@@ -12,7 +12,7 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Protocol, TypeVar
@@ -24,9 +24,11 @@ LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None  # loaded before a
 
 
 class Together(Protocol):
-    """Carries out calls that have nothing to do with each other, and gives what they return in their order."""
+    """Carries out calls that have nothing to do with each other, and gives what they return in their order.
 
-    def __call__(self, calls: Sequence[Callable[[], R]], /) -> Iterator[R]: ...
+    What is not wanted any more is given up by closing it."""
+
+    def __call__(self, calls: Sequence[Callable[[], R]], /) -> Generator[R, None, None]: ...
 
 
 def cores() -> int:
@@ -34,12 +36,12 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else 1
 
 
-def in_turn(calls: Sequence[Callable[[], R]]) -> Iterator[R]:
+def in_turn(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
     """What each call returns, one after the other in this process."""
     return (call() for call in calls)
 
 
-def forked(calls: Sequence[Callable[[], R]]) -> Iterator[R]:
+def forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
     """The same from as many processes at a time as there are cores, in the order of the calls.
 
     What a process does not finish, because the call raises or something ends it, is done again in this one, and so is

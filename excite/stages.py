@@ -8,6 +8,7 @@ other are computed side by side: what is sent back from there is fits alone, as 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -124,40 +125,49 @@ def _stage(machine: Machine, prepared: Prepared, fits: Fits) -> Stage:
     return Stage(machine, prepared, fit, loose=None if loose is None else Stage(machine, prepared, loose))
 
 
-def fitted(machine: Machine, logs: Sequence[Log], filter: Filter) -> Stage:
+def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Together = in_turn) -> Stage:
     """A machine's model fitted to logs, with shapes of effects free.
 
     Where exact dynamics find no estimate, nor one near the logs from that with disturbing forces, with such forces as
     small as the log lets them be: the less they may take up, the plainer the cause. Where these leave the model far
     off, with sensors taken for much noisier than they are, which most models follow; otherwise as `forced` has it.
-    Raises NotConverged.
+    Each way is set out upon before it is known to be needed, where there are processes for it. Raises NotConverged.
     """
     prepared = _prepared(machine, logs, filter)
-    exact = _from_first(prepared, 0.0)
-    if exact is not None:
-        return Stage(machine, prepared, exact)
-    found = _loosened(machine, prepared, smoothing.DISTURBED[0])
-    stage = None if found is None else _stage(machine, prepared, found)
-    if stage is not None and stage.near:
-        return exact_if_near(stage)
     coarse = _noisy(prepared, COARSE)
-    fit = _from_first(coarse, smoothing.DISTURBED[0])
-    if fit is not None:
-        return Stage(machine, coarse, fit, False, stage)
-    return _forced(machine, prepared, smoothing.DISTURBED[1:]) if stage is None else exact_if_near(stage)
+    ways = together(
+        [
+            partial(_strictly, prepared, 0.0, FAR * prepared.readings),
+            partial(_disturbed, machine, prepared, smoothing.DISTURBED[0]),
+            partial(_strictly, coarse, smoothing.DISTURBED[0]),
+        ]
+    )
+    with closing(ways):
+        exact = next(ways)
+        if exact is not None:
+            return _stage(machine, prepared, exact)
+        disturbed = next(ways)
+        stage = None if disturbed is None else _stage(machine, prepared, disturbed)
+        if stage is not None and stage.near:
+            return exact_if_near(stage)
+        noisy = next(ways)
+    if noisy is not None:
+        return Stage(machine, coarse, noisy[0], False, stage)
+    return _forced(machine, prepared, smoothing.DISTURBED[1:], together) if stage is None else _with_least(stage)
 
 
-def forced(stage: Stage) -> Stage:
+def forced(stage: Stage, together: Together) -> Stage:
     """In place of a fit with coarse sensors one with disturbing forces, no matter how much they leave. Where not even
     large ones let the model follow, with the file's parameters: what these leave shows where to look. Raises
     NotConverged where those don't either."""
     if stage.loose is not None:
-        return exact_if_near(stage.loose)
-    return _forced(stage.machine, _noisy(stage.prepared, 1.0), smoothing.DISTURBED[1:])
+        return _with_least(stage.loose)
+    return _forced(stage.machine, _noisy(stage.prepared, 1.0), smoothing.DISTURBED[1:], together)
 
 
-def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float]) -> Stage:
-    found = next((fits for d in forces if (fits := _loosened(machine, prepared, d))), None)
+def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float], together: Together) -> Stage:
+    with closing(together([partial(_loosened, machine, prepared, d) for d in forces])) as ways:
+        found = next((fits for fits in ways if fits), None)
     if found is not None:
         return exact_if_near(_stage(machine, prepared, found))
     asis = replace(prepared, held=np.ones_like(prepared.held))
@@ -218,18 +228,41 @@ def _from_first(prepared: Prepared, disturbed: float, most: float = np.inf) -> F
         return light(failed.nearly) if failed.nearly is not None and disturbed > 0 else None
 
 
-def _loosened(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
-    """A fit from first guesses with disturbing forces, and from there with smaller ones, as long as these let the model
-    come near the logs: large ones hide what else there is."""
+def _strictly(prepared: Prepared, disturbed: float, most: float = np.inf) -> Fits | None:
+    """A fit from first guesses with disturbing forces that stay as they are."""
+    fit = _from_first(prepared, disturbed, most)
+    return None if fit is None else (fit, None)
+
+
+def _disturbed(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
+    """A fit from first guesses with disturbing forces, and from there with smaller ones where it is near."""
     fit = _from_first(prepared, disturbed)
     if fit is None:
         return None
-    stage = _with_less(Stage(machine, prepared, fit))
+    stage = Stage(machine, prepared, fit)
+    return _lessened(stage) if stage.near else (fit, None)
+
+
+def _loosened(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
+    """The same with smaller ones no matter how near it is."""
+    fit = _from_first(prepared, disturbed)
+    return None if fit is None else _lessened(Stage(machine, prepared, fit))
+
+
+def _with_least(stage: Stage) -> Stage:
+    """A stage gone on with with the smallest disturbing forces that it takes, without any where that is near."""
+    return exact_if_near(_stage(stage.machine, stage.prepared, _lessened(stage)))
+
+
+def _lessened(first: Stage) -> Fits:
+    """A fit with smaller disturbing forces, as long as these let the model come near the logs: large ones hide what
+    else there is. And the one that it came from."""
+    stage = _with_less(first)
     if stage is None:
-        return fit, None
+        return first.fit, None
     while (smaller := _with_less(stage)) is not None and smaller.near:
         stage = smaller
-    return stage.fit, fit
+    return stage.fit, first.fit
 
 
 def _with_less(stage: Stage) -> Stage | None:
@@ -265,10 +298,13 @@ def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
 Wish = tuple[Machine, Stage, float]  # what `refitted` is called with
 
 
-def refits(wishes: Sequence[Wish], together: Together) -> Iterator[Stage | None]:
-    """Several refitted, side by side; None where no fit is found."""
+def refits(wishes: Sequence[Wish], together: Together, most: float = np.inf) -> Iterator[Stage | None]:
+    """Several refitted, side by side; None where no fit is found or it is given up, as it still costs more than `most`
+    after a few passes."""
     prepared = [_resumed(machine, of) for machine, of, _ in wishes]
-    calls = [partial(_resumable, p, of, disturbed) for p, (_, of, disturbed) in zip(prepared, wishes, strict=True)]
+    calls = [
+        partial(_resumable, p, of, disturbed, most) for p, (_, of, disturbed) in zip(prepared, wishes, strict=True)
+    ]
     for p, (machine, _, _), fit in zip(prepared, wishes, together(calls), strict=True):
         yield None if fit is None else Stage(machine, p, fit, p.coarse == 1)
 
@@ -329,7 +365,9 @@ def _iterated(
     """A fit from points and X. With disturbing forces it is found as soon as it is nearly: gains are larger by far than
     what another pass would change. Raises NotConverged."""
     p = prepared
-    return newton.iterate(p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, newton.NEARLY, most)
+    return newton.iterate(
+        p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, newton.NEARLY, most, patient=False
+    )
 
 
 def light(fit: Fit) -> Fit:

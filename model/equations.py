@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import casadi as ca
 
@@ -41,6 +42,13 @@ class Sample:
 
     def row(self, body: Body) -> int:
         return self.names.index(body.coordinates[0])
+
+    @cached_property
+    def by_inertia(self) -> ca.SX:
+        """How generalised forces follow from the inertial parameters of all bodies (n_q, 10 bodies), linearly."""
+        every = {b.index: ca.SX.sym(f"inertia{b.index}", 10) for b in self.machine.body}
+        rows = tree.generalised_forces(self.machine, self.at, self.frames, every)
+        return ca.jacobian(ca.vertcat(*[rows[c] for c in self.names]), ca.vertcat(*every.values()))
 
 
 @dataclass(frozen=True)
@@ -284,9 +292,8 @@ def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
         told = effect.inertia(e.scene, e.values)
         moved = placing.shifted(machine, told)
         none = {n: ca.SX(0) for n in s.by_name}
-        change = {b.index: tree.inertial_vector(b, {**none, **moved}) for b in machine.body}
-        rows = tree.generalised_forces(machine, s.at, s.frames, change)
-        force -= ca.vertcat(*[rows[c] for c in s.names])
+        change = ca.vertcat(*[tree.inertial_vector(b, {**none, **moved}) for b in machine.body])
+        force -= s.by_inertia @ change
         if effect.recoil is not None:
             force += e.values[effect.recoil] * _recoil(s, e, told)
     return force

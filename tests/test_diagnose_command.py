@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -223,7 +223,7 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
 def test_what_a_process_found_can_be_sent_back(straight: Model, straight_motion: Motion) -> None:
     """An answer that can't be sent would be computed again in silence."""
 
-    def sent(calls: Sequence[Callable[[], Any]]) -> Iterator[Any]:
+    def sent(calls: Sequence[Callable[[], Any]]) -> Generator[Any, None, None]:
         return (pickle.loads(pickle.dumps(call())) for call in calls)
 
     one = log.check(sensors.measure(straight, straight_motion, seed=3), straight.machine)
@@ -236,6 +236,66 @@ def test_what_a_process_found_can_be_sent_back(straight: Model, straight_motion:
         assert (found.loose is None) == found.exact
     (found,) = stages.refits([(slope, stage, 0.0)], sent)
     assert found is not None
+
+
+def test_ways_that_are_not_needed_are_given_up(straight: Model) -> None:
+    """Of the ways to a fit the first one is enough for a clean log, whatever has been begun beside it."""
+    one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
+    carried: list[int] = []
+
+    def counted(calls: Sequence[Callable[[], Any]]) -> Generator[Any, None, None]:
+        for k, call in enumerate(calls):
+            carried.append(k)
+            yield call()
+
+    there, here = (stages.fitted(straight.machine, [one], straight.machine.filter, t) for t in (forked, counted))
+    assert carried == [0]
+    np.testing.assert_array_equal(there.fit.X, here.fit.X)
+
+
+def test_a_fit_whose_steps_cease_to_shrink_ends(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Near an answer as one that is as good as found, far from any without; whoever is patient spends every pass."""
+    one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
+    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    p, true = stage.prepared, newton.newton_step
+    steps: list[float] = []
+
+    def scripted(*args: Any) -> Any:
+        covariance, move, _, cost = true(*args)
+        return covariance, move, steps.pop(0), cost
+
+    monkeypatch.setattr(newton, "newton_step", scripted)
+    for end, spent, found in ((0.3, 7, True), (30.0, 8, False)):
+        for patient, passes in ((True, 14), (False, spent)):
+            steps[:] = [500.0, 90.0, 80.0, 40.0, *[end] * 10]
+            with pytest.raises(newton.NotConverged) as failed:
+                newton.iterate(
+                    p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.0, p.held, passes=14, patient=patient
+                )
+            hopeless = newton.HOPELESS[0] + 1 if patient and not found else passes
+            assert 14 - len(steps) == hopeless
+            assert (failed.value.nearly is not None) == found
+
+
+def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The likeliest candidate is fitted for what it gains, the others as long as they come to half of that."""
+    iterate = newton.iterate
+    bars: list[tuple[str, float]] = []
+
+    def noted(c: Any, *args: Any, **more: Any) -> newton.Fit:
+        if len(args) > 9 and c.model.effects:
+            bars.append((c.model.effects[0].name, args[9]))
+        return iterate(c, *args, **more)
+
+    monkeypatch.setattr(newton, "iterate", noted)
+    stage = stages.fitted(straight.machine, [log.read(sloping, straight.machine)], straight.machine.filter)
+    likely = choosing.scored(stage, in_turn)
+    choice = choosing.choose(stage, likely, (), in_turn, lambda share, what: None, 0.0)
+    assert choice is not None
+    assert choice.name == "ground_slope@machine"
+    assert bars[0] == (choice.name, np.inf)
+    (bar,) = {bar for name, bar in bars if name != choice.name}
+    assert bar == pytest.approx(stage.fit.cost - choosing.BEHIND * choice.gain)
 
 
 def gentle(model: Model, seconds: float) -> Motion:

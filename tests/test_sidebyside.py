@@ -72,7 +72,7 @@ def test_nothing_is_left_running_behind_an_interrupt(tmp_path: Path) -> None:
     answers = forked([lambda: None, partial(waits, "second"), partial(waits, "third")])
     next(answers)
     begun = _pids(tmp_path, min(cores(), 3) - 1)
-    answers.close()  # type: ignore[attr-defined]
+    answers.close()
     for pid in begun:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
