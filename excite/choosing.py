@@ -28,8 +28,8 @@ WORTH = 15.0  # a first-order gain below which a candidate isn't fitted
 HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
 TRIED = 5  # candidates that are fitted
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
-PAIR = 2  # candidates that are fitted in any case, side by side
-BEHIND = 0.5  # share of the likeliest one's gain that others must have come to after a few passes
+PAIR = 2  # candidates whose fits are begun in any case
+BEHIND = 0.5  # share of what was gained already that further candidates must have come to after a few passes
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
 # Of what is explained already, that a further effect must gain, as nature is never exactly the formula: by the fits'

@@ -29,7 +29,7 @@ from model.prediction import Model
 
 MOST = 4  # effects that are looked for
 FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
-FURTHER = 0.8  # the same for names after the first: what nature has beside its formula looks like many a cause
+FURTHER = 0.8  # SHARE for names after the first: what nature has beside its formula looks like many a cause
 ODD = 50.0  # misfit that every line of what is odd beside names stands for, at least
 
 

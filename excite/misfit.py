@@ -77,7 +77,11 @@ class Size:
 def loosened(stages: Sequence[Stage], together: Together) -> list[Stage]:
     """The same models with disturbing forces of some size; as they are where those find no fit."""
     least = smoothing.DISTURBED[0]
-    known = [s if s.fit.disturbed >= least and s.prepared.coarse == 1 else s.loose for s in stages]
+
+    def loose(s: Stage | None) -> Stage | None:
+        return s if s is None or (s.fit.disturbed >= least and s.prepared.coarse == 1) else loose(s.loose)
+
+    known = [loose(s) for s in stages]
     found = refits([(s.machine, s, least) for s, k in zip(stages, known, strict=True) if k is None], together)
     return [k or next(found) or s for s, k in zip(stages, known, strict=True)]
 

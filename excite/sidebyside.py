@@ -26,7 +26,7 @@ LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None  # loaded before a
 class Together(Protocol):
     """Carries out calls that have nothing to do with each other, and gives what they return in their order.
 
-    What is not wanted any more is given up by closing it."""
+    A caller that wants no more of them closes what it got."""
 
     def __call__(self, calls: Sequence[Callable[[], R]], /) -> Generator[R, None, None]: ...
 
@@ -44,8 +44,8 @@ def in_turn(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
 def forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
     """The same from as many processes at a time as there are cores, in the order of the calls.
 
-    What a process does not finish, because the call raises or something ends it, is done again in this one, and so is
-    what no process can be had for. However this one ends, the others end too.
+    What a process does not finish, because the call raises or something ends it, is done again in this one when its
+    turn comes, and so is what no process can be had for. However this one ends, the others end too.
     """
     at_once = cores()
     if min(at_once, len(calls)) < 2:
@@ -53,6 +53,7 @@ def forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
         return
     running: dict[Connection, tuple[int, BaseProcess]] = {}
     done: dict[int, R] = {}
+    left: set[int] = set()  # to this process
     begun = 0
     try:
         for k in range(len(calls)):
@@ -62,15 +63,18 @@ def forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
                         worker, answer = _started(calls[number], list(running))
                         running[answer] = number, worker
                     except OSError:  # no memory, processes or files left
-                        done[number] = calls[number]()
+                        left.add(number)
                     begun += 1
-                ready = wait(list(running)) if running else []
+                if k in left:
+                    done[k] = calls[k]()
+                    break
+                ready = wait(list(running))
                 for answer in [a for a in running if a in ready]:
                     number, worker = running.pop(answer)
                     try:
                         done[number] = answer.recv()
                     except (EOFError, OSError):
-                        done[number] = calls[number]()
+                        left.add(number)
                     answer.close()
                     worker.join()
             yield done.pop(k)

@@ -128,9 +128,10 @@ def _stage(machine: Machine, prepared: Prepared, fits: Fits) -> Stage:
 def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Together = in_turn) -> Stage:
     """A machine's model fitted to logs, with shapes of effects free.
 
-    Where exact dynamics find no estimate, nor one near the logs from that with disturbing forces, with such forces as
-    small as the log lets them be: the less they may take up, the plainer the cause. Where these leave the model far
-    off, with sensors taken for much noisier than they are, which most models follow; otherwise as `forced` has it.
+    Where exact dynamics find no estimate, or none that is less than FAR off after a few passes, nor one near the logs
+    from that with disturbing forces, with such forces as small as the log lets them be: the less they may take up, the
+    plainer the cause. Where these leave the model far off, with sensors taken for much noisier than they are, which
+    most models follow; otherwise as `forced` has it.
     Each way is set out upon before it is known to be needed, where there are processes for it. Raises NotConverged.
     """
     prepared = _prepared(machine, logs, filter)
@@ -148,9 +149,9 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Toge
             return _stage(machine, prepared, exact)
         disturbed = next(ways)
         stage = None if disturbed is None else _stage(machine, prepared, disturbed)
-        if stage is not None and stage.near:
-            return exact_if_near(stage)
-        noisy = next(ways)
+        noisy = None if stage is not None and stage.near else next(ways)
+    if stage is not None and stage.near:
+        return exact_if_near(stage)
     if noisy is not None:
         return Stage(machine, coarse, noisy[0], False, stage)
     return _forced(machine, prepared, smoothing.DISTURBED[1:], together) if stage is None else _with_least(stage)
@@ -223,7 +224,8 @@ def begun(machines: Sequence[Machine], of: Stage, disturbed: float, together: To
 def _from_first(prepared: Prepared, disturbed: float, most: float = np.inf) -> Fit | None:
     """A fit from first guesses; None where none is found or it is given up, as it still costs more than `most`."""
     try:
-        return light(_iterated(prepared, prepared.starts, prepared.c.model.nominal, disturbed, most=most))
+        nominal, patient = prepared.c.model.nominal, disturbed == 0  # nearly is not enough then
+        return light(_iterated(prepared, prepared.starts, nominal, disturbed, most=most, patient=patient))
     except NotConverged as failed:
         return light(failed.nearly) if failed.nearly is not None and disturbed > 0 else None
 
@@ -251,6 +253,8 @@ def _loosened(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | 
 
 def _with_least(stage: Stage) -> Stage:
     """A stage gone on with with the smallest disturbing forces that it takes, without any where that is near."""
+    if stage.loose is not None:
+        return exact_if_near(stage)
     return exact_if_near(_stage(stage.machine, stage.prepared, _lessened(stage)))
 
 
@@ -361,12 +365,13 @@ def _iterated(
     damping: float = newton.DAMPING[0],
     passes: int = newton.PASSES,
     most: float = np.inf,
+    patient: bool = False,
 ) -> Fit:
     """A fit from points and X. With disturbing forces it is found as soon as it is nearly: gains are larger by far than
     what another pass would change. Raises NotConverged."""
     p = prepared
     return newton.iterate(
-        p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, newton.NEARLY, most, patient=False
+        p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, newton.NEARLY, most, patient
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import pickle
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
@@ -248,13 +249,15 @@ def test_ways_that_are_not_needed_are_given_up(straight: Model) -> None:
             carried.append(k)
             yield call()
 
-    there, here = (stages.fitted(straight.machine, [one], straight.machine.filter, t) for t in (forked, counted))
+    there = stages.fitted(straight.machine, [one], straight.machine.filter, forked)
+    assert not multiprocessing.active_children()
+    here = stages.fitted(straight.machine, [one], straight.machine.filter, counted)
     assert carried == [0]
     np.testing.assert_array_equal(there.fit.X, here.fit.X)
 
 
 def test_a_fit_whose_steps_cease_to_shrink_ends(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Near an answer as one that is as good as found, far from any without; whoever is patient spends every pass."""
+    """Near an answer as one that is as good as found, far from any without; whoever is patient goes on for longer."""
     one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
     stage = stages.fitted(straight.machine, [one], straight.machine.filter)
     p, true = stage.prepared, newton.newton_step
@@ -296,6 +299,11 @@ def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatc
     assert bars[0] == (choice.name, np.inf)
     (bar,) = {bar for name, bar in bars if name != choice.name}
     assert bar == pytest.approx(stage.fit.cost - choosing.BEHIND * choice.gain)
+    texts = ("ground_slope=0.009", "roll_unbalance@rear_roll=500")
+    machines = [placing.extended(straight.machine, placing.parse(t, straight.machine, 40.0)) for t in texts]
+    for most, found in ((np.inf, [True, True]), (bar, [True, False])):
+        tried = stages.refits([(m, stage, stage.fit.disturbed) for m in machines], in_turn, most)
+        assert [x is not None for x in tried] == found
 
 
 def gentle(model: Model, seconds: float) -> Motion:

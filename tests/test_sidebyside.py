@@ -44,9 +44,12 @@ def test_what_a_process_does_not_finish_is_done_here(tmp_path: Path) -> None:
     def fails() -> str:
         raise ValueError("no such thing")
 
-    calls: list[Callable[[], str]] = [lambda: "fine", fails]
+    calls: list[Callable[[], str]] = [lambda: "fine", fails, fails]
     with pytest.raises(ValueError, match="no such thing"):
         list(forked(calls))
+    answers = forked(calls)
+    assert next(answers) == "fine"  # whose turn has not come fails nobody
+    answers.close()
 
 
 @pytest.mark.parametrize("granted", [[], [1, 4]], ids=["none", "some"])
