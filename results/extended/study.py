@@ -1,0 +1,286 @@
+"""What finding an effect does to the parameters, and to the drive that is designed next.
+
+python results/extended/study.py [--runs 20] [--jobs 2] rebuilds summary.json, figure.png and README.md beside this
+file; every effect is kept in results/.extended as it is done, and a study that was stopped goes on from there. The
+roller does something that its file doesn't know. One log of the drive R60_accuracy is diagnosed, and a drive is
+designed for the machine file that comes out. Then both drives are driven many times by the machine that has the effect,
+and identified with the old file and with the new one. Of a tie the new file has the first name.
+"""
+
+from __future__ import annotations
+
+# ruff: noqa: E402  (threads are set before numpy loads)
+import argparse
+import json
+import os
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import joblib
+import numpy as np
+from matplotlib.figure import Figure
+
+from excite import (
+    aim,
+    design,
+    diagnose,
+    examine,
+    folder,
+    identify,
+    limit,
+    log,
+    objective,
+    profiles,
+    sensors,
+    smoothing,
+)
+from excite.estimate import NoEstimate
+from excite.figures import COLOURS, save
+from excite.log import Log
+from excite.sidebyside import forked
+from excite.simulate import Motion, SimulationError, simulate
+from excite.wording import rounded
+from model import machine, placing, prediction
+from model.machine import Machine
+from model.prediction import Model
+
+HERE = Path(__file__).parent
+DRIVE = HERE.parent / "R60_accuracy" / "design" / "profile.csv"
+HIDDEN = (
+    "torque_deadband@rear_roll=80",
+    "rolling_resistance@front_roll=100",
+    "load_dependent_friction@front_roll=0.1",
+    "shear_saturation@rear_roll=0.1",
+    "asymmetric_coulomb@front_roll=100",
+)
+KEPT = 1e-3  # of a limit's range: what a drive leaves it by and still keeps it
+WAYS = {  # of identifying: which file, which drive
+    "old file, old drive": ("old", "old"),
+    "new file, old drive": ("new", "old"),
+    "new file, new drive": ("new", "new"),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=20)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--kept", type=Path, default=HERE.parent / ".extended", help="folder of what is done already")
+    options = parser.parse_args()
+    options.kept.mkdir(exist_ok=True)
+    rows = []
+    for hidden in HIDDEN:
+        path = options.kept / f"{hidden}-{options.runs}.json"
+        if not path.is_file():
+            with folder.writing_file(path) as place:
+                place.write_text(folder.dump(one(hidden, options.runs, options.jobs)), encoding="utf-8")
+        rows.append(json.loads(path.read_text(encoding="utf-8")))
+        print(f"{hidden}: done", flush=True)
+    save(figure(rows), HERE / "figure.png")
+    with folder.writing_file(HERE / "summary.json") as place:
+        place.write_text(folder.dump({"runs": options.runs, "rows": rows}), encoding="utf-8")
+    with folder.writing_file(HERE / "README.md") as place:
+        place.write_text(readme(rows, options.runs), encoding="utf-8")
+
+
+def one(hidden: str, runs: int, jobs: int) -> dict[str, Any]:
+    """One effect: what the diagnosis of one log makes of it, and what old and new file tell on old and new drive."""
+    old = machine.load("va12")
+    true = prediction.build(placing.extended(old, placing.parse(hidden, old, 60.0)))
+    torque, start, _ = profiles.read(DRIVE, true)
+    motions = {"old": simulate(true, torque, q0=start)}
+    found = diagnosed(old, measured(prediction.build(old), true, motions["old"], 1000))
+    row: dict[str, Any] = {"hidden": hidden, "verdict": found.verdict, "found": [], "ways": {}}
+    for f in found.findings:
+        told_with = {"amount": f.amount, "std": f.amount_std, "unit": f.unit, "tied_with": f.tied_with}
+        row["found"].append({"name": f.name, **told_with})
+    files = {"old": prediction.build(old)}
+    if found.findings and found.verdict != "unexplained":
+        files["new"] = prediction.build(placing.extended(old, *(f.entry for f in found.findings)))
+        problem = old.problems["R60"]
+        planned = prediction.build(files["new"].machine, flaws=False)
+        try:
+            made = design.design(planned, problem, aim.aim(planned, "accuracy"), starts=2, seed=0)
+            row["cond_phi"] = made.cond_phi
+            motions["new"] = simulate(true, made.manoeuvre.sample(float(old.sampling_hz)), q0=made.motion.q[0])
+        except (limit.InfeasibleError, SimulationError) as failed:
+            row["failed"] = str(failed)
+        row["violation"] = {n: between(limit.check(true, problem, m)) for n, m in motions.items()}
+    for way, (file, driven) in WAYS.items():
+        if file in files and driven in motions:
+            row["ways"][way] = told(files[file], true, motions[driven], runs, jobs)
+    return row
+
+
+def between(excess: dict[str, float]) -> dict[str, float]:
+    """Excesses of the limits on the motion itself, not of the lane and of rest at its ends."""
+    return {n: x for n, x in excess.items() if not limit.free(n)}
+
+
+def diagnosed(old: Machine, one: Log) -> diagnose.Diagnosis:
+    model = prediction.build(old)
+    return diagnose.diagnose(model, [examine.examine(model, one).log], old.filter, together=forked)
+
+
+def measured(known: Model, true: Model, motion: Motion, seed: int) -> Log:
+    """What the sensors write of a true machine's motion, read as a file says."""
+    table = sensors.measure(true, motion, kit="full", seed=seed)
+    return log.check(table, known.machine, identify.needed_sensors(known, "joint"))
+
+
+def told(known: Model, true: Model, motion: Motion, runs: int, jobs: int) -> dict[str, Any]:
+    """Errors of the parameters that the file knows in per cent of the truth, over many runs of one motion; how often
+    their 95 % intervals hold it; what is attainable there."""
+    work = (joblib.delayed(partial(estimated, known.machine, true.machine, motion))(k) for k in range(runs))
+    answers = [x for x in joblib.Parallel(n_jobs=jobs)(work) if x is not None]
+    names = [n for n in known.base.names if n in true.base.names]
+    at = [known.base.names.index(n) for n in names]
+    truth = true.nominal[[true.base.names.index(n) for n in names]]
+    bound = objective.percent(true, smoothing.cramer_rao(true, motion))
+    found: dict[str, Any] = {"runs": runs, "failed": runs - len(answers), "parameters": {}}
+    if not answers:
+        return found
+    value, low, high = (np.array([a[k] for a in answers])[:, at] for k in range(3))
+    error = 100 * (value - truth) / np.abs(truth)
+    for k, name in enumerate(names):
+        there = np.isfinite(low[:, k]) & np.isfinite(high[:, k])  # a log may not show a parameter
+        e = error[there, k]
+        found["parameters"][name] = {
+            "estimates": int(there.sum()),
+            "bias_percent": float(e.mean()) if len(e) else None,
+            "rms_percent": float(np.sqrt(np.mean(e**2))) if len(e) else None,
+            "coverage95": float(np.mean((low[there, k] <= truth[k]) & (truth[k] <= high[there, k])))
+            if len(e)
+            else None,
+            "attainable_percent": float(bound[true.base.names.index(name)]),
+        }
+    return found
+
+
+def estimated(known: Machine, true: Machine, motion: Motion, seed: int) -> tuple[np.ndarray, ...] | None:
+    model = prediction.build(known)
+    try:
+        estimate = identify.identify(model, [measured(model, prediction.build(true), motion, seed)], "joint")
+    except NoEstimate:
+        return None
+    return estimate.value, *estimate.interval95
+
+
+# ------------------------------------------------------------------------------------------------ the page
+
+
+def own(way: dict[str, Any], key: str) -> np.ndarray:
+    """What there is of a key for the parameters that the machine has without the effect."""
+    return np.array([p[key] for n, p in way["parameters"].items() if "@" not in n], float)
+
+
+def figure(rows: list[dict[str, Any]]) -> Figure:
+    """Errors of every parameter, effect by effect, for each way of identifying."""
+    fig = Figure(figsize=(10, 4.2), layout="constrained")
+    ax = fig.subplots()
+    labelled: set[str] = set()
+    for k, row in enumerate(rows):
+        for j, (way, colour) in enumerate(zip(WAYS, ("0.45", COLOURS[1], COLOURS[0]), strict=True)):
+            if way not in row["ways"] or not row["ways"][way]["parameters"]:
+                continue
+            e = own(row["ways"][way], "rms_percent")
+            x = k + 0.25 * (j - 1)
+            ax.plot(
+                np.full(len(e), x),
+                e,
+                "o",
+                color=colour,
+                markersize=4,
+                alpha=0.6,
+                label=None if way in labelled else way,
+            )
+            labelled.add(way)
+            ax.plot([x - 0.09, x + 0.09], [np.nanmedian(e)] * 2, color=colour, linewidth=2.5)
+    ax.set_yscale("log")
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.set_xticks(range(len(rows)), [r["hidden"].replace("@", "\n") for r in rows], fontsize=8)
+    ax.set_ylabel("true error of a parameter, rms over runs [%]")
+    ax.grid(axis="y", alpha=0.3)
+    ax.legend(fontsize=8)
+    return fig
+
+
+def readme(rows: list[dict[str, Any]], runs: int) -> str:
+    lines = [
+        "# What finding an effect does to the parameters, and to the next drive",
+        "",
+        "`python results/extended/study.py` rebuilds this page; [summary.json](summary.json) has every parameter.",
+        "",
+        "The roller does something that its file doesn't know. One log of the drive"
+        " [R60_accuracy](../R60_accuracy) is diagnosed (old file, va12's), the machine file that comes out is the new"
+        " one, and `accuracy` on R60 is designed for it (new drive). The machine that has the effect drives each"
+        f" {runs} times, with new sensor noise, and joint smoothing identifies. Errors are of the 22 parameters that"
+        " the machine has without the effect, rms over the runs, in per cent of the truth; all other values in both"
+        " files are the true ones.",
+        "",
+        "| hidden | diagnosed | identified with | median error | worst | in 95 % intervals | the effect's amount |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        said = row["verdict"]
+        if row["verdict"] in ("named", "tied"):
+            said = ", ".join(
+                f"{' or '.join([f['name'], *f['tied_with']])}: {rounded(f['amount'], 3)} ± {rounded(f['std'], 2)}"
+                + (f" {f['unit']}" if f["unit"] != "-" else "")
+                for f in row["found"]
+            )
+        said += f" (no new drive: {row['failed']})" if "failed" in row else ""
+        for k, (way, answer) in enumerate(row["ways"].items()):
+            head = [row["hidden"], said] if k == 0 else ["", ""]
+            lines.append("| " + " | ".join([*head, way, *_cells(answer)]) + " |")
+    lines += [
+        "",
+        "![Errors of every parameter with the old and the new file, on the old and the new drive](figure.png)",
+    ]
+    lines += ["", *_limits(rows)]
+    return "\n".join(lines) + "\n"
+
+
+def percent(x: float) -> str:
+    return f"{x:.2g} %" if x < 100 else f"{x:.0f} %"
+
+
+def _cells(way: dict[str, Any]) -> list[str]:
+    if not way["parameters"]:
+        return [f"none: all {way['runs']} failed", "", "", ""]
+    error, cover = own(way, "rms_percent"), own(way, "coverage95")
+    failed = f" ({way['failed']} failed)" if way["failed"] else ""
+    names = [n for n in way["parameters"] if "@" not in n]
+    amounts = [
+        percent(p["rms_percent"])
+        for n, p in way["parameters"].items()
+        if "@" in n and "." not in n and p["rms_percent"] is not None
+    ]
+    return [
+        f"{percent(np.nanmedian(error))}{failed}",
+        f"{percent(np.nanmax(error))} ({names[int(np.nanargmax(error))]})",
+        f"{100 * np.nanmean(cover):.0f} %",
+        ", ".join(amounts),
+    ]
+
+
+def _limits(rows: list[dict[str, Any]]) -> list[str]:
+    """By how much the drives leave the limits on the machine that has the effect."""
+    lines = []
+    for row in rows:
+        said = []
+        for n, excess in row.get("violation", {}).items():
+            name, most = max(excess.items(), key=lambda x: x[1])
+            kept = f"leaves the limit of {name} by {percent(100 * most)} of its range"
+            said.append(f"the {n} drive " + (kept if most > KEPT else "keeps every limit"))
+        if said:
+            lines.append(f"- {row['hidden']}: {', '.join(said)}.")
+    return ["On the machine that has the effect:", "", *lines] if lines else []
+
+
+if __name__ == "__main__":
+    main()
