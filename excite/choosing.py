@@ -38,7 +38,7 @@ CLOSE = 10.0  # a rival that is worse by less than this is a tie
 SHAPE = 0.005, 0.002
 ABSORBED, TIMED, HIDDEN = 0.1, 0.1, 0.25
 ALIKE = 0.03  # of an amount: what two formulas of one effect differ by; those of results/diagnosis do by 1 to 6 %
-BESIDE = 250.0  # a gain that by the latter no effect can be denied
+BESIDE = 250.0  # a gain that by the latter no effect can be denied, nor counted as a rival
 CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
 LEAST = 0.05, 0.15  # of the excess misfit that an effect must explain to be worth a place: weak misfit, strong misfit
 SHARE = 0.7  # of the excess misfit that names must explain, or it is unexplained
@@ -291,10 +291,14 @@ def _one_each(tries: Sequence[_Try]) -> list[_Try]:
 
 def _close(tries: Sequence[_Try], gain: float, share: float | None = None) -> list[_Try]:
     """The best of sorted tries and those that the logs like about as well: no difference counts that is a matter of the
-    formula, of an effect that gains so much. share: of the gain that is, the more where forces had to help."""
-    best = tries[0][1]
+    formula, of an effect that gains so much or is so sure. share: of the gain that is, the more where forces had to
+    help."""
+    score, best = tries[0]
     share = share or (SHAPE[1] if best.exact else FORCED)
     near = max(CLOSE * best.spread, NEAR * best.excess, share * gain)
+    if best.exact and not score.candidate.placed.effect.inverse:
+        # What forces let it gain is less than what it gains without them.
+        near = max(near, min(SHAPE[1] * wald(score.candidate.name, best), BESIDE))
     return [x for x in tries if x[1].fit.cost - best.fit.cost < near]
 
 
