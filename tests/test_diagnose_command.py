@@ -249,8 +249,9 @@ def test_ways_that_are_not_needed_are_given_up(straight: Model) -> None:
             carried.append(k)
             yield call()
 
+    others = multiprocessing.active_children()
     there = stages.fitted(straight.machine, [one], straight.machine.filter, forked)
-    assert not multiprocessing.active_children()
+    assert set(multiprocessing.active_children()) <= set(others)
     here = stages.fitted(straight.machine, [one], straight.machine.filter, counted)
     assert carried == [0]
     np.testing.assert_array_equal(there.fit.X, here.fit.X)
