@@ -37,6 +37,7 @@ from excite import (
     profiles,
     sensors,
     smoothing,
+    verify,
 )
 from excite.estimate import NoEstimate
 from excite.figures import COLOURS, save
@@ -137,27 +138,20 @@ def told(known: Model, true: Model, motion: Motion, runs: int, jobs: int) -> dic
     their 95 % intervals hold it; what is attainable there."""
     work = (joblib.delayed(partial(estimated, known.machine, true.machine, motion))(k) for k in range(runs))
     answers = [x for x in joblib.Parallel(n_jobs=jobs)(work) if x is not None]
-    names = [n for n in known.base.names if n in true.base.names]
-    at = [known.base.names.index(n) for n in names]
-    truth = true.nominal[[true.base.names.index(n) for n in names]]
-    bound = objective.percent(true, smoothing.cramer_rao(true, motion))
     found: dict[str, Any] = {"runs": runs, "failed": runs - len(answers), "parameters": {}}
     if not answers:
         return found
-    value, low, high = (np.array([a[k] for a in answers])[:, at] for k in range(3))
-    error = 100 * (value - truth) / np.abs(truth)
-    for k, name in enumerate(names):
-        there = np.isfinite(low[:, k]) & np.isfinite(high[:, k])  # a log may not show a parameter
-        e = error[there, k]
-        found["parameters"][name] = {
-            "estimates": int(there.sum()),
-            "bias_percent": float(e.mean()) if len(e) else None,
-            "rms_percent": float(np.sqrt(np.mean(e**2))) if len(e) else None,
-            "coverage95": float(np.mean((low[there, k] <= truth[k]) & (truth[k] <= high[there, k])))
-            if len(e)
-            else None,
-            "attainable_percent": float(bound[true.base.names.index(name)]),
-        }
+    names = tuple(n for n in known.base.names if n in true.base.names)
+    at = [known.base.names.index(n) for n in names]
+    there = [true.base.names.index(n) for n in names]
+    value, std, interval = (np.array([a[k] for a in answers])[..., at] for k in range(3))
+    units = tuple(true.base.units[k] for k in there)
+    truth, scale = true.nominal[there], true.scale[there]
+    of = verify.Verification("joint", "full", names, units, truth, scale, value, std, interval, {})
+    bound = objective.percent(true, smoothing.cramer_rao(true, motion))[there]
+    for (name, row), least in zip(verify.summary(of).items(), bound, strict=True):
+        told = {key: row[key] for key in ("bias_percent", "rms_percent", "coverage95")}
+        found["parameters"][name] = {**told, "attainable_percent": float(least)}
     return found
 
 
@@ -167,7 +161,7 @@ def estimated(known: Machine, true: Machine, motion: Motion, seed: int) -> tuple
         estimate = identify.identify(model, [measured(model, prediction.build(true), motion, seed)], "joint")
     except NoEstimate:
         return None
-    return estimate.value, *estimate.interval95
+    return estimate.value, estimate.std, estimate.interval95
 
 
 # ------------------------------------------------------------------------------------------------ the page
