@@ -35,8 +35,8 @@ ODD = 50.0  # misfit that every line of what is odd beside names stands for, at 
 
 @dataclass(frozen=True)
 class Finding:
-    """A named cause. gain: of twice the log-likelihood; p_value: that of no effect at all, for all that were tried;
-    rivals: what it is tied with, as the logs have it."""
+    """A named cause. gain: of twice the log-likelihood; p_value: that of no effect at all beside the others, for all
+    that were tried; rivals: what it is tied with, as the logs have it."""
 
     effect: str
     where: str
@@ -273,7 +273,7 @@ def _share(gained: float, stage: Stage, odd: Sequence[str]) -> float:
 def _verdict(before: Stage, after: Stage, chosen: Sequence[Choice], odd: tuple[str, ...], left: float) -> Diagnosis:
     """The verdict: what is named must explain most of the misfit, and what is left must be noise or be shown. left:
     what a further effect would gain that was not worth a name."""
-    findings = tuple(_finding(x, after, left) for x in chosen)
+    findings = tuple(_finding(x, after, left, alone=len(chosen) == 1) for x in chosen)
     share = 1.0
     if odd or not after.exact:
         share = _share(sum(x.gain for x in chosen), after, odd)
@@ -285,7 +285,15 @@ def _verdict(before: Stage, after: Stage, chosen: Sequence[Choice], odd: tuple[s
     return Diagnosis(verdict, findings, before, after, share, odd, tuple(x.stage for x in chosen))
 
 
-def _finding(choice: Choice, after: Stage, left: float) -> Finding:
+def _beside(choice: Choice, after: Stage) -> float:
+    """What an effect gains given all the others of the last fit: Wald's statistic, which needs no fit without it. No
+    less than any gain for one that is nothing at infinity."""
+    if after.placed(choice.name).effect.inverse:
+        return np.inf
+    return choosing.wald(choice.name, after) / choice.spread
+
+
+def _finding(choice: Choice, after: Stage, left: float, alone: bool) -> Finding:
     """A choice with amount and shapes as the last fit has them. The amount is as unsure as what is left says of the
     formula: where that is a part of what the effect gains, about half its root is a part of the amount; and never surer
     than another formula of the same effect would leave it."""
@@ -302,7 +310,8 @@ def _finding(choice: Choice, after: Stage, left: float) -> Finding:
     }
     added = sum(n == placed.name or n.startswith(placed.name + ".") for n in after.model.base.names)
     gain = choice.gain / choice.spread
-    p = min(1.0, choice.tried * float(scipy.stats.chi2.sf(gain, added)))
+    told = gain if alone else min(gain, _beside(choice, after))  # the gain of one of several is that on the way to them
+    p = min(1.0, choice.tried * float(scipy.stats.chi2.sf(told, added)))
     return Finding(
         placed.effect.name,
         placed.where,

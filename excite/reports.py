@@ -385,8 +385,8 @@ def _diagnose(s: Summary) -> Said:
         )
         columns = ("effect", "amount", "std", "unit", "shape", "p-value", "gain %", "95 % of it", "as well could be")
         caption = (
-            "What was found, in the order in which it was. p-value: of no effect at all, for all causes that were"
-            " tried. Gain: how much less the model errs on stretches that were not fitted on."
+            "What was found, in the order in which it was. p-value: of no effect at all beside the others, for all"
+            " causes that were tried. Gain: how much less the model errs on stretches that were not fitted on."
         )
         tables.append(Table(caption, columns, found))
     rows = tuple(
