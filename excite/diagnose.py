@@ -119,7 +119,7 @@ def diagnose(
         tell(0.9, "judging each given the others")
         chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
     stage = chosen[-1].stage if chosen else before
-    answer = _verdict(before, stage, chosen, odd, left)
+    answer = concluded(before, stage, chosen, odd, left)
     return answer if answer.findings else replace(answer, nearest=nearest)
 
 
@@ -270,7 +270,7 @@ def _share(gained: float, stage: Stage, odd: Sequence[str]) -> float:
     return gained / (gained + left) if gained + left > 0 else 0.0
 
 
-def _verdict(before: Stage, after: Stage, chosen: Sequence[Choice], odd: tuple[str, ...], left: float) -> Diagnosis:
+def concluded(before: Stage, after: Stage, chosen: Sequence[Choice], odd: tuple[str, ...], left: float) -> Diagnosis:
     """The verdict: what is named must explain most of the misfit, and what is left must be noise or be shown. left:
     what a further effect would gain that was not worth a name."""
     findings = tuple(_finding(x, after, left, alone=len(chosen) == 1) for x in chosen)

@@ -213,8 +213,12 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
         again = diagnose.reviewed(found.before, chosen)
         assert [x.name for x in again] == [n for n in order if n in names]
         assert again[-1].stage.fit.cost == pytest.approx(found.after.fit.cost, abs=0.1)
-    # One whose amount comes out as nothing goes, and the others stand as if it had never been there.
+    # One whose amount comes out as nothing goes, and the others stand as if it had never been there. What was gained on
+    # the way makes it no surer.
     chosen = [choosing.Choice(n, more, 1000.0, 1.0, 100, (), 1.0) for n in (name, *names)]
+    p_values = [f.p_value for f in diagnose.concluded(found.before, more, chosen, (), 0.0).findings]
+    assert p_values[0] > 0.05
+    assert max(p_values[1:]) < 1e-100
     left = diagnose.needed(found.before, chosen)
     assert [x.name for x in left] == names
     assert [e.name for e in left[0].stage.machine.effect] == [names[0].split("@")[0]]
