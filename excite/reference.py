@@ -25,7 +25,7 @@ from model.file import Record
 from model.machine import Machine
 
 SETS = 8  # shapes that go together, from which not all are told
-HIDDEN = ("__main__",)
+HIDDEN = ("__main__", "commands", "options")  # the command line, which has a page of its own
 PLAIN = (str, int, float, tuple, type(None))  # defaults that read as they are
 ADDRESS = re.compile(r"<(?:function |bound method |built-in function )?_?(\S+?)(?: object)? at 0x[0-9a-f]+>")
 WORDS: Mapping[type, str] = {str: "text", int: "whole number", float: "number", bool: "true or false"}
@@ -279,7 +279,7 @@ def commands_page() -> str:
     """Every command with its arguments and options, as `--help` says them."""
     import typer
 
-    from excite.__main__ import app
+    from excite.commands import app
 
     lines = ["# Commands", "", "`excite COMMAND --help` says the same.", ""]
     for name, command in _commands(typer.main.get_command(app), "excite"):

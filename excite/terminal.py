@@ -7,12 +7,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from excite.wording import likely, percent, rounded, some
 
 SHOWN = 40  # cells of a study in the terminal
 PAUSE = 30.0  # s between lines of progress
+INTERRUPTED = 130  # exit code of Ctrl-C, as shells have it
 TELLING = 10  # runs before the time left can be told
 ESTIMATE = (  # what is told of a parameter: heading, key, digits
     ("value", "value", 6),
@@ -48,6 +49,13 @@ def finish(summary: dict[str, Any], out: Path, json: bool, show: Callable[[dict[
         return
     show(summary)
     say(f"written to {out}/")
+
+
+def fail(message: str, code: int) -> NoReturn:
+    """Ends the program with one line on stderr."""
+    shown = "".join(c if c.isprintable() else "?" for c in message)  # names from files don't steer the terminal
+    sys.stderr.write(f"excite: {shown}\n")
+    sys.exit(code)
 
 
 def table(*names: str) -> Any:

@@ -19,7 +19,7 @@ import typer
 from conftest import Excite
 
 from excite import folder, handbook, reference
-from excite.__main__ import app
+from excite.commands import app
 from model import effects, machine, units
 
 ROOT = Path(__file__).parents[1]
