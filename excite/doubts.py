@@ -1,7 +1,8 @@
 """What may be wrong with a log though every value is possible: a sign turned around, a torque a thousand times off.
 
 The drive of a joint that steers does more work with the joint's motion than against it, since friction takes some. A
-contact may well brake while another one pulls; but whatever the others do, more torque makes the machine faster.
+contact may well brake while another one pulls; but whatever the others do, more torque makes the machine faster. And
+what the torques of contacts follow from is how fast these turn and speed up, never how far they have turned.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ CLEAR = 2.5  # standard deviations
 AGAINST = 0.3  # correlation, or share of the acceleration that the machine file's masses promise, below zero
 ALIKE = 0.1  # of the largest singular value: torques that differ by less can't be told apart
 FRICTION = 2.0  # times that of the joints: in a bend contacts rub on the ground as well
-CLEARER = 0.8  # times what is left of the torque otherwise: beyond doubt a speed
+SAME = 1e-6  # of the largest singular value: no direction of its own
+RATES = ("rpm", "rad/s")
 SHARE = 0.1  # of the highest speed: below, dry friction fades
 SLOW = 0.1  # rad/s: below, friction fades in an average over a span
 MOVED = 0.05  # rad or m: a joint that moves less says nothing of its drive
@@ -42,6 +44,16 @@ def doubts(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[str, ...
     lines = [line for line in scales if line]
     if lines:
         return tuple(lines)  # with a torque that is too small the others seem to move the machine alone
+    pulls = [values[torques[b.index].name] for b in driven if b.contact]
+    speeds = [angles[b.index] for b in moved if b.contact and not angles[b.index].is_rate]
+    lines = [
+        f"column {s.column}: goes with the torques as the speed of a contact would, and not its angle: is it one? then"
+        f" {as_speed(RATES, machine)}"
+        for s in speeds
+        if s.factor is None and is_speed(values[s.name], pulls, rate)
+    ]
+    if lines:
+        return tuple(lines)
     half = max(1, round(SPAN * rate))
     for b in moved:
         if len(position[b.index]) < 2 * half * LEAST:
@@ -63,25 +75,38 @@ def doubts(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[str, ...
     return tuple(lines)
 
 
-def is_speed(values: np.ndarray, torque: np.ndarray, rate: float) -> bool:
-    """Whether readings (N,) of an angle, in any unit, are rather its speed: what they do goes with the torque (N,), by
-    inertia and friction, better if they are taken for one."""
+def is_speed(values: np.ndarray, torques: Sequence[np.ndarray], rate: float, clear: float = 1.0) -> bool:
+    """Whether readings (N,) of an angle, in any unit, are rather its speed: what they do goes with the torques (N,), by
+    inertia and friction, better if they are taken for one; `clear` times what is left otherwise."""
     half = max(1, round(SPAN * rate))
-    if len(values) < 2 * half * LEAST:
+    moving = [u for u in torques if np.ptp(u) > 0]
+    if not moving or len(values) < 2 * half * LEAST:
         return False
-    u = _mean(torque, half)
+    u = np.column_stack([_mean(u, half) for u in moving])
     first, second = _motion(values, half, rate)
-    return _unexplained(u, _mean(values, half), first) < CLEARER * _unexplained(u, first, second)
+    return _unexplained(u, _mean(values, half), first) < clear * _unexplained(u, first, second)
 
 
-def _unexplained(torque: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) -> float:
-    """What a speed (N,) and its change leave of a torque (N,) by least squares, as a share."""
+def as_speed(units: Sequence[str], machine: Machine) -> str:
+    """What to write for a column that holds a speed in one of these units."""
+    line = " or ".join(f'unit = "{unit}"' for unit in units)
+    return f"write {line} for it in {own_file(machine)}, with its noise [rad/s] instead of counts_per_turn"
+
+
+def _unexplained(torques: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) -> float:
+    """What a speed (N,) and its change leave of the combination of torques (N, k) that goes best with them, as a share:
+    one less the largest canonical correlation squared."""
     dry = np.tanh(speed / (SHARE * np.abs(speed).max() or 1.0))
-    A, y = np.column_stack([speed, acceleration, dry]), torque - torque.mean()
-    A -= A.mean(axis=0)
-    A /= np.maximum(A.std(axis=0), 1e-300)
-    left = y - A @ (np.linalg.pinv(A) @ y)
-    return float(left @ left / max(y @ y, 1e-300))
+    both = _directions(torques).T @ _directions(np.column_stack([speed, acceleration, dry]))
+    return max(1 - float(np.linalg.norm(both, 2)) ** 2, 1e-300)
+
+
+def _directions(A: np.ndarray) -> np.ndarray:
+    """Orthonormal columns that span the columns of A (N, k) but for their means."""
+    A = A - A.mean(axis=0)
+    U, sizes, _ = np.linalg.svd(A / np.maximum(A.std(axis=0), 1e-300), full_matrices=False)
+    found: np.ndarray = U[:, sizes > SAME * sizes[0]]
+    return found
 
 
 @contextmanager

@@ -17,15 +17,22 @@ LONG = 5.0  # s that a stretch must last: a start and some seconds of motion
 MOST = 10  # gaps: a file with more has a fault that cutting does not mend
 
 
-def read(paths: Sequence[Path], machine: Machine, needs: Sequence[str] = ()) -> tuple[list[Log], list[str]]:
-    """The logs in files, one stretch after another, with a note for each that was cut. Raises LogError as `log.read`:
-    also for a gap beside which too little is left, and for more than MOST of them."""
-    parts = [split(log.table_of(path, machine), machine, needs, str(path)) for path in paths]
+def read(
+    paths: Sequence[Path], machine: Machine, needs: Sequence[str] = (), use: str = "identified from"
+) -> tuple[list[Log], list[str]]:
+    """The logs in files, one stretch after another, with a note for each that was cut. use: what the stretches are
+    said to be for. Raises LogError as `log.read`: also for a gap beside which too little is left, and for more than
+    MOST of them."""
+    parts = [split(log.table_of(path, machine), machine, needs, str(path), use) for path in paths]
     return [one for logs, _ in parts for one in logs], [note for _, notes in parts for note in notes]
 
 
 def split(
-    table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log"
+    table: pd.DataFrame,
+    machine: Machine,
+    needs: Sequence[str] = (),
+    source: str = "log",
+    use: str = "identified from",
 ) -> tuple[list[Log], list[str]]:
     """The same of one table of columns."""
     logcheck.refuse(table, machine, needs, source)
@@ -41,7 +48,7 @@ def split(
     ]
     where = ", ".join(f"{t[k] - t[k - 1]:.3g} s before row {k + 1}" for k in cuts)
     gaps = "a gap" if len(cuts) == 1 else f"{len(cuts)} gaps"
-    return stretches, [f"{source}: {gaps} ({where}): identified from the {len(stretches)} stretches between"]
+    return stretches, [f"{source}: {gaps} ({where}): {use} the {len(stretches)} stretches between"]
 
 
 def _gaps(table: pd.DataFrame, machine: Machine, source: str) -> list[int]:

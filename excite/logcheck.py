@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from excite import log
-from excite.doubts import doubts, is_speed, own_file
+from excite.doubts import RATES, as_speed, doubts, is_speed, own_file
 from excite.examine import NEEDED, find_dropouts, find_spikes
 from excite.log import LogError
 from model import machine as machines
@@ -26,6 +26,7 @@ SHOWN = 5  # places named of a fault that is there many times
 STUCK = 50  # equal extreme readings in a row that look like the end of a range
 ALIKE = 0.6  # share of a machine's columns that makes a log look like one of its
 CLOSE = 0.05  # of a unit's size, when a wrong rate of sampling is taken for time in that unit
+CLEARER = 0.8  # times what is left of the torques otherwise: beyond doubt a speed
 AGAINST = -0.5  # correlation of two contacts' speeds that says one is wired the other way round
 
 
@@ -185,19 +186,18 @@ def _speed(sensor: Sensor, values: np.ndarray, table: pd.DataFrame, machine: Mac
         return ""
     if _possible(sensor, values, machine) or np.abs(np.diff(values)).max() > TURN / 2:
         return ""  # not unwrapped, say
-    rates = {unit: sensor.model_copy(update={"unit": unit, "counts_per_turn": None}) for unit in ("rpm", "rad/s")}
+    rates = {unit: sensor.model_copy(update={"unit": unit, "counts_per_turn": None}) for unit in RATES}
     units = [u for u, s in rates.items() if _possible(s, values * (s.gain / sensor.gain), machine)]
     # What moves a roll is the torque of all of them.
     pulling = [b.index for b in machine.actuated if b.contact is not None] if body.contact else [body.index]
     drives = [s for s in machine.sensors("full") if s.kind == "torque" and s.body in pulling]
     torques = [_caught(lambda s=s: log.values_of(s, machine, table, ""), None) for s in drives if s.column in table]  # type: ignore[misc]
     known = [u for u in torques if u is not None]
-    if not units or not known or not is_speed(values, np.sum(known, axis=0), rate):
+    if not units or not is_speed(values, known, rate, CLEARER):
         return ""
-    line = " or ".join(f'unit = "{unit}"' for unit in units)
     return (
-        f"column {sensor.column}: changes faster than the joint can turn, as its speed would: is it one? then write"
-        f" {line} for it in {own_file(machine)}, with its noise [rad/s] instead of counts_per_turn"
+        f"column {sensor.column}: changes faster than the joint can turn, as its speed would: is it one? then"
+        f" {as_speed(units, machine)}"
     )
 
 

@@ -17,7 +17,6 @@ from excite import (
     figures,
     gaps,
     identify,
-    log,
     profiles,
     reports,
     sensors,
@@ -192,8 +191,9 @@ def identified(
     method = asked.method(method, model)
     needs = identify.needed_sensors(model, method)
     read, cut = gaps.read(logs, model.machine, needs)
-    seen = [examine.examine(model, log.read(path, model.machine, needs)) for path in validate]
-    fresh, said = [e.log for e in seen], [line for e in seen for line in (*e.notes, *e.doubts)]
+    others, torn = gaps.read(validate, model.machine, needs, "validated on")
+    seen = [examine.examine(model, one) for one in others]
+    fresh, said = [e.log for e in seen], [*torn, *(line for e in seen for line in (*e.notes, *e.doubts))]
     with terminal.busy("identifying"):
         chosen, reason = examine.FILTERS[filtering](model, read)
         estimate = identify.identify(model, read, method, chosen)

@@ -80,6 +80,18 @@ def test_every_sign_of_a_machine_that_steers(va12: Model, va12_motion: Motion, k
         assert turned(va12, one, sensor, other) == ()
 
 
+@pytest.mark.parametrize("name", ["theta1", "theta4"])
+def test_a_speed_that_breaks_no_limit(va12: Model, name: str) -> None:
+    """Smooth and slow enough for an angle that the roll could follow; with torques of either sign."""
+    one = checked(va12, follow(va12, SPEED, ANGLE, seed=3))
+    turns = np.gradient(one.values[name]) * 100 * 60 / (2 * np.pi)
+    wrong = one.values | {name: np.convolve(turns, np.ones(51) / 51, "same")}
+    for values in (wrong, wrong | {"u1": -wrong["u1"]}):
+        (line,) = doubts.doubts(va12.machine, values)
+        assert line.startswith(f"column {name}_rad: goes with the torques as the speed of a contact would")
+        assert 'write unit = "rpm" or unit = "rad/s" for it in a machine file' in line
+
+
 @pytest.mark.parametrize("name", sorted(set(machine.shipped()) - {"double_loader", "tandem"}))
 def test_clean_logs_of_every_machine(name: str) -> None:
     model = prediction.build(machine.load(name))

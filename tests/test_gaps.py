@@ -57,3 +57,18 @@ def test_identify_reports_the_cut(excite: Excite, table: pd.DataFrame, tmp_path:
     assert code == 0
     assert [source.partition(" ")[2] for source in summary["logs"]] == ["from row 1", "from row 1701"]
     assert any("a gap (1.54 s before row 1701)" in note for note in summary["notes"])
+
+
+def test_a_gap_in_a_log_to_validate_with(excite: Excite, table: pd.DataFrame, tmp_path: Path) -> None:
+    """The stretches beside it are predicted, each as a log of its own."""
+    table.to_csv(tmp_path / "whole.csv", index=False)
+    table.drop(index=range(1700, 1853)).to_csv(tmp_path / "holed.csv", index=False)
+    told = ("identify", "va12_straight", tmp_path / "whole.csv", "--validate", tmp_path / "holed.csv")
+    code, stdout, _ = excite(*told, "--out", tmp_path / "a", "--json")
+    summary = json.loads(stdout)
+    assert code == 0
+    assert len(summary["logs"]) == 1
+    assert [v["log"].partition("holed.csv ")[2] for v in summary["validation"]] == ["from row 1", "from row 1701"]
+    for v in summary["validation"]:
+        assert max(v["torque_error_percent"].values()) < 20
+    assert sum("validated on the 2 stretches between" in note for note in summary["notes"]) == 1
