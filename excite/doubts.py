@@ -2,7 +2,8 @@
 
 The drive of a joint that steers does more work with the joint's motion than against it, since friction takes some. A
 contact may well brake while another one pulls; but whatever the others do, more torque makes the machine faster. And
-what the torques of contacts follow from is how fast these turn and speed up, never how far they have turned.
+what the torques of contacts follow from is how fast these turn and speed up, never how far they have turned. Angles
+that are counted move in whole counts.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ ALIKE = 0.1  # of the largest singular value: torques that differ by less can't 
 FRICTION = 2.0  # times that of the joints: in a bend contacts rub on the ground as well
 SAME = 1e-6  # of the largest singular value: no direction of its own
 RATES = ("rpm", "rad/s")
+SEVERAL = 50  # steps that counts are judged by
+OFF, MOSTLY = 0.1, 0.9  # counts, and share of the steps, by which steps are whole ones
+ONE = 1.4  # times a count that a step may be and still is one
 SHARE = 0.1  # of the highest speed: below, dry friction fades
 SLOW = 0.1  # rad/s: below, friction fades in an average over a span
 MOVED = 0.05  # rad or m: a joint that moves less says nothing of its drive
@@ -40,21 +44,22 @@ def doubts(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[str, ...
     rate = float(machine.sampling_hz)
     position = {i: np.cumsum(values[s.name]) / rate if s.is_rate else values[s.name] for i, s in angles.items()}
     moved = [b for b in driven if np.ptp(position[b.index]) > MOVED]
+    counted = [s for s in machine.sensors("full") if s.name in values and s.resolution is not None]
+    counts = [line for s in counted if (line := _counts(s, machine, values[s.name]))]
     scales = (_scale(torques[b.index], b, machine, values[torques[b.index].name]) for b in moved)
-    lines = [line for line in scales if line]
-    if lines:
-        return tuple(lines)  # with a torque that is too small the others seem to move the machine alone
+    if lines := [line for line in scales if line]:
+        return (*counts, *lines)  # with a torque that is too small the others seem to move the machine alone
     pulls = [values[torques[b.index].name] for b in driven if b.contact]
-    speeds = [angles[b.index] for b in moved if b.contact and not angles[b.index].is_rate]
-    lines = [
-        f"column {s.column}: goes with the torques as the speed of a contact would, and not its angle: is it one? then"
-        f" {as_speed(RATES, machine)}"
-        for s in speeds
-        if s.factor is None and is_speed(values[s.name], pulls, rate)
-    ]
-    if lines:
-        return tuple(lines)
+    turning = [angles[b.index] for b in moved if b.contact and not angles[b.index].is_rate]
+    speeds = [s for s in turning if s.factor is None and is_speed(values[s.name], pulls, rate)]
+    if speeds:
+        return tuple(
+            f"column {s.column}: goes with the torques as the speed of a contact would, and not its angle: is it one?"
+            f" then {as_speed(RATES, machine)}"
+            for s in speeds
+        )
     half = max(1, round(SPAN * rate))
+    lines = []
     for b in moved:
         if len(position[b.index]) < 2 * half * LEAST:
             continue
@@ -72,7 +77,7 @@ def doubts(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[str, ...
                 f"{what}: is the sign of one of them turned around? (right if something else moves this joint: a slope,"
                 " a tow, another drive)"
             )
-    return tuple(lines)
+    return (*counts, *lines)
 
 
 def is_speed(values: np.ndarray, torques: Sequence[np.ndarray], rate: float, clear: float = 1.0) -> bool:
@@ -183,6 +188,31 @@ def _pulls(
         if b.inertia is not None and b.contact is not None
     )
     return float(x[k]) * mass < -AGAINST and float(x[k]) < -CLEAR * deviation
+
+
+def _counts(sensor: Sensor, machine: Machine, values: np.ndarray) -> str:
+    """An angle that moves in other steps than those of its counts, "" where it doesn't."""
+    assert sensor.resolution is not None
+    steps = np.abs(np.diff(values)) / sensor.resolution
+    steps = steps[steps > SAME]
+    if len(steps) < SEVERAL:
+        return ""
+    least, turn = float(np.quantile(steps, 0.01)), float(sensor.counts_per_turn or 0)
+    if _whole(steps / least) and not 1 / ONE < least < ONE:
+        return (
+            f"column {sensor.column}: moves in steps of {least:.3g} counts of {turn:g} per turn: was it filtered or"
+            f" rounded, or is it counts_per_turn = {round(turn / least)}? then write that for it in {own_file(machine)}"
+        )
+    if _whole(steps):
+        return ""
+    return (
+        f"column {sensor.column}: does not move in whole counts of {turn:g} per turn: was it filtered, rounded or"
+        " resampled? deviations are stated for counts as they come"
+    )
+
+
+def _whole(steps: np.ndarray) -> bool:
+    return bool(np.mean(np.abs(steps - np.round(steps)) < OFF) > MOSTLY)
 
 
 def _scale(sensor: Sensor, body: Body, machine: Machine, torque: np.ndarray) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.signal
 from conftest import Excite, drive
 
 from excite import checkup, doubts, identify, log, sensors
@@ -90,6 +91,29 @@ def test_a_speed_that_breaks_no_limit(va12: Model, name: str) -> None:
         (line,) = doubts.doubts(va12.machine, values)
         assert line.startswith(f"column {name}_rad: goes with the torques as the speed of a contact would")
         assert 'write unit = "rpm" or unit = "rad/s" for it in a machine file' in line
+
+
+@pytest.mark.parametrize("name", ["theta1", "theta2", "thetal"])
+def test_counts_of_another_size(va12: Model, va12_motion: Motion, name: str) -> None:
+    """Twice and half as many as the file says, and what was made of counts."""
+    (sensor,) = (s for s in va12.machine.sensor if s.name == name)
+    assert sensor.counts_per_turn is not None
+    assert sensor.resolution is not None
+    one, turn = checked(va12, va12_motion), float(sensor.counts_per_turn)
+    coarse = np.floor(one.values[name] / (2 * sensor.resolution)) * 2 * sensor.resolution
+    (line,) = doubts.doubts(va12.machine, one.values | {name: coarse})
+    assert line.startswith(f"column {name}_rad: moves in steps of 2 counts")
+    assert f"or is it counts_per_turn = {turn / 2:.0f}? then write that for it in a machine file" in line
+    exact = dict(zip(va12.coordinates, va12_motion.q.T, strict=True))
+    if name in exact:
+        fine = np.floor(exact[name] / (sensor.resolution / 2)) * sensor.resolution / 2
+        (line,) = doubts.doubts(va12.machine, one.values | {name: fine})
+        assert f"is it counts_per_turn = {2 * turn:.0f}?" in line
+    smooth = scipy.signal.sosfiltfilt(scipy.signal.butter(4, 10, fs=100, output="sos"), one.values[name])
+    for made in (smooth, np.round(one.values[name], 3)):
+        (line,) = doubts.doubts(va12.machine, one.values | {name: made})
+        assert line.startswith(f"column {name}_rad: ")
+        assert "rounded" in line
 
 
 @pytest.mark.parametrize("name", sorted(set(machine.shipped()) - {"double_loader", "tandem"}))
