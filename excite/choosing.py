@@ -18,6 +18,7 @@ from excite.newton import NotConverged
 from excite.sidebyside import Together
 from excite.stages import SMALL, Stage, begun, exact_if_near, freed, refits, refitted, sharpened
 from model import placing
+from model.effect import Effect
 from model.file import Quantity
 from model.machine import EffectEntry
 
@@ -81,10 +82,24 @@ def _sureness(stage: Stage) -> float:
 
 
 def scored(stage: Stage, together: Together) -> tuple[evidence.Score, ...]:
-    """What every effect that a model does not have promises, best first."""
+    """What every effect that a model does not have promises, best first. None that is as well a harmonic of what it
+    has: of a ripple of one contact, say, when all turn at about the same speed."""
     known = [e.name for e in stage.model.effects]
     sensors = [s.name for s in stage.prepared.c.sensors]
-    return _scanned(stage, evidence.candidates(stage.machine, sensors, _duration(stage.prepared.logs), known), together)
+    found = evidence.candidates(stage.machine, sensors, _duration(stage.prepared.logs))
+    wanted = [x for x in found if x.name not in known or _has_harmonics(x.placed.effect)]
+    scores = _scanned(stage, evidence.renumbered(wanted), together)
+    harmonic: dict[str, float] = {}
+    for s in scores:
+        if s.candidate.name in known:
+            harmonic.setdefault(s.candidate.placed.effect.name, s.gain + CLOSE)
+    new = (s for s in scores if s.candidate.name not in known)
+    return tuple(s for s in new if s.gain > harmonic.get(s.candidate.placed.effect.name, -np.inf))
+
+
+def _has_harmonics(effect: Effect) -> bool:
+    shapes = effect.shapes.values()
+    return any(s.circular for s in shapes) and any(s.whole and len(s.grid) > 1 for s in shapes)
 
 
 def _scanned(stage: Stage, found: Sequence[evidence.Candidate], together: Together) -> tuple[evidence.Score, ...]:
@@ -180,19 +195,25 @@ def choose(
     gain = stage.fit.cost - best.fit.cost
     if gain < max(LEVEL * best.spread, _least(stage, chosen, score.candidate)):
         return None
-    return _chosen(_close(tries, gain), gain, len(scores), together)
+    return _chosen(tries, gain, len(scores), together)
 
 
 def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) -> Choice:
-    """The best of close tries without disturbing forces where that can be, and the rest as its rivals: those as well
-    that only with such forces are known to be as good."""
-    spread = tries[0][1].spread
-    judged = {s.candidate.name: stage for s, stage in tries if not stage.exact}
-    exact, unknown = _without_forces(tries, together)
-    tries = [*_close(exact, gain, SHAPE[0] if judged else SHAPE[1]), *unknown] if exact else tries
-    score, best = tries[0]
-    rivals = tuple(entry_of(other, s.candidate.name) for s, other in tries[1:])
-    loose = judged.get(score.candidate.name) if best.exact else None
+    """The best of tries without disturbing forces where that can be, and what is close to it as its rivals: those as
+    well that only with such forces are known to be as good."""
+    spread, forced = tries[0][1].spread, {s.candidate.name: stage for s, stage in tries if not stage.exact}
+    close = _close(tries, gain)
+    exact, unknown = _without_forces(close, together)
+    if forced and exact and not exact[0][1].near:
+        # Forces hid that it doesn't explain the logs. One that explained a little less under them may do.
+        lowest = tries[0][1].fit
+        like = [x for x in tries[len(close) :] if gain + lowest.cost - x[1].fit.cost >= LIKE * gain]
+        others, _ = _without_forces([x for x in like if x[1].fit.disturbed == lowest.disturbed], together)
+        exact = sorted([*exact, *others], key=lambda x: x[1].fit.cost)
+    judged = [*_close(exact, gain, SHAPE[0] if forced else SHAPE[1]), *unknown] if exact else close
+    score, best = judged[0]
+    rivals = tuple(entry_of(other, s.candidate.name) for s, other in judged[1:])
+    loose = forced.get(score.candidate.name) if best.exact else None
     return Choice(score.candidate.name, best, gain, spread, tried, rivals, score.left, loose)
 
 
@@ -222,7 +243,7 @@ def sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None
                 return None
             # Far from no effect Wald's statistic says too much, and further effects are measured by it.
             sure = min(sure, stage.prepared.coarse * gain)
-            return stage, [_chosen(_close(near, sure), sure, len(scores), together)]
+            return stage, [_chosen(near, sure, len(scores), together)]
     return None
 
 
@@ -248,7 +269,7 @@ def unfollowed(stage: Stage, together: Together) -> tuple[Stage, list[Choice]]:
             gain = wald(score.candidate.name, best)  # of the same kind, and smaller where much is gained
         if gain < LEVEL * best.spread:
             return exact_if_near(stage), []
-        return stage, [_chosen(_close(tries, gain), gain, len(scores), together)]
+        return stage, [_chosen(tries, gain, len(scores), together)]
     return stage, []
 
 
