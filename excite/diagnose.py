@@ -266,17 +266,23 @@ def _odd(stage: Stage) -> tuple[str, ...]:
 
 def _share(gained: float, stage: Stage, odd: Sequence[str]) -> float:
     """Of the misfit, how much effects explain that gained so much, by what is left of it in a stage and what is odd."""
-    left = max(stage.excess, ODD * len(odd))
+    left = _rest(stage, odd)
     return gained / (gained + left) if gained + left > 0 else 0.0
+
+
+def _rest(stage: Stage, odd: Sequence[str]) -> float:
+    """The misfit that is left in a stage."""
+    return max(stage.excess, ODD * len(odd))
 
 
 def concluded(before: Stage, after: Stage, chosen: Sequence[Choice], odd: tuple[str, ...], left: float) -> Diagnosis:
     """The verdict: what is named must explain most of the misfit, and what is left must be noise or be shown. left:
     what a further effect would gain that was not worth a name."""
-    findings = tuple(_finding(x, after, left, alone=len(chosen) == 1) for x in chosen)
     share = 1.0
     if odd or not after.exact:
         share = _share(sum(x.gain for x in chosen), after, odd)
+        left = max(left, _rest(after, odd))
+    findings = tuple(_finding(x, after, left, alone=len(chosen) == 1) for x in chosen)
     verdict = "clean"
     if findings:
         verdict = "tied" if any(f.tied_with for f in findings) else "named"

@@ -18,13 +18,14 @@ Values = Mapping[str, ca.SX]  # the amount "A" and the shapes by name
 @dataclass(frozen=True)
 class Rolling:
     """How a contact, a roll or a wheel, moves: its centre's velocity along and across its chassis [m/s], spin and yaw
-    rate [rad/s]."""
+    rate [rad/s]; x: where its centre is along the root's axis [m]."""
 
     contact: Contact
     Vx: ca.SX
     Vy: ca.SX
     spin: ca.SX
     yaw: ca.SX
+    x: ca.SX
 
     @property
     def slip(self) -> law.Slip:

@@ -27,7 +27,8 @@ SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on th
 BACK = 0.1  # [m] of way back, within which a reversal counts
 MOMENTS = 120  # at which a load is looked for that slides
 PRESSED = 0.1  # [rad] beyond a stop, at which its hardening is stated
-LANE = 10.0  # [m] of way that a reversal is worth where these are counted
+LANE = 10.0  # [m] of way that a pass is worth where these are counted
+EDGE = 0.3  # [m] within which the end of a lane is felt
 
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
 
@@ -127,8 +128,34 @@ def _reversing(s: Scene, k: int, p: Values) -> ca.SX:
     return ca.fmax(-way * ahead * s.z["facing"], 0) / (BACK * (1 - log(2)))
 
 
+def _beyond(name: str, side: float) -> Callable[[Scene, int, Values], ca.SX]:
+    """How fast an end of the lane is moved on by the contact that is there, a little behind it."""
+
+    def rate(s: Scene, k: int, p: Values) -> ca.SX:
+        return side * _way(s, k)[0] * ca.fmax(side * (s.z["place"] - s.z[name]), 0) / EDGE
+
+    return rate
+
+
+def _passes(s: Scene, k: int) -> ca.SX:
+    """How often contacts have passed over the place where one is: every one has been on a stretch of the lane of its
+    own, about as often anywhere on it, and where the lane ends the ground is new. Bodies behind each other follow one
+    track; the lane has no second dimension."""
+    length = s.z["farthest"] - s.z["nearest"]
+    often = ca.fmax(s.z["distance"] / (length + EDGE) - 0.5, 1)
+    place = s.z["place"] + s.rolling[k].x
+    share = ca.SX(0)
+    for other in s.rolling.values():
+        inside = [s.z["farthest"] + other.x - place, place - s.z["nearest"] - other.x]
+        low, high = ((1 + ca.tanh(3 * (room / EDGE + 0.5))) / 2 for room in inside)
+        share += low * high
+    return often * share
+
+
 def _compacted(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
-    way = (1 - p["counted"]) * s.z["distance"] + p["counted"] * LANE * s.z["reversals"]
+    form = p["counted"]
+    way = (1 - form) * (2 - form) / 2 * s.z["distance"] + form * (2 - form) * LANE * s.z["reversals"]
+    way += form * (form - 1) / 2 * LANE * _passes(s, k)
     return _scaled(soil, 1 + p["A"] * (1 - ca.exp(-way / p["pass"])))
 
 
@@ -465,7 +492,12 @@ _declare(
         {
             "pass": Shape("m", 15.0, (5.0, 15.0, 50.0)),
             "counted": Shape(
-                "-", 0.0, (0.0,), whole=True, meaning=f"1: a pass is counted by reversals, each worth {LANE:g} m of way"
+                "-",
+                0.0,
+                (0.0,),
+                whole=True,
+                meaning=f"1: a pass is counted by reversals; 2: place by place along the lane, for every contact; each"
+                f" is worth {LANE:g} m of way",
             ),
         },
         soil=_compacted,
@@ -473,8 +505,11 @@ _declare(
             "distance": Memory(lambda s, k, p: _way(s, k)[0], 1e-6),
             "facing": Memory(_facing, 1e-6),
             "reversals": Memory(_reversing, 1e-6),
+            "place": Memory(lambda s, k, p: s.rolling[k].Vx, 1e-6),
+            "farthest": Memory(_beyond("farthest", 1.0), 1e-6),
+            "nearest": Memory(_beyond("nearest", -1.0), 1e-6),
         },
-        beside=lambda site: [{"pass": x, "counted": 1.0} for x in (5.0, 15.0, 50.0)],
+        beside=lambda site: [{"pass": x, "counted": form} for form in (1.0, 2.0) for x in (5.0, 15.0, 50.0)],
     ),
     Effect(
         "slip_relaxation",
