@@ -351,10 +351,22 @@ def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.in
     try:
         fit = _iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES, most)
     except NotConverged as failed:
-        if failed.nearly is None:
-            raise
-        fit = failed.nearly
+        fit = failed.nearly or _further(prepared, failed, disturbed)
     return light(fit)
+
+
+def _further(prepared: Prepared, failed: NotConverged, disturbed: float) -> Fit:
+    """A fit that ran out of passes gone on with where exact dynamics have come near the logs all the same: what does
+    that is right, from however far it came. Raises NotConverged."""
+    fit = failed.fit
+    if fit is None or disturbed > 0 or fit.cost > STRONG * prepared.readings / prepared.coarse**2:
+        raise failed
+    try:
+        return _iterated(prepared, fit.points, fit.X, disturbed, newton.RESUMED, PASSES)
+    except NotConverged as again:
+        if again.nearly is None:
+            raise
+        return again.nearly
 
 
 def _iterated(
