@@ -142,14 +142,15 @@ def _passes(s: Scene, k: int) -> ca.SX:
     own, about as often anywhere on it, and where the lane ends the ground is new. Bodies behind each other follow one
     track; the lane has no second dimension."""
     length = s.z["farthest"] - s.z["nearest"]
-    often = ca.fmax(s.z["distance"] / (length + EDGE) - 0.5, 1)
-    place = s.z["place"] + s.rolling[k].x
-    share = ca.SX(0)
-    for other in s.rolling.values():
-        inside = [s.z["farthest"] + other.x - place, place - s.z["nearest"] - other.x]
-        low, high = ((1 + ca.tanh(3 * (room / EDGE + 0.5))) / 2 for room in inside)
-        share += low * high
-    return often * share
+    often = s.z["distance"] / (length + EDGE)
+    passes = ca.SX(0)
+    for j, other in s.rolling.items():
+        ahead = s.rolling[k].x - other.x + s.z["place"]
+        low, high = (
+            (1 + ca.tanh(3 * (room / EDGE + 0.5))) / 2 for room in (s.z["farthest"] - ahead, ahead - s.z["nearest"])
+        )
+        passes += low * high * ca.fmax(often - 0.5 * (j == k), 1)  # its own last one isn't complete
+    return passes * length / (length + EDGE)
 
 
 def _compacted(s: Scene, k: int, p: Values, soil: Soil) -> Soil:

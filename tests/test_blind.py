@@ -252,6 +252,14 @@ def test_what_is_so_strong_that_nothing_follows_the_log_is_named(name: str, numb
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("number", [1, 3, 5])
+def test_compaction_that_a_map_of_the_lane_counts_is_named(number: int) -> None:
+    """One way, to and fro, in an eight: the front roll on new ground, the rear one on what that has passed over."""
+    one = case("cause", "compaction_per_pass", number)
+    assert score(one, ask(blind(one).log)).outcome in ("right", "tied")
+
+
+@pytest.mark.slow
 def test_hardly_any_clean_log_is_accused() -> None:
     told = {k: score(case("nothing", "", k), ask(blind(case("nothing", "", k)).log)).outcome for k in range(12)}
     assert sum(o != "clean" for o in told.values()) <= 1, told
