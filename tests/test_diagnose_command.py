@@ -19,6 +19,7 @@ from excite.separate import Rivals
 from excite.sidebyside import forked, in_turn
 from excite.simulate import Motion, simulate
 from model import machine, placing, prediction
+from model.file import Quantity
 from model.machine import EffectEntry
 from model.prediction import Model
 
@@ -283,6 +284,77 @@ def test_a_fit_whose_steps_cease_to_shrink_ends(straight: Model, monkeypatch: py
             hopeless = newton.HOPELESS[0] + 1 if patient and not found else passes
             assert 14 - len(steps) == hopeless
             assert (failed.value.nearly is not None) == found
+
+
+def test_a_fit_that_came_near_the_log_is_gone_on_with(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By exact dynamics: with disturbing forces every fit comes near. Far from the log it is given up."""
+    one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
+    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    true, steps, times = newton.newton_step, list[float](), [1.0]
+
+    def scripted(*args: Any) -> Any:
+        covariance, move, _, cost = true(*args)
+        return covariance, move, steps.pop(0), times[0] * cost
+
+    monkeypatch.setattr(newton, "newton_step", scripted)
+    lost = [500.0, 90.0, 80.0, 40.0, *[30.0] * 4]
+    for disturbed, far, found in ((0.0, 1.0, True), (0.0, 2.0, False), (0.1, 1.0, False)):
+        steps[:], times[0] = [*lost, 1.0, 0.01, 1e-4, 1e-6], far
+        if found:
+            assert stages.refitted(stage.machine, stage, disturbed).fit.cost == pytest.approx(stage.fit.cost, abs=1)
+        else:
+            with pytest.raises(newton.NotConverged):
+                stages.refitted(stage.machine, stage, disturbed)
+            assert len(steps) == 4
+
+
+@pytest.mark.parametrize(("excess", "chosen"), [((0.0, 0.0), 0), ((4.0, 0.1), 1), ((4.0, 3.9), 1), ((4.0, 6.0), 0)])
+def test_forces_hide_which_of_two_is_right(
+    straight: Model, monkeypatch: pytest.MonkeyPatch, excess: tuple[float, float], chosen: int
+) -> None:
+    """Where the better one explains little without them, the other is tried without them too."""
+    one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
+    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    best, other = ("ground_slope=0.009", "rolling_resistance@rear_roll=200")
+    scores = {s.candidate.name: s for s in choosing.scored(stage, in_turn)}
+    noise, tries = stage.noise, []
+    for text, cost in ((best, noise), (other, noise + 600.0)):
+        extended = placing.extended(straight.machine, placing.parse(text, straight.machine, 40.0))
+        found = stages.refitted(extended, stage, 1.0)
+        fit = replace(found.fit, cost=cost)
+        tries.append((scores[found.model.effects[0].name], replace(found, fit=fit)))
+
+    def freed(found: Sequence[Any], together: Any) -> Any:
+        names = [s.candidate.name for s, _ in tries]
+        for x in found:
+            cost = noise * (1 + excess[names.index(x.model.effects[0].name)])
+            yield replace(x, fit=replace(x.fit, cost=cost, disturbed=0.0))
+
+    monkeypatch.setattr(choosing, "freed", freed)
+    choice = choosing._chosen(tries, 3000.0, 100, in_turn)
+    assert choice.name == tries[chosen][0].candidate.name
+    assert choice.stage.exact
+    assert bool(choice.rivals) == (excess == (4.0, 3.9))
+
+
+def test_a_harmonic_is_no_ripple_elsewhere(straight: Model, straight_motion: Motion) -> None:
+    """Straight on, all rolls turn alike: what is twice an order of a known ripple is one of the same machine's."""
+
+    def ripple(amount: float, order: float) -> EffectEntry:
+        entry = placing.parse(f"torque_ripple@rear_roll={amount}", straight.machine, 40.0)
+        return entry.model_copy(update={"shape": {**entry.shape, "order": Quantity(value=order, source="assumed")}})
+
+    hiding = prediction.build(placing.extended(straight.machine, ripple(40, 14)))
+    one = log.check(sensors.measure(hiding, simulate(hiding, straight_motion.u), seed=3), straight.machine)
+    found = []
+    for known in (straight.machine, placing.extended(straight.machine, ripple(40, 7))):
+        stage = stages.fitted(known, [one], straight.machine.filter)
+        found.append({s.candidate.name: s.gain for s in reversed(choosing.scored(stage, in_turn))})
+    bare, rippled = found
+    assert bare["torque_ripple@front_roll"] > 100
+    assert "torque_ripple@front_roll" not in rippled
+    assert "torque_ripple@rear_roll" not in rippled
+    assert rippled.keys() >= bare.keys() - {"torque_ripple@front_roll", "torque_ripple@rear_roll"}
 
 
 def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch) -> None:
