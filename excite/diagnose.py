@@ -29,6 +29,7 @@ from model.prediction import Model
 
 MOST = 4  # effects that are looked for
 FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
+OTHERWISE = 0.05  # of an amount: how far off another formula of the same effect may have it (results/diagnosis)
 FURTHER = 0.8  # SHARE for names after the first: what nature has beside its formula looks like many a cause
 ODD = 50.0  # misfit that every line of what is odd beside names stands for, at least
 
@@ -308,7 +309,7 @@ def _finding(choice: Choice, after: Stage, left: float, alone: bool) -> Finding:
     values = dict(zip(after.model.base.names, zip(after.fit.X, std, strict=True), strict=True))
     amount, sure = values[placed.name]
     sure = float(
-        np.linalg.norm([sure, choosing.ALIKE * amount, FORMULA * amount * np.sqrt(left / max(choice.gain, left, 1.0))])
+        np.linalg.norm([sure, OTHERWISE * amount, FORMULA * amount * np.sqrt(left / max(choice.gain, left, 1.0))])
     )
     shapes = {
         s: (*values.get(f"{placed.name}.{s}", (placed.values[s], 0.0)), shape.unit)
