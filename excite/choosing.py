@@ -56,7 +56,8 @@ class Choice:
 
     gain: of twice the log-likelihood (Wald's statistic where no model without it could be fitted), which what is left
     of the misfit makes `spread` times less sure. left: the share of the effect that parameters don't absorb. loose: the
-    model with it and the disturbing forces that it was judged with, where it needs none.
+    model with it and the disturbing forces that it was judged with, where it needs none. beside: what it gains given
+    the others, where that was measured.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Choice:
     rivals: tuple[EffectEntry, ...]
     left: float
     loose: Stage | None = None
+    beside: float | None = None
 
 
 def wald(name: str, stage: Stage) -> float:
@@ -204,16 +206,17 @@ def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) 
     spread, forced = tries[0][1].spread, {s.candidate.name: stage for s, stage in tries if not stage.exact}
     close = _close(tries, gain)
     exact, unknown = _without_forces(close, together)
+    lowest = tries[0][1].fit.cost
     if forced and exact and not exact[0][1].near:
         # Forces hid that it doesn't explain the logs. One that explained a little less under them may do.
-        lowest = tries[0][1].fit
-        like = [x for x in tries[len(close) :] if gain + lowest.cost - x[1].fit.cost >= LIKE * gain]
-        others, _ = _without_forces([x for x in like if x[1].fit.disturbed == lowest.disturbed], together)
+        left = [x for x in tries if x[0].candidate.name not in {s.candidate.name for s, _ in close}]
+        others, _ = _without_forces([x for x in left if x[1].fit.cost - lowest <= (1 - LIKE) * gain], together)
         exact = sorted([*exact, *others], key=lambda x: x[1].fit.cost)
     judged = [*_close(exact, gain, SHAPE[0] if forced else SHAPE[1]), *unknown] if exact else close
     score, best = judged[0]
     rivals = tuple(entry_of(other, s.candidate.name) for s, other in judged[1:])
     loose = forced.get(score.candidate.name) if best.exact else None
+    gain -= next(x.fit.cost for s, x in tries if s.candidate.name == score.candidate.name) - lowest
     return Choice(score.candidate.name, best, gain, spread, tried, rivals, score.left, loose)
 
 

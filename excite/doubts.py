@@ -1,9 +1,9 @@
-"""What may be wrong with a log though every value is possible: a sign turned around, a torque a thousand times off.
+"""What may be wrong with a log though every value is possible: a sign turned around, a torque a thousand times off, a
+speed for an angle, other counts than the machine file's.
 
 The drive of a joint that steers does more work with the joint's motion than against it, since friction takes some. A
-contact may well brake while another one pulls; but whatever the others do, more torque makes the machine faster. And
-what the torques of contacts follow from is how fast these turn and speed up, never how far they have turned. Angles
-that are counted move in whole counts.
+contact may well brake while another one pulls; but whatever the others do, more torque makes the machine faster. All
+contacts turn about as fast, and angles that are counted move in whole counts.
 """
 
 from __future__ import annotations
@@ -25,9 +25,11 @@ ALIKE = 0.1  # of the largest singular value: torques that differ by less can't 
 FRICTION = 2.0  # times that of the joints: in a bend contacts rub on the ground as well
 SAME = 1e-6  # of the largest singular value: no direction of its own
 RATES = ("rpm", "rad/s")
+FAST, SLOWLY = 0.95, 0.7  # correlation with another one's speed, of a speed and of what is none
 SEVERAL = 50  # steps that counts are judged by
-OFF, MOSTLY = 0.1, 0.9  # counts, and share of the steps, by which steps are whole ones
-ONE = 1.4  # times a count that a step may be and still is one
+STILL = 1e-6  # of a count: no step
+OFF, MOSTLY = 0.1, 0.9  # of a count, and share of the steps, by which steps are whole ones
+ONE = 0.03  # by which the smallest step may differ from one count, as numbers in a file are rounded
 SHARE = 0.1  # of the highest speed: below, dry friction fades
 SLOW = 0.1  # rad/s: below, friction fades in an average over a span
 MOVED = 0.05  # rad or m: a joint that moves less says nothing of its drive
@@ -45,23 +47,21 @@ def doubts(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[str, ...
     position = {i: np.cumsum(values[s.name]) / rate if s.is_rate else values[s.name] for i, s in angles.items()}
     moved = [b for b in driven if np.ptp(position[b.index]) > MOVED]
     counted = [s for s in machine.sensors("full") if s.name in values and s.resolution is not None]
-    counts = [line for s in counted if (line := _counts(s, machine, values[s.name]))]
+    counts = {s.name: line for s in counted if (line := _counts(s, machine, values[s.name]))}
     scales = (_scale(torques[b.index], b, machine, values[torques[b.index].name]) for b in moved)
     if lines := [line for line in scales if line]:
-        return (*counts, *lines)  # with a torque that is too small the others seem to move the machine alone
-    pulls = [values[torques[b.index].name] for b in driven if b.contact]
-    turning = [angles[b.index] for b in moved if b.contact and not angles[b.index].is_rate]
-    speeds = [s for s in turning if s.factor is None and is_speed(values[s.name], pulls, rate)]
-    if speeds:
-        return tuple(
-            f"column {s.column}: goes with the torques as the speed of a contact would, and not its angle: is it one?"
-            f" then {as_speed(RATES, machine)}"
-            for s in speeds
-        )
+        return (*counts.values(), *lines)  # with a torque that is too small the others seem to move the machine alone
+    speeds = _speeds(machine, values, rate)
+    lines = [
+        f"column {s.column}: goes as the speed of {other.column} does, not as its angle: is it a speed? then"
+        f" {as_speed(RATES, machine)}"
+        for s, other in speeds
+    ]
+    for s, _ in speeds:
+        counts.pop(s.name, None)
     half = max(1, round(SPAN * rate))
-    lines = []
     for b in moved:
-        if len(position[b.index]) < 2 * half * LEAST:
+        if len(position[b.index]) < 2 * half * LEAST or (speeds and b.contact):
             continue
         motion = _motion(position[b.index], half, rate)
         means = {c.index: _mean(values[torques[c.index].name], half) for c in driven}
@@ -77,10 +77,35 @@ def doubts(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[str, ...
                 f"{what}: is the sign of one of them turned around? (right if something else moves this joint: a slope,"
                 " a tow, another drive)"
             )
-    return (*counts, *lines)
+    return (*counts.values(), *lines)
 
 
-def is_speed(values: np.ndarray, torques: Sequence[np.ndarray], rate: float, clear: float = 1.0) -> bool:
+def _speeds(machine: Machine, values: Mapping[str, np.ndarray], rate: float) -> list[tuple[Sensor, Sensor]]:
+    """Angles of contacts and measuring wheels that are rather speeds, each with another one that tells so: all go over
+    the same ground, and about as fast."""
+    half = max(1, round(SPAN * rate))
+    angles = [
+        s
+        for s in machine.sensors("full")
+        if s.kind == "wheel" or (s.kind == "angle" and machine.find(s.body).contact is not None)
+    ]
+    angles = [s for s in angles if s.name in values and not s.is_rate and len(values[s.name]) >= 2 * half * LEAST]
+    own = {s.name: _mean(values[s.name], half) for s in angles}
+    turning = {s.name: _motion(values[s.name], half, rate)[0] for s in angles}
+    found = []
+    for s in angles:
+        others = [r for r in angles if r is not s and _alike(own[s.name], turning[r.name]) > FAST]
+        if others and _alike(turning[s.name], turning[others[0].name]) < SLOWLY:
+            found.append((s, others[0]))
+    return found
+
+
+def _alike(x: np.ndarray, y: np.ndarray) -> float:
+    """Correlation, of either sign."""
+    return abs(float(np.corrcoef(x, y)[0, 1])) if min(np.ptp(x), np.ptp(y)) > 0 else 0.0
+
+
+def is_speed(values: np.ndarray, torques: Sequence[np.ndarray], rate: float, clear: float) -> bool:
     """Whether readings (N,) of an angle, in any unit, are rather its speed: what they do goes with the torques (N,), by
     inertia and friction, better if they are taken for one; `clear` times what is left otherwise."""
     half = max(1, round(SPAN * rate))
@@ -194,25 +219,26 @@ def _counts(sensor: Sensor, machine: Machine, values: np.ndarray) -> str:
     """An angle that moves in other steps than those of its counts, "" where it doesn't."""
     assert sensor.resolution is not None
     steps = np.abs(np.diff(values)) / sensor.resolution
-    steps = steps[steps > SAME]
+    steps = steps[steps > STILL]
     if len(steps) < SEVERAL:
         return ""
+    off = OFF + float(np.finfo(np.float32).eps * np.abs(values).max() / sensor.resolution)
     least, turn = float(np.quantile(steps, 0.01)), float(sensor.counts_per_turn or 0)
-    if _whole(steps / least) and not 1 / ONE < least < ONE:
+    if _whole(steps / least, off * min(1, 1 / least)) and abs(least - 1) > ONE:
         return (
-            f"column {sensor.column}: moves in steps of {least:.3g} counts of {turn:g} per turn: was it filtered or"
+            f"column {sensor.column}: moves in steps of {least:.3g} counts of {turn:g} per turn: is it filtered or"
             f" rounded, or is it counts_per_turn = {round(turn / least)}? then write that for it in {own_file(machine)}"
         )
-    if _whole(steps):
+    if _whole(steps, off):
         return ""
     return (
-        f"column {sensor.column}: does not move in whole counts of {turn:g} per turn: was it filtered, rounded or"
+        f"column {sensor.column}: does not move in whole counts of {turn:g} per turn: is it exact, filtered, rounded or"
         " resampled? deviations are stated for counts as they come"
     )
 
 
-def _whole(steps: np.ndarray) -> bool:
-    return bool(np.mean(np.abs(steps - np.round(steps)) < OFF) > MOSTLY)
+def _whole(steps: np.ndarray, off: float) -> bool:
+    return bool(np.mean(np.abs(steps - np.round(steps)) < off) > MOSTLY)
 
 
 def _scale(sensor: Sensor, body: Body, machine: Machine, torque: np.ndarray) -> str:

@@ -50,8 +50,11 @@ class Candidate:
 
     @property
     def variant(self) -> tuple[str, ...]:
-        """The name, and which shapes it has that are nothing by default: another way for the same cause to act."""
-        return (self.name, *_unusual(self.placed.effect, self.placed.values))
+        """The name, and which shapes it has that are nothing by default: another way for the same cause to act, and one
+        more for every value of a whole one."""
+        effect, own = self.placed.effect, self.placed.values
+        unusual = _unusual(effect, own)
+        return (self.name, *(f"{n}={own[n]:g}" if effect.shapes[n].whole else n for n in unusual))
 
 
 def _unusual(effect: Effect, values: Mapping[str, float]) -> list[str]:
@@ -129,6 +132,7 @@ def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
     unusual = _unusual(effect, own)
     alike = [b for b in effect.beside(site) if unusual and _unusual(effect, b) == unusual]
     alike = [b for b in alike if all(b[n] * own[n] > 0 for n in unusual)]
+    alike = [b for b in alike if all(b[n] == own[n] for n in b if effect.shapes[n].whole)]
     if alike:
         varying = [n for n, s in effect.shapes.items() if not s.whole and len({b[n] for b in alike}) > 1]
         families.append(_next_to(own, [{n: b[n] for n in varying} for b in alike], reach))

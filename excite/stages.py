@@ -351,18 +351,19 @@ def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.in
     try:
         fit = _iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES, most)
     except NotConverged as failed:
-        fit = failed.nearly or _further(prepared, failed, disturbed)
+        fit = failed.nearly or _further(prepared, of, failed, disturbed, most)
     return light(fit)
 
 
-def _further(prepared: Prepared, failed: NotConverged, disturbed: float) -> Fit:
-    """A fit that ran out of passes gone on with where exact dynamics have come near the logs all the same: what does
-    that is right, from however far it came. Raises NotConverged."""
+def _further(prepared: Prepared, of: Stage, failed: NotConverged, disturbed: float, most: float) -> Fit:
+    """A fit that was given up gone on with, where by exact dynamics it came near the logs as the stage that it began
+    from did not: what does that is right, from however far it came. Raises NotConverged."""
     fit = failed.fit
-    if fit is None or disturbed > 0 or fit.cost > STRONG * prepared.readings / prepared.coarse**2:
+    near = STRONG * prepared.readings / prepared.coarse**2
+    if fit is None or disturbed > 0 or of.near or fit.cost > min(near, most):
         raise failed
     try:
-        return _iterated(prepared, fit.points, fit.X, disturbed, newton.RESUMED, PASSES)
+        return _iterated(prepared, fit.points, fit.X, disturbed, newton.RESUMED, PASSES, most)
     except NotConverged as again:
         if again.nearly is None:
             raise

@@ -18,14 +18,15 @@ Values = Mapping[str, ca.SX]  # the amount "A" and the shapes by name
 @dataclass(frozen=True)
 class Rolling:
     """How a contact, a roll or a wheel, moves: its centre's velocity along and across its chassis [m/s], spin and yaw
-    rate [rad/s]; x: where its centre is along the root's axis [m]."""
+    rate [rad/s]; x, y: where its centre is when the machine stands straight, along and across the root [m]."""
 
     contact: Contact
     Vx: ca.SX
     Vy: ca.SX
     spin: ca.SX
     yaw: ca.SX
-    x: ca.SX
+    x: float
+    y: float
 
     @property
     def slip(self) -> law.Slip:
@@ -104,8 +105,8 @@ def nothing(site: Site) -> list[dict[str, float]]:
 class Shape:
     """What an effect's amount leaves open: default and grid in units of `size`, which belongs to the site.
 
-    `circular`: a phase, found by its sine and cosine; `whole`: an integer, not refined; `meaning`: what a name leaves
-    open. What is zero by default may have either sign.
+    `circular`: a phase, found by its sine and cosine; `whole`: not refined; `only`: the values that there are, if these
+    are few; `meaning`: what a name leaves open. What is zero by default may have either sign.
     """
 
     unit: str
@@ -114,6 +115,7 @@ class Shape:
     size: Callable[[Site], float] = one
     circular: bool = False
     whole: bool = False
+    only: tuple[float, ...] = ()
     meaning: str = ""
 
     @property

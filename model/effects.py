@@ -139,17 +139,20 @@ def _beyond(name: str, side: float) -> Callable[[Scene, int, Values], ca.SX]:
 
 def _passes(s: Scene, k: int) -> ca.SX:
     """How often contacts have passed over the place where one is: every one has been on a stretch of the lane of its
-    own, about as often anywhere on it, and where the lane ends the ground is new. Bodies behind each other follow one
-    track; the lane has no second dimension."""
+    own, about as often anywhere on it, and where the lane ends the ground is new. Contacts behind each other follow one
+    track, also in a bend; those beside each other count as far as they overlap."""
+    own = s.rolling[k]
     length = s.z["farthest"] - s.z["nearest"]
     often = s.z["distance"] / (length + EDGE)
     passes = ca.SX(0)
     for j, other in s.rolling.items():
-        ahead = s.rolling[k].x - other.x + s.z["place"]
+        width = max((float(own.contact.width) + float(other.contact.width)) / 2, EDGE)
+        overlap = max(0.0, 1 - abs(own.y - other.y) / width)
+        ahead = own.x - other.x + s.z["place"]
         low, high = (
             (1 + ca.tanh(3 * (room / EDGE + 0.5))) / 2 for room in (s.z["farthest"] - ahead, ahead - s.z["nearest"])
         )
-        passes += low * high * ca.fmax(often - 0.5 * (j == k), 1)  # its own last one isn't complete
+        passes += overlap * low * high * ca.fmax(often - 0.5 * (j == k), 1)  # its own last one isn't complete
     return passes * length / (length + EDGE)
 
 
@@ -486,7 +489,7 @@ _declare(
         "compaction_per_pass",
         ("drive",),
         "-",
-        "Kx, Ky grow with the passes towards the factor 1 + A: A (1 - exp(-distance / pass))",
+        "Kx, Ky grow with the passes towards the factor 1 + A: A (1 - exp(-n / pass)), n the way, or passes",
         "less slip at the same force, the longer the drive on the same lane",
         "soil compaction by passes, Forssblad, Vibratory Soil and Rock Fill Compaction, 1981",
         _constant(0.3),
@@ -497,8 +500,9 @@ _declare(
                 0.0,
                 (0.0,),
                 whole=True,
-                meaning=f"1: a pass is counted by reversals; 2: place by place along the lane, for every contact; each"
-                f" is worth {LANE:g} m of way",
+                only=(0.0, 1.0, 2.0),
+                meaning=f"0: n is the way; 1: passes are counted by reversals; 2: place by place along the lane, for"
+                f" every contact; a pass is worth {LANE:g} m of way",
             ),
         },
         soil=_compacted,
@@ -588,7 +592,12 @@ _declare(
             "takes": Shape("s", 0.2, (0.2,)),
             "arm": Shape("m", 0.0, (0.0,), meaning="the yaw inertia about the joint changes by A times this"),
             "recoil": Shape(
-                "-", 0.0, (0.0,), whole=True, meaning="1: a load slides and pushes back; 0: it is put on or taken away"
+                "-",
+                0.0,
+                (0.0,),
+                whole=True,
+                only=(0.0, 1.0),
+                meaning="1: a load slides and pushes back; 0: it is put on or taken away",
             ),
         },
         inertia=_slid,

@@ -117,4 +117,9 @@ def placed(machine: Machine, entry: EffectEntry, duration: float = DURATION) -> 
     for name, shape in effect.shapes.items():
         given = entry.shape.get(name)
         values[name] = float(given) if given is not None else shape.default * shape.size(site)
+        if shape.only and values[name] not in shape.only:
+            options = ", ".join(f"{x:g}" for x in shape.only)
+            raise MachineError(
+                f"{machine.name}: effect {entry.name}: shape {name} must be one of {options} (got {values[name]:g})"
+            )
     return Placed(effect, where, bodies, sensor, values)

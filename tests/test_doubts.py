@@ -1,4 +1,5 @@
-"""A sign turned around, a torque a thousand times off: said of every such log, and of no other."""
+"""A sign turned around, a torque a thousand times off, a speed for an angle, other counts: said of such logs, and of
+clean ones nothing."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from excite.estimate import NoEstimate
 from excite.log import Log
 from excite.newton import NotConverged
 from excite.simulate import Motion, simulate
-from model import machine, prediction
+from model import machine, placing, prediction
 from model.prediction import Model
 
 T = np.arange(4001) / 100
@@ -81,7 +82,7 @@ def test_every_sign_of_a_machine_that_steers(va12: Model, va12_motion: Motion, k
         assert turned(va12, one, sensor, other) == ()
 
 
-@pytest.mark.parametrize("name", ["theta1", "theta4"])
+@pytest.mark.parametrize("name", ["theta1", "theta4", "thetar"])
 def test_a_speed_that_breaks_no_limit(va12: Model, name: str) -> None:
     """Smooth and slow enough for an angle that the roll could follow; with torques of either sign."""
     one = checked(va12, follow(va12, SPEED, ANGLE, seed=3))
@@ -89,8 +90,22 @@ def test_a_speed_that_breaks_no_limit(va12: Model, name: str) -> None:
     wrong = one.values | {name: np.convolve(turns, np.ones(51) / 51, "same")}
     for values in (wrong, wrong | {"u1": -wrong["u1"]}):
         (line,) = doubts.doubts(va12.machine, values)
-        assert line.startswith(f"column {name}_rad: goes with the torques as the speed of a contact would")
+        assert line.startswith(f"column {name}_rad: goes as the speed of ")
         assert 'write unit = "rpm" or unit = "rad/s" for it in a machine file' in line
+    (speed, sign) = doubts.doubts(va12.machine, wrong | {"u2": -wrong["u2"]})
+    assert speed == line
+    assert "u2_Nm" in sign
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.02, 0.1])
+def test_a_circle_on_a_slope_is_no_speed(va12: Model, slope: float) -> None:
+    """Torques that come and go with the heading, and so with the angle of every roll."""
+    circling = va12
+    if slope:
+        entry = placing.parse(f"ground_slope={slope}", va12.machine, 40.0)
+        circling = prediction.build(placing.extended(va12.machine, entry))
+    motion = follow(circling, np.interp(T, [0, 3], [0, 1.0]), np.interp(T, [0, 4], [0, 0.3])[:, None], seed=3)
+    assert not any("speed" in line for line in doubts.doubts(va12.machine, checked(circling, motion).values))
 
 
 @pytest.mark.parametrize("name", ["theta1", "theta2", "thetal"])
@@ -109,11 +124,16 @@ def test_counts_of_another_size(va12: Model, va12_motion: Motion, name: str) -> 
         fine = np.floor(exact[name] / (sensor.resolution / 2)) * sensor.resolution / 2
         (line,) = doubts.doubts(va12.machine, one.values | {name: fine})
         assert f"is it counts_per_turn = {2 * turn:.0f}?" in line
+        of = 2 * np.pi / 10000
+        (line,) = doubts.doubts(va12.machine, one.values | {name: np.floor(exact[name] / of) * of})
+        assert "is it counts_per_turn = 10000?" in line
+    single = one.values[name].astype(np.float32).astype(float)
+    assert doubts.doubts(va12.machine, one.values | {name: single}) == ()
     smooth = scipy.signal.sosfiltfilt(scipy.signal.butter(4, 10, fs=100, output="sos"), one.values[name])
-    for made in (smooth, np.round(one.values[name], 3)):
+    for made, said in ((smooth, "does not move in whole counts"), (np.round(one.values[name], 3), "rounded")):
         (line,) = doubts.doubts(va12.machine, one.values | {name: made})
         assert line.startswith(f"column {name}_rad: ")
-        assert "rounded" in line
+        assert said in line
 
 
 @pytest.mark.parametrize("name", sorted(set(machine.shipped()) - {"double_loader", "tandem"}))

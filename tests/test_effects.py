@@ -12,7 +12,7 @@ from excite import evidence, log, profiles, sensors, stages
 from excite.processing import implicit
 from excite.simulate import simulate
 from model import machine, placing, tree
-from model.effect import DURATION, Effect, Placed, Site
+from model.effect import DURATION, Effect, Placed, Rolling, Scene, Site, Soil
 from model.effects import CATALOGUE
 from model.equations import signatures
 from model.file import Quantity
@@ -295,6 +295,47 @@ def test_passes_are_counted_place_by_place(straight: Model) -> None:
         assert np.corrcoef(felt[10:-10, roll], mean[10:-10])[0, 1] > 0.85
         new = t[::10][10:-10] > 53  # the front roll is beyond all; what the rear one finds there is but an average
         assert roll or error[new].max() < 0.2
+
+
+def test_wheels_beside_each_other_pass_over_ground_of_their_own(straight: Model) -> None:
+    """Of two alike on one axle each counts its own passes, as one alone does; what overlaps by half counts half."""
+    soil = CATALOGUE["compaction_per_pass"].soil
+    assert soil is not None
+    law = straight.machine.contacts[0].contact
+    assert law is not None
+    z = {"distance": 30.0, "facing": 0, "reversals": 0, "place": 5.0, "farthest": 10.0, "nearest": 0.0}
+    known = {name: ca.SX(value) for name, value in z.items()}
+    values = {"A": ca.SX(0.3), "pass": ca.SX(15.0), "counted": ca.SX(2.0)}
+    width, still = float(law.width), ca.SX(0)
+
+    def stiff(*across: float) -> float:
+        rolling = {k: Rolling(law, ca.SX(1), still, ca.SX(1), still, 0.0, y) for k, y in enumerate(across)}
+        scene = Scene({}, {}, {}, {}, {}, {}, rolling, {}, still, known)
+        plain = Soil(rolling[0].slip, still, ca.SX(-1e5), ca.SX(-1e5))
+        return float(ca.evalf(soil(scene, 0, values, plain).Kx / plain.Kx))
+
+    alone = stiff(0.0)
+    assert alone > 1.1
+    assert stiff(0.0, 1.01 * width) == pytest.approx(alone)
+    assert alone < stiff(0.0, 0.5 * width) < stiff(0.0, 0.0)
+
+
+def test_a_way_of_counting_that_there_is_not(straight: Model) -> None:
+    with pytest.raises(MachineError, match=r"shape counted must be one of 0, 1, 2 \(got 3\)"):
+        compacting(straight.machine, 3.0)
+
+
+def test_points_between_the_grids_are_tried_for_every_way_of_counting(straight: Model) -> None:
+    found = evidence.candidates(straight.machine, ("theta1", "theta4"), 40.0)
+    passes = [x for x in found if x.name == "compaction_per_pass@drive" and x.placed.values["pass"] == 15.0]
+    assert len({x.variant for x in passes}) == 3
+    for one in passes:
+        near = evidence.finer([evidence.Score(one, 100.0, {}, 1.0)], straight.machine, 40.0)
+        assert {x.variant for x in near} == {one.variant}
+        tried = sorted({x.placed.values["pass"] for x in near})
+        assert len(tried) == 5
+        assert tried[0] < 9
+        assert tried[-1] > 35
 
 
 @pytest.mark.parametrize(("hardening", "torque"), [(0.0, 1e3), (0.2, 1.2e3)])

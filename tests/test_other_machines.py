@@ -467,7 +467,7 @@ def test_a_diagnosis_names_what_a_roll_has_that_nothing_drives(cause: str) -> No
     )
     name, _, amount = cause.partition("=")
     assert (found.verdict, [f.name for f in found.findings]) == ("named", [name])
-    assert abs(found.findings[0].amount - float(amount)) < 4 * found.findings[0].amount_std < 0.2 * float(amount)
+    assert abs(found.findings[0].amount - float(amount)) < 2 * found.findings[0].amount_std < 0.15 * float(amount)
 
 
 @pytest.mark.parametrize(
