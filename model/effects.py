@@ -515,6 +515,7 @@ _declare(
             "nearest": Memory(_beyond("nearest", -1.0), 1e-6),
         },
         beside=lambda site: [{"pass": x, "counted": form} for form in (1.0, 2.0) for x in (5.0, 15.0, 50.0)],
+        positive=True,
     ),
     Effect(
         "slip_relaxation",
