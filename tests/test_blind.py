@@ -236,7 +236,6 @@ def test_most_plain_causes_are_named_and_hardly_any_wrongly(half: int) -> None:
         ("ground_slope", 3),
         ("articulation_stop_spring", 1),
         ("payload_shift", 0),
-        ("compaction_per_pass", 2),
     ],
 )
 def test_what_is_so_strong_that_nothing_follows_the_log_is_named(name: str, number: int) -> None:
@@ -247,14 +246,14 @@ def test_what_is_so_strong_that_nothing_follows_the_log_is_named(name: str, numb
     assert judged.outcome in ("right", "tied"), said["answer"]
     assert judged.gain is not None
     assert judged.gain > 25, said["answer"]  # per cent
-    if name != "compaction_per_pass":  # by a map of the lane, which the formula isn't
-        assert judged.gain_sure, said["answer"]
+    assert judged.gain_sure, said["answer"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 3, 5])
 def test_compaction_that_a_map_of_the_lane_counts_is_named(number: int) -> None:
-    """One way, to and fro, in an eight: the front roll on new ground, the rear one on what that has passed over."""
+    """One way, to and fro, in an eight: the front roll on new ground, the rear one on what that has passed over. Tracks
+    that fan out are no lane, and stay unexplained (numbers 0 and 2)."""
     one = case("cause", "compaction_per_pass", number)
     assert score(one, ask(blind(one).log)).outcome in ("right", "tied")
 
