@@ -216,7 +216,8 @@ def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) 
     score, best = judged[0]
     rivals = tuple(entry_of(other, s.candidate.name) for s, other in judged[1:])
     loose = forced.get(score.candidate.name) if best.exact else None
-    gain -= next(x.fit.cost for s, x in tries if s.candidate.name == score.candidate.name) - lowest
+    behind = next(x.fit.cost for s, x in tries if s.candidate.name == score.candidate.name) - lowest
+    gain -= min(behind, (1 - LIKE) * gain)  # what is close may be further behind where much is left
     return Choice(score.candidate.name, best, gain, spread, tried, rivals, score.left, loose)
 
 
