@@ -25,8 +25,8 @@ class Rolling:
     Vy: ca.SX
     spin: ca.SX
     yaw: ca.SX
-    x: float
-    y: float
+    x: float = 0.0
+    y: float = 0.0
 
     @property
     def slip(self) -> law.Slip:
