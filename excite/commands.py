@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -55,14 +56,22 @@ def every(
     """Designs test drives that make a machine tell you its parameters, verifies them, and identifies from a log."""
 
 
-def _claim(out: Path, json: bool, inputs: Sequence[Path] = ()) -> None:
-    """Checks before the work that a folder can be written, and says which result it will replace."""
+@contextmanager
+def _result(
+    out: Path, json: bool, show: Callable[[dict[str, Any]], None], inputs: Sequence[Path] = ()
+) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """What most commands do: before the work it is checked that the folder can be written, and said which result it
+    will replace; the summary is told at the end. Given are a place to write to and the summary, still empty."""
     from excite import folder
 
     folder.claim(out, inputs)
     before = folder.former(out)
     if before is not None and not json:
         terminal.say(f"{out}/ will be replaced, what is there is of {before}; --out keeps both")
+    summary: dict[str, Any] = {}
+    with folder.writing(out) as place:
+        yield place, summary
+    terminal.finish(summary, out, json, show)
 
 
 @app.command()
@@ -116,22 +125,20 @@ def design(
     json: JsonOption = False,
 ) -> None:
     """Designs a test drive."""
-    from excite import folder, works
+    from excite import works
     from excite.brief import Brief
 
     out = out or Path(f"results/design-{asked.stem(machine)}")
-    _claim(out, json, after or [])
-    if between:
-        if len(between) != 2 or objective not in ("cond", "discrimination"):
-            raise UsageError("--between: give it twice, two effects, and no other --objective")
-        objective = "discrimination"
-    if phase_min != 3.0 and not driver:
-        raise UsageError("--phase-min is for --driver, give that too")
-    known, pair = tuple(after or ()), tuple(between or ())
-    brief = Brief(objective, sigma_max, robust, known, starts, seed, budget, pair, driver, phase_min)
-    with folder.writing(out) as place:
-        summary = works.design(place, machine, problem, duration, brief)
-    terminal.finish(summary, out, json, terminal.design_table)
+    with _result(out, json, terminal.design_table, after or []) as (place, summary):
+        if between:
+            if len(between) != 2 or objective not in ("cond", "discrimination"):
+                raise UsageError("--between: give it twice, two effects, and no other --objective")
+            objective = "discrimination"
+        if phase_min != 3.0 and not driver:
+            raise UsageError("--phase-min is for --driver, give that too")
+        known, pair = tuple(after or ()), tuple(between or ())
+        brief = Brief(objective, sigma_max, robust, known, starts, seed, budget, pair, driver, phase_min)
+        summary |= works.design(place, machine, problem, duration, brief)
 
 
 @app.command(cls=Choosing)
@@ -145,14 +152,12 @@ def verify(
     json: JsonOption = False,
 ) -> None:
     """Simulates a designed drive and identifies from it, many times: how true and how sure is each parameter."""
-    from excite import folder, stored, works
+    from excite import stored, works
 
     name = stored.summary(design_dir)["machine"]
     out = out or Path(f"results/verify-{name}")
-    _claim(out, json, [design_dir])
-    with folder.writing(out) as place:
-        summary = works.verify(place, design_dir, runs, method, kit, seed)
-    terminal.finish(summary, out, json, terminal.verify_table)
+    with _result(out, json, terminal.verify_table, [design_dir]) as (place, summary):
+        summary |= works.verify(place, design_dir, runs, method, kit, seed)
 
 
 @app.command(cls=Choosing)
@@ -174,13 +179,11 @@ def compare(
     json: JsonOption = False,
 ) -> None:
     """Compares a designed drive with the usual ones on the same problem, limits and time."""
-    from excite import folder, works
+    from excite import works
 
     out = out or Path(f"results/compare-{asked.stem(machine)}")
-    _claim(out, json)
-    with folder.writing(out) as place:
-        summary = works.compare(place, machine, problem, samples, tuple(against or ()), seed, budget)
-    terminal.finish(summary, out, json, terminal.compare_table)
+    with _result(out, json, terminal.compare_table) as (place, summary):
+        summary |= works.compare(place, machine, problem, samples, tuple(against or ()), seed, budget)
 
 
 @app.command(cls=Choosing)
@@ -204,9 +207,12 @@ def run(
     from excite import folder, works
     from excite.brief import Brief
 
+    def show(both: dict[str, Any]) -> None:
+        terminal.design_table(both["design"])
+        terminal.verify_table(both["verify"])
+
     out = out or Path(f"results/run-{asked.stem(machine)}")
-    _claim(out, json)
-    with folder.writing(out) as place:
+    with _result(out, json, show) as (place, summary):
         designed = place / "design"
         designed.mkdir()
         brief = Brief(objective, sigma_max, robust, (), starts, seed, budget)
@@ -216,14 +222,8 @@ def run(
         checked = place / "verify"
         checked.mkdir()
         second = works.verify(checked, designed, runs, method, kit, seed, out / "design")
-        summary = {"design": first, "verify": second}
+        summary |= {"design": first, "verify": second}
         folder.keep(place, summary)
-
-    def show(both: dict[str, Any]) -> None:
-        terminal.design_table(both["design"])
-        terminal.verify_table(both["verify"])
-
-    terminal.finish(summary, out, json, show)
 
 
 @app.command()
@@ -268,14 +268,12 @@ def drive(
 
     name = stored.summary(design_dir)["machine"]
     out = out or Path(f"results/drive-{name}")
-    _claim(out, json, [design_dir])
-    with folder.writing(out) as place:
+    with _result(out, json, terminal.drive_table, [design_dir]) as (place, summary):
         with terminal.bar("driving") as advance:
             made = cab.prepare(stored.read(design_dir), phases, shortest, seed, advance)
-        summary = {"machine": name, "design": str(design_dir), "seed": seed, **cab.write(made, place)}
+        summary |= {"machine": name, "design": str(design_dir), "seed": seed, **cab.write(made, place)}
         summary["versions"] = asked.versions()
         folder.keep(place, summary)
-    terminal.finish(summary, out, json, terminal.drive_table)
     if serve:
         cab.serve(out, made, host, port, live, lambda address: typer.echo(f"{address} (Ctrl-C ends)", err=True))
 
@@ -352,15 +350,13 @@ def identify(
     json: JsonOption = False,
 ) -> None:
     """Estimates the parameters, with uncertainty, from logs."""
-    from excite import folder, works
+    from excite import works
 
     model = asked.model(machine)
     out = out or Path(f"results/identify-{model.machine.name}")
-    _claim(out, json, [*logs, *(validate or [])])
-    _had(logs, filtering)
-    with folder.writing(out) as place:
-        summary = works.identified(place, model, logs, method, filtering, validate or [])
-    terminal.finish(summary, out, json, terminal.identify_table)
+    with _result(out, json, terminal.identify_table, [*logs, *(validate or [])]) as (place, summary):
+        _had(logs, filtering)
+        summary |= works.identified(place, model, logs, method, filtering, validate or [])
 
 
 @app.command()
@@ -377,18 +373,17 @@ def diagnose(
     json: JsonOption = False,
 ) -> None:
     """Shows what the simulation gets wrong, names the cause, extends the machine file, measures the gain."""
-    from excite import checkup, folder, reports
+    from excite import checkup, reports
 
     model = asked.model(machine)
     out = out or Path(f"results/diagnose-{model.machine.name}")
-    _claim(out, json, logs)
-    _had(logs, filtering)
-    with folder.writing(out) as place:
+    with _result(out, json, terminal.diagnose_table, logs) as (place, summary):
+        _had(logs, filtering)
         with terminal.bar("diagnosing") as advance:
-            summary, tied = checkup.write(place, machine, model, logs, filtering, advance)
+            found, tied = checkup.write(place, machine, model, logs, filtering, advance)
+        summary |= found
         summary["separating_drive"] = checkup.separating(place, model.machine, tied, onward)
         reports.finish(place, "diagnose", summary)
-    terminal.finish(summary, out, json, terminal.diagnose_table)
 
 
 logs = typer.Typer(help="What is in a log.", rich_markup_mode=None)
@@ -428,12 +423,8 @@ def _checked(
     show: Callable[[dict[str, Any]], None],
 ) -> None:
     """What is wrong with a file, as a folder and on the terminal; exit code 1 where anything is."""
-    from excite import folder
-
-    _claim(out, json, [file])
-    with folder.writing(out) as place:
-        summary = work(place)
-    terminal.finish(summary, out, json, show)
+    with _result(out, json, show, [file]) as (place, summary):
+        summary |= work(place)
     if summary["faults"]:
         raise typer.Exit(1)
 
@@ -489,11 +480,9 @@ def docs(out: OutOption = None, json: JsonOption = False) -> None:
     from excite import folder, reference
 
     out = out or Path("results/docs-excite")
-    _claim(out, json)
-    with folder.writing(out) as place:
-        summary = {"pages": reference.write(place), "versions": asked.versions()}
+    with _result(out, json, lambda s: terminal.say(", ".join(s["pages"]))) as (place, summary):
+        summary |= {"pages": reference.write(place), "versions": asked.versions()}
         folder.keep(place, summary)
-    terminal.finish(summary, out, json, lambda s: terminal.say(", ".join(s["pages"])))
 
 
 @app.command()

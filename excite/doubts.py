@@ -25,6 +25,7 @@ ALIKE = 0.1  # of the largest singular value: torques that differ by less can't 
 FRICTION = 2.0  # times that of the joints: in a bend contacts rub on the ground as well
 SAME = 1e-6  # of the largest singular value: no direction of its own
 RATES = ("rpm", "rad/s")
+CLEARER = 0.8  # times what is left of the torques otherwise: beyond doubt a speed
 FAST, SLOWLY = 0.95, 0.7  # correlation with another one's speed, of a speed and of what is none
 SEVERAL = 50  # steps that counts are judged by
 STILL = 1e-6  # of a count: no step
@@ -105,16 +106,16 @@ def _alike(x: np.ndarray, y: np.ndarray) -> float:
     return abs(float(np.corrcoef(x, y)[0, 1])) if min(np.ptp(x), np.ptp(y)) > 0 else 0.0
 
 
-def is_speed(values: np.ndarray, torques: Sequence[np.ndarray], rate: float, clear: float) -> bool:
+def is_speed(values: np.ndarray, torques: Sequence[np.ndarray], rate: float) -> bool:
     """Whether readings (N,) of an angle, in any unit, are rather its speed: what they do goes with the torques (N,), by
-    inertia and friction, better if they are taken for one; `clear` times what is left otherwise."""
+    inertia and friction, better if they are taken for one."""
     half = max(1, round(SPAN * rate))
     moving = [u for u in torques if np.ptp(u) > 0]
     if not moving or len(values) < 2 * half * LEAST:
         return False
     u = np.column_stack([_mean(u, half) for u in moving])
     first, second = _motion(values, half, rate)
-    return _unexplained(u, _mean(values, half), first) < clear * _unexplained(u, first, second)
+    return _unexplained(u, _mean(values, half), first) < CLEARER * _unexplained(u, first, second)
 
 
 def as_speed(units: Sequence[str], machine: Machine) -> str:

@@ -74,13 +74,13 @@ class Score:
     left: float
 
 
-def candidates(machine: Machine, sensors: Sequence[str], duration: float, known: Sequence[str] = ()) -> list[Candidate]:
-    """Every effect at every place on its grid, for a log of duration [s] with these sensors; without the `known`."""
+def candidates(machine: Machine, sensors: Sequence[str], duration: float) -> list[Candidate]:
+    """Every effect at every place on its grid, for a log of duration [s] with these sensors."""
     found: list[Candidate] = []
     columns = 0
     for effect in CATALOGUE.values():
         for where, (bodies, sensor) in placing.places(machine, effect).items():
-            if f"{effect.name}@{where}" in known or (effect.reading is not None and sensor not in sensors):
+            if effect.reading is not None and sensor not in sensors:
                 continue
             site = Site(machine, machine.find(bodies[0]), duration)
             for values, width in _grid(effect, site):

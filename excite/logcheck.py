@@ -26,7 +26,6 @@ SHOWN = 5  # places named of a fault that is there many times
 STUCK = 50  # equal extreme readings in a row that look like the end of a range
 ALIKE = 0.6  # share of a machine's columns that makes a log look like one of its
 CLOSE = 0.05  # of a unit's size, when a wrong rate of sampling is taken for time in that unit
-CLEARER = 0.8  # times what is left of the torques otherwise: beyond doubt a speed
 AGAINST = -0.5  # correlation of two contacts' speeds that says one is wired the other way round
 
 
@@ -193,7 +192,7 @@ def _speed(sensor: Sensor, values: np.ndarray, table: pd.DataFrame, machine: Mac
     drives = [s for s in machine.sensors("full") if s.kind == "torque" and s.body in pulling]
     torques = [_caught(lambda s=s: log.values_of(s, machine, table, ""), None) for s in drives if s.column in table]  # type: ignore[misc]
     known = [u for u in torques if u is not None]
-    if not units or not is_speed(values, known, rate, CLEARER):
+    if not units or not is_speed(values, known, rate):
         return ""
     return (
         f"column {sensor.column}: changes faster than the joint can turn, as its speed would: is it one? then"

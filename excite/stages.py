@@ -54,6 +54,11 @@ class Prepared:
         """How many readings the logs have: what twice the negative log-likelihood of a right model is about."""
         return float(sum(r.used.sum() for r in self.records))
 
+    @property
+    def noise(self) -> float:
+        """The misfit that noise makes of a right model."""
+        return self.readings / self.coarse**2
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -82,8 +87,7 @@ class Stage:
 
     @property
     def noise(self) -> float:
-        """The misfit that noise makes of a right model."""
-        return self.prepared.readings / self.prepared.coarse**2
+        return self.prepared.noise
 
     @property
     def excess(self) -> float:
@@ -349,25 +353,25 @@ def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.in
     X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, c.model.nominal, strict=True)])
     points = [carried(c, r, p, of.prepared.c, X) for r, p in zip(prepared.records, of.fit.points, strict=True)]
     try:
-        fit = _iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES, most)
+        fit = _nearly(prepared, points, X, disturbed, most)
     except NotConverged as failed:
-        fit = failed.nearly or _further(prepared, of, failed, disturbed, most)
+        found = failed.fit
+        # By exact dynamics it came near the logs as the stage that it began from did not: what does that is right, from
+        # however far it came, and is gone on with.
+        if found is None or disturbed > 0 or of.near or found.cost > min(STRONG * prepared.noise, most):
+            raise
+        fit = _nearly(prepared, found.points, found.X, disturbed, most)
     return light(fit)
 
 
-def _further(prepared: Prepared, of: Stage, failed: NotConverged, disturbed: float, most: float) -> Fit:
-    """A fit that was given up gone on with, where by exact dynamics it came near the logs as the stage that it began
-    from did not: what does that is right, from however far it came. Raises NotConverged."""
-    fit = failed.fit
-    near = STRONG * prepared.readings / prepared.coarse**2
-    if fit is None or disturbed > 0 or of.near or fit.cost > min(near, most):
-        raise failed
+def _nearly(prepared: Prepared, points: Sequence[Point], X: np.ndarray, disturbed: float, most: float) -> Fit:
+    """A fit that goes on from another, as far as it came if that is as good as found. Raises NotConverged."""
     try:
-        return _iterated(prepared, fit.points, fit.X, disturbed, newton.RESUMED, PASSES, most)
-    except NotConverged as again:
-        if again.nearly is None:
+        return _iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES, most)
+    except NotConverged as failed:
+        if failed.nearly is None:
             raise
-        return again.nearly
+        return failed.nearly
 
 
 def _iterated(

@@ -220,6 +220,13 @@ def compacting(known: machine.Machine, counted: float) -> Model:
     return build(placing.extended(known, entry.model_copy(update={"shape": told})))
 
 
+def with_and_without_soil(model: Model, nu: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Forces (n_q,) at these velocities, as the machine file has the soil and with none."""
+    still, hard = np.zeros(len(model.coordinates)), model.expand @ model.nominal
+    soft = np.where([name.startswith("K") for name in model.base.standard], 0, hard)
+    return tuple(model.balance(still, nu, still, p).full()[:, 0] for p in (hard, soft))
+
+
 def test_compaction_counts_the_way_and_reversals(straight: Model) -> None:
     """Six ways forth and back, with five reversals between them."""
     t = np.arange(0, 24, 1 / 100)
@@ -246,10 +253,7 @@ def test_soil_is_as_stiff_as_what_is_counted_says(straight: Model, counted: floa
         p = model.expand @ model.nominal
         return model.balance(np.zeros(n), nu, np.zeros(n), p, np.zeros(2), z).full()[:, 0]
 
-    bare = straight.balance(np.zeros(n), nu, np.zeros(n), straight.expand @ straight.nominal).full()[:, 0]
-    soft = straight.expand @ straight.nominal
-    soft[[k for k, name in enumerate(straight.base.standard) if name.startswith("K")]] = 0
-    free = straight.balance(np.zeros(n), nu, np.zeros(n), soft).full()[:, 0]
+    bare, free = with_and_without_soil(straight, nu)
     assert push(0.0, 7.0) == pytest.approx(bare, rel=1e-9)
     stiff = free + (bare - free) * (1 + 0.3 * (1 - np.exp(-1)))
     assert push(15.0 / each, 7.0) == pytest.approx(stiff, rel=1e-6)
@@ -271,10 +275,7 @@ def test_passes_are_counted_place_by_place(straight: Model) -> None:
 
     slipping = np.array([1.0, *[1.02 / 0.65] * (n - 1)])
     told = [model.balance(np.zeros(n), slipping, np.zeros(n), p, np.zeros(2), row).full()[:, 0] for row in memory[::10]]
-    bare = straight.balance(np.zeros(n), slipping, np.zeros(n), straight.expand @ straight.nominal).full()[:, 0]
-    soft = straight.expand @ straight.nominal
-    soft[[k for k, name in enumerate(straight.base.standard) if name.startswith("K")]] = 0
-    free = straight.balance(np.zeros(n), slipping, np.zeros(n), soft).full()[:, 0]
+    bare, free = with_and_without_soil(straight, slipping)
     felt = -np.log(1 - ((np.array(told) - free) / (bare - free) - 1)[:, 1:] / 0.3) * 1.5  # passes, by roll
 
     cells, under = np.zeros(1000, int), [-1, -1]
@@ -448,6 +449,6 @@ def test_noise_of_torques_is_no_gain_and_no_delay() -> None:
     at = found.model.base.names.index("torque_gain@articulation")
     assert abs(found.fit.X[at]) < 3.5 * found.fit.std[at]
     assert found.fit.cost < plain.fit.cost + 1  # both are found to so much
-    every = evidence.candidates(VA12, [s.name for s in plain.prepared.c.sensors], 60.0, [])
+    every = evidence.candidates(VA12, [s.name for s in plain.prepared.c.sensors], 60.0)
     scores = evidence.scan(plain.prepared.c, plain.prepared.records, plain.fit, every)
     assert max(s.gain for s in scores if s.candidate.name == "channel_delay@articulation") < 12

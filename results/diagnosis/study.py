@@ -1,7 +1,8 @@
 """Does the diagnosis name what was hidden? Blind logs of a second roller that shares no code with the program.
 
-python results/diagnosis/study.py [--per-cause 12] [--nothing 200] [--per-surprise 6] [--pairs 30] [--jobs 2]
-rebuilds summary.json, cases.csv, confusion.png and README.md beside this file. Each case is kept in
+python results/diagnosis/study.py [--per-cause 6] [--nothing 200] [--per-surprise 2] [--pairs 12] [--jobs 2]
+rebuilds summary.json, cases.csv, confusion.png and README.md beside this file, of cases that nobody had looked at while
+the diagnosis was written; `--seen` goes through those instead that it was mended by. Each case is kept in
 results/.diagnosis/ as soon as it is done, so an interrupted study goes on where it stopped; cases of other versions of
 the program are not used again. `--jobs 0` reports what there is.
 """
@@ -16,7 +17,7 @@ import os
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,7 @@ from surprises import SURPRISES
 from visibility import VISIBLE, visibility
 
 Row = dict[str, Any]
+FRESH = {"nothing": 200, "cause": 8, "surprise": 4, "pair": 20}  # numbers below were looked at when mending
 GOOD = ("right", "tied")  # a tie that holds the cause sends nobody to repair the wrong thing
 
 
@@ -56,12 +58,16 @@ def version() -> str:
     return seen.hexdigest()[:8]
 
 
-def cases(nothing: int, per_cause: int, per_surprise: int, pairs: int) -> list[Case]:
-    """In an order in which a study that is cut short has seen some of everything."""
-    every = [(k / max(nothing, 1), case("nothing", "", k)) for k in range(nothing)]
-    every += [(k / max(per_cause, 1), case("cause", n, k)) for n in CAUSES for k in range(per_cause)]
-    every += [(k / max(per_surprise, 1), case("surprise", n, k)) for n in SURPRISES for k in range(per_surprise)]
-    every += [(k / max(pairs, 1), case("pair", "", k)) for k in range(pairs)]
+def cases(wanted: Mapping[str, int], first: Mapping[str, int]) -> list[Case]:
+    """So many of every kind (causes and surprises: of every name), numbered from the first, in an order in which a study
+    that is cut short has seen some of everything."""
+    names = {"nothing": [""], "cause": list(CAUSES), "surprise": list(SURPRISES), "pair": [""]}
+    every = [
+        (k / count, case(kind, name, first[kind] + k))
+        for kind, count in wanted.items()
+        for name in names[kind]
+        for k in range(count)
+    ]
     return [c for _, c in sorted(every, key=lambda both: both[0])]
 
 
@@ -258,17 +264,19 @@ the start of the program included.
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--per-cause", type=int, default=12)
+    parser.add_argument("--per-cause", type=int, default=6)
     parser.add_argument("--nothing", type=int, default=200)
-    parser.add_argument("--per-surprise", type=int, default=6)
-    parser.add_argument("--pairs", type=int, default=30)
+    parser.add_argument("--per-surprise", type=int, default=2)
+    parser.add_argument("--pairs", type=int, default=12)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--seen", action="store_true", help="cases from number 0, by which the diagnosis was mended")
     parser.add_argument("--only", default="", help="cases whose key begins like this, nothing else is written")
     parser.add_argument("--out", type=Path, default=HERE)
     given = parser.parse_args(argv)
     kept = ROOT / "results" / ".diagnosis" / version()
     kept.mkdir(parents=True, exist_ok=True)
-    every = cases(given.nothing, given.per_cause, given.per_surprise, given.pairs)
+    many = {"nothing": given.nothing, "cause": given.per_cause, "surprise": given.per_surprise, "pair": given.pairs}
+    every = cases(many, dict.fromkeys(FRESH, 0) if given.seen else FRESH)
     wanted = [c for c in every if c.key.startswith(given.only)]
     if given.jobs:
         joblib.Parallel(n_jobs=given.jobs, verbose=5)(joblib.delayed(judged)(c, kept) for c in wanted)
