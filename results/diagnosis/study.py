@@ -59,8 +59,8 @@ def version() -> str:
 
 
 def cases(wanted: Mapping[str, int], first: Mapping[str, int]) -> list[Case]:
-    """So many of every kind (causes and surprises: of every name), numbered from the first, in an order in which a study
-    that is cut short has seen some of everything."""
+    """So many of every kind (causes and surprises: of every name) from the first number on, in an order in which a
+    study that is cut short has seen some of everything."""
     names = {"nothing": [""], "cause": list(CAUSES), "surprise": list(SURPRISES), "pair": [""]}
     every = [
         (k / count, case(kind, name, first[kind] + k))
