@@ -23,6 +23,9 @@ ALARM = 1e-4  # chance of a false alarm of each test in a log
 WINDOWS = 0.5, 2.0  # [s]
 LOUDER = 1.6  # mean square of innovations in a window that counts, however sure
 STUCK = 3.0  # counts that an encoder should have made while it stood still
+SHAKING = 0.1  # of the sampling rate: above that a torque that is driven has nothing
+FEW = 50  # samples by which shaking is told
+SURE = 3.0  # deviations
 TAIL = 1.6  # by which outliers of encoders may exceed those of normal noise: an edge's error is not normal
 
 
@@ -64,6 +67,19 @@ def anomalies(machine: Machine, sensors: tuple[Sensor, ...], log: Log, fit: Fit,
         if sensor.kind == "torque" and sensor.name in log.values:
             found += _in_torque(sensor.name, t, log.values[sensor.name], rate)
     return sorted(found, key=lambda a: -a.size)
+
+
+def shakes(u: np.ndarray, there: np.ndarray) -> bool:
+    """Whether a torque channel u (N,) is surely louder above SHAKING where `there` (N,) is one than where it is none;
+    also where that can't be told."""
+    inside, outside = there > 0.9, there < 0.1
+    few = min(int(inside.sum()), int(outside.sum()))
+    if few < FEW:
+        return True
+    high = scipy.signal.sosfiltfilt(scipy.signal.butter(4, 2 * SHAKING, "high", output="sos"), u)
+    told = 1 - 2 * SHAKING  # share of the samples that tell something new
+    spread = np.sqrt(2 / told * (1 / inside.sum() + 1 / outside.sum()))
+    return bool(np.mean(high[inside] ** 2) > (1 + SURE * spread) * np.mean(high[outside] ** 2))
 
 
 def _in_innovations(name: str, t: np.ndarray, z: np.ndarray, rate: float, counts: bool) -> Iterator[Anomaly]:

@@ -8,11 +8,12 @@ Where no model follows the logs, the first is chosen with coarse sensors (`sharp
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from excite import evidence, smoothing
+from excite.anomaly import shakes
 from excite.log import Log
 from excite.newton import NotConverged
 from excite.sidebyside import Together
@@ -261,6 +262,7 @@ def unfollowed(stage: Stage, together: Together) -> tuple[Stage, list[Choice]]:
     for disturbed in (0.0, smoothing.DISTURBED[0], smoothing.DISTURBED[-1]) if likely else ():
         found = begun(machines, stage, disturbed, together)
         near = [(s, x) for s, x in zip(likely, found, strict=True) if x is not None and x.near]
+        near = [(s, x) for s, x in near if _felt(s.candidate.name, x)]
         if not near:
             continue
         tries = _one_each(near)
@@ -303,7 +305,20 @@ def _tries(
             tell(min(at + k + 1, len(likely) - 1))
             if found is not None:
                 tries.append((score, found))
-    return _one_each(tries)
+    return [(score, stage) for score, stage in _one_each(tries) if _felt(score.candidate.name, stage)]
+
+
+def _felt(name: str, stage: Stage) -> bool:
+    """Whether the torque sensor shakes while an effect acts that shakes it; any other effect passes."""
+    entry, placed = entry_of(stage, name), stage.placed(name)
+    values = {"A": float(entry.amount), **{s: float(x) for s, x in entry.shape.items()}}
+    fitted, body = replace(placed, values=values), placed.bodies[0]
+    sensor = next((s for s in stage.machine.sensors("full") if s.kind == "torque" and s.body == body), None)
+    for one in stage.prepared.logs:
+        there = fitted.shaking(one.t)
+        if there is None or sensor is None or shakes(one.values[sensor.name], there):
+            return True
+    return False
 
 
 def _one_each(tries: Sequence[_Try]) -> list[_Try]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from excite.estimate import Estimate, NoEstimate, noted
 from excite.regression import Block, residual, size
-from model.prediction import Model, standard_parameters
+from model.prediction import Model, signs, standard_parameters
 from model.tree import INERTIAL
 
 MARGIN = 1e-6  # of a parameter's scale, kept from the edge: a mass matrix must be invertible
@@ -88,7 +88,7 @@ def is_possible(model: Model, X: np.ndarray) -> bool:
 def _possible(model: Model, p: dict[str, cp.Expression], margin: float) -> list[cp.Constraint]:
     """What every real machine obeys, in standard parameters by name, `margin` of their nominal size inside."""
     nominal = {name: abs(value) for name, (value, _) in standard_parameters(model.machine).items()}
-    found: list[cp.Constraint] = []
+    found = [sign * p[name] >= margin * nominal[name] for name, sign in signs(model.machine).items()]
     for body in model.machine.body:
         k = body.index
         if body.inertia is not None:
@@ -101,10 +101,6 @@ def _possible(model: Model, p: dict[str, cp.Expression], margin: float) -> list[
             length = float(np.sqrt(inertia / nominal[f"M{k}"])) if inertia > 0 else 1.0
             S = cp.bmat([[second / length**2, h / length], [h.T / length, cp.reshape(m, (1, 1), order="C")]])
             found.append(S / nominal[f"M{k}"] >> margin * np.eye(4))
-        if body.friction is not None:
-            found += [p[f"{name}{k}"] >= margin * nominal[f"{name}{k}"] for name in ("Fv", "Fs")]
-        if body.contact is not None:
-            found += [p[f"{name}{k}"] <= -margin * nominal[f"{name}{k}"] for name in ("Kx", "Ky")]
     return found
 
 

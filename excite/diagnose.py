@@ -26,7 +26,7 @@ from excite.sidebyside import Together, in_turn
 from excite.stages import SMALL, Stage, as_measured, fitted, forced, refitted
 from model import placing
 from model.machine import EffectEntry, Filter
-from model.prediction import Model
+from model.prediction import Model, signs
 
 MOST = 4  # effects that are looked for
 FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
@@ -34,6 +34,7 @@ FORMULA = 0.5  # of an amount, times the root of the share of a gain that its fo
 # amounts in results/diagnosis are within intervals that allow for so much.
 OTHERWISE = 0.05
 FURTHER = 0.8  # SHARE for names after the first: what nature has beside its formula looks like many a cause
+SURELY, WRONG = 3.0, 0.2  # deviations, and a share of its usual size, by which a parameter's sign is wrong
 ODD = 50.0  # misfit that every line of what is odd beside names stands for, at least
 
 
@@ -69,12 +70,22 @@ class Finding:
 
 
 @dataclass(frozen=True)
+class Nearest:
+    """An effect that explains a share of the misfit and is no name, and the parameters that with it would have a value
+    that no machine has, a line each."""
+
+    name: str
+    share: float
+    impossible: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """verdict: clean, named, tied or unexplained. `before`, `after`: the model without and with what was found.
 
     share: of the excess misfit that the names explain. located: lines that say where what is unexplained sits. stages:
     the model with the first finding, the first two, and so on. nearest: where nothing is named, the effect that
-    explains most, and the share that it does.
+    explains most.
     """
 
     verdict: str
@@ -84,7 +95,7 @@ class Diagnosis:
     share: float
     located: tuple[str, ...]
     stages: tuple[Stage, ...]
-    nearest: tuple[str, float] | None = None
+    nearest: Nearest | None = None
 
 
 def diagnose(
@@ -124,29 +135,32 @@ def diagnose(
         chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
     stage = chosen[-1].stage if chosen else before
     answer = concluded(before, stage, chosen, odd, left)
-    return answer if answer.findings else replace(answer, nearest=nearest)
+    if answer.findings or nearest is None:
+        return answer
+    return replace(answer, verdict="unexplained", nearest=nearest)
 
 
-def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tuple[str, ...], tuple[str, float] | None]:
+def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tuple[str, ...], Nearest | None]:
     """Effects without the last ones that are no names: one that leaves most of the misfit where it was is none, unless
-    with what came after it nothing is left, or with the disturbing forces that it was judged with. Also what is odd
-    beside those that stay, and the last one that doesn't, with the share that it explains."""
+    with what came after it nothing is left, or with the disturbing forces that it was judged with; nor is one with
+    which no machine is possible. Also what is odd beside those that stay, and the last one that doesn't."""
     kept, nearest = list(chosen), None
     while True:
         stage = kept[-1].stage if kept else before
         odd = _odd(stage)
-        if not kept or (stage.exact and not odd):
+        impossible = _impossible(stage) if kept and stage.settled else ()
+        if not kept or (stage.exact and not odd and not impossible):
             break
         enough = choosing.SHARE if len(kept) == 1 else FURTHER
         explained = _share(kept[-1].gain, stage, odd)
-        if explained >= enough:
+        if explained >= enough and not impossible:
             break
         loose = kept[-1].loose
-        if loose is not None and _share(kept[-1].gain, loose, odd_loose := _odd(loose)) >= enough:
+        if loose is not None and not impossible and _share(kept[-1].gain, loose, odd_loose := _odd(loose)) >= enough:
             # Exact dynamics make a large misfit of a formula that is nearly right; it was judged with forces.
             kept[-1], odd = replace(kept[-1], stage=loose), odd_loose
             break
-        nearest = kept.pop().name, explained
+        nearest = Nearest(kept.pop().name, explained, impossible)
     return kept, odd, nearest
 
 
@@ -269,6 +283,15 @@ def _odd(stage: Stage) -> tuple[str, ...]:
         for a in anomalies(stage.machine, stage.prepared.c.sensors, log, stage.fit, k)
     ]
     return tuple(dict.fromkeys([*stage.suspects, *map(str, found)]))
+
+
+def _impossible(stage: Stage) -> tuple[str, ...]:
+    """Parameters of a fit that surely have a sign that no machine has, friction that drives or soil that pulls, a line
+    each. What makes them so is no cause, however much it explains."""
+    fit, base, of = stage.fit, stage.model.base, signs(stage.machine)
+    sure = np.maximum(SURELY * stage.doubt * fit.std, WRONG * stage.model.scale)
+    all_of_them = zip(base.names, base.units, fit.X, sure, strict=True)
+    return tuple(f"{n} = {x:.4g} {unit}" for n, unit, x, far in all_of_them if of.get(n, 0.0) * x < -far)
 
 
 def _share(gained: float, stage: Stage, odd: Sequence[str]) -> float:

@@ -85,7 +85,13 @@ def summary(a: Account) -> dict[str, Any]:
         "separating_run": a.run,
         "share_explained": d.share,
         "located": list(a.located),
-        "nearest": {"effect": d.nearest[0], "share": d.nearest[1]} if d.nearest else None,
+        "nearest": {
+            "effect": d.nearest.name,
+            "share": d.nearest.share,
+            "impossible": list(d.nearest.impossible),
+        }
+        if d.nearest
+        else None,
         "parameters": parameters(d),
         "exact": {"before": d.before.exact, "after": d.after.exact},
     }
@@ -177,7 +183,9 @@ def answer(a: Account) -> str:
             first = words(rows[0]["effect"], rows[0]["where"])
             text += f"; {first}{more} would account for {100 * d.share:.0f} % of it, too little to be its name"
         elif d.nearest:
-            text += f"; nearest comes {words(*d.nearest[0].split('@'))} with {100 * d.nearest[1]:.0f} % of it"
+            text += f"; nearest comes {words(*d.nearest.name.split('@'))} with {100 * d.nearest.share:.0f} % of it"
+            if d.nearest.impossible:
+                text += f", but then {', '.join(d.nearest.impossible)}, which no machine has"
         return text + "."
     gained = ""
     if a.whole:

@@ -20,7 +20,9 @@ from excite.simulate import _A, _C, _GAMMA, _SLOPES, _TIMES, _lu, _solve
 from model.machine import Sensor
 from model.prediction import Model
 
-ACCURACY = 1e-5  # of a speed over an interval [rad/s, m/s]: what a sample's torque noise does is far more
+# Of a speed over an interval [rad/s, m/s], and of what an effect remembers in its size: what a sample's torque noise
+# does is far more.
+ACCURACY = 1e-5
 BATCH = 1000  # samples at a time: their intermediate results stay in the processor's cache
 MANY, FEW = 80, 20  # from how many samples on a block pays; samples in one call of CasADi otherwise
 FINE, FINEST = 4, 16  # steps for an interval in which friction turns, and where it turns all at once
@@ -306,7 +308,10 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     seen = ca.vertcat(*[every[model.readable.index(s.name)] for s in sensors])
     flawed = tuple(k for k in range(X.numel()) if ca.depends_on(seen, X[k]))
     slopes = ca.Function("slopes", [state, u, X], local)
-    step = _step(state, u, X, len(core), along(rates[index]), local[0], local[1], local[4])
+    known = np.full(len(index), np.nan)
+    known[len(core) - len(model.memory) : len(core)] = model.remembered
+    size = np.fmax(known, 1.0)  # what effects remember may be torques, thousands of N m
+    step = _step(state, u, X, len(core), along(rates[index]), local[0], local[1], local[4], size)
     readings = ca.Function(
         "readings",
         [state, u, X],
@@ -320,8 +325,6 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     )
     t = ca.SX.sym("t")
     channels = model.channels(t, X)
-    known = np.full(len(index), np.nan)
-    known[len(core) - len(model.memory) : len(core)] = model.remembered
     mass = ca.Function("mass", [q, u, z, X], [ca.diag(M)])(0, 0, 0, model.nominal).full()[:, 0]
     return Chart(
         model,
@@ -344,8 +347,19 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     )
 
 
-def _step(state: ca.SX, u: ca.SX, X: ca.SX, core: int, rates: ca.SX, J: ca.SX, B: ca.SX, R: ca.SX) -> ca.Function:
-    """(state, u, du/dt, h, X) -> state after h, its error [SI]: simulate's Rosenbrock method, on a chart's states.
+def _step(
+    state: ca.SX,
+    u: ca.SX,
+    X: ca.SX,
+    core: int,
+    rates: ca.SX,
+    J: ca.SX,
+    B: ca.SX,
+    R: ca.SX,
+    size: np.ndarray,
+) -> ca.Function:
+    """(state, u, du/dt, h, X) -> state after h, its error in each state's `size` (n,): simulate's Rosenbrock method, on
+    a chart's states.
 
     The angles that nothing depends on take part in the method as they are: below the core's block in the Jacobian.
     """
@@ -362,7 +376,7 @@ def _step(state: ca.SX, u: ca.SX, X: ca.SX, core: int, rates: ca.SX, J: ca.SX, B
         known += sum((w * U for w, U in zip(c, stages, strict=True)), ca.SX(n, 1)) / h
         inner = _solve(lower, upper, known[:core])
         stages.append(ca.vertcat(inner, _GAMMA * h * (Ry @ inner + known[core:])))
-    error = ca.norm_inf(stages[-1])
+    error = ca.norm_inf(stages[-1] / size)
     return ca.Function("step", [y, left, slope, h, X], [at + stages[-1], error], {"cse": True})
 
 

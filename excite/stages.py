@@ -7,10 +7,11 @@ other are computed side by side: what is sent back from there is fits alone, as 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,7 @@ STRONG = 1.3  # misfit over readings from which first-order gains are rough
 FAR = 10.0  # misfit over readings, a few passes after the beginning, from which no fit comes near
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 PASSES = 14  # of a fit that goes on from another
-COARSE = 10.0  # times their noise that sensors are taken to have where nothing follows the logs
+COARSE = 10.0, 30.0  # times their noise that sensors are taken to have where nothing follows the logs, in turn
 LESS = 0.1, 0.3  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
 SMALL = LESS[0] * smoothing.DISTURBED[0]  # the smallest that are tried
 
@@ -139,14 +140,12 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Toge
     Each way is set out upon before it is known to be needed, where there are processes for it. Raises NotConverged.
     """
     prepared = _prepared(machine, logs, filter)
-    coarse = _noisy(prepared, COARSE)
-    ways = together(
-        [
-            partial(_strictly, prepared, 0.0, FAR * prepared.readings),
-            partial(_disturbed, machine, prepared, smoothing.DISTURBED[0]),
-            partial(_strictly, coarse, smoothing.DISTURBED[0]),
-        ]
-    )
+    calls: list[Callable[[], Any]] = [
+        partial(_strictly, prepared),
+        partial(_disturbed, machine, prepared, smoothing.DISTURBED[0]),
+        partial(_coarsely, prepared),
+    ]
+    ways = together(calls)
     with closing(ways):
         exact = next(ways)
         if exact is not None:
@@ -157,7 +156,8 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Toge
     if stage is not None and stage.near:
         return exact_if_near(stage)
     if noisy is not None:
-        return Stage(machine, coarse, noisy[0], False, stage)
+        fit, times = noisy
+        return Stage(machine, _noisy(prepared, times), fit, False, stage)
     return _forced(machine, prepared, smoothing.DISTURBED[1:], together) if stage is None else _with_least(stage)
 
 
@@ -234,10 +234,19 @@ def _from_first(prepared: Prepared, disturbed: float, most: float = np.inf) -> F
         return light(failed.nearly) if failed.nearly is not None and disturbed > 0 else None
 
 
-def _strictly(prepared: Prepared, disturbed: float, most: float = np.inf) -> Fits | None:
-    """A fit from first guesses with disturbing forces that stay as they are."""
-    fit = _from_first(prepared, disturbed, most)
+def _strictly(prepared: Prepared) -> Fits | None:
+    """A fit from first guesses by exact dynamics; None where it is given up, as it stays FAR off."""
+    fit = _from_first(prepared, 0.0, FAR * prepared.readings)
     return None if fit is None else (fit, None)
+
+
+def _coarsely(prepared: Prepared) -> tuple[Fit, float] | None:
+    """A fit from first guesses with disturbing forces and sensors as coarse as it takes to find one, and how coarse."""
+    for times in COARSE:
+        fit = _from_first(_noisy(prepared, times), smoothing.DISTURBED[0])
+        if fit is not None:
+            return fit, times
+    return None
 
 
 def _disturbed(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:

@@ -52,25 +52,29 @@ def wrench(
     Ky: ca.SX,
     saturation: ca.SX | None = None,
     lateral: ca.SX | None = None,
+    strips: ca.SX | float = 1.0,
+    untouched: ca.SX | float = 0.0,
 ) -> Wrench:
     """What the soil does to a contact; yaw_rate [rad/s] of its chassis; Kx, Ky [N] < 0.
 
     Linear (24, 25), or with `saturation` = K / xi_s the exponential law (18) integrated over the patch. `lateral`: the
-    same for the lateral force alone, as a factor on it.
+    same for the lateral force alone, as a factor on it. Simpler readings of (18): with `strips` 0 all of the contact's
+    width saturates as its middle does, with `untouched` 1 the moment does not.
     """
     if lateral is not None:
         Ky = Ky * mobilised(ca.sqrt(s.gy**2 + 1e-12) / lateral)
+    turning = Kx * (float(contact.width) ** 2 / 12) * (-yaw_rate) / s.vn
     if saturation is None:
-        Tz = Kx * (float(contact.width) ** 2 / 12) * (-yaw_rate) / s.vn
-        return Wrench(Kx * s.gx, Ky * s.gy, Tz)
+        return Wrench(Kx * s.gx, Ky * s.gy, turning)
     Sx, Sy, Tz = ca.SX(0), ca.SX(0), ca.SX(0)
-    for y, dy in _across(contact, s, yaw_rate):
+    for y, dy in _across(contact, s, strips * yaw_rate):
         gx = s.gx - y * yaw_rate / s.vn
-        share = mobilised(ca.sqrt(gx**2 + s.gy**2 + 1e-12) / saturation) * dy
+        own = s.gx - strips * y * yaw_rate / s.vn
+        share = mobilised(ca.sqrt(own**2 + s.gy**2 + 1e-12) / saturation) * dy
         Sx += Kx * gx * share
         Sy += Ky * s.gy * share
         Tz += Kx * gx * y * share
-    return Wrench(Sx, Sy, Tz)
+    return Wrench(Sx, Sy, (1 - untouched) * Tz + untouched * turning)
 
 
 def _across(contact: Contact, s: Slip, yaw_rate: ca.SX) -> Iterator[tuple[ca.SX, ca.SX]]:

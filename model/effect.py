@@ -35,7 +35,8 @@ class Rolling:
 
 @dataclass(frozen=True)
 class Soil:
-    """What a contact's wrench is made from: slips, yaw rate, stiffnesses Kx, Ky [N], saturations (None: linear)."""
+    """What a contact's wrench is made from: slips, yaw rate, stiffnesses Kx, Ky [N], saturations (None: linear), and
+    how these are read (`contact.wrench`)."""
 
     slip: law.Slip
     yaw: ca.SX
@@ -43,6 +44,8 @@ class Soil:
     Ky: ca.SX
     saturation: ca.SX | None = None
     lateral: ca.SX | None = None
+    strips: ca.SX | float = 1.0
+    untouched: ca.SX | float = 0.0
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,8 @@ class Effect:
     signature isn't proportional to the amount; `beside`: shapes [unit] that are tried beside their grids. `positive`: a
     negative amount makes no sense; `inverse`: the smaller the amount, the larger the effect; `angular`: a reading's
     error that only a sensor of an angle has, none of a rate. `recoil`: the shape that says which share of a changing
-    `inertia`, of MX and ZZ, comes of a load that slides along x on its body and pushes it back.
+    `inertia`, of MX and ZZ, comes of a load that slides along x on its body and pushes it back. `shaking`: while it
+    acts, 0 to 1 over time [s], the torque sensor shakes as well; where it doesn't, something else acts.
     Hooks take the scene, the body they act on, and the values.
     """
 
@@ -165,6 +169,7 @@ class Effect:
     recoil: str | None = None
     reading: Callable[[Scene, ca.SX, int, Values], ca.SX] | None = None
     channel: Callable[[ca.SX, Values], Channel] | None = None
+    shaking: Callable[[ca.SX, Values], ca.SX] | None = None
     memory: Mapping[str, Memory] = field(default_factory=dict)
     timed: bool = False
     angular: bool = False
@@ -194,6 +199,14 @@ class Placed:
         """Names as parameters of the model -> (value's key, unit): the amount first, then the shapes."""
         named = {self.name: ("A", self.effect.unit)}
         return named | {f"{self.name}.{s}": (s, shape.unit) for s, shape in self.effect.shapes.items()}
+
+    def shaking(self, t: np.ndarray) -> np.ndarray | None:
+        """How much the torque sensor shakes, 0 to 1, at times t (N,) [s]; None of an effect that shakes none."""
+        if self.effect.shaking is None:
+            return None
+        time = ca.SX.sym("t")
+        felt = self.effect.shaking(time, {k: ca.SX(v) for k, v in self.values.items()})
+        return np.asarray(ca.Function("shaking", [time], [felt])(t[None]).full()[0])
 
     def channel(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Gain, offset and delay (N,) that the effect gives a torque sensor at times t (N,) [s]."""

@@ -27,6 +27,7 @@ SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on th
 BACK = 0.1  # [m] of way back, within which a reversal counts
 MOMENTS = 120  # at which a load is looked for that slides
 PRESSED = 0.1  # [rad] beyond a stop, at which its hardening is stated
+BEHIND = 2.0  # [m] from the joint, where a load is put on or taken off
 LANE = 10.0  # [m] of way that a pass is worth where these are counted
 EDGE = 0.3  # [m] within which the end of a lane is felt
 
@@ -93,9 +94,9 @@ def _relaxation(slip: Callable[[Rolling], ca.SX], name: str) -> Memory:
 
 
 def _slid(s: Scene, p: Values) -> dict[str, ca.SX]:
-    """What a load on the last chassis changes of its inertia when it slides to another place within so long."""
+    """What a load on the last chassis changes of its inertia when it slides, is put on or taken off within so long."""
     there = p["A"] * (1 + ca.tanh((s.time - p["instant"]) / ca.sqrt(p["takes"] ** 2 + 0.05**2))) / 2
-    return {"MX": there, "ZZ": p["arm"] * there}
+    return {"M": p["mass"] * there, "MX": there, "ZZ": p["arm"] * there}
 
 
 def _braking(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
@@ -163,6 +164,11 @@ def _compacted(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
     return _scaled(soil, 1 + p["A"] * (1 - ca.exp(-way / p["pass"])))
 
 
+def _saturated(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
+    form = p["across"]
+    return replace(soil, saturation=p["A"], strips=(1 - form) * (2 - form) / 2, untouched=form * (form - 1) / 2)
+
+
 def _between(t: ca.SX, begin: ca.SX, end: ca.SX, width: float) -> ca.SX:
     return (ca.tanh((t - begin) / width) - ca.tanh((t - end) / width)) / 2
 
@@ -173,7 +179,7 @@ def _window(t: ca.SX, p: Values) -> ca.SX:
 
 def _resistance(s: Scene, k: int, p: Values) -> tuple[ca.SX, ca.SX]:
     r = s.rolling[k]
-    return -p["A"] * ca.tanh(r.Vx / SMOOTH_SPEED), ca.SX(0)
+    return -p["A"] * (1 + p["rise"] * r.Vx**2) * ca.tanh(r.Vx / p["soft"]), ca.SX(0)
 
 
 def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
@@ -239,10 +245,13 @@ def _load_moment(site: Site) -> float:
 
 
 def _sliding(site: Site) -> list[dict[str, float]]:
-    """A load that slides within a second, at every second, in long logs at MOMENTS: its recoil is short."""
+    """A load that slides within a second, at every second, in long logs at MOMENTS: its recoil is short. And one that
+    is put on or taken off behind the joint, at every sixth of these."""
     step = max(1.0, site.duration / MOMENTS)
     times = [k * step for k in range(1, round(site.duration / step))]
-    return [{"instant": t, "takes": 0.5, "arm": 0.0, "recoil": 1.0} for t in times]
+    slid = [{"instant": t, "takes": 0.5, "arm": 0.0, "mass": 0.0, "recoil": 1.0} for t in times]
+    off = [{"instant": t, "takes": 0.5, "arm": -BEHIND, "mass": -1 / BEHIND, "recoil": 0.0} for t in times[5::6]]
+    return slid + off
 
 
 def _one_over_torque(site: Site) -> float:
@@ -460,7 +469,18 @@ _declare(
         grid=(0.5, 1.0, 3.0),
         positive=True,
         inverse=True,
-        soil=lambda s, k, p, soil: replace(soil, saturation=p["A"]),
+        shapes={
+            "across": Shape(
+                "-",
+                0.0,
+                (0.0, 1.0, 2.0),
+                whole=True,
+                only=(0.0, 1.0, 2.0),
+                meaning="0: every strip of the width saturates by its own slip; 1: all of it as its middle; 2: the"
+                " same, but for the moment T_z",
+            )
+        },
+        soil=_saturated,
     ),
     Effect(
         "lateral_saturation",
@@ -552,6 +572,7 @@ _declare(
         positive=True,
         soil=lambda s, k, p, soil: _scaled(soil, 1 - p["A"] * _window(s.time, p)),
         channel=lambda t, p: Channel(offset=p["shake"] * _window(t, p) * ca.sin(2 * pi * p["frequency"] * t)),
+        shaking=_window,
         timed=True,
     ),
     # ---------------------------------------------------------------- forces
@@ -563,6 +584,7 @@ _declare(
         "a force that turns with the direction of travel",
         "Bekker, Introduction to Terrain-Vehicle Systems, 1969",
         _weighing(0.002),
+        {"rise": Shape("s2/m2", 0.0, (0.0,)), "soft": Shape("m/s", 1.0, (1.0,), _constant(SMOOTH_SPEED))},
         push=_resistance,
     ),
     Effect(
@@ -592,6 +614,7 @@ _declare(
             "instant": Shape("s", 0.5, (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), _duration),
             "takes": Shape("s", 0.2, (0.2,)),
             "arm": Shape("m", 0.0, (0.0,), meaning="the yaw inertia about the joint changes by A times this"),
+            "mass": Shape("1/m", 0.0, (0.0,), meaning="the mass changes by A times this"),
             "recoil": Shape(
                 "-",
                 0.0,

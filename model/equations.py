@@ -340,7 +340,8 @@ def _soil(s: Sample, body: Body, rolling: Rolling) -> Soil:
 def _pushed(body: Body, soil: Soil, lever: ca.SX) -> ca.SX:
     """Generalised force (n_q,) of a contact (11), by virtual power."""
     assert body.contact is not None
-    w = contact.wrench(body.contact, soil.slip, soil.yaw, soil.Kx, soil.Ky, soil.saturation, soil.lateral)
+    how = soil.saturation, soil.lateral, soil.strips, soil.untouched
+    w = contact.wrench(body.contact, soil.slip, soil.yaw, soil.Kx, soil.Ky, *how)
     return lever.T @ ca.vertcat(w.Sx, w.Sy, -float(body.contact.radius) * w.Sx, -w.Tz)
 
 

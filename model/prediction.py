@@ -75,6 +75,18 @@ def standard_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
     return chassis | joints
 
 
+def signs(machine: Machine) -> dict[str, float]:
+    """The sign that standard parameters must have, of those that have one by themselves: joints only brake and the soil
+    only resists."""
+    found: dict[str, float] = {}
+    for body in machine.body:
+        if body.friction is not None:
+            found |= dict.fromkeys((f"Fv{body.index}", f"Fs{body.index}"), 1.0)
+        if body.contact is not None:
+            found |= dict.fromkeys((f"Kx{body.index}", f"Ky{body.index}"), -1.0)
+    return found
+
+
 def _inertial_unit(name: str) -> str:
     letters = name.rstrip("0123456789")
     return {1: "kg", 2: "kg m" if letters[0] == "M" else "kg m2"}[len(letters)]

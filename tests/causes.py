@@ -184,9 +184,10 @@ def _developed(slip: ca.SX, A: float) -> ca.SX:
 
 
 def shear_saturation(s: Scene, place: str, A: float, draw: DRAW) -> None:
-    """Each strip of the roll's width has its own slip, and saturates on its own."""
+    """Each strip of the roll's width has its own slip, and saturates on its own; or all of it by that of its middle,
+    with the moment or without it."""
 
-    def law(c: Any) -> tuple[ca.SX, ca.SX, ca.SX]:
+    def of_strips(c: Any) -> tuple[ca.SX, ca.SX, ca.SX]:
         Sx, Sy, Mz = ca.SX(0), ca.SX(0), ca.SX(0)
         for x, weight in zip(_PLACES, _WEIGHTS, strict=True):
             y = x * c.L / 2
@@ -195,8 +196,14 @@ def shear_saturation(s: Scene, place: str, A: float, draw: DRAW) -> None:
             Sx, Sy, Mz = Sx + share * c.Kx * gx, Sy + share * c.Ky * gy, Mz - y * share * c.Kx * gx
         return Sx, Sy, Mz
 
+    def of_the_middle(c: Any) -> tuple[ca.SX, ca.SX, ca.SX]:
+        Sx, Sy, Mz = plant.linear(c)
+        share = _developed(ca.sqrt(((c.Vx - c.rim) ** 2 + c.Vy**2) / c.vn**2 + 1e-16), A)
+        return share * Sx, share * Sy, (share if moment else 1) * Mz
+
+    strips, moment = draw.uniform(size=2) < 0.5
     if np.isfinite(A):
-        s.law[place] = law
+        s.law[place] = of_strips if strips else of_the_middle
 
 
 def lateral_saturation(s: Scene, place: str, A: float, draw: DRAW) -> None:

@@ -151,6 +151,15 @@ def tight_spot(s: Scene, size: float, draw: DRAW) -> None:
     )
 
 
+def worn_roll(s: Scene, size: float, draw: DRAW) -> None:
+    """A roll is smaller than the drawing says: its rim is slower than its encoder tells."""
+
+    def change(c: Any) -> None:
+        c.rim = c.rim * (1 - 0.02 * size)
+
+    s.soil[str(draw.choice(ROLLS))].append(change)
+
+
 SURPRISES: dict[str, Callable[[Scene, float, DRAW], None]] = {
     f.__name__: f
     for f in (
@@ -167,6 +176,7 @@ SURPRISES: dict[str, Callable[[Scene, float, DRAW], None]] = {
         cg_drift,
         sloshing,
         tight_spot,
+        worn_roll,
     )
 }
 

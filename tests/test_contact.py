@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import dblquad
+from scipy.integrate import dblquad, quad
 
 from model import contact
 from model.machine import Contact, Machine, load
@@ -86,6 +86,15 @@ def by_virtual_work(theta2: float, roll: int, wrench: tuple[float, float, float]
     return np.array([Sx * m.Vx + Sy * m.Vy - RC * Sx * m.spin - Tz * m.yaw for m in unit])
 
 
+def of_the_middle(m: Motion, Kx: float, Ky: float, g_K: float) -> tuple[float, float, float]:
+    """(18) over the length of the patch alone, at the slip of its middle, as a share of the linear law."""
+    v_n = math.sqrt((RC * m.spin) ** 2 + V_EPS**2)
+    g = math.hypot((m.Vx - RC * m.spin) / v_n, m.Vy / v_n)
+    share = quad(lambda zeta: -2 * g_K * math.expm1(-g * zeta / g_K) / g, 0, 1)[0] if g > 0 else 1.0
+    Sx, Sy, Tz = linear(m, Kx, Ky)
+    return share * Sx, share * Sy, share * Tz
+
+
 # ------------------------------------------------------------------------------------------------ the model
 def with_contacts(machine: Machine, **changes: Any) -> Machine:
     raw = machine.model_dump()
@@ -128,10 +137,10 @@ def states(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return q, nu
 
 
-def wrench_of(roll: Contact, m: Motion, g_K: float | None = None) -> tuple[float, float, float]:
+def wrench_of(roll: Contact, m: Motion, g_K: float | None = None, **how: float) -> tuple[float, float, float]:
     s = contact.slip(roll, ca.SX(m.Vx), ca.SX(m.Vy), ca.SX(m.spin))
     saturation = None if g_K is None else ca.SX(g_K)
-    w = contact.wrench(roll, s, ca.SX(m.yaw), ca.SX(STIFFNESS[1][0]), ca.SX(STIFFNESS[1][1]), saturation)
+    w = contact.wrench(roll, s, ca.SX(m.yaw), ca.SX(STIFFNESS[1][0]), ca.SX(STIFFNESS[1][1]), saturation, **how)
     return float(ca.DM(w.Sx)), float(ca.DM(w.Sy)), float(ca.DM(w.Tz))
 
 
@@ -204,6 +213,18 @@ def test_exponential_law_is_the_integral_over_the_patch(m: Motion, g_K: float, t
     want = exponential(m, *STIFFNESS[1], g_K)
     size = math.hypot(*linear(m, *STIFFNESS[1]))
     assert wrench_of(ROLL, m, g_K) == pytest.approx(want, rel=0, abs=tolerance * size)
+
+
+@pytest.mark.parametrize(
+    "m", [Motion(1.0, 0.1, 1.4, 0.0), Motion(-0.9, -0.03, -1.2, -0.3), Motion(0.65, 0.0, 1.0, 0.5)]
+)
+@pytest.mark.parametrize("untouched", [0.0, 1.0])
+def test_simpler_readings_of_the_law_go_by_the_middle(m: Motion, untouched: float) -> None:
+    Sx, Sy, Tz = of_the_middle(m, *STIFFNESS[1], 0.15)
+    want = Sx, Sy, linear(m, *STIFFNESS[1])[2] if untouched else Tz
+    assert wrench_of(ROLL, m, 0.15, strips=0.0, untouched=untouched) == pytest.approx(want, rel=1e-5, abs=1e-5)
+    if m.yaw:
+        assert abs(wrench_of(ROLL, m, 0.15)[2]) < 0.99 * abs(Tz)  # the ends slip more, and give way first
 
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0.6, 0.8, 0), (0.5, 0.2, 0.4)])

@@ -214,6 +214,39 @@ def test_a_load_slides_on_the_last_chassis(name: str, body: int) -> None:
     assert np.abs(want - plain.balance(q, nu, a, p).full()).max() > 0.1
 
 
+@pytest.mark.parametrize(("name", "body"), LOADED.items())
+def test_a_load_is_put_on(name: str, body: int) -> None:
+    """Long after, the machine is one with another mass there: a point's mass, first moment and inertia."""
+    known = machine.load(name)
+    plain, mass, x = build(known), 30.0, -1.5
+    told = {"instant": 5.0, "takes": 0.5, "arm": x, "mass": 1 / x, "recoil": 0.0}
+    entry = placing.parse(f"payload_shift={mass * x}", known, 10.0)
+    shape = {n: Quantity(value=v, source="assumed") for n, v in told.items()}
+    loaded = build(placing.extended(known, entry.model_copy(update={"shape": shape})))
+    n, rng = len(plain.coordinates), np.random.default_rng(1)
+    q, nu, a = rng.uniform(-1, 1, (3, n))
+    u, late = np.zeros(len(plain.inputs)), np.full(len(loaded.memory), 1e3)
+    p = plain.expand @ plain.nominal
+    moved = p.copy()
+    for letter, change in (("M", mass), ("MX", mass * x), ("ZZ", mass * x**2)):
+        moved[plain.base.standard.index(f"{letter}{body}")] += change
+    want = plain.balance(q, nu, a, moved).full()
+    assert loaded.balance(q, nu, a, loaded.expand @ loaded.nominal, u, late).full() == pytest.approx(want, rel=1e-9)
+
+
+@pytest.mark.parametrize("V", [-1.5, -0.02, 0.01, 1.2])
+def test_what_resists_rolling_may_grow_with_speed(va12: Model, V: float) -> None:
+    """A (1 + rise V^2) against the motion, fully so from a speed on that the file tells."""
+    entry = placing.parse("rolling_resistance@front_roll=200", VA12, 10.0)
+    told = {"rise": Quantity(value=0.2, source="assumed"), "soft": Quantity(value=0.05, source="assumed")}
+    model = build(placing.extended(VA12, entry.model_copy(update={"shape": told})))
+    still, nu = np.zeros(6), np.array([V, 0, 0, V / 0.65, 0, V / 0.65])
+    u, z = np.zeros(len(model.inputs)), np.zeros(len(model.memory))
+    plain = va12.balance(still, nu, still, va12.expand @ va12.nominal).full()[:, 0]
+    felt = plain - model.balance(still, nu, still, model.expand @ model.nominal, u, z).full()[:, 0]
+    assert felt == pytest.approx([-200 * (1 + 0.2 * V**2) * np.tanh(V / 0.05), 0, 0, 0, 0, 0], abs=1e-6)
+
+
 def compacting(known: machine.Machine, counted: float) -> Model:
     entry = placing.parse("compaction_per_pass=0.3", known, 24.0)
     told = {**entry.shape, "counted": Quantity(value=counted, source="assumed")}
