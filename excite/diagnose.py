@@ -288,7 +288,8 @@ def _odd(stage: Stage) -> tuple[str, ...]:
 def _impossible(stage: Stage) -> tuple[str, ...]:
     """Parameters of a fit that surely have a sign that no machine has, friction that drives or soil that pulls, a line
     each. What makes them so is no cause, however much it explains."""
-    fit, base, of = stage.fit, stage.model.base, signs(stage.machine)
+    fit, base = stage.fit, stage.model.base
+    of = signs(stage.machine) | {e.name: 1.0 for e in stage.model.effects if e.effect.resisting}
     sure = np.maximum(SURELY * stage.doubt * fit.std, WRONG * stage.model.scale)
     all_of_them = zip(base.names, base.units, fit.X, sure, strict=True)
     return tuple(f"{n} = {x:.4g} {unit}" for n, unit, x, far in all_of_them if of.get(n, 0.0) * x < -far)

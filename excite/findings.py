@@ -21,6 +21,8 @@ from excite.stages import as_measured
 from model.machine import EffectEntry, Machine, shipped
 
 DIGITS = 8  # of amounts in a machine file
+STRIKING = 3  # lines of what is odd that come before all others
+NEARLY_ALL = 0.9  # of the misfit: names that explain less are told with the share that they do
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,8 @@ def account(d: Diagnosis, advance: Advance | None = None, together: Together = i
     located = d.located
     if d.verdict == "unexplained":  # which signals, and how much more than noise there is in them, is in these lines
         measured = as_measured(d.after)
-        located = (*misfit.located(measured), *(line for line in d.located if line not in measured.suspects))
+        odd = [line for line in d.located if line not in measured.suspects]
+        located = (*odd[:STRIKING], *misfit.located(measured), *odd[STRIKING:])
     return Account(d, whole, single, before, after, missing, tuple(dict.fromkeys(located)), separate.run(d))
 
 
@@ -185,7 +188,7 @@ def answer(a: Account) -> str:
         elif d.nearest:
             text += f"; nearest comes {words(*d.nearest.name.split('@'))} with {100 * d.nearest.share:.0f} % of it"
             if d.nearest.impossible:
-                text += f", but then {', '.join(d.nearest.impossible)}, which no machine has"
+                text += f", but then {', '.join(d.nearest.impossible)}, which no machine has (check its dimensions)"
         return text + "."
     gained = ""
     if a.whole:
@@ -193,16 +196,20 @@ def answer(a: Account) -> str:
         most = max(better)
         low, high = a.whole.interval
         gained = (
-            f" On stretches that were not fitted on, the model with it errs {_change(a.whole.percent)} (95 %:"
-            f" {low:.2g} to {high:.2g} %); most in {most[1]}, by {100 * most[0]:.0f} %."
+            f" On stretches that were not fitted on, the model with it errs {_change(a.whole.percent, low, high)}; most"
+            f" in {most[1]}, by {100 * most[0]:.0f} %."
         )
+    if d.share < NEARLY_ALL:
+        gained = f" That is {100 * d.share:.0f} % of what the model lacks, the rest has no name.{gained}"
     if d.verdict == "tied":
         return f"{logs} {named}: this data can't tell which.{gained}"
     return f"{logs} {named}: {'; '.join(amount(r) for r in rows)}.{gained}"
 
 
-def _change(percent: float) -> str:
-    return f"{percent:.2g} % less" if percent >= 0 else f"{-percent:.2g} % more"
+def _change(percent: float, low: float, high: float) -> str:
+    if percent >= 0:
+        return f"{percent:.2g} % less (95 %: {low:.2g} to {high:.2g} %)"
+    return f"{-percent:.2g} % more (95 %: {-high:.2g} to {-low:.2g} %)"
 
 
 # ------------------------------------------------------------------------------------------------ machine file

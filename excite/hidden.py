@@ -107,7 +107,8 @@ def advice(model: Model, logs: Sequence[Samples], names: Sequence[str]) -> dict[
         if not shown.max(initial=0.0) > 1e-6:
             found[name] = "no drive that was tried shows it apart from the others"
             continue
-        best = options[int(np.argmax(shown >= ENOUGH * shown.max()))]
+        more = np.maximum(shown - _apart(here / level, k), 0.0)  # a log that begins at rest shows a little as it is
+        best = options[int(np.argmax(more >= ENOUGH * more.max()))]
         rest = [c for k, c in enumerate(model.coordinates) if still[k] and k in best.coordinates]
         why = f"{', '.join(rest)} never move{'s' if len(rest) == 1 else ''} in this log: " if rest else ""
         found[name] = why + best.text

@@ -23,6 +23,7 @@ from excite.stages import Stage, as_measured, refits
 BLOCK_S = 0.25  # [s] over which slow errors are means
 BINS = 24  # of a quantity
 FEWEST = 20  # samples in a bin that is shown
+MOMENT = 0.02  # of a log: what is shorter is told by when it was
 CONCENTRATED = 0.6, 0.3  # so much of the misfit in at most so much of the samples is a place
 PEAK = 15.0  # of a periodogram over its mean; noise stays below 11
 EXCESS = 1.6  # mean square of innovations from which a signal has something beside noise: null logs stay below
@@ -311,9 +312,11 @@ def _places(course: Course, z: np.ndarray) -> list[str]:
             continue  # says what time says
         for label, series in _distinct(values).items():
             low, high, share, of = _densest(series[: n * b].reshape(n, b).mean(axis=1), excess)
+            if of < MOMENT and name != "time":
+                continue
             if share >= CONCENTRATED[0] and of <= CONCENTRATED[1]:
-                where = f"{name}{label} from {low:.2g} to {high:.2g} {unit}".removesuffix(" -")
-                found.append((share / of, f"{100 * share:.0f} % of it at {where}, {100 * of:.0f} % of the log"))
+                where = f"{name}{label} from {low:.3g} to {high:.3g} {unit}".removesuffix(" -")
+                found.append((share / of, f"{100 * share:.0f} % of it at {where}, {100 * of:.2g} % of the log"))
     found.sort(reverse=True)
     return [text for _, text in found[:2]]
 
@@ -352,7 +355,7 @@ def _peak(course: Course, z: np.ndarray) -> float | None:
         return None
     z = scipy.signal.detrend(np.where(told, z, 0.0))
     f, power = scipy.signal.periodogram(z, course.rate, window="hann")
-    level = scipy.signal.medfilt(power, 101) / np.log(2)
+    level = scipy.ndimage.median_filter(power, 101, mode="reflect") / np.log(2)
     high = (f > 2.0) & (level > 0)
     if not high.any():
         return None

@@ -585,6 +585,7 @@ _declare(
         "Bekker, Introduction to Terrain-Vehicle Systems, 1969",
         _weighing(0.002),
         {"rise": Shape("s2/m2", 0.0, (0.0,)), "soft": Shape("m/s", 1.0, (1.0,), _constant(SMOOTH_SPEED))},
+        resisting=True,
         push=_resistance,
     ),
     Effect(
