@@ -399,28 +399,29 @@ def gentle(model: Model, seconds: float) -> Motion:
     return simulate(model, np.column_stack([1500 * np.sin(1.7 * t) * slow, 1200 * np.sin(2.6 * t) * slow]))
 
 
-def unfit(monkeypatch: pytest.MonkeyPatch, refused: Callable[[Any, int], bool]) -> None:
-    """Some fits to sensors as they are find nothing: told are the chart and the number of passes."""
+def unfit(monkeypatch: pytest.MonkeyPatch, refused: Callable[[Any, int], bool], coarse: float = 1.0) -> None:
+    """Some fits to sensors as they are, or up to so coarse, find nothing: told are chart and number of passes."""
     iterate = newton.iterate
 
     def found(c: Any, records: Any, *args: Any, **more: Any) -> newton.Fit:
-        if records[0].coarse == 1 and refused(c, args[6] if len(args) > 6 else 0):
+        if records[0].coarse <= coarse and refused(c, args[6] if len(args) > 6 else 0):
             raise newton.NotConverged("no fit")
         return iterate(c, records, *args, **more)
 
     monkeypatch.setattr(newton, "iterate", found)
 
 
+@pytest.mark.parametrize(("refused", "followed"), [(1, stages.COARSE[0]), (stages.COARSE[0], stages.COARSE[1])])
 def test_what_is_followed_with_coarse_sensors_only_is_named(
-    sloping: Path, straight: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    refused: float, followed: float, sloping: Path, straight: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No model without the slope can be fitted to sensors as they are."""
-    unfit(monkeypatch, lambda c, passes: not c.model.effects)
+    """No model without the slope can be fitted to sensors as they are, or to some that are much coarser."""
+    unfit(monkeypatch, lambda c, passes: not c.model.effects, refused)
     d = diagnose.diagnose(straight, [log.read(sloping, straight.machine)], straight.machine.filter)
     assert d.verdict == "named"
     assert [f.name for f in d.findings] == ["ground_slope@machine"]
     assert abs(d.findings[0].amount - 0.01) < 2 * d.findings[0].amount_std < 0.001
-    assert (d.before.prepared.coarse, d.before.settled) == (stages.COARSE, False)
+    assert (d.before.prepared.coarse, d.before.settled) == (followed, False)
     assert (d.after.prepared.coarse, d.after.settled, d.after.exact) == (1, True, True)
     told = findings.account(d)
     assert told.whole is not None
@@ -429,7 +430,7 @@ def test_what_is_followed_with_coarse_sensors_only_is_named(
     assert all(np.isnan(row["std_before"]) and row["moved"] is None for row in findings.parameters(d).values())
     monkeypatch.setattr(checkup, "diagnose", lambda *args: d)
     said, _ = checkup.write(tmp_path, "va12_straight", straight, [sloping], "machine", lambda *a: None)
-    assert any("fitted to sensors taken for 10 times as noisy" in note for note in said["notes"])
+    assert any(f"fitted to sensors taken for {followed:g} times as noisy" in note for note in said["notes"])
     # Innovations are held against the sensors' true noise, not that of coarse ones.
     assert max(size.slow for size in misfit.mean_sizes(told.before).values()) > 20
     assert max(size.slow for size in misfit.mean_sizes(told.after).values()) < 3
@@ -454,7 +455,7 @@ def test_coarse_sensors_blur_no_estimate(straight: Model) -> None:
     """A right model has the misfit that noise makes, and parameters are where sharp sensors have them."""
     one = log.check(sensors.measure(straight, gentle(straight, 20.0), seed=3), straight.machine)
     sharp = stages.fitted(straight.machine, [one], straight.machine.filter)
-    coarse = replace(sharp.prepared, records=tuple(replace(r, coarse=stages.COARSE) for r in sharp.prepared.records))
+    coarse = replace(sharp.prepared, records=tuple(replace(r, coarse=stages.COARSE[0]) for r in sharp.prepared.records))
     blurred = stages.refitted(straight.machine, replace(sharp, prepared=coarse), 0.0)
     assert not blurred.settled
     assert 0.5 < blurred.fit.cost / blurred.noise < 2
