@@ -23,7 +23,7 @@ ALARM = 1e-4  # chance of a false alarm of each test in a log
 WINDOWS = 0.5, 2.0  # [s]
 LOUDER = 1.6  # mean square of innovations in a window that counts, however sure
 STUCK = 3.0  # counts that an encoder should have made while it stood still
-SHAKING = 0.1  # of the sampling rate: above that a torque that is driven has nothing
+SHAKING = 10.0  # [Hz]: above that a torque that is driven has little
 FEW = 50  # samples by which shaking is told
 SURE = 3.0  # deviations
 TAIL = 1.6  # by which outliers of encoders may exceed those of normal noise: an edge's error is not normal
@@ -69,17 +69,17 @@ def anomalies(machine: Machine, sensors: tuple[Sensor, ...], log: Log, fit: Fit,
     return sorted(found, key=lambda a: -a.size)
 
 
-def shakes(u: np.ndarray, there: np.ndarray) -> bool:
-    """Whether a torque channel u (N,) is surely louder above SHAKING where `there` (N,) is one than where it is none;
-    also where that can't be told."""
+def shakes(u: np.ndarray, there: np.ndarray, rate: float) -> bool | None:
+    """Whether a torque channel u (N,), sampled at a rate [Hz], is surely louder above SHAKING where `there` (N,) is one
+    than where it is none; None where that can't be told."""
     inside, outside = there > 0.9, there < 0.1
-    few = min(int(inside.sum()), int(outside.sum()))
-    if few < FEW:
-        return True
-    high = scipy.signal.sosfiltfilt(scipy.signal.butter(4, 2 * SHAKING, "high", output="sos"), u)
-    told = 1 - 2 * SHAKING  # share of the samples that tell something new
-    spread = np.sqrt(2 / told * (1 / inside.sum() + 1 / outside.sum()))
-    return bool(np.mean(high[inside] ** 2) > (1 + SURE * spread) * np.mean(high[outside] ** 2))
+    if min(int(inside.sum()), int(outside.sum())) < FEW or rate < 4 * SHAKING:
+        return None
+    high = scipy.signal.sosfiltfilt(scipy.signal.butter(4, SHAKING, "high", fs=rate, output="sos"), u) ** 2
+    independent = 1 - 2 * SHAKING / rate  # share of the samples
+    # Medians: the steps of a drive are loud and rare. That of squares of normal noise scatters by 2.33 / sqrt(N).
+    spread = 2.33 * np.sqrt((1 / inside.sum() + 1 / outside.sum()) / independent)
+    return bool(np.median(high[inside]) > (1 + SURE * spread) * np.median(high[outside]))
 
 
 def _in_innovations(name: str, t: np.ndarray, z: np.ndarray, rate: float, counts: bool) -> Iterator[Anomaly]:

@@ -8,7 +8,7 @@ Where no model follows the logs, the first is chosen with coarse sensors (`sharp
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -180,8 +180,12 @@ def choose(
     likely = _likely(stage, scores, chosen, together)
     if not likely:
         return None
-    tries = _tries(stage, likely, together, lambda k: tell(done + 0.03 * k, f"fitting {likely[k].candidate.name}"))
-    if stage.exact and likely[0].candidate.name not in {s.candidate.name for s, _ in tries}:
+
+    def told(k: int) -> None:
+        tell(done + 0.03 * k, f"fitting {likely[k].candidate.name}")
+
+    tries, refused = _tries(stage, likely, together, told)
+    if stage.exact and likely[0].candidate.name not in {*refused, *(s.candidate.name for s, _ in tries)}:
         # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
         try:
             stage = refitted(stage.machine, stage, SMALL)
@@ -191,7 +195,7 @@ def choose(
         likely = _shortlist(stage, _scanned(stage, found, together), chosen)
         if not likely:
             return None
-        tries = _tries(stage, likely, together, lambda k: None)
+        tries, _ = _tries(stage, likely, together, lambda k: None)
     if not tries:
         return None
     score, best = tries[0]
@@ -230,7 +234,7 @@ def sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None
     if plain is not None and plain.near:
         return plain, []
     scores = scored(stage, together)
-    tries = _tries(stage, _likely(stage, scores, (), together), together, lambda k: None)
+    tries, _ = _tries(stage, _likely(stage, scores, (), together), together, lambda k: None)
     if not tries:
         return None
     _, best = tries[0]
@@ -288,11 +292,11 @@ def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate
 
 def _tries(
     stage: Stage, likely: Sequence[evidence.Score], together: Together, tell: Callable[[int], None]
-) -> list[_Try]:
+) -> tuple[list[_Try], set[str]]:
     """The candidates whose fits were found, as the model without them was fitted: the likeliest first, the others as
     long as they don't stay far behind what it gains. Those that promise far less than the best come last, and only
-    where they may still come near what was gained."""
-    tries: list[_Try] = []
+    where they may still come near what was gained. And the names that were fitted and are none: they are not felt."""
+    tries, refused = list[_Try](), set[str]()
     near = max(PAIR, sum(OVER * s.gain >= likely[0].gain for s in likely))
     for at, batch in ((0, likely[:1]), (1, likely[1:near]), (near, likely[near:])):
         gained = max((stage.fit.cost - found.fit.cost for _, found in tries), default=0.0)
@@ -303,22 +307,23 @@ def _tries(
         most = stage.fit.cost - BEHIND * gained if tries else np.inf
         for k, (score, found) in enumerate(zip(batch, refits(wishes, together, most), strict=True)):
             tell(min(at + k + 1, len(likely) - 1))
-            if found is not None:
+            if found is not None and _felt(score.candidate.name, found):
                 tries.append((score, found))
-    return [(score, stage) for score, stage in _one_each(tries) if _felt(score.candidate.name, stage)]
+            elif found is not None:
+                refused.add(score.candidate.name)
+    return _one_each(tries), refused
 
 
 def _felt(name: str, stage: Stage) -> bool:
-    """Whether the torque sensor shakes while an effect acts that shakes it; any other effect passes."""
-    entry, placed = entry_of(stage, name), stage.placed(name)
-    values = {"A": float(entry.amount), **{s: float(x) for s, x in entry.shape.items()}}
-    fitted, body = replace(placed, values=values), placed.bodies[0]
-    sensor = next((s for s in stage.machine.sensors("full") if s.kind == "torque" and s.body == body), None)
-    for one in stage.prepared.logs:
-        there = fitted.shaking(one.t)
-        if there is None or sensor is None or shakes(one.values[sensor.name], there):
-            return True
-    return False
+    """Whether the torque sensor shakes, in one of the logs, while an effect acts that shakes it; also where none of
+    them can tell, and of any other effect."""
+    fitted = placing.placed(stage.machine, entry_of(stage, name))
+    of = (s for s in stage.machine.sensors("full") if s.kind == "torque" and s.body == fitted.bodies[0])
+    sensor, rate = next(of, None), float(stage.machine.sampling_hz)
+    if sensor is None or fitted.effect.shaking is None:
+        return True
+    told = [shakes(x.values[sensor.name], fitted.shaking(x.t), rate) for x in stage.prepared.logs]
+    return any(told) or all(x is None for x in told)
 
 
 def _one_each(tries: Sequence[_Try]) -> list[_Try]:

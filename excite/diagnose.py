@@ -34,7 +34,7 @@ FORMULA = 0.5  # of an amount, times the root of the share of a gain that its fo
 # amounts in results/diagnosis are within intervals that allow for so much.
 OTHERWISE = 0.05
 FURTHER = 0.8  # SHARE for names after the first: what nature has beside its formula looks like many a cause
-SURELY, WRONG = 3.0, 0.2  # deviations, and a share of its usual size, by which a parameter's sign is wrong
+SURELY, WRONG = 3.0, 0.5  # deviations, and a share of its usual size, by which a parameter's sign is wrong
 ODD = 50.0  # misfit that every line of what is odd beside names stands for, at least
 
 
@@ -134,10 +134,7 @@ def diagnose(
         tell(0.9, "judging each given the others")
         chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
     stage = chosen[-1].stage if chosen else before
-    answer = concluded(before, stage, chosen, odd, left)
-    if answer.findings or nearest is None:
-        return answer
-    return replace(answer, verdict="unexplained", nearest=nearest)
+    return concluded(before, stage, chosen, odd, left, nearest)
 
 
 def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tuple[str, ...], Nearest | None]:
@@ -275,14 +272,16 @@ def _without(name: str, stage: Stage) -> Stage:
 
 
 def _odd(stage: Stage) -> tuple[str, ...]:
-    """What is left beside noise, a line each: innovations that are too large, and what stands out in them."""
+    """What is left beside noise, a line each: innovations that are too large, and what stands out in them, the most
+    striking first."""
     stage = as_measured(stage)
+    logs = stage.prepared.logs
     found = [
-        a
-        for k, log in enumerate(stage.prepared.logs)
+        (f"{log.source}: {a}" if len(logs) > 1 else str(a), a.size)
+        for k, log in enumerate(logs)
         for a in anomalies(stage.machine, stage.prepared.c.sensors, log, stage.fit, k)
     ]
-    return tuple(dict.fromkeys([*stage.suspects, *map(str, found)]))
+    return tuple(dict.fromkeys([*stage.suspects, *(line for line, _ in sorted(found, key=lambda x: -x[1]))]))
 
 
 def _impossible(stage: Stage) -> tuple[str, ...]:
@@ -291,8 +290,14 @@ def _impossible(stage: Stage) -> tuple[str, ...]:
     fit, base = stage.fit, stage.model.base
     of = signs(stage.machine) | {e.name: 1.0 for e in stage.model.effects if e.effect.resisting}
     sure = np.maximum(SURELY * stage.doubt * fit.std, WRONG * stage.model.scale)
-    all_of_them = zip(base.names, base.units, fit.X, sure, strict=True)
-    return tuple(f"{n} = {x:.4g} {unit}" for n, unit, x, far in all_of_them if of.get(n, 0.0) * x < -far)
+    found: list[str] = []
+    for k, (name, unit) in enumerate(zip(base.names, base.units, strict=True)):
+        # What stands for one standard parameter alone has its sign, whatever the machine file calls it.
+        alone = np.count_nonzero(base.matrix[k]) == 1
+        sign = of.get(base.standard[base.independent[k]], 0.0) if alone else 0.0
+        if sign * fit.X[k] < -sure[k]:
+            found.append(f"{name} = {fit.X[k]:.4g} {unit}")
+    return tuple(found)
 
 
 def _share(gained: float, stage: Stage, odd: Sequence[str]) -> float:
@@ -306,20 +311,32 @@ def _rest(stage: Stage, odd: Sequence[str]) -> float:
     return max(stage.excess, ODD * len(odd))
 
 
-def concluded(before: Stage, after: Stage, chosen: Sequence[Choice], odd: tuple[str, ...], left: float) -> Diagnosis:
-    """The verdict: what is named must explain most of the misfit, and what is left must be noise or be shown. left:
-    what a further effect would gain that was not worth a name."""
+def concluded(
+    before: Stage,
+    after: Stage,
+    chosen: Sequence[Choice],
+    odd: tuple[str, ...],
+    left: float,
+    nearest: Nearest | None = None,
+) -> Diagnosis:
+    """The verdict: what is named must explain most of the misfit, and what is left must be noise or be shown; where
+    something explains it and is no name, it is unexplained. left: what a further effect would gain that was not worth a
+    name."""
     share = 1.0
     if odd or not after.exact:
         share = _share(sum(x.gain for x in chosen), after, odd)
         left = max(left, _rest(after, odd))
     findings = tuple(_finding(x, after, left, alone=len(chosen) == 1) for x in chosen)
+    nearest = None if findings else nearest
     verdict = "clean"
     if findings:
         verdict = "tied" if any(f.tied_with for f in findings) else "named"
     if not after.settled or (odd and (share < choosing.SHARE or not findings)) or (not after.exact and not findings):
         verdict = "unexplained"
-    return Diagnosis(verdict, findings, before, after, share, odd, tuple(x.stage for x in chosen))
+    if nearest is not None:
+        verdict, share = "unexplained", 0.0
+    stages = tuple(x.stage for x in chosen)
+    return Diagnosis(verdict, findings, before, after, share, odd, stages, nearest)
 
 
 def _beside(choice: Choice, after: Stage) -> float:

@@ -135,7 +135,7 @@ def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
     alike = [b for b in alike if all(b[n] == own[n] for n in b if effect.shapes[n].whole)]
     if alike:
         varying = [n for n, s in effect.shapes.items() if not s.whole and len({b[n] for b in alike}) > 1]
-        families.append(_next_to(own, [{n: b[n] for n in varying} for b in alike], reach))
+        families += [_next_to(own, [{n: b[n] for n in varying} for b in alike], reach)] if varying else []
     for name, shape in effect.shapes.items() if not alike else ():
         if len(shape.grid) > 1 and not (shape.circular or shape.whole or name in unusual):
             families.append(_next_to(own, [{name: g * shape.size(site)} for g in shape.grid], reach))

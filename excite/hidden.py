@@ -104,10 +104,10 @@ def advice(model: Model, logs: Sequence[Samples], names: Sequence[str]) -> dict[
     for name in names:
         k = model.base.names.index(name)
         shown = np.array([_apart(t / level, k) for t in tried])
-        if not shown.max(initial=0.0) > 1e-6:
+        more = shown - _apart(here / level, k)  # a log that begins at rest shows a little as it is
+        if not more.max(initial=0.0) > 1e-6:
             found[name] = "no drive that was tried shows it apart from the others"
             continue
-        more = np.maximum(shown - _apart(here / level, k), 0.0)  # a log that begins at rest shows a little as it is
         best = options[int(np.argmax(more >= ENOUGH * more.max()))]
         rest = [c for k, c in enumerate(model.coordinates) if still[k] and k in best.coordinates]
         why = f"{', '.join(rest)} never move{'s' if len(rest) == 1 else ''} in this log: " if rest else ""

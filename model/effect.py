@@ -202,21 +202,29 @@ class Placed:
         named = {self.name: ("A", self.effect.unit)}
         return named | {f"{self.name}.{s}": (s, shape.unit) for s, shape in self.effect.shapes.items()}
 
-    def shaking(self, t: np.ndarray) -> np.ndarray | None:
-        """How much the torque sensor shakes, 0 to 1, at times t (N,) [s]; None of an effect that shakes none."""
-        if self.effect.shaking is None:
-            return None
-        time = ca.SX.sym("t")
-        felt = self.effect.shaking(time, {k: ca.SX(v) for k, v in self.values.items()})
-        return np.asarray(ca.Function("shaking", [time], [felt])(t[None]).full()[0])
+    def shaking(self, t: np.ndarray) -> np.ndarray:
+        """How much the effect shakes a torque sensor, 0 to 1, at times t (N,) [s]."""
+        hook = self.effect.shaking
+        assert hook is not None
+        (felt,) = self._over(t, lambda time, values: [hook(time, values)])
+        return felt
 
     def channel(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Gain, offset and delay (N,) that the effect gives a torque sensor at times t (N,) [s]."""
-        assert self.effect.channel is not None
-        time = ca.SX.sym("t")
-        own = self.effect.channel(time, {k: ca.SX(v) for k, v in self.values.items()})
-        told = [ca.SX(x) for x in (own.gain, own.offset, own.delay)]
-        read = ca.Function("channel", [time], told)
-        at = t[None] if ca.depends_on(ca.vertcat(*told), time) else 0.0
-        gain, offset, delay = (np.broadcast_to(x.full()[0], t.shape) for x in read(at))
+        hook = self.effect.channel
+        assert hook is not None
+
+        def told(time: ca.SX, values: Values) -> list[ca.SX]:
+            own = hook(time, values)
+            return [ca.SX(x) for x in (own.gain, own.offset, own.delay)]
+
+        gain, offset, delay = self._over(t, told)
         return gain, offset, delay
+
+    def _over(self, t: np.ndarray, hook: Callable[[ca.SX, Values], list[ca.SX]]) -> list[np.ndarray]:
+        """What a hook gives, each (N,), at times t (N,) [s]."""
+        time = ca.SX.sym("t")
+        told = hook(time, {k: ca.SX(v) for k, v in self.values.items()})
+        read = ca.Function("over", [time], told)
+        at = t[None] if ca.depends_on(ca.vertcat(*told), time) else 0.0
+        return [np.broadcast_to(x.full()[0], t.shape) for x in read.call([ca.DM(at)])]

@@ -580,7 +580,7 @@ _declare(
         "rolling_resistance",
         ("contacts",),
         "N",
-        "a force against the motion at the contact's centre",
+        "a force against the motion at the contact's centre: A (1 + rise V_x^2) tanh(V_x / soft)",
         "a force that turns with the direction of travel",
         "Bekker, Introduction to Terrain-Vehicle Systems, 1969",
         _weighing(0.002),

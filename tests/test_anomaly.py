@@ -8,27 +8,48 @@ import scipy.signal
 
 from excite.anomaly import shakes
 
-T = np.arange(6000) / 100
-THERE = ((T > 20) & (T < 32)).astype(float)
+
+def times(rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """A minute, and the twelve seconds of it in which something acts."""
+    t = np.arange(round(60 * rate)) / rate
+    return t, ((t > 20) & (t < 32)).astype(float)
 
 
-def driven(seed: int) -> np.ndarray:
-    """A torque as a person drives it, with a sensor's noise."""
+def driven(seed: int, t: np.ndarray, steps: bool) -> np.ndarray:
+    """A torque as a person drives it, or in ramps from step to step, with a sensor's noise."""
     rng = np.random.default_rng(seed)
-    slow = scipy.signal.sosfiltfilt(scipy.signal.butter(2, 0.02, output="sos"), rng.normal(size=len(T)))
-    return np.asarray(8000 * slow + 40 * rng.normal(size=len(T)))
+    if steps:
+        knots = np.repeat(rng.uniform(-3000, 3000, 40), 2)
+        slow = np.interp(t, np.sort(np.concatenate([np.arange(40) * 1.5, np.arange(40) * 1.5 + 1.2])), knots)
+    else:
+        rate = 1 / (t[1] - t[0])
+        low = scipy.signal.butter(2, 1.0, fs=rate, output="sos")
+        slow = scipy.signal.sosfiltfilt(low, rng.normal(size=len(t))) * 80 * np.sqrt(rate)
+    return np.asarray(slow + 40 * rng.normal(size=len(t)))
 
 
-@pytest.mark.parametrize("frequency", [18.0, 29.3, 45.0, 61.0])
-def test_a_channel_shakes_where_a_vibration_is_on_it(frequency: float) -> None:
-    """Down to an amplitude below its noise; also at a frequency that the sampling folds."""
-    shaken = [driven(k) + 30 * THERE * np.sin(2 * np.pi * frequency * T) for k in range(20)]
-    assert all(shakes(u, THERE) for u in shaken)
+@pytest.mark.parametrize("steps", [False, True])
+@pytest.mark.parametrize(("rate", "frequency"), [(50, 18.0), (100, 18.0), (100, 29.3), (100, 61.0), (1000, 27.0)])
+def test_a_channel_shakes_where_a_vibration_is_on_it(rate: float, frequency: float, steps: bool) -> None:
+    """Of an amplitude like that of its noise; also at a frequency that the sampling folds."""
+    t, there = times(rate)
+    shaken = [driven(k, t, steps) + 50 * there * np.sin(2 * np.pi * frequency * t) for k in range(20)]
+    assert sum(bool(shakes(u, there, rate)) for u in shaken) >= 19
 
 
-def test_no_channel_shakes_of_its_noise() -> None:
-    assert sum(shakes(driven(k), THERE) for k in range(200)) <= 2
+@pytest.mark.parametrize("steps", [False, True])
+@pytest.mark.parametrize("rate", [50, 100, 1000])
+def test_no_channel_shakes_of_its_noise(rate: float, steps: bool) -> None:
+    t, there = times(rate)
+    told = [shakes(driven(k, t, steps), there, rate) for k in range(60)]
+    assert None not in told
+    assert sum(map(bool, told)) <= 2
 
 
-def test_what_is_always_there_cannot_be_told() -> None:
-    assert shakes(driven(0), np.ones(len(T)))
+def test_what_cannot_be_told() -> None:
+    """What is always there, or never, and a rate at which no vibration is seen."""
+    t, there = times(100)
+    assert shakes(driven(0, t, False), np.ones(len(t)), 100) is None
+    assert shakes(driven(0, t, False), np.zeros(len(t)), 100) is None
+    t, there = times(20)
+    assert shakes(driven(0, t, False), there, 20) is None

@@ -5,7 +5,9 @@ The logs come from a second roller that shares no code with the program (`plant`
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,8 @@ from visibility import VISIBLE, visibility
 from excite import log as logs
 from excite.identify import identify
 from model.prediction import Model
+
+ROOT = Path(__file__).parents[1]
 
 
 def slalom(*hidden: Hidden, kind: str = "cause", kit: str = "full", seed: int = 5, duration: float = 60) -> Case:
@@ -212,6 +216,17 @@ PLAIN = {  # of each cause the first minute of driving in which it is ten times 
     "payload_shift": 1,
     "relief_valve": 0,
 }
+
+
+def test_the_study_takes_cases_that_no_test_knows() -> None:
+    spec = importlib.util.spec_from_file_location("study", ROOT / "results" / "diagnosis" / "study.py")
+    assert spec is not None
+    assert spec.loader is not None
+    study = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(study)
+    assert max(PLAIN.values()) < study.FRESH["cause"]
+    assert study.FRESH["surprise"] > 4
+    assert study.FRESH["pair"] > 20
 
 
 @pytest.mark.slow

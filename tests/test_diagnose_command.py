@@ -226,6 +226,53 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
     assert [x.name for x in diagnose.needed(found.before, left)] == names
 
 
+def test_what_no_machine_has_is_no_name(straight: Model, straight_motion: Motion) -> None:
+    """Friction that drives, by whatever name the file calls it, or a resistance that pushes: unexplained, with what
+    comes nearest and why it is none; as plain as it may be otherwise, and with nothing left that is odd."""
+    entry = placing.parse("rolling_resistance@rear_roll=400", straight.machine, 40.0)
+    one = log.check(sensors.measure(straight, straight_motion, seed=3), straight.machine)
+    before = stages.fitted(straight.machine, [one], straight.machine.filter)
+    after = stages.refitted(placing.extended(straight.machine, entry), before, 0.0)
+    names = after.model.base.names
+
+    def said(name: str, value: float) -> diagnose.Diagnosis:
+        X = after.fit.X.copy()
+        X[names.index("rolling_resistance@rear_roll")] = 400.0
+        X[names.index(name)] = value
+        stage = replace(after, fit=replace(after.fit, X=X, covariance=np.diag((0.01 * X) ** 2)))
+        chosen = [choosing.Choice("rolling_resistance@rear_roll", stage, 1000.0, 1.0, 100, (), 1.0)]
+        kept, odd, nearest = diagnose.weighed(before, chosen)
+        return diagnose.concluded(before, kept[-1].stage if kept else before, kept, odd, 0.0, nearest)
+
+    assert said("Fs4", 150.0).verdict == "named"
+    for name, value in (("Fs4", -150.0), ("Fv1", -90.0), ("Kx4", 1e5), ("rolling_resistance@rear_roll", -400.0)):
+        d = said(name, value)
+        assert (d.verdict, d.findings, d.share) == ("unexplained", (), 0.0)
+        assert d.nearest is not None
+        assert (d.nearest.name, len(d.nearest.impossible)) == ("rolling_resistance@rear_roll", 1)
+        assert d.nearest.impossible[0].startswith(f"{name} = -" if value < 0 else f"{name} = 1e+05")
+        assert "which no machine has" in findings.answer(findings.account(d))
+
+
+def test_a_vibration_shakes_a_sensor_in_one_log_at_least(straight: Model) -> None:
+    """A log too short to tell says nothing either way."""
+    entry = placing.parse("vibration_on@rear_roll=0.3", straight.machine, 20.0)
+    told = {"begin": 5.0, "length": 6.0, "shake": 80.0, "frequency": 27.0}
+    entry = entry.model_copy(update={"shape": {n: Quantity(value=v, source="assumed") for n, v in told.items()}})
+    shaken = prediction.build(placing.extended(straight.machine, entry))
+    quiet, loud = (log.check(sensors.measure(m, gentle(m, 20.0), seed=3), straight.machine) for m in (straight, shaken))
+    short = log.check(sensors.measure(straight, gentle(straight, 4.0), seed=4), straight.machine)
+    for logs, felt in (
+        ([loud], True),
+        ([quiet], False),
+        ([short], True),
+        ([short, quiet], False),
+        ([quiet, loud], True),
+    ):
+        stage = stages.fitted(shaken.machine, logs, straight.machine.filter)
+        assert choosing._felt("vibration_on@rear_roll", stage) == felt
+
+
 def test_what_a_process_found_can_be_sent_back(straight: Model, straight_motion: Motion) -> None:
     """An answer that can't be sent would be computed again in silence."""
 

@@ -485,3 +485,13 @@ def test_noise_of_torques_is_no_gain_and_no_delay() -> None:
     every = evidence.candidates(VA12, [s.name for s in plain.prepared.c.sensors], 60.0)
     scores = evidence.scan(plain.prepared.c, plain.prepared.records, plain.fit, every)
     assert max(s.gain for s in scores if s.candidate.name == "channel_delay@articulation") < 12
+
+
+@pytest.mark.parametrize("duration", [2.0, 5.0, 7.0, 10.0, 12.0, 15.0, 60.0])
+def test_every_candidate_can_be_tried_closer(duration: float) -> None:
+    """Also in logs so short that there is one point to try."""
+    every = evidence.candidates(VA12, [s.name for s in VA12.sensors("full")], duration)
+    assert len(every) > 100
+    for x in every:
+        nearby = evidence.finer([evidence.Score(x, 1.0, x.placed.values, 1.0)], VA12, duration)
+        assert all(y.name == x.name for y in nearby)
