@@ -229,7 +229,8 @@ def told(s: dict[str, Any], planned: int) -> str:
     return f"""# Does the diagnosis name what was hidden?
 
 `python results/diagnosis/study.py` rebuilds this page; [summary.json](summary.json) has every rate,
-[cases.csv](cases.csv) every case.{part}
+[cases.csv](cases.csv) every case.{part} Nobody had looked at any of them while the diagnosis was written: their numbers
+begin where those end that it was mended by, which `--seen` runs instead.
 
 A second roller (`tests/plant.py`) shares no code with the program: Lagrange's equations in ground coordinates by
 automatic differentiation, half-millisecond Runge-Kutta steps, a person with delay, slow hand and hydraulics at the

@@ -24,10 +24,10 @@ from scipy.optimize import least_squares
 
 from excite.figures import COLOURS, STYLES, save
 from model import contact
-from model.effect import Rolling, Scene, Soil
+from model.effect import DURATION, Rolling, Scene, Site, Soil
 from model.effects import CATALOGUE
 from model.file import Quantity
-from model.machine import Contact
+from model.machine import Contact, load
 
 HERE = Path(__file__).parent
 DATA = HERE.parents[2] / "shared" / "data" / "cmu_single_wheel" / "smooth_wheel.csv"
@@ -47,6 +47,8 @@ WHEEL = Contact(
     Ky=quantity(-1.0),
     v_eps=quantity(1e-6),
 )
+ROLLER = load("va12")
+USUAL = Site(ROLLER, ROLLER.contacts[0], DURATION)  # shapes of effects are as in any other machine
 
 
 def force(names: Sequence[str]) -> tuple[ca.Function, list[str], np.ndarray]:
@@ -62,14 +64,17 @@ def force(names: Sequence[str]) -> tuple[ca.Function, list[str], np.ndarray]:
     scene = Scene(none, none, none, none, {}, {}, {1: rolling}, none, ca.SX(0))
     pushed = ca.SX(0)
     for k, name in enumerate(names):
-        effect, values = CATALOGUE[name], {"A": p[k + 1]}
+        effect = CATALOGUE[name]
+        shapes = {s: ca.SX(x.default * x.size(USUAL)) for s, x in effect.shapes.items()}
+        values = {"A": p[k + 1], **shapes}
         labels.append(name)
         first.append({"shear_saturation": 0.3, "drive_brake_asymmetry": 1.0, "rolling_resistance": 1.0}[name])
         if effect.soil is not None:
             soil = effect.soil(scene, 1, values, soil)
         if effect.push is not None:
             pushed += effect.push(scene, 1, values)[0]
-    w = contact.wrench(WHEEL, soil.slip, soil.yaw, soil.Kx, soil.Ky, soil.saturation, soil.lateral)
+    how = soil.saturation, soil.lateral, soil.strips, soil.untouched
+    w = contact.wrench(WHEEL, soil.slip, soil.yaw, soil.Kx, soil.Ky, *how)
     return ca.Function("force", [V, rim, p], [w.Sx + pushed]), labels, np.array(first)
 
 
