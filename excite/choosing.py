@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.stats
 
 from excite import evidence, smoothing
 from excite.anomaly import shakes
@@ -26,6 +27,7 @@ from model.machine import EffectEntry
 # Of twice the log-likelihood that an effect must gain; logs without any stayed below 16. For all candidates of va12
 # together chi-squared gives 0.8 % of logs of a minute above it, 1 % of longer ones, whatever their number of shapes.
 LEVEL = 22.0
+CHANCE = 0.05  # p-value above which no effect has a name: those with many shapes must gain more than LEVEL
 WORTH = 15.0  # a first-order gain below which a candidate isn't fitted
 HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
 TRIED = 5  # candidates that are fitted
@@ -77,6 +79,16 @@ def wald(name: str, stage: Stage) -> float:
     held, as nothing shows it."""
     k, fit = stage.model.base.names.index(name), stage.fit
     return 0.0 if fit.unseen[k] else float((fit.X[k] / fit.std[k]) ** 2)
+
+
+def freedom(name: str, stage: Stage) -> int:
+    """How many parameters an effect has in a model: its amount and the shapes that are fitted."""
+    return sum(n == name or n.startswith(f"{name}.") for n in stage.model.base.names)
+
+
+def threshold(name: str, stage: Stage, tried: int) -> float:
+    """What an effect must gain of twice the log-likelihood to be one, of so many candidates that were tried."""
+    return max(LEVEL, float(scipy.stats.chi2.isf(CHANCE / tried, freedom(name, stage))))
 
 
 def _sureness(stage: Stage) -> float:
@@ -200,7 +212,8 @@ def choose(
         return None
     score, best = tries[0]
     gain = stage.fit.cost - best.fit.cost
-    if gain < max(LEVEL * best.spread, _least(stage, chosen, score.candidate)):
+    level = threshold(score.candidate.name, best, len(scores))
+    if gain < max(level * best.spread, _least(stage, chosen, score.candidate)):
         return None
     return _chosen(tries, gain, len(scores), together)
 

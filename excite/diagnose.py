@@ -230,7 +230,7 @@ def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
             without = _without(x.name, whole)
             if without.fit.disturbed <= whole.fit.disturbed:
                 beside = without.fit.cost - whole.fit.cost
-        if beside < choosing.LEVEL:
+        if beside < choosing.threshold(x.name, whole, x.tried):
             kept, whole = [y for y in kept if y.name != x.name], without
         else:
             kept = [replace(y, beside=beside) if y.name == x.name else y for y in kept]
@@ -364,10 +364,9 @@ def _finding(choice: Choice, after: Stage, left: float, alone: bool) -> Finding:
         s: (*values.get(f"{placed.name}.{s}", (placed.values[s], 0.0)), shape.unit)
         for s, shape in placed.effect.shapes.items()
     }
-    added = sum(n == placed.name or n.startswith(placed.name + ".") for n in after.model.base.names)
     gain = choice.gain / choice.spread
     told = gain if alone else min(gain, _beside(choice, after))  # the gain of one of several is that on the way to them
-    p = min(1.0, choice.tried * float(scipy.stats.chi2.sf(told, added)))
+    p = min(1.0, choice.tried * float(scipy.stats.chi2.sf(told, choosing.freedom(choice.name, after))))
     return Finding(
         placed.effect.name,
         placed.where,

@@ -226,6 +226,24 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
     assert [x.name for x in diagnose.needed(found.before, left)] == names
 
 
+def test_what_gets_a_name_is_no_chance(straight: Model, straight_motion: Motion) -> None:
+    """The more shapes an effect has, the more it must gain; with just that much its p-value is at most CHANCE."""
+    told = ("torque_gain@rear_roll=0.1", "stribeck_friction@rear_roll=150", "vibration_on@rear_roll=0.2")
+    entries = [placing.parse(text, straight.machine, 40.0) for text in told]
+    has = prediction.build(placing.extended(straight.machine, *entries))
+    motion = simulate(has, straight_motion.u, q0=straight_motion.q[0], nu0=straight_motion.nu[0])
+    stage = stages.fitted(
+        has.machine, [log.check(sensors.measure(has, motion, seed=3), has.machine)], has.machine.filter
+    )
+    names = [e.name for e in stage.model.effects]
+    assert [choosing.freedom(n, stage) for n in names] == [1, 2, 3]
+    levels = [choosing.threshold(n, stage, 2000) for n in names]
+    assert levels[0] == choosing.LEVEL <= levels[1] < levels[2]
+    for name, level in zip(names, levels, strict=True):
+        chosen = [choosing.Choice(name, stage, level, 1.0, 2000, (), 1.0)]
+        assert diagnose.concluded(stage, stage, chosen, (), 0.0).findings[0].p_value <= choosing.CHANCE * 1.000001
+
+
 def test_what_no_machine_has_is_no_name(straight: Model, straight_motion: Motion) -> None:
     """Friction that drives, by whatever name the file calls it, or a resistance that pushes: unexplained, with what
     comes nearest and why it is none; as plain as it may be otherwise, and with nothing left that is odd."""
