@@ -330,10 +330,12 @@ def _tries(
 def _felt(name: str, stage: Stage) -> bool:
     """Whether the torque sensor shakes, in one of the logs, while an effect acts that shakes it; also where none of
     them can tell, and of any other effect."""
+    if stage.placed(name).effect.shaking is None:
+        return True
     fitted = placing.placed(stage.machine, entry_of(stage, name))
     of = (s for s in stage.machine.sensors("full") if s.kind == "torque" and s.body == fitted.bodies[0])
     sensor, rate = next(of, None), float(stage.machine.sampling_hz)
-    if sensor is None or fitted.effect.shaking is None:
+    if sensor is None:
         return True
     told = [shakes(x.values[sensor.name], fitted.shaking(x.t), rate) for x in stage.prepared.logs]
     return any(told) or all(x is None for x in told)

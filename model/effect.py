@@ -47,6 +47,11 @@ class Soil:
     strips: ca.SX | float = 1.0
     untouched: ca.SX | float = 0.0
 
+    def wrench(self, on: Contact) -> law.Wrench:
+        """What it does to a contact."""
+        how = self.saturation, self.lateral, self.strips, self.untouched
+        return law.wrench(on, self.slip, self.yaw, self.Kx, self.Ky, *how)
+
 
 @dataclass(frozen=True)
 class Scene:

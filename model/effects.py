@@ -11,25 +11,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from math import log, pi
+from math import pi
 
 import casadi as ca
 
 from model import contact as law
+from model import lane
 from model.effect import Channel, Effect, Memory, Rolling, Scene, Shape, Site, Soil, Values
 from model.machine import Body, Machine
 
 GRAVITY = 9.81
 SMOOTH_SLIP = 0.005  # slip over which driving turns into braking
-SMOOTH_SPEED = 0.02  # [m/s] over which a force against the motion turns
+SMOOTH_SPEED = 0.02  # [m/s] over which rolling resistance turns
 SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
 
-BACK = 0.1  # [m] of way back, within which a reversal counts
 MOMENTS = 120  # at which a load is looked for that slides
 PRESSED = 0.1  # [rad] beyond a stop, at which its hardening is stated
 BEHIND = 2.0  # [m] from the joint, where a load is put on or taken off
-LANE = 10.0  # [m] of way that a pass is worth where these are counted
-EDGE = 0.3  # [m] within which the end of a lane is felt
 
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
 
@@ -110,63 +108,20 @@ def _scaled(soil: Soil, factor: ca.SX) -> Soil:
     return replace(soil, Kx=soil.Kx * factor, Ky=soil.Ky * factor)
 
 
-def _way(s: Scene, k: int) -> tuple[ca.SX, ca.SX]:
-    """Speed of a contact's centre, forward or back, nothing at standstill, and which way it goes, 1 or -1."""
-    Vx = s.rolling[k].Vx
-    ahead = ca.tanh(Vx / SMOOTH_SPEED)
-    return Vx * ahead, ahead
-
-
-def _facing(s: Scene, k: int, p: Values) -> ca.SX:
-    """How fast the direction that a contact remembers follows the one that it goes."""
-    way, ahead = _way(s, k)
-    return way * (ahead - s.z["facing"]) / BACK
-
-
-def _reversing(s: Scene, k: int, p: Values) -> ca.SX:
-    """One for each reversal: against the direction that it remembers, which is 0 before any and turns 2 exp(-x) - 1."""
-    way, ahead = _way(s, k)
-    return ca.fmax(-way * ahead * s.z["facing"], 0) / (BACK * (1 - log(2)))
-
-
-def _beyond(name: str, side: float) -> Callable[[Scene, int, Values], ca.SX]:
-    """How fast an end of the lane is moved on by the contact that is there, a little behind it."""
-
-    def rate(s: Scene, k: int, p: Values) -> ca.SX:
-        return side * _way(s, k)[0] * ca.fmax(side * (s.z["place"] - s.z[name]), 0) / EDGE
-
-    return rate
-
-
-def _passes(s: Scene, k: int) -> ca.SX:
-    """How often contacts have passed over the place where one is: every one has been on a stretch of the lane of its
-    own, about as often anywhere on it, and where the lane ends the ground is new. Contacts behind each other follow one
-    track, also in a bend; those beside each other count as far as they overlap."""
-    own = s.rolling[k]
-    length = s.z["farthest"] - s.z["nearest"]
-    often = s.z["distance"] / (length + EDGE)
-    passes = ca.SX(0)
-    for j, other in s.rolling.items():
-        width = max((float(own.contact.width) + float(other.contact.width)) / 2, EDGE)
-        overlap = max(0.0, 1 - abs(own.y - other.y) / width)
-        ahead = own.x - other.x + s.z["place"]
-        low, high = (
-            (1 + ca.tanh(3 * (room / EDGE + 0.5))) / 2 for room in (s.z["farthest"] - ahead, ahead - s.z["nearest"])
-        )
-        passes += overlap * low * high * ca.fmax(often - 0.5 * (j == k), 1)  # its own last one isn't complete
-    return passes * length / (length + EDGE)
+def _of_three(form: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Weights of three forms 0, 1, 2 that a shape chooses from: one for that form, none for the others."""
+    return (1 - form) * (2 - form) / 2, form * (2 - form), form * (form - 1) / 2
 
 
 def _compacted(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
-    form = p["counted"]
-    way = (1 - form) * (2 - form) / 2 * s.z["distance"] + form * (2 - form) * LANE * s.z["reversals"]
-    way += form * (form - 1) / 2 * LANE * _passes(s, k)
+    driven, reversed_, passed = _of_three(p["counted"])
+    way = driven * s.z["distance"] + lane.PASS * (reversed_ * s.z["reversals"] + passed * lane.passes(s, k))
     return _scaled(soil, 1 + p["A"] * (1 - ca.exp(-way / p["pass"])))
 
 
 def _saturated(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
-    form = p["across"]
-    return replace(soil, saturation=p["A"], strips=(1 - form) * (2 - form) / 2, untouched=form * (form - 1) / 2)
+    strips, _, untouched = _of_three(p["across"])
+    return replace(soil, saturation=p["A"], strips=strips, untouched=untouched)
 
 
 def _between(t: ca.SX, begin: ca.SX, end: ca.SX, width: float) -> ca.SX:
@@ -522,18 +477,11 @@ _declare(
                 whole=True,
                 only=(0.0, 1.0, 2.0),
                 meaning=f"0: n is the way; 1: passes are counted by reversals; 2: place by place along the lane, for"
-                f" every contact; a pass is worth {LANE:g} m of way",
+                f" every contact; a pass is worth {lane.PASS:g} m of way",
             ),
         },
         soil=_compacted,
-        memory={
-            "distance": Memory(lambda s, k, p: _way(s, k)[0], 1e-6),
-            "facing": Memory(_facing, 1e-6),
-            "reversals": Memory(_reversing, 1e-6),
-            "place": Memory(lambda s, k, p: s.rolling[k].Vx, 1e-6),
-            "farthest": Memory(_beyond("farthest", 1.0), 1e-6),
-            "nearest": Memory(_beyond("nearest", -1.0), 1e-6),
-        },
+        memory=lane.MEMORY,
         beside=lambda site: [{"pass": x, "counted": form} for form in (1.0, 2.0) for x in (5.0, 15.0, 50.0)],
         positive=True,
     ),

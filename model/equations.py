@@ -12,8 +12,8 @@ from functools import cached_property
 
 import casadi as ca
 
-from model import contact, placing, tree
 from model import effects as catalogue
+from model import placing, tree
 from model.effect import Placed, Rolling, Scene, Soil, Values
 from model.machine import Body, Machine, MachineError
 
@@ -340,8 +340,7 @@ def _soil(s: Sample, body: Body, rolling: Rolling) -> Soil:
 def _pushed(body: Body, soil: Soil, lever: ca.SX) -> ca.SX:
     """Generalised force (n_q,) of a contact (11), by virtual power."""
     assert body.contact is not None
-    how = soil.saturation, soil.lateral, soil.strips, soil.untouched
-    w = contact.wrench(body.contact, soil.slip, soil.yaw, soil.Kx, soil.Ky, *how)
+    w = soil.wrench(body.contact)
     return lever.T @ ca.vertcat(w.Sx, w.Sy, -float(body.contact.radius) * w.Sx, -w.Tz)
 
 

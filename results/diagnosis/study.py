@@ -27,6 +27,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
+KEPT = ROOT / "results" / ".diagnosis"
 sys.path.insert(0, str(ROOT / "tests"))
 
 import joblib
@@ -42,6 +43,15 @@ from visibility import VISIBLE, visibility
 Row = dict[str, Any]
 FRESH = {"nothing": 200, "cause": 10, "surprise": 5, "pair": 21}  # numbers below were looked at when mending
 GOOD = ("right", "tied")  # a tie that holds the cause sends nobody to repair the wrong thing
+ROLLER = [ROOT / "tests" / n for n in ("plant.py", "causes.py", "surprises.py", "blind.py", "visibility.py")]
+
+
+def _digits(files: Sequence[Path]) -> str:
+    seen = hashlib.sha1()
+    for file in dict.fromkeys(files):
+        if file.is_file():
+            seen.update(file.read_bytes())
+    return seen.hexdigest()[:8]
 
 
 def version() -> str:
@@ -49,13 +59,7 @@ def version() -> str:
     files = sorted([*(ROOT / "model").rglob("*.py"), *(ROOT / "model").rglob("*.toml")])
     names = ("diagnose", "choosing", "stages", "misfit", "findings", "evidence", "innovations", "smoothing", "newton")
     names += ("linearise", "chain", "record", "gain", "hidden", "processing", "sensors", "anomaly", "log", "estimate")
-    files += [ROOT / "excite" / f"{n}.py" for n in names]
-    files += [ROOT / "tests" / n for n in ("plant.py", "causes.py", "surprises.py", "blind.py", "visibility.py")]
-    seen = hashlib.sha1()
-    for file in dict.fromkeys(files):
-        if file.is_file():
-            seen.update(file.read_bytes())
-    return seen.hexdigest()[:8]
+    return _digits([*files, *(ROOT / "excite" / f"{n}.py" for n in names), *ROLLER])
 
 
 def cases(wanted: Mapping[str, int], first: Mapping[str, int]) -> list[Case]:
@@ -71,12 +75,30 @@ def cases(wanted: Mapping[str, int], first: Mapping[str, int]) -> list[Case]:
     return [c for _, c in sorted(every, key=lambda both: both[0])]
 
 
+def _kept(file: Path, row: Row) -> None:
+    part = file.with_suffix(f".{os.getpid()}.part")
+    part.write_text(json.dumps(row, default=float))
+    os.replace(part, file)
+
+
+def driven(one: Case) -> tuple[pd.DataFrame, float]:
+    """The log of a case and how visible its cause is: kept too, as the program has no part in it."""
+    kept = KEPT / f"driven-{_digits(ROLLER)}"
+    kept.mkdir(parents=True, exist_ok=True)
+    log, file = kept / f"{one.key}.parquet", kept / f"{one.key}.json"
+    if not file.exists():
+        drive = blind(one)
+        drive.log.to_parquet(log)
+        _kept(file, {"visibility": visibility(drive)})  # last: a log without it is driven again
+    return pd.read_parquet(log), float(json.loads(file.read_text())["visibility"])
+
+
 def judged(one: Case, kept: Path) -> None:
     """Drives a case, has it diagnosed, judges it and keeps the row."""
     file = kept / f"{one.key}.json"
     if file.exists():
         return
-    seen = blind(one)
+    log, seen = driven(one)
     row: Row = {
         "key": one.key,
         "kind": one.kind,
@@ -85,20 +107,18 @@ def judged(one: Case, kept: Path) -> None:
         "manoeuvre": one.manoeuvre,
         "duration_s": one.duration,
         "kit": one.kit,
-        "visibility": visibility(seen),
+        "visibility": seen,
     }
     begin = time.perf_counter()
     try:
-        said = ask(seen.log)
+        said = ask(log)
         row |= {"error": None, "verdict": said["verdict"], "findings": said["findings"], **asdict(score(one, said))}
         kept_too = ("error_before_percent", "error_after_percent", "share_explained", "nearest", "located")
         row |= {k: said[k] for k in kept_too}
     except RuntimeError as err:
         row |= {"error": str(err), "verdict": None, "findings": [], "outcome": "failed", "named": "failed"}
     row["wall_s"] = time.perf_counter() - begin
-    part = file.with_suffix(f".{os.getpid()}.part")
-    part.write_text(json.dumps(row, default=float))
-    os.replace(part, file)
+    _kept(file, row)
 
 
 # ------------------------------------------------------------------------------------------------------ figures
@@ -271,14 +291,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--pairs", type=int, default=12)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seen", action="store_true", help="cases from number 0, by which the diagnosis was mended")
+    parser.add_argument("--drive", action="store_true", help="drive the second roller only, nothing is diagnosed yet")
     parser.add_argument("--only", default="", help="cases whose key begins like this, nothing else is written")
     parser.add_argument("--out", type=Path, default=HERE)
     given = parser.parse_args(argv)
-    kept = ROOT / "results" / ".diagnosis" / version()
+    kept = KEPT / version()
     kept.mkdir(parents=True, exist_ok=True)
     many = {"nothing": given.nothing, "cause": given.per_cause, "surprise": given.per_surprise, "pair": given.pairs}
     every = cases(many, dict.fromkeys(FRESH, 0) if given.seen else FRESH)
     wanted = [c for c in every if c.key.startswith(given.only)]
+    if given.drive:
+        joblib.Parallel(n_jobs=given.jobs or 1, verbose=5)(joblib.delayed(driven)(c) for c in wanted)
+        return
     if given.jobs:
         joblib.Parallel(n_jobs=given.jobs, verbose=5)(joblib.delayed(judged)(c, kept) for c in wanted)
     files = [kept / f"{c.key}.json" for c in wanted]

@@ -73,9 +73,7 @@ def force(names: Sequence[str]) -> tuple[ca.Function, list[str], np.ndarray]:
             soil = effect.soil(scene, 1, values, soil)
         if effect.push is not None:
             pushed += effect.push(scene, 1, values)[0]
-    how = soil.saturation, soil.lateral, soil.strips, soil.untouched
-    w = contact.wrench(WHEEL, soil.slip, soil.yaw, soil.Kx, soil.Ky, *how)
-    return ca.Function("force", [V, rim, p], [w.Sx + pushed]), labels, np.array(first)
+    return ca.Function("force", [V, rim, p], [soil.wrench(WHEEL).Sx + pushed]), labels, np.array(first)
 
 
 def fitted(
