@@ -18,7 +18,7 @@ from excite.anomaly import shakes
 from excite.log import Log
 from excite.newton import NotConverged
 from excite.sidebyside import Together
-from excite.stages import SMALL, Stage, begun, exact_if_near, freed, refits, refitted, sharpened
+from excite.stages import FAR, SMALL, Stage, begun, exact_if_near, freed, refits, refitted, sharpened
 from model import placing
 from model.effect import Effect
 from model.file import Quantity
@@ -32,6 +32,7 @@ WORTH = 15.0  # a first-order gain below which a candidate isn't fitted
 HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
 TRIED = 5  # candidates that are fitted
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
+ANEW = 12  # effects that begin anew where nothing was found
 PAIR = 2  # candidates whose fits are begun in any case
 BEHIND = 0.5  # share of what was gained already that further candidates must have come to after a few passes
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
@@ -257,14 +258,14 @@ def sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None
     alike = [x for x in tries if stage.fit.cost - x[1].fit.cost >= LIKE * gain]
     for disturbed in (0.0, smoothing.DISTURBED[0]) if gain >= SHARE * (gain + best.excess) else (0.0,):
         sharp = zip(alike, sharpened([x for _, x in alike], disturbed, together), strict=True)
-        near = _one_each([(score, x) for (score, _), x in sharp if x is not None and x.near])
+        near = _one_each([(score, x) for (score, _), x in sharp if x is not None and x.follows])
         if near:
             score, best = near[0]
             sure = wald(score.candidate.name, best)  # of the same kind as a gain, and smaller where that is large
             if sure < LEVEL * best.spread:
                 return None
             # Far from no effect Wald's statistic says too much, and further effects are measured by it.
-            sure = min(sure, stage.prepared.coarse * gain)
+            sure = min(sure, max(stage.prepared.coarse * gain, FAR * best.noise - best.fit.cost))
             return stage, [_chosen(near, sure, len(scores), together)]
     return None
 
@@ -275,10 +276,28 @@ def unfollowed(stage: Stage, together: Together) -> tuple[Stage, list[Choice]]:
     good: the model began too far off. The stage as it was and no effect where nothing helps."""
     scores = scored(stage, together)
     likely = _likely(stage, scores, (), together)
+    forces = 0.0, smoothing.DISTURBED[0], smoothing.DISTURBED[-1]
+    return _followed(stage, likely, forces, len(scores), together) or (stage, [])
+
+
+def unlikely(scanned: Stage, stage: Stage, together: Together) -> tuple[Stage, list[Choice]]:
+    """Where nothing was found that explains the logs: far from any fit an effect promises little of what it explains,
+    or something else does. So those that promise anything in a stage, scanned, begin anew with exact dynamics, which
+    follow the logs with the right one only. As `unfollowed` has it."""
+    scores = scored(scanned, together)
+    best = {s.candidate.name: s for s in reversed(scores) if s.values["A"] != 0}
+    most = sorted(best.values(), key=lambda s: -s.gain)[:ANEW]
+    return _followed(stage, most, (0.0,), len(scores), together) or (stage, [])
+
+
+def _followed(
+    stage: Stage, likely: Sequence[evidence.Score], forces: Sequence[float], tried: int, together: Together
+) -> tuple[Stage, list[Choice]] | None:
+    """The effect with which a model can follow the logs from the beginning, with the first forces that do."""
     machines = [placing.extended(stage.machine, _entry(s)) for s in likely]
-    for disturbed in (0.0, smoothing.DISTURBED[0], smoothing.DISTURBED[-1]) if likely else ():
+    for disturbed in forces if likely else ():
         found = begun(machines, stage, disturbed, together)
-        near = [(s, x) for s, x in zip(likely, found, strict=True) if x is not None and x.near]
+        near = [(s, x) for s, x in zip(likely, found, strict=True) if x is not None and x.follows]
         near = [(s, x) for s, x in near if _felt(s.candidate.name, x)]
         if not near:
             continue
@@ -292,8 +311,8 @@ def unfollowed(stage: Stage, together: Together) -> tuple[Stage, list[Choice]]:
             gain = wald(score.candidate.name, best)  # of the same kind, and smaller where much is gained
         if gain < LEVEL * best.spread:
             return exact_if_near(stage), []
-        return stage, [_chosen(tries, gain, len(scores), together)]
-    return stage, []
+        return stage, [_chosen(tries, gain, tried, together)]
+    return None
 
 
 def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate) -> float:

@@ -106,8 +106,8 @@ def diagnose(
     torque is missing."""
     tell = advance or (lambda share, what: None)
     tell(0.0, "fitting the model")
-    before = fitted(model.machine, logs, filter, together)
-    chosen, left = list[Choice](), 0.0
+    first = before = fitted(model.machine, logs, filter, together)
+    chosen = list[Choice]()
     if before.prepared.coarse > 1:
         tell(0.15, "fitting effects with coarse sensors")
         sharp = choosing.sharp(before, together)
@@ -115,26 +115,38 @@ def diagnose(
     if not (before.settled or chosen):
         tell(0.15, "fitting effects from the beginning")
         before, chosen = choosing.unfollowed(before, together)
+    chosen, left = extended(before, chosen, together, tell)
+    chosen, odd, nearest = weighed(before, chosen)
+    if not chosen and not before.near:
+        tell(0.85, "fitting less likely effects from the beginning")
+        before, anew = choosing.unlikely(first, before, together)
+        if anew:
+            anew, left = extended(before, anew, together, tell)
+            chosen, odd, nearest = weighed(before, anew)
+    if len(chosen) > 1:
+        tell(0.9, "judging each given the others")
+        chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
     stage = chosen[-1].stage if chosen else before
+    return concluded(before, stage, chosen, odd, left, nearest)
+
+
+def extended(before: Stage, first: Sequence[Choice], together: Together, tell: Advance) -> tuple[list[Choice], float]:
+    """Effects one after the other, after those that were chosen first, until nothing is left that has a name; and what
+    a further one would gain that was not worth one."""
+    chosen, stage, left = list(first), first[-1].stage if first else before, 0.0
     while stage.settled and len(chosen) < MOST:
         turn = len(chosen)
         tell(0.15 + 0.2 * turn, "scoring effects")
         scores = choosing.scored(stage, together)
         choice = choosing.choose(stage, scores, chosen, together, tell, 0.2 + 0.2 * turn)
         if choice is not None and before.settled and _outgrows(choice, chosen):
-            chosen = []
-            break
+            return [], 0.0
         if choice is None or _makes_good(choice, chosen):
             left = max(0.0, scores[0].gain - choosing.LEVEL) if scores else 0.0
             break
         chosen.append(choice)
         stage = choice.stage
-    chosen, odd, nearest = weighed(before, chosen)
-    if len(chosen) > 1:
-        tell(0.9, "judging each given the others")
-        chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
-    stage = chosen[-1].stage if chosen else before
-    return concluded(before, stage, chosen, odd, left, nearest)
+    return chosen, left
 
 
 def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tuple[str, ...], Nearest | None]:
@@ -240,8 +252,12 @@ def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
 
 
 def _surely(name: str, stage: Stage) -> bool:
-    """Whether an effect's amount is surely any in a fit; one that is nothing at infinity is taken for sure."""
-    return stage.placed(name).effect.inverse or choosing.wald(name, stage) > choosing.LEVEL
+    """Whether an effect is surely any in a fit, by its amount or by a shape that is none by default; one that is
+    nothing at infinity is taken for sure."""
+    effect = stage.placed(name).effect
+    told = [name, *(f"{name}.{s}" for s, shape in effect.shapes.items() if shape.signed and not shape.circular)]
+    fitted = [n for n in told if n in stage.model.base.names]
+    return effect.inverse or max(choosing.wald(n, stage) for n in fitted) > choosing.LEVEL
 
 
 def _makes_good(choice: Choice, chosen: Sequence[Choice]) -> bool:
@@ -339,6 +355,11 @@ def concluded(
     return Diagnosis(verdict, findings, before, after, share, odd, stages, nearest)
 
 
+def opposite(phase: float) -> float:
+    """The phase [rad] half a turn on, from -pi to pi: an effect with it is the same as one with the amount negative."""
+    return float(np.angle(-np.exp(1j * phase)))
+
+
 def _beside(choice: Choice, after: Stage) -> float:
     """What an effect gains given all the others of the last fit: as it was measured, or Wald's statistic, which needs
     no fit without it. No less than any gain for one that is nothing at infinity."""
@@ -364,6 +385,11 @@ def _finding(choice: Choice, after: Stage, left: float, alone: bool) -> Finding:
         s: (*values.get(f"{placed.name}.{s}", (placed.values[s], 0.0)), shape.unit)
         for s, shape in placed.effect.shapes.items()
     }
+    if amount < 0 and (circular := [s for s, shape in placed.effect.shapes.items() if shape.circular]):
+        # The same half a turn on.
+        amount = -amount
+        for s in circular:
+            shapes[s] = (opposite(shapes[s][0]), *shapes[s][1:])
     gain = choice.gain / choice.spread
     told = gain if alone else min(gain, _beside(choice, after))  # the gain of one of several is that on the way to them
     p = min(1.0, choice.tried * float(scipy.stats.chi2.sf(told, choosing.freedom(choice.name, after))))

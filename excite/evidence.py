@@ -132,7 +132,7 @@ def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
     unusual = _unusual(effect, own)
     alike = [b for b in effect.beside(site) if unusual and _unusual(effect, b) == unusual]
     alike = [b for b in alike if all(b[n] * own[n] > 0 for n in unusual)]
-    alike = [b for b in alike if all(b[n] == own[n] for n in b if effect.shapes[n].whole)]
+    alike = [b for b in alike if all(b[n] == own[n] for n in b if n != "A" and effect.shapes[n].whole)]
     if alike:
         varying = [n for n, s in effect.shapes.items() if not s.whole and len({b[n] for b in alike}) > 1]
         families += [_next_to(own, [{n: b[n] for n in varying} for b in alike], reach)] if varying else []

@@ -14,6 +14,7 @@ from functools import lru_cache
 
 import casadi as ca
 import numpy as np
+import scipy.special
 
 from excite.sensors import torque_behind
 from excite.simulate import _A, _C, _GAMMA, _SLOPES, _TIMES, _lu, _solve
@@ -129,11 +130,27 @@ _OPERATIONS: dict[int, np.ufunc] = {
     ca.OP_SIN: np.sin,
     ca.OP_COS: np.cos,
     ca.OP_TAN: np.tan,
+    ca.OP_ASIN: np.arcsin,
+    ca.OP_ACOS: np.arccos,
+    ca.OP_ATAN: np.arctan,
+    ca.OP_SINH: np.sinh,
+    ca.OP_COSH: np.cosh,
     ca.OP_TANH: np.tanh,
+    ca.OP_ASINH: np.arcsinh,
+    ca.OP_ACOSH: np.arccosh,
+    ca.OP_ATANH: np.arctanh,
     ca.OP_EXP: np.exp,
+    ca.OP_EXPM1: np.expm1,
     ca.OP_LOG: np.log,
+    ca.OP_LOG1P: np.log1p,
+    ca.OP_ERF: scipy.special.erf,
+    ca.OP_FLOOR: np.floor,
+    ca.OP_CEIL: np.ceil,
     ca.OP_FABS: np.abs,
     ca.OP_SIGN: np.sign,
+    ca.OP_FMOD: np.fmod,
+    ca.OP_HYPOT: np.hypot,
+    ca.OP_COPYSIGN: np.copysign,
     ca.OP_FMAX: np.maximum,
     ca.OP_FMIN: np.minimum,
     ca.OP_ATAN2: np.arctan2,
@@ -141,6 +158,10 @@ _OPERATIONS: dict[int, np.ufunc] = {
     ca.OP_CONSTPOW: np.power,
     ca.OP_LT: np.less,
     ca.OP_LE: np.less_equal,
+    ca.OP_EQ: np.equal,
+    ca.OP_NE: np.not_equal,
+    ca.OP_AND: np.logical_and,
+    ca.OP_OR: np.logical_or,
     ca.OP_NOT: np.logical_not,
     ca.OP_IF_ELSE_ZERO: np.multiply,
 }

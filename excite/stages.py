@@ -27,6 +27,7 @@ from model.machine import Filter, Machine
 from model.prediction import Model, build
 
 STRONG = 1.3  # misfit over readings from which first-order gains are rough
+FOLLOWED = 2.5  # misfit over readings up to which an effect lets exact dynamics follow logs that are FAR off without it
 FAR = 10.0  # misfit over readings, a few passes after the beginning, from which no fit comes near
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 PASSES = 14  # of a fit that goes on from another
@@ -99,6 +100,12 @@ class Stage:
     def near(self) -> bool:
         """Whether the misfit is not far from what noise makes."""
         return self.fit.cost <= STRONG * self.noise
+
+    @property
+    def follows(self) -> bool:
+        """Whether exact dynamics follow the logs, by far better than where nothing does: a formula that is nearly right
+        leaves much where an effect is large."""
+        return self.near or (self.exact and self.fit.cost <= FOLLOWED * self.noise)
 
     @property
     def spread(self) -> float:
@@ -218,7 +225,7 @@ def begun(machines: Sequence[Machine], of: Stage, disturbed: float, together: To
     """Machines with other effects, each fitted to the logs of a stage from the beginning, with so large disturbing
     forces or smaller ones, side by side; None where no fit is found. Where exact dynamics leave much, with small
     disturbing forces after all."""
-    prepared = [_resumed(machine, of) for machine in machines]
+    prepared = [_noisy(_resumed(machine, of), 1.0) for machine in machines]
     made = partial(_loosened, disturbed=disturbed) if disturbed > 0 else _plain
     calls = [partial(made, m, p) for m, p in zip(machines, prepared, strict=True)]
     for m, p, fits in zip(machines, prepared, together(calls), strict=True):

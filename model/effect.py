@@ -58,15 +58,16 @@ class Scene:
     """One sample as an effect sees it.
 
     q, w: angle and rate of a joint [rad, rad/s] by body; u: torque that its sensor feels, flaws aside [N m]; friction:
-    Fv w + Fs sgn w [N m]; smooth: the rate over which sgn turns; full: what counts as a large torque [N m]; rolling: of
-    contacts; ahead: V_x of each body's origin in its own axes [m/s]; time [s] since the log began; z: what this effect
-    remembers, by name.
+    Fv w + Fs sgn w [N m]; coulomb: Fs [N m]; smooth: the rate over which sgn turns [rad/s]; full: what counts as a
+    large torque [N m]; rolling: of contacts; ahead: V_x of each body's origin in its own axes [m/s]; time [s] since the
+    log began; z: what this effect remembers, by name.
     """
 
     q: Mapping[int, ca.SX]
     w: Mapping[int, ca.SX]
     u: Mapping[int, ca.SX]
     friction: Mapping[int, ca.SX]
+    coulomb: Mapping[int, ca.SX]
     smooth: Mapping[int, float]
     full: Mapping[int, float]
     rolling: Mapping[int, Rolling]

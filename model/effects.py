@@ -30,6 +30,7 @@ PRESSED = 0.1  # [rad] beyond a stop, at which its hardening is stated
 BEHIND = 2.0  # [m] from the joint, where a load is put on or taken off
 
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
+TWICE = Shape("rad", 0.0, (0.0,), lambda site: 0.001)
 
 
 # ------------------------------------------------------------------------------------------------ sizes
@@ -66,6 +67,19 @@ def _full_torque(site: Site) -> float:
 def _softplus(x: ca.SX, width: float | ca.SX) -> ca.SX:
     """max(x, 0), rounded over `width`."""
     return (x + ca.sqrt(x**2 + width**2)) / 2
+
+
+def _turned(s: Scene, k: int, p: Values) -> ca.SX:
+    x = s.w[k] / s.smooth[k] * ca.exp(p["A"])
+    slowly = ca.atan(x * pi / 2) * 2 / pi
+    return s.coulomb[k] * (s.sign(k) - (1 - p["slow"]) * ca.tanh(x) - p["slow"] * slowly)
+
+
+def _eccentric(s: Scene, angle: ca.SX, k: int, p: Values) -> ca.SX:
+    def error(at: ca.SX | float) -> ca.SX:
+        return p["A"] * ca.sin(at + p["phase"]) + p["cos2"] * ca.cos(2 * at) + p["sin2"] * ca.sin(2 * at)
+
+    return error(angle) - error(0.0)
 
 
 def _deadband(s: Scene, k: int, p: Values) -> ca.SX:
@@ -244,6 +258,23 @@ _declare(
         ),
     ),
     Effect(
+        "friction_transition",
+        ("joints",),
+        "-",
+        "Coulomb friction turns over the rate w_s exp(-A) in place of w_s: the larger A, the more suddenly",
+        "torque missing just at starts and reversals, within the rate over which friction turns",
+        "Andersson, Soderberg, Bjorklund, Tribology International 40 (2007), smoothed Coulomb friction",
+        _constant(0.5),
+        {
+            "slow": Shape(
+                "-", 0.0, (0.0,), meaning="0: as tanh does; 1: as slowly as the arc tangent; in between or beyond"
+            )
+        },
+        grid=(1.0, 3.0, -1.0),
+        beside=lambda site: [{"A": 0.05, "slow": 0.5}],
+        torque=_turned,
+    ),
+    Effect(
         "load_dependent_friction",
         ("drives",),
         "-",
@@ -390,12 +421,12 @@ _declare(
         "encoder_eccentricity",
         ("contacts", "wheels"),
         "rad",
-        "the encoder reads A sin(theta + phase) too much",
+        "the encoder reads A sin(theta + phase) too much, and cos2 cos(2 theta) + sin2 sin(2 theta)",
         "an angle error periodic in the angle itself",
         "eccentric encoder discs, Dunster; error once per turn",
         _constant(0.005),
-        {"phase": PHASE},
-        reading=lambda s, exact, k, p: p["A"] * (ca.sin(exact + p["phase"]) - ca.sin(p["phase"])),
+        {"phase": PHASE, "cos2": TWICE, "sin2": TWICE},
+        reading=_eccentric,
         angular=True,
     ),
     Effect(

@@ -227,6 +227,7 @@ def _scene(s: Sample, time: ca.SX) -> Scene:
         {b.index: s.rate[b.coordinates[0]] for b in turning},
         dict(zip([b.index for b in s.machine.actuated], ca.vertsplit(s.u), strict=True)),
         {b.index: _friction(s, b) for b in rubbing},
+        {b.index: s.by_name[f"Fs{b.index}"] for b in rubbing},
         {b.index: float(b.friction.smoothing) for b in rubbing if b.friction is not None},
         {b.index: catalogue.full_torque(s.machine, b) for b in s.machine.actuated},
         {b.index: _rolling(s, b)[0] for b in s.machine.contacts},

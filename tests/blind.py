@@ -20,6 +20,9 @@ from plant import Machine, Motion, Scene, System
 from surprises import SURPRISES, surprise
 
 KINDS = ("nothing", "cause", "surprise", "pair")
+# Cases are drawn by a name's place here and stay what they were when causes are added: these come last.
+FIRST = list(CAUSES)[:29]
+NAMES = [*FIRST, *SURPRISES, *list(CAUSES)[len(FIRST) :]]
 
 
 @dataclass(frozen=True)
@@ -57,14 +60,13 @@ def case(kind: str, name: str = "", number: int = 0) -> Case:
 
     Amounts are drawn evenly in their logarithm between just visible and strong. Raises KeyError for unknown names.
     """
-    names = list(CAUSES) + list(SURPRISES)
-    rng = np.random.default_rng([KINDS.index(kind), names.index(name) if name else 0, number, 17])
+    rng = np.random.default_rng([KINDS.index(kind), NAMES.index(name) if name else 0, number, 17])
     seed = int(rng.integers(1 << 31))
     manoeuvre = str(rng.choice(list(plant.MANOEUVRES)))
     duration, kit = float(rng.choice([60, 120], p=[0.7, 0.3])), str(rng.choice(["full", "paper"], p=[0.65, 0.35]))
     chosen: list[str] = []
     if kind == "pair":
-        chosen = [str(n) for n in rng.choice(list(CAUSES), 2, replace=False)]
+        chosen = [str(n) for n in rng.choice(FIRST, 2, replace=False)]
     elif kind != "nothing":
         chosen = [name]
     return Case(kind, number, seed, manoeuvre, duration, kit, tuple(_drawn(n, rng) for n in chosen))

@@ -6,6 +6,7 @@ the rolls have been, saturation is integrated over the patch. Shapes (decay spee
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -384,6 +385,12 @@ def payload_shift(s: Scene, place: str, A: float, draw: DRAW) -> None:
     s.point(-mass, "rear", -0.95, 0.0)
 
 
+def friction_transition(s: Scene, place: str, A: float, draw: DRAW) -> None:
+    """Dry friction turns more suddenly, or less, and not quite as it did further out."""
+    tail = draw.uniform(-0.2, 0.3)
+    s.sign[JOINTS[place]] = lambda x: ca.tanh(math.exp(A) * x + tail * A * x**3 / (1 + x**2))
+
+
 _JOINTS, _WHEELED = tuple(JOINTS), (*ROLLS, *WHEELS)
 _TABLE: tuple[tuple[Hide, tuple[str, ...], str, dict[str, tuple[float, float]], dict[str, Any]], ...] = (
     (stribeck_friction, _JOINTS, "N m", {"": (40, 180), "articulation": (200, 1000)}, {}),
@@ -415,6 +422,7 @@ _TABLE: tuple[tuple[Hide, tuple[str, ...], str, dict[str, tuple[float, float]], 
     (vibration_on, ROLLS, "-", {"": (0.04, 0.35)}, {}),
     (payload_shift, ("machine",), "kg m", {"": (120, 1000)}, {"signed": True}),
     (relief_valve, ROLLS, "-", {"": (0.15, 1.0)}, {}),
+    (friction_transition, _JOINTS, "-", {"": (0.6, 3), "articulation": (0.2, 1.5)}, {"signed": True}),
 )
 CAUSES: dict[str, Cause] = {
     f.__name__: Cause(places, unit, amounts, f, **more) for f, places, unit, amounts, more in _TABLE

@@ -98,6 +98,7 @@ class Scene:
       transform a torque on its way to the joint      torque[j]: callables u -> u
       add friction                                    friction[j]: callables (w, delivered torque) -> torque
       scale the machine's own friction                wear[j]: factors
+      turn its dry part otherwise                     sign[j]: rate over the smoothing one -> -1 to 1
       change soil (c.Kx, c.Ky) or the law itself      soil[roll]: callables c -> None; law[roll]: c -> Sx, Sy, Mz
       push, or add moving mass                        `push`, `point`
       have states and slow memory of its own          `state`, `rates`, `hold`
@@ -114,6 +115,7 @@ class Scene:
         self.torque: list[list[Callable[[ca.SX], ca.SX]]] = [[], [], []]
         self.friction: list[list[Callable[[ca.SX, ca.SX], ca.SX]]] = [[], [], []]
         self.wear: list[ca.SX] = [ca.SX(1), ca.SX(1), ca.SX(1)]
+        self.sign: list[Callable[[ca.SX], ca.SX]] = [ca.tanh, ca.tanh, ca.tanh]
         self.soil: dict[str, list[Callable[[Any], None]]] = {r: [] for r in ROLLS}
         self.law: dict[str, Callable[[Any], tuple[ca.SX, ca.SX, ca.SX]]] = dict.fromkeys(ROLLS, linear)
         self.stiff = False  # whether something stiff was added, so that fine steps are needed at any speed
@@ -227,7 +229,7 @@ class Scene:
             for step in self.torque[j]:
                 U = step(U)
             w = qd[k]
-            U_friction = self.wear[j] * (viscous[j] * w + dry[j] * ca.tanh(w / smooth[j]))
+            U_friction = self.wear[j] * (viscous[j] * w + dry[j] * self.sign[j](w / smooth[j]))
             for more in self.friction[j]:
                 U_friction = U_friction + more(w, U)
             Q[k] += U - U_friction

@@ -215,6 +215,7 @@ PLAIN = {  # of each cause the first minute of driving in which it is ten times 
     "vibration_on": 0,
     "payload_shift": 1,
     "relief_valve": 0,
+    "friction_transition": 0,
 }
 
 

@@ -77,6 +77,21 @@ def test_a_slope_from_log_to_extended_machine(
     assert np.abs(right.q - again.q).max() < 0.05 * np.abs(wrong.q - again.q).max()
 
 
+def test_where_nothing_promises_anything_effects_begin_anew(
+    sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Far from any fit first-order gains say little. The right cause is found by what it makes of exact dynamics."""
+    for way in ("choose", "sharp"):
+        monkeypatch.setattr(f"excite.choosing.{way}", lambda *asked: None)
+    monkeypatch.setattr("excite.choosing.unfollowed", lambda stage, together: (stage, []))
+    one = log.read(sloping, straight.machine)
+    found = diagnose.diagnose(straight, [one], straight.machine.filter)
+    assert [f.name for f in found.findings] == ["ground_slope@machine"]
+    assert found.findings[0].amount == pytest.approx(0.01, rel=0.02)
+    monkeypatch.setattr("excite.choosing.unlikely", lambda scanned, stage, together: (stage, []))
+    assert diagnose.diagnose(straight, [one], straight.machine.filter).verdict == "unexplained"
+
+
 def _slope(straight: Model) -> EffectEntry:
     return placing.parse("ground_slope=0.01", straight.machine, 40.0)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from excite import evidence, log, profiles, sensors, stages
+from excite.diagnose import opposite
 from excite.processing import implicit
 from excite.simulate import simulate
 from model import machine, placing, tree
@@ -67,6 +68,43 @@ def extended(effect: Effect, amount: float) -> Model:
         name=effect.name, where=where(effect), amount=Quantity(value=amount, source="assumed"), shape={}
     )
     return build(placing.extended(VA12, entry))
+
+
+CIRCULAR = {
+    e.name: (e, s) for e in CATALOGUE.values() for s, shape in e.shapes.items() if shape.circular and not e.sensed
+}
+
+
+@pytest.mark.parametrize(("effect", "circular"), CIRCULAR.values(), ids=list(CIRCULAR))
+def test_a_negative_amount_is_a_positive_one_half_a_turn_on(effect: Effect, circular: str) -> None:
+    """So that a fit which came to a negative one is given as a positive one."""
+    size, told = typical(effect), []
+    for amount, phase in ((-size, 0.7), (size, opposite(0.7))):
+        entry = extended(effect, amount).machine.effect[0]
+        shape = {circular: Quantity(value=phase, source="assumed")}
+        model = build(placing.extended(VA12, entry.model_copy(update={"shape": shape})))
+        q, nu, _, u, z = samples(model)
+        told.append(model.acceleration(q, nu, u, z, model.nominal).full())
+    np.testing.assert_allclose(told[0], told[1], rtol=1e-9, atol=1e-9)
+    assert abs(opposite(0.7)) <= np.pi
+
+
+@pytest.mark.parametrize("slow", [0.0, 0.6])
+def test_dry_friction_may_turn_more_suddenly(va12: Model, slow: float) -> None:
+    """From the formula: at rates from far within to far beyond the one over which it turns."""
+    k, ws, Fs = 3, 0.02, 174.74
+    w = np.array([-0.1, -0.02, -0.004, 0.001, 0.01, 0.3])
+    entry = placing.parse("friction_transition@front_roll=0.7", VA12, DURATION)
+    entry = entry.model_copy(update={"shape": {"slow": Quantity(value=slow, source="assumed")}})
+    model = build(placing.extended(VA12, entry))
+    nu = np.zeros((6, len(w)))
+    nu[k] = w
+    q, a, u, z = np.zeros((6, len(w))), np.zeros((6, len(w))), np.zeros((3, len(w))), np.zeros((0, len(w)))
+    with_it = model.predict(q, nu, a, model.expand @ model.nominal, u, z).full()[k]
+    without = va12.predict(q, nu, a, va12.expand @ va12.nominal).full()[k]
+    x = 2.0137527 * w / ws  # exp(0.7)
+    sign = (1 - slow) * np.tanh(x) + slow * np.arctan(np.pi / 2 * x) / (np.pi / 2)
+    np.testing.assert_allclose(with_it - without, Fs * (sign - np.tanh(w / ws)), rtol=1e-6, atol=1e-4)
 
 
 def samples(model: Model, count: int = 40, seed: int = 0) -> list[np.ndarray]:
@@ -344,7 +382,7 @@ def test_wheels_beside_each_other_pass_over_ground_of_their_own(straight: Model)
 
     def stiff(*across: float) -> float:
         rolling = {k: Rolling(law, ca.SX(1), still, ca.SX(1), still, 0.0, y) for k, y in enumerate(across)}
-        scene = Scene({}, {}, {}, {}, {}, {}, rolling, {}, still, known)
+        scene = Scene({}, {}, {}, {}, {}, {}, {}, rolling, {}, still, known)
         plain = Soil(rolling[0].slip, still, ca.SX(-1e5), ca.SX(-1e5))
         return float(ca.evalf(soil(scene, 0, values, plain).Kx / plain.Kx))
 

@@ -196,6 +196,10 @@ def test_friction_causes_resist_as_they_should() -> None:
     warm = felt("friction_warm_up", "front_roll", 0.5)
     assert warm(1.0) == pytest.approx(-0.5 * (64.75 + 174.74), rel=1e-3)
     assert abs(warm(1.0, t=500)) < 0.01
+    turning = felt("friction_transition", "front_roll", 1.0)
+    assert -110 < turning(0.01) < -50  # of 174.74 N m, 46 % of which resist there without it
+    assert turning(-0.01) == pytest.approx(-turning(0.01))
+    assert turning(0.5) == pytest.approx(0, abs=1e-3)
 
 
 def test_torque_causes_change_what_is_delivered() -> None:

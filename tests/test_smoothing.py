@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pandas as pd
 import pytest
@@ -15,7 +16,7 @@ import scipy.signal
 from excite import chain, deviations, newton, sensors, smoothing
 from excite.driver import follow
 from excite.identify import identify
-from excite.linearise import Chart, advance, chart, differentiate
+from excite.linearise import Batch, Chart, advance, chart, differentiate
 from excite.log import Log, check
 from excite.record import Record, beating, common_sensors, first_point, record
 from excite.simulate import Motion, simulate
@@ -129,6 +130,22 @@ def test_chain_agrees_with_dense_algebra() -> None:
     still = solved.states(np.zeros(2))[0]
     for j, move in enumerate(np.eye(2)):
         np.testing.assert_allclose(solved.slopes(slice(j, j + 1))[:, :, 0], solved.states(move)[0] - still, atol=1e-9)
+
+
+def test_an_effect_may_use_any_elementary_function() -> None:
+    """Samples are taken many at a time by instructions of our own; each does what CasADi's does."""
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    one = (ca.sin, ca.cos, ca.tan, ca.asin, ca.acos, ca.atan, ca.sinh, ca.cosh, ca.tanh, ca.asinh, ca.atanh, ca.exp)
+    one += (ca.expm1, ca.log, ca.log1p, ca.erf, ca.floor, ca.ceil, ca.fabs, ca.sign, ca.sqrt)
+    two = (ca.fmod, ca.hypot, ca.copysign, ca.fmax, ca.fmin, ca.atan2, ca.power, ca.lt, ca.le, ca.eq, ca.ne)
+    told = [f(x) for f in one] + [ca.acosh(1 + x)] + [f(x, y) for f in two]
+    told += [ca.logic_and(x - 0.5 > 0, y > 0.5), ca.logic_or(x > 0.5, y > 0.5), ca.if_else(x > y, x, y)]
+    f = ca.Function("f", [x, y], [ca.horzcat(*told)])
+    at = np.random.default_rng(0).uniform(0.05, 0.95, (2, 200))
+    (found,) = Batch(f, ())(at[0][:, None], at[1][:, None])
+    np.testing.assert_allclose(
+        found.reshape(200, -1), f(at[:1], at[1:]).full().reshape(200, -1), rtol=1e-12, atol=1e-12
+    )
 
 
 def test_where_samples_lead_and_how_that_moves(va12: Model) -> None:
