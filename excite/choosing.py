@@ -2,7 +2,7 @@
 well kept as rivals of the best.
 
 Where no model follows the logs, the first is chosen with coarse sensors (`sharp`) or from the logs' beginning
-(`unfollowed`).
+(`unfollowed`); where nothing explains them, from their beginning too, however little it promises (`unlikely`).
 """
 
 from __future__ import annotations
@@ -76,10 +76,12 @@ class Choice:
 
 
 def wald(name: str, stage: Stage) -> float:
-    """By how many deviations an effect's amount is from none in a fit, squared (Wald's statistic); 0 of one that was
-    held, as nothing shows it."""
-    k, fit = stage.model.base.names.index(name), stage.fit
-    return 0.0 if fit.unseen[k] else float((fit.X[k] / fit.std[k]) ** 2)
+    """By how many deviations an effect's amount, or a shape that is none by default, is from none in a fit, squared
+    (Wald's statistic); 0 of one that was held, as nothing shows it."""
+    shapes, names, fit = stage.placed(name).effect.shapes, stage.model.base.names, stage.fit
+    told = [name, *(f"{name}.{s}" for s, shape in shapes.items() if shape.signed and not shape.circular)]
+    at = [names.index(n) for n in told if n in names]
+    return max(0.0 if fit.unseen[k] else float((fit.X[k] / fit.std[k]) ** 2) for k in at)
 
 
 def freedom(name: str, stage: Stage) -> int:
@@ -256,18 +258,29 @@ def sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None
     if gain < max(LEVEL * best.spread, LEAST[1] * stage.excess):
         return None
     alike = [x for x in tries if stage.fit.cost - x[1].fit.cost >= LIKE * gain]
+    follow: list[_Try] = []
     for disturbed in (0.0, smoothing.DISTURBED[0]) if gain >= SHARE * (gain + best.excess) else (0.0,):
         sharp = zip(alike, sharpened([x for _, x in alike], disturbed, together), strict=True)
-        near = _one_each([(score, x) for (score, _), x in sharp if x is not None and x.follows])
-        if near:
-            score, best = near[0]
-            sure = wald(score.candidate.name, best)  # of the same kind as a gain, and smaller where that is large
-            if sure < LEVEL * best.spread:
-                return None
-            # Far from no effect Wald's statistic says too much, and further effects are measured by it.
-            sure = min(sure, max(stage.prepared.coarse * gain, FAR * best.noise - best.fit.cost))
-            return stage, [_chosen(near, sure, len(scores), together)]
-    return None
+        found = [(score, x) for (score, _), x in sharp if x is not None and x.follows]
+        follow = follow or found
+        if near := _one_each([x for x in found if x[1].near]):
+            follow = near
+            break
+    if not follow:
+        return None
+    follow = _one_each(follow)
+    score, best = follow[0]
+    sure = wald(score.candidate.name, best)  # of the same kind as a gain, and smaller where that is large
+    if sure < LEVEL * best.spread:
+        return None
+    # Far from no effect Wald's statistic says too much, and further effects are measured by it. Coarse sensors say too
+    # little: without it the misfit is what a fit has, or as large for sharp ones, as far as a fit is waited for.
+    coarse = stage.prepared.coarse
+    without = (
+        min(coarse**2 * gain, FAR * best.noise - best.fit.cost) if plain is None else plain.fit.cost - best.fit.cost
+    )
+    sure = min(sure, max(coarse * gain, without))
+    return stage, [_chosen(follow, sure, len(scores), together)]
 
 
 def unfollowed(stage: Stage, together: Together) -> tuple[Stage, list[Choice]]:
@@ -285,7 +298,7 @@ def unlikely(scanned: Stage, stage: Stage, together: Together) -> tuple[Stage, l
     or something else does. So those that promise anything in a stage, scanned, begin anew with exact dynamics, which
     follow the logs with the right one only. As `unfollowed` has it."""
     scores = scored(scanned, together)
-    best = {s.candidate.name: s for s in reversed(scores) if s.values["A"] != 0}
+    best = {s.candidate.name: s for s in reversed(scores) if s.gain > 0 and s.values["A"] != 0}
     most = sorted(best.values(), key=lambda s: -s.gain)[:ANEW]
     return _followed(stage, most, (0.0,), len(scores), together) or (stage, [])
 
@@ -297,18 +310,20 @@ def _followed(
     machines = [placing.extended(stage.machine, _entry(s)) for s in likely]
     for disturbed in forces if likely else ():
         found = begun(machines, stage, disturbed, together)
-        near = [(s, x) for s, x in zip(likely, found, strict=True) if x is not None and x.follows]
-        near = [(s, x) for s, x in near if _felt(s.candidate.name, x)]
-        if not near:
+        follow = [(s, x) for s, x in zip(likely, found, strict=True) if x is not None and x.follows]
+        follow = [(s, x) for s, x in follow if _felt(s.candidate.name, x)]
+        if not follow:
             continue
-        tries = _one_each(near)
+        tries = _one_each([x for x in follow if x[1].near] or follow)
         score, best = tries[0]
         tries = [x for x in tries if x[1].fit.disturbed == best.fit.disturbed]
+        comparable = stage.settled and stage.fit.disturbed == best.fit.disturbed
         try:
-            stage = refitted(stage.machine, best, best.fit.disturbed)
+            without = refitted(stage.machine, best, best.fit.disturbed)
+            stage = stage if comparable and stage.fit.cost < without.fit.cost else without
             gain = stage.fit.cost - best.fit.cost
-        except NotConverged:
-            gain = wald(score.candidate.name, best)  # of the same kind, and smaller where much is gained
+        except NotConverged:  # Wald's statistic is of the same kind, and smaller where much is gained
+            gain = stage.fit.cost - best.fit.cost if comparable else wald(score.candidate.name, best)
         if gain < LEVEL * best.spread:
             return exact_if_near(stage), []
         return stage, [_chosen(tries, gain, tried, together)]

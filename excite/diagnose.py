@@ -5,7 +5,8 @@ scored (`evidence`), the best are fitted with amount and shapes as parameters, a
 added to the model; then again, until nothing is left or nothing in the catalogue helps. Names that the log likes as
 well are given together. What no name explains is said to be unexplained. Where the model without effects can be fitted
 to much coarser sensors only, the first effect is found with these and the fit sharpened with it; where not even that,
-effects are scored along the file's parameters and fitted from the logs' beginning.
+effects are scored along the file's parameters and fitted from the logs' beginning; so are those that promise less where
+nothing explains the logs.
 """
 
 from __future__ import annotations
@@ -117,12 +118,15 @@ def diagnose(
         before, chosen = choosing.unfollowed(before, together)
     chosen, left = extended(before, chosen, together, tell)
     chosen, odd, nearest = weighed(before, chosen)
-    if not chosen and not before.near:
+    if not chosen and (before.prepared.coarse > 1 or not before.near):
         tell(0.85, "fitting less likely effects from the beginning")
-        before, anew = choosing.unlikely(first, before, together)
-        if anew:
-            anew, left = extended(before, anew, together, tell)
-            chosen, odd, nearest = weighed(before, anew)
+        old = before if before.prepared.coarse == 1 else forced(before, together)
+        before, anew = choosing.unlikely(first, old, together)
+        if anew or before is not old:
+            anew, left = extended(before, anew, together, lambda share, what: tell(max(share, 0.85), what))
+            nearest = None if before is not old else nearest
+        chosen, odd, closer = weighed(before, anew)
+        nearest = closer or nearest
     if len(chosen) > 1:
         tell(0.9, "judging each given the others")
         chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
@@ -252,12 +256,8 @@ def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
 
 
 def _surely(name: str, stage: Stage) -> bool:
-    """Whether an effect is surely any in a fit, by its amount or by a shape that is none by default; one that is
-    nothing at infinity is taken for sure."""
-    effect = stage.placed(name).effect
-    told = [name, *(f"{name}.{s}" for s, shape in effect.shapes.items() if shape.signed and not shape.circular)]
-    fitted = [n for n in told if n in stage.model.base.names]
-    return effect.inverse or max(choosing.wald(n, stage) for n in fitted) > choosing.LEVEL
+    """Whether an effect is surely any in a fit; one that is nothing at infinity is taken for sure."""
+    return stage.placed(name).effect.inverse or choosing.wald(name, stage) > choosing.LEVEL
 
 
 def _makes_good(choice: Choice, chosen: Sequence[Choice]) -> bool:

@@ -140,7 +140,8 @@ def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
         if len(shape.grid) > 1 and not (shape.circular or shape.whole or name in unusual):
             families.append(_next_to(own, [{name: g * shape.size(site)} for g in shape.grid], reach))
     every = [{name: x for part in parts for name, x in part.items()} for parts in product(*families)]
-    return [{**own, **values} for values in every if all(x >= 0 for n, x in values.items() if n not in unusual)]
+    free = {"A", *unusual}
+    return [{**own, **values} for values in every if all(x >= 0 for n, x in values.items() if n not in free)]
 
 
 def _next_to(own: Mapping[str, float], points: Sequence[Mapping[str, float]], reach: float) -> list[dict[str, float]]:
@@ -318,6 +319,8 @@ def _score(x: Candidate, S: np.ndarray, g: np.ndarray, own: np.ndarray) -> Told 
         values["A"] *= float(np.hypot(*step))
     else:
         values["A"] *= float(step[0])
-    if effect.positive and step[0] <= 0 and len(shown) == 1:
+    # Where negative amounts are on the grid, a step back from a positive one says that these are meant.
+    forward = effect.positive or min(effect.grid) < 0
+    if forward and step[0] <= 0 and len(shown) == 1:
         return 0.0, values, left
     return float(-step[shown] @ g[at]), values, left

@@ -27,7 +27,7 @@ from model.machine import Filter, Machine
 from model.prediction import Model, build
 
 STRONG = 1.3  # misfit over readings from which first-order gains are rough
-FOLLOWED = 2.5  # misfit over readings up to which an effect lets exact dynamics follow logs that are FAR off without it
+FOLLOWED = 2.5  # misfit over readings up to which exact dynamics follow logs where nothing else does
 FAR = 10.0  # misfit over readings, a few passes after the beginning, from which no fit comes near
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 PASSES = 14  # of a fit that goes on from another
@@ -224,7 +224,7 @@ def sharpened(found: Sequence[Stage], disturbed: float, together: Together) -> I
 def begun(machines: Sequence[Machine], of: Stage, disturbed: float, together: Together) -> Iterator[Stage | None]:
     """Machines with other effects, each fitted to the logs of a stage from the beginning, with so large disturbing
     forces or smaller ones, side by side; None where no fit is found. Where exact dynamics leave much, with small
-    disturbing forces after all."""
+    disturbing forces after all, if they bring it near or it doesn't follow."""
     prepared = [_noisy(_resumed(machine, of), 1.0) for machine in machines]
     made = partial(_loosened, disturbed=disturbed) if disturbed > 0 else _plain
     calls = [partial(made, m, p) for m, p in zip(machines, prepared, strict=True)]
@@ -306,10 +306,13 @@ def _plain(machine: Machine, prepared: Prepared) -> Fits | None:
     if fit is None:
         return None
     stage = Stage(machine, prepared, fit)
+    if stage.near:
+        return fit, None
     try:
-        return (fit if stage.near else _resume(prepared, stage, SMALL)), None
+        loose = _resume(prepared, stage, SMALL)
     except NotConverged:
         return fit, None
+    return (fit if stage.follows and not replace(stage, fit=loose).near else loose), None
 
 
 def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:

@@ -146,13 +146,14 @@ class Effect:
 
     `places`: joints (with friction), drives (driven joints), contacts, driven_contacts, drive (all of these together,
     of soil all contacts), articulation (driven joints without contact), wheels (measuring ones), yaw_rate,
-    lateral_speed, machine. `amount`: a typical one [unit] at a site, `grid`: shares of it that are tried where the
-    signature isn't proportional to the amount; `beside`: shapes [unit] that are tried beside their grids. `positive`: a
-    negative amount is never tried; `resisting`: where a fit finds one, something else is the cause; `inverse`: the
-    smaller the amount, the larger the effect; `angular`: a reading's error that only a sensor of an angle has, none of
-    a rate. `recoil`: the shape that says which share of a changing `inertia`, of MX and ZZ, comes of a load that slides
-    along x on its body and pushes it back. `shaking`: while it acts, 0 to 1 over time [s], the torque sensor shakes as
-    well; where it doesn't, something else acts.
+    lateral_speed, machine. `amount`: a typical one [unit] at a site, `grid`: shares of it, of either sign, that are
+    tried where the signature isn't proportional to the amount; `beside`: shapes [unit] that are tried beside their
+    grids, and an amount "A" where it isn't the typical one. `positive`: a negative amount is never tried; `resisting`:
+    where a fit finds one, something else is the cause; `inverse`: the smaller the amount, the larger the effect;
+    `angular`: a reading's error that only a sensor of an angle has, none of a rate. `recoil`: the shape that says which
+    share of a changing `inertia`, of MX and ZZ, comes of a load that slides along x on its body and pushes it back.
+    `shaking`: while it acts, 0 to 1 over time [s], the torque sensor shakes as well; where it doesn't, something else
+    acts.
     Hooks take the scene, the body they act on, and the values.
     """
 

@@ -271,7 +271,7 @@ _declare(
             )
         },
         grid=(1.0, 3.0, -1.0),
-        beside=lambda site: [{"A": 0.05, "slow": 0.5}],
+        beside=lambda site: [{"A": 0.05, "slow": 0.5}, {"A": 0.05, "slow": -0.5}],
         torque=_turned,
     ),
     Effect(

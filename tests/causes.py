@@ -387,8 +387,8 @@ def payload_shift(s: Scene, place: str, A: float, draw: DRAW) -> None:
 
 def friction_transition(s: Scene, place: str, A: float, draw: DRAW) -> None:
     """Dry friction turns more suddenly, or less, and not quite as it did further out."""
-    tail = draw.uniform(-0.2, 0.3)
-    s.sign[JOINTS[place]] = lambda x: ca.tanh(math.exp(A) * x + tail * A * x**3 / (1 + x**2))
+    tail = draw.uniform(-0.2, 0.3) * math.tanh(abs(A))
+    s.sign[JOINTS[place]] = lambda x: ca.tanh(math.exp(A) * x * (1 + tail * x**2 / (1 + x**2)))
 
 
 _JOINTS, _WHEELED = tuple(JOINTS), (*ROLLS, *WHEELS)

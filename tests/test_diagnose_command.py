@@ -92,6 +92,35 @@ def test_where_nothing_promises_anything_effects_begin_anew(
     assert diagnose.diagnose(straight, [one], straight.machine.filter).verdict == "unexplained"
 
 
+def test_a_phase_that_was_found_the_other_way_round_is_turned(sloping: Path, straight: Model) -> None:
+    """A fit that began with a slope downhill keeps it so, its amount negative; people are given a positive one."""
+    one = log.read(sloping, straight.machine)
+    uphill = _slope(straight)
+    turned = {"direction": Quantity(value=np.pi, source="assumed")}
+    downhill = uphill.model_copy(
+        update={"amount": Quantity(value=-0.008, source="assumed"), "shape": turned},
+    )
+    stage = stages.fitted(placing.extended(straight.machine, downhill), [one], straight.machine.filter)
+    assert dict(zip(stage.model.base.names, stage.fit.X, strict=True))["ground_slope@machine"] < 0
+    choice = choosing.Choice("ground_slope@machine", stage, 1e4, 1.0, 200, (), 0.5)
+    found = diagnose._finding(choice, stage, 0.0, alone=True)
+    assert found.amount == pytest.approx(0.01, rel=0.02)
+    assert found.shapes["direction"][0] == pytest.approx(0, abs=0.2)
+
+
+def test_what_promises_nothing_at_all_is_not_tried(
+    emps: Model, emps_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A candidate whose best amount has the wrong sign can't even be put into a machine file."""
+    one = log.read(emps_data, emps.machine)
+    stage = stages.fitted(emps.machine, [one], emps.machine.filter)
+    scores = choosing.scored(stage, in_turn)
+    late = next(s for s in scores if s.candidate.placed.effect.name == "channel_delay")
+    scores = (replace(late, gain=0.0, values={**late.values, "A": -0.01}),)
+    monkeypatch.setattr("excite.choosing.scored", lambda stage, together: scores)
+    assert not choosing.unlikely(stage, stages.forced(stage, in_turn), in_turn)[1]
+
+
 def _slope(straight: Model) -> EffectEntry:
     return placing.parse("ground_slope=0.01", straight.machine, 40.0)
 

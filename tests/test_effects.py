@@ -70,9 +70,7 @@ def extended(effect: Effect, amount: float) -> Model:
     return build(placing.extended(VA12, entry))
 
 
-CIRCULAR = {
-    e.name: (e, s) for e in CATALOGUE.values() for s, shape in e.shapes.items() if shape.circular and not e.sensed
-}
+CIRCULAR = {e.name: (e, s) for e in CATALOGUE.values() for s, shape in e.shapes.items() if shape.circular}
 
 
 @pytest.mark.parametrize(("effect", "circular"), CIRCULAR.values(), ids=list(CIRCULAR))
@@ -84,7 +82,9 @@ def test_a_negative_amount_is_a_positive_one_half_a_turn_on(effect: Effect, circ
         shape = {circular: Quantity(value=phase, source="assumed")}
         model = build(placing.extended(VA12, entry.model_copy(update={"shape": shape})))
         q, nu, _, u, z = samples(model)
-        told.append(model.acceleration(q, nu, u, z, model.nominal).full())
+        wheels = np.linspace(-3, 3, q.shape[1]) * np.ones((2, 1))
+        read = model.read(q, nu, wheels, u, z, model.nominal).full()
+        told.append(np.vstack([model.acceleration(q, nu, u, z, model.nominal).full(), read]))
     np.testing.assert_allclose(told[0], told[1], rtol=1e-9, atol=1e-9)
     assert abs(opposite(0.7)) <= np.pi
 

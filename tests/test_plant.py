@@ -200,6 +200,9 @@ def test_friction_causes_resist_as_they_should() -> None:
     assert -110 < turning(0.01) < -50  # of 174.74 N m, 46 % of which resist there without it
     assert turning(-0.01) == pytest.approx(-turning(0.01))
     assert turning(0.5) == pytest.approx(0, abs=1e-3)
+    lazy = felt("friction_transition", "front_roll", -3.0)
+    assert 0 < lazy(0.1) < 174.74  # less than without it, and it still resists
+    assert lazy(3.0) == pytest.approx(0, abs=5)
 
 
 def test_torque_causes_change_what_is_delivered() -> None:

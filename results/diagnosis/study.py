@@ -88,7 +88,9 @@ def driven(one: Case) -> tuple[pd.DataFrame, float]:
     log, file = kept / f"{one.key}.parquet", kept / f"{one.key}.json"
     if not file.exists():
         drive = blind(one)
-        drive.log.to_parquet(log)
+        part = log.with_suffix(f".{os.getpid()}.part")
+        drive.log.to_parquet(part)
+        os.replace(part, log)
         _kept(file, {"visibility": visibility(drive)})  # last: a log without it is driven again
     return pd.read_parquet(log), float(json.loads(file.read_text())["visibility"])
 
