@@ -7,7 +7,7 @@ Where no model follows the logs, the first is chosen with coarse sensors (`sharp
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -162,7 +162,7 @@ def _shortlist(stage: Stage, scores: Sequence[evidence.Score], chosen: Sequence[
     most: dict[str, float] = {}
     hope = max(WORTH, HOPE[stage.rough] * scores[0].gain) if scores else 0.0
     for s in scores:
-        least = _least(stage, chosen, s.candidate) / OVER if stage.settled else 0.0
+        least = _least(stage, chosen, s.candidate, 0.0) / OVER if stage.settled else 0.0
         worth = s.gain >= max(least, hope) and s.values["A"] != 0
         if worth and s.gain >= LIKE * most.setdefault(s.candidate.name, s.gain):
             best.setdefault(s.candidate.variant, s)
@@ -216,9 +216,13 @@ def choose(
     score, best = tries[0]
     gain = stage.fit.cost - best.fit.cost
     level = threshold(score.candidate.name, best, len(scores))
-    if gain < max(level * best.spread, _least(stage, chosen, score.candidate)):
+    if gain < max(level * best.spread, _least(stage, chosen, score.candidate, 0.0)):
         return None
-    return _chosen(tries, gain, len(scores), together)
+    hidden = gain < _least(stage, chosen, score.candidate)
+    if hidden and not best.near:
+        return None
+    choice = _chosen(tries, gain, len(scores), together)
+    return None if hidden and not (choice.stage.exact and choice.stage.near) else choice
 
 
 def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) -> Choice:
@@ -283,23 +287,26 @@ def sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None
     return stage, [_chosen(follow, sure, len(scores), together)]
 
 
-def unfollowed(stage: Stage, together: Together) -> tuple[Stage, list[Choice]]:
+def unfollowed(stage: Stage, together: Together) -> tuple[Stage, list[Choice], frozenset[str]]:
     """Where no fit was found: the effect with which the model can follow the logs, with as small disturbing forces as
     there is one. With it there may be a fit without it after all, which then is what it is compared with, and may be as
-    good: the model began too far off. The stage as it was and no effect where nothing helps."""
+    good: the model began too far off. The stage as it was and no effect where nothing helps. And the names that were
+    tried."""
     scores = scored(stage, together)
     likely = _likely(stage, scores, (), together)
     forces = 0.0, smoothing.DISTURBED[0], smoothing.DISTURBED[-1]
-    return _followed(stage, likely, forces, len(scores), together) or (stage, [])
+    found = _followed(stage, likely, forces, len(scores), together) or (stage, [])
+    return *found, frozenset(s.candidate.name for s in likely)
 
 
-def unlikely(scanned: Stage, stage: Stage, together: Together) -> tuple[Stage, list[Choice]]:
+def unlikely(scanned: Stage, stage: Stage, tried: Container[str], together: Together) -> tuple[Stage, list[Choice]]:
     """Where nothing was found that explains the logs: far from any fit an effect promises little of what it explains,
     or something else does. So those that promise anything in a stage, scanned, begin anew with exact dynamics, which
-    follow the logs with the right one only. As `unfollowed` has it."""
+    follow the logs with the right one only; but those that were tried. As `unfollowed` has it."""
     scores = scored(scanned, together)
     best = {s.candidate.name: s for s in reversed(scores) if s.gain > 0 and s.values["A"] != 0}
     most = sorted(best.values(), key=lambda s: -s.gain)[:ANEW]
+    most = [s for s in most if s.candidate.name not in tried]
     return _followed(stage, most, (0.0,), len(scores), together) or (stage, [])
 
 
@@ -330,9 +337,10 @@ def _followed(
     return None
 
 
-def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate) -> float:
-    """What an effect must gain to be worth a place beside those that were chosen."""
-    part = max(SHAPE[0], TIMED * candidate.placed.effect.timed, HIDDEN * (not stage.exact))
+def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate, hidden: float = HIDDEN) -> float:
+    """What an effect must gain to be worth a place beside those that were chosen. hidden: of what they gained, where
+    forces hide how good their formulas are; none where exact dynamics come near the logs with it."""
+    part = max(SHAPE[0], TIMED * candidate.placed.effect.timed, hidden * (not stage.exact))
     shape = sum(max(part, min(ALIKE**2 / x.left, ABSORBED)) * x.gain for x in chosen)
     return max(LEAST[stage.rough] * stage.excess, shape, min(SHAPE[1] * _sureness(stage), BESIDE))
 

@@ -113,15 +113,16 @@ def diagnose(
         tell(0.15, "fitting effects with coarse sensors")
         sharp = choosing.sharp(before, together)
         before, chosen = sharp or (forced(before, together), chosen)
+    tried: Container[str] = ()
     if not (before.settled or chosen):
         tell(0.15, "fitting effects from the beginning")
-        before, chosen = choosing.unfollowed(before, together)
+        before, chosen, tried = choosing.unfollowed(before, together)
     chosen, left = extended(before, chosen, together, tell)
     chosen, odd, nearest = weighed(before, chosen)
     if not chosen and (before.prepared.coarse > 1 or not before.near):
         tell(0.85, "fitting less likely effects from the beginning")
         old = before if before.prepared.coarse == 1 else forced(before, together)
-        before, anew = choosing.unlikely(first, old, together)
+        before, anew = choosing.unlikely(first, old, tried if old is first else (), together)
         if anew or before is not old:
             anew, left = extended(before, anew, together, lambda share, what: tell(max(share, 0.85), what))
             nearest = None if before is not old else nearest
@@ -279,8 +280,7 @@ def _others(choice: Choice, found: Container[str]) -> tuple[EffectEntry, ...]:
 
 def _without(name: str, stage: Stage) -> Stage:
     """A stage's model without one of its effects, fitted. Raises NotConverged."""
-    rest = tuple(e for e in stage.machine.effect if f"{e.name}@{e.where}" != name)
-    machine = stage.machine.model_copy(update={"effect": rest})
+    machine = placing.without(stage.machine, name)
     try:
         return refitted(machine, stage, stage.fit.disturbed)
     except NotConverged:

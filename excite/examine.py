@@ -21,6 +21,7 @@ SPIKE = 10.0  # robust deviations from the neighbours that make an outlier
 STEPS = 8.0  # counts, likewise
 MANY = 0.005  # share of a channel's samples that may be repaired
 HELD = 8  # equal readings in a row that make a drop-out
+JUMP = 10.0  # times any step around and a count, at the end of such a stretch: what a standing joint can't do
 LATE = 4.0  # standard deviations that make a delay worth a remark
 FLOOR = 4.0  # times the noise floor where a spectrum counts as sunk
 NEEDED = ("angle", "torque", "wheel")  # kinds of sensor that no method does without
@@ -120,7 +121,7 @@ def find_spikes(sensor: Sensor, x: np.ndarray) -> np.ndarray:
 
 def find_dropouts(sensor: Sensor, x: np.ndarray) -> tuple[tuple[int, int], ...]:
     """Stretches (first, last row) in which a noisy channel reads the same, or an encoder that turned fast before and
-    after doesn't count."""
+    after doesn't count, or jumps after it."""
     same = np.flatnonzero(np.diff(np.concatenate([[1.0], np.diff(x) != 0.0, [1.0]])) != 0)
     runs: list[tuple[int, int]] = [
         (int(a), int(b)) for a, b in itertools.pairwise(same) if a + 1 < len(x) and x[a + 1] == x[a]
@@ -135,7 +136,9 @@ def find_dropouts(sensor: Sensor, x: np.ndarray) -> tuple[tuple[int, int], ...]:
         if min(len(before), len(after)) <= HELD:
             continue
         speed = min(abs(before[-1] - before[0]), abs(after[-1] - after[0])) / HELD
-        if speed > 3 * sensor.resolution and abs(x[b + 1] - x[a]) > 0.5 * speed * (b - a):
+        steps = np.abs(np.concatenate([np.diff(before), np.diff(after[1:])]))
+        jump, usual = abs(x[b + 1] - x[a]), steps.max() + sensor.resolution
+        if (speed > 3 * sensor.resolution and jump > 0.5 * speed * (b - a)) or jump > JUMP * usual:
             found.append((a, b))
     return tuple(found)
 

@@ -90,6 +90,12 @@ def extended(machine: Machine, *entries: EffectEntry) -> Machine:
     return machine.model_copy(update={"effect": (*machine.effect, *entries)})
 
 
+def without(machine: Machine, name: str) -> Machine:
+    """The machine without the effect of this name (effect@place)."""
+    rest = tuple(e for e in machine.effect if f"{e.name}@{e.where}" != name)
+    return machine.model_copy(update={"effect": rest})
+
+
 def placed(machine: Machine, entry: EffectEntry, duration: float = DURATION) -> Placed:
     """An effect of a machine file, checked. Raises MachineError for an unknown name, place or shape.
 

@@ -83,12 +83,12 @@ def test_where_nothing_promises_anything_effects_begin_anew(
     """Far from any fit first-order gains say little. The right cause is found by what it makes of exact dynamics."""
     for way in ("choose", "sharp"):
         monkeypatch.setattr(f"excite.choosing.{way}", lambda *asked: None)
-    monkeypatch.setattr("excite.choosing.unfollowed", lambda stage, together: (stage, []))
+    monkeypatch.setattr("excite.choosing.unfollowed", lambda stage, together: (stage, [], frozenset()))
     one = log.read(sloping, straight.machine)
     found = diagnose.diagnose(straight, [one], straight.machine.filter)
     assert [f.name for f in found.findings] == ["ground_slope@machine"]
     assert found.findings[0].amount == pytest.approx(0.01, rel=0.02)
-    monkeypatch.setattr("excite.choosing.unlikely", lambda scanned, stage, together: (stage, []))
+    monkeypatch.setattr("excite.choosing.unlikely", lambda scanned, stage, tried, together: (stage, []))
     assert diagnose.diagnose(straight, [one], straight.machine.filter).verdict == "unexplained"
 
 
@@ -118,7 +118,7 @@ def test_what_promises_nothing_at_all_is_not_tried(
     late = next(s for s in scores if s.candidate.placed.effect.name == "channel_delay")
     scores = (replace(late, gain=0.0, values={**late.values, "A": -0.01}),)
     monkeypatch.setattr("excite.choosing.scored", lambda stage, together: scores)
-    assert not choosing.unlikely(stage, stages.forced(stage, in_turn), in_turn)[1]
+    assert not choosing.unlikely(stage, stages.forced(stage, in_turn), (), in_turn)[1]
 
 
 def _slope(straight: Model) -> EffectEntry:

@@ -90,6 +90,16 @@ def test_dropouts_are_found(straight: Model, straight_motion: Motion, clean: Log
         examine.examine(straight, changed(clean, "theta1", y))
 
 
+def test_a_jump_after_standing_still_is_a_dropout(straight: Model, straight_motion: Motion, clean: Log) -> None:
+    """A reading that freezes while the joint is slow, and is where the joint has gone to when it thaws."""
+    speed = np.abs(straight_motion.nu[:, 1])
+    slow = next(k for k in range(400, len(speed) - 600) if speed[k] < 0.03 and speed[k : k + 200].max() > 0.3)
+    y = clean.values["theta1"].copy()
+    y[slow : slow + 100] = y[slow]
+    with pytest.raises(LogError, match=rf"theta1_rad: 1 drop-out.*row {slow + 1} to {slow + 100} "):
+        examine.examine(straight, changed(clean, "theta1", y))
+
+
 def test_late_channels_are_found_to_a_millisecond(straight: Model, clean: Log) -> None:
     """No alarm on a clean log; 30 ms on one channel is 30 ms on that one, and none on the other."""
     assert examine.late_channels(straight, clean) == ()
