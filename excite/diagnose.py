@@ -240,7 +240,8 @@ def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
     be any, and without it the fit is as good. Disturbing forces hide what else a right name explains."""
     kept, whole = list(chosen), chosen[-1].stage
     for x in chosen:
-        if len(kept) == 1 or _surely(x.name, whole):
+        # Of one that is nothing at infinity the amount's deviation says little.
+        if len(kept) == 1 or (_surely(x.name, whole) and not whole.placed(x.name).effect.inverse):
             continue
         beside = np.inf  # nothing fits without it
         with suppress(NotConverged):

@@ -268,6 +268,12 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
     assert [x.name for x in left] == names
     assert [e.name for e in left[0].stage.machine.effect] == [names[0].split("@")[0]]
     assert [x.name for x in diagnose.needed(found.before, left)] == names
+    # Nor does one stay whose amount says that it is nothing, however sure that amount seems to be.
+    faint = placing.parse("shear_saturation@rear_roll=6", straight.machine, 40.0)
+    more = stages.refitted(placing.extended(found.after.machine, faint), found.after, 0.0)
+    name = f"{faint.name}@{faint.where}"
+    chosen = [choosing.Choice(n, more, 1000.0, 1.0, 100, (), 1.0) for n in (name, *names)]
+    assert [x.name for x in diagnose.needed(found.before, chosen)] == names
 
 
 def test_what_gets_a_name_is_no_chance(straight: Model, straight_motion: Motion) -> None:
