@@ -92,6 +92,26 @@ def test_where_nothing_promises_anything_effects_begin_anew(
     assert diagnose.diagnose(straight, [one], straight.machine.filter).verdict == "unexplained"
 
 
+def test_a_second_cause_with_which_exact_dynamics_follow_is_no_flaw_of_the_first(
+    straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Forces hide how good a first cause's formula is, so that what gains a sixth of it may be its flaw; but not where
+    exact dynamics follow the log with both."""
+    slope = placing.parse("ground_slope=0.002", straight.machine, 30.0)
+    both = prediction.build(placing.extended(straight.machine, slope))
+    motion = simulate(both, gentle(straight, 30.0).u)
+    one = log.check(sensors.measure(both, motion, seed=3), straight.machine)
+    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    assert stage.fit.disturbed > 0
+    scores = choosing.scored(stage, in_turn)
+    first = choosing.Choice("torque_gain@rear_roll", stage, 6 * scores[0].gain, 1.0, 200, (), 1.0)
+    found = choosing.choose(stage, scores, [first], in_turn, lambda share, what: None, 0.0)
+    assert found is not None
+    assert (found.name, found.stage.exact, found.stage.near) == ("ground_slope@machine", True, True)
+    monkeypatch.setattr("excite.choosing.freed", lambda found, together: (None for _ in found))
+    assert choosing.choose(stage, scores, [first], in_turn, lambda share, what: None, 0.0) is None
+
+
 def test_a_phase_that_was_found_the_other_way_round_is_turned(sloping: Path, straight: Model) -> None:
     """A fit that began with a slope downhill keeps it so, its amount negative; people are given a positive one."""
     one = log.read(sloping, straight.machine)
