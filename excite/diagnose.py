@@ -3,10 +3,10 @@
 A log is smoothed with the machine's model. Where the innovations hold more than noise, every effect of the catalogue is
 scored (`evidence`), the best are fitted with amount and shapes as parameters, and the one that the log likes best is
 added to the model; then again, until nothing is left or nothing in the catalogue helps. Names that the log likes as
-well are given together. What no name explains is said to be unexplained. Where the model without effects can be fitted
-to much coarser sensors only, the first effect is found with these and the fit sharpened with it; where not even that,
-effects are scored along the file's parameters and fitted from the logs' beginning; so are those that promise less where
-nothing explains the logs.
+well are given together. What no name explains, or takes four, is said to be unexplained. Where the model without
+effects can be fitted to much coarser sensors only, the first effect is found with these and the fit sharpened with it;
+where not even that, effects are scored along the file's parameters and fitted from the logs' beginning; so are those
+that promise less where nothing explains the logs.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from model import placing
 from model.machine import EffectEntry, Filter
 from model.prediction import Model, signs
 
-MOST = 4  # effects that are looked for
+MOST = 4  # effects that are looked for; so many of different kinds are a patchwork, of what has no name
 FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
 # Of an amount: what another formula of the same effect makes of it. ALIKE is what it does in the middle; 95 % of the
 # amounts in results/diagnosis are within intervals that allow for so much.
@@ -131,6 +131,8 @@ def diagnose(
     if len(chosen) > 1:
         tell(0.9, "judging each given the others")
         chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
+    if len({x.name.split("@")[0] for x in chosen}) >= MOST:
+        chosen, odd, nearest = [], _odd(before), _largest(chosen, odd)
     stage = chosen[-1].stage if chosen else before
     return concluded(before, stage, chosen, odd, left, nearest)
 
@@ -176,6 +178,13 @@ def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tupl
             break
         nearest = Nearest(kept.pop().name, explained, impossible)
     return kept, odd, nearest
+
+
+def _largest(chosen: Sequence[Choice], odd: Sequence[str]) -> Nearest:
+    """The effect that gains most of several."""
+    most = max(chosen, key=lambda x: x.gain)
+    rest = sum(x.gain for x in chosen) - most.gain + _rest(chosen[-1].stage, odd)
+    return Nearest(most.name, most.gain / (most.gain + rest))
 
 
 def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_turn) -> list[Choice]:

@@ -8,6 +8,7 @@ import pickle
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -110,6 +111,37 @@ def test_a_second_cause_with_which_exact_dynamics_follow_is_no_flaw_of_the_first
     assert (found.name, found.stage.exact, found.stage.near) == ("ground_slope@machine", True, True)
     monkeypatch.setattr("excite.choosing.freed", lambda found, together: (None for _ in found))
     assert choosing.choose(stage, scores, [first], in_turn, lambda share, what: None, 0.0) is None
+
+
+@pytest.mark.parametrize(
+    ("names", "verdict"),
+    [
+        (("torque_gain@rear_roll", "torque_ripple@rear_roll", "stribeck_friction@rear_roll"), "named"),
+        (("torque_gain@rear_roll", *(f"friction_transition@{x}" for x in ("front_roll", "rear_roll", "x"))), "named"),
+        (
+            ("torque_gain@rear_roll", "torque_ripple@rear_roll", "stribeck_friction@rear_roll", "ground_slope@machine"),
+            "unexplained",
+        ),
+    ],
+)
+def test_many_names_are_none(
+    names: tuple[str, ...], verdict: str, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What takes four kinds of causes is something that isn't known; the one that explains most is the nearest."""
+    one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
+    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    chosen = [choosing.Choice(n, stage, 100.0 + k, 1.0, 200, (), 1.0) for k, n in enumerate(names)]
+    kept = {"fitted": stage, "extended": (chosen, 0.0), "reviewed": chosen, "needed": chosen}
+    for name, answer in (*kept.items(), ("weighed", (chosen, (), None))):
+        monkeypatch.setattr(f"excite.diagnose.{name}", lambda *asked, answer=answer: answer)
+    monkeypatch.setattr("excite.diagnose._finding", lambda *asked, **more: SimpleNamespace(tied_with=()))
+    found = diagnose.diagnose(straight, [one], straight.machine.filter)
+    assert (found.verdict, len(found.findings)) == (verdict, len(names) if verdict == "named" else 0)
+    if verdict == "unexplained":
+        assert found.after is stage
+        assert found.nearest is not None
+        assert found.nearest.name == names[-1]
+        assert found.nearest.share == pytest.approx(103 / 406)
 
 
 def test_a_phase_that_was_found_the_other_way_round_is_turned(sloping: Path, straight: Model) -> None:
