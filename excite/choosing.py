@@ -8,7 +8,7 @@ Where no model follows the logs, the first is chosen with coarse sensors (`sharp
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.stats
@@ -222,7 +222,9 @@ def choose(
     if hidden and not best.near:
         return None
     choice = _chosen(tries, gain, len(scores), together)
-    return None if hidden and not (choice.stage.exact and choice.stage.near) else choice
+    if not hidden:
+        return choice
+    return replace(choice, loose=None) if choice.stage.exact and choice.stage.near else None
 
 
 def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) -> Choice:
@@ -290,19 +292,19 @@ def sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None
 def unfollowed(stage: Stage, together: Together) -> tuple[Stage, list[Choice], frozenset[str]]:
     """Where no fit was found: the effect with which the model can follow the logs, with as small disturbing forces as
     there is one. With it there may be a fit without it after all, which then is what it is compared with, and may be as
-    good: the model began too far off. The stage as it was and no effect where nothing helps. And the names that were
-    tried."""
+    good: the model began too far off. The stage as it was and no effect where nothing helps, and the names that were
+    tried then."""
     scores = scored(stage, together)
     likely = _likely(stage, scores, (), together)
     forces = 0.0, smoothing.DISTURBED[0], smoothing.DISTURBED[-1]
-    found = _followed(stage, likely, forces, len(scores), together) or (stage, [])
-    return *found, frozenset(s.candidate.name for s in likely)
+    found = _followed(stage, likely, forces, len(scores), together)
+    return (*found, frozenset()) if found else (stage, [], frozenset(s.candidate.name for s in likely))
 
 
 def unlikely(scanned: Stage, stage: Stage, tried: Container[str], together: Together) -> tuple[Stage, list[Choice]]:
     """Where nothing was found that explains the logs: far from any fit an effect promises little of what it explains,
     or something else does. So those that promise anything in a stage, scanned, begin anew with exact dynamics, which
-    follow the logs with the right one only; but those that were tried. As `unfollowed` has it."""
+    follow the logs with the right one only; but those that were tried so. As `unfollowed` has it."""
     scores = scored(scanned, together)
     best = {s.candidate.name: s for s in reversed(scores) if s.gain > 0 and s.values["A"] != 0}
     most = sorted(best.values(), key=lambda s: -s.gain)[:ANEW]

@@ -3,10 +3,10 @@
 A log is smoothed with the machine's model. Where the innovations hold more than noise, every effect of the catalogue is
 scored (`evidence`), the best are fitted with amount and shapes as parameters, and the one that the log likes best is
 added to the model; then again, until nothing is left or nothing in the catalogue helps. Names that the log likes as
-well are given together. What no name explains, or takes four, is said to be unexplained. Where the model without
-effects can be fitted to much coarser sensors only, the first effect is found with these and the fit sharpened with it;
-where not even that, effects are scored along the file's parameters and fitted from the logs' beginning; so are those
-that promise less where nothing explains the logs.
+well are given together. What no name explains, or only four together, is said to be unexplained. Where the model
+without effects can be fitted to much coarser sensors only, the first effect is found with these and the fit sharpened
+with it; where not even that, effects are scored along the file's parameters and fitted from the logs' beginning; so are
+those that promise less where nothing explains the logs.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from model import placing
 from model.machine import EffectEntry, Filter
 from model.prediction import Model, signs
 
-MOST = 4  # effects that are looked for; so many of different kinds are a patchwork, of what has no name
+MOST = 4  # effects that are looked for; so many kinds, none of which explains SHARE, patch up what has no name
 FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
 # Of an amount: what another formula of the same effect makes of it. ALIKE is what it does in the middle; 95 % of the
 # amounts in results/diagnosis are within intervals that allow for so much.
@@ -131,7 +131,7 @@ def diagnose(
     if len(chosen) > 1:
         tell(0.9, "judging each given the others")
         chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
-    if len({x.name.split("@")[0] for x in chosen}) >= MOST:
+    if len({x.name.split("@")[0] for x in chosen}) >= MOST and _largest(chosen, odd).share < choosing.SHARE:
         chosen, odd, nearest = [], _odd(before), _largest(chosen, odd)
     stage = chosen[-1].stage if chosen else before
     return concluded(before, stage, chosen, odd, left, nearest)
@@ -250,7 +250,8 @@ def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
     kept, whole = list(chosen), chosen[-1].stage
     for x in chosen:
         # Of one that is nothing at infinity the amount's deviation says little.
-        if len(kept) == 1 or (_surely(x.name, whole) and not whole.placed(x.name).effect.inverse):
+        doubtful = whole.exact and whole.placed(x.name).effect.inverse
+        if len(kept) == 1 or (_surely(x.name, whole) and not doubtful):
             continue
         beside = np.inf  # nothing fits without it
         with suppress(NotConverged):

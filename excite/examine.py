@@ -21,7 +21,7 @@ SPIKE = 10.0  # robust deviations from the neighbours that make an outlier
 STEPS = 8.0  # counts, likewise
 MANY = 0.005  # share of a channel's samples that may be repaired
 HELD = 8  # equal readings in a row that make a drop-out
-JUMP = 10.0  # times any step around and a count, at the end of such a stretch: what a standing joint can't do
+JUMP = 3.0  # times as far, at the end of such a stretch, as the encoder moves in a sample elsewhere
 LATE = 4.0  # standard deviations that make a delay worth a remark
 FLOOR = 4.0  # times the noise floor where a spectrum counts as sunk
 NEEDED = ("angle", "torque", "wheel")  # kinds of sensor that no method does without
@@ -130,15 +130,16 @@ def find_dropouts(sensor: Sensor, x: np.ndarray) -> tuple[tuple[int, int], ...]:
     if sensor.resolution is None:
         moving = np.count_nonzero(np.diff(x)) > 0.9 * (len(x) - 1)  # a channel without noise may well stand still
         return tuple(long) if moving else ()
-    found = []
+    found, fastest = [], float(np.quantile(np.abs(np.diff(x)), 0.999)) if long else 0.0
     for a, b in long:
         before, after = x[max(a - HELD, 0) : a + 1], x[b : b + HELD + 1]
         if min(len(before), len(after)) <= HELD:
             continue
         speed = min(abs(before[-1] - before[0]), abs(after[-1] - after[0])) / HELD
-        steps = np.abs(np.concatenate([np.diff(before), np.diff(after[1:])]))
-        jump, usual = abs(x[b + 1] - x[a]), steps.max() + sensor.resolution
-        if (speed > 3 * sensor.resolution and jump > 0.5 * speed * (b - a)) or jump > JUMP * usual:
+        jump = abs(x[b + 1] - x[a])
+        if (speed > 3 * sensor.resolution and jump > 0.5 * speed * (b - a)) or jump > JUMP * (
+            fastest + sensor.resolution
+        ):
             found.append((a, b))
     return tuple(found)
 

@@ -118,6 +118,7 @@ def test_a_second_cause_with_which_exact_dynamics_follow_is_no_flaw_of_the_first
     [
         (("torque_gain@rear_roll", "torque_ripple@rear_roll", "stribeck_friction@rear_roll"), "named"),
         (("torque_gain@rear_roll", *(f"friction_transition@{x}" for x in ("front_roll", "rear_roll", "x"))), "named"),
+        (("ground_slope@machine", "torque_ripple@rear_roll", "stribeck_friction@rear_roll", "torque_gain@x"), "named"),
         (
             ("torque_gain@rear_roll", "torque_ripple@rear_roll", "stribeck_friction@rear_roll", "ground_slope@machine"),
             "unexplained",
@@ -127,10 +128,11 @@ def test_a_second_cause_with_which_exact_dynamics_follow_is_no_flaw_of_the_first
 def test_many_names_are_none(
     names: tuple[str, ...], verdict: str, straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What takes four kinds of causes is something that isn't known; the one that explains most is the nearest."""
+    """What takes four kinds of causes, none of which explains most, is something that isn't known."""
     one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
     stage = stages.fitted(straight.machine, [one], straight.machine.filter)
-    chosen = [choosing.Choice(n, stage, 100.0 + k, 1.0, 200, (), 1.0) for k, n in enumerate(names)]
+    gains = {"ground_slope@machine": 1000.0} if verdict == "named" else {}
+    chosen = [choosing.Choice(n, stage, gains.get(n, 100.0 + k), 1.0, 200, (), 1.0) for k, n in enumerate(names)]
     kept = {"fitted": stage, "extended": (chosen, 0.0), "reviewed": chosen, "needed": chosen}
     for name, answer in (*kept.items(), ("weighed", (chosen, (), None))):
         monkeypatch.setattr(f"excite.diagnose.{name}", lambda *asked, answer=answer: answer)
@@ -171,6 +173,18 @@ def test_what_promises_nothing_at_all_is_not_tried(
     scores = (replace(late, gain=0.0, values={**late.values, "A": -0.01}),)
     monkeypatch.setattr("excite.choosing.scored", lambda stage, together: scores)
     assert not choosing.unlikely(stage, stages.forced(stage, in_turn), (), in_turn)[1]
+    # Nor is what was begun already.
+    begun = list[str]()
+
+    def begin(machines: Sequence[machine.Machine], *asked: object) -> list[None]:
+        begun.extend(e.name for m in machines for e in m.effect)
+        return [None for _ in machines]
+
+    scores = (replace(late, gain=100.0, values={**late.values, "A": 0.01}),)
+    monkeypatch.setattr("excite.choosing.begun", begin)
+    for tried, expected in (((late.candidate.name,), []), ((), ["channel_delay"])):
+        assert choosing.unlikely(stage, stage, tried, in_turn) == (stage, [])
+        assert begun == expected
 
 
 def _slope(straight: Model) -> EffectEntry:
