@@ -208,8 +208,8 @@ def confusion(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def told(s: dict[str, Any], planned: int) -> str:
-    """The README: what was done and what came out, of so many cases planned."""
+def told(s: dict[str, Any], planned: int, options: Sequence[str]) -> str:
+    """The README: what was done with these options and what came out, of so many cases planned."""
 
     def line(what: str, r: dict[str, Any], aim: str = "") -> str:
         if not r["of"]:
@@ -249,11 +249,14 @@ def told(s: dict[str, Any], planned: int) -> str:
         if s["cases"] < planned
         else ""
     )
+    command = " ".join(["python results/diagnosis/study.py", *options])
     return f"""# Does the diagnosis name what was hidden?
 
-`python results/diagnosis/study.py` rebuilds this page; [summary.json](summary.json) has every rate,
-[cases.csv](cases.csv) every case.{part} Nobody had looked at any of them while the diagnosis was written: their numbers
-begin where those end that it was mended by, which `--seen` runs instead.
+`{command}`
+rebuilds this page; [summary.json](summary.json) has every rate, [cases.csv](cases.csv) every case.{part} Nobody had
+looked at any of them while the diagnosis was written: their numbers begin where those end that it was mended by, which
+`--seen` runs instead. What came of them and of earlier rounds is in
+[docs/derivations.md](../../docs/derivations.md).
 
 A second roller (`tests/plant.py`) shares no code with the program: Lagrange's equations in ground coordinates by
 automatic differentiation, half-millisecond Runge-Kutta steps, a person with delay, slow hand and hydraulics at the
@@ -322,7 +325,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     flat.to_csv(given.out / "cases.csv", index=False, float_format="%.6g")
     confusion(rows).savefig(given.out / "confusion.png", dpi=110, metadata={"Software": None})
     (given.out / "summary.json").write_text(json.dumps(s, indent=1) + "\n")
-    (given.out / "README.md").write_text(told(s, len(wanted)))
+    names = ("nothing", "per_cause", "per_surprise", "pairs")
+    options = [f"--{name.replace('_', '-')} {getattr(given, name)}" for name in names]
+    (given.out / "README.md").write_text(told(s, len(wanted), [*options, *(["--seen"] if given.seen else [])]))
 
 
 if __name__ == "__main__":
