@@ -178,9 +178,11 @@ model = prediction.build(machine.load("va12"))
 motion = simulate(model, drive(model, 60, 0, {"u1": 1200, "u2": 4500, "u4": 1200}))
 one = log.check(sensors.measure(model, motion, seed=1), model.machine)
 minutes = int(sys.argv[1])
-kinds = {s.name: s.kind if s.name != "theta2" else "" for s in model.machine.sensor}
+kinds = {s.name: s.kind for s in model.machine.sensor}
 def repeated(name, v):
     travel = v[-1] - v[0] if kinds[name] in ("angle", "wheel") else 0.0
+    if name == "theta2":  # a joint that ends where it began, so that it doesn't jump there
+        v, travel = v - travel * np.linspace(0, 1, len(v)), 0.0
     return np.concatenate([v[:-1] + k * travel for k in range(minutes)])
 long = Log("long", np.arange(6000 * minutes) / 100, {k: repeated(k, v) for k, v in one.values.items()})
 begin = time.process_time()
