@@ -90,7 +90,7 @@ def separating(place: Path, machine: Machine, tied: Sequence[Rivals], onward: bo
             model = brief.beside(build(pair.machine, flaws=False), pair.between)
         except MachineError:
             continue  # a sensor's: no equation of motion shows it
-        between = tuple(f"{e.name}@{e.where}={float(e.amount):.5g}" for e in pair.between)
+        between = tuple(f"{e.label}={float(e.amount):.5g}" for e in pair.between)
         told: dict[str, Any] = {"between": list(between), "folder": None}
         if onward:
             (place / NEXT).mkdir()

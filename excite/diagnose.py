@@ -60,7 +60,7 @@ class Finding:
 
     @property
     def tied_with(self) -> tuple[str, ...]:
-        return tuple(f"{e.name}@{e.where}" for e in self.rivals)
+        return tuple(e.label for e in self.rivals)
 
     @property
     def entry(self) -> EffectEntry:
@@ -131,8 +131,8 @@ def diagnose(
     if len(chosen) > 1:
         tell(0.9, "judging each given the others")
         chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
-    if len({x.name.split("@")[0] for x in chosen}) >= MOST and _largest(chosen, odd).share < choosing.SHARE:
-        chosen, odd, nearest = [], _odd(before), _largest(chosen, odd)
+    if (largest := _patched(chosen, odd)) is not None:
+        chosen, odd, nearest = [], _odd(before), largest
     stage = chosen[-1].stage if chosen else before
     return concluded(before, stage, chosen, odd, left, nearest)
 
@@ -180,11 +180,13 @@ def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tupl
     return kept, odd, nearest
 
 
-def _largest(chosen: Sequence[Choice], odd: Sequence[str]) -> Nearest:
-    """The effect that gains most of several."""
-    most = max(chosen, key=lambda x: x.gain)
-    rest = sum(x.gain for x in chosen) - most.gain + _rest(chosen[-1].stage, odd)
-    return Nearest(most.name, most.gain / (most.gain + rest))
+def _patched(chosen: Sequence[Choice], odd: Sequence[str]) -> Nearest | None:
+    """The effect that gains most of so many kinds that they only patch up what has no name; None where they don't."""
+    if len({x.name.split("@")[0] for x in chosen}) < MOST:
+        return None
+    most, gained = max(chosen, key=lambda x: x.gain), sum(x.gain for x in chosen)
+    share = _share(gained, chosen[-1].stage, odd) * most.gain / gained
+    return Nearest(most.name, share) if share < choosing.SHARE else None
 
 
 def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_turn) -> list[Choice]:
@@ -286,7 +288,7 @@ def _outgrows(choice: Choice, chosen: Sequence[Choice]) -> bool:
 
 def _others(choice: Choice, found: Container[str]) -> tuple[EffectEntry, ...]:
     """The rivals of an effect that aren't found beside it."""
-    return tuple(e for e in choice.rivals if f"{e.name}@{e.where}" not in found)
+    return tuple(e for e in choice.rivals if e.label not in found)
 
 
 def _without(name: str, stage: Stage) -> Stage:

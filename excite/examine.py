@@ -137,9 +137,8 @@ def find_dropouts(sensor: Sensor, x: np.ndarray) -> tuple[tuple[int, int], ...]:
             continue
         speed = min(abs(before[-1] - before[0]), abs(after[-1] - after[0])) / HELD
         jump = abs(x[b + 1] - x[a])
-        if (speed > 3 * sensor.resolution and jump > 0.5 * speed * (b - a)) or jump > JUMP * (
-            fastest + sensor.resolution
-        ):
+        caught_up = speed > 3 * sensor.resolution and jump > 0.5 * speed * (b - a)
+        if caught_up or jump > JUMP * (fastest + sensor.resolution):
             found.append((a, b))
     return tuple(found)
 

@@ -336,6 +336,11 @@ class EffectEntry(Record):
     std: NotNegative | None = None
     shape: dict[str, Quantity] = Field({})
 
+    @property
+    def label(self) -> str:
+        """As people give it: effect@place."""
+        return f"{self.name}@{self.where}"
+
 
 def _convex(corners: Sequence[tuple[float, float]]) -> bool:
     """Whether corners, in order, go once around a convex area, turning the same way at every one."""

@@ -92,7 +92,7 @@ def extended(machine: Machine, *entries: EffectEntry) -> Machine:
 
 def without(machine: Machine, name: str) -> Machine:
     """The machine without the effect of this name (effect@place)."""
-    rest = tuple(e for e in machine.effect if f"{e.name}@{e.where}" != name)
+    rest = tuple(e for e in machine.effect if e.label != name)
     return machine.model_copy(update={"effect": rest})
 
 

@@ -307,14 +307,14 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
     found, same = (diagnose.diagnose(straight, [one], straight.machine.filter, together=t) for t in (forked, in_turn))
     assert found.findings == same.findings
     np.testing.assert_array_equal(found.after.fit.X, same.after.fit.X)
-    names = [f"{e.name}@{e.where}" for e in true]
+    names = [e.label for e in true]
     assert (found.verdict, sorted(f.name for f in found.findings)) == ("named", sorted(names))
     for f, e in zip(sorted(found.findings, key=lambda f: f.name), true, strict=True):
         assert abs(f.amount - float(e.amount)) < 4 * f.amount_std
 
     wrong = placing.parse("asymmetric_coulomb@rear_roll=60", straight.machine, 40.0)
     more = stages.refitted(placing.extended(found.after.machine, wrong), found.after, 0.0)
-    name = f"{wrong.name}@{wrong.where}"
+    name = wrong.label
     for order, stage in (
         (names[::-1], found.after),
         ([name, *names], more),
@@ -337,7 +337,7 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
     # Nor does one stay whose amount says that it is nothing, however sure that amount seems to be.
     faint = placing.parse("shear_saturation@rear_roll=6", straight.machine, 40.0)
     more = stages.refitted(placing.extended(found.after.machine, faint), found.after, 0.0)
-    name = f"{faint.name}@{faint.where}"
+    name = faint.label
     chosen = [choosing.Choice(n, more, 1000.0, 1.0, 100, (), 1.0) for n in (name, *names)]
     assert [x.name for x in diagnose.needed(found.before, chosen)] == names
 

@@ -40,6 +40,8 @@ from matplotlib.figure import Figure
 from surprises import SURPRISES
 from visibility import VISIBLE, visibility
 
+from excite.folder import writing_file
+
 Row = dict[str, Any]
 FRESH = {"nothing": 201, "cause": 12, "surprise": 5, "pair": 21}  # numbers below were looked at when mending
 GOOD = ("right", "tied")  # a tie that holds the cause sends nobody to repair the wrong thing
@@ -77,9 +79,8 @@ def cases(wanted: Mapping[str, int], first: Mapping[str, int]) -> list[Case]:
 
 
 def _kept(file: Path, row: Row) -> None:
-    part = file.with_suffix(f".{os.getpid()}.part")
-    part.write_text(json.dumps(row, default=float))
-    os.replace(part, file)
+    with writing_file(file) as part:
+        part.write_text(json.dumps(row, default=float))
 
 
 def driven(one: Case) -> tuple[pd.DataFrame, float]:
@@ -89,9 +90,8 @@ def driven(one: Case) -> tuple[pd.DataFrame, float]:
     log, file = kept / f"{one.key}.parquet", kept / f"{one.key}.json"
     if not file.exists():
         drive = blind(one)
-        part = log.with_suffix(f".{os.getpid()}.part")
-        drive.log.to_parquet(part)
-        os.replace(part, log)
+        with writing_file(log) as part:
+            drive.log.to_parquet(part)
         _kept(file, {"visibility": visibility(drive)})  # last: a log without it is driven again
     return pd.read_parquet(log), float(json.loads(file.read_text())["visibility"])
 
