@@ -26,6 +26,7 @@ SMOOTH_SPEED = 0.02  # [m/s] over which rolling resistance turns
 SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
 
 MOMENTS = 120  # at which a load is looked for that slides
+CROSSING = 0.01  # [s] that an actuator takes for its play where it is pushed by so much as the shape `turn` says
 PRESSED = 0.1  # [rad] beyond a stop, at which its hardening is stated
 BEHIND = 2.0  # [m] from the joint, where a load is put on or taken off
 
@@ -149,6 +150,13 @@ def _window(t: ca.SX, p: Values) -> ca.SX:
 def _resistance(s: Scene, k: int, p: Values) -> tuple[ca.SX, ca.SX]:
     r = s.rolling[k]
     return -p["A"] * (1 + p["rise"] * r.Vx**2) * ca.tanh(r.Vx / p["soft"]), ca.SX(0)
+
+
+def _played(s: Scene, k: int, p: Values) -> ca.SX:
+    """Where the actuator is in its play, -1 to 1: it goes to the side that it is pushed to beyond its own friction."""
+    width = SMOOTH_TORQUE * s.full[k]
+    ahead, back = _softplus(s.u[k] - p["held"], width), _softplus(-s.u[k] - p["held"], width)
+    return (ahead * (1 - s.z["play"]) - back * (1 + s.z["play"])) / (p["turn"] * CROSSING)
 
 
 def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
@@ -618,9 +626,13 @@ _declare(
         "the angle jumps where the torque changes its sign",
         "Nordin, Gutman, Automatica 38 (2002)",
         _constant(0.005),
-        {"turn": Shape("N m", 0.02, (0.01, 0.05), _full_torque)},
+        {
+            "turn": Shape("N m", 0.02, (0.01, 0.05), _full_torque),
+            "held": Shape("N m", 0.0, (0.0, 0.01, 0.03), _full_torque),
+        },
         positive=True,
-        reading=lambda s, exact, k, p: p["A"] / 2 * ca.tanh(s.u[k] / p["turn"]),
+        reading=lambda s, exact, k, p: p["A"] / 2 * s.z["play"],
+        memory={"play": Memory(_played, 1.0)},
         angular=True,
     ),
     Effect(
