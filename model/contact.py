@@ -29,6 +29,25 @@ class Wrench:
 
 
 @dataclass(frozen=True)
+class Saturation:
+    """How forces fall behind the linear law. slip: K / xi_s, at which the shear displacement is K at the patch's rear.
+
+    bend: 0 as the exponential law (18) has it, 1 along a hyperbola of the same slope (Kondner, J. Soil Mech. 89, 1963).
+    Simpler readings of (18): with `strips` 0 all of the contact's width saturates as its middle does, with `untouched`
+    1 the moment does not.
+    """
+
+    slip: ca.SX
+    bend: ca.SX | float = 0.0
+    strips: ca.SX | float = 1.0
+    untouched: ca.SX | float = 0.0
+
+    def share(self, gx: ca.SX | float, gy: ca.SX) -> ca.SX:
+        """Of the linear law's force, at slips gx, gy."""
+        return mobilised(ca.sqrt(gx**2 + gy**2 + 1e-12) / self.slip, self.bend)
+
+
+@dataclass(frozen=True)
 class Slip:
     """Slips at the middle of the contact, longitudinal and lateral [-], and v_n [m/s]."""
 
@@ -50,31 +69,27 @@ def wrench(
     yaw_rate: ca.SX,
     Kx: ca.SX,
     Ky: ca.SX,
-    saturation: ca.SX | None = None,
-    lateral: ca.SX | None = None,
-    strips: ca.SX | float = 1.0,
-    untouched: ca.SX | float = 0.0,
+    saturation: Saturation | None = None,
+    lateral: Saturation | None = None,
 ) -> Wrench:
     """What the soil does to a contact; yaw_rate [rad/s] of its chassis; Kx, Ky [N] < 0.
 
-    Linear (24, 25), or with `saturation` = K / xi_s the exponential law (18) integrated over the patch. `lateral`: the
-    same for the lateral force alone, as a factor on it. Simpler readings of (18): with `strips` 0 all of the contact's
-    width saturates as its middle does, with `untouched` 1 the moment does not.
+    Linear (24, 25), or with `saturation` the exponential law (18) integrated over the patch. `lateral`: the same for
+    the lateral force alone, as a factor on it.
     """
     if lateral is not None:
-        Ky = Ky * mobilised(ca.sqrt(s.gy**2 + 1e-12) / lateral)
+        Ky = Ky * lateral.share(0.0, s.gy)
     turning = Kx * (float(contact.width) ** 2 / 12) * (-yaw_rate) / s.vn
     if saturation is None:
         return Wrench(Kx * s.gx, Ky * s.gy, turning)
     Sx, Sy, Tz = ca.SX(0), ca.SX(0), ca.SX(0)
-    for y, dy in _across(contact, s, strips * yaw_rate):
+    for y, dy in _across(contact, s, saturation.strips * yaw_rate):
         gx = s.gx - y * yaw_rate / s.vn
-        own = s.gx - strips * y * yaw_rate / s.vn
-        share = mobilised(ca.sqrt(own**2 + s.gy**2 + 1e-12) / saturation) * dy
+        share = saturation.share(s.gx - saturation.strips * y * yaw_rate / s.vn, s.gy) * dy
         Sx += Kx * gx * share
         Sy += Ky * s.gy * share
         Tz += Kx * gx * y * share
-    return Wrench(Sx, Sy, (1 - untouched) * Tz + untouched * turning)
+    return Wrench(Sx, Sy, (1 - saturation.untouched) * Tz + saturation.untouched * turning)
 
 
 def _across(contact: Contact, s: Slip, yaw_rate: ca.SX) -> Iterator[tuple[ca.SX, ca.SX]]:
@@ -92,12 +107,14 @@ def _across(contact: Contact, s: Slip, yaw_rate: ca.SX) -> Iterator[tuple[ca.SX,
             yield edge * (still + h * point**2), ca.fabs(h) * point * weight
 
 
-def mobilised(x: ca.SX) -> ca.SX:
+def mobilised(x: ca.SX, bend: ca.SX | float = 0.0) -> ca.SX:
     """Force of the exponential law over that of its linear limit, for x = |g| xi_s / K: 2 (x - 1 + e^-x) / x^2.
 
     The mean over the patch of (1 - exp(-j/K)), j = |g| xi, against j/K (18). Below x = 0.05 the series
-    1 - x/3 + x^2/12 - x^3/60 + x^4/360 replaces it, where the closed form cancels.
+    1 - x/3 + x^2/12 - x^3/60 + x^4/360 replaces it, where the closed form cancels. `bend`: the share of the hyperbola
+    1 / (1 + x/3) in its place.
     """
     series = 1 - x / 3 + x**2 / 12 - x**3 / 60 + x**4 / 360
     safe = ca.fmax(x, 0.05)
-    return ca.if_else(x < 0.05, series, 2 * (safe - 1 + ca.exp(-safe)) / safe**2)
+    exponential = ca.if_else(x < 0.05, series, 2 * (safe - 1 + ca.exp(-safe)) / safe**2)
+    return exponential + bend * (1 / (1 + x / 3) - exponential)

@@ -35,22 +35,18 @@ class Rolling:
 
 @dataclass(frozen=True)
 class Soil:
-    """What a contact's wrench is made from: slips, yaw rate, stiffnesses Kx, Ky [N], saturations (None: linear), and
-    how these are read (`contact.wrench`)."""
+    """What a contact's wrench is made from: slips, yaw rate, stiffnesses Kx, Ky [N], saturations (None: linear)."""
 
     slip: law.Slip
     yaw: ca.SX
     Kx: ca.SX
     Ky: ca.SX
-    saturation: ca.SX | None = None
-    lateral: ca.SX | None = None
-    strips: ca.SX | float = 1.0
-    untouched: ca.SX | float = 0.0
+    saturation: law.Saturation | None = None
+    lateral: law.Saturation | None = None
 
     def wrench(self, on: Contact) -> law.Wrench:
         """What it does to a contact."""
-        how = self.saturation, self.lateral, self.strips, self.untouched
-        return law.wrench(on, self.slip, self.yaw, self.Kx, self.Ky, *how)
+        return law.wrench(on, self.slip, self.yaw, self.Kx, self.Ky, self.saturation, self.lateral)
 
 
 @dataclass(frozen=True)

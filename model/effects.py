@@ -31,6 +31,7 @@ PRESSED = 0.1  # [rad] beyond a stop, at which its hardening is stated
 BEHIND = 2.0  # [m] from the joint, where a load is put on or taken off
 
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
+BEND = Shape("-", 0.0, (0.0,), meaning="0: as the exponential law has it; 1: as a hyperbola; in between or beyond")
 TWICE = Shape("rad", 0.0, (0.0,), lambda site: 0.001)
 
 
@@ -136,7 +137,7 @@ def _compacted(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
 
 def _saturated(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
     strips, _, untouched = _of_three(p["across"])
-    return replace(soil, saturation=p["A"], strips=strips, untouched=untouched)
+    return replace(soil, saturation=law.Saturation(p["A"], p["bend"], strips, untouched))
 
 
 def _between(t: ca.SX, begin: ca.SX, end: ca.SX, width: float) -> ca.SX:
@@ -472,7 +473,8 @@ _declare(
                 only=(0.0, 1.0, 2.0),
                 meaning="0: every strip of the width saturates by its own slip; 1: all of it as its middle; 2: the"
                 " same, but for the moment T_z",
-            )
+            ),
+            "bend": BEND,
         },
         soil=_saturated,
     ),
@@ -487,7 +489,8 @@ _declare(
         grid=(0.5, 1.0, 3.0),
         positive=True,
         inverse=True,
-        soil=lambda s, k, p, soil: replace(soil, lateral=p["A"]),
+        shapes={"bend": BEND},
+        soil=lambda s, k, p, soil: replace(soil, lateral=law.Saturation(p["A"], p["bend"])),
     ),
     Effect(
         "drive_brake_asymmetry",

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import casadi as ca
 
+from model import contact as law
 from model import effects as catalogue
 from model import placing, tree
 from model.effect import Placed, Rolling, Scene, Soil, Values
@@ -329,11 +330,11 @@ def _rolling(s: Sample, body: Body) -> tuple[Rolling, ca.SX]:
 
 def _soil(s: Sample, body: Body, rolling: Rolling) -> Soil:
     """The soil under a contact as the machine file has it."""
-    law = rolling.contact
+    ground = rolling.contact
     saturation = None
-    if law.law == "exponential":
-        assert law.saturation_slip is not None
-        saturation = ca.SX(float(law.saturation_slip))
+    if ground.law == "exponential":
+        assert ground.saturation_slip is not None
+        saturation = law.Saturation(ca.SX(float(ground.saturation_slip)))
     Kx, Ky = s.by_name[f"Kx{body.index}"], s.by_name[f"Ky{body.index}"]
     return Soil(rolling.slip, rolling.yaw, Kx, Ky, saturation)
 

@@ -139,8 +139,8 @@ def states(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def wrench_of(roll: Contact, m: Motion, g_K: float | None = None, **how: float) -> tuple[float, float, float]:
     s = contact.slip(roll, ca.SX(m.Vx), ca.SX(m.Vy), ca.SX(m.spin))
-    saturation = None if g_K is None else ca.SX(g_K)
-    w = contact.wrench(roll, s, ca.SX(m.yaw), ca.SX(STIFFNESS[1][0]), ca.SX(STIFFNESS[1][1]), saturation, **how)
+    saturation = None if g_K is None else contact.Saturation(ca.SX(g_K), **how)
+    w = contact.wrench(roll, s, ca.SX(m.yaw), ca.SX(STIFFNESS[1][0]), ca.SX(STIFFNESS[1][1]), saturation)
     return float(ca.DM(w.Sx)), float(ca.DM(w.Sy)), float(ca.DM(w.Tz))
 
 
@@ -250,6 +250,15 @@ def test_mobilised_share_is_the_mean_along_the_patch(x: float) -> None:
     zeta = (np.arange(200_000) + 0.5) / 200_000
     want = np.mean(-np.expm1(-x * zeta)) / (x / 2)
     assert float(ca.DM(contact.mobilised(ca.SX(x)))) == pytest.approx(want, rel=1e-8)
+
+
+@pytest.mark.parametrize("x", [1e-3, 0.3, 5.0])
+def test_a_hyperbola_has_the_same_slope_and_half_as_much_again_at_its_end(x: float) -> None:
+    """Kondner's stress x / (a + b x): 1 / (1 + x/3) of the linear law, 3 in the limit, where the exponential has 2."""
+    bent = float(ca.DM(contact.mobilised(ca.SX(x), 1.0)))
+    assert bent == pytest.approx(1 / (1 + x / 3), rel=1e-8)
+    assert bent >= float(ca.DM(contact.mobilised(ca.SX(x))))
+    assert 1e9 * float(ca.DM(contact.mobilised(ca.SX(1e9), 1.0))) == pytest.approx(3.0, rel=1e-6)
 
 
 def test_a_wheel_without_width_only_slips_at_its_middle() -> None:
