@@ -44,7 +44,9 @@ SHAPE = 0.005, 0.002
 ABSORBED, TIMED, HIDDEN = 0.1, 0.1, 0.25
 ALIKE = 0.03  # of an amount: what two formulas of one effect differ by; those of results/diagnosis do by 1 to 6 %
 BESIDE = 250.0  # a gain that by the latter no effect can be denied, nor counted as a rival
-CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
+# Way to the grid's next points within which the best candidates are tried again, in turn; the last one for what acts
+# at some time, as a fit finds an instant from within a fraction of a second only.
+CLOSER = 1.0, 0.35, 0.12
 LEAST = 0.05, 0.15  # of the excess misfit that an effect must explain to be worth a place: weak misfit, strong misfit
 SHARE = 0.7  # of the excess misfit that names must explain, or it is unexplained
 FORCED = 0.02  # of what is gained with disturbing forces, by which a rival is a tie: they take up part of a difference
@@ -175,8 +177,9 @@ def _likely(
     """What is worth a fit, with shapes between the grid's points."""
     likely = _shortlist(stage, scores, chosen)
     for reach in CLOSER if likely else ():
-        nearby = evidence.finer(likely, stage.machine, _duration(stage.prepared.logs), reach)
-        if len(nearby) > len(likely):
+        about = [s for s in likely if reach > CLOSER[-1] or s.candidate.placed.effect.timed]
+        nearby = evidence.finer(about, stage.machine, _duration(stage.prepared.logs), reach)
+        if len(nearby) > len(about):
             likely = _shortlist(
                 stage, sorted([*likely, *_scanned(stage, nearby, together)], key=lambda s: -s.gain), chosen
             )

@@ -100,7 +100,8 @@ def _grid(effect: Effect, site: Site) -> list[tuple[dict[str, float], int]]:
     for share in effect.grid:
         for shapes in product(*grids):
             values = {"A": share * effect.amount(site), **dict(zip(names, shapes, strict=True))}
-            if "begin" in values and values["begin"] + values["length"] > site.duration:
+            begin = values.get("begin", 0.0)
+            if begin + values.get("length", 0.0) > site.duration or values.get("end", np.inf) <= begin:
                 continue
             tried.append((values | ({circular: 0.0} if circular else {}), 2 if circular else 1))
     return tried + [({"A": effect.amount(site), **shapes}, 1) for shapes in effect.beside(site)]

@@ -335,6 +335,22 @@ _declare(
         torque=lambda s, k, p: -p["A"] * ca.exp(-s.time / p["fade"]) * s.friction[k],
         timed=True,
     ),
+    Effect(
+        "brake_drag",
+        ("driven_contacts",),
+        "N m",
+        "between two instants a brake drags: dry friction larger by A",
+        "friction that begins or ends at an instant",
+        "Limpert, Brake Design and Safety, 3rd ed., SAE, 2011: residual brake torque",
+        _coulomb(2.0),
+        {
+            "begin": Shape("s", 0.1, (0.0, 0.25, 0.5, 0.75), _duration),
+            "end": Shape("s", 0.5, (0.25, 0.5, 0.75, 1.0), _duration),
+        },
+        positive=True,
+        torque=lambda s, k, p: -p["A"] * s.sign(k) * _between(s.time, p["begin"], p["end"], 0.2),
+        timed=True,
+    ),
     # ---------------------------------------------------------------- drives and torque channels
     Effect(
         "actuator_lag",
