@@ -42,11 +42,11 @@ CLOSE = 10.0  # a rival that is worse by less than this is a tie
 # they absorb none of its formula's error; for what acts at some time only; where forces hide how good the formula is.
 SHAPE = 0.005, 0.002
 ABSORBED, TIMED, HIDDEN = 0.1, 0.1, 0.25
+MUCH = 0.1  # misfit beside noise, over what noise makes, of which one further effect takes away all only as a cause
 ALIKE = 0.03  # of an amount: what two formulas of one effect differ by; those of results/diagnosis do by 1 to 6 %
 BESIDE = 250.0  # a gain that by the latter no effect can be denied, nor counted as a rival
-# Way to the grid's next points within which the best candidates are tried again, in turn; the last one for what acts
-# at some time, as a fit finds an instant from within a fraction of a second only.
-CLOSER = 1.0, 0.35, 0.12
+CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
+INSTANT = 0.5  # [s] about which instants are known before a fit, which finds them from near only
 LEAST = 0.05, 0.15  # of the excess misfit that an effect must explain to be worth a place: weak misfit, strong misfit
 SHARE = 0.7  # of the excess misfit that names must explain, or it is unexplained
 FORCED = 0.02  # of what is gained with disturbing forces, by which a rival is a tie: they take up part of a difference
@@ -164,7 +164,8 @@ def _shortlist(stage: Stage, scores: Sequence[evidence.Score], chosen: Sequence[
     most: dict[str, float] = {}
     hope = max(WORTH, HOPE[stage.rough] * scores[0].gain) if scores else 0.0
     for s in scores:
-        least = _least(stage, chosen, s.candidate, 0.0) / OVER if stage.settled else 0.0
+        whole = _much(stage) and OVER * s.gain >= stage.excess
+        least = _least(stage, chosen, s.candidate, 0.0) / OVER if stage.settled and not whole else 0.0
         worth = s.gain >= max(least, hope) and s.values["A"] != 0
         if worth and s.gain >= LIKE * most.setdefault(s.candidate.name, s.gain):
             best.setdefault(s.candidate.variant, s)
@@ -175,15 +176,23 @@ def _likely(
     stage: Stage, scores: Sequence[evidence.Score], chosen: Sequence[Choice], together: Together
 ) -> list[evidence.Score]:
     """What is worth a fit, with shapes between the grid's points."""
-    likely = _shortlist(stage, scores, chosen)
-    for reach in CLOSER if likely else ():
-        about = [s for s in likely if reach > CLOSER[-1] or s.candidate.placed.effect.timed]
-        nearby = evidence.finer(about, stage.machine, _duration(stage.prepared.logs), reach)
+    likely, duration = _shortlist(stage, scores, chosen), _duration(stage.prepared.logs)
+    for reach in (*CLOSER, *_reaches(duration)) if likely else ():
+        about = [s for s in likely if reach in CLOSER or s.candidate.placed.effect.timed]
+        nearby = evidence.finer(about, stage.machine, duration, reach)
         if len(nearby) > len(about):
             likely = _shortlist(
                 stage, sorted([*likely, *_scanned(stage, nearby, together)], key=lambda s: -s.gain), chosen
             )
     return likely
+
+
+def _reaches(duration: float) -> list[float]:
+    """Further reaches for what acts at some time in a log of duration [s], until instants are known."""
+    found = [CLOSER[-1]]
+    while found[-1] * duration / 12 > INSTANT:  # a third of the way between a quarter of the log
+        found.append(found[-1] * CLOSER[-1])
+    return found[1:]
 
 
 def choose(
@@ -219,9 +228,10 @@ def choose(
     score, best = tries[0]
     gain = stage.fit.cost - best.fit.cost
     level = threshold(score.candidate.name, best, len(scores))
-    if gain < max(level * best.spread, _least(stage, chosen, score.candidate, 0.0)):
+    whole = _completes(best, stage)
+    if gain < max(level * best.spread, 0.0 if whole else _least(stage, chosen, score.candidate, 0.0)):
         return None
-    hidden = gain < _least(stage, chosen, score.candidate)
+    hidden = not whole and gain < _least(stage, chosen, score.candidate)
     if hidden and not best.near:
         return None
     choice = _chosen(tries, gain, len(scores), together)
@@ -348,6 +358,17 @@ def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate
     part = max(SHAPE[0], TIMED * candidate.placed.effect.timed, hidden * (not stage.exact))
     shape = sum(max(part, min(ALIKE**2 / x.left, ABSORBED)) * x.gain for x in chosen)
     return max(LEAST[stage.rough] * stage.excess, shape, min(SHAPE[1] * _sureness(stage), BESIDE))
+
+
+def _completes(found: Stage, before: Stage) -> bool:
+    """Whether exact dynamics leave nothing with a further effect and much without: what is wrong with the others'
+    formulas no other effect would take away as a whole."""
+    return _much(before) and found.exact and found.excess == 0
+
+
+def _much(stage: Stage) -> bool:
+    """Whether exact dynamics leave much beside noise."""
+    return stage.exact and stage.excess > MUCH * stage.noise
 
 
 def _tries(

@@ -100,11 +100,17 @@ def _grid(effect: Effect, site: Site) -> list[tuple[dict[str, float], int]]:
     for share in effect.grid:
         for shapes in product(*grids):
             values = {"A": share * effect.amount(site), **dict(zip(names, shapes, strict=True))}
-            begin = values.get("begin", 0.0)
-            if begin + values.get("length", 0.0) > site.duration or values.get("end", np.inf) <= begin:
-                continue
             tried.append((values | ({circular: 0.0} if circular else {}), 2 if circular else 1))
-    return tried + [({"A": effect.amount(site), **shapes}, 1) for shapes in effect.beside(site)]
+    tried += [({"A": effect.amount(site), **shapes}, 1) for shapes in effect.beside(site)]
+    return [x for x in tried if _within(x[0], site.duration)]
+
+
+def _within(values: Mapping[str, float], duration: float) -> bool:
+    """Whether what acts between two instants begins before it ends, in a log of duration [s]; also anything else."""
+    if "begin" not in values:
+        return True
+    end = values["end"] if "end" in values else values["begin"] + values["length"]
+    return values["begin"] < end <= duration
 
 
 def finer(scores: Sequence[Score], machine: Machine, duration: float, reach: float = 1.0) -> list[Candidate]:
@@ -142,7 +148,8 @@ def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
             families.append(_next_to(own, [{name: g * shape.size(site)} for g in shape.grid], reach))
     every = [{name: x for part in parts for name, x in part.items()} for parts in product(*families)]
     free = {"A", *unusual}
-    return [{**own, **values} for values in every if all(x >= 0 for n, x in values.items() if n not in free)]
+    every = [{**own, **values} for values in every if all(x >= 0 for n, x in values.items() if n not in free)]
+    return [x for x in every if _within(x, site.duration)]
 
 
 def _next_to(own: Mapping[str, float], points: Sequence[Mapping[str, float]], reach: float) -> list[dict[str, float]]:

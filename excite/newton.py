@@ -30,7 +30,7 @@ HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in stan
 LATELY = 4  # passes whose steps tell how small the last one will be
 IDLE = 0.5, 0.8  # share of a step two passes earlier above which it hardly shrinks: near an answer, far from any
 FALLING = 0.01  # of a cost, in two passes
-NEARLY = 1.5  # a step, in standard deviations, at which a fit that runs out of passes is as good as found
+NEARLY = 1.0  # a step, in standard deviations, at which a fit that runs out of passes is as good as found
 CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviations
 ENOUGH = 0.2  # likewise with disturbing forces, whose deviations are no promise
 # Steps that turn back and hardly shrink are shortened by TURNED; others grow by SHARE up to the whole.

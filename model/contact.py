@@ -32,7 +32,8 @@ class Wrench:
 class Saturation:
     """How forces fall behind the linear law. slip: K / xi_s, at which the shear displacement is K at the patch's rear.
 
-    bend: 0 as the exponential law (18) has it, 1 along a hyperbola of the same slope (Kondner, J. Soil Mech. 89, 1963).
+    bend: 0 as the exponential law (18) has it, 1 with the force along a hyperbola that begins alike (after Kondner, J.
+    Soil Mech. 89, 1963, who has it for a sample of soil); it must be above -2, the force's limit is (2 + bend) slip K.
     Simpler readings of (18): with `strips` 0 all of the contact's width saturates as its middle does, with `untouched`
     1 the moment does not.
     """

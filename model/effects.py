@@ -26,12 +26,11 @@ SMOOTH_SPEED = 0.02  # [m/s] over which rolling resistance turns
 SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
 
 MOMENTS = 120  # at which a load is looked for that slides
-CROSSING = 0.01  # [s] that an actuator takes for its play where it is pushed by so much as the shape `turn` says
 PRESSED = 0.1  # [rad] beyond a stop, at which its hardening is stated
 BEHIND = 2.0  # [m] from the joint, where a load is put on or taken off
 
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
-BEND = Shape("-", 0.0, (0.0,), meaning="0: as the exponential law has it; 1: as a hyperbola; in between or beyond")
+BEND = Shape("-", 0.0, (0.0,), meaning="0: exponential law; 1: hyperbola; the force's limit is (2 + bend) A K")
 TWICE = Shape("rad", 0.0, (0.0,), lambda site: 0.001)
 
 
@@ -154,10 +153,11 @@ def _resistance(s: Scene, k: int, p: Values) -> tuple[ca.SX, ca.SX]:
 
 
 def _played(s: Scene, k: int, p: Values) -> ca.SX:
-    """Where the actuator is in its play, -1 to 1: it goes to the side that it is pushed to beyond its own friction."""
+    """How the actuator moves in its play, -1 to 1: to the side that it is pushed to by more than its own friction has;
+    pushed less it creeps, the more slowly the more friction there is. No fit finds a way to a sharper one."""
     width = SMOOTH_TORQUE * s.full[k]
-    ahead, back = _softplus(s.u[k] - p["held"], width), _softplus(-s.u[k] - p["held"], width)
-    return (ahead * (1 - s.z["play"]) - back * (1 + s.z["play"])) / (p["turn"] * CROSSING)
+    ahead, back = _softplus(s.u[k] - p["breakaway"], width), _softplus(-s.u[k] - p["breakaway"], width)
+    return (ahead * (1 - s.z["play"]) - back * (1 + s.z["play"])) / p["damping"]
 
 
 def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
@@ -348,7 +348,7 @@ _declare(
             "end": Shape("s", 0.5, (0.25, 0.5, 0.75, 1.0), _duration),
         },
         positive=True,
-        torque=lambda s, k, p: -p["A"] * s.sign(k) * _between(s.time, p["begin"], p["end"], 0.2),
+        torque=lambda s, k, p: -p["A"] * s.sign(k) * ca.fmax(0, _between(s.time, p["begin"], p["end"], 0.2)),
         timed=True,
     ),
     # ---------------------------------------------------------------- drives and torque channels
@@ -642,12 +642,24 @@ _declare(
         ("articulation",),
         "rad",
         "play A between the actuator, with its encoder, and the joint",
-        "the angle jumps where the torque changes its sign",
+        "the angle jumps after the torque has changed its sign",
         "Nordin, Gutman, Automatica 38 (2002)",
         _constant(0.005),
         {
-            "turn": Shape("N m", 0.02, (0.01, 0.05), _full_torque),
-            "held": Shape("N m", 0.0, (0.0, 0.01, 0.03), _full_torque),
+            "damping": Shape(
+                "N m s",
+                0.0002,
+                (0.0001, 0.0005),
+                _full_torque,
+                meaning="over the torque beyond breakaway: the time constant with which the actuator crosses its play",
+            ),
+            "breakaway": Shape(
+                "N m",
+                0.01,
+                (0.003, 0.01, 0.03),
+                _full_torque,
+                meaning="torque that the actuator's own friction takes: below it, it only creeps in its play",
+            ),
         },
         positive=True,
         reading=lambda s, exact, k, p: p["A"] / 2 * s.z["play"],

@@ -330,11 +330,11 @@ def _rolling(s: Sample, body: Body) -> tuple[Rolling, ca.SX]:
 
 def _soil(s: Sample, body: Body, rolling: Rolling) -> Soil:
     """The soil under a contact as the machine file has it."""
-    ground = rolling.contact
+    contact = rolling.contact
     saturation = None
-    if ground.law == "exponential":
-        assert ground.saturation_slip is not None
-        saturation = law.Saturation(ca.SX(float(ground.saturation_slip)))
+    if contact.law == "exponential":
+        assert contact.saturation_slip is not None
+        saturation = law.Saturation(ca.SX(float(contact.saturation_slip)))
     Kx, Ky = s.by_name[f"Kx{body.index}"], s.by_name[f"Ky{body.index}"]
     return Soil(rolling.slip, rolling.yaw, Kx, Ky, saturation)
 

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from excite import evidence, log, profiles, sensors, stages
+from excite import choosing, evidence, log, profiles, sensors, stages
 from excite.diagnose import opposite
 from excite.processing import implicit
 from excite.simulate import simulate
@@ -107,6 +107,51 @@ def test_dry_friction_may_turn_more_suddenly(va12: Model, slow: float) -> None:
     np.testing.assert_allclose(with_it - without, Fs * (sign - np.tanh(w / ws)), rtol=1e-6, atol=1e-4)
 
 
+def test_an_actuator_in_its_play_waits_for_a_push() -> None:
+    """Pushed ahead it lies at the front of its play and reads half of it too much; let go, it is still nearer the front
+    after some tenths of a second; pushed back by less than its own friction it creeps, by more it goes to the rear."""
+    entry = EffectEntry(
+        name="articulation_backlash",
+        where="articulation",
+        amount=Quantity(value=0.004, source="assumed"),
+        shape={n: Quantity(value=v, source="assumed") for n, v in {"damping": 3.0, "breakaway": 400.0}.items()},
+    )
+    model = build(placing.extended(VA12, entry))
+    t = np.arange(400) / 100
+    torque = np.zeros((400, 3))
+    torque[:, 1] = np.interp(
+        t, [0, 0.2, 1.0, 1.2, 1.7, 1.8, 2.3, 2.5, 4.0], [0, 3e3, 3e3, 0, 0, -200, -200, -3e3, -3e3]
+    )
+    motion = simulate(model, torque)
+    joint, k = motion.q[:, 4], list(model.memory)
+    play = (sensors.signals(model, motion)["theta2"] - joint) / 0.002
+    assert len(k) == 1
+    assert play[90] == pytest.approx(1.0, abs=0.02)
+    assert play[140] > 0.6
+    assert play[170] > play[225] > -0.5
+    assert play[270] == pytest.approx(-1.0, abs=0.02)
+
+
+@pytest.mark.parametrize(("second", "share"), [(0.0, 0.0), (1.0, 0.5), (2.0, 1.0), (3.0, 0.5), (4.0, 0.0)])
+def test_a_brake_drags_between_its_instants(second: float, share: float, va12: Model) -> None:
+    """Dry friction larger by its amount, against the motion either way."""
+    entry = EffectEntry(
+        name="brake_drag",
+        where="rear_roll",
+        amount=Quantity(value=300.0, source="assumed"),
+        shape={n: Quantity(value=v, source="assumed") for n, v in {"begin": 1.0, "end": 3.0}.items()},
+    )
+    model = build(placing.extended(VA12, entry))
+    nu = np.zeros((6, 2))
+    nu[5] = 1.0, -1.0
+    q, a, u = np.zeros((6, 2)), np.zeros((6, 2)), np.zeros((3, 2))
+    with_it = model.predict(q, nu, a, model.expand @ model.nominal, u, np.full((1, 2), second)).full()
+    without = va12.predict(q, nu, a, va12.expand @ va12.nominal).full()
+    want = np.zeros((6, 2))
+    want[5] = 300.0 * share, -300.0 * share
+    np.testing.assert_allclose(with_it - without, want, atol=0.1)
+
+
 def samples(model: Model, count: int = 40, seed: int = 0) -> list[np.ndarray]:
     """q, nu, a, u, z of states a roller may be in."""
     rng = np.random.default_rng(seed)
@@ -152,9 +197,9 @@ def test_an_effect_of_no_size_changes_nothing(effect: Effect, va12: Model) -> No
 
     def change(amount: float) -> float:
         model = extended(effect, amount)
-        if effect.name == "vibration_on":  # its shaking of the torque channel is a shape
+        if effect.name in WITHIN:
             effect_at = model.machine.effect[0].model_copy(
-                update={"shape": {s: Quantity(value=v, source="assumed") for s, v in SHAKEN.items()}}
+                update={"shape": {s: Quantity(value=v, source="assumed") for s, v in WITHIN[effect.name].items()}}
             )
             model = build(placing.extended(VA12, effect_at))
         read = sensors.signals(model, simulate(model, torque))
@@ -165,7 +210,8 @@ def test_an_effect_of_no_size_changes_nothing(effect: Effect, va12: Model) -> No
     assert change(size) > 1e-5 or effect.name in FAR
 
 
-SHAKEN = {"begin": 1.0, "length": 2.0, "shake": 0.0}
+# Within these seconds; that one shakes the torque channel is a shape.
+WITHIN = {"vibration_on": {"begin": 1.0, "length": 2.0, "shake": 0.0}, "brake_drag": {"begin": 1.0, "end": 3.0}}
 # Beyond what these seconds hold: a moment late in the log, an angle or a torque that isn't reached.
 FAR = ("payload_shift", "articulation_stop_spring", "relief_valve")
 
@@ -533,3 +579,18 @@ def test_every_candidate_can_be_tried_closer(duration: float) -> None:
     for x in every:
         nearby = evidence.finer([evidence.Score(x, 1.0, x.placed.values, 1.0)], VA12, duration)
         assert all(y.name == x.name for y in nearby)
+
+
+def test_what_acts_between_two_instants_begins_before_it_ends() -> None:
+    """On the grid and about its points; and instants come so near to one that a fit finds it, in logs of any length."""
+    for duration in (60.0, 600.0):
+        found = [x for x in evidence.candidates(VA12, [], duration) if "begin" in x.placed.values]
+        assert {x.placed.effect.name for x in found} == {"brake_drag", "vibration_on"}
+        scores = [evidence.Score(x, 1.0, x.placed.values, 1.0) for x in found]
+        for reach in (1.0, 0.35, *choosing._reaches(duration)):
+            found = evidence.finer(scores, VA12, duration, reach)
+            for values in (x.placed.values for x in found):
+                end = values.get("end", values["begin"] + values.get("length", 0.0))
+                assert 0 <= values["begin"] < end <= duration
+        ends = sorted({x.placed.values["end"] for x in found if x.placed.effect.name == "brake_drag"})
+        assert np.diff(ends).min() < 1.0
