@@ -152,14 +152,6 @@ def _resistance(s: Scene, k: int, p: Values) -> tuple[ca.SX, ca.SX]:
     return -p["A"] * (1 + p["rise"] * r.Vx**2) * ca.tanh(r.Vx / p["soft"]), ca.SX(0)
 
 
-def _played(s: Scene, k: int, p: Values) -> ca.SX:
-    """How the actuator moves in its play, -1 to 1: to the side that it is pushed to by more than its own friction has;
-    pushed less it creeps, the more slowly the more friction there is. No fit finds a way to a sharper one."""
-    width = SMOOTH_TORQUE * s.full[k]
-    ahead, back = _softplus(s.u[k] - p["breakaway"], width), _softplus(-s.u[k] - p["breakaway"], width)
-    return (ahead * (1 - s.z["play"]) - back * (1 + s.z["play"])) / p["damping"]
-
-
 def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
     q = s.q[k] - p["centre"]
     high, low = _softplus(q - p["stop"], 0.01), _softplus(-q - p["stop"], 0.01)
@@ -642,28 +634,12 @@ _declare(
         ("articulation",),
         "rad",
         "play A between the actuator, with its encoder, and the joint",
-        "the angle jumps after the torque has changed its sign",
+        "the angle jumps where the torque changes its sign",
         "Nordin, Gutman, Automatica 38 (2002)",
         _constant(0.005),
-        {
-            "damping": Shape(
-                "N m s",
-                0.0002,
-                (0.0001, 0.0005),
-                _full_torque,
-                meaning="over the torque beyond breakaway: the time constant with which the actuator crosses its play",
-            ),
-            "breakaway": Shape(
-                "N m",
-                0.01,
-                (0.003, 0.01, 0.03),
-                _full_torque,
-                meaning="torque that the actuator's own friction takes: below it, it only creeps in its play",
-            ),
-        },
+        {"turn": Shape("N m", 0.02, (0.01, 0.05), _full_torque)},
         positive=True,
-        reading=lambda s, exact, k, p: p["A"] / 2 * s.z["play"],
-        memory={"play": Memory(_played, 1.0)},
+        reading=lambda s, exact, k, p: p["A"] / 2 * ca.tanh(s.u[k] / p["turn"]),
         angular=True,
     ),
     Effect(

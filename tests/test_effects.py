@@ -107,31 +107,6 @@ def test_dry_friction_may_turn_more_suddenly(va12: Model, slow: float) -> None:
     np.testing.assert_allclose(with_it - without, Fs * (sign - np.tanh(w / ws)), rtol=1e-6, atol=1e-4)
 
 
-def test_an_actuator_in_its_play_waits_for_a_push() -> None:
-    """Pushed ahead it lies at the front of its play and reads half of it too much; let go, it is still nearer the front
-    after some tenths of a second; pushed back by less than its own friction it creeps, by more it goes to the rear."""
-    entry = EffectEntry(
-        name="articulation_backlash",
-        where="articulation",
-        amount=Quantity(value=0.004, source="assumed"),
-        shape={n: Quantity(value=v, source="assumed") for n, v in {"damping": 3.0, "breakaway": 400.0}.items()},
-    )
-    model = build(placing.extended(VA12, entry))
-    t = np.arange(400) / 100
-    torque = np.zeros((400, 3))
-    torque[:, 1] = np.interp(
-        t, [0, 0.2, 1.0, 1.2, 1.7, 1.8, 2.3, 2.5, 4.0], [0, 3e3, 3e3, 0, 0, -200, -200, -3e3, -3e3]
-    )
-    motion = simulate(model, torque)
-    joint, k = motion.q[:, 4], list(model.memory)
-    play = (sensors.signals(model, motion)["theta2"] - joint) / 0.002
-    assert len(k) == 1
-    assert play[90] == pytest.approx(1.0, abs=0.02)
-    assert play[140] > 0.6
-    assert play[170] > play[225] > -0.5
-    assert play[270] == pytest.approx(-1.0, abs=0.02)
-
-
 @pytest.mark.parametrize(("second", "share"), [(0.0, 0.0), (1.0, 0.5), (2.0, 1.0), (3.0, 0.5), (4.0, 0.0)])
 def test_a_brake_drags_between_its_instants(second: float, share: float, va12: Model) -> None:
     """Dry friction larger by its amount, against the motion either way."""
