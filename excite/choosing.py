@@ -190,7 +190,7 @@ def _likely(
 def _reaches(duration: float) -> list[float]:
     """Further reaches for what acts at some time in a log of duration [s], until instants are known."""
     found = [CLOSER[-1]]
-    while found[-1] * duration / 12 > INSTANT:  # a third of the way between a quarter of the log
+    while found[-1] * duration / 12 > INSTANT:  # of a grid as wide as a quarter of the log, thirds are tried
         found.append(found[-1] * CLOSER[-1])
     return found[1:]
 

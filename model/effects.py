@@ -16,14 +16,13 @@ from math import pi
 import casadi as ca
 
 from model import contact as law
-from model import lane
+from model import lane, sizes
 from model.effect import Channel, Effect, Memory, Rolling, Scene, Shape, Site, Soil, Values
-from model.machine import Body, Machine
 
-GRAVITY = 9.81
 SMOOTH_SLIP = 0.005  # slip over which driving turns into braking
 SMOOTH_SPEED = 0.02  # [m/s] over which rolling resistance turns
 SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
+EDGE = 0.2  # [s] over which what acts between two instants begins and ends
 
 MOMENTS = 120  # at which a load is looked for that slides
 PRESSED = 0.1  # [rad] beyond a stop, at which its hardening is stated
@@ -32,34 +31,6 @@ BEHIND = 2.0  # [m] from the joint, where a load is put on or taken off
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
 BEND = Shape("-", 0.0, (0.0,), meaning="0: exponential law; 1: hyperbola; the force's limit is (2 + bend) A K")
 TWICE = Shape("rad", 0.0, (0.0,), lambda site: 0.001)
-
-
-# ------------------------------------------------------------------------------------------------ sizes
-
-
-def _smooth(site: Site) -> float:
-    return float(site.body.friction.smoothing) if site.body.friction is not None else 1.0
-
-
-def _duration(site: Site) -> float:
-    return site.duration
-
-
-def _stop(site: Site) -> float:
-    return float(site.body.limit.position) if site.body.limit.position is not None else 0.6
-
-
-def full_torque(machine: Machine, body: Body) -> float:
-    """What counts as a large torque [N m] at a joint: its limit, the machine's largest, or what friction suggests."""
-    if body.limit.torque is not None:
-        return float(body.limit.torque)
-    stated = [float(b.limit.torque) for b in machine.body if b.limit.torque is not None]
-    rubbing = [30 * float(b.friction.Fs) for b in machine.body if b.friction is not None]
-    return max(stated or rubbing, default=0.0) or 1.0
-
-
-def _full_torque(site: Site) -> float:
-    return full_torque(site.machine, site.body)
 
 
 # ------------------------------------------------------------------------------------------------ the hooks
@@ -139,12 +110,12 @@ def _saturated(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
     return replace(soil, saturation=law.Saturation(p["A"], p["bend"], strips, untouched))
 
 
-def _between(t: ca.SX, begin: ca.SX, end: ca.SX, width: float) -> ca.SX:
-    return (ca.tanh((t - begin) / width) - ca.tanh((t - end) / width)) / 2
+def _between(t: ca.SX, begin: ca.SX, end: ca.SX) -> ca.SX:
+    return (ca.tanh((t - begin) / EDGE) - ca.tanh((t - end) / EDGE)) / 2
 
 
 def _window(t: ca.SX, p: Values) -> ca.SX:
-    return _between(t, p["begin"], p["begin"] + p["length"], 0.2)
+    return _between(t, p["begin"], p["begin"] + p["length"])
 
 
 def _resistance(s: Scene, k: int, p: Values) -> tuple[ca.SX, ca.SX]:
@@ -160,7 +131,7 @@ def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
 
 def _one_sided(site: Site) -> list[dict[str, float]]:
     """Stops so far from the middle that only one of them is reached."""
-    limit = _stop(site)
+    limit = sizes.stop(site)
     stops = [x * limit for x in (0.15, 0.35, 0.55, 0.75)]
     sides = [{"stop": (limit + x) / 2, "centre": side * (x - limit) / 2} for x in stops for side in (1.0, -1.0)]
     return [{**x, "hardening": 0.0} for x in sides]
@@ -173,47 +144,6 @@ def _clipped(s: Scene, k: int, p: Values) -> ca.SX:
     return -p["A"] * over
 
 
-def _constant(value: float) -> Callable[[Site], float]:
-    return lambda site: value
-
-
-def _of(size: Callable[[Site], float], share: float) -> Callable[[Site], float]:
-    return lambda site: share * size(site)
-
-
-def _coulomb(share: float) -> Callable[[Site], float]:
-    return lambda site: share * max(float(site.body.friction.Fs), 1e-6) if site.body.friction is not None else share
-
-
-def _viscous(share: float, power: float = 0.0) -> Callable[[Site], float]:
-    """A share of Fv over a rate of 1 m/s at the rim, or half the rate limit, to a power."""
-
-    def size(site: Site) -> float:
-        body = site.body
-        assert body.friction is not None
-        rate = 1.0
-        if body.contact is not None:
-            rate = 1.0 / float(body.contact.radius)
-        elif body.limit.rate is not None:
-            rate = float(body.limit.rate) / 2
-        return share * max(float(body.friction.Fv), 1e-6) / rate**power
-
-    return size
-
-
-def _mass(machine: Machine) -> float:
-    return sum(float(b.inertia.mass) for b in machine.body if b.inertia is not None)
-
-
-def _weighing(share: float) -> Callable[[Site], float]:
-    """A share of the machine's weight [N]."""
-    return lambda site: share * GRAVITY * _mass(site.machine)
-
-
-def _load_moment(site: Site) -> float:
-    return 0.05 * _mass(site.machine)
-
-
 def _sliding(site: Site) -> list[dict[str, float]]:
     """A load that slides within a second, at every second, in long logs at MOMENTS: its recoil is short. And one that
     is put on or taken off behind the joint, at every sixth of these."""
@@ -222,10 +152,6 @@ def _sliding(site: Site) -> list[dict[str, float]]:
     slid = [{"instant": t, "takes": 0.5, "arm": 0.0, "mass": 0.0, "recoil": 1.0} for t in times]
     off = [{"instant": t, "takes": 0.5, "arm": -BEHIND, "mass": -1 / BEHIND, "recoil": 0.0} for t in times[5::6]]
     return slid + off
-
-
-def _one_over_torque(site: Site) -> float:
-    return 0.002 / _full_torque(site) * 3
 
 
 CATALOGUE: dict[str, Effect] = {}
@@ -247,9 +173,9 @@ _declare(
         "friction above Fs near standstill, fading with speed: A sgn(w) exp(-abs(w/decay)^power)",
         "torque missing just after every start and reversal",
         "Stribeck 1902; Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30 (1994), eq. (4)",
-        _coulomb(0.5),
+        sizes.coulomb(0.5),
         {
-            "decay": Shape("rad/s", 15.0, (4.0, 12.0, 36.0), _smooth),
+            "decay": Shape("rad/s", 15.0, (4.0, 12.0, 36.0), sizes.smooth),
             "power": Shape("-", 2.0, (1.0, 2.0), whole=True),
         },
         torque=lambda s, k, p: (
@@ -265,7 +191,7 @@ _declare(
         "Coulomb friction turns over the rate w_s exp(-A) in place of w_s: the larger A, the more suddenly",
         "torque missing just at starts and reversals, within the rate over which friction turns",
         "Andersson, Soderberg, Bjorklund, Tribology International 40 (2007), smoothed Coulomb friction",
-        _constant(0.5),
+        sizes.constant(0.5),
         {
             "slow": Shape(
                 "-", 0.0, (0.0,), meaning="0: as tanh does; 1: as slowly as the arc tangent; in between or beyond"
@@ -282,7 +208,7 @@ _declare(
         "friction grows by A times the delivered torque's size",
         "friction larger where the torque is large, at the same speed",
         "Dohring et al. 1993; Linderoth et al. 2013, load-dependent Coulomb friction",
-        _constant(0.05),
+        sizes.constant(0.05),
         torque=lambda s, k, p: -p["A"] * ca.sqrt(s.u[k] ** 2 + (SMOOTH_TORQUE * s.full[k]) ** 2) * s.sign(k),
     ),
     Effect(
@@ -292,7 +218,7 @@ _declare(
         "Coulomb friction Fs + A forward, Fs - A backward",
         "an offset of the torque while the joint moves that is gone at rest",
         "Armstrong-Helouvry 1991, ch. 4",
-        _coulomb(0.3),
+        sizes.coulomb(0.3),
         torque=lambda s, k, p: -p["A"] * s.sign(k) ** 2,
     ),
     Effect(
@@ -302,7 +228,7 @@ _declare(
         "friction grows by A abs(w): viscous friction Fv + A forward, Fv - A backward",
         "an error even in speed and proportional to it",
         "Janot, Gautier, Brunot 2019 (EMPS: direction-dependent friction)",
-        _viscous(0.3),
+        sizes.viscous(0.3),
         torque=lambda s, k, p: -p["A"] * s.w[k] * s.sign(k),
     ),
     Effect(
@@ -312,7 +238,7 @@ _declare(
         "friction grows by A w abs(w)",
         "an error odd in speed, growing with its square",
         "turbulent losses of hydraulic motors, Merritt, Hydraulic Control Systems, 1967",
-        _viscous(0.5, 1.0),
+        sizes.viscous(0.5, 1.0),
         torque=lambda s, k, p: -p["A"] * s.w[k] * ca.sqrt(s.w[k] ** 2 + s.smooth[k] ** 2),
     ),
     Effect(
@@ -322,7 +248,7 @@ _declare(
         "Fv and Fs larger by the factor 1 + A at the start, fading with time: A exp(-t/fade)",
         "friction that falls over minutes as oil warms",
         "Bittencourt, Axelsson, J. Dyn. Sys. 136 (2014): friction and temperature",
-        _constant(0.5),
+        sizes.constant(0.5),
         {"fade": Shape("s", 30.0, (8.0, 25.0, 80.0))},
         torque=lambda s, k, p: -p["A"] * ca.exp(-s.time / p["fade"]) * s.friction[k],
         timed=True,
@@ -334,13 +260,13 @@ _declare(
         "between two instants a brake drags: dry friction larger by A",
         "friction that begins or ends at an instant",
         "Limpert, Brake Design and Safety, 3rd ed., SAE, 2011: residual brake torque",
-        _coulomb(2.0),
+        sizes.coulomb(2.0),
         {
-            "begin": Shape("s", 0.1, (0.0, 0.25, 0.5, 0.75), _duration),
-            "end": Shape("s", 0.5, (0.25, 0.5, 0.75, 1.0), _duration),
+            "begin": Shape("s", 0.1, (0.0, 0.25, 0.5, 0.75), sizes.duration),
+            "end": Shape("s", 0.5, (0.25, 0.5, 0.75, 1.0), sizes.duration),
         },
         positive=True,
-        torque=lambda s, k, p: -p["A"] * s.sign(k) * ca.fmax(0, _between(s.time, p["begin"], p["end"], 0.2)),
+        torque=lambda s, k, p: -p["A"] * s.sign(k) * ca.fmax(0, _between(s.time, p["begin"], p["end"])),
         timed=True,
     ),
     # ---------------------------------------------------------------- drives and torque channels
@@ -351,7 +277,7 @@ _declare(
         "the delivered torque follows the measured one with a first-order lag of time constant A",
         "torque errors proportional to the torque's rate of change",
         "Merritt, Hydraulic Control Systems, 1967, ch. 4",
-        _constant(0.05),
+        sizes.constant(0.05),
         grid=(0.3, 1.0, 4.0),
         positive=True,
         torque=lambda s, k, p: s.z["u"] - s.u[k],
@@ -364,7 +290,7 @@ _declare(
         "the torque channel is late by A: u_measured(t) = u(t - A) + u0",
         "torque errors proportional to the torque's rate of change, with the sign of a torque that comes early",
         "Ljung, System Identification, 2nd ed., 10.3",
-        _constant(0.03),
+        sizes.constant(0.03),
         positive=True,
         channel=lambda t, p: Channel(delay=p["A"]),
     ),
@@ -375,7 +301,7 @@ _declare(
         "u_measured = (1 + A) u + u0",
         "one joint's parameters scaled against the rest of the machine",
         "Gautier, Briot, J. Dyn. Sys. 136 (2014): global identification of drive gains",
-        _constant(0.05),
+        sizes.constant(0.05),
         channel=lambda t, p: Channel(gain=1 + p["A"]),
     ),
     Effect(
@@ -385,7 +311,7 @@ _declare(
         "the torque sensor's offset drifts by A a second",
         "a torque error that grows steadily with time",
         "strain-gauge and pressure sensors' zero drift, Doebelin, Measurement Systems, ch. 5",
-        _of(_full_torque, 2e-4),
+        sizes.of(sizes.torque, 2e-4),
         channel=lambda t, p: Channel(offset=p["A"] * t),
         timed=True,
     ),
@@ -396,7 +322,7 @@ _declare(
         "delivered sgn(u) max(abs(u) - A, 0), u measured",
         "a loss of torque with the sign of the torque, also at standstill",
         "overlap of proportional valves, Merritt, Hydraulic Control Systems, 1967, ch. 5",
-        _of(_full_torque, 0.02),
+        sizes.of(sizes.torque, 0.02),
         grid=(1.0, 4.0),
         positive=True,
         torque=_deadband,
@@ -408,7 +334,7 @@ _declare(
         "each driven contact's delivered torque grows by A times what the others' sensors read",
         "one driven contact answers to another's torque",
         "two motors on one hydraulic pump",
-        _constant(0.05),
+        sizes.constant(0.05),
         torque=_coupling,
     ),
     Effect(
@@ -418,8 +344,8 @@ _declare(
         "of the torque beyond a valve's opening the share A is not delivered",
         "torque missing at the largest torques alone",
         "pressure relief valves, Merritt, Hydraulic Control Systems, 1967, ch. 5",
-        _constant(0.5),
-        {"valve": Shape("N m", 0.6, (0.3, 0.5, 0.7, 0.85), _full_torque)},
+        sizes.constant(0.5),
+        {"valve": Shape("N m", 0.6, (0.3, 0.5, 0.7, 0.85), sizes.torque)},
         torque=_clipped,
     ),
     # ---------------------------------------------------------------- once or several times per turn
@@ -430,7 +356,7 @@ _declare(
         "a torque once per turn of the contact: A sin(theta + phase)",
         "a torque error periodic in the contact's angle",
         "eccentric mass or bearing of a roll or wheel",
-        _of(_full_torque, 0.02),
+        sizes.of(sizes.torque, 0.02),
         {"phase": PHASE},
         torque=lambda s, k, p: p["A"] * ca.sin(s.q[k] + p["phase"]),
     ),
@@ -441,7 +367,7 @@ _declare(
         "the encoder reads A sin(theta + phase) too much, and cos2 cos(2 theta) + sin2 sin(2 theta)",
         "an angle error periodic in the angle itself",
         "eccentric encoder discs, Dunster; error once per turn",
-        _constant(0.005),
+        sizes.constant(0.005),
         {"phase": PHASE, "cos2": TWICE, "sin2": TWICE},
         reading=_eccentric,
         angular=True,
@@ -453,7 +379,7 @@ _declare(
         "the delivered torque ripples several times per turn: A sin(order theta + phase)",
         "a torque error periodic in the contact's angle, several times per turn",
         "piston motors, Ivantysyn, Hydrostatic Pumps and Motors, 2001",
-        _of(_full_torque, 0.02),
+        sizes.of(sizes.torque, 0.02),
         {
             "order": Shape("1/turn", 5.0, tuple(float(n) for n in range(2, 21)), whole=True),
             "phase": PHASE,
@@ -468,7 +394,7 @@ _declare(
         "law (18) instead of the linear one; A = K / xi_s, the slip at which j = K at the rear of the patch",
         "contact forces fall behind the linear law at large slips",
         "paper (18), (20); Janosi, Hanamoto 1961",
-        _constant(0.3),
+        sizes.constant(0.3),
         grid=(0.5, 1.0, 3.0),
         positive=True,
         inverse=True,
@@ -493,7 +419,7 @@ _declare(
         "law (18) for the lateral force alone",
         "lateral forces fall behind the linear law at large lateral slips",
         "paper (18); Wong, Theory of Ground Vehicles, ch. 2",
-        _constant(0.3),
+        sizes.constant(0.3),
         grid=(0.5, 1.0, 3.0),
         positive=True,
         inverse=True,
@@ -507,7 +433,7 @@ _declare(
         "Kx larger by the factor 1 + A when braking (abs(V_x) > abs(R_c w))",
         "slip of another size when braking than when driving at the same force",
         "Wong, Theory of Ground Vehicles, ch. 2; driven and towed wheels on sand",
-        _constant(0.3),
+        sizes.constant(0.3),
         soil=_braking,
     ),
     Effect(
@@ -517,7 +443,7 @@ _declare(
         "Kx, Ky grow with the passes towards the factor 1 + A: A (1 - exp(-n / pass)), n the way, or passes",
         "less slip at the same force, the longer the drive on the same lane",
         "soil compaction by passes, Forssblad, Vibratory Soil and Rock Fill Compaction, 1981",
-        _constant(0.3),
+        sizes.constant(0.3),
         {
             "pass": Shape("m", 15.0, (5.0, 15.0, 50.0)),
             "counted": Shape(
@@ -542,7 +468,7 @@ _declare(
         "contact forces build up over the distance A",
         "contact forces late against slip, by a distance",
         "relaxation length, Pacejka, Tire and Vehicle Dynamics, ch. 5",
-        _constant(0.05),
+        sizes.constant(0.05),
         {"moment": Shape("-", 1.0, (0.0, 1.0))},
         grid=(0.2, 1.0, 4.0),
         positive=True,
@@ -560,11 +486,11 @@ _declare(
         "for a while Kx and Ky are smaller by the factor 1 - A, the contact vibrates",
         "more slip at the same force between two instants",
         "Forssblad, Vibratory Soil and Rock Fill Compaction, 1981",
-        _constant(0.3),
+        sizes.constant(0.3),
         {
-            "begin": Shape("s", 0.4, (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), _duration),
-            "length": Shape("s", 0.25, (0.125, 0.25, 0.5), _duration),
-            "shake": Shape("N m", 0.02, (0.0,), _full_torque, whole=True),
+            "begin": Shape("s", 0.4, (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), sizes.duration),
+            "length": Shape("s", 0.25, (0.125, 0.25, 0.5), sizes.duration),
+            "shake": Shape("N m", 0.02, (0.0,), sizes.torque, whole=True),
             "frequency": Shape("Hz", 27.0, (27.0,), whole=True),
         },
         positive=True,
@@ -581,8 +507,8 @@ _declare(
         "a force against the motion at the contact's centre: A (1 + rise V_x^2) tanh(V_x / soft)",
         "a force that turns with the direction of travel",
         "Bekker, Introduction to Terrain-Vehicle Systems, 1969",
-        _weighing(0.002),
-        {"rise": Shape("s2/m2", 0.0, (0.0,)), "soft": Shape("m/s", 1.0, (1.0,), _constant(SMOOTH_SPEED))},
+        sizes.weighing(0.002),
+        {"rise": Shape("s2/m2", 0.0, (0.0,)), "soft": Shape("m/s", 1.0, (1.0,), sizes.constant(SMOOTH_SPEED))},
         resisting=True,
         push=_resistance,
     ),
@@ -594,11 +520,11 @@ _declare(
         " first heading where no x0 is",
         "a force that keeps its direction on the ground while the machine turns and reverses",
         "statics of an inclined plane",
-        _constant(0.005),
+        sizes.constant(0.005),
         {"direction": PHASE},
         gravity=lambda s, p: (
-            GRAVITY * p["A"] * ca.cos(p["direction"]),
-            GRAVITY * p["A"] * ca.sin(p["direction"]),
+            sizes.GRAVITY * p["A"] * ca.cos(p["direction"]),
+            sizes.GRAVITY * p["A"] * ca.sin(p["direction"]),
         ),
     ),
     Effect(
@@ -608,9 +534,9 @@ _declare(
         "at one instant the first moment of the last chassis along its axis changes by A",
         "inertial and yaw forces that change at an instant",
         "a water tank or a load that moves",
-        _load_moment,
+        sizes.load_moment,
         {
-            "instant": Shape("s", 0.5, (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), _duration),
+            "instant": Shape("s", 0.5, (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), sizes.duration),
             "takes": Shape("s", 0.2, (0.2,)),
             "arm": Shape("m", 0.0, (0.0,), meaning="the yaw inertia about the joint changes by A times this"),
             "mass": Shape("1/m", 0.0, (0.0,), meaning="the mass changes by A times this"),
@@ -636,8 +562,8 @@ _declare(
         "play A between the actuator, with its encoder, and the joint",
         "the angle jumps where the torque changes its sign",
         "Nordin, Gutman, Automatica 38 (2002)",
-        _constant(0.005),
-        {"turn": Shape("N m", 0.02, (0.01, 0.05), _full_torque)},
+        sizes.constant(0.005),
+        {"turn": Shape("N m", 0.02, (0.01, 0.05), sizes.torque)},
         positive=True,
         reading=lambda s, exact, k, p: p["A"] / 2 * ca.tanh(s.u[k] / p["turn"]),
         angular=True,
@@ -649,7 +575,7 @@ _declare(
         "a spring between the actuator, with its encoder, and the joint: it winds up by A times the torque",
         "the angle leads by an amount proportional to the torque",
         "Spong 1987, flexible joints",
-        _one_over_torque,
+        sizes.one_over_torque,
         positive=True,
         reading=lambda s, exact, k, p: p["A"] * s.u[k],
         angular=True,
@@ -661,9 +587,9 @@ _declare(
         "a spring beyond some angle, to both sides of a middle that may be off; rubber hardens as it is pressed",
         "a torque that grows with the angle beyond a limit",
         "rubber stops of articulated frames",
-        lambda site: _full_torque(site),
+        sizes.torque,
         {
-            "stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), _stop),
+            "stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), sizes.stop),
             "centre": Shape("rad", 0.0, (0.0,), meaning="the angle in the middle between the stops"),
             "hardening": Shape("-", 0.0, (0.0,), meaning="x beyond the stop gives A x (1 + hardening x / 0.1 rad)"),
         },
@@ -678,7 +604,7 @@ _declare(
         "the true radius is R (1 + A)",
         "slip where there is none, proportional to speed, and the same forward and backward",
         "Borenstein, Feng, IEEE Trans. Robotics and Automation 12 (1996): odometry",
-        _constant(0.002),
+        sizes.constant(0.002),
         reading=lambda s, exact, k, p: exact / (1 + p["A"]) - exact,
     ),
     Effect(
@@ -688,7 +614,7 @@ _declare(
         "the gyro reads A too much",
         "a constant difference between gyro and measuring wheels",
         "IEEE Std 952, gyro bias",
-        _constant(0.001),
+        sizes.constant(0.001),
         reading=lambda s, exact, k, p: p["A"] + 0 * exact,
     ),
     Effect(
@@ -698,7 +624,7 @@ _declare(
         "the gyro reads 1 + A times the rate",
         "a difference between gyro and measuring wheels proportional to the rate",
         "IEEE Std 952, scale factor",
-        _constant(0.02),
+        sizes.constant(0.02),
         reading=lambda s, exact, k, p: p["A"] * exact,
     ),
     Effect(
@@ -708,7 +634,7 @@ _declare(
         "the lateral speed sensor reads A too much",
         "a lateral speed that stays at rest",
         "optical speed sensors' zero",
-        _constant(0.005),
+        sizes.constant(0.005),
         reading=lambda s, exact, k, p: p["A"] + 0 * exact,
     ),
     Effect(
@@ -718,7 +644,7 @@ _declare(
         "the lateral speed sensor is turned by A and reads a share of the forward speed",
         "a lateral speed proportional to the forward speed",
         "mounting angle of optical speed sensors",
-        _constant(0.01),
+        sizes.constant(0.01),
         reading=lambda s, exact, k, p: p["A"] * s.ahead[k],
     ),
 )

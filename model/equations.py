@@ -13,8 +13,7 @@ from functools import cached_property
 import casadi as ca
 
 from model import contact as law
-from model import effects as catalogue
-from model import placing, tree
+from model import placing, sizes, tree
 from model.effect import Placed, Rolling, Scene, Soil, Values
 from model.machine import Body, Machine, MachineError
 
@@ -230,7 +229,7 @@ def _scene(s: Sample, time: ca.SX) -> Scene:
         {b.index: _friction(s, b) for b in rubbing},
         {b.index: s.by_name[f"Fs{b.index}"] for b in rubbing},
         {b.index: float(b.friction.smoothing) for b in rubbing if b.friction is not None},
-        {b.index: catalogue.full_torque(s.machine, b) for b in s.machine.actuated},
+        {b.index: sizes.full_torque(s.machine, b) for b in s.machine.actuated},
         {b.index: _rolling(s, b)[0] for b in s.machine.contacts},
         {b.index: s.frames[b.index].velocity[0] for b in s.machine.body},
         time,

@@ -254,7 +254,7 @@ def test_mobilised_share_is_the_mean_along_the_patch(x: float) -> None:
 
 @pytest.mark.parametrize("x", [1e-3, 0.3, 5.0])
 def test_a_hyperbola_has_the_same_slope_and_half_as_much_again_at_its_end(x: float) -> None:
-    """Kondner's stress x / (a + b x): 1 / (1 + x/3) of the linear law, 3 in the limit, where the exponential has 2."""
+    """A force as x / (a + b x): 1 / (1 + x/3) of the linear law, 3 in the limit, where the exponential one has 2."""
     bent = float(ca.DM(contact.mobilised(ca.SX(x), 1.0)))
     assert bent == pytest.approx(1 / (1 + x / 3), rel=1e-8)
     assert bent >= float(ca.DM(contact.mobilised(ca.SX(x))))

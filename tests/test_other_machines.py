@@ -40,7 +40,7 @@ from excite import (
 from excite.diagnose import Diagnosis
 from excite.limit import InfeasibleError
 from excite.simulate import Motion, simulate
-from model import effects, placing
+from model import effects, placing, sizes
 from model.effect import Site
 from model.file import Quantity
 from model.machine import Machine, Problem, load, shipped
@@ -391,7 +391,7 @@ def test_torques_that_effects_take_are_of_the_machines_own_size(name: str) -> No
     plain = model_of(name)
     still, p = np.zeros(len(plain.coordinates)), plain.expand @ plain.nominal
     for k, (row, body) in enumerate(zip(plain.actuated, plain.machine.actuated, strict=True)):
-        full, nu = effects.full_torque(plain.machine, body), np.zeros(len(still))
+        full, nu = sizes.full_torque(plain.machine, body), np.zeros(len(still))
         u, nu[row] = full * np.eye(len(plain.inputs))[k], 1.0
         for cause, share in (("torque_deadband", 1.0), ("relief_valve", 0.4 * full), ("load_dependent_friction", full)):
             effect = effects.CATALOGUE[cause]

@@ -220,15 +220,15 @@ def test_real_time_is_kept(open_page: Callable[..., Tab]) -> None:
     tab = open_page(fake=False)
     tab.page.keyboard.press("s")
     tab.page.tap("#start")
-    lags, drifts = [], []
+    lags, least, most = [], [], []
     for _ in range(10):
         before = time.perf_counter()
         now, painted = tab.page.evaluate("[aid.time(), Number(document.body.dataset.t)]")
-        after = time.perf_counter()
-        drifts.append(now - (before + after) / 2)
+        least.append(now - time.perf_counter())  # a busy machine answers late: the page read its clock in between
+        most.append(now - before)
         lags.append(now - painted)
         time.sleep(0.35)
-    assert np.ptp(drifts) < 0.05
+    assert max(least) - min(most) < 0.05
     assert float(np.median(lags)) < 0.05
 
 
