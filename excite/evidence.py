@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
+from math import prod
 
 import casadi as ca
 import numpy as np
@@ -131,7 +132,7 @@ def finer(scores: Sequence[Score], machine: Machine, duration: float, reach: flo
 
 def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
     """Values near those of a candidate: shapes up to two thirds of the way to the next points that are tried. What is
-    tried beside the grid are points on a line of shapes that go together."""
+    tried beside the grid is a grid of its own, or points on a line of shapes that go together."""
     effect, own = placed.effect, placed.values
     families: list[list[dict[str, float]]] = []
     if len(effect.grid) > 1:
@@ -141,8 +142,12 @@ def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
     alike = [b for b in alike if all(b[n] * own[n] > 0 for n in unusual)]
     alike = [b for b in alike if all(b[n] == own[n] for n in b if n != "A" and effect.shapes[n].whole)]
     if alike:
-        varying = [n for n, s in effect.shapes.items() if not s.whole and len({b[n] for b in alike}) > 1]
-        families += [_next_to(own, [{n: b[n] for n in varying} for b in alike], reach)] if varying else []
+        tried = {n: {b[n] for b in alike} for n, s in effect.shapes.items() if not s.whole}
+        varying = [n for n, values in tried.items() if len(values) > 1]
+        if len(alike) == prod(len(tried[n]) for n in varying):
+            families += [_next_to(own, [{n: x} for x in tried[n]], reach) for n in varying]
+        else:
+            families += [_next_to(own, [{n: b[n] for n in varying} for b in alike], reach)]
     for name, shape in effect.shapes.items() if not alike else ():
         if len(shape.grid) > 1 and not (shape.circular or shape.whole or name in unusual):
             families.append(_next_to(own, [{name: g * shape.size(site)} for g in shape.grid], reach))

@@ -29,6 +29,7 @@ MANY, FEW = 80, 20  # from how many samples on a block pays; samples in one call
 FINE, FINEST = 4, 16  # steps for an interval in which friction turns, and where it turns all at once
 ABRUPT = 1.5  # of the speed that friction takes to turn: a change within an interval from which it does so at once
 SPLITS = 6  # an interval is halved at most this often
+MOST = 12  # steps for each interval, on average: a motion that takes more is none
 
 
 class Batch:
@@ -404,24 +405,28 @@ def _step(
 def advance(chart: Chart, s: np.ndarray, left: np.ndarray, right: np.ndarray, X: np.ndarray) -> np.ndarray:
     """Where K states s (K, n) lead in one sample (K, n) under torques from left to right (K, n_u) [N m].
 
-    Not finite where an interval can't be integrated.
+    Not finite where an interval can't be integrated, or where so many take so many steps that it isn't worth it.
     """
     sample = 1 / float(chart.model.machine.sampling_hz)
     with np.errstate(all="ignore"):
-        return _intervals(chart, s, left, (right - left) / sample, sample, X, SPLITS)
+        return _intervals(chart, s, left, (right - left) / sample, sample, X, SPLITS, MOST * max(len(s), BATCH))[0]
 
 
 def _intervals(
-    chart: Chart, start: np.ndarray, u: np.ndarray, rate: np.ndarray, h: float, X: np.ndarray, splits: int
-) -> np.ndarray:
-    """One step over h; intervals with too large an error in two halves."""
+    chart: Chart, start: np.ndarray, u: np.ndarray, rate: np.ndarray, h: float, X: np.ndarray, splits: int, most: int
+) -> tuple[np.ndarray, int]:
+    """One step over h; intervals with too large an error in two halves. most: steps that may be made. Also how many
+    are left then; not finite where none are."""
+    if len(start) > most:
+        return np.full_like(start, np.nan), 0
+    most -= len(start)
     end, error = chart.step(start, u, rate, np.array([h]), X)
     end = end[:, :, 0]
     bad = np.flatnonzero(~(error[:, 0, 0] < ACCURACY))
     if len(bad) and splits:
-        middle = _intervals(chart, start[bad], u[bad], rate[bad], h / 2, X, splits - 1)
-        end[bad] = _intervals(chart, middle, u[bad] + rate[bad] * (h / 2), rate[bad], h / 2, X, splits - 1)
-    return end
+        middle, most = _intervals(chart, start[bad], u[bad], rate[bad], h / 2, X, splits - 1, most)
+        end[bad], most = _intervals(chart, middle, u[bad] + rate[bad] * (h / 2), rate[bad], h / 2, X, splits - 1, most)
+    return end, most
 
 
 def differentiate(

@@ -130,10 +130,12 @@ class Shape:
 
 @dataclass(frozen=True)
 class Memory:
-    """A state of its own that an effect has: its rate of change, and how far it may be from zero when a log begins."""
+    """A state of its own that an effect has: its rate of change, and how far it may be from zero when a log begins.
+    each: every body that the effect acts on has one, by the name and the body's index."""
 
     rate: Callable[[Scene, int, Values], ca.SX]
     spread: float
+    each: bool = False
 
 
 @dataclass(frozen=True)
@@ -204,6 +206,14 @@ class Placed:
         """Names as parameters of the model -> (value's key, unit): the amount first, then the shapes."""
         named = {self.name: ("A", self.effect.unit)}
         return named | {f"{self.name}.{s}": (s, shape.unit) for s, shape in self.effect.shapes.items()}
+
+    @property
+    def memory(self) -> dict[str, tuple[int, Memory]]:
+        """What it remembers, by name, each with the body that it is remembered of."""
+        found: dict[str, tuple[int, Memory]] = {}
+        for name, own in self.effect.memory.items():
+            found |= {f"{name}{k}": (k, own) for k in self.bodies} if own.each else {name: (self.bodies[0], own)}
+        return found
 
     def shaking(self, t: np.ndarray) -> np.ndarray:
         """How much the effect shakes a torque sensor, 0 to 1, at times t (N,) [s]."""

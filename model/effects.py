@@ -60,7 +60,8 @@ def _deadband(s: Scene, k: int, p: Values) -> ca.SX:
 
 
 def _coupling(s: Scene, k: int, p: Values) -> ca.SX:
-    return p["A"] * sum((s.u[j] for j in s.others(k)), ca.SX(0))
+    felt = [(1 - p["hose"]) * s.u[j] + p["hose"] * s.z[f"late{j}"] for j in s.others(k)]
+    return p["A"] * sum(felt, ca.SX(0))
 
 
 def _relaxed(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
@@ -123,6 +124,14 @@ def _resistance(s: Scene, k: int, p: Values) -> tuple[ca.SX, ca.SX]:
     return -p["A"] * (1 + p["rise"] * r.Vx**2) * ca.tanh(r.Vx / p["soft"]), ca.SX(0)
 
 
+def _played(s: Scene, k: int, p: Values) -> ca.SX:
+    """How an actuator moves in its play, -1 to 1: to the side that it is pushed to by more than its own friction has;
+    pushed less it creeps, the more slowly the more friction there is. No fit finds a way to a sharper one."""
+    width = SMOOTH_TORQUE * s.full[k]
+    ahead, back = _softplus(s.u[k] - p["breakaway"], width), _softplus(-s.u[k] - p["breakaway"], width)
+    return (ahead * (1 - s.z["play"]) - back * (1 + s.z["play"])) / p["damping"]
+
+
 def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
     q = s.q[k] - p["centre"]
     high, low = _softplus(q - p["stop"], 0.01), _softplus(-q - p["stop"], 0.01)
@@ -135,6 +144,13 @@ def _one_sided(site: Site) -> list[dict[str, float]]:
     stops = [x * limit for x in (0.15, 0.35, 0.55, 0.75)]
     sides = [{"stop": (limit + x) / 2, "centre": side * (x - limit) / 2} for x in stops for side in (1.0, -1.0)]
     return [{**x, "hardening": 0.0} for x in sides]
+
+
+def _rubbing(site: Site) -> list[dict[str, float]]:
+    """Plays that an actuator crosses against its own friction."""
+    full = sizes.torque(site)
+    held = [(damping, breakaway) for damping in (0.0001, 0.0005) for breakaway in (0.003, 0.01, 0.03)]
+    return [{"turn": 0.02 * full, "rubs": 1.0, "damping": d * full, "breakaway": b * full} for d, b in held]
 
 
 def _clipped(s: Scene, k: int, p: Values) -> ca.SX:
@@ -335,7 +351,20 @@ _declare(
         "one driven contact answers to another's torque",
         "two motors on one hydraulic pump",
         sizes.constant(0.05),
+        {
+            "hose": Shape(
+                "-",
+                0.0,
+                (0.0,),
+                whole=True,
+                only=(0.0, 1.0),
+                meaning="0: the other's torque acts at once; 1: through a hose, with a first-order lag",
+            ),
+            "lag": Shape("s", 0.1, (0.1,)),
+        },
+        beside=lambda site: [{"hose": 1.0, "lag": x} for x in (0.03, 0.1, 0.3)],
         torque=_coupling,
+        memory={"late": Memory(lambda s, k, p: (s.u[k] - s.z[f"late{k}"]) / p["lag"], 1000.0, each=True)},
     ),
     Effect(
         "relief_valve",
@@ -560,12 +589,40 @@ _declare(
         ("articulation",),
         "rad",
         "play A between the actuator, with its encoder, and the joint",
-        "the angle jumps where the torque changes its sign",
+        "the angle jumps where the torque changes its sign, or after it has",
         "Nordin, Gutman, Automatica 38 (2002)",
         sizes.constant(0.005),
-        {"turn": Shape("N m", 0.02, (0.01, 0.05), sizes.torque)},
+        {
+            "turn": Shape("N m", 0.02, (0.01, 0.05), sizes.torque),
+            "rubs": Shape(
+                "-",
+                0.0,
+                (0.0,),
+                whole=True,
+                only=(0.0, 1.0),
+                meaning="0: the play is crossed at once; 1: against the actuator's own friction, over time",
+            ),
+            "damping": Shape(
+                "N m s",
+                0.0002,
+                (0.0002,),
+                sizes.torque,
+                meaning="over the torque beyond breakaway: the time constant with which the actuator crosses its play",
+            ),
+            "breakaway": Shape(
+                "N m",
+                0.01,
+                (0.01,),
+                sizes.torque,
+                meaning="torque that the actuator's own friction takes: below it, it only creeps in its play",
+            ),
+        },
+        beside=_rubbing,
         positive=True,
-        reading=lambda s, exact, k, p: p["A"] / 2 * ca.tanh(s.u[k] / p["turn"]),
+        reading=lambda s, exact, k, p: (
+            p["A"] / 2 * ((1 - p["rubs"]) * ca.tanh(s.u[k] / p["turn"]) + p["rubs"] * s.z["play"])
+        ),
+        memory={"play": Memory(_played, 1.0)},
         angular=True,
     ),
     Effect(

@@ -133,7 +133,7 @@ def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Plac
         predict[row] = ca.substitute(gain[k], time, now) * predict[row] + ca.substitute(offset[k], time, now)
     rates = [ca.SX(1)] if "time" in memory else []
     for e in acting:
-        rates += [m.rate(e.scene, e.placed.bodies[0], e.values) for m in e.placed.effect.memory.values()]
+        rates += _rates(e)
     beside = [s.u, z] if placed else []
     labels = ["q", "nu", "a", "p", "u", "z"][: 4 + len(beside)]
     sample = [s.q, s.nu, s.a, s.p, *beside]
@@ -179,7 +179,7 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Pla
     scene = _scene(s, time)
     rollings = {b.index: _rolling(s, b) for b in machine.contacts}
     for e in placed:
-        z = {m: ca.SX.sym(m) for m in e.effect.memory}
+        z = {m: ca.SX.sym(m) for m in e.memory}
         own = _seeing(s, scene, e, z)
         added = _added(s, own, inertia)
         if e.effect.soil is not None:
@@ -197,7 +197,7 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Pla
             read[at] = e.effect.reading(own.scene, exact[at], sensors[at].body, own.values)
         reading.append(read)
         states += z.values()
-        rates += [m.rate(own.scene, e.bodies[0], own.values) for m in e.effect.memory.values()]
+        rates += _rates(own)
     held = ca.vertcat(*states, ca.SX(0, 1))
     arguments = [s.q, s.nu, s.a, s.u, time, held, exact, s.p]
     return Signatures(
@@ -210,11 +210,11 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Pla
 def _acting(s: Sample, placed: Sequence[Placed]) -> tuple[tuple[str, ...], ca.SX, list[Acting]]:
     """What effects remember, its symbols z, and the effects with what they see of a sample."""
     memory = ["time"] if any(e.effect.timed for e in placed) else []
-    memory += [f"{e.name}.{m}" for e in placed for m in e.effect.memory]
+    memory += [f"{e.name}.{m}" for e in placed for m in e.memory]
     z = ca.SX.sym("z", len(memory))
     known = dict(zip(memory, ca.vertsplit(z), strict=True))
     scene = _scene(s, known.get("time", ca.SX(0)))
-    acting = [_seeing(s, scene, e, {m: known[f"{e.name}.{m}"] for m in e.effect.memory}) for e in placed]
+    acting = [_seeing(s, scene, e, {m: known[f"{e.name}.{m}"] for m in e.memory}) for e in placed]
     return tuple(memory), z, acting
 
 
@@ -239,6 +239,11 @@ def _scene(s: Sample, time: ca.SX) -> Scene:
 def _seeing(s: Sample, scene: Scene, e: Placed, z: Mapping[str, ca.SX]) -> Acting:
     values = {key: s.by_name.get(name, ca.SX(e.values[key])) for name, (key, _) in e.parameters.items()}
     return Acting(e, replace(scene, z=z), values)
+
+
+def _rates(e: Acting) -> list[ca.SX]:
+    """How fast all that an effect remembers changes."""
+    return [own.rate(e.scene, k, e.values) for k, own in e.placed.memory.values()]
 
 
 def _friction(s: Sample, body: Body) -> ca.SX:

@@ -147,7 +147,7 @@ class Model:
     @property
     def remembered(self) -> np.ndarray:
         """How well `fresh` is known at the start of a log (n_z,)."""
-        own = [m.spread for e in self.effects for m in e.effect.memory.values()]
+        own = [m.spread for e in self.effects for _, m in e.memory.values()]
         return np.array([1e-6] * ("time" in self.memory) + own)
 
     @cached_property

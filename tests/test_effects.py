@@ -107,6 +107,63 @@ def test_dry_friction_may_turn_more_suddenly(va12: Model, slow: float) -> None:
     np.testing.assert_allclose(with_it - without, Fs * (sign - np.tanh(w / ws)), rtol=1e-6, atol=1e-4)
 
 
+def test_an_actuator_in_its_play_waits_for_a_push() -> None:
+    """Pushed ahead it lies at the front of its play and reads half of it too much; let go, it is still nearer the front
+    after some tenths of a second; pushed back by less than its own friction it creeps, by more it goes to the rear."""
+    entry = EffectEntry(
+        name="articulation_backlash",
+        where="articulation",
+        amount=Quantity(value=0.004, source="assumed"),
+        shape={
+            n: Quantity(value=v, source="assumed") for n, v in {"rubs": 1.0, "damping": 3.0, "breakaway": 400.0}.items()
+        },
+    )
+    model = build(placing.extended(VA12, entry))
+    t = np.arange(400) / 100
+    torque = np.zeros((400, 3))
+    torque[:, 1] = np.interp(
+        t, [0, 0.2, 1.0, 1.2, 1.7, 1.8, 2.3, 2.5, 4.0], [0, 3e3, 3e3, 0, 0, -200, -200, -3e3, -3e3]
+    )
+    motion = simulate(model, torque)
+    joint, k = motion.q[:, 4], list(model.memory)
+    play = (sensors.signals(model, motion)["theta2"] - joint) / 0.002
+    assert len(k) == 1
+    assert play[90] == pytest.approx(1.0, abs=0.02)
+    assert play[140] > 0.6
+    assert play[170] > play[225] > -0.5
+    assert play[270] == pytest.approx(-1.0, abs=0.02)
+
+
+def test_a_pump_is_felt_through_a_hose(va12: Model) -> None:
+    """A step of one roll's torque comes to the other by the share A, as a first-order lag has it; at once without."""
+    entry = EffectEntry(
+        name="pump_coupling",
+        where="drive",
+        amount=Quantity(value=0.1, source="assumed"),
+        shape={n: Quantity(value=v, source="assumed") for n, v in {"hose": 1.0, "lag": 0.2}.items()},
+    )
+    model, at_once = (build(placing.extended(VA12, e)) for e in (entry, entry.model_copy(update={"shape": {}})))
+    t = np.arange(100) / 100
+    torque = np.column_stack([1000 * (t >= 0.3), 0 * t, 0 * t])
+    motion = simulate(model, torque)
+    names = ["pump_coupling@drive.late1", "pump_coupling@drive.late4"]
+    assert list(model.memory) == names
+    z = motion.memory[:, model.memory.index(names[0])]
+    lagged = 1000 * (1 - np.exp(-np.maximum(t - 0.295, 0) / 0.2))
+    np.testing.assert_allclose(z, lagged, atol=3.0)
+    still, u = np.zeros((6, 1)), torque[-1:].T
+    p = va12.expand @ va12.nominal
+    felt = [
+        (
+            va12.balance(still, still, still, p)
+            - m.balance(still, still, still, m.expand @ m.nominal, u, motion.memory[-1])
+        ).full()
+        for m in (model, at_once)
+    ]
+    assert felt[0][5, 0] == pytest.approx(0.1 * z[-1], abs=1e-6)
+    assert felt[1][5, 0] == pytest.approx(100.0, abs=1e-6)
+
+
 @pytest.mark.parametrize(("second", "share"), [(0.0, 0.0), (1.0, 0.5), (2.0, 1.0), (3.0, 0.5), (4.0, 0.0)])
 def test_a_brake_drags_between_its_instants(second: float, share: float, va12: Model) -> None:
     """Dry friction larger by its amount, against the motion either way."""
