@@ -32,6 +32,7 @@ WORTH = 15.0  # a first-order gain below which a candidate isn't fitted
 HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
 TRIED = 5  # candidates that are fitted
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
+PLAIN = 0.5  # the same of the one without unusual shapes: the others bend to what isn't theirs
 ANEW = 12  # effects that begin anew where nothing was found
 PAIR = 2  # candidates whose fits are begun in any case
 BEHIND = 0.5  # share of what was gained already that further candidates must have come to after a few passes
@@ -167,7 +168,8 @@ def _shortlist(stage: Stage, scores: Sequence[evidence.Score], chosen: Sequence[
         whole = _much(stage) and OVER * s.gain >= stage.excess
         least = _least(stage, chosen, s.candidate, 0.0) / OVER if stage.settled and not whole else 0.0
         worth = s.gain >= max(least, hope) and s.values["A"] != 0
-        if worth and s.gain >= LIKE * most.setdefault(s.candidate.name, s.gain):
+        like = LIKE if len(s.candidate.variant) > 1 else PLAIN
+        if worth and s.gain >= like * most.setdefault(s.candidate.name, s.gain):
             best.setdefault(s.candidate.variant, s)
     return list(best.values())[:TRIED]
 

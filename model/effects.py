@@ -41,6 +41,32 @@ def _softplus(x: ca.SX, width: float | ca.SX) -> ca.SX:
     return (x + ca.sqrt(x**2 + width**2)) / 2
 
 
+def _fading(s: Scene, k: int, p: Values) -> ca.SX:
+    """Stribeck friction's share of what it is at standstill."""
+    return ca.exp(-(((s.w[k] ** 2 + (0.1 * s.smooth[k]) ** 2) / p["decay"] ** 2) ** (p["power"] / 2)))
+
+
+def _stribeck(s: Scene, k: int, p: Values) -> ca.SX:
+    bent = (s.coulomb[k] + p["A"]) * s.z["bent"] - s.coulomb[k] * s.sign(k)
+    return -(1 - p["bristles"]) * p["A"] * s.sign(k) * _fading(s, k, p) - p["bristles"] * bent
+
+
+def _bending(s: Scene, k: int, p: Values) -> ca.SX:
+    """How bristles bend, -1 to 1 at standstill, where they hold most."""
+    w, most = s.w[k], s.coulomb[k] + p["A"]
+    sliding = ca.sqrt(w**2 + (0.01 * s.smooth[k]) ** 2) * most / (s.coulomb[k] + p["A"] * _fading(s, k, p))
+    return (w - sliding * s.z["bent"]) / p["presliding"]
+
+
+def _bristly(site: Site) -> list[dict[str, float]]:
+    smooth = sizes.smooth(site)
+    return [
+        {"decay": x * smooth, "power": 2.0, "bristles": 1.0, "presliding": far}
+        for x in (4.0, 12.0, 36.0)
+        for far in (0.001, 0.004)
+    ]
+
+
 def _turned(s: Scene, k: int, p: Values) -> ca.SX:
     x = s.w[k] / s.smooth[k] * ca.exp(p["A"])
     slowly = ca.atan(x * pi / 2) * 2 / pi
@@ -193,12 +219,19 @@ _declare(
         {
             "decay": Shape("rad/s", 15.0, (4.0, 12.0, 36.0), sizes.smooth),
             "power": Shape("-", 2.0, (1.0, 2.0), whole=True),
+            "bristles": Shape(
+                "-",
+                0.0,
+                (0.0,),
+                whole=True,
+                only=(0.0, 1.0),
+                meaning="0: friction turns with the speed; 1: all of it as bristles bend (LuGre)",
+            ),
+            "presliding": Shape("rad", 0.003, (0.003,), meaning="the angle within which bristles bend"),
         },
-        torque=lambda s, k, p: (
-            -p["A"]
-            * s.sign(k)
-            * ca.exp(-(((s.w[k] ** 2 + (0.1 * s.smooth[k]) ** 2) / p["decay"] ** 2) ** (p["power"] / 2)))
-        ),
+        beside=_bristly,
+        torque=_stribeck,
+        memory={"bent": Memory(_bending, 1.0)},
     ),
     Effect(
         "friction_transition",

@@ -164,6 +164,36 @@ def test_a_pump_is_felt_through_a_hose(va12: Model) -> None:
     assert felt[1][5, 0] == pytest.approx(100.0, abs=1e-6)
 
 
+def test_bristles_bend_before_a_joint_slides(va12: Model) -> None:
+    """LuGre: from rest friction grows with the angle as a spring does, (Fs + A) / presliding; sliding steadily it is
+    Stribeck's, Fs + A exp(-(w / decay)^2) against the motion either way (Canudas de Wit et al. 1995, (1) to (4))."""
+    shape = {"decay": 0.3, "power": 2.0, "bristles": 1.0, "presliding": 0.004}
+    entry = EffectEntry(
+        name="stribeck_friction",
+        where="rear_roll",
+        amount=Quantity(value=250.0, source="assumed"),
+        shape={n: Quantity(value=v, source="assumed") for n, v in shape.items()},
+    )
+    model = build(placing.extended(VA12, entry))
+    p, still, u = model.expand @ model.nominal, np.zeros(6), np.zeros(3)
+    Fs, Fv = (float(p[model.base.standard.index(n)]) for n in ("Fs4", "Fv4"))
+
+    def bends(w: float, z: float) -> float:
+        return float(model.flow(still, w * np.eye(6)[5], u, [z], model.nominal)[0])
+
+    def rubs(w: float, z: float) -> float:
+        nu = w * np.eye(6)[5]
+        soft = np.where([n.startswith("K") for n in model.base.standard], 0, p)
+        return float(model.balance(still, nu, still, soft, u, [z])[5])
+
+    assert bends(0.01, 0.0) == pytest.approx(0.01 / 0.004)
+    assert rubs(0.0, 0.3) == pytest.approx(0.3 * (Fs + 250))
+    for w in (0.15, -0.6, 1.5):
+        steady = bends(w, 0.0) / (bends(w, 0.0) - bends(w, 1.0))
+        slides = Fs + 250 * np.exp(-((w / 0.3) ** 2))
+        assert rubs(w, steady) == pytest.approx(np.sign(w) * slides + Fv * w, rel=1e-3)
+
+
 @pytest.mark.parametrize(("second", "share"), [(0.0, 0.0), (1.0, 0.5), (2.0, 1.0), (3.0, 0.5), (4.0, 0.0)])
 def test_a_brake_drags_between_its_instants(second: float, share: float, va12: Model) -> None:
     """Dry friction larger by its amount, against the motion either way."""
