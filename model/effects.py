@@ -59,9 +59,10 @@ def _bending(s: Scene, k: int, p: Values) -> ca.SX:
 
 
 def _bristly(site: Site) -> list[dict[str, float]]:
+    """Bristles of a power in the middle: fitted, it would make Stribeck friction of much that is none."""
     smooth = sizes.smooth(site)
     return [
-        {"decay": x * smooth, "power": 2.0, "bristles": 1.0, "presliding": far}
+        {"decay": x * smooth, "power": 1.5, "bristles": 1.0, "presliding": far}
         for x in (4.0, 12.0, 36.0)
         for far in (0.001, 0.004)
     ]
