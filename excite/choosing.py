@@ -32,7 +32,7 @@ WORTH = 15.0  # a first-order gain below which a candidate isn't fitted
 HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
 TRIED = 5  # candidates that are fitted
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
-PLAIN = 0.5  # the same of the one without unusual shapes: the others bend to what isn't theirs
+PLAIN = 0.5  # the same for the variant without unusual shapes, which the others may mimic before a fit
 ANEW = 12  # effects that begin anew where nothing was found
 PAIR = 2  # candidates whose fits are begun in any case
 BEHIND = 0.5  # share of what was gained already that further candidates must have come to after a few passes
@@ -139,7 +139,7 @@ def _entry(score: evidence.Score) -> EffectEntry:
         # Not proportional to the amount: no further from the grid's value than the signature holds.
         step = float(np.clip(amount / e.values["A"], 0.3, 2.0))
         amount = e.values["A"] / step if e.effect.inverse else e.values["A"] * step
-    return identified(e.effect.name, e.where, amount, {n: round(v, 12) for n, v in values.items()})
+    return identified(e.effect.name, e.where, amount, {n: round(v, 12) for n, v in values.items() if n in e.shapes})
 
 
 def entry_of(stage: Stage, name: str) -> EffectEntry:

@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from math import prod
 
 import casadi as ca
 import numpy as np
@@ -35,6 +34,7 @@ from model.machine import Machine
 NEARBY = 0.6, 0.8, 1.0, 1.3, 1.7  # amounts that are tried about the grid's, where they aren't a factor
 ALONE = 100  # columns that aren't worth a second process
 CHUNK = 20_000  # innovations whose products are summed at once
+HUGE = 1e9  # of a state's or a reading's scale: what is remembered of a far-off motion has no bounds
 ABSORBED = 1e-5  # share of a signature that is left, below which it is but single precision's error
 
 
@@ -144,7 +144,7 @@ def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
     if alike:
         tried = {n: {b[n] for b in alike} for n, s in effect.shapes.items() if not s.whole}
         varying = [n for n, values in tried.items() if len(values) > 1]
-        if len(alike) == prod(len(tried[n]) for n in varying):
+        if {tuple(b[n] for n in varying) for b in alike} == set(product(*(tried[n] for n in varying))):
             families += [_next_to(own, [{n: x} for x in tried[n]], reach) for n in varying]
         else:
             families += [_next_to(own, [{n: b[n] for n in varying} for b in alike], reach)]
@@ -213,19 +213,25 @@ class Signatures:
                 self.torque[:, :, k] = _misread(c, e, u, t)
 
     def along(self, X: np.ndarray, r: Record, p: Point) -> tuple[np.ndarray, np.ndarray]:
-        """What signatures do to the scaled state behind each sample (N - 1, n, C), and to readings (N, m, C)."""
+        """What signatures do to the scaled state behind each sample (N - 1, n, C), and to readings (N, m, C). Nothing
+        where one has no bounds: what it would remember along a motion that is far off may come apart."""
         c, N = self.chart, len(p.s)
         u, scale = self.samples[3], newton.state_scale(c)
         push = np.empty((N - 1, c.n, self.columns), np.float32)
         reading = np.empty((N, len(c.sensors), self.columns), np.float32)
+        bounded = np.ones(self.columns, bool)
         for at in range(0, N - 1, BATCH):
             until = min(at + BATCH, N - 1)
             by = differentiate(c, p.s[at : until + 1], u[at:until], u[at + 1 : until + 1], X, force=True)
             held = tuple(x[at : until + 1] for x in self.samples)
             force = self.force(*held, self.p)[0]
             torque = self.torque[at : until + 1]
-            push[at:until] = _pushed(c, by, force, torque, scale)
-            reading[at : until + 1] = self.reading(*held, self.p)[0][:, self.rows]
+            with np.errstate(over="ignore", invalid="ignore"):
+                push[at:until] = _pushed(c, by, force, torque, scale)
+                reading[at : until + 1] = self.reading(*held, self.p)[0][:, self.rows]
+            for part in (push[at:until], reading[at : until + 1]):
+                bounded &= np.abs(part).max(axis=(0, 1), initial=0.0) < HUGE
+        push[:, :, ~bounded] = reading[:, :, ~bounded] = 0
         return push, reading
 
 
@@ -315,7 +321,7 @@ def _square(E: np.ndarray) -> np.ndarray:
 def _score(x: Candidate, S: np.ndarray, g: np.ndarray, own: np.ndarray) -> Told | None:
     """The evidence of one candidate; None where the parameters absorb all of it or nothing shows it."""
     size = np.diag(own)[list(x.columns)]
-    if size.max() < 1e-6:
+    if not (np.isfinite(size).all() and size.max() >= 1e-6):
         return None
     # A sine or a cosine that does nothing here, as a slope across a straight lane, stays out.
     shown = size > 1e-9 * size.max()

@@ -29,7 +29,9 @@ MANY, FEW = 80, 20  # from how many samples on a block pays; samples in one call
 FINE, FINEST = 4, 16  # steps for an interval in which friction turns, and where it turns all at once
 ABRUPT = 1.5  # of the speed that friction takes to turn: a change within an interval from which it does so at once
 SPLITS = 6  # an interval is halved at most this often
-MOST = 12  # steps for each interval, on average: a motion that takes more is none
+# Steps for each interval on average, in logs longer than BATCH: guesses that lead to a fit take up to 8, a motion that
+# takes more has come apart.
+MOST = 12
 
 
 class Batch:

@@ -13,6 +13,7 @@ from model.machine import Body, Contact, Machine
 
 DURATION = 60.0  # [s] of a log, where nobody says
 Values = Mapping[str, ca.SX]  # the amount "A" and the shapes by name
+Form = tuple[str, float]  # a shape that an effect's way of acting is chosen by, and its value
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,8 @@ class Shape:
     """What an effect's amount leaves open: default and grid in units of `size`, which belongs to the site.
 
     `circular`: a phase, found by its sine and cosine; `whole`: not refined; `only`: the values that there are, if these
-    are few; `meaning`: what a name leaves open. What is zero by default may have either sign.
+    are few; `meaning`: what a name leaves open; `form`: the shape and its value with which alone it has a meaning. What
+    is zero by default may have either sign.
     """
 
     unit: str
@@ -122,6 +124,7 @@ class Shape:
     whole: bool = False
     only: tuple[float, ...] = ()
     meaning: str = ""
+    form: Form | None = None
 
     @property
     def signed(self) -> bool:
@@ -131,11 +134,13 @@ class Shape:
 @dataclass(frozen=True)
 class Memory:
     """A state of its own that an effect has: its rate of change, and how far it may be from zero when a log begins.
-    each: every body that the effect acts on has one, by the name and the body's index."""
+    each: one for each body that the effect acts on, named by the name and the body's index; form: the shape and its
+    value with which alone there is one, or None."""
 
     rate: Callable[[Scene, int, Values], ca.SX]
     spread: float
     each: bool = False
+    form: Form | None = None
 
 
 @dataclass(frozen=True)
@@ -205,13 +210,23 @@ class Placed:
     def parameters(self) -> dict[str, tuple[str, str]]:
         """Names as parameters of the model -> (value's key, unit): the amount first, then the shapes."""
         named = {self.name: ("A", self.effect.unit)}
-        return named | {f"{self.name}.{s}": (s, shape.unit) for s, shape in self.effect.shapes.items()}
+        return named | {f"{self.name}.{s}": (s, shape.unit) for s, shape in self.shapes.items()}
+
+    @property
+    def shapes(self) -> dict[str, Shape]:
+        """Those shapes of the effect that mean something in the form that it has here."""
+        return {name: shape for name, shape in self.effect.shapes.items() if self._has(shape.form)}
+
+    def _has(self, form: Form | None) -> bool:
+        return form is None or self.values[form[0]] == form[1]
 
     @property
     def memory(self) -> dict[str, tuple[int, Memory]]:
         """What it remembers, by name, each with the body that it is remembered of."""
         found: dict[str, tuple[int, Memory]] = {}
         for name, own in self.effect.memory.items():
+            if not self._has(own.form):
+                continue
             found |= {f"{name}{k}": (k, own) for k in self.bodies} if own.each else {name: (self.bodies[0], own)}
         return found
 

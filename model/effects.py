@@ -22,6 +22,7 @@ from model.effect import Channel, Effect, Memory, Rolling, Scene, Shape, Site, S
 SMOOTH_SLIP = 0.005  # slip over which driving turns into braking
 SMOOTH_SPEED = 0.02  # [m/s] over which rolling resistance turns
 SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
+LEAST_HELD = 0.1  # of what bristles hold at rest, that they hold at any speed: what a fit passes by may be less
 EDGE = 0.2  # [s] over which what acts between two instants begins and ends
 
 MOMENTS = 120  # at which a load is looked for that slides
@@ -47,24 +48,26 @@ def _fading(s: Scene, k: int, p: Values) -> ca.SX:
 
 
 def _stribeck(s: Scene, k: int, p: Values) -> ca.SX:
-    bent = (s.coulomb[k] + p["A"]) * s.z["bent"] - s.coulomb[k] * s.sign(k)
+    bent = (s.coulomb[k] + p["A"]) * s.z.get("bent", ca.SX(0)) - s.coulomb[k] * s.sign(k)
     return -(1 - p["bristles"]) * p["A"] * s.sign(k) * _fading(s, k, p) - p["bristles"] * bent
 
 
 def _bending(s: Scene, k: int, p: Values) -> ca.SX:
-    """How bristles bend, -1 to 1 at standstill, where they hold most."""
+    """How fast bristles bend: from 0 towards what they hold of Fs + A, the most; sliding steadily that is the share
+    (Fs + A exp(-(w/decay)^power)) / (Fs + A) of it, with the sign of the speed."""
     w, most = s.w[k], s.coulomb[k] + p["A"]
-    sliding = ca.sqrt(w**2 + (0.01 * s.smooth[k]) ** 2) * most / (s.coulomb[k] + p["A"] * _fading(s, k, p))
+    held = (s.coulomb[k] + p["A"] * _fading(s, k, p)) * most / (most**2 + 1e-6)
+    sliding = ca.sqrt(w**2 + (0.001 * s.smooth[k]) ** 2) / ca.fmax(held, LEAST_HELD)
     return (w - sliding * s.z["bent"]) / p["presliding"]
 
 
 def _bristly(site: Site) -> list[dict[str, float]]:
-    """Bristles of a power in the middle: fitted, it would make Stribeck friction of much that is none."""
+    """Bristles: the power is held between the two of the plain form; free, they would take up much that is none."""
     smooth = sizes.smooth(site)
     return [
-        {"decay": x * smooth, "power": 1.5, "bristles": 1.0, "presliding": far}
+        {"decay": x * smooth, "power": 1.5, "bristles": 1.0, "presliding": far * smooth}
         for x in (4.0, 12.0, 36.0)
-        for far in (0.001, 0.004)
+        for far in (0.05, 0.2)
     ]
 
 
@@ -87,8 +90,13 @@ def _deadband(s: Scene, k: int, p: Values) -> ca.SX:
 
 
 def _coupling(s: Scene, k: int, p: Values) -> ca.SX:
-    felt = [(1 - p["hose"]) * s.u[j] + p["hose"] * s.z[f"late{j}"] for j in s.others(k)]
+    felt = [(1 - p["hose"]) * s.u[j] + p["hose"] * s.z.get(f"late{j}", ca.SX(0)) for j in s.others(k)]
     return p["A"] * sum(felt, ca.SX(0))
+
+
+def _behind(s: Scene, k: int, p: Values) -> ca.SX:
+    """How a hose follows a contact's torque."""
+    return (s.u[k] - s.z[f"late{k}"]) / p["lag"]
 
 
 def _relaxed(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
@@ -152,8 +160,9 @@ def _resistance(s: Scene, k: int, p: Values) -> tuple[ca.SX, ca.SX]:
 
 
 def _played(s: Scene, k: int, p: Values) -> ca.SX:
-    """How an actuator moves in its play, -1 to 1: to the side that it is pushed to by more than its own friction has;
-    pushed less it creeps, the more slowly the more friction there is. No fit finds a way to a sharper one."""
+    """How fast an actuator moves in its play, -1 to 1: to the side that it is pushed to by more than its own friction
+    has; pushed by less it creeps towards u / breakaway, the more slowly the more friction there is. A friction that
+    holds it there would be sharper than any fit finds a way to."""
     width = SMOOTH_TORQUE * s.full[k]
     ahead, back = _softplus(s.u[k] - p["breakaway"], width), _softplus(-s.u[k] - p["breakaway"], width)
     return (ahead * (1 - s.z["play"]) - back * (1 + s.z["play"])) / p["damping"]
@@ -213,9 +222,11 @@ _declare(
         "stribeck_friction",
         ("joints",),
         "N m",
-        "friction above Fs near standstill, fading with speed: A sgn(w) exp(-abs(w/decay)^power)",
+        "friction above Fs near standstill, fading with speed: A sgn(w) exp(-abs(w/decay)^power); or Fs and it by"
+        " bristles that bend",
         "torque missing just after every start and reversal",
-        "Stribeck 1902; Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30 (1994), eq. (4)",
+        "Stribeck 1902; Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30 (1994), eq. (4); bristles: Canudas de"
+        " Wit, Olsson, Astrom, Lischinsky, IEEE TAC 40 (1995), (1) to (4)",
         sizes.coulomb(0.5),
         {
             "decay": Shape("rad/s", 15.0, (4.0, 12.0, 36.0), sizes.smooth),
@@ -226,13 +237,20 @@ _declare(
                 (0.0,),
                 whole=True,
                 only=(0.0, 1.0),
-                meaning="0: friction turns with the speed; 1: all of it as bristles bend (LuGre)",
+                meaning="0: friction turns with the speed; 1: all of it as bristles bend (LuGre without damping)",
             ),
-            "presliding": Shape("rad", 0.003, (0.003,), meaning="the angle within which bristles bend"),
+            "presliding": Shape(
+                "rad",
+                0.2,
+                (0.2,),
+                sizes.smooth,
+                meaning="the angle within which bristles bend",
+                form=("bristles", 1.0),
+            ),
         },
         beside=_bristly,
         torque=_stribeck,
-        memory={"bent": Memory(_bending, 1.0)},
+        memory={"bent": Memory(_bending, 1.0, form=("bristles", 1.0))},
     ),
     Effect(
         "friction_transition",
@@ -381,7 +399,7 @@ _declare(
         "pump_coupling",
         ("drive",),
         "-",
-        "each driven contact's delivered torque grows by A times what the others' sensors read",
+        "each driven contact's delivered torque grows by A times what the others' sensors read, at once or after a lag",
         "one driven contact answers to another's torque",
         "two motors on one hydraulic pump",
         sizes.constant(0.05),
@@ -394,11 +412,11 @@ _declare(
                 only=(0.0, 1.0),
                 meaning="0: the other's torque acts at once; 1: through a hose, with a first-order lag",
             ),
-            "lag": Shape("s", 0.1, (0.1,)),
+            "lag": Shape("s", 0.1, (0.1,), meaning="time constant of the hose", form=("hose", 1.0)),
         },
         beside=lambda site: [{"hose": 1.0, "lag": x} for x in (0.03, 0.1, 0.3)],
         torque=_coupling,
-        memory={"late": Memory(lambda s, k, p: (s.u[k] - s.z[f"late{k}"]) / p["lag"], 1000.0, each=True)},
+        memory={"late": Memory(_behind, 1000.0, each=True, form=("hose", 1.0))},
     ),
     Effect(
         "relief_valve",
@@ -627,7 +645,7 @@ _declare(
         "Nordin, Gutman, Automatica 38 (2002)",
         sizes.constant(0.005),
         {
-            "turn": Shape("N m", 0.02, (0.01, 0.05), sizes.torque),
+            "turn": Shape("N m", 0.02, (0.01, 0.05), sizes.torque, form=("rubs", 0.0)),
             "rubs": Shape(
                 "-",
                 0.0,
@@ -642,21 +660,23 @@ _declare(
                 (0.0002,),
                 sizes.torque,
                 meaning="over the torque beyond breakaway: the time constant with which the actuator crosses its play",
+                form=("rubs", 1.0),
             ),
             "breakaway": Shape(
                 "N m",
                 0.01,
                 (0.01,),
                 sizes.torque,
-                meaning="torque that the actuator's own friction takes: below it, it only creeps in its play",
+                meaning="torque that the actuator's own friction takes: below it, it creeps to that share of its play",
+                form=("rubs", 1.0),
             ),
         },
         beside=_rubbing,
         positive=True,
         reading=lambda s, exact, k, p: (
-            p["A"] / 2 * ((1 - p["rubs"]) * ca.tanh(s.u[k] / p["turn"]) + p["rubs"] * s.z["play"])
+            p["A"] / 2 * ((1 - p["rubs"]) * ca.tanh(s.u[k] / p["turn"]) + p["rubs"] * s.z.get("play", ca.SX(0)))
         ),
-        memory={"play": Memory(_played, 1.0)},
+        memory={"play": Memory(_played, 1.0, form=("rubs", 1.0))},
         angular=True,
     ),
     Effect(

@@ -237,7 +237,8 @@ def _scene(s: Sample, time: ca.SX) -> Scene:
 
 
 def _seeing(s: Sample, scene: Scene, e: Placed, z: Mapping[str, ca.SX]) -> Acting:
-    values = {key: s.by_name.get(name, ca.SX(e.values[key])) for name, (key, _) in e.parameters.items()}
+    values = {key: ca.SX(x) for key, x in e.values.items()}
+    values |= {key: s.by_name[name] for name, (key, _) in e.parameters.items() if name in s.by_name}
     return Acting(e, replace(scene, z=z), values)
 
 

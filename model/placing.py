@@ -81,7 +81,7 @@ def parse(text: str, machine: Machine, duration: float) -> EffectEntry:
         raise MachineError(f"effect {text}: must be NAME[@WHERE]=AMOUNT")
     entry = EffectEntry.model_construct(name=name, where=where or None, amount=value, std=None, shape={})
     found = placed(machine, entry, duration)
-    shapes = {s: Quantity(value=found.values[s], source="assumed") for s in found.effect.shapes}
+    shapes = {s: Quantity(value=found.values[s], source="assumed") for s in found.shapes}
     return EffectEntry(name=name, where=found.where, amount=value, shape=shapes)
 
 

@@ -1,6 +1,6 @@
 """How large things typically are at a site: what amounts and shapes of effects are shares of.
 
-A size is a function of the site; those with a share give such a function.
+Most are functions of the site; `constant` and `of` make one.
 """
 
 from __future__ import annotations

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import casadi as ca
 import numpy as np
@@ -63,9 +65,12 @@ def typical(effect: Effect) -> float:
     return effect.amount(Site(VA12, VA12.find(bodies[0]), DURATION))
 
 
-def extended(effect: Effect, amount: float) -> Model:
+def extended(effect: Effect, amount: float, shapes: Mapping[str, float] = MappingProxyType({})) -> Model:
     entry = EffectEntry(
-        name=effect.name, where=where(effect), amount=Quantity(value=amount, source="assumed"), shape={}
+        name=effect.name,
+        where=where(effect),
+        amount=Quantity(value=amount, source="assumed"),
+        shape={n: Quantity(value=x, source="assumed") for n, x in shapes.items()},
     )
     return build(placing.extended(VA12, entry))
 
@@ -109,7 +114,8 @@ def test_dry_friction_may_turn_more_suddenly(va12: Model, slow: float) -> None:
 
 def test_an_actuator_in_its_play_waits_for_a_push() -> None:
     """Pushed ahead it lies at the front of its play and reads half of it too much; let go, it is still nearer the front
-    after some tenths of a second; pushed back by less than its own friction it creeps, by more it goes to the rear."""
+    after some tenths of a second; pushed back by less than its own friction it creeps, to that share of its play if one
+    waits; pushed back by more it goes to the rear at once."""
     entry = EffectEntry(
         name="articulation_backlash",
         where="articulation",
@@ -125,12 +131,11 @@ def test_an_actuator_in_its_play_waits_for_a_push() -> None:
         t, [0, 0.2, 1.0, 1.2, 1.7, 1.8, 2.3, 2.5, 4.0], [0, 3e3, 3e3, 0, 0, -200, -200, -3e3, -3e3]
     )
     motion = simulate(model, torque)
-    joint, k = motion.q[:, 4], list(model.memory)
-    play = (sensors.signals(model, motion)["theta2"] - joint) / 0.002
-    assert len(k) == 1
+    play = (sensors.signals(model, motion)["theta2"] - motion.q[:, 4]) / 0.002
+    assert model.memory == ("articulation_backlash@articulation.play",)
     assert play[90] == pytest.approx(1.0, abs=0.02)
     assert play[140] > 0.6
-    assert play[170] > play[225] > -0.5
+    assert play[170] > play[225] > -200 / 400
     assert play[270] == pytest.approx(-1.0, abs=0.02)
 
 
@@ -156,7 +161,7 @@ def test_a_pump_is_felt_through_a_hose(va12: Model) -> None:
     felt = [
         (
             va12.balance(still, still, still, p)
-            - m.balance(still, still, still, m.expand @ m.nominal, u, motion.memory[-1])
+            - m.balance(still, still, still, m.expand @ m.nominal, u, motion.memory[-1, : len(m.memory)])
         ).full()
         for m in (model, at_once)
     ]
@@ -221,18 +226,34 @@ def samples(model: Model, count: int = 40, seed: int = 0) -> list[np.ndarray]:
     q, nu, a = (rng.uniform(-1, 1, (n, count)) for _ in range(3))
     nu[3] = nu[0] / 0.65 + rng.uniform(-0.1, 0.1, count)
     nu[5] = nu[0] / 0.65 + rng.uniform(-0.1, 0.1, count)
-    return [q, nu, a, rng.uniform(-3000, 3000, (3, count)), rng.uniform(0, 0.5, (len(model.memory), count))]
+    z = rng.uniform(0, 0.5, (len(model.memory), count))
+    z[[m.endswith(".farthest") for m in model.memory]] += 0.5  # than the nearest end of a lane
+    return [q, nu, a, rng.uniform(-3000, 3000, (3, count)), z]
 
 
 def test_the_contract_is_in_the_catalogue() -> None:
     assert {(name, CATALOGUE[name].unit) for name, _ in CONTRACT} == set(CONTRACT)
 
 
-@pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
-def test_what_an_effect_predicts_is_what_it_does(effect: Effect) -> None:
+def forms(effect: Effect) -> list[dict[str, float]]:
+    """The shapes of every form that an effect has, the plain one first: the first of each that is tried."""
+    bodies, _ = placing.places(VA12, effect)[where(effect)]
+    found: dict[tuple[tuple[str, float], ...], dict[str, float]] = {(): {}}
+    for shapes in effect.beside(Site(VA12, VA12.find(bodies[0]), DURATION)):
+        form = tuple((n, x) for n, x in shapes.items() if n != "A" and effect.shapes[n].only)
+        found.setdefault(form, {n: x for n, x in shapes.items() if n != "A"})
+    return list(found.values())
+
+
+FORMS = {f"{e.name}-{k}": (e, shapes) for e in CATALOGUE.values() for k, shapes in enumerate(forms(e))}
+formed = pytest.mark.parametrize(("effect", "shapes"), FORMS.values(), ids=list(FORMS))
+
+
+@formed
+def test_what_an_effect_predicts_is_what_it_does(effect: Effect, shapes: dict[str, float]) -> None:
     """Forward dynamics put into the prediction give the torques that the sensors read, and the regressor is the exact
     slope of the prediction, by differences."""
-    model = extended(effect, typical(effect))
+    model = extended(effect, typical(effect), shapes)
     q, nu, _, u, z = samples(model)
     X = model.nominal
     a = model.acceleration(q, nu, u, z, X).full()
@@ -248,6 +269,33 @@ def test_what_an_effect_predicts_is_what_it_does(effect: Effect) -> None:
         up, down = (model.predict(q, nu, a, model.expand @ (X + s * step), u, z).full() for s in (1, -1))
         slope = ((up - down) / (2e-5 * model.scale[k])).T
         assert np.abs(W[:, :, k] - slope).max() <= 1e-4 * np.abs(slope).max() + 1e-6 * np.abs(Y).max() / model.scale[k]
+
+
+FORMED = {name: x for name, x in FORMS.items() if any(s.form for s in x[0].shapes.values())}
+
+
+@pytest.mark.parametrize(("effect", "shapes"), FORMED.values(), ids=list(FORMED))
+def test_an_effect_has_the_parameters_and_the_memory_of_its_form(effect: Effect, shapes: dict[str, float]) -> None:
+    """Every shape that is a parameter changes torques, readings or what is remembered; what other forms remember is
+    not there."""
+    entry = extended(effect, typical(effect), shapes).machine.effect[0]
+    model = build(placing.extended(VA12, entry), shapes=True)
+    q, nu, a, u, z = samples(model)
+    wheels = np.ones((2, q.shape[1]))
+
+    def told(X: np.ndarray) -> np.ndarray:
+        force = model.predict(q, nu, a, model.expand @ X, u, z).full()
+        flow = model.flow(q, nu, u, z, X).full()
+        return np.vstack([force, model.read(q, nu, wheels, u, z, X).full(), flow])
+
+    own = model.effects[0].parameters
+    for k, name in enumerate(model.base.names):
+        if name in own:
+            moved = np.abs(
+                told(model.nominal + 0.1 * model.scale[k] * np.eye(len(model.nominal))[k]) - told(model.nominal)
+            )
+            assert moved.max() > 0, name
+    assert bool(model.memory) == any(shapes.get(m.form[0]) == m.form[1] for m in effect.memory.values() if m.form)
 
 
 @pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
@@ -278,10 +326,10 @@ WITHIN = {"vibration_on": {"begin": 1.0, "length": 2.0, "shake": 0.0}, "brake_dr
 FAR = ("payload_shift", "articulation_stop_spring", "relief_valve")
 
 
-@pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
-def test_a_signature_is_what_the_extended_model_has_more(effect: Effect, va12: Model) -> None:
+@formed
+def test_a_signature_is_what_the_extended_model_has_more(effect: Effect, shapes: dict[str, float], va12: Model) -> None:
     """The force of a signature is the difference of the two balances, and so is its reading."""
-    model = extended(effect, typical(effect))
+    model = extended(effect, typical(effect), shapes)
     e = model.effects[0]
     q, nu, a, u, z = samples(model)
     count = q.shape[1]
