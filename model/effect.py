@@ -112,8 +112,8 @@ class Shape:
     """What an effect's amount leaves open: default and grid in units of `size`, which belongs to the site.
 
     `circular`: a phase, found by its sine and cosine; `whole`: not refined; `only`: the values that there are, if these
-    are few; `meaning`: what a name leaves open; `form`: the shape and its value with which alone it has a meaning. What
-    is zero by default may have either sign.
+    are few; `meaning`: what a name leaves open; `form`: the shape and its value with which alone it means anything.
+    What is zero by default may have either sign.
     """
 
     unit: str
