@@ -398,7 +398,7 @@ def _finding(choice: Choice, after: Stage, left: float, alone: bool) -> Finding:
         s: (*values.get(f"{placed.name}.{s}", (placed.values[s], 0.0)), shape.unit)
         for s, shape in placed.shapes.items()
     }
-    if amount < 0 and (circular := [s for s, shape in placed.effect.shapes.items() if shape.circular]):
+    if amount < 0 and (circular := [s for s, shape in placed.shapes.items() if shape.circular]):
         # The same half a turn on.
         amount = -amount
         for s in circular:

@@ -113,9 +113,8 @@ def _amount(e: Effect) -> str:
 def _shape(name: str, shape: Shape) -> tuple[str, str, str, str, str]:
     of = "" if shape.size is one else " of the site's size"
     tried = ", ".join(f"{x:.3g}" for x in shape.grid) + of
-    form = [f"where {shape.form[0]} is {shape.form[1]:g}"] if shape.form else []
-    meaning = "; ".join([shape.meaning, *form] if shape.meaning else form)
-    return name, shape.unit, f"{shape.default:.3g}{of}", tried, meaning
+    form = f"where {shape.form[0]} is {shape.form[1]:g}" if shape.form else ""
+    return name, shape.unit, f"{shape.default:.3g}{of}", tried, "; ".join(filter(None, (shape.meaning, form)))
 
 
 def _sets(beside: Sequence[Mapping[str, float]]) -> str:

@@ -57,7 +57,7 @@ class Scene:
     q, w: angle and rate of a joint [rad, rad/s] by body; u: torque that its sensor feels, flaws aside [N m]; friction:
     Fv w + Fs sgn w [N m]; coulomb: Fs [N m]; smooth: the rate over which sgn turns [rad/s]; full: what counts as a
     large torque [N m]; rolling: of contacts; ahead: V_x of each body's origin in its own axes [m/s]; time [s] since the
-    log began; z: what this effect remembers, by name.
+    log began; z: what this effect remembers, by name; zero what it does in another form only.
     """
 
     q: Mapping[int, ca.SX]
@@ -222,11 +222,14 @@ class Placed:
 
     @property
     def memory(self) -> dict[str, tuple[int, Memory]]:
-        """What it remembers, by name, each with the body that it is remembered of."""
+        """What it remembers in the form that it has here, by name, each with the body that it is remembered of."""
+        return {name: (k, own) for name, (k, own) in self.memories.items() if self._has(own.form)}
+
+    @property
+    def memories(self) -> dict[str, tuple[int, Memory]]:
+        """The same of all forms."""
         found: dict[str, tuple[int, Memory]] = {}
         for name, own in self.effect.memory.items():
-            if not self._has(own.form):
-                continue
             found |= {f"{name}{k}": (k, own) for k in self.bodies} if own.each else {name: (self.bodies[0], own)}
         return found
 

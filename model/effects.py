@@ -16,13 +16,12 @@ from math import pi
 import casadi as ca
 
 from model import contact as law
-from model import lane, sizes
+from model import friction, lane, sizes
 from model.effect import Channel, Effect, Memory, Rolling, Scene, Shape, Site, Soil, Values
 
 SMOOTH_SLIP = 0.005  # slip over which driving turns into braking
 SMOOTH_SPEED = 0.02  # [m/s] over which rolling resistance turns
 SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
-LEAST_HELD = 0.1  # of what bristles hold at rest, that they hold at any speed: what a fit passes by may be less
 EDGE = 0.2  # [s] over which what acts between two instants begins and ends
 
 MOMENTS = 120  # at which a load is looked for that slides
@@ -34,47 +33,17 @@ BEND = Shape("-", 0.0, (0.0,), meaning="0: exponential law; 1: hyperbola; the fo
 TWICE = Shape("rad", 0.0, (0.0,), lambda site: 0.001)
 
 
+def _forms(meaning: str, only: tuple[float, ...] = (0.0, 1.0), grid: tuple[float, ...] = (0.0,)) -> Shape:
+    """A shape that chooses in which of several ways an effect acts."""
+    return Shape("-", 0.0, grid, whole=True, only=only, meaning=meaning)
+
+
 # ------------------------------------------------------------------------------------------------ the hooks
 
 
 def _softplus(x: ca.SX, width: float | ca.SX) -> ca.SX:
     """max(x, 0), rounded over `width`."""
     return (x + ca.sqrt(x**2 + width**2)) / 2
-
-
-def _fading(s: Scene, k: int, p: Values) -> ca.SX:
-    """Stribeck friction's share of what it is at standstill."""
-    return ca.exp(-(((s.w[k] ** 2 + (0.1 * s.smooth[k]) ** 2) / p["decay"] ** 2) ** (p["power"] / 2)))
-
-
-def _stribeck(s: Scene, k: int, p: Values) -> ca.SX:
-    bent = (s.coulomb[k] + p["A"]) * s.z.get("bent", ca.SX(0)) - s.coulomb[k] * s.sign(k)
-    return -(1 - p["bristles"]) * p["A"] * s.sign(k) * _fading(s, k, p) - p["bristles"] * bent
-
-
-def _bending(s: Scene, k: int, p: Values) -> ca.SX:
-    """How fast bristles bend: from 0 towards what they hold of Fs + A, the most; sliding steadily that is the share
-    (Fs + A exp(-(w/decay)^power)) / (Fs + A) of it, with the sign of the speed."""
-    w, most = s.w[k], s.coulomb[k] + p["A"]
-    held = (s.coulomb[k] + p["A"] * _fading(s, k, p)) * most / (most**2 + 1e-6)
-    sliding = ca.sqrt(w**2 + (0.001 * s.smooth[k]) ** 2) / ca.fmax(held, LEAST_HELD)
-    return (w - sliding * s.z["bent"]) / p["presliding"]
-
-
-def _bristly(site: Site) -> list[dict[str, float]]:
-    """Bristles: the power is held between the two of the plain form; free, they would take up much that is none."""
-    smooth = sizes.smooth(site)
-    return [
-        {"decay": x * smooth, "power": 1.5, "bristles": 1.0, "presliding": far * smooth}
-        for x in (4.0, 12.0, 36.0)
-        for far in (0.05, 0.2)
-    ]
-
-
-def _turned(s: Scene, k: int, p: Values) -> ca.SX:
-    x = s.w[k] / s.smooth[k] * ca.exp(p["A"])
-    slowly = ca.atan(x * pi / 2) * 2 / pi
-    return s.coulomb[k] * (s.sign(k) - (1 - p["slow"]) * ca.tanh(x) - p["slow"] * slowly)
 
 
 def _eccentric(s: Scene, angle: ca.SX, k: int, p: Values) -> ca.SX:
@@ -90,7 +59,7 @@ def _deadband(s: Scene, k: int, p: Values) -> ca.SX:
 
 
 def _coupling(s: Scene, k: int, p: Values) -> ca.SX:
-    felt = [(1 - p["hose"]) * s.u[j] + p["hose"] * s.z.get(f"late{j}", ca.SX(0)) for j in s.others(k)]
+    felt = [(1 - p["hose"]) * s.u[j] + p["hose"] * s.z[f"late{j}"] for j in s.others(k)]
     return p["A"] * sum(felt, ca.SX(0))
 
 
@@ -231,13 +200,8 @@ _declare(
         {
             "decay": Shape("rad/s", 15.0, (4.0, 12.0, 36.0), sizes.smooth),
             "power": Shape("-", 2.0, (1.0, 2.0), whole=True),
-            "bristles": Shape(
-                "-",
-                0.0,
-                (0.0,),
-                whole=True,
-                only=(0.0, 1.0),
-                meaning="0: friction turns with the speed; 1: all of it as bristles bend (LuGre without damping)",
+            "bristles": _forms(
+                "0: friction turns with the speed; 1: all of it as bristles bend (LuGre without damping)"
             ),
             "presliding": Shape(
                 "rad",
@@ -248,9 +212,9 @@ _declare(
                 form=("bristles", 1.0),
             ),
         },
-        beside=_bristly,
-        torque=_stribeck,
-        memory={"bent": Memory(_bending, 1.0, form=("bristles", 1.0))},
+        beside=friction.bristly,
+        torque=friction.stribeck,
+        memory={"bent": Memory(friction.bending, 1.0, form=("bristles", 1.0))},
     ),
     Effect(
         "friction_transition",
@@ -267,7 +231,7 @@ _declare(
         },
         grid=(1.0, 3.0, -1.0),
         beside=lambda site: [{"A": 0.05, "slow": 0.5}, {"A": 0.05, "slow": -0.5}],
-        torque=_turned,
+        torque=friction.turned,
     ),
     Effect(
         "load_dependent_friction",
@@ -404,14 +368,7 @@ _declare(
         "two motors on one hydraulic pump",
         sizes.constant(0.05),
         {
-            "hose": Shape(
-                "-",
-                0.0,
-                (0.0,),
-                whole=True,
-                only=(0.0, 1.0),
-                meaning="0: the other's torque acts at once; 1: through a hose, with a first-order lag",
-            ),
+            "hose": _forms("0: the other's torque acts at once; 1: through a hose, with a first-order lag"),
             "lag": Shape("s", 0.1, (0.1,), meaning="time constant of the hose", form=("hose", 1.0)),
         },
         beside=lambda site: [{"hose": 1.0, "lag": x} for x in (0.03, 0.1, 0.3)],
@@ -480,14 +437,11 @@ _declare(
         positive=True,
         inverse=True,
         shapes={
-            "across": Shape(
-                "-",
-                0.0,
-                (0.0, 1.0, 2.0),
-                whole=True,
-                only=(0.0, 1.0, 2.0),
-                meaning="0: every strip of the width saturates by its own slip; 1: all of it as its middle; 2: the"
+            "across": _forms(
+                "0: every strip of the width saturates by its own slip; 1: all of it as its middle; 2: the"
                 " same, but for the moment T_z",
+                (0.0, 1.0, 2.0),
+                grid=(0.0, 1.0, 2.0),
             ),
             "bend": BEND,
         },
@@ -527,14 +481,10 @@ _declare(
         sizes.constant(0.3),
         {
             "pass": Shape("m", 15.0, (5.0, 15.0, 50.0)),
-            "counted": Shape(
-                "-",
-                0.0,
-                (0.0,),
-                whole=True,
-                only=(0.0, 1.0, 2.0),
-                meaning=f"0: n is the way; 1: passes are counted by reversals; 2: place by place along the lane, for"
+            "counted": _forms(
+                f"0: n is the way; 1: passes are counted by reversals; 2: place by place along the lane, for"
                 f" every contact; a pass is worth {lane.PASS:g} m of way",
+                (0.0, 1.0, 2.0),
             ),
         },
         soil=_compacted,
@@ -621,14 +571,7 @@ _declare(
             "takes": Shape("s", 0.2, (0.2,)),
             "arm": Shape("m", 0.0, (0.0,), meaning="the yaw inertia about the joint changes by A times this"),
             "mass": Shape("1/m", 0.0, (0.0,), meaning="the mass changes by A times this"),
-            "recoil": Shape(
-                "-",
-                0.0,
-                (0.0,),
-                whole=True,
-                only=(0.0, 1.0),
-                meaning="1: a load slides and pushes back; 0: it is put on or taken away",
-            ),
+            "recoil": _forms("1: a load slides and pushes back; 0: it is put on or taken away"),
         },
         inertia=_slid,
         recoil="recoil",
@@ -646,14 +589,7 @@ _declare(
         sizes.constant(0.005),
         {
             "turn": Shape("N m", 0.02, (0.01, 0.05), sizes.torque, form=("rubs", 0.0)),
-            "rubs": Shape(
-                "-",
-                0.0,
-                (0.0,),
-                whole=True,
-                only=(0.0, 1.0),
-                meaning="0: the play is crossed at once; 1: against the actuator's own friction, over time",
-            ),
+            "rubs": _forms("0: the play is crossed at once; 1: against the actuator's own friction, over time"),
             "damping": Shape(
                 "N m s",
                 0.0002,
@@ -674,7 +610,7 @@ _declare(
         beside=_rubbing,
         positive=True,
         reading=lambda s, exact, k, p: (
-            p["A"] / 2 * ((1 - p["rubs"]) * ca.tanh(s.u[k] / p["turn"]) + p["rubs"] * s.z.get("play", ca.SX(0)))
+            p["A"] / 2 * ((1 - p["rubs"]) * ca.tanh(s.u[k] / p["turn"]) + p["rubs"] * s.z["play"])
         ),
         memory={"play": Memory(_played, 1.0, form=("rubs", 1.0))},
         angular=True,

@@ -236,10 +236,10 @@ def _scene(s: Sample, time: ca.SX) -> Scene:
     )
 
 
-def _seeing(s: Sample, scene: Scene, e: Placed, z: Mapping[str, ca.SX]) -> Acting:
+def _seeing(s: Sample, scene: Scene, e: Placed, z: dict[str, ca.SX]) -> Acting:
     values = {key: ca.SX(x) for key, x in e.values.items()}
     values |= {key: s.by_name[name] for name, (key, _) in e.parameters.items() if name in s.by_name}
-    return Acting(e, replace(scene, z=z), values)
+    return Acting(e, replace(scene, z=dict.fromkeys(e.memories, ca.SX(0)) | z), values)
 
 
 def _rates(e: Acting) -> list[ca.SX]:

@@ -65,14 +65,19 @@ def typical(effect: Effect) -> float:
     return effect.amount(Site(VA12, VA12.find(bodies[0]), DURATION))
 
 
+def shaped(text: str, shapes: Mapping[str, float], known: machine.Machine = VA12) -> EffectEntry:
+    """`NAME@WHERE=AMOUNT` with these shapes."""
+    told = {name: Quantity(value=value, source="assumed") for name, value in shapes.items()}
+    return placing.parse(text, known, DURATION).model_copy(update={"shape": told})
+
+
+def there(effect: Effect, amount: float, shapes: Mapping[str, float]) -> EffectEntry:
+    """At the first place that it may have."""
+    return shaped(f"{effect.name}@{where(effect)}={amount!r}", shapes)
+
+
 def extended(effect: Effect, amount: float, shapes: Mapping[str, float] = MappingProxyType({})) -> Model:
-    entry = EffectEntry(
-        name=effect.name,
-        where=where(effect),
-        amount=Quantity(value=amount, source="assumed"),
-        shape={n: Quantity(value=x, source="assumed") for n, x in shapes.items()},
-    )
-    return build(placing.extended(VA12, entry))
+    return build(placing.extended(VA12, there(effect, amount, shapes)))
 
 
 CIRCULAR = {e.name: (e, s) for e in CATALOGUE.values() for s, shape in e.shapes.items() if shape.circular}
@@ -83,9 +88,7 @@ def test_a_negative_amount_is_a_positive_one_half_a_turn_on(effect: Effect, circ
     """So that a fit which came to a negative one is given as a positive one."""
     size, told = typical(effect), []
     for amount, phase in ((-size, 0.7), (size, opposite(0.7))):
-        entry = extended(effect, amount).machine.effect[0]
-        shape = {circular: Quantity(value=phase, source="assumed")}
-        model = build(placing.extended(VA12, entry.model_copy(update={"shape": shape})))
+        model = extended(effect, amount, {circular: phase})
         q, nu, _, u, z = samples(model)
         wheels = np.linspace(-3, 3, q.shape[1]) * np.ones((2, 1))
         read = model.read(q, nu, wheels, u, z, model.nominal).full()
@@ -99,9 +102,7 @@ def test_dry_friction_may_turn_more_suddenly(va12: Model, slow: float) -> None:
     """From the formula: at rates from far within to far beyond the one over which it turns."""
     k, ws, Fs = 3, 0.02, 174.74
     w = np.array([-0.1, -0.02, -0.004, 0.001, 0.01, 0.3])
-    entry = placing.parse("friction_transition@front_roll=0.7", VA12, DURATION)
-    entry = entry.model_copy(update={"shape": {"slow": Quantity(value=slow, source="assumed")}})
-    model = build(placing.extended(VA12, entry))
+    model = build(placing.extended(VA12, shaped("friction_transition@front_roll=0.7", {"slow": slow})))
     nu = np.zeros((6, len(w)))
     nu[k] = w
     q, a, u, z = np.zeros((6, len(w))), np.zeros((6, len(w))), np.zeros((3, len(w))), np.zeros((0, len(w)))
@@ -116,15 +117,8 @@ def test_an_actuator_in_its_play_waits_for_a_push() -> None:
     """Pushed ahead it lies at the front of its play and reads half of it too much; let go, it is still nearer the front
     after some tenths of a second; pushed back by less than its own friction it creeps, to that share of its play if one
     waits; pushed back by more it goes to the rear at once."""
-    entry = EffectEntry(
-        name="articulation_backlash",
-        where="articulation",
-        amount=Quantity(value=0.004, source="assumed"),
-        shape={
-            n: Quantity(value=v, source="assumed") for n, v in {"rubs": 1.0, "damping": 3.0, "breakaway": 400.0}.items()
-        },
-    )
-    model = build(placing.extended(VA12, entry))
+    shapes = {"rubs": 1.0, "damping": 3.0, "breakaway": 400.0}
+    model = build(placing.extended(VA12, shaped("articulation_backlash=0.004", shapes)))
     t = np.arange(400) / 100
     torque = np.zeros((400, 3))
     torque[:, 1] = np.interp(
@@ -141,13 +135,8 @@ def test_an_actuator_in_its_play_waits_for_a_push() -> None:
 
 def test_a_pump_is_felt_through_a_hose(va12: Model) -> None:
     """A step of one roll's torque comes to the other by the share A, as a first-order lag has it; at once without."""
-    entry = EffectEntry(
-        name="pump_coupling",
-        where="drive",
-        amount=Quantity(value=0.1, source="assumed"),
-        shape={n: Quantity(value=v, source="assumed") for n, v in {"hose": 1.0, "lag": 0.2}.items()},
-    )
-    model, at_once = (build(placing.extended(VA12, e)) for e in (entry, entry.model_copy(update={"shape": {}})))
+    hose: dict[str, float] = {"hose": 1.0, "lag": 0.2}
+    model, at_once = (build(placing.extended(VA12, shaped("pump_coupling=0.1", x))) for x in (hose, {}))
     t = np.arange(100) / 100
     torque = np.column_stack([1000 * (t >= 0.3), 0 * t, 0 * t])
     motion = simulate(model, torque)
@@ -172,14 +161,8 @@ def test_a_pump_is_felt_through_a_hose(va12: Model) -> None:
 def test_bristles_bend_before_a_joint_slides(va12: Model) -> None:
     """LuGre: from rest friction grows with the angle as a spring does, (Fs + A) / presliding; sliding steadily it is
     Stribeck's, Fs + A exp(-(w / decay)^2) against the motion either way (Canudas de Wit et al. 1995, (1) to (4))."""
-    shape = {"decay": 0.3, "power": 2.0, "bristles": 1.0, "presliding": 0.004}
-    entry = EffectEntry(
-        name="stribeck_friction",
-        where="rear_roll",
-        amount=Quantity(value=250.0, source="assumed"),
-        shape={n: Quantity(value=v, source="assumed") for n, v in shape.items()},
-    )
-    model = build(placing.extended(VA12, entry))
+    shapes = {"decay": 0.3, "power": 2.0, "bristles": 1.0, "presliding": 0.004}
+    model = build(placing.extended(VA12, shaped("stribeck_friction@rear_roll=250", shapes)))
     p, still, u = model.expand @ model.nominal, np.zeros(6), np.zeros(3)
     Fs, Fv = (float(p[model.base.standard.index(n)]) for n in ("Fs4", "Fv4"))
 
@@ -202,13 +185,7 @@ def test_bristles_bend_before_a_joint_slides(va12: Model) -> None:
 @pytest.mark.parametrize(("second", "share"), [(0.0, 0.0), (1.0, 0.5), (2.0, 1.0), (3.0, 0.5), (4.0, 0.0)])
 def test_a_brake_drags_between_its_instants(second: float, share: float, va12: Model) -> None:
     """Dry friction larger by its amount, against the motion either way."""
-    entry = EffectEntry(
-        name="brake_drag",
-        where="rear_roll",
-        amount=Quantity(value=300.0, source="assumed"),
-        shape={n: Quantity(value=v, source="assumed") for n, v in {"begin": 1.0, "end": 3.0}.items()},
-    )
-    model = build(placing.extended(VA12, entry))
+    model = build(placing.extended(VA12, shaped("brake_drag@rear_roll=300", {"begin": 1.0, "end": 3.0})))
     nu = np.zeros((6, 2))
     nu[5] = 1.0, -1.0
     q, a, u = np.zeros((6, 2)), np.zeros((6, 2)), np.zeros((3, 2))
@@ -282,8 +259,7 @@ FORMED = {
 def test_an_effect_has_the_parameters_and_the_memory_of_its_form(effect: Effect, shapes: dict[str, float]) -> None:
     """Every shape that is a parameter changes torques, readings or what is remembered; what other forms remember is
     not there."""
-    entry = extended(effect, typical(effect), shapes).machine.effect[0]
-    model = build(placing.extended(VA12, entry), shapes=True)
+    model = build(placing.extended(VA12, there(effect, typical(effect), shapes)), shapes=True)
     q, nu, a, u, z = samples(model)
     wheels = np.ones((2, q.shape[1]))
 
@@ -310,12 +286,7 @@ def test_an_effect_of_no_size_changes_nothing(effect: Effect, va12: Model) -> No
     plain = sensors.signals(va12, simulate(va12, torque))
 
     def change(amount: float) -> float:
-        model = extended(effect, amount)
-        if effect.name in WITHIN:
-            effect_at = model.machine.effect[0].model_copy(
-                update={"shape": {s: Quantity(value=v, source="assumed") for s, v in WITHIN[effect.name].items()}}
-            )
-            model = build(placing.extended(VA12, effect_at))
+        model = extended(effect, amount, WITHIN.get(effect.name, {}))
         read = sensors.signals(model, simulate(model, torque))
         return max(float(np.abs(read[n] - x).max() / np.abs(x).max()) for n, x in plain.items())
 
@@ -421,9 +392,7 @@ def test_a_load_is_put_on(name: str, body: int) -> None:
     known = machine.load(name)
     plain, mass, x = build(known), 30.0, -1.5
     told = {"instant": 5.0, "takes": 0.5, "arm": x, "mass": 1 / x, "recoil": 0.0}
-    entry = placing.parse(f"payload_shift={mass * x}", known, 10.0)
-    shape = {n: Quantity(value=v, source="assumed") for n, v in told.items()}
-    loaded = build(placing.extended(known, entry.model_copy(update={"shape": shape})))
+    loaded = build(placing.extended(known, shaped(f"payload_shift={mass * x}", told, known)))
     n, rng = len(plain.coordinates), np.random.default_rng(1)
     q, nu, a = rng.uniform(-1, 1, (3, n))
     u, late = np.zeros(len(plain.inputs)), np.full(len(loaded.memory), 1e3)
@@ -438,9 +407,7 @@ def test_a_load_is_put_on(name: str, body: int) -> None:
 @pytest.mark.parametrize("V", [-1.5, -0.02, 0.01, 1.2])
 def test_what_resists_rolling_may_grow_with_speed(va12: Model, V: float) -> None:
     """A (1 + rise V^2) against the motion, fully so from a speed on that the file tells."""
-    entry = placing.parse("rolling_resistance@front_roll=200", VA12, 10.0)
-    told = {"rise": Quantity(value=0.2, source="assumed"), "soft": Quantity(value=0.05, source="assumed")}
-    model = build(placing.extended(VA12, entry.model_copy(update={"shape": told})))
+    model = build(placing.extended(VA12, shaped("rolling_resistance@front_roll=200", {"rise": 0.2, "soft": 0.05})))
     still, nu = np.zeros(6), np.array([V, 0, 0, V / 0.65, 0, V / 0.65])
     u, z = np.zeros(len(model.inputs)), np.zeros(len(model.memory))
     plain = va12.balance(still, nu, still, va12.expand @ va12.nominal).full()[:, 0]
@@ -576,14 +543,7 @@ def test_points_between_the_grids_are_tried_for_every_way_of_counting(straight: 
 @pytest.mark.parametrize(("hardening", "torque"), [(0.0, 1e3), (0.2, 1.2e3)])
 def test_stops_may_be_out_of_the_middle_and_harden(hardening: float, torque: float) -> None:
     """A stop that only one side reaches pushes back there alone, and more so the further it is pressed."""
-    told = {"stop": 0.4, "centre": -0.2, "hardening": hardening}
-    shape = {name: Quantity(value=value, source="assumed") for name, value in told.items()}
-    entry = EffectEntry(
-        name="articulation_stop_spring",
-        where="articulation",
-        amount=Quantity(value=1e4, source="assumed"),
-        shape=shape,
-    )
+    entry = shaped("articulation_stop_spring=10000", {"stop": 0.4, "centre": -0.2, "hardening": hardening})
     plain, sprung = build(VA12), build(placing.extended(VA12, entry))
     still = np.zeros(len(plain.coordinates))
 
