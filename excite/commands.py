@@ -20,6 +20,7 @@ from excite.options import (
     DurationOption,
     JsonOption,
     KitOption,
+    LogsArgument,
     MachineArgument,
     MethodOption,
     ObjectiveOption,
@@ -128,16 +129,16 @@ def design(
     from excite import works
     from excite.brief import Brief
 
+    if between:
+        if len(between) != 2 or objective not in ("cond", "discrimination"):
+            raise UsageError("--between: give it twice, two effects, and no other --objective")
+        objective = "discrimination"
+    if phase_min != 3.0 and not driver:
+        raise UsageError("--phase-min is for --driver, give that too")
+    known, pair = tuple(after or ()), tuple(between or ())
+    brief = Brief(objective, sigma_max, robust, known, starts, seed, budget, pair, driver, phase_min)
     out = out or Path(f"results/design-{asked.stem(machine)}")
     with _result(out, json, terminal.design_table, after or []) as (place, summary):
-        if between:
-            if len(between) != 2 or objective not in ("cond", "discrimination"):
-                raise UsageError("--between: give it twice, two effects, and no other --objective")
-            objective = "discrimination"
-        if phase_min != 3.0 and not driver:
-            raise UsageError("--phase-min is for --driver, give that too")
-        known, pair = tuple(after or ()), tuple(between or ())
-        brief = Brief(objective, sigma_max, robust, known, starts, seed, budget, pair, driver, phase_min)
         summary |= works.design(place, machine, problem, duration, brief)
 
 
@@ -338,7 +339,7 @@ def simulate(
 @app.command(cls=Choosing)
 def identify(
     machine: MachineArgument,
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="one log or several (.csv, .parquet, .mat)")],
+    logs: LogsArgument,
     method: MethodOption = None,
     filtering: Annotated[
         str, typer.Option("--filter", help="machine: the machine file's, or auto: by evidence")
@@ -354,15 +355,15 @@ def identify(
 
     model = asked.model(machine)
     out = out or Path(f"results/identify-{model.machine.name}")
+    _had(logs, filtering)
     with _result(out, json, terminal.identify_table, [*logs, *(validate or [])]) as (place, summary):
-        _had(logs, filtering)
         summary |= works.identified(place, model, logs, method, filtering, validate or [])
 
 
 @app.command()
 def diagnose(
     machine: MachineArgument,
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="one log or several (.csv, .parquet, .mat)")],
+    logs: LogsArgument,
     filtering: Annotated[
         str, typer.Option("--filter", help="of the first guess; machine: the machine file's, or auto: by evidence")
     ] = "machine",
@@ -377,8 +378,8 @@ def diagnose(
 
     model = asked.model(machine)
     out = out or Path(f"results/diagnose-{model.machine.name}")
+    _had(logs, filtering)
     with _result(out, json, terminal.diagnose_table, logs) as (place, summary):
-        _had(logs, filtering)
         with terminal.bar("diagnosing") as advance:
             found, tied = checkup.write(place, machine, model, logs, filtering, advance)
         summary |= found

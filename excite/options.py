@@ -40,6 +40,9 @@ MachineArgument = Annotated[
     typer.Argument(metavar="MACHINE", help="a shipped name or a machine file (.toml)", autocompletion=machine_names),
 ]
 DesignArgument = Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="what `excite design` wrote")]
+LogsArgument = Annotated[
+    list[Path], typer.Argument(metavar="LOG...", help="one log or several (.csv, .txt, .parquet, .mat, .mf4)")
+]
 OutOption = Annotated[Path | None, typer.Option("--out", help="folder to write [results/<command>-<machine>]")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the summary as JSON and nothing else")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="same seed, same result")]
@@ -57,9 +60,7 @@ StartsOption = Annotated[int, typer.Option("--starts", min=1, help="number of st
 SigmaMaxOption = Annotated[
     float | None, typer.Option("--sigma-max", help="what the worst parameter's standard deviation may be [%]")
 ]
-RobustOption = Annotated[
-    bool, typer.Option("--robust", help="for every machine within 20 %, not the nominal one alone")
-]
+RobustOption = Annotated[bool, typer.Option("--robust", help="for machines up to 20 % off, not the nominal one alone")]
 AfterOption = Annotated[
     list[Path] | None, typer.Option("--after", help="log of an earlier drive: design for what it leaves (repeatable)")
 ]

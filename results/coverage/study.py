@@ -233,21 +233,12 @@ the bound is Cramer and Rao's along the first drive. Seconds are of one core's o
 other work kept busy.
 """
 EDGES = """
-## One-way drives: why Fs and u0 were stated three times too wide
+## One-way drives: why Fs and u0 are stated too wide
 
 On S40, which goes one way, only starting and stopping tell dry friction from the torque offset, and only the moments
-of single encoder edges show it. An edge's deviation has a floor, as real encoders' divisions are not exact. It was 0.29
-counts; simulated encoders have perfect edges. Six logs, kit full, from values 20 % off (start from the true values: the
-same), stated deviation and true rms error:
-
-| floor [counts] | Fs1 stated, true | u10 stated, true | Fs4 stated, true | u40 stated, true |
-|---|---|---|---|---|
-| 0.29 | 19.9, 5.7 % | 18.9, 5.1 % | 24.3, 5.2 % | 19.0, 4.0 % |
-| 0.10 | 8.0, 4.3 % | 7.5, 3.9 % | 9.8, 2.7 % | 7.5, 1.7 % |
-| 0.03 | 5.0, 4.6 % | 4.6, 4.4 % | 6.1, 3.9 % | 4.6, 2.8 % |
-
-The floor is now 0.1 counts: what a good encoder's divisions are off. What is left of the difference is the price of not
-believing in perfect ones.
+of single encoder edges show it. An edge's deviation has a floor, 0.1 counts: what a good encoder's divisions are off.
+Simulated encoders have perfect edges, so that there Fs and u0 err less than is stated, by about 1.3 times
+([1999](../1999)). That is the price of not believing in perfect ones.
 """
 
 
