@@ -212,7 +212,7 @@ class Signatures:
             if e.effect.channel is not None:
                 self.torque[:, :, k] = _misread(c, e, u, t)
 
-    def along(self, X: np.ndarray, r: Record, p: Point) -> tuple[np.ndarray, np.ndarray]:
+    def along(self, X: np.ndarray, p: Point) -> tuple[np.ndarray, np.ndarray]:
         """What signatures do to the scaled state behind each sample (N - 1, n, C), and to readings (N, m, C). Nothing
         where one has no bounds: what it would remember along a motion that is far off may come apart."""
         c, N = self.chart, len(p.s)
@@ -296,7 +296,7 @@ def _told(c: Chart, records: Sequence[Record], fit: newton.Fit, found: Sequence[
     Z = np.zeros((1 + n + total, 1 + n + total))
     for k, (r, linear) in enumerate(zip(records, fit.linear, strict=True)):
         made = Signatures(c, r, fit, k, found)
-        push, reading = made.along(fit.X, r, fit.points[k])
+        push, reading = made.along(fit.X, fit.points[k])
         E = whitened(linear, c.flawed, push, reading)
         form = sum((_square(E[at : at + CHUNK]) for at in range(0, len(E), CHUNK)), np.zeros((E.shape[1],) * 2))
         # Offsets of counts belong to one log: integrate them out.

@@ -83,7 +83,7 @@ def summary(a: Account) -> dict[str, Any]:
         "error_before_percent": a.whole.before if a.whole else None,
         "error_after_percent": a.whole.after if a.whole else None,
         "gain_percent": a.whole.percent if a.whole and d.findings else None,
-        "gain_ci95": list(a.whole.interval) if a.whole and d.findings else None,
+        "gain_ci95": list(a.whole.interval) if a.whole and a.whole.interval and d.findings else None,
         "signals": signals(a),
         "separating_run": a.run,
         "share_explained": d.share,
@@ -112,7 +112,7 @@ def _finding(f: Finding, g: Gain | None) -> dict[str, Any]:
         "shapes": {n: {"value": value, "std": std, "unit": unit} for n, (value, std, unit) in f.shapes.items()},
         "chi2_gain": f.gain,
         "gain_percent": g.percent if g else None,
-        "gain_ci95": list(g.interval) if g else None,
+        "gain_ci95": list(g.interval) if g and g.interval else None,
     }
 
 
@@ -194,10 +194,10 @@ def answer(a: Account) -> str:
     if a.whole:
         better = [(1 - now / was, n) for n, (was, now, _) in a.whole.signals.items() if was > 0]
         most = max(better)
-        low, high = a.whole.interval
+        change = _change(a.whole.percent, a.whole.interval)
         gained = (
-            f" On stretches that were not fitted on, the model with it errs {_change(a.whole.percent, low, high)}; most"
-            f" in {most[1]}, by {100 * most[0]:.0f} %."
+            f" On stretches that were not fitted on, the model with it errs {change}; most in {most[1]}, by"
+            f" {100 * most[0]:.0f} %."
         )
     if d.share < NEARLY_ALL:
         gained = f" That is {100 * d.share:.0f} % of what the model lacks, the rest has no name.{gained}"
@@ -206,7 +206,10 @@ def answer(a: Account) -> str:
     return f"{logs} {named}: {'; '.join(amount(r) for r in rows)}.{gained}"
 
 
-def _change(percent: float, low: float, high: float) -> str:
+def _change(percent: float, interval: tuple[float, float] | None) -> str:
+    if interval is None:
+        return f"{abs(percent):.2g} % {'less' if percent >= 0 else 'more'}"
+    low, high = interval
     if percent >= 0:
         return f"{percent:.2g} % less (95 %: {low:.2g} to {high:.2g} %)"
     return f"{-percent:.2g} % more (95 %: {-high:.2g} to {-low:.2g} %)"

@@ -57,22 +57,24 @@ class Withheld:
 
 @dataclass(frozen=True)
 class Gain:
-    """Error before and after [%], the gain in per cent of the error before, and its 95 % interval."""
+    """Error before and after [%], the gain in per cent of the error before, and its 95 % interval, if there is one."""
 
     before: float
     after: float
     percent: float
-    interval: tuple[float, float]
+    interval: tuple[float, float] | None
     signals: Mapping[str, tuple[float, float, str]]
 
 
 def withheld(stage: Stage) -> Withheld | None:
     """How well a fitted model predicts stretches that are hidden from it, or the machine file's where none could be
-    fitted, not even to coarse sensors; None where no fit to the rest is found."""
+    fitted, not even to coarse sensors; None where no fit to the rest is found or logs are too short to hide any."""
     prepared, fit = stage.prepared, stage.fit
     held = prepared.held | fit.unseen if stage.settled or prepared.coarse > 1 else np.ones_like(prepared.held)
     c, rate = prepared.c, float(stage.machine.sampling_hz)
     stretches = [_stretches(len(r.used), rate) for r in prepared.records]
+    if not any(stretches):
+        return None  # too short to hide anything
     masked = []
     for r, own in zip(prepared.records, stretches, strict=True):
         used = r.used.copy()
@@ -116,10 +118,10 @@ def withheld(stage: Stage) -> Withheld | None:
 
 
 def gain(before: Withheld, after: Withheld, seed: int = 0) -> Gain:
-    """What a model gains on the same stretches, with an interval; NaN where there is but one stretch."""
+    """What a model gains on the same stretches, with an interval; none where there is but one stretch."""
     n = len(before.squares)
     old, new = before.percent(), after.percent()
-    interval = (float("nan"), float("nan"))
+    interval = None
     if n > 1:
         drawn = np.random.default_rng(seed).integers(0, n, (DRAWS, n))
         gains = [100 * (1 - after.percent(draw) / before.percent(draw)) for draw in drawn]

@@ -29,7 +29,6 @@ import itertools
 import json
 import math
 import re
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -47,7 +46,7 @@ from excite.objective import OBJECTIVES
 from model import machine as machines
 from model import placing, prediction
 from model.effect import DURATION
-from model.file import Number, Record, one_line
+from model.file import Number, Record, one_line, read_toml
 from model.machine import Machine, MachineError
 
 STEPS = ("design", "simulate", "identify", "diagnose", "verify")
@@ -332,11 +331,9 @@ def read(path: str | Path) -> Plan:
     if path.suffix != ".toml":
         raise StudyError(f"{path}: must be a study file (.toml)")
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as err:
-        raise StudyError(f"{path}: not a TOML file: {err}") from None
-    except OSError as err:
-        raise StudyError(f"{path}: can't be read: {err.strerror}") from None
+        raw = read_toml(path)
+    except ValueError as err:
+        raise StudyError(str(err)) from None
     try:
         study = Study.model_validate(raw)
     except ValidationError as err:
@@ -375,8 +372,8 @@ def _texts(place: str | Path) -> dict[str, str]:
     found: dict[str, str] = {}
     while str(place) not in machines.shipped():
         path = Path(place)
-        found[path.name] = path.read_text(encoding="utf-8")
-        parent = tomllib.loads(found[path.name]).get("extends")
+        found[path.name] = path.read_text(encoding="utf-8-sig")
+        parent = read_toml(path).get("extends")
         if parent is None or parent in machines.shipped():
             break
         place = path.parent / parent

@@ -114,6 +114,12 @@ def respond(
     state[2 * n_q + n_w :] = model.fresh
     driven = np.empty((samples, n_u))
     history = _integrate(step, state, driven, torque, parameters, 1.0 / rate)
+    finite = np.isfinite(history).all(axis=1)  # an error estimate of many states overlooks one that is no number
+    if not finite.all():
+        raise SimulationError(
+            f"the motion is no number any more at t = {int(np.argmin(finite)) / rate:g} s: check the machine file's"
+            " values, those of its effects as well"
+        )
     q, nu, wheels, memory = np.split(history, [n_q, 2 * n_q, 2 * n_q + n_w], axis=1)
     # an L-stable step damps even what must blow up, so a mass matrix that isn't one has to be looked for
     solid = (model.pivots(q.T, parameters).full() > 0).all(axis=0)

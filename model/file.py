@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 import reprlib
+import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -15,6 +16,20 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pydantic_core import ErrorDetails
 
 Source = Literal["paper", "data sheet", "measured", "published", "identified", "assumed", "definition"]
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """What is in a TOML file, with a byte-order mark or without. Raises ValueError, one line."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except UnicodeDecodeError as err:
+        line = err.object.count(b"\n", 0, err.start) + 1
+        raise ValueError(f"{path}: not a TOML file: line {line} is no utf-8; save it as UTF-8") from None
+    except (tomllib.TOMLDecodeError, RecursionError) as err:
+        raise ValueError(f"{path}: not a TOML file: {err}") from None
+    except OSError as err:
+        raise ValueError(f"{path}: can't be read: {err.strerror}") from None
+
 
 _PI = re.compile(r"^\s*([+-]?)\s*(?:(\d+(?:\.\d+)?)\s*\*\s*)?pi\s*(?:/\s*(\d+(?:\.\d+)?))?\s*$")
 

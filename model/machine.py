@@ -8,7 +8,6 @@ Every number carries where it comes from. All values are SI.
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,7 +16,20 @@ import numpy as np
 from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
 from model import hydraulics, units
-from model.file import Flag, Negative, NotNegative, Number, Point, Positive, Quantity, Record, Source, Vector3, one_line
+from model.file import (
+    Flag,
+    Negative,
+    NotNegative,
+    Number,
+    Point,
+    Positive,
+    Quantity,
+    Record,
+    Source,
+    Vector3,
+    one_line,
+    read_toml,
+)
 
 MACHINES = Path(__file__).parent / "machines"
 Index = Annotated[int, Field(strict=True, ge=0, le=99)]
@@ -213,7 +225,8 @@ class Sensor(Record):
 
     kind `angle`: encoder of a joint; `wheel`: measuring wheel of `radius` [m] at `lateral` [m] (+ left) on the axis
     through the body's origin (32); `torque`: delivered torque or force + u0; `yaw_rate`, `lateral_speed`: of the
-    body, in its own frame; `x`, `y`: position of its origin on the ground.
+    body, in its own frame; `x`, `y`: position of its origin on the ground. All but angles and torques sit on the first
+    chassis. Every sensor is in kit `full`.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
@@ -228,7 +241,7 @@ class Sensor(Record):
     kits: tuple[Literal["paper", "full"], ...] = ("paper", "full")
     place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
     counts_per_turn: Positive | None = None
-    noise: NotNegative | None = None
+    noise: Positive | None = None
     lateral: Quantity | None = None
     radius: Positive | None = None
 
@@ -284,6 +297,8 @@ class Sensor(Record):
             raise ValueError(f"{'radius' if self.radius else 'lateral'}: is for kind wheel only")
         if self.factor is not None and self.factor.value == 0:
             raise ValueError("factor: must not be 0")
+        if "full" not in self.kits:
+            raise ValueError(f'kits: "full" has every sensor, add it (got {", ".join(self.kits) or "none"})')
         return self
 
 
@@ -496,6 +511,11 @@ class Machine(Record):
                 raise ValueError(f"sensor[{k}].body: joint {sensor.body} isn't actuated, allowed: {driven}")
             if sensor.kind not in ("angle", "torque") and not self.planar:
                 raise ValueError(f"sensor[{k}].kind: {sensor.kind} needs a planar root, allowed here: angle, torque")
+            if sensor.kind not in ("angle", "torque") and sensor.body != self.body[0].index:
+                raise ValueError(
+                    f"sensor[{k}].body: {sensor.kind} is measured on the first chassis alone, body {self.body[0].index}"
+                    f" (got {sensor.body}); leave the sensor out, or begin the table with that chassis"
+                )
             if sensor.name in names:
                 raise ValueError(f"sensor[{k}].name: {sensor.name} is used twice")
             for column in sensor.columns:
@@ -561,11 +581,9 @@ def _read(path: Path, depth: int = 0) -> dict[str, Any]:
     if depth > 4:
         raise MachineError(f"{path}: extends: more than 4 files deep, a loop?")
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as err:
-        raise MachineError(f"{path}: not a TOML file: {err}") from None
-    except OSError as err:
-        raise MachineError(f"{path}: can't be read: {err.strerror}") from None
+        raw = read_toml(path)
+    except ValueError as err:
+        raise MachineError(str(err)) from None
     parent = raw.pop("extends", None)
     if parent is None:
         return raw

@@ -12,10 +12,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from conftest import Excite
 
-from excite import checkup, choosing, diagnose, findings, log, misfit, newton, profiles, sensors, stages
+from excite import checkup, choosing, diagnose, findings, gain, log, misfit, newton, profiles, sensors, stages
 from excite.separate import Rivals
 from excite.sidebyside import forked, in_turn
 from excite.simulate import Motion, simulate
@@ -42,6 +43,28 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def sloping(straight: Model, straight_motion: Motion, place: Path) -> Path:
     return logged(straight, straight_motion, place / "sloping.csv", 7, "ground_slope=0.01")
+
+
+def test_a_log_too_short_to_hide_stretches_has_no_gain(
+    straight: Model, straight_motion: Motion, tmp_path: Path, excite: Excite
+) -> None:
+    """Stretches are hidden from a fit where there are five seconds or more."""
+    whole = logged(straight, straight_motion, tmp_path / "whole.csv", 7)
+    pd.read_csv(whole).iloc[:461].to_csv(tmp_path / "short.csv", index=False)
+    code, stdout, stderr = excite(
+        "diagnose", "va12_straight", tmp_path / "short.csv", "--out", tmp_path / "d", "--json"
+    )
+    assert (code, stderr) == (0, "")
+    said = json.loads(stdout)
+    assert (said["verdict"], said["error_before_percent"], said["gain_percent"]) == ("clean", None, None)
+
+
+def test_one_stretch_tells_no_interval() -> None:
+    def errs(by: float) -> gain.Withheld:
+        return gain.Withheld((("u1", "N m"),), np.array([[by]]), np.array([[1]]), np.ones(1), np.ones(1))
+
+    made = gain.gain(errs(4.0), errs(1.0))
+    assert (made.percent, made.interval) == (pytest.approx(50.0), None)
 
 
 def test_a_slope_from_log_to_extended_machine(

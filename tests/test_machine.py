@@ -233,7 +233,11 @@ BROKEN: dict[str, tuple[str | bytes, str, str]] = {
     "not TOML": ("name = \n", "", "not a TOML file.*line 1"),
     "a bracket left open": (VA12 + "\n[problems.R61\n", "", "not a TOML file.*line"),
     "a key twice": (top('name = "again"'), "", "not a TOML file.*line"),
-    "Latin-1": (edit("Albaret VA12", "Albaret VA12 à", text=VA12).encode("latin-1"), "", "not a TOML file.*utf-8"),
+    "Latin-1": (
+        edit("Albaret VA12", "Albaret VA12 à", text=VA12).encode("latin-1"),
+        "",
+        "not a TOML file.*line 1 is no utf-8",
+    ),
     "binary": (b"\x93NUMPY\x01\x00\xff", "", "not a TOML file"),
     "empty": ("", "", "missing"),
     # keys
@@ -415,6 +419,17 @@ BROKEN: dict[str, tuple[str | bytes, str, str]] = {
         "theta1_rad is used twice",
     ),
     "a sensor in the time column": (edit('"theta4_rad"', '"t_s"'), "sensor[1].column", "t_s is used twice"),
+    "sensor without noise at all": (edit("value = 0.002", "value = 0"), "sensor[8].noise", "must be > 0"),
+    "gyro on the rear chassis": (
+        edit('kind = "yaw_rate"\nbody = 0', 'kind = "yaw_rate"\nbody = 2'),
+        "sensor[8].body",
+        "yaw_rate is measured on the first chassis alone, body 0 .got 2",
+    ),
+    "sensor of the small kit alone": (
+        edit('kits = ["full"]', 'kits = ["paper"]'),
+        "sensor[8].kits",
+        '"full" has every sensor, add it',
+    ),
     "two sensors with one name": (edit('name = "theta4"', 'name = "theta1"'), "sensor[1].name", "theta1 is used twice"),
     "unknown kind of sensor": (
         edit('kind = "angle"', 'kind = "smell"'),
@@ -483,6 +498,10 @@ def test_a_broken_file_gets_one_clear_line(case: str, tmp_path: Path) -> None:
     assert message.startswith(f"{path}: {key}"), message
     assert re.search(says, message[len(str(path)) :]), message
     assert len(message) - len(str(path)) < 320, message
+
+
+def test_a_byte_order_mark_is_no_harm(tmp_path: Path) -> None:
+    assert load(write(tmp_path, b"\xef\xbb\xbf" + VA12.encode())) == load("va12")
 
 
 def test_files_that_extend_each_other_are_refused(tmp_path: Path) -> None:

@@ -9,8 +9,9 @@ from scipy.integrate import solve_ivp
 
 from excite import sensors
 from excite.simulate import Motion, SimulationError, simulate
-from model import machine, prediction
-from model.file import Quantity
+from model import machine, placing, prediction
+from model.file import Quantity, Source
+from model.machine import MachineError
 from model.prediction import Model
 
 
@@ -115,6 +116,21 @@ def test_divergence_is_said(va12: Model) -> None:
     X[va12.base.names.index("Fv1")] = -1e7
     with pytest.raises(SimulationError, match="diverges at t = "):
         simulate(va12, np.full((6001, 3), 1000.0), X)
+
+
+def test_what_an_effect_remembers_is_a_number_as_well(va12: Model) -> None:
+    """0 / 0 in one state of many, which the largest of their errors overlooks. A file that says so is refused."""
+
+    def rubbing(source: Source) -> Model:
+        entry = placing.parse("articulation_backlash=0.005", va12.machine, 60.0)
+        own = {"rubs": 1.0, "damping": 0.0, "breakaway": 0.0}
+        shape = {name: Quantity(value=x, source=source) for name, x in own.items()}
+        return prediction.build(placing.extended(va12.machine, entry.model_copy(update={"shape": shape})))
+
+    with pytest.raises(SimulationError, match="no number any more at t = "):
+        simulate(rubbing("identified"), np.full((20, 3), 1000.0))
+    with pytest.raises(MachineError, match="articulation_backlash: shape damping must be > 0"):
+        rubbing("assumed")
 
 
 @pytest.mark.parametrize(
