@@ -8,6 +8,7 @@ contacts turn about as fast, and angles that are counted move in whole counts.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
@@ -15,12 +16,14 @@ import numpy as np
 
 from excite.estimate import NoEstimate
 from model import machine as machines
+from model import tree
 from model.machine import Body, Machine, Sensor
 
 SPAN = 0.5  # s: half of what accelerations and torques are taken over, so that counts and noise don't matter
 LEAST = 10  # independent spans that a sign is judged by
 CLEAR = 2.5  # standard deviations
 AGAINST = 0.3  # correlation, or share of the acceleration that the machine file's masses promise, below zero
+OPPOSED = -0.5  # correlation of two speeds that says that one is counted the other way round
 ALIKE = 0.1  # of the largest singular value: torques that differ by less can't be told apart
 FRICTION = 2.0  # times that of the joints: in a bend contacts rub on the ground as well
 SAME = 1e-6  # of the largest singular value: no direction of its own
@@ -50,8 +53,10 @@ def doubts(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[str, ...
     counted = [s for s in machine.sensors("full") if s.name in values and s.resolution is not None]
     counts = {s.name: line for s in counted if (line := _counts(s, machine, values[s.name]))}
     scales = (_scale(torques[b.index], b, machine, values[torques[b.index].name]) for b in moved)
+    dead = _dead(machine, values)
     if lines := [line for line in scales if line]:
-        return (*counts.values(), *lines)  # with a torque that is too small the others seem to move the machine alone
+        # With a torque that is too small the others seem to move the machine alone.
+        return (*dead, *counts.values(), *lines)
     speeds = _speeds(machine, values, rate)
     lines = [
         f"column {s.column}: goes as the speed of {other.column} does, not as its angle: is it a speed? then"
@@ -78,7 +83,75 @@ def doubts(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[str, ...
                 f"{what}: is the sign of one of them turned around? (right if something else moves this joint: a slope,"
                 " a tow, another drive)"
             )
-    return (*counts.values(), *lines)
+    return (*dead, *counts.values(), *lines, *_backward(machine, values))
+
+
+def against(machine: Machine, values: Mapping[str, np.ndarray]) -> list[str]:
+    """A line for every two contacts that turn against each other: the sensor of one of them counts the wrong way."""
+    contacts = _contacts(machine, values)
+    sides = _sides(machine, contacts)
+    found = []
+    for one, other in itertools.pairwise(sorted(contacts, key=lambda s: sides[s.name])):
+        if sides[one.name] == sides[other.name] and _opposed(one, other, values):
+            first, second = (machine.find(s.body).where.replace("_", " ") for s in (one, other))
+            found.append(
+                f"columns {one.column}, {other.column}: {first} and {second} turn against each other; give one a"
+                " negative factor"
+            )
+    return found
+
+
+def _backward(machine: Machine, values: Mapping[str, np.ndarray]) -> list[str]:
+    """A line for every measuring wheel that turns against all contacts beside it."""
+    wheels = [s for s in machine.sensors("full") if s.name in values and s.kind == "wheel"]
+    contacts = _contacts(machine, values)
+    sides = _sides(machine, [*contacts, *wheels])
+    found = []
+    for wheel in wheels:
+        beside = [s for s in contacts if sides[s.name] == sides[wheel.name]]
+        if beside and all(_opposed(wheel, s, values) for s in beside):
+            found.append(
+                f"column {wheel.column}: turns against {', '.join(s.column for s in beside)}: is its sign right?"
+            )
+    return found
+
+
+def _contacts(machine: Machine, values: Mapping[str, np.ndarray]) -> list[Sensor]:
+    """The sensors of contacts' angles."""
+    known = [s for s in machine.sensors("full") if s.name in values and s.kind == "angle"]
+    return [s for s in known if machine.find(s.body).contact is not None]
+
+
+def _sides(machine: Machine, sensors: Sequence[Sensor]) -> dict[str, float]:
+    """Left or right, of sensors on a machine with no joint to steer with, which turns its sides against each other."""
+    if any(b.contact is None for b in machine.actuated):
+        return {s.name: 0.0 for s in sensors}
+    places = tree.poses(machine, {})
+    across = {s.name: float(s.lateral) if s.lateral is not None else places[s.body][1][1] for s in sensors}
+    return {name: float(np.sign(round(y, 6))) for name, y in across.items()}
+
+
+def _opposed(one: Sensor, other: Sensor, values: Mapping[str, np.ndarray]) -> bool:
+    """Whether two contacts or measuring wheels turn against each other."""
+    a, b = (values[s.name][::10] if s.is_rate else np.diff(values[s.name][::10]) for s in (one, other))
+    a, b = a[: len(b)], b[: len(a)]
+    return len(a) > 10 and np.ptp(a) > 0 and np.ptp(b) > 0 and bool(np.corrcoef(a, b)[0, 1] < OPPOSED)
+
+
+def unchanging(sensor: Sensor, values: np.ndarray) -> str:
+    """What is said of a channel that always reads the same, "" of any other."""
+    name = " - ".join(sensor.columns)
+    return f"column {name}: never changes ({values[0]:g}): is the sensor connected?" if np.ptp(values) == 0 else ""
+
+
+def _dead(machine: Machine, values: Mapping[str, np.ndarray]) -> list[str]:
+    """Channels of torques, contacts and measuring wheels that never change while something turns."""
+    there = [s for s in machine.sensors("full") if s.name in values]
+    rolling = [*_contacts(machine, values), *(s for s in there if s.kind == "wheel")]
+    if not any(np.ptp(values[s.name]) > MOVED for s in rolling):
+        return []
+    found = (unchanging(s, values[s.name]) for s in there if s.kind == "torque" or s in rolling)
+    return [line for line in found if line]
 
 
 def _speeds(machine: Machine, values: Mapping[str, np.ndarray], rate: float) -> list[tuple[Sensor, Sensor]]:

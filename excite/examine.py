@@ -21,6 +21,7 @@ SPIKE = 10.0  # robust deviations from the neighbours that make an outlier
 STEPS = 8.0  # counts, likewise
 MANY = 0.005  # share of a channel's samples that may be repaired
 HELD = 8  # equal readings in a row that make a drop-out
+DEAD = 100  # the same for a channel that ends so
 JUMP = 3.0  # times as far, at the end of such a stretch, as the encoder moves in a sample elsewhere
 LATE = 4.0  # standard deviations that make a delay worth a remark
 FLOOR = 4.0  # times the noise floor where a spectrum counts as sunk
@@ -92,7 +93,10 @@ def examine(model: Model, log: Log) -> Examination:
                 f" stands still from row {first + 1} to {last + 1} ({log.t[first]:.2f} s to {log.t[last]:.2f} s)"
             )
             if sensor.resolution is not None or last - first > 100 * HELD:
-                raise LogError(f"{text}; give the stretches before and after as two logs")
+                rest = (
+                    "cut the log there" if last == len(log) - 1 else "give the stretches before and after as two logs"
+                )
+                raise LogError(f"{text}; {rest}")
             notes.append(f"{text}: what is in between counts as measured")
     doubtful = tuple(f"{log.source}: {line}" for line in doubts(model.machine, values))
     return Examination(Log(log.source, log.t, values), tuple(notes), spikes, dropouts, doubtful)
@@ -104,7 +108,11 @@ def find_spikes(sensor: Sensor, x: np.ndarray) -> np.ndarray:
         return np.zeros(0, int)
     bend = np.zeros(len(x))
     bend[1:-1] = x[1:-1] - (x[:-2] + x[2:]) / 2
-    scale = 1.4826 * float(np.median(np.abs(bend[1:-1])))
+    alive = np.ones(len(x), bool)  # a channel that died tells nothing of its noise
+    for a, b in _held(x) if sensor.resolution is None else ():
+        alive[a : b + 1] = False
+    noisy = np.abs(bend[1:-1][alive[1:-1]])
+    scale = 1.4826 * float(np.median(noisy)) if len(noisy) else 0.0
     least = SPIKE * scale + STEPS * (sensor.resolution or 0.0) + 1e-9 * float(np.abs(x).max())
     k = np.flatnonzero(np.abs(bend) > least)
     k = k[(k > 1) & (k < len(x) - 2)]
@@ -121,17 +129,20 @@ def find_spikes(sensor: Sensor, x: np.ndarray) -> np.ndarray:
 
 def find_dropouts(sensor: Sensor, x: np.ndarray) -> tuple[tuple[int, int], ...]:
     """Stretches (first, last row) in which a noisy channel reads the same, or an encoder that turned fast before and
-    after doesn't count, or jumps after it."""
-    same = np.flatnonzero(np.diff(np.concatenate([[1.0], np.diff(x) != 0.0, [1.0]])) != 0)
-    runs: list[tuple[int, int]] = [
-        (int(a), int(b)) for a, b in itertools.pairwise(same) if a + 1 < len(x) and x[a + 1] == x[a]
-    ]
-    long = [(a, b) for a, b in runs if b - a >= HELD]
+    after doesn't count, or jumps after it, or stands from one row to the next until the log ends."""
+    long = _held(x)
     if sensor.resolution is None:
-        moving = np.count_nonzero(np.diff(x)) > 0.9 * (len(x) - 1)  # a channel without noise may well stand still
+        rest = len(x) - 1 - sum(b - a for a, b in long)
+        moving = np.count_nonzero(np.diff(x)) > max(0.9 * rest, HELD)  # a channel without noise may well stand still
         return tuple(long) if moving else ()
     found, fastest = [], float(np.quantile(np.abs(np.diff(x)), 0.999)) if long else 0.0
     for a, b in long:
+        if b == len(x) - 1 and b - a > DEAD and a > 0:
+            # What rolls comes to rest by degrees.
+            speeds = np.diff(x[: a + 1])
+            usual = float(np.quantile(np.abs(np.diff(speeds)), 0.999)) if len(speeds) > DEAD else np.inf
+            if abs(speeds[-1]) > JUMP * (usual + sensor.resolution):
+                found.append((a, b))
         before, after = x[max(a - HELD, 0) : a + 1], x[b : b + HELD + 1]
         if min(len(before), len(after)) <= HELD:
             continue
@@ -141,6 +152,13 @@ def find_dropouts(sensor: Sensor, x: np.ndarray) -> tuple[tuple[int, int], ...]:
         if caught_up or jump > JUMP * (fastest + sensor.resolution):
             found.append((a, b))
     return tuple(found)
+
+
+def _held(x: np.ndarray) -> list[tuple[int, int]]:
+    """Stretches (first, last row) in which a signal (N,) reads the same HELD times and more."""
+    same = np.flatnonzero(np.diff(np.concatenate([[1.0], np.diff(x) != 0.0, [1.0]])) != 0)
+    runs = [(int(a), int(b)) for a, b in itertools.pairwise(same) if a + 1 < len(x) and x[a + 1] == x[a]]
+    return [(a, b) for a, b in runs if b - a >= HELD]
 
 
 def delays(model: Model, log: Log, filter: Filter | None = None) -> tuple[Delay, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import itertools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,11 +12,10 @@ import numpy as np
 import pandas as pd
 
 from excite import log
-from excite.doubts import RATES, as_speed, doubts, is_speed, own_file
+from excite.doubts import RATES, against, as_speed, doubts, is_speed, own_file, unchanging
 from excite.examine import NEEDED, find_dropouts, find_spikes
 from excite.log import LogError
 from model import machine as machines
-from model import tree
 from model.machine import Machine, Sensor
 from model.units import TURN, UNITS
 
@@ -26,7 +24,6 @@ SHOWN = 5  # places named of a fault that is there many times
 STUCK = 50  # equal extreme readings in a row that look like the end of a range
 ALIKE = 0.6  # share of a machine's columns that makes a log look like one of its
 CLOSE = 0.05  # of a unit's size, when a wrong rate of sampling is taken for time in that unit
-AGAINST = -0.5  # correlation of two contacts' speeds that says one is wired the other way round
 
 
 @dataclass(frozen=True)
@@ -120,7 +117,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         jumps = [speed] if speed else jumps
         faults += [line for line in jumps if not line.startswith(after)]  # across a gap an angle may jump
         remarks += _oddities(sensor, values)
-    faults += _wiring(machine, readings)
+    faults += against(machine, readings)
     if readings:
         faults += absent
     else:
@@ -139,6 +136,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         _caught(lambda: log.check(table, machine, (), ""), faults)
     seconds = float(t[-1] - t[0]) if len(t) > 1 else np.nan
     typical = 1 / float(np.median(np.diff(t))) if len(t) > 1 and np.median(np.diff(t)) > 0 else np.nan
+    doubtful = () if faults else doubts(machine, readings)
     return Inspection(
         source,
         machine.name,
@@ -147,8 +145,8 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         typical,
         tuple(columns),
         tuple(dict.fromkeys(faults)),
-        () if faults else doubts(machine, readings),
-        tuple(remarks),
+        doubtful,
+        tuple(line for line in remarks if line not in doubtful),
         signals,
         gaps,
     )
@@ -304,8 +302,8 @@ def _time(table: pd.DataFrame, machine: Machine, faults: list[str]) -> tuple[np.
 def _oddities(sensor: Sensor, values: np.ndarray) -> list[str]:
     """What leaves a log usable: a channel that never changes or is at the end of its range, spikes, drop-outs."""
     name = sensor.column
-    if np.ptp(values) == 0:
-        return [f"column {name}: never changes ({values[0]:g}): is the sensor connected?"]
+    if line := unchanging(sensor, values):
+        return [line]
     lines = []
     for end, word in ((values.max(), "highest"), (values.min(), "lowest")):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], values == end, [0]])))
@@ -318,30 +316,4 @@ def _oddities(sensor: Sensor, values: np.ndarray) -> list[str]:
             lines.append(f"column {name}: {len(spikes)} spikes of a single row, the first in row {spikes[0] + 1}")
         for first, last in find_dropouts(sensor, values)[:SHOWN]:
             lines.append(f"column {name}: held in rows {first + 1} to {last + 1} while the machine moved: a drop-out?")
-    return lines
-
-
-def _wiring(machine: Machine, readings: dict[str, np.ndarray]) -> list[str]:
-    """Contacts that turn against each other: the sensor of one of them counts the wrong way.
-
-    A machine with no joint to steer with turns its sides against each other: there only those of one side are compared.
-    """
-    spins = [s for s in machine.sensors("full") if s.kind == "angle" and machine.find(s.body).contact is not None]
-    spins = [s for s in spins if s.name in readings]
-    places = tree.poses(machine, {})
-    steers = any(b.contact is None for b in machine.actuated)
-    side = {s.name: 0.0 if steers else np.sign(places[s.body][1][1].round(6)) for s in spins}
-    spins = sorted(spins, key=lambda s: side[s.name])
-    lines = []
-    for one, other in itertools.pairwise(spins):
-        if side[one.name] != side[other.name]:
-            continue
-        a, b = (readings[s.name][::10] if s.is_rate else np.diff(readings[s.name][::10]) for s in (one, other))
-        a, b = a[: len(b)], b[: len(a)]
-        if len(a) > 10 and np.ptp(a) > 0 and np.ptp(b) > 0 and np.corrcoef(a, b)[0, 1] < AGAINST:
-            first, second = (machine.find(s.body).where.replace("_", " ") for s in (one, other))
-            lines.append(
-                f"columns {one.column}, {other.column}: {first} and {second} turn against each other;"
-                " give one a negative factor"
-            )
     return lines

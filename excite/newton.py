@@ -278,7 +278,7 @@ def iterate(
         stood = Fit(X, in_si(c, covariance), unseen, known, tuple(points), tuple(linear), cost, disturbed)
     raise NotConverged(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
-        " log with `excite diagnose`, or start from better values in the machine file",
+        " log with `excite log check` and `excite diagnose`, or start from better values in the machine file",
         stood,
         float(step),
     )
@@ -347,7 +347,7 @@ def newton_step(
         cost += float(found.Z[0, 0] + away @ away)
     covariance = np.linalg.inv(information)
     if not (np.diag(covariance) > 0).all():
-        raise NotConverged("joint smoothing lost its numbers: check the log with `excite diagnose`")
+        raise NotConverged("joint smoothing lost its numbers: check the log with `excite log check`")
     sigma = np.sqrt(np.diag(covariance))[:n]
     left = float(np.abs((covariance @ slope)[:n] / sigma).max())
     cost -= float(slope @ covariance @ slope)

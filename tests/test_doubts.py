@@ -214,3 +214,17 @@ def test_diagnose_says_what_is_doubtful(
     monkeypatch.setattr(checkup, "diagnose", fails)
     with pytest.raises(NotConverged, match=r"^no motion; .*log.csv: column u1_Nm: .* is it in kN m"):
         checkup.write(tmp_path, "va12_straight", straight, [tmp_path / "log.csv"], "machine", lambda *a: None)
+
+
+@pytest.mark.parametrize("name", ["thetal", "thetar"])
+def test_a_measuring_wheel_that_counts_backward_is_told(va12: Model, va12_motion: Motion, name: str) -> None:
+    (line,) = turned(va12, checked(va12, va12_motion), name)
+    assert line == f"column {name}_rad: turns against theta1_rad, theta4_rad: is its sign right?"
+
+
+@pytest.mark.parametrize("name", ["u1", "theta1", "thetal"])
+def test_a_dead_channel_is_named_where_no_estimate_is_found(va12: Model, va12_motion: Motion, name: str) -> None:
+    one = checked(va12, va12_motion)
+    dead = Log("dead", one.t, one.values | {name: np.full(len(one), one.values[name][0])})
+    with pytest.raises(NoEstimate, match=rf"{name}_\w+: never changes \(.*is the sensor connected"):
+        identify.identify(va12, [dead], "joint")

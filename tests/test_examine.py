@@ -100,6 +100,26 @@ def test_a_jump_after_standing_still_is_a_dropout(straight: Model, straight_moti
         examine.examine(straight, changed(clean, "theta1", y))
 
 
+@pytest.mark.parametrize(("name", "column"), [("u1", "u1_Nm"), ("theta1", "theta1_rad"), ("thetal", "thetal_rad")])
+def test_a_channel_that_dies_is_told_from_then_on(
+    straight: Model, straight_motion: Motion, clean: Log, name: str, column: str
+) -> None:
+    """While the machine moves on for more than half of the log. One that stands still with the machine is none."""
+    dies = 1000 + int(np.argmax(np.abs(straight_motion.nu[1000:1500, 1])))
+    x = clean.values[name].copy()
+    x[dies:] = x[dies]
+    with pytest.raises(LogError, match=rf"{column}: 1 drop-out.* row {dies + 1} to {len(x)} .*; cut the log there"):
+        examine.examine(straight, changed(clean, name, x))
+    coasts, rests = np.cumsum(0.98 ** np.arange(800)), dict(clean.values)
+    for sensor in straight.machine.sensors("full"):
+        own, step = clean.values[sensor.name], sensor.resolution
+        if step is not None:
+            rests[sensor.name] = np.append(own, own[-1] + step * np.round((own[-1] - own[-11]) / 10 * coasts / step))
+        else:
+            rests[sensor.name] = np.append(own, own[-1] + np.random.default_rng(0).normal(0, 40, 800))
+    assert examine.examine(straight, Log("rests", np.arange(len(x) + 800) / 100, rests)).dropouts == {}
+
+
 def test_late_channels_are_found_to_a_millisecond(straight: Model, clean: Log) -> None:
     """No alarm on a clean log; 30 ms on one channel is 30 ms on that one, and none on the other."""
     assert examine.late_channels(straight, clean) == ()

@@ -92,7 +92,7 @@ def test_what_is_wrong_is_said(
     for words in faults:
         assert any(words in line for line in found.faults), found.faults
     for words in remarks:
-        assert any(words in line for line in found.remarks), found.remarks
+        assert any(words in line for line in (*found.doubts, *found.remarks)), found
     assert found.usable == (not faults)
     assert all(len(t) == len(values) for t, values, _ in found.signals.values())
 
