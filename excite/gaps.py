@@ -59,6 +59,6 @@ def _gaps(table: pd.DataFrame, machine: Machine, source: str) -> list[int]:
         dt = np.diff(log.times(table, machine, source)) * float(machine.sampling_hz)
     except LogError:
         return []
-    if (dt <= 0).any() or abs(float(np.median(dt)) - 1) > 0.02:
+    if (dt <= 0).any() or abs(float(np.median(dt)) - 1) > log.OFF_RATE:
         return []
-    return [int(k) + 1 for k in np.flatnonzero(dt > 1.5)]
+    return [int(k) + 1 for k in np.flatnonzero(dt > log.GAP)]

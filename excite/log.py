@@ -19,6 +19,8 @@ from model.machine import Machine, Sensor
 from model.units import UNITS
 
 SHORTEST = 100  # samples: below this no filter and no estimate makes sense
+OFF_RATE = 0.02  # by which the usual rate of sampling may differ from the machine file's
+GAP = 1.5  # samples from one row to the next that leave something out
 
 
 @dataclass(frozen=True)
@@ -64,9 +66,8 @@ def check(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sour
         names = ", ".join(f"{c} ({what_of(s, machine)})" for s in missing for c in s.columns if c not in table.columns)
         raise LogError(f"{source}: no column {names}, {columns_of(table)}{looks_like(table, machine)}")
     t = times(table, machine, source)
-    least = max(SHORTEST, sum(machine.filter.drop) + 12 * machine.filter.decimation)
-    if len(t) < least:
-        raise LogError(f"{source}: only {len(t)} rows, at least {least} are needed: is the file complete?")
+    if line := too_short(len(t), machine):
+        raise LogError(f"{source}: {line}")
     rate = float(machine.sampling_hz)
     values = {s.name: values_of(s, machine, table, source) for s in known}
     check_time(t, rate, machine.time_column, source)
@@ -138,6 +139,12 @@ def numbers(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
     return values
 
 
+def too_short(rows: int, machine: Machine) -> str:
+    """What is said of a log of so few rows that nothing can be made of it, "" otherwise."""
+    least = max(SHORTEST, sum(machine.filter.drop) + 12 * machine.filter.decimation)
+    return f"only {rows} rows, at least {least} are needed: is the file complete?" if rows < least else ""
+
+
 def check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
     dt = np.diff(t)
     if (dt <= 0).any():
@@ -148,12 +155,12 @@ def check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
             " sort or cut the log"
         )
     typical = float(np.median(dt))
-    if abs(typical * rate - 1) > 0.02:
+    if abs(typical * rate - 1) > OFF_RATE:
         raise LogError(
             f"{source}: column {column}: sampled at {1 / typical:.4g} Hz, the machine file says {rate:g} Hz;"
             " resample the log or correct sampling_hz"
         )
-    jump = np.abs(dt * rate - 1) > 0.5
+    jump = np.abs(dt * rate - 1) > GAP - 1
     if jump.any():
         k = int(np.argmax(jump))
         raise LogError(

@@ -129,9 +129,8 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
     unknown = [c.name for c in columns if not c.what]
     if unknown:
         remarks.append(f"not used: {', '.join(unknown)}")
-    least = max(log.SHORTEST, sum(machine.filter.drop) + 12 * machine.filter.decimation)
-    if len(table) < least:
-        faults.append(f"only {len(table)} rows, at least {least} are needed: is the file complete?")
+    if line := log.too_short(len(table), machine):
+        faults.append(line)
     if not faults:  # what the piecewise look does not see
         _caught(lambda: log.check(table, machine, (), ""), faults)
     seconds = float(t[-1] - t[0]) if len(t) > 1 else np.nan
@@ -286,8 +285,8 @@ def _time(table: pd.DataFrame, machine: Machine, faults: list[str]) -> tuple[np.
         rows = ", ".join(str(k + 2) for k in back[:SHOWN]) + (", ..." if len(back) > SHOWN else "")
         faults.append(f"column {name}: time goes back or stands still {len(back)} times (rows {rows}); sort or cut it")
     typical = float(np.median(dt))
-    wide = np.flatnonzero(dt > 1.5 * typical) if typical > 0 else np.empty(0, int)
-    if typical > 0 and abs(typical * rate - 1) <= 0.02:
+    wide = np.flatnonzero(dt > log.GAP * typical) if typical > 0 else np.empty(0, int)
+    if typical > 0 and abs(typical * rate - 1) <= log.OFF_RATE:
         for k in wide[:SHOWN]:
             faults.append(f"column {name}: a gap of {dt[k]:.4g} s in row {k + 2} (from {t[k]:g} s to {t[k + 1]:g} s)")
         if len(wide) > SHOWN:
