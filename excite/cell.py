@@ -21,7 +21,7 @@ from excite.limit import InfeasibleError
 from excite.log import LogError
 from excite.simulate import Motion, SimulationError, simulate
 from model import machine as machines
-from model.machine import Machine, Problem
+from model.machine import Machine, MachineError, Problem
 from model.prediction import Model, build, built
 
 DONE, FAILED, DEFECT = STATUSES = ("done", "failed", "defect")
@@ -69,9 +69,9 @@ def carry(work: Work) -> tuple[str, list[tuple[int, Row]]]:
 def run(work: Work, seed: int) -> Row:
     """One run: status, reason where it failed, and what its steps found.
 
-    A failure of the method (no estimate, no motion, a log that can't be used) is `failed`; any other error is a
-    defect of the program, which is told as such and doesn't end the study. Raises KeyboardInterrupt for one that came
-    meanwhile, in whatever guise.
+    A failure of the method (no estimate, no motion, a log or a machine that can't be used) is `failed`; any other error
+    is a defect of the program, which is told as such and doesn't end the study. Raises KeyboardInterrupt for one that
+    came meanwhile, in whatever guise.
     """
     return interrupt.whole(_judged, work, seed)
 
@@ -79,7 +79,7 @@ def run(work: Work, seed: int) -> Row:
 def _judged(work: Work, seed: int) -> Row:
     try:
         return {"status": DONE} | _run(work, seed)
-    except (NoEstimate, SimulationError, LogError) as err:
+    except (NoEstimate, SimulationError, LogError, MachineError) as err:
         return {"status": FAILED, "reason": _said(err)}
     except Exception as err:
         return {"status": DEFECT, "reason": f"{type(err).__name__}: {_said(err)}"}
@@ -161,12 +161,14 @@ def designed(order: Order) -> Designed:
 
 
 def _designed(order: Order) -> Designed:
-    model = build(Machine.model_validate_json(order.machine))
     asked = Brief(order.objective, starts=order.starts, seed=order.seed)
     try:
+        model = build(Machine.model_validate_json(order.machine), flaws=False)  # no drive shows what sits in a sensor
         answer = brief.answer(model, order.problem, asked)
-    except (InfeasibleError, SimulationError, NoEstimate) as err:
+    except (InfeasibleError, SimulationError, NoEstimate, MachineError) as err:
         return Designed("", {}, _said(err))
+    except np.linalg.LinAlgError:
+        return Designed("", {}, f"some parameter moves nothing in problem {order.name}, so no drive shows it")
     except Exception as err:
         return Designed("", {}, f"{DEFECT}: {type(err).__name__}: {_said(err)}")
     if not answer.design.complete:

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,10 @@ from excite.folder import FolderError
 from excite.limit import InfeasibleError
 from excite.plan import Plan
 from excite.simulate import Motion, simulate
-from model.machine import Problem
-from model.prediction import Model
+from model import machine as machines
+from model import placing
+from model.machine import MachineError, Problem
+from model.prediction import Model, build
 
 ROOT = Path(__file__).parents[1]
 TINY = """
@@ -253,15 +256,17 @@ def test_what_can_not_be_had_is_said_and_does_not_end_the_study(
             raise NotIdentifiable("nothing\nmoves")
         if seed == int(np.random.SeedSequence(0).generate_state(4)[2]):
             raise TypeError("a slip of ours")
+        if seed == int(np.random.SeedSequence(0).generate_state(4)[3]):
+            raise MachineError("no such machine")
         return plain(work, seed)
 
     monkeypatch.setattr(cell, "_run", moody)
     summary = study.carry(tiny(4), tmp_path / "out", jobs=1)
     table = pd.read_parquet(tmp_path / "out" / "runs.parquet")
-    assert list(table["status"])[:4] == ["done", "failed", "defect", "done"]
-    assert list(table["reason"])[1:3] == ["nothing moves", "TypeError: a slip of ours"]
+    assert list(table["status"])[:4] == ["done", "failed", "defect", "failed"]
+    assert list(table["reason"])[1:4] == ["nothing moves", "TypeError: a slip of ours", "no such machine"]
     assert table.loc[1, "value.M"] != table.loc[1, "value.M"]  # none, not a number that looks like one
-    assert (summary["done"], summary["failed"], summary["defects"]) == (4, 2, 2)
+    assert (summary["done"], summary["failed"], summary["defects"]) == (2, 4, 2)
 
 
 def test_designs_are_made_once_and_can_be_verified(
@@ -296,6 +301,28 @@ def test_designs_are_made_once_and_can_be_verified(
         "verify", tmp_path / "out" / "drives" / "0001", "--runs", 1, "--method", "ols", "--out", tmp_path / "v"
     )
     assert code == 0
+
+
+def test_a_drive_is_designed_for_what_drives_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `excite design` does it: what sits in a sensor is no parameter, where cond(Phi) would be infinite."""
+    roller = machines.load("va12")
+    machine = placing.extended(roller, placing.parse("yaw_rate_bias=0.01", roller, 60.0))
+    asked: list[Model] = []
+
+    def answer(model: Model, *_: Any) -> Any:
+        asked.append(model)
+        raise refused
+
+    monkeypatch.setattr(cell.brief, "answer", answer)
+    order = cell.Order(0, machine.model_dump_json(), "R60", machine.problems["R60"], "cond", 1, 0)
+    refused: Exception = MachineError("sensor vy: give noise")
+    assert cell.designed(order).failure == "sensor vy: give noise"
+    assert asked[0].base.names == build(roller).base.names
+    refused = np.linalg.LinAlgError("Singular matrix")
+    assert cell.designed(order).failure == "some parameter moves nothing in problem R60, so no drive shows it"
+    twice = machine.model_copy(update={"effect": machine.effect * 2})
+    order = replace(order, machine=twice.model_dump_json())
+    assert "given twice at one place: yaw_rate_bias@yaw_rate" in (cell.designed(order).failure or "")
 
 
 # ------------------------------------------------------------------------------------------------ interrupted
