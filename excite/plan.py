@@ -36,7 +36,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WrapValidator, model_validator
+from pydantic_core import PydanticCustomError
 
 from excite import asked, identify, profiles
 from excite.asked import UsageError
@@ -52,6 +53,7 @@ from model.machine import Machine, MachineError
 STEPS = ("design", "simulate", "identify", "diagnose", "verify")
 MOST = 1_000_000  # runs of a study
 MOST_CELLS = 100_000
+MOST_TIMES = 10.0  # a machine's own limit: 50 is meant for per cent
 SPAN = re.compile(r"^(?P<what>[^=]*)=(?P<low>[^=]+)\.\.(?P<high>[^=]+)$")
 
 
@@ -78,7 +80,8 @@ class Range(Record):
     @model_validator(mode="after")
     def _consistent(self) -> Range:
         if not self.low < self.high or (self.log and self.low <= 0):
-            raise ValueError(f"high: must be above low{', which must be > 0 for log' if self.log else ''}")
+            positive = ", which must be > 0 for log" if self.log else ""
+            raise ValueError(f"high: must be above low{positive} (got {self.low:g} to {self.high:g})")
         return self
 
     def draw(self, rng: np.random.Generator) -> float:
@@ -87,19 +90,32 @@ class Range(Record):
         return float(rng.uniform(self.low, self.high))
 
 
+_NUMBER: TypeAdapter[float] = TypeAdapter(Number)
+
+
+def _varied(value: Any, _: object) -> Any:
+    """A table is a range, anything else a number: what is wrong is said of the one that is meant alone."""
+    return Range.model_validate(value) if isinstance(value, dict) else _NUMBER.validate_python(value)
+
+
+Varied = Annotated[Number | Range, WrapValidator(_varied)]
 Text = Annotated[str, Field(min_length=1, max_length=1000)]
 Whole = Annotated[int, Field(strict=True, ge=0, le=2**32 - 1)]
 Starts = Annotated[int, Field(strict=True, ge=1, le=1000)]
 
 
-def _limit(name: str) -> str:
+def _limits(value: Any) -> Any:
+    """Every set of limits has names that machine files know."""
     allowed = [known for known, kind in KINDS.items() if kind.stated]
-    if name not in allowed:
-        raise ValueError(f"no such limit of a machine file, allowed: {', '.join(allowed)}")
-    return name
+    for name in value if isinstance(value, dict) else ():
+        if name not in allowed:
+            said = PydanticCustomError("value_error", f"no such limit of a machine file, allowed: {', '.join(allowed)}")
+            raise ValidationError.from_exception_data("limits", [{"type": said, "loc": (name,), "input": name}])
+    return value
 
 
-Limit = Annotated[str, AfterValidator(_limit)]
+Limits = Annotated[dict[str, Number], BeforeValidator(_limits)]
+VariedLimits = Annotated[dict[str, Varied], BeforeValidator(_limits)]
 
 
 class Axes(Record):
@@ -110,13 +126,13 @@ class Axes(Record):
     """
 
     machine: Annotated[tuple[Text, ...], BeforeValidator(_several), Field(min_length=1)]
-    problem: Annotated[tuple[Text, ...], BeforeValidator(_several)] = ()
+    problem: Annotated[tuple[Text, ...], BeforeValidator(_several), Field(min_length=1)] = ()
     objective: Annotated[tuple[Text, ...], BeforeValidator(_several), Field(min_length=1)] = ("cond",)
     starts: Annotated[tuple[Starts, ...], BeforeValidator(_several), Field(min_length=1)] = (2,)
     design_seed: Annotated[tuple[Whole, ...], BeforeValidator(_several), Field(min_length=1)] = (0,)
-    profile: Annotated[tuple[Text, ...], BeforeValidator(_several)] = ()
+    profile: Annotated[tuple[Text, ...], BeforeValidator(_several), Field(min_length=1)] = ()
     kit: Annotated[tuple[Literal["paper", "full"], ...], BeforeValidator(_several), Field(min_length=1)] = ("full",)
-    method: Annotated[tuple[Text, ...], BeforeValidator(_several)] = ()
+    method: Annotated[tuple[Text, ...], BeforeValidator(_several), Field(min_length=1)] = ()
     effects: Annotated[tuple[tuple[Text, ...], ...], BeforeValidator(_sets), Field(min_length=1)] = ((),)
     seed: Annotated[tuple[Whole, ...], BeforeValidator(_several), Field(min_length=1)] = (0,)
 
@@ -129,11 +145,32 @@ class Axes(Record):
         return self
 
 
+def _typed(value: Any) -> str:
+    """A value about as a study file has it."""
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_typed, value))}]"
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{name} = {_typed(inner)}' for name, inner in value.items())}}}"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
 class Grid(Axes):
     """Every combination of its axes."""
 
-    duration_s: Annotated[tuple[Number, ...], BeforeValidator(_several)] = ()
-    limits: Annotated[tuple[dict[Limit, Number], ...], BeforeValidator(_several), Field(min_length=1)] = ({},)
+    duration_s: Annotated[tuple[Number, ...], BeforeValidator(_several), Field(min_length=1)] = ()
+    limits: Annotated[tuple[Limits, ...], BeforeValidator(_several), Field(min_length=1)] = ({},)
+
+    @model_validator(mode="after")
+    def _no_twins(self) -> Grid:
+        """A value that is given twice would make cells twice, with the same runs in them."""
+        for name in AXES:
+            seen: set[Any] = set()
+            for value in getattr(self, name):
+                key = tuple(sorted(value.items())) if isinstance(value, dict) else value
+                if key in seen:
+                    raise ValueError(f"{name}: a value is given twice, leave one of them out (got {_typed(value)})")
+                seen.add(key)
+        return self
 
     @property
     def choices(self) -> dict[str, tuple[Any, ...]]:
@@ -153,8 +190,8 @@ class Sample(Axes):
 
     count: Annotated[int, Field(strict=True, ge=1, le=MOST)]
     sample_seed: Whole = 0
-    duration_s: Annotated[tuple[Number | Range, ...], BeforeValidator(_several)] = ()
-    limits: Annotated[tuple[dict[Limit, Number | Range], ...], BeforeValidator(_several), Field(min_length=1)] = ({},)
+    duration_s: Annotated[tuple[Varied, ...], BeforeValidator(_several), Field(min_length=1)] = ()
+    limits: Annotated[tuple[VariedLimits, ...], BeforeValidator(_several), Field(min_length=1)] = ({},)
 
     def __len__(self) -> int:
         return self.count
@@ -394,13 +431,20 @@ def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:
             profiles.read(plan.base / d.profile, prediction.build(machine))
         else:
             asked.known("--objective", d.objective, tuple(OBJECTIVES))
+            if d.objective == "discrimination" and len(machine.effect) < 2:
+                raise StudyError(
+                    f"objective: discrimination: needs two effects to tell apart, {machine.name} has"
+                    f" {len(machine.effect) or 'none'}; give its machine file two ([[effect]])"
+                )
             asked.problem(plan.designed(d), d.problem, d.duration_s)
     if fresh(d.machine, cell.effects):
-        for text in cell.effects:
-            placing.parse(text, machine, DURATION)
-        names = [t.partition("=")[0] for t in cell.effects]
-        if len(set(names)) < len(names):
-            raise StudyError(f"effects: {', '.join(cell.effects)}: an effect is given twice")
+        own = [placing.placed(machine, entry).name for entry in machine.effect]
+        labels = [placing.parse(text, machine, DURATION).label for text in cell.effects]
+        for k, label in enumerate(labels):
+            if label in labels[:k]:
+                raise StudyError(f"effects: {', '.join(cell.effects)}: an effect is given twice, {label}")
+            if label in own:
+                raise StudyError(f"effects: {cell.effects[k]}: {machine.name} has {label} already, in its machine file")
     if fresh(d.machine, cell.method, cell.kit) and set(plan.study.steps) & {"identify", "verify"}:
         asked.method(plan.method(cell), prediction.build(machine), cell.kit)
 
@@ -411,8 +455,11 @@ def limited(machine: Machine, factors: dict[str, float]) -> Machine:
         return machine
     raw = json.loads(machine.model_dump_json())
     for name, factor in factors.items():
-        if not 0 < factor <= 1000:
-            raise StudyError(f"limits: {name}: must be a factor on the machine's own limit, > 0 (got {factor:g})")
+        if not 0 < factor <= MOST_TIMES:
+            raise StudyError(
+                f"limits: {name}: must be a factor on the machine's own limit, above 0 and at most {MOST_TIMES:g} (got"
+                f" {factor:g}); 0.5 is half of it"
+            )
         stated = [_multiply(raw, path, factor) for path in KINDS[name].stated]
         if not any(stated):
             raise StudyError(f"limits: {machine.name} has no limit {name}")

@@ -100,6 +100,8 @@ def test_a_sample_draws_evenly_and_again_the_same() -> None:
         '[sample]\ncount = 400\nmachine = ["va12", "va12_straight"]\nduration_s = { low = 20, high = 60 }\n'
         'limits = { rim_speed = { low = 0.1, high = 10, log = true } }\neffects = ["ground_slope=0.001..0.005"]\n'
     )
+    kept = json.loads(spans(text).model_dump_json(warnings="error"))["sample"][0]
+    assert kept["duration_s"] == [{"low": 20, "high": 60, "log": False}]
     cells = list(spans(text).cells())
     assert cells == list(spans(text).cells())
     assert cells != list(spans(text.replace("count = 400", "count = 400\nsample_seed = 1")).cells())
@@ -116,6 +118,14 @@ def test_a_sample_draws_evenly_and_again_the_same() -> None:
 
 
 GRID = '[grid]\nmachine = "va12_straight"\n'
+SAMPLE = '[sample]\nmachine = "va12_straight"\ncount = 1\n'
+SLOPING = """
+extends = "va12_straight"
+name = "sloping"
+[[effect]]
+name = "ground_slope"
+amount = { value = 0.005, source = "assumed" }
+"""
 WRONG = {
     "no file": (None, "can't be read"),
     "not TOML": ("= 3", "not a TOML file"),
@@ -134,12 +144,50 @@ WRONG = {
     "effect unknown": (GRID + 'effects = "magic=1"', "effect magic: unknown, allowed"),
     "effect without amount": (GRID + 'effects = "ground_slope"', "must be NAME[@WHERE]=AMOUNT"),
     "effect twice": (GRID + 'effects = [["ground_slope=0.1", "ground_slope=0.2"]]', "an effect is given twice"),
+    "effect twice, at the one place that it has": (
+        GRID + 'effects = [["ground_slope=0.01", "ground_slope@machine=0.02"]]',
+        "an effect is given twice, ground_slope@machine",
+    ),
+    "effect that the machine has": (
+        '[grid]\nmachine = "sloping.toml"\neffects = "ground_slope=0.01"',
+        "effects: ground_slope=0.01: sloping has ground_slope@machine already, in its machine file",
+    ),
+    "nothing to tell apart": (
+        GRID + 'objective = ["cond", "discrimination"]',
+        "objective: discrimination: needs two effects to tell apart, va12_straight has none",
+    ),
+    "one effect to tell apart": (
+        '[grid]\nmachine = "sloping.toml"\nobjective = "discrimination"',
+        "needs two effects to tell apart, sloping has 1; give its machine file two ([[effect]])",
+    ),
     "duration too short": (GRID + "duration_s = 0.1", "duration_s: must be between 0.8 and 3600 s (got 0.1)"),
     "duration not a number": (GRID + 'duration_s = "long"', "grid[0].duration_s[0]: must be a number"),
-    "limit unknown": (GRID + "limits = { charm = 2 }", "grid[0].limits[0].charm"),
+    "limit unknown": (GRID + "limits = { charm = 2 }", "grid[0].limits[0].charm: no such limit of a machine file, "),
+    "limit in per cent": (GRID + "limits = { rim_speed = 50 }", "above 0 and at most 10 (got 50); 0.5 is half of it"),
     "limit that it hasn't": ('[grid]\nmachine = "emps"\nlimits = { slip = 2 }', "limits: emps has no limit slip"),
     "limit not positive": (GRID + "limits = { torque = 0 }", "limits: torque: must be a factor"),
-    "range upside down": (GRID.replace("grid", "sample") + "count = 1\nduration_s = { low = 9, high = 3 }", "high"),
+    "range upside down": (
+        SAMPLE + "duration_s = { low = 9, high = 3 }",
+        "wrong.toml: sample[0].duration_s[0].high: must be above low (got 9 to 3)\n",
+    ),
+    "range without an end": (SAMPLE + "limits = { slip = { low = 1 } }", "sample[0].limits[0].slip.high: is missing\n"),
+    "neither number nor range": (SAMPLE + 'duration_s = "long"', "sample[0].duration_s[0]: must be a number, or a"),
+    "limit unknown in a sample": (SAMPLE + "limits = { charm = 2 }", "sample[0].limits[0].charm: no such limit"),
+    "no profile": (GRID + "profile = []", "grid[0].profile: must have at least 1 (got 0)"),
+    "no method": (SAMPLE + "method = []", "sample[0].method: must have at least 1 (got 0)"),
+    "no problem": (GRID + "problem = []", "grid[0].problem: must have at least 1 (got 0)"),
+    "no duration": (GRID + "duration_s = []", "grid[0].duration_s: must have at least 1 (got 0)"),
+    "no duration to draw from": (SAMPLE + "duration_s = []", "sample[0].duration_s: must have at least 1 (got 0)"),
+    "method twice": (
+        GRID + 'method = ["ols", "joint", "ols"]',
+        "grid[0].method: a value is given twice, leave one of them out (got ols)",
+    ),
+    "duration twice": (GRID + "duration_s = [30, 30.0]", "duration_s: a value is given twice, leave one of them out"),
+    "limits twice": (
+        GRID + "limits = [{ slip = 2, torque = 0.5 }, { torque = 0.5, slip = 2 }]",
+        "grid[0].limits: a value is given twice, leave one of them out (got {torque = 0.5, slip = 2})",
+    ),
+    "effects twice": (GRID + 'effects = [[], "a=1", ["a=1"]]', "leave one of them out (got [a=1])"),
     "no runs": ("runs = 0\n" + GRID, "runs: must be greater than or equal to 1 (got 0)"),
     "too many": (GRID.replace("grid", "sample") + "count = 1000000", "1000000 cells, at most 100000 are allowed"),
     "far too many": ("runs = 1000000\n" + GRID + "kit = ['full', 'paper']", "2000000 runs in all"),
@@ -157,12 +205,18 @@ def test_a_wrong_study_is_one_clear_line(name: str, tmp_path: Path, excite: Exci
     if text is not None:
         title = "../../away" if name == "name that leads away" else "wrong"
         path.write_text(f'name = "{title}"\n{text}\n')
+    (tmp_path / "sloping.toml").write_text(SLOPING)
     code, stdout, stderr = excite("study", path, "--out", tmp_path / "out")
     assert (code, stdout) == (2, ""), stderr
     assert stderr.count("\n") == 1
     assert str(path) in stderr
     assert words in stderr
-    assert {p.name for p in tmp_path.iterdir()} <= {"wrong.toml"}
+    assert {p.name for p in tmp_path.iterdir()} <= {"wrong.toml", "sloping.toml"}
+
+
+def test_what_a_sample_draws_from_may_weigh_twice() -> None:
+    cells = list(spans(SAMPLE.replace("1\n", "300\n") + 'kit = ["full", "full", "paper"]').cells())
+    assert 160 < sum(c.kit == "full" for c in cells) < 240
 
 
 def test_limits_are_multiplied() -> None:
