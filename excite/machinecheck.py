@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from excite import figures, folder, identify, limit, manoeuvre, page, reports, smoothing, terminal, topview
+from excite.asked import LONGEST
 from excite.meaning import meanings
 from excite.page import Picture, Table
 from excite.simulate import SimulationError, simulate
@@ -31,6 +32,11 @@ PICTURE = "machine.png"
 LINEAR = 0.15  # slip up to which the linear law holds, where a contact gives no limit
 CRAWL = 0.05  # m/s2: a machine that can't be accelerated so much hardly moves
 LOADS = (0.3, 50.0)  # stiffness of a contact over the load on it
+WHEELS = (0.02, 2.0)  # radius of a measuring wheel [m]
+ASIDE = 10.0  # m: a measuring wheel runs nearer than that
+ROLLS, WIDEST = 5.0, 20.0  # radius and width of a contact [m]
+STEERING = 3.5  # rad/s: a joint that turns a chassis by 200 degrees in a second is none
+FASTEST = 10e3  # Hz: beyond it no random drive is tried, which would take minutes
 TRIED, HARDLY = (0, 1), 50.0  # random drives; what is uncertain by so much [%] after the best of them
 TRIAL = Problem(
     source="definition",
@@ -46,7 +52,7 @@ class Checked:
     """A machine file: what is wrong, what is doubtful, what else must be known, a line each; its model if it has one.
 
     sigma_percent: after the best of some random drives, one standard deviation by parameter (Cramer-Rao, all sensors);
-    empty where none could be driven.
+    empty where none could be driven, or none was tried.
     """
 
     faults: tuple[str, ...]
@@ -67,7 +73,7 @@ def check(path: Path) -> Checked:
         return Checked((str(err),), (), (), None, {})
     faults = [line for rule in FAULTS for line in rule(model)]
     doubts = [line for rule in DOUBTS for line in rule(model)]
-    sigma = {} if faults else _trial(model)
+    sigma = {} if faults or float(model.machine.sampling_hz) > FASTEST else _trial(model)
     doubts += [
         f"{name}: random drives leave it uncertain by {value:.0f} %: hardly any drive shows it apart from the others"
         for name, value in sigma.items()
@@ -242,6 +248,73 @@ def _bodies(model: Model) -> Iterator[str]:
             )
 
 
+def _sizes(model: Model) -> Iterator[str]:
+    """Lengths as no machine has them."""
+    for s in model.machine.sensors("full"):
+        if s.radius is not None and not WHEELS[0] <= float(s.radius) <= WHEELS[1]:
+            low, high = WHEELS
+            yield f"sensor {s.name}: radius: {float(s.radius):g} m, usual are {low:g} to {high:g}: in mm?"
+        if s.lateral is not None and abs(float(s.lateral)) > ASIDE:
+            yield f"sensor {s.name}: lateral: {float(s.lateral):g} m, usual are {ASIDE:g} at most: in mm?"
+    for b in model.machine.contacts:
+        assert b.contact is not None
+        for key, most in (("radius", ROLLS), ("width", WIDEST)):
+            size = float(getattr(b.contact, key))
+            if size > most:
+                yield f"{b.name}: contact.{key}: {size:g} m, usual are {most:g} at most: in mm?"
+
+
+def _slips(model: Model) -> Iterator[str]:
+    for b in model.machine.contacts:
+        if b.contact is not None and b.contact.slip_limit is not None and float(b.contact.slip_limit) > 1:
+            yield (
+                f"{b.name}: contact.slip_limit: {float(b.contact.slip_limit):g}, the linear law holds to about"
+                f" {LINEAR:g}: in per cent?"
+            )
+
+
+def _times(model: Model) -> Iterator[str]:
+    """Rates and durations as no machine has them, and a filter whose decimation takes more than its cut-off."""
+    for b in topview.steered(model.machine):
+        if b.limit.rate is not None and float(b.limit.rate) > STEERING:
+            yield (
+                f"{b.name}: limit.rate: {float(b.limit.rate):g} rad/s, steered joints turn by less than"
+                f" {STEERING:g}: in deg/s?"
+            )
+    for name, problem in model.machine.problems.items():
+        if float(problem.duration_s) > LONGEST:
+            yield (
+                f"problems.{name}.duration_s: {float(problem.duration_s):g} s, usual are {LONGEST:g} at most: in ms?"
+            )
+    f, rate = model.machine.filter, float(model.machine.sampling_hz)
+    if rate > FASTEST:
+        yield (
+            f"sampling_hz: {rate:g} Hz, usual are {FASTEST:g} at most: samples in a second? (no random drive is"
+            " tried at such a rate)"
+        )
+    left = rate / f.decimation / 2
+    if left < float(f.cutoff_hz) and f.source != "published":  # who published one has tried it: EMPS cuts lower so
+        yield (
+            f"filter.decimation: one row in {f.decimation} at {rate:g} Hz shows motion up to {left:g} Hz, below"
+            f" filter.cutoff_hz {float(f.cutoff_hz):g}: at most {int(rate / 2 / float(f.cutoff_hz))} keeps all of it"
+        )
+
+
+def _turning(model: Model) -> Iterator[str]:
+    """Chassis that turn about the vertical as if their mass were in one point."""
+    poses = tree.poses(model.machine, {})
+    for b in model.machine.body:
+        i = b.inertia
+        if i is None or i.axisymmetric or b.joint not in ("planar", "revolute") or float(i.ZZ):
+            continue
+        upright = abs(poses[b.index][0][2, 2]) > 0.9
+        if upright and b.coordinates[-1] in model.coordinates:
+            yield (
+                f"{b.name}: inertia.ZZ: 0 kg m2 with {float(i.mass):g} kg, a body that turns has one: about mass times"
+                " (length squared + width squared) / 12"
+            )
+
+
 def _noise(model: Model) -> Iterator[str]:
     for s in model.machine.sensors("full"):
         if not s.graded:
@@ -264,7 +337,9 @@ def _scales(model: Model) -> Iterator[str]:
             )
 
 
-DOUBTS: tuple[Callable[[Model], Iterator[str]], ...] = (_traction, _speed, _bounds, _bodies, _noise, _scales)
+DOUBTS: tuple[Callable[[Model], Iterator[str]], ...] = (
+    *(_traction, _speed, _bounds, _bodies, _sizes, _slips, _times, _turning, _noise, _scales),
+)
 
 
 # ------------------------------------------------------------------------------------------------ unseen

@@ -105,6 +105,42 @@ DOUBTFUL = {
     "more than a disc": ([("body.1.inertia.ZZ.value", 900)], "more than a flat disc"),
     "a scale in vain": ([("scale.MX0", assumed(5))], "scale.MX0: does nothing, the base parameter is called MX0R"),
     "nearly zero": ([("body.0.inertia.com.value", [0.2, 0.001, 0.0]), ("scale.MY0", None)], "MY0: 2 kg m"),
+    "a measuring wheel in millimetres": (
+        [("sensor.3.radius.value", 330)],
+        "sensor wheel_left: radius: 330 m, usual are 0.02 to 2: in mm",
+    ),
+    "a measuring wheel like a pea": ([("sensor.3.radius.value", 0.01)], "sensor wheel_left: radius: 0.01 m, usual"),
+    "a measuring wheel far away": (
+        [("sensor.4.lateral.value", -1100)],
+        "sensor wheel_right: lateral: -1100 m, usual are 10 at most: in mm?",
+    ),
+    "a roll in millimetres": (
+        [("body.1.contact.radius.value", 550), ("body.1.limit.rim_speed.value", 2000)],
+        "front_axle: contact.radius: 550 m, usual are 5 at most: in mm?",
+    ),
+    "a width in millimetres": ([("body.3.contact.width.value", 2400)], "rear_axle: contact.width: 2400 m, usual"),
+    "slip in per cent": (
+        [("body.1.contact.slip_limit.value", 15)],
+        "front_axle: contact.slip_limit: 15, the linear law holds to about 0.15: in per cent?",
+    ),
+    "a rate in degrees": (
+        [("body.2.limit.rate.value", 20)],
+        "rear_frame: limit.rate: 20 rad/s, steered joints turn by less than 3.5: in deg/s?",
+    ),
+    "a drive in milliseconds": (
+        [("problems.T30.duration_s.value", 30000)],
+        "problems.T30.duration_s: 30000 s, usual are 3600 at most: in ms?",
+    ),
+    "samples in kilohertz": ([("sampling_hz.value", 1e5)], "sampling_hz: 100000 Hz, usual are 10000 at most"),
+    "a decimation that undoes the filter": (
+        [("filter.decimation", 50)],
+        "filter.decimation: one row in 50 at 100 Hz shows motion up to 1 Hz, below filter.cutoff_hz 3: at most 16",
+    ),
+    "a root that turns without inertia": ([("body.0.inertia.ZZ", None)], "front_frame: inertia.ZZ: 0 kg m2 with 2000"),
+    "a frame that turns without inertia": (
+        [("body.2.inertia.ZZ", None), ("scale.ZZ2", assumed(2000))],
+        "rear_frame: inertia.ZZ: 0 kg m2 with 2600 kg, a body that turns has one",
+    ),
     "no noise": ([("sensor.5.noise", None)], "sensor u_front: neither noise nor counts_per_turn"),
 }
 
@@ -139,6 +175,23 @@ def test_everything_wrong_is_said_at_once(tmp_path: Path) -> None:
 def test_nothing_is_wrong_with_what_ships(name: str) -> None:
     model = build(load(name))
     assert [line for rule in machinecheck.FAULTS for line in rule(model)] == []
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_nothing_is_doubtful_in_what_ships(name: str) -> None:
+    """But for the rig, whose published description has neither noise nor every limit."""
+    model = build(load(name))
+    lines = [line for rule in machinecheck.DOUBTS for line in rule(model)]
+    assert len(lines) == 3 * (name == "emps"), lines
+    assert all("not given" in line or "neither noise nor counts" in line for line in lines)
+
+
+def test_no_drive_is_tried_at_a_rate_that_no_logger_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slip of the keyboard must not take minutes."""
+    monkeypatch.setattr(machinecheck, "_trial", lambda model: pytest.fail("drives are tried"))
+    found = machinecheck.check(spoilt(tmp_path, ("sampling_hz.value", 1e6)))
+    assert found.faults == ()
+    assert [line for line in found.doubts if "no random drive is tried at such a rate" in line]
 
 
 def test_a_pendulum_on_the_plane_is_said_to_be_unseen() -> None:
