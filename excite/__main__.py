@@ -24,7 +24,10 @@ def main() -> None:
     signal.signal(signal.SIGTERM, _terminate)
     with interrupt.heard() as said:
         try:
-            result = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+            try:
+                result = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+            finally:
+                interrupt.deaf()
         except typer.TyperException as err:
             fail(" ".join(err.format_message().split()), 2)
         except (KeyboardInterrupt, typer.Abort):

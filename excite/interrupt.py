@@ -46,7 +46,14 @@ def heard() -> Iterator[Heard]:
         yield said
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if signal.getsignal(number) is note:  # not deaf by now
+                signal.signal(number, handler)
+
+
+def deaf() -> None:
+    """From here on Ctrl-C is ignored: the program is at its end, and waits for its processes alone."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def whole(call: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -202,3 +203,30 @@ def test_killed_run_leaves_nothing_that_looks_finished(profile: Path, tmp_path: 
         run.kill()
         run.wait()
         assert not out.exists()
+
+
+ENDING = """
+import signal, sys, threading
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from excite import __main__ as program
+
+def app(**_):
+    threading.Thread(target=sys.stdin.read).start()  # as the processes of a design, which are waited for
+    raise KeyboardInterrupt
+
+program.app = app
+program.main()
+"""
+
+
+def test_a_second_ctrl_c_does_not_disturb_the_end_of_the_first() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", ENDING], stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as run:
+        assert run.stderr is not None
+        said = run.stderr.readline()
+        for _ in range(3):
+            time.sleep(0.1)
+            run.send_signal(signal.SIGINT)
+        _, more = run.communicate("", timeout=60)
+    assert (said, more, run.returncode) == ("excite: interrupted, nothing was written\n", "", 130)
