@@ -594,7 +594,15 @@ def _read(path: Path, depth: int = 0) -> dict[str, Any]:
         raise MachineError(
             f"{path}: extends: no machine {parent}, allowed: {', '.join(shipped())}, or a file beside it"
         )
-    return _merge(_read(base, depth + 1), raw)
+    whole = _read(base, depth + 1)
+    own, known = (x if isinstance(x, list) else [] for x in (raw.get("sensor"), whole.get("sensor")))
+    names = [x.get("name") for x in known if isinstance(x, dict)]
+    if any(isinstance(x, dict) and x.get("name") in names and "kind" not in x for x in own):
+        raise MachineError(
+            f"{path}: sensor: the list takes the place of that of {parent}, so that every sensor needs all its keys;"
+            " `excite machine new NAME --like` writes them"
+        )
+    return _merge(whole, raw)
 
 
 def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:

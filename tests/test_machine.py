@@ -470,6 +470,11 @@ BROKEN: dict[str, tuple[str | bytes, str, str]] = {
     "unknown extends": ('extends = "va13"\nname = "x"\n', "extends", "no machine va13, allowed: .*emps, .*va12"),
     "extends a number": ('extends = 12\nname = "x"\n', "extends", "shipped name or a file name"),
     "extends itself": ('extends = "mine.toml"\nname = "x"\n', "extends", "loop"),
+    "extends, with a sensor's column alone": (
+        'extends = "va12"\nname = "x"\n[[sensor]]\nname = "u1"\ncolumn = "Moment"\n',
+        "sensor",
+        "takes the place of that of va12.*machine new NAME --like",
+    ),
     "extends, then breaks": (
         'extends = "va12"\nname = "x"\nsampling_hz = { value = -1, source = "assumed" }\n',
         "sampling_hz",
