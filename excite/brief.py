@@ -82,6 +82,16 @@ def beside(model: Model, rivals: Sequence[EffectEntry]) -> Model:
     return both
 
 
+def graded(model: Model) -> None:
+    """Refuses sensors of unknown noise, whose accuracy can't be stated. Raises MachineError."""
+    for s in model.machine.sensors("full"):
+        if s.kind not in ("x", "y") and not s.graded:
+            raise MachineError(
+                f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file, a design"
+                " states the accuracy that it makes attainable"
+            )
+
+
 def answer(
     model: Model, problem: Problem, brief: Brief, progress: Callable[[int, int, float], None] | None = None
 ) -> Answer:
@@ -92,12 +102,7 @@ def answer(
     """
     if brief.driver:
         phased.check(model, problem, brief.phase_min_s)
-    for s in model.machine.sensors("full"):
-        if s.kind not in ("x", "y") and not s.graded:
-            raise MachineError(
-                f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file, a design"
-                " states the accuracy that it makes attainable"
-            )
+    graded(model)
     prior = None
     if brief.after:
         needs = identify.needed_sensors(model, "joint")

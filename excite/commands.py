@@ -75,6 +75,11 @@ def _result(
     terminal.finish(summary, out, json, show)
 
 
+def _file(machine: str) -> list[Path]:
+    """The machine's file, which no result may take the place of; none of a shipped one."""
+    return [Path(machine)] if Path(machine).is_file() else []
+
+
 @app.command()
 def machines(json: JsonOption = False) -> None:
     """Lists the machines that come with excite."""
@@ -138,7 +143,7 @@ def design(
     known, pair = tuple(after or ()), tuple(between or ())
     brief = Brief(objective, sigma_max, robust, known, starts, seed, budget, pair, driver, phase_min)
     out = out or Path(f"results/design-{asked.stem(machine)}")
-    with _result(out, json, terminal.design_table, after or []) as (place, summary):
+    with _result(out, json, terminal.design_table, [*_file(machine), *(after or [])]) as (place, summary):
         summary |= works.design(place, machine, problem, duration, brief)
 
 
@@ -183,7 +188,7 @@ def compare(
     from excite import works
 
     out = out or Path(f"results/compare-{asked.stem(machine)}")
-    with _result(out, json, terminal.compare_table) as (place, summary):
+    with _result(out, json, terminal.compare_table, _file(machine)) as (place, summary):
         summary |= works.compare(place, machine, problem, samples, tuple(against or ()), seed, budget)
 
 
@@ -205,15 +210,17 @@ def run(
     json: JsonOption = False,
 ) -> None:
     """Designs a test drive and verifies it, in one go."""
-    from excite import folder, works
+    from excite import folder, sensors, works
     from excite.brief import Brief
 
     def show(both: dict[str, Any]) -> None:
         terminal.design_table(both["design"])
         terminal.verify_table(both["verify"])
 
+    asked.known("--kit", kit, sensors.KITS)
+    asked.method(method, asked.model(machine), kit)
     out = out or Path(f"results/run-{asked.stem(machine)}")
-    with _result(out, json, show) as (place, summary):
+    with _result(out, json, show, _file(machine)) as (place, summary):
         designed = place / "design"
         designed.mkdir()
         brief = Brief(objective, sigma_max, robust, (), starts, seed, budget)
@@ -309,6 +316,8 @@ def simulate(
     writers = {".csv": lambda t, p: t.to_csv(p, index=False), ".parquet": lambda t, p: t.to_parquet(p, index=False)}
     asked.known("--out: ending", out.suffix.lower(), tuple(writers))
     model = asked.model(machine)
+    if out.resolve() in [path.resolve() for path in (profile, *_file(machine))]:
+        raise UsageError(f"--out {out}: is what the log is made from, choose another file")
     torque, q0, nu0 = profiles.read(profile, model)
     if effect:
         seconds = (len(torque) - 1) / float(model.machine.sampling_hz)
@@ -356,7 +365,7 @@ def identify(
     model = asked.model(machine)
     out = out or Path(f"results/identify-{model.machine.name}")
     _had(logs, filtering)
-    with _result(out, json, terminal.identify_table, [*logs, *(validate or [])]) as (place, summary):
+    with _result(out, json, terminal.identify_table, [*_file(machine), *logs, *(validate or [])]) as (place, summary):
         summary |= works.identified(place, model, logs, method, filtering, validate or [])
 
 
@@ -379,7 +388,7 @@ def diagnose(
     model = asked.model(machine)
     out = out or Path(f"results/diagnose-{model.machine.name}")
     _had(logs, filtering)
-    with _result(out, json, terminal.diagnose_table, logs) as (place, summary):
+    with _result(out, json, terminal.diagnose_table, [*_file(machine), *logs]) as (place, summary):
         with terminal.bar("diagnosing") as advance:
             found, tied = checkup.write(place, machine, model, logs, filtering, advance)
         summary |= found

@@ -9,10 +9,14 @@ import numpy as np
 from excite.estimate import Estimate
 from excite.log import Log
 from excite.processing import lowpass, samples
-from excite.sensors import signals
+from excite.sensors import signals, torque_behind
 from excite.simulate import simulate
 from model.machine import Filter
 from model.prediction import Model
+
+FAR = 4.0  # times as large or as small as in the machine file
+SURELY = 3.0  # deviations from it
+SHOWN = 4  # parameters that are named
 
 
 @dataclass(frozen=True)
@@ -61,8 +65,28 @@ def _torque_unit(model: Model, row: int) -> str:
     return "N m" if model.coordinates[row].startswith("theta") else "N"
 
 
+def far(model: Model, estimate: Estimate) -> tuple[str, ...]:
+    """What is said of parameters that have another sign than the machine file's or another size by FAR, offsets aside:
+    of most of them a machine file is not so wrong."""
+    file = model.nominal
+    free = np.abs(model.offsets).sum(axis=0) > 0
+    told = np.isfinite(estimate.value) & ~free & (file != 0)
+    sure = np.abs(estimate.value - file) > SURELY * estimate.std
+    ratio = np.divide(estimate.value, file, out=np.ones_like(file), where=told)
+    found = [k for k in np.flatnonzero(told & sure) if not 1 / FAR < ratio[k] < FAR]
+    if not found:
+        return ()
+    order = sorted(found, key=lambda k: -abs(np.log(max(ratio[k], 1e-12))))[:SHOWN]
+    listed = ", ".join(f"{estimate.names[k]} {estimate.value[k]:.4g} ({file[k]:.4g})" for k in order)
+    more = f" and {len(found) - len(order)} more" if len(found) > len(order) else ""
+    return (
+        f"{estimate.method}: far from the machine file's values (in brackets): {listed}{more}; check columns, units and"
+        " signs, and compare another --method",
+    )
+
+
 def motions(model: Model, log: Log, estimate: Estimate, filter: Filter | None = None) -> Comparison:
-    """Direct simulation: the log's torques less the offsets drive the machine, from the log's first state, open loop.
+    """Direct simulation: the torques behind a log's readings drive the machine, from the log's first state, open loop.
 
     Every signal but the torques; angles count from their first reading. Errors of torques and parameters add up along
     the log, as they do in the machine's use. Raises ValueError where a parameter is unknown, SimulationError where the
@@ -74,7 +98,9 @@ def motions(model: Model, log: Log, estimate: Estimate, filter: Filter | None = 
         raise ValueError(f"a simulation needs every parameter, unknown: {', '.join(unknown)}")
     s = samples(model, log, filter)
     X = estimate.value
-    torque = s.Y[list(model.actuated)].T - model.offsets @ X
+    channels = (x.full() for x in model.channels(log.t[None], X))
+    read = zip(s.Y[list(model.actuated)], *channels, strict=True)
+    torque = np.column_stack([torque_behind(log.t, *one) for one in read])
     motion = simulate(model, torque, X, s.q[:, 0], s.nu[:, 0])
     exact = signals(model, motion, X)
     chosen = [x for x in model.machine.sensors("full") if x.name in log.values and x.kind not in ("torque", "x", "y")]

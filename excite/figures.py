@@ -127,8 +127,15 @@ def _path(ax: Axes, model: Model, problem: Problem, motion: Motion) -> None:
     for k, i in enumerate(problem.lane_points):
         body = model.machine.find(i)
         x, y, _ = places[:, :, model.machine.body.index(body)]
-        ax.plot(x, y, color=COLOURS[k], linestyle=STYLES[k], linewidth=1.2, label=body.name.replace("_", " "))
-        ax.plot(x[0], y[0], "o", color=COLOURS[k], markersize=5)
+        ax.plot(
+            x,
+            y,
+            color=COLOURS[k % len(COLOURS)],
+            linestyle=STYLES[k % len(STYLES)],
+            linewidth=1.2,
+            label=body.name.replace("_", " "),
+        )
+        ax.plot(x[0], y[0], "o", color=COLOURS[k % len(COLOURS)], markersize=5)
     length, width = problem.lane_m
     ax.plot(
         *np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]).T * [[length / 2], [width / 2]], "k:", linewidth=0.8
@@ -168,8 +175,10 @@ def limit_use(model: Model, problem: Problem, motion: Motion) -> dict[str, float
     use: dict[str, float] = {}
     for bound in limit.limits(model, problem):
         values = bound.expression(motion.q.T, motion.nu.T, motion.u.T, du.T).full()
-        low = values.min() / bound.low if bound.low < 0 else 0.0
-        use[bound.name] = float(max(values.max() / bound.high, low))
+        if np.isfinite(bound.low):
+            use[bound.name] = float(np.abs(values - bound.centre).max() / (bound.range / 2))
+        else:
+            use[bound.name] = float(values.max() / bound.high)
     return use
 
 

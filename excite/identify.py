@@ -11,7 +11,7 @@ import numpy as np
 
 from excite import bootstrap, doubts
 from excite.bootstrap import Find
-from excite.estimate import Estimate, NotIdentifiable, noted
+from excite.estimate import Estimate, NoEstimate, NotIdentifiable, noted
 from excite.examine import NEEDED, examine
 from excite.hidden import explained
 from excite.instruments import iv
@@ -112,16 +112,18 @@ def with_bias(
 ) -> Estimate:
     """The estimate with its method's bias on these logs, from simulated ones (see `bootstrap`).
 
-    Of the machine that instrumental variables find, where they find one: least squares can be so far off that its own
-    machine says nothing of its bias.
+    Of the machine that joint smoothing finds, or instrumental variables, where they find one: least squares can be so
+    far off that its own machine says nothing of its bias.
     """
     if not model.plain:
         return noted(estimate, "the method's bias on these logs was not looked for: the machine has effects")
     filter = filter or model.machine.filter
     around: np.ndarray | None = None
     if METHODS[estimate.method].biased:
-        with suppress(NotIdentifiable):
-            around = iv(model, logs, filter).value
+        for find in (METHODS["joint"].find, iv):
+            with suppress(NoEstimate):
+                around = find(model, logs, filter).value
+                break
     return bootstrap.with_bias(model, logs, estimate, METHODS[estimate.method].find, filter, around, runs)
 
 

@@ -81,11 +81,14 @@ def oe(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
             if ahead is not None and _misfit(ahead, level) < 1.001 * _misfit(runs, level):
                 break
             share /= 2
-        if ahead is None:
-            break
+        else:
+            raise NotIdentifiable(
+                "oe: no step makes the fit better, and it is none yet; start from better values in the machine file, or"
+                " use another method"
+            )
         pieces, runs, x = moved, ahead, x + share * step
         level = np.maximum(np.sqrt(_energy(runs)), sensor_noise)
-        if (share * np.abs(step[kept]) < CONVERGED * np.sqrt(np.diag(covariance))).all():
+        if (np.abs(step[kept]) < CONVERGED * np.sqrt(np.diag(covariance))).all():
             _, _, covariance = _step(runs, level, torque_noise, sensor_noise, kept)
             return _answer(model, blocks, x, covariance, len(pieces))
     raise NotIdentifiable(

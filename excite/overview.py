@@ -82,13 +82,14 @@ class Seen:
 
     @property
     def rms(self) -> dict[str, float]:
-        """Root-mean-square error of every parameter [%]."""
-        return {n: float(p["rms_percent"]) for n, p in self.parameters.items()}
+        """Root-mean-square error of every parameter that some run found [%]."""
+        found = {n: float(p["rms_percent"]) for n, p in self.parameters.items()}
+        return {n: error for n, error in found.items() if np.isfinite(error)}
 
     @property
     def coverage(self) -> float:
         """How often a 95 % interval holds the truth, over all parameters."""
-        return float(np.mean([float(p["coverage95"]) for p in self.parameters.values()])) if self.parameters else np.nan
+        return float(np.mean([float(self.parameters[n]["coverage95"]) for n in self.rms])) if self.rms else np.nan
 
 
 def write_table(
@@ -242,7 +243,7 @@ def _said(s: Seen, name: str) -> dict[str, Any]:
     said: dict[str, Any] = {"cell": name, "cond_phi": s.cond_phi, **{k: s.statuses.get(k, 0) for k in cells.STATUSES}}
     if s.reasons:
         said["reasons"] = dict(s.reasons)
-    if s.parameters:
+    if s.rms:
         worst = max(s.rms, key=lambda n: s.rms[n])
         said |= {
             "worst_parameter": worst,
@@ -262,10 +263,10 @@ def figure(seen: Sequence[Seen], title: str) -> Figure:
     shown = Figure(figsize=(11.5, 1.6 + 0.3 * min(n, NAMED) + (2.5 if n > NAMED else 0)), layout="constrained")
     shown.suptitle(figures.plain(title))
     y = np.arange(n)
-    if any(s.parameters for s in seen):
+    if any(s.rms for s in seen):
         left, right = shown.subplots(1, 2, sharey=True, width_ratios=(2, 1))
         for k, s in enumerate(seen):
-            if s.parameters:
+            if s.rms:
                 left.plot(list(s.rms.values()), [k] * len(s.rms), "o", color=COLOURS[0], markersize=3, alpha=0.5)
                 left.plot(np.median(list(s.rms.values())), k, "D", color=COLOURS[1], markersize=5)
                 right.plot(100 * s.coverage, k, "D", color=COLOURS[1], markersize=5)

@@ -114,6 +114,8 @@ def solved(blocks: Sequence[Block]) -> Solution:
         if not (np.isfinite(W).all() and np.isfinite(Y).all()):
             raise NotIdentifiable("the filtered log is not finite: is a value in it far out of range?")
     rows = sum(Y.size for _, Y in blocks)
+    if not any((Y != 0).any() for _, Y in blocks):
+        raise NotIdentifiable("every torque is zero all along: are their sensors connected?")
     if rows <= n_base:
         raise NotIdentifiable(f"{rows} filtered rows for {n_base} parameters: the log is too short")
     solution = solve(triangle(blocks))

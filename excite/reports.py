@@ -212,9 +212,12 @@ def _by_hand(s: Summary) -> tuple[list[str], list[Table]]:
 
 def _verify(s: Summary) -> Said:
     rows = s["parameters"]
-    errors = {n: float(np.hypot(r["bias_percent"], r["std_percent"])) for n, r in rows.items()}
+    errors = {n: float(r["rms_percent"]) for n, r in rows.items() if np.isfinite(r["rms_percent"])}
+    if not errors:
+        none = f"In none of {s['runs']} simulated test days a parameter was found."
+        return f"Verification of a drive for {s['machine']}", none, [], []
     worst = max(errors, key=lambda n: errors[n])
-    cover = 100 * float(np.mean([r["coverage95"] for r in rows.values()]))
+    cover = 100 * float(np.mean([rows[n]["coverage95"] for n in errors]))
     median = float(np.median(list(errors.values())))
     answer = (
         f"In {s['runs']} simulated test days the parameters came out within {percent(median)} of the truth (median;"

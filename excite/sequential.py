@@ -14,7 +14,7 @@ import numpy as np
 from excite.estimate import Estimate, NotIdentifiable
 from excite.identify import identify
 from excite.log import Log
-from model.prediction import Model
+from model.prediction import Model, signs
 
 POSES = 181  # at which the mass matrix is looked at
 SHARES = np.linspace(1, 0, 21)
@@ -70,5 +70,6 @@ def _possible(model: Model, X: np.ndarray) -> bool:
                 q[model.coordinates.index(c)] = np.linspace(-wide, wide, POSES)
     if not (model.pivots(q, X).full() > 0).all():
         return False
-    kept = [k for k, n in enumerate(model.base.names) if n.startswith(("Fv", "Fs", "Kx", "Ky"))]
-    return bool((X[kept] * model.nominal[kept] >= 0).all())
+    of = signs(model.machine)
+    sign = np.array([of.get(model.base.standard[k], 0.0) for k in model.base.independent])
+    return bool((X * sign >= 0).all())

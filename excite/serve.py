@@ -155,6 +155,7 @@ class Tail:
         self.rest = ""
         self.names: list[str] = []
         self.rows: list[tuple[float, float]] = []  # time [s], way rolled [m]
+        self.turned: dict[str, float] = {}  # the last angles [rad]
 
     def new(self) -> list[dict[str, float]]:
         """The values of the rows that are new since the last call; lines that are no numbers are left out."""
@@ -166,7 +167,7 @@ class Tail:
             file.seek(self.place)
             text = self.rest + file.read()
             self.place = file.tell()
-        *lines, self.rest = text.split("\n")
+        *lines, self.rest = text.removeprefix("\ufeff").split("\n")
         said = []
         for line in lines:
             cells = [cell.strip() for cell in line.split(",")]
@@ -191,21 +192,27 @@ class Tail:
             return None
         if not ways or not math.isfinite(t + sum(ways)):
             return None
+        angles = self._angles(cells, t - self.rows[-1][0] if self.rows else 0.0)
         self.rows.append((t, sum(ways) / len(ways)))
         while len(self.rows) > 2 and self.rows[1][0] <= t - SPAN:
             self.rows.pop(0)
         before = self.rows[0]
         if t <= before[0]:
             return None
-        return {TIME: t, SPEED: (self.rows[-1][1] - before[1]) / (t - before[0]), **self._angles(cells)}
+        return {TIME: t, SPEED: (self.rows[-1][1] - before[1]) / (t - before[0]), **angles}
 
-    def _angles(self, cells: dict[str, str]) -> dict[str, float]:
-        """The steered angles that a row has: the page keeps the last value of any other."""
+    def _angles(self, cells: dict[str, str], seconds: float) -> dict[str, float]:
+        """The steered angles that a row has, so long after the one before it: the page keeps the last value of any
+        other. A rate is summed up from zero."""
         found = {}
         for key, s in self.angles:
             with contextlib.suppress(KeyError, ValueError):
                 found[key] = s.gain * float(cells[s.column])
-        return {key: angle for key, angle in found.items() if math.isfinite(angle)}
+                if s.is_rate:
+                    found[key] = self.turned.get(key, 0.0) + found[key] * seconds
+        found = {key: angle for key, angle in found.items() if math.isfinite(angle)}
+        self.turned |= found
+        return found
 
 
 async def run(

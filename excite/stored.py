@@ -58,13 +58,16 @@ def read(design_dir: Path) -> Stored:
         model = build(Machine.model_validate_json(path.read_bytes()))
     except (OSError, ValueError):
         raise StoredError(f"{path}: missing or damaged, design again") from None
-    if "nominal" in before:  # designed for what logs told of the machine, not for the machine file's values
-        nominal = np.array([float(before["nominal"][n]) for n in model.base.names])
-        model = replace(model, nominal=nominal)
+    nominal = dict(zip(model.base.names, model.nominal.tolist(), strict=True))
+    try:
+        # Designed for what logs told of the machine, if it was; what sits in a sensor alone is no part of a design.
+        nominal |= {n: float(x) for n, x in before.get("nominal", {}).items()}
+        seconds = float(before["duration_s"])
+    except (AttributeError, TypeError, ValueError):
+        raise StoredError(f"{design_dir / folder.SUMMARY}: damaged, design again") from None
+    model = replace(model, nominal=np.array([nominal[n] for n in model.base.names]))
     torque, q0, nu0 = profiles.read(design_dir / "profile.csv", model)
-    if len(torque) != round(before["duration_s"] * float(model.machine.sampling_hz)) + 1:
-        raise StoredError(
-            f"{design_dir / 'profile.csv'}: {len(torque)} rows do not make {before['duration_s']:g} s, design again"
-        )
+    if len(torque) != round(seconds * float(model.machine.sampling_hz)) + 1:
+        raise StoredError(f"{design_dir / 'profile.csv'}: {len(torque)} rows do not make {seconds:g} s, design again")
     problem = model.machine.problems.get(str(before.get("problem")))
     return Stored(before, model, problem, simulate(model, torque, q0=q0, nu0=nu0))

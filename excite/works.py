@@ -133,6 +133,7 @@ def compare(
 ) -> dict[str, Any]:
     model = asked.model(machine, flaws=False)
     name, chosen = asked.problem(model.machine, problem, None)
+    briefs.graded(model)
     asked.positive("--budget", budget, "s")
     for usual in against:
         asked.known("--against", usual, tuple(comparisons.USUAL))
@@ -197,6 +198,7 @@ def identified(
     with terminal.busy("identifying"):
         chosen, reason = examine.FILTERS[filtering](model, read)
         estimate = identify.identify(model, read, method, chosen)
+        read = [examine.examine(model, one).log for one in read]  # as it was identified from
         if model.slips and identify.METHODS[method].biased:
             estimate = identify.with_bias(model, read, estimate, chosen)
         late = [remark for one in read for remark in examine.late_channels(model, one, chosen)]
@@ -211,7 +213,7 @@ def identified(
         "relative_error_percent": estimate.relative_error_percent,
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
-        "notes": [*cut, *([reason] if reason else []), *estimate.notes, *late, *said],
+        "notes": [*cut, *([reason] if reason else []), *estimate.notes, *crosscheck.far(model, estimate), *late, *said],
         "validation": [_check(model, one, estimate, chosen) for one in fresh],
         "versions": asked.versions(),
     }
