@@ -175,6 +175,14 @@ def test_after_a_log_its_information_is_there(straight: Model, motion: Motion) -
     assert np.allclose(np.sqrt(np.diag(C)), known.estimate.std, rtol=1e-6)
 
 
+def test_signs_are_known_whatever_a_machine_calls_its_parameters(emps: Model) -> None:
+    """Dry friction of the rig is Fc, that of the roller Fs1: neither drives."""
+    wrong = emps.nominal.copy()
+    wrong[emps.base.names.index("Fc")] *= -1
+    assert sequential._possible(emps, emps.nominal)
+    assert not sequential._possible(emps, wrong)
+
+
 def test_an_impossible_estimate_is_not_designed_for(straight: Model, motion: Motion) -> None:
     table = sensors.measure(straight, motion, seed=4)
     one = log.check(table, straight.machine, identify.needed_sensors(straight, "joint"))

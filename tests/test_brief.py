@@ -71,6 +71,25 @@ def test_after_a_log_the_next_drive_is_for_the_estimated_machine(
     assert "without --after" in err
 
 
+def test_what_sits_in_a_sensor_is_no_part_of_a_design_that_is_read_back(
+    excite: Excite, straight: Model, straight_motion: Motion, tmp_path: Path
+) -> None:
+    """A machine file with a wheel of another radius, a design after a log: its summary tells the radius nothing."""
+    own, path, out = tmp_path / "own.toml", tmp_path / "log.csv", tmp_path / "d"
+    own.write_text(
+        'extends = "va12_straight"\n[[effect]]\nname = "measuring_wheel_radius"\nwhere = "measuring_wheel_left"\n'
+        'amount = { value = 0.001, source = "identified" }\n'
+    )
+    sensors.measure(straight, straight_motion, seed=5).to_csv(path, index=False)
+    code, _, err = excite("design", own, "--after", path, "--duration", 12, "--starts", 1, "--budget", 5, "--out", out)
+    assert code == 0, err
+    assert "measuring_wheel_radius@measuring_wheel_left" in stored.read(out).model.base.names
+    text = json.loads((out / "summary.json").read_text())
+    (out / "summary.json").write_text(json.dumps(text | {"duration_s": None}))
+    with pytest.raises(stored.StoredError, match="damaged, design again"):
+        stored.read(out)
+
+
 def test_sensors_of_unknown_noise_are_named(excite: Excite, tmp_path: Path) -> None:
     path = tmp_path / "bench.toml"
     number = 'source = "assumed"'

@@ -121,6 +121,9 @@ def test_same_seed_same_bytes(profile: Path, tmp_path: Path, excite: Excite) -> 
         (["identify", "va12", "nothing.csv"], ["nothing.csv", "no such file"]),
         (["identify", "va12_straight", "PROFILE", "--method", "guess"], ["guess", "allowed", "ols"]),
         (["identify", "va12_straight", "PROFILE", "--out", "PROFILE"], ["is a file"]),
+        (["simulate", "va12_straight", "PROFILE", "--out", "PROFILE"], ["is what the log is made from"]),
+        (["run", "va12_straight", "--kit", "gold"], ["gold", "paper, full"]),
+        (["run", "va12_straight", "--method", "guess"], ["guess", "allowed", "ols"]),
     ],
 )
 def test_bad_usage_is_one_clear_line(
@@ -151,6 +154,20 @@ def test_what_is_not_ours_is_not_overwritten(profile: Path, tmp_path: Path, exci
     assert code == 2
     assert "choose another" in stderr
     assert (mine / "thesis.txt").read_text() == "years of work"
+
+
+def test_a_machine_file_is_kept(profile: Path, tmp_path: Path, excite: Excite) -> None:
+    """One that stands in a result of ours, as `excite diagnose` writes it."""
+    own, log = tmp_path / "o" / "machine.toml", tmp_path / "log.csv"
+    own.parent.mkdir()
+    own.write_text('extends = "va12_straight"\nname = "mine"\n')
+    (own.parent / "summary.json").write_text("{}")
+    excite("simulate", own, profile, "--out", log)
+    code, _, stderr = excite("identify", own, log, "--method", "ols", "--out", own.parent)
+    assert (code, "machine.toml, which is read, choose another --out" in stderr) == (2, True)
+    code, _, stderr = excite("simulate", own, profile, "--out", own.with_suffix(".csv"))
+    assert (code, stderr) == (0, "")
+    assert own.read_text().startswith("extends")
 
 
 def test_a_second_run_replaces_the_first(profile: Path, tmp_path: Path, excite: Excite) -> None:

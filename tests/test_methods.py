@@ -245,3 +245,10 @@ def test_instruments_say_when_they_find_no_machine(straight: Model, straight_mot
     wrong = {k: -v if k in ("u1", "u4") else v for k, v in one.values.items()}
     with pytest.raises(NotIdentifiable, match="iv: "):
         identify.identify(straight, [Log("wrong", one.t, wrong)], "iv")
+
+
+def test_a_log_whose_torques_are_dead_is_refused(straight: Model, straight_motion: Motion) -> None:
+    one = log.check(sensors.measure(straight, straight_motion, seed=1), straight.machine)
+    dead = Log("dead", one.t, one.values | {name: np.zeros(len(one)) for name in ("u1", "u4")})
+    with pytest.raises(NotIdentifiable, match=r"every torque is zero all along.*never changes"):
+        identify.identify(straight, [dead], "ols")

@@ -27,6 +27,7 @@ from websockets.typing import Origin
 
 from excite import drive, page, sensors, serve
 from excite.drive import Trace
+from model.file import Quantity
 from model.machine import load
 from model.prediction import Model, build
 
@@ -550,6 +551,22 @@ def test_growing_log_becomes_values(va12: Model, followed: pd.DataFrame, tmp_pat
     assert said[499]["articulation_rad"] == pytest.approx(followed["theta2_rad"][500])
     path.write_text("t_s,other\n")
     assert tail.new() == []
+
+
+def test_a_steered_joint_measured_as_a_rate_is_summed_up(va12: Model, tmp_path: Path) -> None:
+    """And a byte-order mark is no part of the first column's name."""
+    angle = next(s for s in va12.machine.sensor if s.name == "theta2")
+    rate = angle.model_copy(
+        update={"unit": "deg/s", "counts_per_turn": None, "noise": Quantity(value=0.01, source="assumed")}
+    )
+    others = tuple(rate if s is angle else s for s in va12.machine.sensor)
+    machine = va12.machine.model_copy(update={"sensor": others})
+    path = tmp_path / "log.csv"
+    rows = "".join(f"{0.1 * k:g},0,0,{9 if k < 11 else 0}\n" for k in range(21))
+    path.write_text("\ufefft_s,theta1_rad,theta4_rad,theta2_rad\n" + rows, encoding="utf-8")
+    said = serve.Tail(path, machine, TRACE.levers).new()
+    assert len(said) == 20
+    assert said[-1]["articulation_rad"] == pytest.approx(np.deg2rad(9.0))
 
 
 def test_an_angle_that_is_missing_silences_nothing_else(tmp_path: Path) -> None:

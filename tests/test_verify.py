@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from excite import figures
+from excite import figures, reports
 from excite.simulate import Motion
 from excite.verify import Verification, summary, verify
 from model.prediction import Model
@@ -92,3 +94,16 @@ def test_large_errors_have_an_axis_that_says_that_it_is_logarithmic(percent: flo
 def test_no_runs_is_refused(straight: Model, straight_motion: Motion) -> None:
     with pytest.raises(ValueError, match="at least 1"):
         verify(straight, straight_motion, "ols", runs=0)
+
+
+def test_what_no_run_finds_is_left_out_of_the_answer(straight: Model, straight_motion: Motion) -> None:
+    """And one run has an error, though no spread."""
+    one = verify(straight, straight_motion, "ols", "paper", runs=1, seed=7, jobs=1)
+    lost = one.value.copy()
+    lost[:, 0] = np.nan
+    for v, words in ((one, "worst"), (replace(one, value=lost), "worst"), (replace(one, value=lost * np.nan), "none")):
+        made = {"machine": "x", "runs": 1, "failed": 0, "biased": [], "meanings": {}, "parameters": summary(v)}
+        answer = reports.KINDS["verify"](made)[1]
+        assert words in answer
+        assert "nan" not in answer
+        assert " - %" not in answer
