@@ -11,9 +11,12 @@ from conftest import Excite
 
 from excite import profiles, sensors, stored
 from excite.brief import POOR, Brief, advice
-from excite.simulate import Motion
+from excite.simulate import Motion, simulate
 from excite.smoothing import cramer_rao
-from model.prediction import Model
+from model.machine import load
+from model.prediction import Model, build
+
+S40 = Path(__file__).parents[1] / "results" / "S40" / "design"
 
 
 def test_advice_names_what_to_do() -> None:
@@ -71,16 +74,16 @@ def test_after_a_log_the_next_drive_is_for_the_estimated_machine(
     assert "without --after" in err
 
 
-def test_what_sits_in_a_sensor_is_no_part_of_a_design_that_is_read_back(
-    excite: Excite, straight: Model, straight_motion: Motion, tmp_path: Path
-) -> None:
+def test_what_sits_in_a_sensor_is_no_part_of_a_design_that_is_read_back(excite: Excite, tmp_path: Path) -> None:
     """A machine file with a wheel of another radius, a design after a log: its summary tells the radius nothing."""
     own, path, out = tmp_path / "own.toml", tmp_path / "log.csv", tmp_path / "d"
     own.write_text(
         'extends = "va12_straight"\n[[effect]]\nname = "measuring_wheel_radius"\nwhere = "measuring_wheel_left"\n'
         'amount = { value = 0.001, source = "identified" }\n'
     )
-    sensors.measure(straight, straight_motion, seed=5).to_csv(path, index=False)
+    model = build(load(own))
+    torque, q0, nu0 = profiles.read(S40 / "profile.csv", model)
+    sensors.measure(model, simulate(model, torque, q0=q0, nu0=nu0), seed=5).to_csv(path, index=False)
     code, _, err = excite("design", own, "--after", path, "--duration", 12, "--starts", 1, "--budget", 5, "--out", out)
     assert code == 0, err
     assert "measuring_wheel_radius@measuring_wheel_left" in stored.read(out).model.base.names
