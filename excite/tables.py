@@ -13,9 +13,17 @@ import numpy as np
 import pandas as pd
 import scipy
 
+from model.units import UNITS
+
 SEPARATORS = ("\t", ";", ",", "|")
 ENCODINGS = ("utf-8-sig", "cp1252")  # the second reads any byte: what European loggers write
-COMMA = re.compile(r"^\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*$")
+COMMENTS = ("#", "%")
+COMMA = re.compile(r"\s*[+-]?(?:\d*|\d{1,3}(?:\.\d{3})+),\d+(?:[eE][+-]?\d+)?\s*")  # perhaps with points: 1.238,5
+THOUSANDS = re.compile(r"\s*[+-]?\d{1,3}(?:\.\d{3}){2,}\s*")  # 1.238.500
+POINT = re.compile(r"\s*[+-]?(?:\d+\.\d*|\.\d+)(?:[eE][+-]?\d+)?\s*")
+DATE = re.compile(r"\s*(\d{1,2}\.\d{1,2}\.\d{2,4})[ T]+(\d{1,2}:\d{2}:\d{2})([.,]\d+)?\s*")
+NAMELESS = re.compile(r"[+-]?[.,]?\d[\d\s.,:/+eETZ-]*|(?i:[+-]?(?:nan|inf))")  # numbers, dates
+LONGEST = 500  # characters of a column's name: a line that has more is no header
 MDF_TIME = "timestamps"
 
 
@@ -40,45 +48,134 @@ def read(path: str | Path) -> pd.DataFrame:
 
 
 def _csv(path: Path) -> pd.DataFrame:
-    """Any of the usual separators, decimal commas, lines of comment before the header, a line of units below it."""
-    text = _text(path)
-    lines = text.split("\n")
-    head = next((k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith(("#", "%"))), None)
+    """Any of the usual separators, decimal commas, lines of comment before the header, a line of units below it, which
+    are kept by column in attrs["units"]."""
+    lines = _text(path).split("\n")
+    head = next((k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith(COMMENTS)), None)
     if head is None:
         raise LogError(f"{path}: the file is empty, there is no header with the names of columns")
     if lines[head].strip().lower().startswith("sep="):
         head += 1
     separator = _separator(lines[head])
-    header = [name.strip() for name in next(csv.reader([lines[head]], delimiter=separator))]
-    twice = [name for name in header if header.count(name) > 1]
-    if twice:
-        raise LogError(f"{path}: line {head + 1}: column {twice[0]} is there twice, keep one")
-    first = next((line for line in lines[head + 1 :] if line.strip()), "")
-    cells = next(csv.reader([first], delimiter=separator), [])
-    skip = int(bool(cells) and not any(_numeric(cell) for cell in cells) and _numeric_below(lines, head + 2, separator))
-    commas = separator != "," and any(COMMA.match(c) for c in _cells(lines, head + 1 + skip, separator))
-    body = "\n".join([lines[head], *lines[head + 1 + skip :]])
+    header = _header(path, lines, head, separator)
+    start = next((k for k in range(head + 1, len(lines)) if lines[k].strip()), len(lines))
+    below = _row(path, lines, start, separator) if start < len(lines) else []
+    units: dict[str, str] = {}
+    if below and not any(_numeric(cell) for cell in below) and _numeric_below(lines, start + 1, separator):
+        if not lines[start].lstrip().startswith(COMMENTS):
+            units = {name: unit for name, cell in zip(header, below, strict=False) if (unit := cell.strip(" []()"))}
+        start += 1
+    body = "\n".join([lines[head], *lines[start:]])
+    comma = _decimal_comma(body, separator)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", pd.errors.ParserWarning)
             table = pd.read_csv(
                 io.StringIO(body),
                 sep=separator,
-                decimal="," if commas else ".",
+                decimal="," if comma else ".",
                 skipinitialspace=True,
                 low_memory=False,
                 index_col=False,
             )
     except pd.errors.EmptyDataError:
         raise LogError(f"{path}: the file is empty") from None
-    except pd.errors.ParserWarning:
-        raise LogError(f"{path}: not a table: lines have more cells than the header has names") from None
-    except pd.errors.ParserError as err:
-        raise LogError(f"{path}: not a table: {' '.join(str(err).split())}") from None
+    except (pd.errors.ParserWarning, pd.errors.ParserError) as err:
+        why = _too_wide(path, lines, start, len(header), separator) or " ".join(str(err).split())
+        raise LogError(f"{path}: not a table: {why}") from None
     table.columns = table.columns.astype(str).str.strip()
     if header and header[-1] == "" and table.iloc[:, -1].isna().all():  # a separator at the end of every line
-        table = table.iloc[:, :-1]
+        table = table.iloc[:, :-1].copy()
+    for name in [n for n in table.columns if table[n].dtype.kind not in "biuf"]:
+        if comma:
+            table[name] = _without_commas(table[name], comma, path)
+        table[name] = _dates(table[name])
+    table.attrs["units"] = units
     return table
+
+
+def _row(path: Path, lines: list[str], k: int, separator: str) -> list[str]:
+    """The cells of a line (from 0)."""
+    try:
+        return next(csv.reader([lines[k]], delimiter=separator), [])
+    except csv.Error:
+        raise LogError(
+            f"{path}: not a table: line {k + 1} has a cell of more than {csv.field_size_limit()} characters"
+        ) from None
+
+
+def _header(path: Path, lines: list[str], k: int, separator: str) -> list[str]:
+    """The names of the columns, in a line (from 0)."""
+    header = [name.strip() for name in _row(path, lines, k, separator)]
+    longest = max(map(len, header), default=0)
+    if longest > LONGEST:
+        raise LogError(f"{path}: not a table: line {k + 1} should be the header, it has a name of {longest} characters")
+    twice = [name for name in header if header.count(name) > 1]
+    counted = not twice and all(name.isdigit() for name in header)  # 0,1,2,...: programs' names for columns without
+    names = [name for name in header if name]
+    if names and not counted and all(NAMELESS.fullmatch(name) for name in names):
+        raise LogError(
+            f"{path}: line {k + 1} holds numbers, there is no header: write a line with the names of the columns above"
+        )
+    if twice:
+        raise LogError(f"{path}: line {k + 1}: column {twice[0] or 'without a name'} is there twice, keep one")
+    return header
+
+
+def _too_wide(path: Path, lines: list[str], start: int, names: int, separator: str) -> str:
+    """What is said of the first line (from 0) that has more cells than there are names, "" where none has."""
+    for k in range(start, len(lines)):
+        cells = _row(path, lines, k, separator)
+        if len(cells) <= names:
+            continue
+        line = f"line {k + 1} has more cells than the header has names ({len(cells)}, not {names})"
+        if lines[k].lstrip().startswith(COMMENTS):
+            return f"{line}; it is a comment, cut it"
+        if separator == "," and all(re.fullmatch(r"\s*[+-]?\d+(?:[eE][+-]?\d+)?\s*", cell) for cell in cells):
+            return f"{line}: decimal commas, and commas between columns? write decimal points, or semicolons between"
+        return line
+    return ""
+
+
+def _decimal_comma(body: str, separator: str) -> str:
+    """The first cell with a decimal comma, "" where there is none."""
+    if separator == "," or "," not in body:
+        return ""
+    inside = rf'[^{re.escape(separator)}\n"]'
+    found = re.search(f"(?<!{inside}){COMMA.pattern}(?!{inside})", body)
+    return found.group().strip() if found else ""
+
+
+def _without_commas(column: pd.Series, comma: str, path: Path) -> pd.Series:
+    """A column with decimal commas that was left as text, as some cells are not plain numbers: without points between
+    thousands, with decimal points. comma: a cell that has one. Raises LogError for a point that may be either."""
+    cells = column.tolist()
+    for k, cell in enumerate(cells):
+        if isinstance(cell, str) and POINT.fullmatch(cell):
+            raise LogError(
+                f"{path}: row {k + 1}, column {column.name}: {cell.strip()[:30]!r} has a point, other cells a decimal"
+                f" comma ({comma[:30]!r}); write all numbers alike, without marks between thousands"
+            )
+        if isinstance(cell, str) and (COMMA.fullmatch(cell) or THOUSANDS.fullmatch(cell)):
+            cells[k] = cell.replace(".", "").replace(",", ".")
+    plain = pd.Series(cells, column.index, object, column.name)
+    number = pd.to_numeric(plain, errors="coerce")
+    return number if (number.isna() == plain.isna()).all() else plain
+
+
+def _dates(column: pd.Series) -> pd.Series:
+    """Text as dates where all of it is dates with points, which have the day first; as it is otherwise."""
+    first = column.iloc[0] if len(column) else None
+    if not (isinstance(first, str) and DATE.fullmatch(first)):
+        return column
+    parts = column.astype(str).str.extract(DATE)
+    day, clock, fraction = (parts[k] for k in range(3))
+    for year in ("%Y", "%y"):
+        date = pd.to_datetime(day + " " + clock, format=f"%d.%m.{year} %H:%M:%S", errors="coerce")
+        if date.notna().all():
+            part = pd.to_numeric("0." + fraction.str[1:].fillna("0"))
+            return date + pd.to_timedelta(part, unit="s")
+    return column
 
 
 def _text(path: Path) -> str:
@@ -109,7 +206,9 @@ def _cells(lines: list[str], start: int, separator: str) -> list[str]:
 
 
 def _numeric(cell: str) -> bool:
-    return bool(COMMA.match(cell)) or bool(re.match(r"^\s*[+-]?(\d|\.\d|nan\b|inf\b)", cell, re.IGNORECASE))
+    if cell.strip(" []()") in UNITS:  # 1/min
+        return False
+    return bool(COMMA.fullmatch(cell)) or bool(re.match(r"^\s*[+-]?(\d|\.\d|nan\b|inf\b)", cell, re.IGNORECASE))
 
 
 def _numeric_below(lines: list[str], start: int, separator: str) -> bool:

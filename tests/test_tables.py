@@ -83,11 +83,66 @@ def test_the_same_numbers_from_every_file(write: Callable[[Path], Path], tmp_pat
         assert read[name].to_numpy(dtype=float) == pytest.approx(TABLE[name].to_numpy(), rel=1e-12, abs=1e-300)
 
 
-def test_thousands_are_no_decimals(tmp_path: Path) -> None:
+def _read(folder: Path, text: str) -> pd.DataFrame:
+    (folder / "log.csv").write_text(text)
+    return tables.read(folder / "log.csv")
+
+
+@pytest.mark.parametrize("rows", ["0,00,1,5\n0,01,1,6\n", "0,1\n0,01,1,6\n"])
+def test_thousands_are_no_decimals(rows: str, tmp_path: Path) -> None:
     """With commas between the columns a comma is no decimal: 1,5 would be two cells, and says so."""
-    (tmp_path / "log.csv").write_text("t_s,u1_Nm\n0,00,1,5\n0,01,1,6\n")
-    with pytest.raises(LogError, match="more cells than the header"):
-        tables.read(tmp_path / "log.csv")
+    with pytest.raises(LogError, match=r"line \d has more cells than the header .* decimal commas, and commas between"):
+        _read(tmp_path, "t_s,u1_Nm\n" + rows)
+
+
+@pytest.mark.parametrize("cell", ["-1.005", "0.5", "1.", "1.5e3", '"-1.005"'])
+def test_a_point_among_decimal_commas_is_never_guessed(cell: str, tmp_path: Path) -> None:
+    """-1.005 may be about -1 or about -1000."""
+    with pytest.raises(
+        LogError, match=r"row 2, column u1_Nm: .* has a point, other cells a decimal comma \('-21,85'\)"
+    ):
+        _read(tmp_path, f"t_s;u1_Nm;theta1_rad\n0;-999;1\n1;{cell};2\n2;-1.238;-21,85\n")
+
+
+def test_points_between_thousands_are_read_where_nothing_else_is_meant(tmp_path: Path) -> None:
+    read = _read(tmp_path, "t_s;u1_Nm;u4_Nm\n0,00;-999;1.238.500\n0,01;-1.005,25;1,5\n0,02;12.345.678,9;7\n")
+    assert read["u1_Nm"].tolist() == [-999, -1005.25, 12345678.9]
+    assert read["u4_Nm"].tolist() == [1238500, 1.5, 7]
+    assert _read(tmp_path, "t_s;u1_Nm\n0;1.238,5\n")["u1_Nm"].tolist() == [1238.5]  # the only comma
+
+
+def test_decimal_commas_begin_anywhere_and_spoil_no_other_cell(tmp_path: Path) -> None:
+    """The first comma far below; an error in a column leaves the rest of it numbers."""
+    rows = [f"{k};{k};0" for k in range(40)] + ["40;-21,85;error", "41;-21,86;0,5"]
+    read = _read(tmp_path, "t_s;theta1_rad;u1_Nm\n" + "\n".join(rows))
+    assert read["theta1_rad"].tolist() == [*range(40), -21.85, -21.86]
+    u1 = pd.to_numeric(read["u1_Nm"], errors="coerce")
+    assert (u1.isna().sum(), u1.iloc[41]) == (1, 0.5)
+
+
+@pytest.mark.parametrize("form", ["%d.%m.%Y %H:%M:%S,%f", "%d.%m.%y %H:%M:%S.%f"])
+def test_dates_with_points_have_the_day_first(form: str, va12: Model, tmp_path: Path) -> None:
+    """Over midnight, the second day's too: 06.03. is no 3rd of June."""
+    when = pd.date_range("2024-03-05 23:59:59.5", periods=100, freq="10ms")
+    cells = [w.strftime(form)[:-4] for w in when]
+    cells[50] = cells[50][:-3]  # a full second without its zeros
+    read = _read(tmp_path, "t_s;u1_Nm\n" + "".join(f"{cell};0\n" for cell in cells))
+    t = log.times(read, va12.machine, "log")
+    assert t == pytest.approx(np.arange(100) / 100, abs=1e-6)
+
+
+def test_units_below_the_header_are_kept(tmp_path: Path) -> None:
+    read = _read(tmp_path, "t_s;n1;theta2_rad;x\n[ms];1/min;(deg);\n0;1;2;3\n")
+    assert read.attrs["units"] == {"t_s": "ms", "n1": "1/min", "theta2_rad": "deg"}
+    assert len(read) == 1
+    assert _read(tmp_path, "t_s;n1\n# a note\n0;1\n").attrs["units"] == {}
+    assert len(_read(tmp_path, "t_s;n1\n\nms;rpm\n0;1\n")) == 1  # after an empty line
+
+
+def test_columns_may_be_counted(tmp_path: Path) -> None:
+    """A table without names, as programs write it; and names that begin as numbers do."""
+    assert list(_read(tmp_path, "0,1,2\n0.5,0.5,0.5\n")) == ["0", "1", "2"]
+    assert list(_read(tmp_path, "1_theta,2_theta\n0.5,0.5\n")) == ["1_theta", "2_theta"]
 
 
 @pytest.mark.parametrize(
@@ -97,6 +152,17 @@ def test_thousands_are_no_decimals(tmp_path: Path) -> None:
         ("log.csv", b"# only a comment\n", "no header"),
         ("log.csv", b"a;b;a\n1;2;3\n", "column a is there twice"),
         ("log.csv", b"a,b\n", "no rows"),
+        ("log.csv", b"0.0,0.0,1.5\n0.01,2,3\n", "line 1 holds numbers, there is no header"),
+        ("log.csv", b"2024-05-03 10:00:00;-1,5\n2024-05-03 10:00:01;-2\n", "line 1 holds numbers, there is no header"),
+        ("log.csv", b"x" * 200_000, "not a table: line 1 has a cell of more than"),
+        ("log.csv", b"x" * 2_000 + b",b\n1,2\n", "not a table: line 1 should be the header, it has a name of 2000"),
+        ("log.csv", b"a,b\n" + b"x" * 200_000, "not a table: line 2 has a cell of more than"),
+        ("log.csv", b"# May\na;b\ns;m\n1;2\n1;2;3;4\n", "line 5 has more cells than the header has names (4, not 2)"),
+        (
+            "log.csv",
+            b"a,b\n1,2\n# stop, go, stop\n",
+            "line 3 has more cells than the header has names (3, not 2); it is",
+        ),
         ("log.csv", b"PK\x03\x04\x00\x00\xff\x00\x00", "not a text file"),
         ("log.parquet", b"hello", "not a Parquet file"),
         ("log.mat", b"hello", "not a MATLAB file"),
