@@ -15,6 +15,7 @@ from excite import log
 from excite.doubts import RATES, against, as_speed, doubts, is_speed, own_file, unchanging
 from excite.examine import NEEDED, find_dropouts, find_spikes
 from excite.log import LogError
+from excite.tables import COMMENTS
 from model import machine as machines
 from model.machine import Machine, Sensor
 from model.units import TURN, UNITS
@@ -77,8 +78,12 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
     """Everything that is wrong with a table of measurements, not only the first fault. Never raises for its content."""
     columns, faults, remarks = [], [], []
     found = {c: s for s in machine.sensors("full") for c in s.columns} if machine else {}
+    strays = _strays(table)
+    faults += list(strays.values())[:SHOWN]
+    if len(strays) > SHOWN:
+        faults.append(f"{len(strays) - SHOWN} more such rows")
     for name in map(str, table.columns):
-        column, fault = _column(table, name, machine, found.get(name))
+        column, fault = _column(table, name, machine, found.get(name), list(strays))
         columns.append(column)
         if fault and machine and (name in found or name == machine.time_column):
             faults.append(fault)
@@ -86,6 +91,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
             remarks.append(fault)
     if machine is None:
         remarks.append("no shipped machine has these columns: name yours with --machine to have them checked")
+        remarks = [*faults, *remarks]
         return Inspection(source, None, len(table), np.nan, np.nan, tuple(columns), (), (), tuple(remarks), {}, ())
     t, gaps = _time(table, machine, faults)
     signals: dict[str, tuple[np.ndarray, np.ndarray, str]] = {}
@@ -118,7 +124,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         faults += [line for line in jumps if not line.startswith(after)]  # across a gap an angle may jump
         remarks += _oddities(sensor, values)
     faults += against(machine, readings)
-    if readings:
+    if readings or not found.keys().isdisjoint(table.columns):
         faults += absent
     else:
         own = f": `excite machine new NAME --like {machine.name}` writes a machine file to name them in"
@@ -126,6 +132,8 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
             f"none of the columns of {machine.name} is there; is it a log of another machine, or with columns"
             f" of its own{own if machine.name in machines.shipped() else '?'}"
         )
+    contradicted, unheard = _units(table, machine)
+    remarks += unheard
     unknown = [c.name for c in columns if not c.what]
     if unknown:
         remarks.append(f"not used: {', '.join(unknown)}")
@@ -135,7 +143,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         _caught(lambda: log.check(table, machine, (), ""), faults)
     seconds = float(t[-1] - t[0]) if len(t) > 1 else np.nan
     typical = 1 / float(np.median(np.diff(t))) if len(t) > 1 and np.median(np.diff(t)) > 0 else np.nan
-    doubtful = () if faults else doubts(machine, readings)
+    doubtful = (*contradicted, *(() if faults else doubts(machine, readings)))
     return Inspection(
         source,
         machine.name,
@@ -163,6 +171,8 @@ def refuse(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sou
         raise LogError(f"{source}: no column {', '.join(name + hint for name, hint in lacking)}")
     if lacking or machine.time_column not in table.columns:
         return
+    for stray in _strays(table).values():
+        raise LogError(f"{source}: {stray}")
     t = _caught(lambda: log.times(table, machine, source), None)
     if t is not None and (clock := _clock(t, machine)):
         raise LogError(f"{source}: {clock}")
@@ -186,8 +196,9 @@ def _speed(sensor: Sensor, values: np.ndarray, table: pd.DataFrame, machine: Mac
     units = [u for u, s in rates.items() if _possible(s, values * (s.gain / sensor.gain), machine)]
     # What moves a roll is the torque of all of them.
     pulling = [b.index for b in machine.actuated if b.contact is not None] if body.contact else [body.index]
-    drives = [s for s in machine.sensors("full") if s.kind == "torque" and s.body in pulling]
-    torques = [_caught(lambda s=s: log.values_of(s, machine, table, ""), None) for s in drives if s.column in table]  # type: ignore[misc]
+    there = [s for s in machine.sensors("full") if set(s.columns) <= set(table.columns)]
+    drives = [s for s in there if s.kind == "torque" and s.body in pulling]
+    torques = [_caught(lambda s=s: log.values_of(s, machine, table, ""), None) for s in drives]  # type: ignore[misc]
     known = [u for u in torques if u is not None]
     if not units or not is_speed(values, known, rate):
         return ""
@@ -247,14 +258,57 @@ def _caught(work: Callable[[], T], faults: list[str] | None) -> T | None:
         return None
 
 
-def _column(table: pd.DataFrame, name: str, machine: Machine | None, sensor: Sensor | None) -> tuple[Column, str]:
+def _strays(table: pd.DataFrame) -> dict[int, str]:
+    """Rows (from 0) that are no data, each with what is said of it: the header once more, a comment."""
+    names = [str(c) for c in table.columns]
+    found = {}
+    for k, cell in enumerate(table.iloc[:, 0].tolist() if names else ()):
+        text = cell.strip() if isinstance(cell, str) else ""
+        if text.startswith(COMMENTS):
+            found[k] = f"row {k + 1}: is a comment ({text[:30]!r}), not data; cut it"
+        elif text and text == names[0] and [str(c).strip() for c in table.iloc[k]] == names:
+            found[k] = f"row {k + 1}: is the header once more, not data; cut it"
+    return found
+
+
+def _units(table: pd.DataFrame, machine: Machine) -> tuple[list[str], list[str]]:
+    """What a line of units in a file says against the machine file's, and what of it nobody knows."""
+    said: dict[str, str] = table.attrs.get("units", {})
+    own: dict[str, tuple[str, str, float]] = {machine.time_column: (machine.time_unit, *UNITS[machine.time_unit])}
+    for sensor in machine.sensors("full"):
+        quantity, size = UNITS.get(sensor.unit, ("", 0.0))
+        if sensor.factor is not None:  # whatever the unit's name says
+            quantity, size = "", abs(float(sensor.factor))
+        own |= dict.fromkeys(sensor.columns, (sensor.unit, quantity, size))
+    differ, unknown = [], []
+    for name, unit in said.items():
+        if name not in own or unit in (own[name][0], "-"):
+            continue
+        named, quantity, size = own[name]
+        if unit not in UNITS:
+            unknown.append(f"{unit} for {name}")
+        elif not np.isclose(UNITS[unit][1], size, rtol=1e-6, atol=0) or quantity not in ("", UNITS[unit][0]):
+            line = f'{"time_unit" if name == machine.time_column else "unit"} = "{unit}"'
+            mend = f"if the file is right, write {line} in {own_file(machine)}"
+            what = mend if quantity == UNITS[unit][0] else "which is right?"
+            differ.append(f"the file says {unit} in column {name}, the machine file {named}: {what}")
+    listed = f"the line below the header is taken for units, which are not known: {', '.join(unknown)}"
+    return differ, [listed] if unknown else []
+
+
+def _column(
+    table: pd.DataFrame, name: str, machine: Machine | None, sensor: Sensor | None, strays: list[int]
+) -> tuple[Column, str]:
+    """strays: rows (from 0) that are no data."""
     raw = table[name]
     time = machine is not None and name == machine.time_column
-    if time and raw.dtype.kind not in "fiu" and pd.to_numeric(raw, errors="coerce").isna().all():
+    dated = raw.dtype.kind == "M" or (raw.dtype.kind in "OTU" and pd.to_numeric(raw, errors="coerce").isna().all())
+    if time and dated:
         return Column(name, "time (dates)", "", np.nan, np.nan, 0), ""
     number = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float) if raw.dtype.kind != "M" else np.zeros(len(raw))
     bad = ~np.isfinite(number)
     good = number[~bad]
+    bad[strays] = False
     what, unit = "", ""
     if machine is not None and time:
         what, unit = "time", machine.time_unit

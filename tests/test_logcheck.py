@@ -11,8 +11,11 @@ import pandas as pd
 import pytest
 from conftest import Excite
 
-from excite import logcheck, sensors
+from excite import log, logcheck, sensors, tables
+from excite.log import LogError
 from excite.simulate import Motion
+from model.file import Quantity
+from model.machine import Machine
 from model.prediction import Model
 
 
@@ -134,6 +137,114 @@ def test_a_column_of_another_joint_is_no_lookalike(va12: Model, table: pd.DataFr
     lacking = table.drop(columns="theta1_rad").rename(columns={"theta4_rad": "theta_4"})
     assert logcheck.lookalike(["theta1_rad"], lacking, va12.machine) == ""
     assert "theta_4" in logcheck.lookalike(["theta4_rad"], lacking, va12.machine)
+
+
+@pytest.mark.parametrize("options", [{}, {"sep": ";", "decimal": ","}])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda rows: [*rows[:41], rows[0], *rows[41:]], "row 41: is the header once more, not data; cut it"),
+        (lambda rows: [*rows[:41], "# stopped here", *rows[41:]], "row 41: is a comment ('# stopped here'), not data"),
+    ],
+)
+def test_a_row_that_is_no_data_is_named(
+    va12: Model,
+    table: pd.DataFrame,
+    options: dict[str, str],
+    change: Callable[[list[str]], list[str]],
+    words: str,
+    tmp_path: Path,
+) -> None:
+    """By one line, and not as a log of another machine; by the other commands as well."""
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(change(table.to_csv(index=False, **options).splitlines())))  # type: ignore[call-overload]
+    read = tables.read(path)
+    (line,) = logcheck.inspect(read, va12.machine).faults
+    assert words in line
+    with pytest.raises(LogError, match="row 41"):
+        logcheck.refuse(read, va12.machine)
+
+
+def test_only_a_log_without_the_machines_columns_is_anothers(va12: Model, table: pd.DataFrame) -> None:
+    unread = table.assign(**{name: "?" for name in table if name != "t_s"})
+    assert not any("none of the columns" in line for line in logcheck.inspect(unread, va12.machine).faults)
+    other = table[["t_s"]].assign(speed=1.0)
+    assert any("none of the columns of va12" in line for line in logcheck.inspect(other, va12.machine).faults)
+
+
+@pytest.mark.parametrize(
+    ("units", "doubtful", "remark"),
+    [
+        (
+            "ms;N m;;deg",
+            [
+                "says ms in column t_s, the machine file s: if the file is right, write time_unit",
+                "deg in column theta2_rad, the machine file rad",
+            ],
+            "",
+        ),
+        ("s;Nm;;[rad]", [], ""),
+        (
+            "s;kNm;-;mm",
+            ["kNm in column u1_Nm, the machine file N m", "mm in column theta2_rad, the machine file rad: which"],
+            "",
+        ),
+        ("s;N m;;Grad", [], "which are not known: Grad for theta2_rad"),
+    ],
+)
+def test_units_in_the_file_that_are_not_the_machine_files(
+    va12: Model, table: pd.DataFrame, units: str, doubtful: list[str], remark: str, tmp_path: Path
+) -> None:
+    names = ["t_s", "u1_Nm", "u4_Nm", "theta2_rad"]
+    table = table[[*names, *(c for c in table if c not in names)]]
+    head, _, rest = table.to_csv(index=False, sep=";").partition("\n")
+    (tmp_path / "log.csv").write_text(f"{head}\n{units}{';' * (len(table.columns) - 4)}\n{rest}")
+    found = logcheck.inspect(log.table_of(tmp_path / "log.csv", va12.machine), va12.machine)
+    assert found.faults == ()
+    assert len(found.doubts) == len(doubtful)
+    for words, line in zip(doubtful, found.doubts, strict=True):
+        assert words in line
+    assert remark in " ".join(found.remarks)
+    assert bool(found.remarks) == bool(remark)
+
+
+def _with(model: Model, name: str, **changed: object) -> Machine:
+    """The machine with one of its sensors changed."""
+    own = tuple(s.model_copy(update=changed) if s.name == name else s for s in model.machine.sensor)
+    return model.machine.model_copy(update={"sensor": own})
+
+
+def test_a_factor_says_what_unit_a_column_is_in(va12: Model, table: pd.DataFrame) -> None:
+    """Whatever the unit is called: a negative factor turns a sign around, pi / 180 says degrees."""
+    table = table.copy()
+    for factor, unit, right in ((-1.0, "rad", True), (np.pi / 180, "deg", True), (-1.0, "deg", False)):
+        table.attrs["units"] = {"theta2_rad": unit}
+        found = logcheck.inspect(table, _with(va12, "theta2", factor=Quantity(value=factor, source="assumed")))
+        assert any("theta2_rad, the machine file" in line for line in found.doubts) != right, (factor, unit)
+
+
+def test_dates_are_time(va12: Model, table: pd.DataFrame) -> None:
+    dated = table.assign(t_s=pd.Timestamp("2024-03-05") + pd.to_timedelta(table["t_s"], unit="s"))
+    found = logcheck.inspect(dated, va12.machine)
+    assert found.faults == ()
+    assert found.columns[0].what == "time (dates)"
+
+
+def test_a_pressure_that_lacks_its_return(va12: Model, table: pd.DataFrame) -> None:
+    """A speed for an angle is judged by the torques that are there."""
+    litres = Quantity(value=8e-3, source="assumed")
+    machine = _with(va12, "u1", column="p1 a", return_column="p1 b", unit="bar", displacement=litres)
+    rpm = np.gradient(table["theta1_rad"], 0.01) * 60 / (2 * np.pi)
+    half = table.rename(columns={"u1_Nm": "p1 a"}).assign(theta1_rad=rpm)
+    faults = logcheck.inspect(half, machine).faults
+    assert any("no column p1 b" in line for line in faults), faults
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3])
+def test_a_log_of_a_row_is_too_short(rows: int, va12: Model, table: pd.DataFrame) -> None:
+    faults = logcheck.inspect(table.head(rows), va12.machine).faults
+    assert any(f"only {rows} rows" in line for line in faults), faults
+    logcheck.refuse(table.head(rows), va12.machine)
 
 
 def test_every_fault_at_once(va12: Model, table: pd.DataFrame) -> None:
