@@ -352,9 +352,6 @@ def _advance(
         above, below = _one_way(tr, nodes, model, problem, track.going)
         task = replace(task, above=above, below=below)
 
-    def watch(*_: object) -> bool:
-        return over()
-
     try:
         Z = settle(tr, start, U, Z)
     except UnsettledError:
@@ -367,14 +364,14 @@ def _advance(
     try:
         if kept:
             point = interior.begin(tr, task, start, Z, U, stage.barrier, 1e-3)
-            point, state = interior.minimise(tr, task, point, levels, watch)
+            point, state = interior.minimise(tr, task, point, levels, over)
             kept = interior.infeasibility(state, point) < STUCK
         if not kept:  # by way of the nearest torques that keep every limit and come to rest
             near = replace(task, aim=None, pull=1.0, goal=U)
             point = interior.begin(tr, near, start, Z, U, 1e-3, 0.05)
-            point, _ = interior.minimise(tr, near, point, (interior.Level(1.0, 1e-3, 1e-3, 40),), watch)
+            point, _ = interior.minimise(tr, near, point, (interior.Level(1.0, 1e-3, 1e-3, 40),), over)
             point = interior.begin(tr, task, point.start, point.Z, point.U, max(stage.barrier, 1e-4), 0.05)
-            point, _ = interior.minimise(tr, task, point, levels, watch)
+            point, _ = interior.minimise(tr, task, point, levels, over)
     except np.linalg.LinAlgError:  # the information is singular: the machine hardly moves
         return None
     try:

@@ -19,6 +19,7 @@ from excite.simulate import Motion
 from model.machine import Body, Problem
 from model.prediction import Model
 
+BROKEN = 0.02  # of its range, by which a limit is broken
 GRID = 0.5  # s between places where a phase may begin
 SPEED_STEP, ANGLE_STEP = 0.1, np.deg2rad(2)  # what is read from a dial and steered to
 RESERVE = 0.93  # of speed and rate limits that a trace asks for: a person overshoots
@@ -399,10 +400,10 @@ def middle(scores: Sequence[Score]) -> Score:
     return sorted(scores, key=lambda s: s.worst_percent)[(len(scores) - 1) // 2]
 
 
-def broken(model: Model, problem: Problem, motion: Motion, least: float = 0.02) -> dict[str, float]:
-    """Limits of machine and lane that a motion exceeds by more than `least` of their range, with the excess."""
+def broken(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
+    """Limits of machine and lane that a motion exceeds by more than BROKEN of their range, with the excess."""
     over = limit.check(model, problem, motion)
-    return {name: value for name, value in over.items() if value > least and not limit.of_rest(name)}
+    return {name: value for name, value in over.items() if value > BROKEN and not limit.of_rest(name)}
 
 
 # ------------------------------------------------------------------------------------------------ room

@@ -129,14 +129,12 @@ def _square(
     return found, half @ scatter(blocks, found, kept, Z) @ half.T
 
 
-def observe(
-    model: Model, s: Samples, x: np.ndarray, filter: Filter, unseen: Sequence[int] = (), pull: float = PULL
-) -> Samples:
+def observe(model: Model, s: Samples, x: np.ndarray, filter: Filter, unseen: Sequence[int] = ()) -> Samples:
     """The motion of the machine x (n_base,) under a log's low-passed torques, drawn towards the log's speeds and joint
-    angles with time constant `pull` [s], but for coordinates `unseen`. Raises SimulationError."""
+    angles with time constant PULL [s], but for coordinates `unseen`. Raises SimulationError."""
     rate = float(model.machine.sampling_hz)
     stretch = max(1, round(STRETCH * rate))
-    gain = np.full(len(s.q), 1 - np.exp(-stretch / rate / pull))
+    gain = np.full(len(s.q), 1 - np.exp(-stretch / rate / PULL))
     gain[list(unseen)] = 0.0
     torque = lowpass(s.Y[list(model.actuated)], rate, filter).T - model.offsets @ x
     q, nu = s.q[:, 0].copy(), s.nu[:, 0].copy()

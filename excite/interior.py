@@ -93,19 +93,6 @@ class State:
 
 
 @dataclass(frozen=True)
-class Progress:
-    """What an iteration did: objective, distance of the slacks from the limits, expected decrease, step length."""
-
-    iteration: int
-    level: int
-    objective: float
-    infeasibility: float
-    decrement: float
-    step: float
-    regular: float
-
-
-@dataclass(frozen=True)
 class Quadratic:
     """The problem around a point, in the steps r = (left state, left torque, right torque) of the intervals (K, n_r).
 
@@ -127,9 +114,6 @@ class Quadratic:
     state: State
 
 
-Watch = Callable[[Progress, Point, State], bool]
-
-
 def begin(
     tr: Transcription, task: Task, start: np.ndarray, Z: np.ndarray, U: np.ndarray, barrier: float, push: float
 ) -> Point:
@@ -142,11 +126,11 @@ def begin(
 
 
 def minimise(
-    tr: Transcription, task: Task, point: Point, levels: tuple[Level, ...], watch: Watch | None = None
+    tr: Transcription, task: Task, point: Point, levels: tuple[Level, ...], over: Callable[[], bool] = lambda: False
 ) -> tuple[Point, State]:
-    """Newton's method through the levels. `watch` sees every iterate and stops the search by returning True."""
-    iteration, regular = 0, 0.0
-    for number, level in enumerate(levels):
+    """Newton's method through the levels, until there is no more time: `over` says so after an iteration."""
+    regular = 0.0
+    for level in levels:
         mu, blocked, failures = level.barrier, list[tuple[float, float]](), 0
         for _ in range(level.iterations):
             near = _linearise(tr, task, point, level)
@@ -177,9 +161,7 @@ def minimise(
                 continue
             assert trial is not None
             point = _safe(tr, task, trial, mu)
-            iteration += 1
-            seen = Progress(iteration, number, new.f, theta_new, slope, alpha, regular)
-            if watch is not None and watch(seen, point, new):
+            if over():
                 return point, new
             if theta_new < 1e-3 and abs(slope) < level.decrement and alpha > 0.3:
                 break

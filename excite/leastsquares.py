@@ -55,7 +55,7 @@ class Solution:
         return half @ half.T
 
     def spread(self, S: np.ndarray) -> np.ndarray:
-        """(k, n_all) S (n_all, n_all) restricted to the kept columns, as a full matrix with NaN elsewhere."""
+        """S (k, k) of the kept columns among all (n, n), NaN elsewhere."""
         full = np.full((len(self.x), len(self.x)), np.nan)
         full[np.ix_(self.kept, self.kept)] = S
         return full
