@@ -20,6 +20,7 @@ ENCODINGS = ("utf-8-sig", "cp1252")  # the second reads any byte: what European 
 COMMENTS = ("#", "%")
 COMMA = re.compile(r"\s*[+-]?(?:\d*|\d{1,3}(?:\.\d{3})+),\d+(?:[eE][+-]?\d+)?\s*")  # perhaps with points: 1.238,5
 THOUSANDS = re.compile(r"\s*[+-]?\d{1,3}(?:\.\d{3}){2,}\s*")  # 1.238.500
+GROUPED = re.compile(r"\s*[+-]?\d{1,3}\.\d{3}\s*")  # 1.238
 POINT = re.compile(r"\s*[+-]?(?:\d+\.\d*|\.\d+)(?:[eE][+-]?\d+)?\s*")
 DATE = re.compile(r"\s*(\d{1,2}\.\d{1,2}\.\d{2,4})[ T]+(\d{1,2}:\d{2}:\d{2})([.,]\d+)?\s*")
 NAMELESS = re.compile(r"[+-]?[.,]?\d[\d\s.,:/+eETZ-]*|(?i:[+-]?(?:nan|inf))")  # numbers, dates
@@ -150,6 +151,11 @@ def _without_commas(column: pd.Series, comma: str, path: Path) -> pd.Series:
     """A column with decimal commas that was left as text, as some cells are not plain numbers: without points between
     thousands, with decimal points. comma: a cell that has one. Raises LogError for a point that may be either."""
     cells = column.tolist()
+    if not any("," in str(cell) for cell in cells):
+        pointed = [cell for cell in cells if isinstance(cell, str) and POINT.fullmatch(cell)]
+        own = pd.to_numeric(column, errors="coerce")
+        if not all(GROUPED.fullmatch(cell) for cell in pointed) and (own.isna() == column.isna()).all():
+            return own  # decimal points throughout: thousands don't look like that
     for k, cell in enumerate(cells):
         if isinstance(cell, str) and POINT.fullmatch(cell):
             raise LogError(

@@ -95,13 +95,23 @@ def test_thousands_are_no_decimals(rows: str, tmp_path: Path) -> None:
         _read(tmp_path, "t_s,u1_Nm\n" + rows)
 
 
-@pytest.mark.parametrize("cell", ["-1.005", "0.5", "1.", "1.5e3", '"-1.005"'])
-def test_a_point_among_decimal_commas_is_never_guessed(cell: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("cell", "below"),
+    [("-1.005", "-1.238"), ('"-1.005"', "-1.238"), ("0.5", "-1,238"), ("1.", "-1,238"), ("1.5e3", "-1,238")],
+)
+def test_a_point_among_decimal_commas_is_never_guessed(cell: str, below: str, tmp_path: Path) -> None:
     """-1.005 may be about -1 or about -1000."""
     with pytest.raises(
-        LogError, match=r"row 2, column u1_Nm: .* has a point, other cells a decimal comma \('-21,85'\)"
+        LogError, match=r"row 2, column u1_Nm: .* has a point, other cells a decimal comma \('-\d+,\d+'\)"
     ):
-        _read(tmp_path, f"t_s;u1_Nm;theta1_rad\n0;-999;1\n1;{cell};2\n2;-1.238;-21,85\n")
+        _read(tmp_path, f"t_s;u1_Nm;theta1_rad\n0;-999;1\n1;{cell};2\n2;{below};-21,85\n")
+
+
+def test_a_column_with_points_throughout_has_decimal_points(tmp_path: Path) -> None:
+    """A position, say, that another device writes: where one number is no group of thousands none is."""
+    table = _read(tmp_path, "t_s;u1_Nm;lat\n0,00;-21,85;48.137\n0,01;-22,5;48.1371\n")
+    assert table["lat"].tolist() == [48.137, 48.1371]
+    assert table["u1_Nm"].tolist() == [-21.85, -22.5]
 
 
 def test_points_between_thousands_are_read_where_nothing_else_is_meant(tmp_path: Path) -> None:
