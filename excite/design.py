@@ -13,6 +13,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -95,15 +96,19 @@ def design(
         # loky even for one start: only there can the number of threads of the linear algebra be set
         run = joblib.Parallel(n_jobs=processes(), return_as="generator_unordered")
         call = joblib.delayed(_carry)
-        for track in run(call(model, problem, aim, k, g, None, half, stop) for k, g in enumerate(guesses)):
-            if track is not None:
-                tracks[track.number] = track
+        with _broken_off(stop):
+            for track in run(call(model, problem, aim, k, g, None, half, stop) for k, g in enumerate(guesses)):
+                if track is not None:
+                    tracks[track.number] = track
         ranked = sorted(tracks.values(), key=lambda t: (t.number < starts, promise(t.latest), t.number))
         chosen = ranked[:kept]
-        for track in run(call(model, problem, aim, t.number, 0, t, deadline, stop) for t in chosen):
-            if track is not None:
-                tracks[track.number] = track
+        with _broken_off(stop):
+            for track in run(call(model, problem, aim, t.number, 0, t, deadline, stop) for t in chosen):
+                if track is not None:
+                    tracks[track.number] = track
         interrupted = stop.exists()
+    if not tracks:
+        raise KeyboardInterrupt
     best = min(tracks.values(), key=lambda t: (*rank(t.best), t.number))
     complete = len(tracks) == len(guesses) and all(tracks[t.number].complete for t in chosen)
     if not best.best.feasible:
@@ -124,6 +129,16 @@ def design(
         tuple(_score(aim, tracks[k].best) if k in tracks else float("inf") for k in range(len(guesses))),
         complete,
     )
+
+
+@contextmanager
+def _broken_off(stop: Path) -> Iterator[None]:
+    """Workers that Ctrl-C kills before they listen to it are no error."""
+    try:
+        yield
+    except BrokenProcessPool:
+        if not stop.exists():
+            raise
 
 
 def processes() -> int:

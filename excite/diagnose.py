@@ -19,6 +19,7 @@ import numpy as np
 import scipy.stats
 
 from excite import choosing
+from excite import gain as gains
 from excite.anomaly import anomalies
 from excite.choosing import Advance, Choice
 from excite.log import Log
@@ -248,25 +249,33 @@ def _one_from_another(chosen: Sequence[Choice], whole: Stage) -> list[Choice]:
 
 def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
     """Several effects without those that were needed on the way only: in the last fit their amount is hardly known to
-    be any, and without it the fit is as good. Disturbing forces hide what else a right name explains."""
+    be any, and without it the fit is as good, or foretells as much of what it hasn't seen: then it is shapes that
+    follow the noise. Disturbing forces hide what else a right name explains."""
     kept, whole = list(chosen), chosen[-1].stage
     for x in chosen:
         # Of one that is nothing at infinity the amount's deviation says little.
         doubtful = whole.exact and whole.placed(x.name).effect.inverse
         if len(kept) == 1 or (_surely(x.name, whole) and not doubtful):
             continue
-        beside = np.inf  # nothing fits without it
+        beside, idle = np.inf, False  # nothing fits without it
         with suppress(NotConverged):
             without = _without(x.name, whole)
             if without.fit.disturbed <= whole.fit.disturbed:
                 beside = without.fit.cost - whole.fit.cost
-        if beside < choosing.threshold(x.name, whole, x.tried):
+                idle = not whole.placed(x.name).effect.inverse and not _foretells(without, whole)
+        if idle or beside < choosing.threshold(x.name, whole, x.tried):
             kept, whole = [y for y in kept if y.name != x.name], without
         else:
             kept = [replace(y, beside=beside) if y.name == x.name else y for y in kept]
     if len(kept) == len(chosen):
         return kept
     return _one_by_one(before, kept, whole) or [replace(x, stage=whole, loose=None) for x in kept]
+
+
+def _foretells(without: Stage, whole: Stage) -> bool:
+    """Whether a stage errs less than one without an effect on stretches that were hidden from both, if any can be."""
+    old, new = gains.withheld(without), gains.withheld(whole)
+    return old is None or new is None or gains.gain(old, new).percent > 0
 
 
 def _surely(name: str, stage: Stage) -> bool:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
+import joblib
 import numpy as np
 import pytest
+from joblib.externals.loky.process_executor import TerminatedWorkerError
 from matplotlib.path import Path as MplPath
 
 from excite import collocation, interior, objective
@@ -413,3 +417,22 @@ def test_a_drive_to_start_from_is_not_made_worse(straight: Model, quick: Design)
     assert again.max_violation <= TOLERANCE
     with pytest.raises(ValueError, match="at least 1"):
         design(straight, problem, starts=0)
+
+
+def test_workers_that_an_interruption_kills_are_no_error(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They die of it until they listen to it themselves; dying of anything else is one."""
+    pressed = True
+
+    def dying(calls: Iterable[Any]) -> Iterator[Any]:
+        if pressed:
+            signal.raise_signal(signal.SIGINT)
+        raise TerminatedWorkerError
+        yield calls
+
+    monkeypatch.setattr(joblib, "Parallel", lambda **_: dying)
+    problem = straight.machine.problems["S40"]
+    with pytest.raises(KeyboardInterrupt):
+        design(straight, problem)
+    pressed = False
+    with pytest.raises(TerminatedWorkerError):
+        design(straight, problem)

@@ -683,6 +683,30 @@ def test_an_amount_that_nothing_shows_is_not_sure(straight: Model) -> None:
     assert [x.name for x in diagnose.needed(clean, chosen)] == names[1:]
 
 
+@pytest.mark.parametrize("percent", [-0.5, 0.5])
+def test_what_foretells_nothing_is_no_name(percent: float, straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An effect whose amount is hardly known must pay on stretches hidden from the fit, however good that is."""
+    one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
+    clean = stages.fitted(straight.machine, [one], straight.machine.filter)
+    told = ("ground_slope=0.001", "rolling_resistance@rear_roll=9")
+    entries = [placing.parse(text, straight.machine, 12.0) for text in told]
+    both = stages.refitted(placing.extended(straight.machine, *entries), clean, 0.0)
+    names = [e.name for e in both.model.effects]
+    chosen = [choosing.Choice(n, both, 1000.0, 1.0, 100, (), 1.0) for n in names]
+    monkeypatch.setattr(choosing, "threshold", lambda *_: -np.inf)
+    seen: list[int] = []
+
+    def measured(before: gain.Withheld, after: gain.Withheld) -> SimpleNamespace:
+        seen.append(len(before.squares))
+        assert before.squares.shape == after.squares.shape
+        return SimpleNamespace(percent=percent)
+
+    monkeypatch.setattr(diagnose.gains, "gain", measured)
+    left = [x.name for x in diagnose.needed(clean, chosen)]
+    assert left == (names if percent > 0 else names[1:])
+    assert min(seen) > 0
+
+
 @pytest.mark.parametrize(("share", "seed"), [(0.03, 3), (0.03, 4), (0.2, 3), (0.4, 3), (3.0, 3), (30.0, 4)])
 def test_a_file_that_is_far_off_is_no_cause(straight: Model, share: float, seed: int) -> None:
     """A clean log, the file's contacts at so large a share of the true ones."""
