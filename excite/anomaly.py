@@ -26,6 +26,7 @@ STUCK = 3.0  # counts that an encoder should have made while it stood still
 SHAKING = 10.0  # [Hz]: above that a torque that is driven has little
 FEW = 50  # samples by which shaking is told
 SURE = 3.0  # deviations
+SCATTER = 3.0  # of the logarithm of a median square of third differences, over the root of their number
 TAIL = 1.6  # by which outliers of encoders may exceed those of normal noise: an edge's error is not normal
 
 
@@ -114,7 +115,10 @@ def _in_windows(
     level = np.median(squares[enough] / counts[enough])
     loud = np.where(enough, (squares / np.maximum(counts, 1) / max(level, 1.0) - 1) * np.sqrt(counts / heavy), 0.0)
     k = int(np.argmax(loud))
-    if loud[k] > limit * 1.3 and squares[k] > LOUDER * counts[k]:
+    # A sum of squares is no normal variable: of narrow windows more are large.
+    free = 2 * max(float(counts[k]), 1.0) / heavy
+    skewed = (float(scipy.stats.chi2.isf(ALARM / n, free)) / free - 1) * np.sqrt(free / 2)
+    if loud[k] > max(limit * 1.3, skewed) and squares[k] > LOUDER * counts[k]:
         yield Anomaly(name, "burst", t[k * width], t[(k + 1) * width - 1], None, loud[k] / limit)
     slow = np.where(enough, np.abs(sums) / np.sqrt(np.maximum(counts, 1)), 0.0)
     k = int(np.argmax(slow))
@@ -156,8 +160,9 @@ def _in_torque(name: str, t: np.ndarray, u: np.ndarray, rate: float) -> Iterator
     if n < 3:
         return
     level = np.median(rough[: n * width].reshape(n, width) ** 2, axis=1) / 0.4549
-    # The third difference of white noise is coloured: its median square over a window scatters as of a fifth as many.
-    limit = 1 + float(scipy.stats.norm.isf(ALARM / n)) * np.sqrt(2.7 * 5 / width)
+    # The third difference of white noise is coloured. The logarithm of its median square over a window is about normal,
+    # and scatters by SCATTER / sqrt(width): found by simulation.
+    limit = float(np.exp(scipy.stats.norm.isf(ALARM / n) * SCATTER / np.sqrt(width)))
     k = int(np.argmax(level))
     if level[k] > limit and level[k] > LOUDER:
         yield Anomaly(name, "burst", t[k * width], t[(k + 1) * width - 1], None, level[k] / limit)
