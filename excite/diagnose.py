@@ -32,8 +32,8 @@ from model.prediction import Model, signs
 
 MOST = 4  # effects that are looked for; so many kinds, none of which explains SHARE, patch up what has no name
 FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
-# Of an amount: what another formula of the same effect makes of it. ALIKE is what it does in the middle; 95 % of the
-# amounts in results/diagnosis are within intervals that allow for so much.
+# Of an amount: what another formula of the same effect makes of it. ALIKE is what it does in the middle; nine in ten of
+# the amounts in results/diagnosis are within intervals that allow for so much.
 OTHERWISE = 0.05
 FURTHER = 0.8  # SHARE for names after the first: what nature has beside its formula looks like many a cause
 SURELY, WRONG = 3.0, 0.5  # deviations, and a share of its usual size, by which a parameter's sign is wrong
