@@ -34,7 +34,7 @@ CRAWL = 0.05  # m/s2: a machine that can't be accelerated so much hardly moves
 LOADS = (0.3, 50.0)  # stiffness of a contact over the load on it
 WHEELS = (0.02, 2.0)  # radius of a measuring wheel [m]
 ASIDE = 10.0  # m: a measuring wheel runs nearer than that
-ROLLS, WIDEST = 5.0, 20.0  # radius and width of a contact [m]
+LARGEST, WIDEST = 5.0, 20.0  # radius and width of a contact [m]
 STEERING = 3.5  # rad/s: a joint that turns a chassis by 200 degrees in a second is none
 FASTEST = 10e3  # Hz: beyond it no random drive is tried, which would take minutes
 TRIED, HARDLY = (0, 1), 50.0  # random drives; what is uncertain by so much [%] after the best of them
@@ -258,7 +258,7 @@ def _sizes(model: Model) -> Iterator[str]:
             yield f"sensor {s.name}: lateral: {float(s.lateral):g} m, usual are {ASIDE:g} at most: in mm?"
     for b in model.machine.contacts:
         assert b.contact is not None
-        for key, most in (("radius", ROLLS), ("width", WIDEST)):
+        for key, most in (("radius", LARGEST), ("width", WIDEST)):
             size = float(getattr(b.contact, key))
             if size > most:
                 yield f"{b.name}: contact.{key}: {size:g} m, usual are {most:g} at most: in mm?"

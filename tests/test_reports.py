@@ -65,6 +65,7 @@ def test_verify_answers_with_error_against_the_truth() -> None:
 
     def row(bias: float, spread: float, cover: float) -> dict[str, Any]:
         percent = {"bias_percent": bias, "std_percent": spread, "predicted_std_percent": 1.0}
+        percent["rms_percent"] = float(np.hypot(bias, spread))
         return {"unit": "kg", "true": 10.0, "mean": 10.1, "coverage95": cover, **percent}
 
     rows = {"a": row(3, 4, 0.8), "b": row(0, 1, 1.0), "c": row(0.0, 2.0, 0.9)}
