@@ -296,6 +296,14 @@ def _identify(s: Summary) -> Said:
         f"From {logs}, {count} are found to {percent(median)} (median, one standard deviation; worst {worst},"
         f" {percent(known[worst])}); the prediction leaves {percent(rest)} of what was measured."
     )
+    off = {n: abs(r["bias"] / (r["value"] - r["bias"])) for n, r in rows.items() if n in known and _is_biased(r)}
+    if off:
+        most = max(off, key=lambda n: off[n])
+        answer = (
+            f"From {logs}, {s['method']} finds {count}, {len(off)} of them wrong by more than it says: on simulated logs"
+            f" like this by up to {percent(100 * off[most])} ({most}); the prediction leaves {percent(rest)} of what was"
+            " measured."
+        )
     remarks = [f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()] + list(s["notes"])
     for check in s["validation"]:
         errors = ", ".join(f"{n} {v:.1f} %" for n, v in check["torque_error_percent"].items())
@@ -321,6 +329,12 @@ def _identify(s: Summary) -> Said:
     conds = f"cond(W) {s['cond_w']:.4g}, cond(Phi) {s['cond_phi']:.4g}"
     caption = f"Parameters with one standard deviation and 95 % interval, method {s['method']}; {conds}."
     return f"Parameters of {s['machine']}", answer, remarks, [Table(caption, names, table)]
+
+
+def _is_biased(row: Mapping[str, Any]) -> bool:
+    """Whether the method's bias of a parameter is known to be more than its deviation."""
+    bias, std = row.get("bias"), row.get("bias_std")
+    return bias is not None and std is not None and abs(bias) > max(row["std"], 3 * std)
 
 
 def _log(s: Summary) -> Said:

@@ -127,6 +127,23 @@ def test_identify_reports_what_was_found(
     assert code == 0  # a folder with a report in it is ours and may be replaced
 
 
+def test_what_a_method_errs_by_comes_first(excite: Excite, tmp_path: Path) -> None:
+    """Least squares on the drive of lowest condition number: small deviations, a mass of a fifteenth."""
+    profile = Path(__file__).parents[1] / "results" / "S40" / "design" / "profile.csv"
+    excite("simulate", "va12_straight", profile, "--seed", 3, "--out", tmp_path / "log.csv")
+    for method, words in (
+        ("ols", "of them wrong by more than it says: on simulated logs like"),
+        ("joint", "are found to"),
+    ):
+        out = tmp_path / method
+        code, _, _ = excite("identify", "va12_straight", tmp_path / "log.csv", "--method", method, "--out", out)
+        assert code == 0
+        assert words in " ".join((out / "report.html").read_text().split())
+    summary = json.loads((tmp_path / "ols" / "summary.json").read_text())
+    assert summary["parameters"]["M"]["bias"] == pytest.approx(-10_300, rel=0.05)
+    assert any("far from the machine file's values" in note for note in summary["notes"])
+
+
 def _figures(model: Model, motion: Motion) -> list[Figure]:
     problem = model.machine.problems[str(model.machine.problem)]
     sigma = dict(zip(model.base.names, np.linspace(0.1, 5, len(model.base.names)), strict=True))
