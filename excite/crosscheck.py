@@ -70,7 +70,9 @@ def far(model: Model, estimate: Estimate) -> tuple[str, ...]:
     of most of them a machine file is not so wrong."""
     file = model.nominal
     free = np.abs(model.offsets).sum(axis=0) > 0
-    told = np.isfinite(estimate.value) & ~free & (file != 0)
+    effects = {name for e in model.effects for name in e.parameters}
+    own = np.array([name not in effects for name in model.base.names])
+    told = np.isfinite(estimate.value) & own & ~free & (file != 0)
     sure = np.abs(estimate.value - file) > SURELY * estimate.std
     ratio = np.divide(estimate.value, file, out=np.ones_like(file), where=told)
     found = [k for k in np.flatnonzero(told & sure) if not 1 / FAR < ratio[k] < FAR]

@@ -132,15 +132,21 @@ def find_dropouts(sensor: Sensor, x: np.ndarray) -> tuple[tuple[int, int], ...]:
     after doesn't count, or jumps after it, or stands from one row to the next until the log ends."""
     long = _held(x)
     if sensor.resolution is None:
-        rest = len(x) - 1 - sum(b - a for a, b in long)
-        moving = np.count_nonzero(np.diff(x)) > max(0.9 * rest, HELD)  # a channel without noise may well stand still
-        return tuple(long) if moving else ()
+        changes = np.diff(x) != 0.0
+        if np.count_nonzero(changes) > 0.9 * len(changes):  # a channel without noise may well stand still
+            return tuple(long)
+        # One with noise may be dead by the end; zero is what many say at rest.
+        return tuple(
+            (a, b)
+            for a, b in long
+            if b == len(x) - 1 and b - a > DEAD and x[b] and changes[:a][-DEAD:].sum() > 0.9 * DEAD
+        )
     found, fastest = [], float(np.quantile(np.abs(np.diff(x)), 0.999)) if long else 0.0
     for a, b in long:
         if b == len(x) - 1 and b - a > DEAD and a > 0:
             # What rolls comes to rest by degrees.
             speeds = np.diff(x[: a + 1])
-            usual = float(np.quantile(np.abs(np.diff(speeds)), 0.999)) if len(speeds) > DEAD else np.inf
+            usual = float(np.abs(np.diff(speeds)).max()) if len(speeds) > DEAD else np.inf
             if abs(speeds[-1]) > JUMP * (usual + sensor.resolution):
                 found.append((a, b))
         before, after = x[max(a - HELD, 0) : a + 1], x[b : b + HELD + 1]

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from excite import tables
-from excite.tables import MDF_TIME
+from excite.tables import MDF_TIME, UNCLEAR
 from excite.tables import LogError as LogError
 from model import hydraulics
 from model import machine as machines
@@ -125,6 +125,8 @@ def _joint_angle(sensor: Sensor, machine: Machine, table: pd.DataFrame, source: 
 
 def numbers(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
     raw = table[column]
+    if unclear := table.attrs.get(UNCLEAR, {}).get(column):
+        raise LogError(f"{source}: {unclear}")
     if raw.dtype.kind == "c":
         raise LogError(f"{source}: column {column}: complex numbers, a measurement is real")
     values = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float)

@@ -264,7 +264,7 @@ def _strays(table: pd.DataFrame) -> dict[int, str]:
     found = {}
     for k, cell in enumerate(table.iloc[:, 0].tolist() if names else ()):
         text = cell.strip() if isinstance(cell, str) else ""
-        if text.startswith(COMMENTS):
+        if text.startswith(COMMENTS) and table.iloc[k, 1:].isna().all():
             found[k] = f"row {k + 1}: is a comment ({text[:30]!r}), not data; cut it"
         elif text and text == names[0] and [str(c).strip() for c in table.iloc[k]] == names:
             found[k] = f"row {k + 1}: is the header once more, not data; cut it"

@@ -300,9 +300,9 @@ def _identify(s: Summary) -> Said:
     if off:
         most = max(off, key=lambda n: off[n])
         answer = (
-            f"From {logs}, {s['method']} finds {count}, {len(off)} of them wrong by more than it says: on simulated logs"
-            f" like this by up to {percent(100 * off[most])} ({most}); the prediction leaves {percent(rest)} of what was"
-            " measured."
+            f"From {logs}, {s['method']} finds {count}, {len(off)} of them wrong by more than it says: on simulated"
+            f" logs like this by up to {percent(100 * off[most])} ({most}); the prediction leaves {percent(rest)} of"
+            " what was measured."
         )
     remarks = [f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()] + list(s["notes"])
     for check in s["validation"]:

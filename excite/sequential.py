@@ -72,4 +72,4 @@ def _possible(model: Model, X: np.ndarray) -> bool:
         return False
     of = signs(model.machine)
     sign = np.array([of.get(model.base.standard[k], 0.0) for k in model.base.independent])
-    return bool((X * sign >= 0).all())
+    return bool((X * sign >= 0)[model.nominal != 0].all())  # of none an estimate may be a little less

@@ -20,12 +20,14 @@ ENCODINGS = ("utf-8-sig", "cp1252")  # the second reads any byte: what European 
 COMMENTS = ("#", "%")
 COMMA = re.compile(r"\s*[+-]?(?:\d*|\d{1,3}(?:\.\d{3})+),\d+(?:[eE][+-]?\d+)?\s*")  # perhaps with points: 1.238,5
 THOUSANDS = re.compile(r"\s*[+-]?\d{1,3}(?:\.\d{3}){2,}\s*")  # 1.238.500
-GROUPED = re.compile(r"\s*[+-]?\d{1,3}\.\d{3}\s*")  # 1.238
+GROUPED = re.compile(r"\s*[+-]?[1-9]\d{0,2}\.\d{3}\s*")  # 1.238
 POINT = re.compile(r"\s*[+-]?(?:\d+\.\d*|\.\d+)(?:[eE][+-]?\d+)?\s*")
 DATE = re.compile(r"\s*(\d{1,2}\.\d{1,2}\.\d{2,4})[ T]+(\d{1,2}:\d{2}:\d{2})([.,]\d+)?\s*")
 NAMELESS = re.compile(r"[+-]?[.,]?\d[\d\s.,:/+eETZ-]*|(?i:[+-]?(?:nan|inf))")  # numbers, dates
+ENOUGH = 200_000  # characters by which it is judged whether commas or points are decimal
 LONGEST = 500  # characters of a column's name: a line that has more is no header
 MDF_TIME = "timestamps"
+UNCLEAR = "unclear"  # of a table's attrs: what is said of columns whose numbers may be read in two ways
 
 
 class LogError(ValueError):
@@ -87,11 +89,12 @@ def _csv(path: Path) -> pd.DataFrame:
     table.columns = table.columns.astype(str).str.strip()
     if header and header[-1] == "" and table.iloc[:, -1].isna().all():  # a separator at the end of every line
         table = table.iloc[:, :-1].copy()
+    unclear: dict[str, str] = {}
     for name in [n for n in table.columns if table[n].dtype.kind not in "biuf"]:
         if comma:
-            table[name] = _without_commas(table[name], comma, path)
+            table[name], unclear[name] = _without_commas(table[name], comma)
         table[name] = _dates(table[name])
-    table.attrs["units"] = units
+    table.attrs |= {"units": units, UNCLEAR: unclear}
     return table
 
 
@@ -139,34 +142,39 @@ def _too_wide(path: Path, lines: list[str], start: int, names: int, separator: s
 
 
 def _decimal_comma(body: str, separator: str) -> str:
-    """The first cell with a decimal comma, "" where there is none."""
+    """The first cell with a decimal comma, "" where there is none, or more cells behind it have a point."""
     if separator == "," or "," not in body:
         return ""
     inside = rf'[^{re.escape(separator)}\n"]'
-    found = re.search(f"(?<!{inside}){COMMA.pattern}(?!{inside})", body)
-    return found.group().strip() if found else ""
+    comma, point = (re.compile(f"(?<!{inside})(?:{p.pattern})(?!{inside})") for p in (COMMA, POINT))
+    found = comma.search(body)
+    if found is None:
+        return ""
+    part = body[found.start() : found.start() + ENOUGH]
+    return found.group().strip() if len(comma.findall(part)) >= len(point.findall(part)) else ""
 
 
-def _without_commas(column: pd.Series, comma: str, path: Path) -> pd.Series:
+def _without_commas(column: pd.Series, comma: str) -> tuple[pd.Series, str]:
     """A column with decimal commas that was left as text, as some cells are not plain numbers: without points between
-    thousands, with decimal points. comma: a cell that has one. Raises LogError for a point that may be either."""
+    thousands, with decimal points. comma: a cell that has one. Behind it what is said of a point that may be either, ""
+    where there is none."""
     cells = column.tolist()
     if not any("," in str(cell) for cell in cells):
         pointed = [cell for cell in cells if isinstance(cell, str) and POINT.fullmatch(cell)]
         own = pd.to_numeric(column, errors="coerce")
         if not all(GROUPED.fullmatch(cell) for cell in pointed) and (own.isna() == column.isna()).all():
-            return own  # decimal points throughout: thousands don't look like that
+            return own, ""  # decimal points throughout: thousands don't look like that
     for k, cell in enumerate(cells):
         if isinstance(cell, str) and POINT.fullmatch(cell):
-            raise LogError(
-                f"{path}: row {k + 1}, column {column.name}: {cell.strip()[:30]!r} has a point, other cells a decimal"
-                f" comma ({comma[:30]!r}); write all numbers alike, without marks between thousands"
+            return column, (
+                f"row {k + 1}, column {column.name}: {cell.strip()[:30]!r} has a point, other cells a decimal comma"
+                f" ({comma[:30]!r}); write all numbers alike, without marks between thousands"
             )
         if isinstance(cell, str) and (COMMA.fullmatch(cell) or THOUSANDS.fullmatch(cell)):
             cells[k] = cell.replace(".", "").replace(",", ".")
     plain = pd.Series(cells, column.index, object, column.name)
     number = pd.to_numeric(plain, errors="coerce")
-    return number if (number.isna() == plain.isna()).all() else plain
+    return (number if (number.isna() == plain.isna()).all() else plain), ""
 
 
 def _dates(column: pd.Series) -> pd.Series:

@@ -241,7 +241,7 @@ class Sensor(Record):
     kits: tuple[Literal["paper", "full"], ...] = ("paper", "full")
     place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
     counts_per_turn: Positive | None = None
-    noise: Positive | None = None
+    noise: NotNegative | None = None
     lateral: Quantity | None = None
     radius: Positive | None = None
 
@@ -297,6 +297,8 @@ class Sensor(Record):
             raise ValueError(f"{'radius' if self.radius else 'lateral'}: is for kind wheel only")
         if self.factor is not None and self.factor.value == 0:
             raise ValueError("factor: must not be 0")
+        if self.noise is not None and self.noise.value == 0 and self.counts_per_turn is None:
+            raise ValueError("noise: must be > 0 (got 0); leave it out where nobody knows it")
         if "full" not in self.kits:
             raise ValueError(f'kits: "full" has every sensor, add it (got {", ".join(self.kits) or "none"})')
         return self

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import casadi as ca
 
+from model import sizes
 from model.effect import DURATION, Effect, Placed, Site
 from model.effects import CATALOGUE
 from model.file import Quantity
@@ -81,8 +82,8 @@ def parse(text: str, machine: Machine, duration: float) -> EffectEntry:
         raise MachineError(f"effect {text}: must be NAME[@WHERE]=AMOUNT")
     entry = EffectEntry.model_construct(name=name, where=where or None, amount=value, std=None, shape={})
     found = placed(machine, entry, duration)
-    if found.effect.resisting and not float(value) > 0:
-        raise MachineError(f"effect {text}: must be > 0, what resists doesn't push")
+    if found.effect.resisting and float(value) < 0:
+        raise MachineError(f"effect {text}: must not be negative, what resists doesn't push")
     shapes = {s: Quantity(value=found.values[s], source="assumed") for s in found.shapes}
     return EffectEntry(name=name, where=found.where, amount=value, shape=shapes)
 
@@ -125,13 +126,17 @@ def placed(machine: Machine, entry: EffectEntry, duration: float = DURATION) -> 
     for name, shape in effect.shapes.items():
         given = entry.shape.get(name)
         values[name] = float(given) if given is not None else shape.default * shape.size(site)
-        stated = given is not None and given.source != "identified"  # what a fit finds is above zero by itself
-        possible = values[name] > 0 or (values[name] == 0 and 0 in shape.grid)
-        if stated and not (shape.signed or shape.only or possible):
-            raise MachineError(f"{machine.name}: effect {entry.name}: shape {name} must be > 0 (got {values[name]:g})")
         if shape.only and values[name] not in shape.only:
             options = ", ".join(f"{x:g}" for x in shape.only)
             raise MachineError(
                 f"{machine.name}: effect {entry.name}: shape {name} must be one of {options} (got {values[name]:g})"
             )
-    return Placed(effect, where, bodies, sensor, values)
+    made = Placed(effect, where, bodies, sensor, values)
+    for name, shape in made.shapes.items():
+        stated = (
+            name in entry.shape and entry.shape[name].source != "identified"
+        )  # a fit's are above zero by themselves
+        least = 0 in shape.grid or shape.size is sizes.duration  # an instant may be the log's beginning
+        if stated and not (shape.signed or shape.only) and (values[name] < 0 or (values[name] == 0 and not least)):
+            raise MachineError(f"{machine.name}: effect {entry.name}: shape {name} must be > 0 (got {values[name]:g})")
+    return made

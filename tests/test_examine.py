@@ -120,6 +120,16 @@ def test_a_channel_that_dies_is_told_from_then_on(
     assert examine.examine(straight, Log("rests", np.arange(len(x) + 800) / 100, rests)).dropouts == {}
 
 
+def test_what_stands_exactly_still_is_no_dropout(straight: Model, clean: Log) -> None:
+    """A torque that is zero at rest, one that is commanded in steps, an axis that stops from one row to the next."""
+    zero, steps = clean.values["u1"].copy(), np.repeat(np.arange(10.0) * 100 - 333, 401)[: len(clean)]
+    zero[:1000] = zero[-1000:] = 0.0
+    step = next(s.resolution for s in straight.machine.sensors("full") if s.name == "theta1")
+    ramp = step * np.round(np.clip(np.arange(len(clean)) - 1500, 0, 200) * 9.3)
+    for name, x in (("u1", zero), ("u1", steps), ("theta1", ramp)):
+        assert examine.find_dropouts(next(s for s in straight.machine.sensor if s.name == name), x) == (), name
+
+
 def test_late_channels_are_found_to_a_millisecond(straight: Model, clean: Log) -> None:
     """No alarm on a clean log; 30 ms on one channel is 30 ms on that one, and none on the other."""
     assert examine.late_channels(straight, clean) == ()

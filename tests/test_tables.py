@@ -102,9 +102,19 @@ def test_thousands_are_no_decimals(rows: str, tmp_path: Path) -> None:
 def test_a_point_among_decimal_commas_is_never_guessed(cell: str, below: str, tmp_path: Path) -> None:
     """-1.005 may be about -1 or about -1000."""
     with pytest.raises(
-        LogError, match=r"row 2, column u1_Nm: .* has a point, other cells a decimal comma \('-\d+,\d+'\)"
+        LogError, match=r"row 2, column u1_Nm: .* has a point, other cells a decimal comma \('-?\d+,\d+'\)"
     ):
-        _read(tmp_path, f"t_s;u1_Nm;theta1_rad\n0;-999;1\n1;{cell};2\n2;{below};-21,85\n")
+        log.numbers(_read(tmp_path, f"t_s;u1_Nm;theta1_rad\n0;-999;1,5\n1;{cell};2,5\n2;{below};-21,85\n"), "u1_Nm", "")
+
+
+def test_a_point_in_a_column_that_nobody_uses_is_no_harm(tmp_path: Path) -> None:
+    """A version, a label; nor is a comma in a file with points, nor a point behind a zero."""
+    table = _read(tmp_path, "t_s;u1_Nm;version\n0,00;-999;1.234\n0,01;-21,85;1.234\n")
+    assert log.numbers(table, "u1_Nm", "").tolist() == [-999, -21.85]
+    table = _read(tmp_path, "t_s;u1_Nm;note\n0.00;-999.5;3,5\n0.01;-21.85;stop\n")
+    assert log.numbers(table, "u1_Nm", "").tolist() == [-999.5, -21.85]
+    table = _read(tmp_path, "t_s;u1_Nm;u4_Nm\n0.010;-999,5;1,5\n0.020;-21,85;1,5\n")
+    assert log.numbers(table, "t_s", "").tolist() == [0.01, 0.02]
 
 
 def test_a_column_with_points_throughout_has_decimal_points(tmp_path: Path) -> None:
