@@ -27,6 +27,7 @@ from model import tree
 from model.file import Quantity
 from model.machine import Machine, MachineError, Problem
 from model.prediction import Model, build, standard_parameters
+from model.sizes import GRAVITY
 
 PICTURE = "machine.png"
 LINEAR = 0.15  # slip up to which the linear law holds, where a contact gives no limit
@@ -180,7 +181,7 @@ def _traction(model: Model) -> Iterator[str]:
         assert b.contact is not None
         slip = float(b.contact.slip_limit) if b.contact.slip_limit is not None else LINEAR
         push += abs(float(b.contact.Kx)) * slip * b.actuated
-        load = mass * 9.81 / len(machine.contacts)
+        load = mass * GRAVITY / len(machine.contacts)
         for key in ("Kx", "Ky"):
             stiff = abs(float(getattr(b.contact, key)))
             if not LOADS[0] * load < stiff < LOADS[1] * load:
