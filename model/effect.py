@@ -19,7 +19,8 @@ Form = tuple[str, float]  # a shape that an effect's way of acting is chosen by,
 @dataclass(frozen=True)
 class Rolling:
     """How a contact, a roll or a wheel, moves: its centre's velocity along and across its chassis [m/s], spin and yaw
-    rate [rad/s]; x, y: where its centre is when the machine stands straight, along and across the root [m]."""
+    rate [rad/s]; x, y: where its centre is when the machine stands straight, along and across the root [m]; further: by
+    how much the ground is further from its axle than its radius [m]."""
 
     contact: Contact
     Vx: ca.SX
@@ -28,10 +29,16 @@ class Rolling:
     yaw: ca.SX
     x: float = 0.0
     y: float = 0.0
+    further: ca.SX | float = 0.0
+
+    @property
+    def rim(self) -> ca.SX:
+        """Speed of the rim at the ground [m/s]."""
+        return (float(self.contact.radius) + self.further) * self.spin
 
     @property
     def slip(self) -> law.Slip:
-        return law.slip(self.contact, self.Vx, self.Vy, self.spin)
+        return law.slip(self.contact, self.Vx, self.Vy, self.rim / float(self.contact.radius))
 
 
 @dataclass(frozen=True)
@@ -112,7 +119,8 @@ class Shape:
     """What an effect's amount leaves open: default and grid in units of `size`, which belongs to the site.
 
     `circular`: a phase, found by its sine and cosine; `whole`: not refined; `only`: the values that there are, if these
-    are few; `meaning`: what a name leaves open; `form`: the shape and its value with which alone it means anything.
+    are few; `meaning`: what a name leaves open; `form`: the shape and its value with which alone it means anything;
+    `within`: what it can be, in units of `size`: where a fit finds less or more, something else acts.
     What is zero by default may have either sign.
     """
 
@@ -125,6 +133,7 @@ class Shape:
     only: tuple[float, ...] = ()
     meaning: str = ""
     form: Form | None = None
+    within: tuple[float, float] | None = None
 
     @property
     def signed(self) -> bool:
@@ -157,7 +166,8 @@ class Effect:
     share of a changing `inertia`, of MX and ZZ, comes of a load that slides along x on its body and pushes it back.
     `shaking`: while it acts, 0 to 1 over time [s], the torque sensor shakes as well; where it doesn't, something else
     acts.
-    Hooks take the scene, the body they act on, and the values.
+    Hooks take the scene, the body they act on, and the values; `further` [m] changes the contacts of the scene that all
+    effects see.
     """
 
     name: str
@@ -174,6 +184,7 @@ class Effect:
     resisting: bool = False
     inverse: bool = False
     torque: Callable[[Scene, int, Values], ca.SX] | None = None
+    further: Callable[[Scene, int, Values], ca.SX] | None = None
     soil: Callable[[Scene, int, Values, Soil], Soil] | None = None
     push: Callable[[Scene, int, Values], tuple[ca.SX, ca.SX]] | None = None
     gravity: Callable[[Scene, Values], tuple[ca.SX, ca.SX]] | None = None
@@ -189,7 +200,8 @@ class Effect:
     @property
     def sensed(self) -> bool:
         """Whether it sits in a sensor only, so that no equation of motion shows it."""
-        return not (self.torque or self.soil or self.push or self.gravity or self.inertia or self.channel)
+        felt = self.torque or self.further or self.soil or self.push or self.gravity or self.inertia or self.channel
+        return not felt
 
 
 @dataclass(frozen=True)

@@ -9,18 +9,13 @@ decay speed, a phase), the shape has a default for simulation and a grid on whic
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
 from math import pi
 
 import casadi as ca
 
-from model import contact as law
-from model import friction, lane, sizes
-from model.effect import Channel, Effect, Memory, Rolling, Scene, Shape, Site, Soil, Values
+from model import friction, lane, sizes, soil
+from model.effect import Channel, Effect, Memory, Scene, Shape, Site, Values
 
-SMOOTH_SLIP = 0.005  # slip over which driving turns into braking
-SMOOTH_SPEED = 0.02  # [m/s] over which rolling resistance turns
 SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
 EDGE = 0.2  # [s] over which what acts between two instants begins and ends
 
@@ -68,51 +63,10 @@ def _behind(s: Scene, k: int, p: Values) -> ca.SX:
     return (s.u[k] - s.z[f"late{k}"]) / p["lag"]
 
 
-def _relaxed(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
-    """The forces' slips lag the geometric ones over the distance A, the moment's by a share of it."""
-    slip = law.Slip(s.z["gx"], s.z["gy"], soil.slip.vn)
-    return replace(soil, slip=slip, yaw=(1 - p["moment"]) * soil.yaw + p["moment"] * s.z["turn"] * soil.slip.vn)
-
-
-def _relaxation(slip: Callable[[Rolling], ca.SX], name: str) -> Memory:
-    def rate(s: Scene, k: int, p: Values) -> ca.SX:
-        r = s.rolling[k]
-        return (slip(r) - s.z[name]) * r.slip.vn / p["A"]
-
-    return Memory(rate, 0.05)
-
-
 def _slid(s: Scene, p: Values) -> dict[str, ca.SX]:
     """What a load on the last chassis changes of its inertia when it slides, is put on or taken off within so long."""
     there = p["A"] * (1 + ca.tanh((s.time - p["instant"]) / ca.sqrt(p["takes"] ** 2 + 0.05**2))) / 2
     return {"M": p["mass"] * there, "MX": there, "ZZ": p["arm"] * there}
-
-
-def _braking(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
-    r = s.rolling[k]
-    rim = float(r.contact.radius) * r.spin
-    excess = (ca.sqrt(r.Vx**2 + 1e-6) - ca.sqrt(rim**2 + 1e-6)) / soil.slip.vn
-    return replace(soil, Kx=soil.Kx * (1 + p["A"] * (1 + ca.tanh(excess / SMOOTH_SLIP)) / 2))
-
-
-def _scaled(soil: Soil, factor: ca.SX) -> Soil:
-    return replace(soil, Kx=soil.Kx * factor, Ky=soil.Ky * factor)
-
-
-def _of_three(form: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Weights of three forms 0, 1, 2 that a shape chooses from: one for that form, none for the others."""
-    return (1 - form) * (2 - form) / 2, form * (2 - form), form * (form - 1) / 2
-
-
-def _compacted(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
-    driven, reversed_, passed = _of_three(p["counted"])
-    way = driven * s.z["distance"] + lane.PASS * (reversed_ * s.z["reversals"] + passed * lane.passes(s, k))
-    return _scaled(soil, 1 + p["A"] * (1 - ca.exp(-way / p["pass"])))
-
-
-def _saturated(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
-    strips, _, untouched = _of_three(p["across"])
-    return replace(soil, saturation=law.Saturation(p["A"], p["bend"], strips, untouched))
 
 
 def _between(t: ca.SX, begin: ca.SX, end: ca.SX) -> ca.SX:
@@ -121,11 +75,6 @@ def _between(t: ca.SX, begin: ca.SX, end: ca.SX) -> ca.SX:
 
 def _window(t: ca.SX, p: Values) -> ca.SX:
     return _between(t, p["begin"], p["begin"] + p["length"])
-
-
-def _resistance(s: Scene, k: int, p: Values) -> tuple[ca.SX, ca.SX]:
-    r = s.rolling[k]
-    return -p["A"] * (1 + p["rise"] * r.Vx**2) * ca.tanh(r.Vx / p["soft"]), ca.SX(0)
 
 
 def _played(s: Scene, k: int, p: Values) -> ca.SX:
@@ -399,6 +348,23 @@ _declare(
         torque=lambda s, k, p: p["A"] * ca.sin(s.q[k] + p["phase"]),
     ),
     Effect(
+        "roll_out_of_round",
+        ("contacts",),
+        "m",
+        "the ground is A sin(theta + phase) further from the axle than the radius; a load goes up and down with it",
+        "slip and torque errors once per turn, a quarter of a turn apart",
+        "rolling and statics of a disc that turns about a point beside its middle",
+        sizes.constant(0.003),
+        {
+            "phase": PHASE,
+            "load": Shape(
+                "N", 0.5, (0.5,), sizes.weighing(1.0), meaning="the weight that the axle carries", within=(0.1, 1.0)
+            ),
+        },
+        further=lambda s, k, p: p["A"] * ca.sin(s.q[k] + p["phase"]),
+        torque=lambda s, k, p: -p["A"] * p["load"] * ca.cos(s.q[k] + p["phase"]),
+    ),
+    Effect(
         "encoder_eccentricity",
         ("contacts", "wheels"),
         "rad",
@@ -445,7 +411,7 @@ _declare(
             ),
             "bend": BEND,
         },
-        soil=_saturated,
+        soil=soil.saturated,
     ),
     Effect(
         "lateral_saturation",
@@ -459,7 +425,7 @@ _declare(
         positive=True,
         inverse=True,
         shapes={"bend": BEND},
-        soil=lambda s, k, p, soil: replace(soil, lateral=law.Saturation(p["A"], p["bend"])),
+        soil=soil.saturated_aside,
     ),
     Effect(
         "drive_brake_asymmetry",
@@ -469,7 +435,7 @@ _declare(
         "slip of another size when braking than when driving at the same force",
         "Wong, Theory of Ground Vehicles, ch. 2; driven and towed wheels on sand",
         sizes.constant(0.3),
-        soil=_braking,
+        soil=soil.braking,
     ),
     Effect(
         "compaction_per_pass",
@@ -487,7 +453,7 @@ _declare(
                 (0.0, 1.0, 2.0),
             ),
         },
-        soil=_compacted,
+        soil=soil.compacted,
         memory=lane.MEMORY,
         beside=lambda site: [{"pass": x, "counted": form} for form in (1.0, 2.0) for x in (5.0, 15.0, 50.0)],
         positive=True,
@@ -503,11 +469,11 @@ _declare(
         {"moment": Shape("-", 1.0, (0.0, 1.0))},
         grid=(0.2, 1.0, 4.0),
         positive=True,
-        soil=_relaxed,
+        soil=soil.relaxed,
         memory={
-            "gx": _relaxation(lambda r: r.slip.gx, "gx"),
-            "gy": _relaxation(lambda r: r.slip.gy, "gy"),
-            "turn": _relaxation(lambda r: r.yaw / r.slip.vn, "turn"),
+            "gx": soil.relaxation(lambda r: r.slip.gx, "gx"),
+            "gy": soil.relaxation(lambda r: r.slip.gy, "gy"),
+            "turn": soil.relaxation(lambda r: r.yaw / r.slip.vn, "turn"),
         },
     ),
     Effect(
@@ -525,7 +491,7 @@ _declare(
             "frequency": Shape("Hz", 27.0, (27.0,), whole=True),
         },
         positive=True,
-        soil=lambda s, k, p, soil: _scaled(soil, 1 - p["A"] * _window(s.time, p)),
+        soil=lambda s, k, p, plain: soil.scaled(plain, 1 - p["A"] * _window(s.time, p)),
         channel=lambda t, p: Channel(offset=p["shake"] * _window(t, p) * ca.sin(2 * pi * p["frequency"] * t)),
         shaking=_window,
         timed=True,
@@ -539,9 +505,9 @@ _declare(
         "a force that turns with the direction of travel",
         "Bekker, Introduction to Terrain-Vehicle Systems, 1969",
         sizes.weighing(0.002),
-        {"rise": Shape("s2/m2", 0.0, (0.0,)), "soft": Shape("m/s", 1.0, (1.0,), sizes.constant(SMOOTH_SPEED))},
+        {"rise": Shape("s2/m2", 0.0, (0.0,)), "soft": Shape("m/s", 1.0, (1.0,), sizes.constant(soil.SMOOTH_SPEED))},
         resisting=True,
-        push=_resistance,
+        push=soil.resistance,
     ),
     Effect(
         "ground_slope",

@@ -180,15 +180,14 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Pla
     rollings = {b.index: _rolling(s, b) for b in machine.contacts}
     for e in placed:
         z = {m: ca.SX.sym(m) for m in e.memory}
-        own = _seeing(s, scene, e, z)
+        (own,) = _rolled([_seeing(s, scene, e, z)])
         added = _added(s, own, inertia)
-        if e.effect.soil is not None:
+        if e.effect.further is not None or e.effect.soil is not None:
             for k in e.bodies:
-                body = machine.find(k)
-                rolling, lever = rollings[k]
-                soil = _soil(s, body, rolling)
-                changed = e.effect.soil(own.scene, k, own.values, soil)
-                added += _pushed(body, changed, lever) - _pushed(body, soil, lever)
+                body, lever = machine.find(k), rollings[k][1]
+                plain, rolling = rollings[k][0], own.scene.rolling[k]
+                added += _pushed(body, _changed(s, [own], body, rolling), lever, rolling)
+                added -= _pushed(body, _soil(s, body, plain), lever, plain)
         force.append(added)
         read = ca.SX.zeros(exact.numel())
         if e.effect.reading is not None:
@@ -215,7 +214,20 @@ def _acting(s: Sample, placed: Sequence[Placed]) -> tuple[tuple[str, ...], ca.SX
     known = dict(zip(memory, ca.vertsplit(z), strict=True))
     scene = _scene(s, known.get("time", ca.SX(0)))
     acting = [_seeing(s, scene, e, {m: known[f"{e.name}.{m}"] for m in e.memory}) for e in placed]
-    return tuple(memory), z, acting
+    return tuple(memory), z, _rolled(acting)
+
+
+def _rolled(acting: list[Acting]) -> list[Acting]:
+    """Effects that see the contacts as some of them make these."""
+    further: dict[int, ca.SX] = {}
+    for e in acting:
+        if e.placed.effect.further is not None:
+            for k in e.placed.bodies:
+                further[k] = further.get(k, ca.SX(0)) + e.placed.effect.further(e.scene, k, e.values)
+    if not further:
+        return acting
+    rolling = {k: replace(r, further=further.get(k, 0.0)) for k, r in acting[0].scene.rolling.items()}
+    return [replace(e, scene=replace(e.scene, rolling=rolling)) for e in acting]
 
 
 def _scene(s: Sample, time: ca.SX) -> Scene:
@@ -266,13 +278,10 @@ def _balance(s: Sample, acting: Sequence[Acting]) -> tuple[ca.SX, dict[str, ca.S
         force -= _added(s, e, inertia)
     slips: dict[str, ca.SX] = {}
     for body in machine.contacts:
-        rolling, lever = _rolling(s, body)
-        soil = _soil(s, body, rolling)
-        slips |= {f"gx{body.index}": soil.slip.gx, f"gy{body.index}": soil.slip.gy}
-        for e in acting:
-            if e.placed.effect.soil is not None and body.index in e.placed.bodies:
-                soil = e.placed.effect.soil(e.scene, body.index, e.values, soil)
-        force -= _pushed(body, soil, lever)
+        plain, lever = _rolling(s, body)
+        rolling = acting[0].scene.rolling[body.index] if acting else plain
+        slips |= {f"gx{body.index}": plain.slip.gx, f"gy{body.index}": plain.slip.gy}
+        force -= _pushed(body, _changed(s, acting, body, rolling), lever, rolling)
     if machine.planar and machine.body[0].coordinates[1] in machine.locked:
         slips = {g: x for g, x in slips.items() if not g.startswith("gy")}
     return force, slips
@@ -344,11 +353,20 @@ def _soil(s: Sample, body: Body, rolling: Rolling) -> Soil:
     return Soil(rolling.slip, rolling.yaw, Kx, Ky, saturation)
 
 
-def _pushed(body: Body, soil: Soil, lever: ca.SX) -> ca.SX:
+def _changed(s: Sample, acting: Sequence[Acting], body: Body, rolling: Rolling) -> Soil:
+    """The soil under a contact as effects make it, one after the other."""
+    soil = _soil(s, body, rolling)
+    for e in acting:
+        if e.placed.effect.soil is not None and body.index in e.placed.bodies:
+            soil = e.placed.effect.soil(e.scene, body.index, e.values, soil)
+    return soil
+
+
+def _pushed(body: Body, soil: Soil, lever: ca.SX, rolling: Rolling) -> ca.SX:
     """Generalised force (n_q,) of a contact (11), by virtual power."""
     assert body.contact is not None
     w = soil.wrench(body.contact)
-    return lever.T @ ca.vertcat(w.Sx, w.Sy, -float(body.contact.radius) * w.Sx, -w.Tz)
+    return lever.T @ ca.vertcat(w.Sx, w.Sy, -(float(body.contact.radius) + rolling.further) * w.Sx, -w.Tz)
 
 
 def _channels(s: Sample, acting: Sequence[Acting], time: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:

@@ -32,6 +32,7 @@ from model.file import (
 )
 
 MACHINES = Path(__file__).parent / "machines"
+NAMED = ("body", "sensor")  # lists of what has a name of its own
 Index = Annotated[int, Field(strict=True, ge=0, le=99)]
 
 
@@ -557,7 +558,8 @@ def shipped() -> tuple[str, ...]:
 def load(name: str | Path) -> Machine:
     """The machine of a shipped name, or of a path to a TOML file.
 
-    A file may say `extends = "va12"` and give only what differs (tables merge, values and lists replace).
+    A file may say `extends = "va12"` and give only what differs: tables merge, values and lists replace; a table
+    [body.NAME] or [sensor.NAME] changes the one of that name.
     Raises MachineError: one line with file, key, what is wrong, what is allowed.
     """
     path = _find(str(name))
@@ -602,14 +604,30 @@ def _read(path: Path, depth: int = 0) -> dict[str, Any]:
     if any(isinstance(x, dict) and x.get("name") in names and "kind" not in x for x in own):
         raise MachineError(
             f"{path}: sensor: the list takes the place of that of {parent}, so that every sensor needs all its keys;"
-            " `excite machine new NAME --like` writes them"
+            " [sensor.NAME] changes one, `excite machine new NAME --like` writes all"
         )
+    for key in NAMED:
+        if isinstance(raw.get(key), dict) and isinstance(whole.get(key), list):
+            raw[key] = _changed(path, key, whole[key], raw[key])
     return _merge(whole, raw)
+
+
+def _changed(path: Path, key: str, known: list[Any], changes: dict[str, Any]) -> list[Any]:
+    """A list of named tables with some of them changed, each by a table of its name."""
+    names = [x.get("name") if isinstance(x, dict) else None for x in known]
+    for name, change in changes.items():
+        if name not in names:
+            allowed = ", ".join(str(x) for x in names)
+            raise MachineError(f"{path}: {key}.{name}: no such {key}, allowed: {allowed}")
+        if not isinstance(change, dict):
+            raise MachineError(f"{path}: {key}.{name}: must be a table of what differs (got {change!r})")
+    return [_merge(x, changes[n]) if n in changes else x for n, x in zip(names, known, strict=True)]
 
 
 def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in change.items():
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = _merge(merged[key], value) if both else value
+        # A quantity is replaced as a whole: source and note are those of its value.
+        merged[key] = _merge(merged[key], value) if both and "value" not in value else value
     return merged

@@ -12,6 +12,9 @@ from model.effects import CATALOGUE
 from model.file import Quantity
 from model.machine import Body, EffectEntry, Machine, MachineError, Sensor
 
+HUGE = 50.0  # times what an effect usually is, from which its amount is doubtful
+SMALLEST = 1e-5  # N m: a usual friction below which there is none to compare with
+
 
 def places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...], str | None]]:
     """Where an effect may sit on a machine: name of the place -> bodies, sensor."""
@@ -97,6 +100,24 @@ def without(machine: Machine, name: str) -> Machine:
     """The machine without the effect of this name (effect@place)."""
     rest = tuple(e for e in machine.effect if e.label != name)
     return machine.model_copy(update={"effect": rest})
+
+
+def possible(machine: Machine, effect: Placed) -> bool:
+    """Whether an effect's shapes are such as there are at its place."""
+    site = Site(machine, machine.find(effect.bodies[0]), DURATION)
+    ranges = {n: [x * s.size(site) for x in s.within] for n, s in effect.shapes.items() if s.within is not None}
+    return all(low <= effect.values[n] <= high for n, (low, high) in ranges.items())
+
+
+def doubtful(machine: Machine, effect: Placed) -> str | None:
+    """What is said of an effect that is far larger than such effects are at its place."""
+    usual, amount = effect.effect.amount(Site(machine, machine.find(effect.bodies[0]), DURATION)), effect.values["A"]
+    large, small = (usual, abs(amount)) if effect.effect.inverse else (abs(amount), usual)
+    unit = effect.effect.unit
+    if large < HUGE * small or (usual < SMALLEST and unit.startswith("N m")):
+        return None
+    much = f"{amount:g} {unit}".removesuffix(" -")
+    return f"{effect.name}: {much}, usual are about {usual:.1g}: in another unit?"
 
 
 def placed(machine: Machine, entry: EffectEntry, duration: float = DURATION) -> Placed:

@@ -157,6 +157,25 @@ def roll_unbalance(s: Scene, place: str, A: float, draw: DRAW) -> None:
     s.torque[JOINTS[place]].append(lambda U: U + A * ca.cos(s.q[TURNING[place]] + phase))
 
 
+def roll_out_of_round(s: Scene, place: str, A: float, draw: DRAW) -> None:
+    """A roll turns about a point A beside its middle and is a little oval; its half of the machine climbs over that."""
+    angle, m = s.q[TURNING[place]], s.m
+    first, second = draw.uniform(0, 2 * np.pi, 2)
+    further = A * (ca.cos(angle + first) + draw.uniform(0, 0.05) * ca.cos(2 * angle + second))
+    wheelbase = m.D2 + m.D3
+    behind = [(mass, -x if chassis == "front" else m.D2 - x) for mass, chassis, x, _ in s.bodies()]
+    share = [(x if place == "rear_roll" else wheelbase - x) / wheelbase * mass for mass, x in behind]
+    climb = G * sum(share) * ca.jacobian(further, angle)
+    s.torque[JOINTS[place]].append(lambda U: U - climb)
+
+    def change(c: Any) -> None:
+        c.R = c.R + further
+        c.rim = c.R * c.w
+        c.vn = ca.sqrt(c.rim**2 + m.v_eps**2)
+
+    s.soil[place].append(change)
+
+
 def encoder_eccentricity(s: Scene, place: str, A: float, draw: DRAW) -> None:
     """A disc off its axis: once per turn, with a little of the second harmonic."""
     column, phase, second = ANGLE_COLUMN[place], draw.uniform(0, 2 * np.pi), draw.uniform(-0.08, 0.08)
@@ -406,6 +425,7 @@ _TABLE: tuple[tuple[Hide, tuple[str, ...], str, dict[str, tuple[float, float]], 
     (torque_deadband, ROLLS, "N m", {"": (20, 150)}, {}),
     (pump_coupling, ("drive",), "-", {"": (0.02, 0.12)}, {"signed": True}),
     (roll_unbalance, ROLLS, "N m", {"": (10, 100)}, {}),
+    (roll_out_of_round, ROLLS, "m", {"": (0.0002, 0.004)}, {}),
     (encoder_eccentricity, _WHEELED, "rad", {"": (0.001, 0.01)}, {}),
     (torque_ripple, ROLLS, "N m", {"": (20, 150)}, {}),
     (shear_saturation, ROLLS, "-", {"": (0.8, 0.15)}, {"none": np.inf}),

@@ -17,10 +17,14 @@ from typing import Any, Protocol
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from excite.simulate import Motion, simulate
 from model import machine, prediction
 from model.prediction import Model
+
+settings.register_profile("calm", deadline=None)  # other work on the machine is no fault of the code
+settings.load_profile("calm")
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 RESULTS = Path(__file__).parents[1] / "results"

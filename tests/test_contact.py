@@ -285,7 +285,7 @@ def test_the_soil_only_takes_energy(m: Motion, g_K: float | None) -> None:
     assert Sx * m.Vx + Sy * m.Vy - RC * Sx * m.spin - Tz * m.yaw <= 1e-9
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 2**31))
 def test_the_soil_only_takes_energy_from_the_machine(seed: int, va12: Model) -> None:
     q, nu = states(20, seed)

@@ -113,6 +113,48 @@ def test_dry_friction_may_turn_more_suddenly(va12: Model, slow: float) -> None:
     np.testing.assert_allclose(with_it - without, Fs * (sign - np.tanh(w / ws)), rtol=1e-6, atol=1e-4)
 
 
+def test_a_roll_out_of_round_rolls_as_far_as_it_reaches_and_climbs(va12: Model) -> None:
+    """Its weight is held by the slope of its outline; where its centre goes as fast as the ground under it the soil
+    does nothing; what the soil does acts at the distance of the ground."""
+    shapes = {"phase": 0.4, "load": 5e4}
+    model = build(placing.extended(VA12, shaped("roll_out_of_round@front_roll=0.01", shapes)))
+    angle = np.linspace(0, 2 * np.pi, 9)
+    distance = 0.65 + 0.01 * np.sin(angle + 0.4)
+    q, still, u = (np.zeros((n, 9)) for n in (6, 6, 3))
+    q[3] = angle
+
+    def held(on: Model, turns: np.ndarray, soil: float = 1.0) -> np.ndarray:
+        """What motors must deliver at 0.8 m/s with the front roll so fast, on soil so stiff."""
+        nu = np.zeros((6, 9))
+        nu[0], nu[3], nu[5] = 0.8, turns, 0.8 / 0.65
+        p = on.expand @ on.nominal * np.where([n.startswith("K") for n in on.base.standard], soil, 1.0)
+        rest = (u, np.zeros((0, 9))) if on.effects else ()
+        return np.asarray(on.balance(q, nu, still, p, *rest).full())
+
+    rolling = 0.8 / distance
+    climbs = np.zeros((6, 9))
+    climbs[3] = 5e4 * 0.01 * np.cos(angle + 0.4)
+    np.testing.assert_allclose(held(model, rolling) - held(va12, rolling, 0.0), climbs, atol=1e-6)
+    slipping = held(model, 1.1 * rolling) - held(model, 1.1 * rolling, 0.0)
+    assert np.abs(slipping[0]).min() > 5000
+    np.testing.assert_allclose(slipping[3], -distance * slipping[0])
+
+
+@pytest.mark.parametrize("other", ["slip_relaxation@front_roll=0.03", "drive_brake_asymmetry@front_roll=0.3"])
+def test_the_order_of_effects_at_one_roll_does_not_count(other: str) -> None:
+    """All see the contact as a roll that is out of round makes it."""
+    entries = [shaped("roll_out_of_round@front_roll=0.01", {"phase": 0.4, "load": 5e4}), shaped(other, {})]
+    told = []
+    for order in (entries, entries[::-1]):
+        model = build(placing.extended(VA12, *order))
+        q, nu, a, u, z = samples(model)
+        values = dict(zip(model.base.names, model.nominal, strict=True))
+        assert len(values) == len(model.nominal)
+        flow = model.flow(q, nu, u, z, model.nominal).full()
+        told.append(np.vstack([model.balance(q, nu, a, model.expand @ model.nominal, u, z).full(), flow]))
+    np.testing.assert_allclose(told[0], told[1], rtol=1e-12, atol=1e-9)
+
+
 def test_an_actuator_in_its_play_waits_for_a_push() -> None:
     """Pushed ahead it lies at the front of its play and reads half of it too much; let go, it is still nearer the front
     after some tenths of a second; pushed back by less than its own friction it creeps, to that share of its play if one

@@ -174,6 +174,27 @@ def test_a_file_may_extend_a_shipped_machine(tmp_path: Path) -> None:
     assert machine.body == parent.body
 
 
+def test_one_sensor_and_one_body_may_be_changed(tmp_path: Path) -> None:
+    """By tables of their names; the rest, of them too, stays as it was, but for the note on a value that is gone."""
+    own = write(
+        tmp_path,
+        'extends = "va12"\nname = "mine"\n[sensor.u1]\nnoise = { value = 15, source = "measured" }\n'
+        '[body.front_roll.contact]\nKx = { value = -2e5, source = "assumed" }\n',
+    )
+    mine, plain = load(own), load("va12")
+    for old, new in zip(plain.sensors("full"), mine.sensors("full"), strict=True):
+        assert (new.model_copy(update={"noise": old.noise}) if new.name == "u1" else new) == old
+        assert new.name != "u1" or float(new.noise) == 15
+    for was, now in zip(plain.body, mine.body, strict=True):
+        if now.name != "front_roll":
+            assert now == was
+            continue
+        assert (float(now.contact.Kx), now.contact.Kx.note) == (-2e5, "")
+        assert was.contact.Kx.note
+        assert now.model_copy(update={"contact": was.contact}) == was
+        assert now.contact.model_copy(update={"Kx": was.contact.Kx}) == was.contact
+
+
 def test_a_file_may_extend_a_file_beside_it(tmp_path: Path) -> None:
     write(tmp_path, 'extends = "va12"\nname = "first"\nlocked = ["y0", "theta0", "theta2"]\n', "first.toml")
     machine = load(write(tmp_path, 'extends = "first.toml"\nname = "second"\n', "second.toml"))
@@ -477,7 +498,27 @@ BROKEN: dict[str, tuple[str | bytes, str, str]] = {
     "extends, with a sensor's column alone": (
         'extends = "va12"\nname = "x"\n[[sensor]]\nname = "u1"\ncolumn = "Moment"\n',
         "sensor",
-        "takes the place of that of va12.*machine new NAME --like",
+        "takes the place of that of va12.*.sensor.NAME. changes one.*machine new NAME --like",
+    ),
+    "extends, with a value that nobody answers for": (
+        'extends = "va12"\nname = "x"\n[body.front_roll.contact]\nKx = { value = -2e5 }\n',
+        "body[1].contact.Kx.source",
+        "missing",
+    ),
+    "extends, with a sensor that there is none of": (
+        'extends = "va12"\nname = "x"\n[sensor.u9]\nnoise = { value = 1, source = "assumed" }\n',
+        "sensor.u9",
+        "no such sensor, allowed: .*u1",
+    ),
+    "extends, with a number for a body": (
+        'extends = "va12"\nname = "x"\n[body]\nfront_roll = 3\n',
+        "body.front_roll",
+        "must be a table of what differs .got 3",
+    ),
+    "extends, with a key of a body that there is none of": (
+        'extends = "va12"\nname = "x"\n[body.front_roll.limit]\ntorqe = 3\n',
+        "body[1].limit.torqe",
+        "no such key",
     ),
     "extends, then breaks": (
         'extends = "va12"\nname = "x"\nsampling_hz = { value = -1, source = "assumed" }\n',
@@ -550,7 +591,7 @@ def refusal(path: Path) -> str:
     return ""
 
 
-@settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(line=st.sampled_from(LINES), wrong=st.sampled_from(["", *WRONG]), inside=st.booleans())
 def test_any_line_gone_or_wrong_is_a_machine_or_one_clear_line(
     line: int, wrong: str, inside: bool, tmp_path: Path

@@ -213,6 +213,14 @@ def test_torque_causes_change_what_is_delivered() -> None:
     content = np.abs(np.fft.rfft(turn)) / 18
     assert content[1] == pytest.approx(50, rel=1e-6)
     assert content[[0, *range(2, 18)]].max() < 1e-6
+    climbs = []
+    for place in plant.ROLLS:
+        oval = felt("roll_out_of_round", place, 0.002)
+        turn = np.array([oval(angle=a) for a in np.linspace(0, 2 * np.pi, 36, endpoint=False)])
+        climbs.append(np.abs(np.fft.rfft(turn))[1] / 18)
+    m = Machine()
+    assert sum(climbs) == pytest.approx(0.002 * plant.G * (m.m0 + m.m1 + m.m2 + m.m4), rel=1e-6)
+    assert 0.4 < climbs[0] / sum(climbs) < 0.6
     ripple = felt("torque_ripple", "rear_roll", 50)
     content = np.abs(np.fft.rfft([ripple(angle=a) for a in np.linspace(0, 2 * np.pi, 128, endpoint=False)])) / 64
     assert content.max() == pytest.approx(50, rel=0.01)
