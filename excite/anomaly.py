@@ -27,12 +27,19 @@ SHAKING = 10.0  # [Hz]: above that a torque that is driven has little
 FEW = 50  # samples by which shaking is told
 SURE = 3.0  # deviations
 SCATTER = 3.0  # of the logarithm of a median square of third differences, over the root of their number
+# Values that never occur between such as do, as a converter with a stuck bit leaves them out: holes HOLE times wider
+# than the distance of values about them, MANY of them at least, every other band of one width.
+HOLE, ABOUT, MANY, EVERY = 20.0, 40, 4, 0.1
+# Values at either edge of a hole whose distances are averaged, those that they are compared with, and how much larger
+# they may be.
+EDGE, WIDELY, SHARP = 5, 201, 2.0
 TAIL = 1.6  # by which outliers of encoders may exceed those of normal noise: an edge's error is not normal
 
 
 @dataclass(frozen=True)
 class Anomaly:
-    """Something beside noise: its signal, kind (jump, burst, drift, tone, stuck), span of time [s] and frequency [Hz].
+    """Something beside noise: its signal, kind (jump, burst, drift, tone, stuck, bands), span of time [s], frequency
+    [Hz].
 
     size: the statistic over its threshold.
     """
@@ -51,6 +58,7 @@ class Anomaly:
             "drift": f"a slow error between {self.begin:.1f} s and {self.end:.1f} s",
             "tone": f"a tone at {self.frequency or 0:.2f} Hz",
             "stuck": f"counts that stand still while the machine moves, first at {self.begin:.2f} s",
+            "bands": "values in bands of one width with nothing between them: a bit of its converter never changes",
         }[self.kind]
         return f"{self.signal}: {what}"
 
@@ -67,6 +75,8 @@ def anomalies(machine: Machine, sensors: tuple[Sensor, ...], log: Log, fit: Fit,
     for sensor in machine.sensors("full"):
         if sensor.kind == "torque" and sensor.name in log.values:
             found += _in_torque(sensor.name, t, log.values[sensor.name], rate)
+        if sensor.resolution is None and sensor.name in log.values:
+            found += _bands(sensor.name, t, log.values[sensor.name])
     return sorted(found, key=lambda a: -a.size)
 
 
@@ -148,6 +158,30 @@ def _stuck(sensor: Sensor, t: np.ndarray, value: np.ndarray) -> Iterator[Anomaly
     bad = np.flatnonzero(still[1:-1] & (around > STUCK))
     if len(bad) >= 3:
         yield Anomaly(sensor.name, "stuck", t[bad[0] + 2], t[bad[-1] + 2], None, len(bad) / 3)
+
+
+def _bands(name: str, t: np.ndarray, value: np.ndarray) -> Iterator[Anomaly]:
+    """Values of a channel that come in every other band of one width alone."""
+    x = np.sort(value)
+    gap = np.diff(x)
+    usual = scipy.ndimage.median_filter(gap, ABOUT, mode="nearest") / np.log(2)
+    at = np.flatnonzero((usual > 0) & (gap > HOLE * usual))
+    if len(at) < MANY:
+        return
+    width = float(np.median(gap[at]))
+    place = (x[at] + gap[at] / 2) / (2 * width)
+    # The width is a little too large, by the distance of values: so is what is found of the way from hole to hole.
+    apart = np.diff(place)
+    whole = np.maximum(np.round(apart), 1.0)
+    regular = (np.abs(apart / whole - np.median(apart / whole)) < EVERY) & (np.abs(gap[at][1:] / width - 1) < 2 * EVERY)
+    # A bit cuts values off where they are as dense as elsewhere; noise about levels that a drive steps to fades.
+    beside = np.add.outer(at, [*range(-EDGE, 0), *range(1, EDGE + 1)])
+    around = scipy.ndimage.median_filter(gap, WIDELY, mode="nearest")[at] / np.log(2)
+    edges = gap[np.clip(beside, 0, len(gap) - 1)].mean(axis=1) / around
+    if np.median(edges) > SHARP:
+        return
+    if regular.sum() >= max(MANY - 1, 0.8 * len(regular)) and abs(float(np.median(apart / whole)) - 1) < EVERY:
+        yield Anomaly(name, "bands", t[0], t[-1], None, len(at) / MANY)
 
 
 def _in_torque(name: str, t: np.ndarray, u: np.ndarray, rate: float) -> Iterator[Anomaly]:

@@ -92,6 +92,11 @@ def graded(model: Model) -> None:
             )
 
 
+def unmoved(problem: str) -> str:
+    """What is said where a design's information is singular, of a problem by its name."""
+    return f"some parameter moves nothing in problem {problem}, so no drive shows it"
+
+
 def answer(
     model: Model, problem: Problem, brief: Brief, progress: Callable[[int, int, float], None] | None = None
 ) -> Answer:

@@ -168,7 +168,7 @@ def _designed(order: Order) -> Designed:
     except (InfeasibleError, SimulationError, NoEstimate, MachineError) as err:
         return Designed("", {}, _said(err))
     except np.linalg.LinAlgError:
-        return Designed("", {}, f"some parameter moves nothing in problem {order.name}, so no drive shows it")
+        return Designed("", {}, brief.unmoved(order.name))
     except Exception as err:
         return Designed("", {}, f"{DEFECT}: {type(err).__name__}: {_said(err)}")
     if not answer.design.complete:

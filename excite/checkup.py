@@ -10,6 +10,7 @@ from typing import Any
 from excite import asked, brief, doubts, examine, findings, gaps, identify, portrait, separate, works
 from excite.brief import Brief
 from excite.diagnose import Diagnosis, diagnose
+from excite.estimate import NotIdentifiable
 from excite.limit import InfeasibleError
 from excite.separate import Rivals
 from excite.sidebyside import forked
@@ -44,6 +45,9 @@ def write(
     mended = [e.log for e in examined]
     doubtful = [line for e in examined for line in e.doubts]
     notes += [note for e in examined for note in e.notes] + doubtful
+    if not any(examine.moves(model, one) for one in mended):
+        sources = ", ".join(one.source for one in mended)
+        raise NotIdentifiable(f"{sources}: nothing moves, which shows no cause; give a log of a drive as well")
     chosen, reason = examine.FILTERS[filtering](model, mended)
     notes += [reason] if reason else []
 

@@ -20,12 +20,12 @@ from excite.newton import NotConverged
 from excite.sidebyside import Together
 from excite.stages import FAR, SMALL, Stage, begun, exact_if_near, freed, refits, refitted, sharpened
 from model import placing
-from model.effect import Effect
+from model.effect import Effect, Placed
 from model.file import Quantity
 from model.machine import EffectEntry
 
 # Of twice the log-likelihood that an effect must gain; logs without any stayed below 16. Chi-squared gives 2.1 % of
-# logs of a minute above what `threshold` makes of it, 2.7 % of longer ones, at most: summed over the 366 and 436
+# logs of a minute above what `threshold` makes of it, 2.7 % of longer ones, at most: summed over the 368 and 438
 # candidates of va12 as if these had nothing in common, with all their shapes.
 LEVEL = 22.0
 CHANCE = 0.05  # p-value above which no effect has a name: those with many shapes must gain more than LEVEL
@@ -146,9 +146,14 @@ def _entry(score: evidence.Score) -> EffectEntry:
 def entry_of(stage: Stage, name: str) -> EffectEntry:
     """An effect with amount and shapes as a stage's fit has them."""
     placed = stage.placed(name)
-    fitted = dict(zip(stage.model.base.names, stage.fit.X, strict=True))
-    values = {key: float(fitted.get(p, placed.values[key])) for p, (key, _) in placed.parameters.items()}
+    values = _values(stage, placed)
     return identified(placed.effect.name, placed.where, values.pop("A"), values)
+
+
+def _values(stage: Stage, placed: Placed) -> dict[str, float]:
+    """Amount and shapes of an effect as a stage's fit has them."""
+    fitted = dict(zip(stage.model.base.names, stage.fit.X, strict=True))
+    return {key: float(fitted.get(p, placed.values[key])) for p, (key, _) in placed.parameters.items()}
 
 
 def identified(effect: str, where: str, amount: float, shapes: Mapping[str, float]) -> EffectEntry:
@@ -399,9 +404,12 @@ def _tries(
 
 
 def _felt(name: str, stage: Stage) -> bool:
-    """Whether the torque sensor shakes, in one of the logs, while an effect acts that shakes it; also where none of
-    them can tell, and of any other effect."""
-    if stage.placed(name).effect.shaking is None:
+    """Whether an effect's shapes are such as there are, and the torque sensor shakes, in one of the logs, while it acts
+    if that shakes it; also where none of them can tell."""
+    own = stage.placed(name)
+    if not placing.possible(stage.machine, replace(own, values={**own.values, **_values(stage, own)})):
+        return False
+    if own.effect.shaking is None:
         return True
     fitted = placing.placed(stage.machine, entry_of(stage, name))
     of = (s for s in stage.machine.sensors("full") if s.kind == "torque" and s.body == fitted.bodies[0])

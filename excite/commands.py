@@ -319,10 +319,13 @@ def simulate(
     if out.resolve() in [path.resolve() for path in (profile, *_file(machine))]:
         raise UsageError(f"--out {out}: is what the log is made from, choose another file")
     torque, q0, nu0 = profiles.read(profile, model)
+    doubts: list[str] = []
     if effect:
         seconds = (len(torque) - 1) / float(model.machine.sampling_hz)
         entries = [placing.parse(text, model.machine, seconds) for text in effect]
         model = build(placing.extended(model.machine, *entries))
+        placed = (placing.placed(model.machine, entry) for entry in entries)
+        doubts = [f"--effect {x}" for e in placed if (x := placing.doubtful(model.machine, e)) is not None]
     with folder.writing_file(out) as path:
         motion = drive(model, torque, q0=q0, nu0=nu0)
         table = sensors.measure(model, motion, kit=kit, seed=seed, noise=noise == "on")
@@ -337,12 +340,15 @@ def simulate(
         "kit": kit,
         "noise": noise,
         "effects": effect or [],
+        "doubts": doubts,
         "seed": seed,
     }
     if json:
         terminal.show_json(summary)
     else:
         terminal.say(f"{out}: {len(table)} rows, {motion.t[-1]:g} s, columns {', '.join(table.columns)}")
+        for line in doubts:
+            terminal.say(line)
 
 
 @app.command(cls=Choosing)

@@ -9,8 +9,8 @@ import numpy as np
 from excite.estimate import Estimate
 from excite.log import Log
 from excite.processing import lowpass, samples
-from excite.sensors import signals, torque_behind
-from excite.simulate import simulate
+from excite.sensors import signals, torques_behind
+from excite.simulate import Motion, simulate
 from model.machine import Filter
 from model.prediction import Model
 
@@ -87,6 +87,15 @@ def far(model: Model, estimate: Estimate) -> tuple[str, ...]:
     )
 
 
+def replayed(model: Model, log: Log, X: np.ndarray, filter: Filter | None = None) -> Motion:
+    """What the torques behind a log's readings make of a machine X (n_base,) from the log's first state on, open loop.
+    Raises SimulationError where the parameters are no machine."""
+    s = samples(model, log, filter or model.machine.filter)
+    channels = [x.full() for x in model.channels(log.t[None], X)]
+    torque = torques_behind(log.t, s.Y[list(model.actuated)].T, channels)
+    return simulate(model, torque, X, s.q[:, 0], s.nu[:, 0])
+
+
 def motions(model: Model, log: Log, estimate: Estimate, filter: Filter | None = None) -> Comparison:
     """Direct simulation: the torques behind a log's readings drive the machine, from the log's first state, open loop.
 
@@ -94,16 +103,11 @@ def motions(model: Model, log: Log, estimate: Estimate, filter: Filter | None = 
     the log, as they do in the machine's use. Raises ValueError where a parameter is unknown, SimulationError where the
     parameters are no machine.
     """
-    filter = filter or model.machine.filter
     unknown = [n for n, v in zip(estimate.names, estimate.value, strict=True) if not np.isfinite(v)]
     if unknown:
         raise ValueError(f"a simulation needs every parameter, unknown: {', '.join(unknown)}")
-    s = samples(model, log, filter)
     X = estimate.value
-    channels = (x.full() for x in model.channels(log.t[None], X))
-    read = zip(s.Y[list(model.actuated)], *channels, strict=True)
-    torque = np.column_stack([torque_behind(log.t, *one) for one in read])
-    motion = simulate(model, torque, X, s.q[:, 0], s.nu[:, 0])
+    motion = replayed(model, log, X, filter)
     exact = signals(model, motion, X)
     chosen = [x for x in model.machine.sensors("full") if x.name in log.values and x.kind not in ("torque", "x", "y")]
     turned = {x.name: x.kind in ("angle", "wheel") and not x.is_rate for x in chosen}

@@ -17,6 +17,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import joblib
 import numpy as np
@@ -96,16 +97,17 @@ def design(
         # loky even for one start: only there can the number of threads of the linear algebra be set
         run = joblib.Parallel(n_jobs=processes(), return_as="generator_unordered")
         call = joblib.delayed(_carry)
-        with _broken_off(stop):
-            for track in run(call(model, problem, aim, k, g, None, half, stop) for k, g in enumerate(guesses)):
-                if track is not None:
-                    tracks[track.number] = track
+
+        def gather(calls: Iterator[Any]) -> None:
+            with _broken_off(stop):
+                for track in run(calls):
+                    if track is not None:
+                        tracks[track.number] = track
+
+        gather(call(model, problem, aim, k, g, None, half, stop) for k, g in enumerate(guesses))
         ranked = sorted(tracks.values(), key=lambda t: (t.number < starts, promise(t.latest), t.number))
         chosen = ranked[:kept]
-        with _broken_off(stop):
-            for track in run(call(model, problem, aim, t.number, 0, t, deadline, stop) for t in chosen):
-                if track is not None:
-                    tracks[track.number] = track
+        gather(call(model, problem, aim, t.number, 0, t, deadline, stop) for t in chosen)
         interrupted = stop.exists()
     if not tracks:
         raise KeyboardInterrupt

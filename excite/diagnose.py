@@ -257,13 +257,13 @@ def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
         doubtful = whole.exact and whole.placed(x.name).effect.inverse
         if len(kept) == 1 or (_surely(x.name, whole) and not doubtful):
             continue
-        beside, idle = np.inf, False  # nothing fits without it
+        beside = np.inf  # nothing fits without it
         with suppress(NotConverged):
             without = _without(x.name, whole)
             if without.fit.disturbed <= whole.fit.disturbed:
                 beside = without.fit.cost - whole.fit.cost
-                idle = not whole.placed(x.name).effect.inverse and not _foretells(without, whole)
-        if idle or beside < choosing.threshold(x.name, whole, x.tried):
+        proven = whole.placed(x.name).effect.inverse or np.isinf(beside)
+        if beside < choosing.threshold(x.name, whole, x.tried) or not (proven or _foretells(without, whole)):
             kept, whole = [y for y in kept if y.name != x.name], without
         else:
             kept = [replace(y, beside=beside) if y.name == x.name else y for y in kept]
@@ -274,8 +274,8 @@ def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
 
 def _foretells(without: Stage, whole: Stage) -> bool:
     """Whether a stage errs less than one without an effect on stretches that were hidden from both, if any can be."""
-    old, new = gains.withheld(without), gains.withheld(whole)
-    return old is None or new is None or gains.gain(old, new).percent > 0
+    found = gains.gain(gains.withheld(without), gains.withheld(whole))
+    return found is None or found.percent > 0
 
 
 def _surely(name: str, stage: Stage) -> bool:

@@ -9,11 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from excite import sensors
+from excite.crosscheck import replayed
 from excite.doubts import doubts
-from excite.log import Log, LogError
+from excite.log import Log, LogError, check
 from excite.noise import spread, whitener
 from excite.processing import decimate, derivative, lowpass, regression, samples
 from excite.regression import sandwich, solved, whitened
+from excite.simulate import SimulationError
 from model.machine import Filter, Sensor
 from model.prediction import Model
 
@@ -24,6 +27,7 @@ HELD = 8  # equal readings in a row that make a drop-out
 DEAD = 100  # the same for a channel that ends so
 JUMP = 3.0  # times as far, at the end of such a stretch, as the encoder moves in a sample elsewhere
 LATE = 4.0  # standard deviations that make a delay worth a remark
+NOISY = 2e-3  # s: a deviation from which noise of slips hides a part of a delay
 FLOOR = 4.0  # times the noise floor where a spectrum counts as sunk
 NEEDED = ("angle", "torque", "wheel")  # kinds of sensor that no method does without
 ROOM = 0.8  # of the Nyquist frequency after decimation is passed (see `decimate`)
@@ -52,6 +56,10 @@ class Delay:
     @property
     def significant(self) -> bool:
         return abs(self.value) > LATE * self.std
+
+    def beside(self, usual: Delay) -> Delay:
+        """What is more than a usual one."""
+        return Delay(self.name, self.value - usual.value, float(np.hypot(self.std, usual.std)))
 
 
 def examine(model: Model, log: Log) -> Examination:
@@ -125,6 +133,12 @@ def find_spikes(sensor: Sensor, x: np.ndarray) -> np.ndarray:
         and max(abs(bend[i - 2]), abs(bend[i + 2])) < 0.3 * abs(bend[i])
     ]
     return np.array(alone, int)
+
+
+def moves(model: Model, log: Log) -> bool:
+    """Whether any angle goes further than a count or two; taken for granted where one isn't counted."""
+    turning = [s for s in model.machine.sensors("full") if s.kind in ("angle", "wheel") and s.name in log.values]
+    return any(s.resolution is None or np.ptp(log.values[s.name]) > 2.5 * s.resolution for s in turning)
 
 
 def find_dropouts(sensor: Sensor, x: np.ndarray) -> tuple[tuple[int, int], ...]:
@@ -202,14 +216,37 @@ def _torque_name(model: Model, row: int) -> str:
     return next(s.name for s in model.machine.sensor if s.kind == "torque" and s.body == body.index)
 
 
-def late_channels(model: Model, log: Log, filter: Filter | None = None) -> tuple[str, ...]:
-    """A remark for every torque channel that is late or early beyond doubt."""
-    return tuple(
-        f"{log.source}: {d.name} is {abs(d.value) * 1e3:.1f} ms (+-{d.std * 1e3:.1g})"
-        f" {'late' if d.value > 0 else 'early'} against the motion: shift the channel, or run `excite diagnose`"
-        for d in delays(model, log, filter)
-        if d.significant
-    )
+def late_channels(model: Model, log: Log, filter: Filter | None = None, X: np.ndarray | None = None) -> tuple[str, ...]:
+    """A remark for every torque channel that is late or early beyond doubt.
+
+    Where rows are mostly noise, what is left of it in them passes for a delay: so the same is asked of the machine X
+    (n_base,) driven by the log's torques with every channel in time, and that is taken off. Nothing is said of such
+    rows without X: the machine file's soil may be another one.
+    """
+    found = [d for d in delays(model, log, filter) if d.significant]
+    if X is not None and found:
+        try:
+            usual = {d.name: d for d in delays(model, _in_time(model, log, filter, X), filter)}
+        except (SimulationError, LogError):
+            usual, found = {}, [d for d in found if d.std < NOISY]
+        found = [d.beside(usual[d.name]) if d.name in usual else d for d in found]
+    said = []
+    for d in found:
+        which = f"{'late' if d.value > 0 else 'early'} against the motion"
+        much = f"{abs(d.value) * 1e3:.1f} ms (+-{d.std * 1e3:.1g})"
+        if d.significant and d.std < NOISY:
+            said.append(f"{log.source}: {d.name} is {much} {which}: shift the channel, or run `excite diagnose`")
+        elif d.significant and X is not None:
+            line = f"{d.name} is {which}, by {much} as far as noise tells: `excite diagnose` says by how much"
+            said.append(f"{log.source}: {line}")
+    return tuple(said)
+
+
+def _in_time(model: Model, log: Log, filter: Filter | None, X: np.ndarray) -> Log:
+    """What a log's sensors would read of a drive by its torques if no channel were late."""
+    motion = replayed(model, log, X, filter)
+    made = check(sensors.measure(model, motion, X), model.machine)
+    return Log(log.source, made.t, {n: made.values[n] for n in log.values if n in made.values})
 
 
 # ------------------------------------------------------------------------------------------------ filters

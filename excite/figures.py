@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -34,9 +35,14 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
+def _style(k: int) -> dict[str, Any]:
+    """Colour and dashes of the k-th of several lines."""
+    return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
+
+
 def _lines(ax: Axes, t: np.ndarray, curves: Mapping[str, np.ndarray], label: str, legend: bool = True) -> None:
     for k, (name, values) in enumerate(curves.items()):
-        ax.plot(t, values, color=COLOURS[k % 6], linestyle=STYLES[k % 6], linewidth=1.2, label=name)
+        ax.plot(t, values, **_style(k), linewidth=1.2, label=name)
     ax.set_ylabel(label)
     ax.grid(alpha=0.3)
     if legend:
@@ -127,15 +133,8 @@ def _path(ax: Axes, model: Model, problem: Problem, motion: Motion) -> None:
     for k, i in enumerate(problem.lane_points):
         body = model.machine.find(i)
         x, y, _ = places[:, :, model.machine.body.index(body)]
-        ax.plot(
-            x,
-            y,
-            color=COLOURS[k % len(COLOURS)],
-            linestyle=STYLES[k % len(STYLES)],
-            linewidth=1.2,
-            label=body.name.replace("_", " "),
-        )
-        ax.plot(x[0], y[0], "o", color=COLOURS[k % len(COLOURS)], markersize=5)
+        ax.plot(x, y, **_style(k), linewidth=1.2, label=body.name.replace("_", " "))
+        ax.plot(x[0], y[0], "o", color=_style(k)["color"], markersize=5)
     length, width = problem.lane_m
     ax.plot(
         *np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]).T * [[length / 2], [width / 2]], "k:", linewidth=0.8

@@ -54,9 +54,8 @@ def account(d: Diagnosis, advance: Advance | None = None, together: Together = i
     for k, found in enumerate(together([partial(gain.withheld, s) for s in stages])):
         tell((k + 1) / (len(stages) + 1), "measuring the gain")
         held.append(found)
-    single = tuple(gain.gain(a, b) if a is not None and b is not None else None for a, b in pairwise(held))
-    first, last = held[0], held[-1]
-    whole = gain.gain(first, last) if first is not None and last is not None else None
+    single = tuple(gain.gain(a, b) for a, b in pairwise(held))
+    whole = gain.gain(held[0], held[-1])
     before = misfit.courses(d.before)
     after = misfit.courses(d.after) if d.stages else before
     missing = before, after
@@ -83,7 +82,7 @@ def summary(a: Account) -> dict[str, Any]:
         "error_before_percent": a.whole.before if a.whole else None,
         "error_after_percent": a.whole.after if a.whole else None,
         "gain_percent": a.whole.percent if a.whole and d.findings else None,
-        "gain_ci95": list(a.whole.interval) if a.whole and a.whole.interval and d.findings else None,
+        "gain_ci95": _interval(a.whole) if d.findings else None,
         "signals": signals(a),
         "separating_run": a.run,
         "share_explained": d.share,
@@ -112,8 +111,12 @@ def _finding(f: Finding, g: Gain | None) -> dict[str, Any]:
         "shapes": {n: {"value": value, "std": std, "unit": unit} for n, (value, std, unit) in f.shapes.items()},
         "chi2_gain": f.gain,
         "gain_percent": g.percent if g else None,
-        "gain_ci95": list(g.interval) if g and g.interval else None,
+        "gain_ci95": _interval(g),
     }
+
+
+def _interval(g: Gain | None) -> list[float] | None:
+    return list(g.interval) if g and g.interval else None
 
 
 def signals(a: Account) -> dict[str, dict[str, Any]]:

@@ -21,6 +21,7 @@ from excite.record import readings
 from excite.stages import Stage
 
 HIDDEN, PERIOD = 2.0, 6.0  # [s] withheld of every so many
+ENOUGH, TURNS = 20, 3  # stretches that are wanted, and how often a short log is hidden in turn for them, at most
 LOOSER = 0.1, 1.0, 4.0  # disturbing forces that are tried where a wrong model finds no fit to what isn't withheld
 DRAWS = 2000
 
@@ -30,7 +31,7 @@ class Withheld:
     """Errors of a model on withheld stretches: mean squares (stretches, m) [SI squared] and how many readings (same).
 
     sensors (m): names and units; motion (m,): mean square of what each signal does in a stretch; noise (m,): variance
-    of a reading.
+    of a reading; turn (stretches,): which of them were hidden at once.
     """
 
     sensors: tuple[tuple[str, str], ...]
@@ -38,6 +39,12 @@ class Withheld:
     counts: np.ndarray
     motion: np.ndarray
     noise: np.ndarray
+    turn: np.ndarray
+
+    def of(self, turns: np.ndarray) -> Withheld:
+        """The stretches of some turns only."""
+        own = np.isin(self.turn, turns)
+        return replace(self, squares=self.squares[own], counts=self.counts[own], turn=self.turn[own])
 
     def percent(self, draw: np.ndarray | None = None) -> float:
         """The error in per cent of the motion, all signals in units of their noise, so that what is measured badly
@@ -71,11 +78,31 @@ def withheld(stage: Stage) -> Withheld | None:
     fitted, not even to coarse sensors; None where no fit to the rest is found or logs are too short to hide any."""
     prepared, fit = stage.prepared, stage.fit
     held = prepared.held | fit.unseen if stage.settled or prepared.coarse > 1 else np.ones_like(prepared.held)
-    c, rate = prepared.c, float(stage.machine.sampling_hz)
-    stretches = [_stretches(len(r.used), rate) for r in prepared.records]
-    if not any(stretches):
+    rate = float(stage.machine.sampling_hz)
+    lengths = [len(r.used) for r in prepared.records]
+    once = sum(len(_stretches(n, rate)) for n in lengths)
+    if once == 0:
         return None  # too short to hide anything
-    masked = []
+    turns = min(-(-ENOUGH // once), TURNS)
+    parts = []
+    for turn in range(turns):
+        stretches = [_stretches(n, rate, turn / turns) for n in lengths]
+        part = _hidden(stage, held, stretches, turn) if any(stretches) else None
+        if part is not None:
+            parts.append(part)
+    if not parts:
+        return None
+    squares, counts, each = (np.concatenate([getattr(p, x) for p in parts]) for x in ("squares", "counts", "turn"))
+    motion, noise = (np.mean([getattr(p, x) for p in parts], axis=0) for x in ("motion", "noise"))
+    return Withheld(parts[0].sensors, squares, counts, motion, noise, each)
+
+
+def _hidden(
+    stage: Stage, held: np.ndarray, stretches: Sequence[Sequence[tuple[int, int]]], turn: int
+) -> Withheld | None:
+    """The same of some stretches of each log, hidden at once."""
+    prepared, fit = stage.prepared, stage.fit
+    c, masked = prepared.c, []
     for r, own in zip(prepared.records, stretches, strict=True):
         used = r.used.copy()
         for a, b in own:
@@ -114,11 +141,19 @@ def withheld(stage: Stage) -> Withheld | None:
             counts.append(told.sum(axis=0))
             motion.append(h[a:b].var(axis=0))
     sensors = tuple((s.name, c.model.machine.si(s)) for s in c.sensors)
-    return Withheld(sensors, np.array(squares), np.array(counts), np.mean(motion, axis=0), np.mean(noise, axis=0))
+    each = np.full(len(squares), turn)
+    return Withheld(sensors, np.array(squares), np.array(counts), np.mean(motion, axis=0), np.mean(noise, axis=0), each)
 
 
-def gain(before: Withheld, after: Withheld, seed: int = 0) -> Gain:
-    """What a model gains on the same stretches, with an interval; none where there is but one stretch."""
+def gain(before: Withheld | None, after: Withheld | None, seed: int = 0) -> Gain | None:
+    """What a model gains on the same stretches, with an interval; none where there is but one stretch. None where the
+    two have no stretch in common."""
+    if before is None or after is None:
+        return None
+    both = np.intersect1d(before.turn, after.turn)
+    if len(both) == 0:
+        return None
+    before, after = before.of(both), after.of(both)
     n = len(before.squares)
     old, new = before.percent(), after.percent()
     interval = None
@@ -137,8 +172,8 @@ def gain(before: Withheld, after: Withheld, seed: int = 0) -> Gain:
     )
 
 
-def _stretches(samples: int, rate: float) -> Sequence[tuple[int, int]]:
-    """First and last sample of the withheld stretches, none at the ends."""
+def _stretches(samples: int, rate: float, shift: float = 0.0) -> Sequence[tuple[int, int]]:
+    """First and last sample of the withheld stretches, none at the ends, later by a share of the period."""
     length, period = round(HIDDEN * rate), round(PERIOD * rate)
-    first = (period - length) // 2
-    return [(a, a + length) for a in range(first, samples - length - first // 2, period)]
+    first = (period - length) // 2 + round(shift * period)
+    return [(a, a + length) for a in range(first, samples - length - (period - length) // 4, period)]

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from excite import log, logcheck
-from excite.log import Log, LogError
+from excite.log import Log
 from model.machine import Machine
 
 LONG = 5.0  # s that a stretch must last: a start and some seconds of motion
@@ -36,7 +36,7 @@ def split(
 ) -> tuple[list[Log], list[str]]:
     """The same of one table of columns."""
     logcheck.refuse(table, machine, needs, source)
-    cuts = _gaps(table, machine, source)
+    cuts = log.gap_rows(table, machine, source)
     rate = float(machine.sampling_hz)
     rows = [0, *cuts, len(table)]
     if not cuts or len(cuts) > MOST or min(np.diff(rows)) < LONG * rate:
@@ -49,16 +49,3 @@ def split(
     where = ", ".join(f"{t[k] - t[k - 1]:.3g} s before row {k + 1}" for k in cuts)
     gaps = "a gap" if len(cuts) == 1 else f"{len(cuts)} gaps"
     return stretches, [f"{source}: {gaps} ({where}): {use} the {len(stretches)} stretches between"]
-
-
-def _gaps(table: pd.DataFrame, machine: Machine, source: str) -> list[int]:
-    """First rows (from 0) after each gap; none where time is not what it should be in other ways."""
-    if machine.time_column not in table.columns or len(table) < 2:
-        return []
-    try:
-        dt = np.diff(log.times(table, machine, source)) * float(machine.sampling_hz)
-    except LogError:
-        return []
-    if (dt <= 0).any() or abs(float(np.median(dt)) - 1) > log.OFF_RATE:
-        return []
-    return [int(k) + 1 for k in np.flatnonzero(dt > log.GAP)]

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 import scipy.special
 
-from excite.sensors import torque_behind
+from excite.sensors import torques_behind
 from excite.simulate import _A, _C, _GAMMA, _SLOPES, _TIMES, _lu, _solve
 from model.machine import Sensor
 from model.prediction import Model
@@ -232,7 +232,7 @@ class Chart:
         out = [e.full() for e in self.channels(t[None], X)]
         gain, offset = (e.T for e in out[:2])
         by = [e.reshape(n_u, N, len(X)).transpose(1, 0, 2) for e in out[3:]]
-        u = np.column_stack([torque_behind(t, *each) for each in zip(torque.T, *out[:3], strict=True)])
+        u = torques_behind(t, torque, out[:3])
         true = u + errors
         rise = np.gradient(gain * true + offset, step, axis=0)
         slope = (rise[:, :, None] * by[2] - by[1] - true[:, :, None] * by[0]) / gain[:, :, None]

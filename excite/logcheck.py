@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -97,6 +98,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
     signals: dict[str, tuple[np.ndarray, np.ndarray, str]] = {}
     readings: dict[str, np.ndarray] = {}
     rate = float(machine.sampling_hz)
+    unbroken = _unbroken(table, machine)
     after = tuple(f"row {int(np.searchsorted(t, gap)) + 2}," for gap in gaps)
     absent: list[str] = []
     for sensor in machine.sensors("full"):
@@ -119,7 +121,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         signals[" - ".join(sensor.columns)] = (when, values, machine.si(sensor))
         jumps: list[str] = []
         _caught(lambda s=sensor, v=values: log.check_values(s, v, rate, machine, ""), jumps)  # type: ignore[misc]
-        speed = _speed(sensor, values, table, machine) if jumps else ""
+        speed = _speed(sensor, values[unbroken], table.iloc[unbroken], machine) if jumps else ""
         jumps = [speed] if speed else jumps
         faults += [line for line in jumps if not line.startswith(after)]  # across a gap an angle may jump
         remarks += _oddities(sensor, values)
@@ -176,12 +178,19 @@ def refuse(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sou
     t = _caught(lambda: log.times(table, machine, source), None)
     if t is not None and (clock := _clock(t, machine)):
         raise LogError(f"{source}: {clock}")
+    table = table.iloc[_unbroken(table, machine)].reset_index(drop=True)
     for sensor in machine.sensors("full"):
         if sensor.kind != "angle" or not set(sensor.columns) <= set(table.columns):
             continue
         values = _caught(lambda s=sensor: log.values_of(s, machine, table, source), None)  # type: ignore[misc]
         if values is not None and len(values) > 1 and (speed := _speed(sensor, values, table, machine)):
             raise LogError(f"{source}: {speed}")
+
+
+def _unbroken(table: pd.DataFrame, machine: Machine) -> slice:
+    """Rows of the longest stretch without a gap: across one an angle may jump."""
+    edges = [0, *log.gap_rows(table, machine, ""), len(table)]
+    return slice(*max(itertools.pairwise(edges), key=lambda ends: ends[1] - ends[0]))
 
 
 def _speed(sensor: Sensor, values: np.ndarray, table: pd.DataFrame, machine: Machine) -> str:

@@ -23,7 +23,7 @@ from excite.simulate import SimulationError, simulate
 from excite.wording import rounded
 from model import file as files
 from model import machine as machines
-from model import tree
+from model import placing, tree
 from model.file import Quantity
 from model.machine import Machine, MachineError, Problem
 from model.prediction import Model, build, standard_parameters
@@ -301,6 +301,13 @@ def _times(model: Model) -> Iterator[str]:
         )
 
 
+def _effects(model: Model) -> Iterator[str]:
+    for e in model.effects:
+        said = placing.doubtful(model.machine, e)
+        if said is not None:
+            yield f"effect {said}"
+
+
 def _turning(model: Model) -> Iterator[str]:
     """Chassis that turn about the vertical as if their mass were in one point."""
     poses = tree.poses(model.machine, {})
@@ -339,7 +346,7 @@ def _scales(model: Model) -> Iterator[str]:
 
 
 DOUBTS: tuple[Callable[[Model], Iterator[str]], ...] = (
-    *(_traction, _speed, _bounds, _bodies, _sizes, _slips, _times, _turning, _noise, _scales),
+    *(_traction, _speed, _bounds, _bodies, _sizes, _slips, _effects, _times, _turning, _noise, _scales),
 )
 
 

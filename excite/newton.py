@@ -35,6 +35,7 @@ CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviati
 ENOUGH = 0.2  # likewise with disturbing forces, whose deviations are no promise
 # Steps that turn back and hardly shrink are shortened by TURNED; others grow by SHARE up to the whole.
 TURNED, SHARE, SLOW = 0.7, 1.15, 0.3
+FREE = 0.05  # of a parameter's size, in the last step: it is hardly known
 ALONG = 0.9  # cosine between two steps that go the same way
 LARGEST_STEP = 0.5  # of a parameter in one pass, relative to its size
 # Disturbing forces where the model is not trusted, white from sample to sample, as accelerations [m/s2, rad/s2]: on a
@@ -272,6 +273,10 @@ def iterate(
         # What this step will have left undone, if steps go on shrinking as they do.
         ratio = min(max(step / before, 1 - whole), 0.9)
         if (step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED) or (disturbed > 0 and step < enough):
+            if (np.abs(there[1] - X) > FREE * np.maximum(np.abs(X), model.scale)).any():
+                # What is hardly known may have gone where no motion is: other fits must be able to go on from here.
+                found = linearised(c, records, there[0], starts, there[1], disturbed)
+                there = here if found is None else there
             return Fit(there[1], in_si(c, covariance), unseen, known, tuple(there[0]), tuple(linear), cost, disturbed)
     stood = None
     if linear is not None:

@@ -28,6 +28,8 @@ LEEWAY = 0.02  # of a first state in one pass [rad, m/s, rad/s]: what no reading
 PARTS = 4  # of a sample, for the slopes
 PASSES = 20  # of Gauss-Newton, at most
 CONVERGED = 0.02  # a step this small against the standard deviation ends it
+# What ends it where friction that sticks makes steps jump about: the smallest step of all passes, if it is so small.
+NEARLY = 0.1
 SHORTER = 8  # times that a step is halved where the machine it leads to can't be simulated
 BOLDEST = 0.5  # step of a parameter in one pass, relative to its scale
 
@@ -71,6 +73,7 @@ def oe(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     runs = _simulated(c, pieces, x)
     if runs is None:
         raise NotIdentifiable("oe: the machine file's values give no motion along this log; check masses and inertias")
+    nearest = np.inf, x, runs
     for _ in range(PASSES):
         step, starts, covariance = _step(runs, level, torque_noise, sensor_noise, kept)
         limit = BOLDEST * np.maximum(model.scale, np.abs(x))
@@ -88,12 +91,19 @@ def oe(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
             )
         pieces, runs, x = moved, ahead, x + share * step
         level = np.maximum(np.sqrt(_energy(runs)), sensor_noise)
-        if (np.abs(step[kept]) < CONVERGED * np.sqrt(np.diag(covariance))).all():
-            _, _, covariance = _step(runs, level, torque_noise, sensor_noise, kept)
-            return _answer(model, blocks, x, covariance, len(pieces))
-    raise NotIdentifiable(
-        f"oe: no end after {PASSES} passes; start from better values in the machine file, or use another method"
-    )
+        left = float((np.abs(step[kept]) / np.sqrt(np.diag(covariance))).max())
+        nearest = min(nearest, (left, x, runs), key=lambda one: one[0])
+        if left < CONVERGED:
+            break
+    left, x, runs = nearest
+    if left > NEARLY:
+        raise NotIdentifiable(
+            f"oe: no end after {PASSES} passes (the smallest step is {left:.2g} standard deviations); start from better"
+            " values in the machine file, or use another method"
+        )
+    level = np.maximum(np.sqrt(_energy(runs)), sensor_noise)
+    _, _, covariance = _step(runs, level, torque_noise, sensor_noise, kept)
+    return _answer(model, blocks, x, covariance, len(pieces))
 
 
 def _answer(

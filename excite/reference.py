@@ -114,7 +114,8 @@ def _shape(name: str, shape: Shape) -> tuple[str, str, str, str, str]:
     of = "" if shape.size is one else " of the site's size"
     tried = ", ".join(f"{x:.3g}" for x in shape.grid) + of
     form = f"where {shape.form[0]} is {shape.form[1]:g}" if shape.form else ""
-    return name, shape.unit, f"{shape.default:.3g}{of}", tried, "; ".join(filter(None, (shape.meaning, form)))
+    ends = "from {:g} to {:g}".format(*shape.within) + of if shape.within else ""
+    return name, shape.unit, f"{shape.default:.3g}{of}", tried, "; ".join(filter(None, (shape.meaning, ends, form)))
 
 
 def _sets(beside: Sequence[Mapping[str, float]]) -> str:
@@ -131,8 +132,8 @@ def machine_page() -> str:
     return _page(
         "# Machine file",
         "",
-        'TOML; a file may say `extends = "va12"` and give only what differs. `excite machine new NAME` writes one with',
-        "comments to start from.",
+        'TOML; a file may say `extends = "va12"` and give only what differs: `[sensor.u1]` changes a sensor,',
+        "`[body.front_roll.limit]` limits of a body. `excite machine new NAME` writes one with comments to start from.",
         "",
         *_keys(Machine),
         "## Units",

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from excite import figures, folder, log, logcheck, objective, tables
+from excite.bootstrap import SURE
 from excite.limit import TOLERANCE
 from excite.page import Picture, Table, report_page
 from excite.terminal import ESTIMATE
@@ -334,7 +335,7 @@ def _identify(s: Summary) -> Said:
 def _is_biased(row: Mapping[str, Any]) -> bool:
     """Whether the method's bias of a parameter is known to be more than its deviation."""
     bias, std = row.get("bias"), row.get("bias_std")
-    return bias is not None and std is not None and abs(bias) > max(row["std"], 3 * std)
+    return bias is not None and std is not None and abs(bias) > max(row["std"], SURE * std)
 
 
 def _log(s: Summary) -> Said:

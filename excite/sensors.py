@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 
@@ -85,6 +87,11 @@ def torque_behind(
 ) -> np.ndarray:
     """The reverse of one channel: the torque (N,) [N m] behind what is read (N,); gain, offset, delay [s] (N,)."""
     return np.asarray((np.interp(t + delay, t, read) - offset) / gain)
+
+
+def torques_behind(t: np.ndarray, read: np.ndarray, channels: Sequence[np.ndarray]) -> np.ndarray:
+    """The same of all channels, (N, n_u) of (N, n_u); channels: gain, offset, delay, (n_u, N) each."""
+    return np.column_stack([torque_behind(t, *each) for each in zip(read.T, *channels, strict=True)])
 
 
 def _flawed(sensor: Sensor, exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -26,6 +26,7 @@ from model.effect import Placed
 from model.machine import Filter, Machine
 from model.prediction import Model, build
 
+NEARER = 100.0  # of a cost, by which what was not found comes nearer to logs that are near already
 STRONG = 1.3  # misfit over readings from which first-order gains are rough
 FOLLOWED = 2.5  # misfit over readings up to which exact dynamics follow logs where nothing else does
 FAR = 10.0  # misfit over readings, a few passes after the beginning, from which no fit comes near
@@ -375,9 +376,12 @@ def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.in
         fit = _nearly(prepared, points, X, disturbed, most)
     except NotConverged as failed:
         found = failed.fit
-        # By exact dynamics it came near the logs as the stage that it began from did not: what does that is right, from
-        # however far it came, and is gone on with.
-        if found is None or disturbed > 0 or of.near or found.cost > min(STRONG * prepared.noise, most):
+        if found is None or disturbed > 0:
+            raise
+        # By exact dynamics it came near the logs as the stage that it began from did not, or nearer by far: what does
+        # that is right, from however far it came, and is gone on with.
+        near = of.fit.cost - NEARER if of.near else STRONG * prepared.noise
+        if found.cost > min(near, most):
             raise
         fit = _nearly(prepared, found.points, found.X, disturbed, most)
     return light(fit)

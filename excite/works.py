@@ -59,8 +59,7 @@ def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief
             found = briefs.answer(model, chosen, brief, advance)
         except np.linalg.LinAlgError:
             raise MachineError(
-                f"{model.machine.name}: some parameter moves nothing in problem {name}, so no drive shows it; is an"
-                " effect outside of what the drive can reach?"
+                f"{model.machine.name}: {briefs.unmoved(name)}; is an effect outside of what the drive can reach?"
             ) from None
     wall = time.perf_counter() - begin
     profiles.of(found.model, found.design.motion).to_csv(place / "profile.csv", index=False)
@@ -201,7 +200,8 @@ def identified(
         read = [examine.examine(model, one).log for one in read]  # as it was identified from
         if model.slips and identify.METHODS[method].biased:
             estimate = identify.with_bias(model, read, estimate, chosen)
-        late = [remark for one in read for remark in examine.late_channels(model, one, chosen)]
+        found = estimate.value if estimate.method == "joint" and np.isfinite(estimate.value).all() else None
+        late = [remark for one in read for remark in examine.late_channels(model, one, chosen, found)]
     summary = {
         "machine": model.machine.name,
         "logs": [one.source for one in read],

@@ -62,3 +62,31 @@ def test_noise_alone_is_no_burst() -> None:
     rng, t = np.random.default_rng(0), np.arange(12_000) / 100
     found = [a for _ in range(3000) for a in anomaly._in_torque("u", t, 40 * rng.standard_normal(len(t)), 100.0)]
     assert [a for a in found if a.kind == "burst"] == []
+
+
+@pytest.mark.parametrize(("bit", "steps"), [(16, False), (32, False), (32, True), (64, True), (256, True)])
+def test_a_bit_that_is_always_set_leaves_bands(bit: int, steps: bool) -> None:
+    """Smaller than the sensor's noise or far larger; values that are steps of a converter are no bands."""
+    t, _ = times(100)
+    for seed in range(10):
+        u = driven(seed, t, steps)
+        stuck = u + np.where((u // bit) % 2 == 0, bit, 0)
+        assert [str(a) for a in anomaly._bands("u1", t, stuck)] == [
+            "u1: values in bands of one width with nothing between them: a bit of its converter never changes"
+        ]
+        assert not list(anomaly._bands("u1", t, u))
+        assert not list(anomaly._bands("u1", t, np.round(u / bit) * bit))
+        assert not list(anomaly._bands("u1", t, np.round(u)))
+
+
+@pytest.mark.parametrize(
+    ("level", "noise", "rise"), [(500.0, 40.0, 0), (60.0, 5.0, 0), (500.0, 40.0, 3), (1000.0, 40.0, 0)]
+)
+def test_a_drive_in_steps_of_one_size_is_no_converter(level: float, noise: float, rise: int) -> None:
+    t, _ = times(100)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        u = np.repeat(level * rng.integers(-4, 5, 40), len(t) // 40)
+        if rise:
+            u = np.convolve(np.pad(u, rise, mode="edge"), np.ones(2 * rise + 1) / (2 * rise + 1), mode="valid")
+        assert not list(anomaly._bands("u1", t, u + noise * rng.normal(size=len(u)))), seed

@@ -199,6 +199,7 @@ PLAIN = {  # of each cause the first minute of driving in which it is ten times 
     "torque_offset_drift": 1,
     "torque_deadband": 0,
     "roll_unbalance": 0,
+    "roll_out_of_round": 0,
     "encoder_eccentricity": 0,
     "torque_ripple": 0,
     "shear_saturation": 1,

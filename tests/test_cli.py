@@ -72,6 +72,28 @@ def test_machines_are_listed(excite: Excite) -> None:
     assert "va12_straight" in stdout
 
 
+@pytest.mark.parametrize(
+    ("effect", "doubts"),
+    [
+        ("rolling_resistance@rear_roll=30", []),
+        (
+            "rolling_resistance@rear_roll=40000",
+            ["--effect rolling_resistance@rear_roll: 40000 N, usual are about 2e+02"],
+        ),
+        ("shear_saturation@rear_roll=0.2", []),
+        ("shear_saturation@rear_roll=0.002", ["--effect shear_saturation@rear_roll: 0.002, usual are about 0.3"]),
+    ],
+)
+def test_an_effect_as_large_as_none_is_said(
+    effect: str, doubts: list[str], profile: Path, tmp_path: Path, excite: Excite
+) -> None:
+    """It may be meant in another unit; it is simulated all the same."""
+    out = tmp_path / "log.csv"
+    _, stdout, _ = excite("simulate", "va12_straight", profile, "--effect", effect, "--out", out, "--json")
+    assert [line.split(":")[0:2] for line in json.loads(stdout)["doubts"]] == [x.split(":") for x in doubts]
+    assert out.exists()
+
+
 def test_simulate_then_identify(profile: Path, tmp_path: Path, excite: Excite, straight: Model) -> None:
     """The loop through files: exact signals give the truth back."""
     out = tmp_path / "log.csv"

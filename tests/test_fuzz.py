@@ -691,7 +691,7 @@ def test_titles_and_paths_are_text_in_figures_and_reports(
 # ------------------------------------------------------------------------------------------------ properties
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=200, derandomize=True)
 @given(st.text(max_size=60))
 def test_any_text_is_an_effect_or_is_refused(text: str) -> None:
     try:
@@ -712,7 +712,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=500, deadline=None, derandomize=True)
+@settings(max_examples=500, derandomize=True)
 @given(JSON | st.binary(max_size=40) | st.text(max_size=40))
 def test_a_message_is_numbers_or_is_refused(message: Any) -> None:
     """What the driver's page shows is finite numbers under known keys, whatever is sent."""
@@ -722,7 +722,7 @@ def test_a_message_is_numbers_or_is_refused(message: Any) -> None:
         assert all(isinstance(v, float) and math.isfinite(v) for v in said.values())
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=25, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1e-6, 1.0, 1e4]), st.sampled_from(["u1", "u4"]))
 def test_what_is_written_is_what_is_read(seed: int, size: float, name: str) -> None:
     """Any torques go through a CSV file as they are, to the last bit."""

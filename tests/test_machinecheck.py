@@ -141,6 +141,10 @@ DOUBTFUL = {
         [("body.2.inertia.ZZ", None), ("scale.ZZ2", assumed(2000))],
         "rear_frame: inertia.ZZ: 0 kg m2 with 2600 kg, a body that turns has one",
     ),
+    "a slope in per cent": (
+        [("effect", [{"name": "ground_slope", "amount": assumed(3.0)}])],
+        "effect ground_slope@machine: 3 rad, usual are about 0.005: in another unit?",
+    ),
     "no noise": ([("sensor.5.noise", None)], "sensor u_front: neither noise nor counts_per_turn"),
 }
 

@@ -166,6 +166,14 @@ def test_emps_by_the_other_methods(emps: Model, emps_data: Path) -> None:
     assert (np.abs(total.value - weighted.value) < 2 * weighted.std).all()
 
 
+@pytest.mark.slow
+def test_output_error_ends_where_friction_sticks(emps: Model, emps_data: Path) -> None:
+    """A carriage that starts and stops: steps jump about there, whichever pass has the smallest is the answer."""
+    one = log.read(emps_data, emps.machine)
+    found, weighted = (identify.identify(emps, [one], m) for m in ("oe", "wls"))
+    assert (np.abs(found.value - weighted.value) < 2 * np.hypot(found.std, weighted.std)).all()
+
+
 def test_kits_without_lateral_speed_are_known(va12: Model) -> None:
     assert "vy" in identify.needed_sensors(va12, "tls")
     assert "vy" not in identify.needed_sensors(va12, "iv")
