@@ -172,15 +172,15 @@ def _bands(name: str, t: np.ndarray, value: np.ndarray) -> Iterator[Anomaly]:
     place = (x[at] + gap[at] / 2) / (2 * width)
     # The width is a little too large, by the distance of values: so is what is found of the way from hole to hole.
     apart = np.diff(place)
-    whole = np.maximum(np.round(apart), 1.0)
-    regular = (np.abs(apart / whole - np.median(apart / whole)) < EVERY) & (np.abs(gap[at][1:] / width - 1) < 2 * EVERY)
+    apart /= np.maximum(np.round(apart), 1.0)
+    period = float(np.median(apart))
+    regular = (np.abs(apart - period) < EVERY) & (np.abs(gap[at][1:] / width - 1) < 2 * EVERY)
     # A bit cuts values off where they are as dense as elsewhere; noise about levels that a drive steps to fades.
     beside = np.add.outer(at, [*range(-EDGE, 0), *range(1, EDGE + 1)])
     around = scipy.ndimage.median_filter(gap, WIDELY, mode="nearest")[at] / np.log(2)
     edges = gap[np.clip(beside, 0, len(gap) - 1)].mean(axis=1) / around
-    if np.median(edges) > SHARP:
-        return
-    if regular.sum() >= max(MANY - 1, 0.8 * len(regular)) and abs(float(np.median(apart / whole)) - 1) < EVERY:
+    sharp, often = np.median(edges) <= SHARP, regular.sum() >= max(MANY - 1, 0.8 * len(regular))
+    if sharp and often and abs(period - 1) < EVERY:
         yield Anomaly(name, "bands", t[0], t[-1], None, len(at) / MANY)
 
 

@@ -406,12 +406,12 @@ def _tries(
 def _felt(name: str, stage: Stage) -> bool:
     """Whether an effect's shapes are such as there are, and the torque sensor shakes, in one of the logs, while it acts
     if that shakes it; also where none of them can tell."""
-    own = stage.placed(name)
-    if not placing.possible(stage.machine, replace(own, values={**own.values, **_values(stage, own)})):
+    placed = stage.placed(name)
+    fitted = replace(placed, values={**placed.values, **_values(stage, placed)})
+    if not placing.possible(stage.machine, fitted):
         return False
-    if own.effect.shaking is None:
+    if fitted.effect.shaking is None:
         return True
-    fitted = placing.placed(stage.machine, entry_of(stage, name))
     of = (s for s in stage.machine.sensors("full") if s.kind == "torque" and s.body == fitted.bodies[0])
     sensor, rate = next(of, None), float(stage.machine.sampling_hz)
     if sensor is None:

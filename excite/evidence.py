@@ -83,7 +83,7 @@ def candidates(machine: Machine, sensors: Sequence[str], duration: float) -> lis
         for where, (bodies, sensor) in placing.places(machine, effect).items():
             if effect.reading is not None and sensor not in sensors:
                 continue
-            site = Site(machine, machine.find(bodies[0]), duration)
+            site = Site.of(machine, bodies, duration)
             for values, width in _grid(effect, site):
                 placed = Placed(effect, where, bodies, sensor, values)
                 found.append(Candidate(placed, tuple(range(columns, columns + width))))
@@ -121,7 +121,7 @@ def finer(scores: Sequence[Score], machine: Machine, duration: float, reach: flo
     columns = 0
     for score in scores:
         placed = score.candidate.placed
-        site = Site(machine, machine.find(placed.bodies[0]), duration)
+        site = Site.of(machine, placed.bodies, duration)
         for values in _about(placed, site, reach):
             width = len(score.candidate.columns)
             own = Placed(placed.effect, placed.where, placed.bodies, placed.sensor, values)

@@ -227,18 +227,22 @@ def late_channels(model: Model, log: Log, filter: Filter | None = None, X: np.nd
     if X is not None and found:
         try:
             usual = {d.name: d for d in delays(model, _in_time(model, log, filter, X), filter)}
+            found = [d.beside(usual[d.name]) if d.name in usual else d for d in found]
         except (SimulationError, LogError):
-            usual, found = {}, [d for d in found if d.std < NOISY]
-        found = [d.beside(usual[d.name]) if d.name in usual else d for d in found]
+            X = None  # nothing to take off
     said = []
     for d in found:
+        precise = d.std < NOISY
+        if not d.significant or not (precise or X is not None):
+            continue
         which = f"{'late' if d.value > 0 else 'early'} against the motion"
         much = f"{abs(d.value) * 1e3:.1f} ms (+-{d.std * 1e3:.1g})"
-        if d.significant and d.std < NOISY:
-            said.append(f"{log.source}: {d.name} is {much} {which}: shift the channel, or run `excite diagnose`")
-        elif d.significant and X is not None:
-            line = f"{d.name} is {which}, by {much} as far as noise tells: `excite diagnose` says by how much"
-            said.append(f"{log.source}: {line}")
+        line = (
+            f"{d.name} is {much} {which}: shift the channel, or run `excite diagnose`"
+            if precise
+            else f"{d.name} is {which}, by {much} as far as noise tells: `excite diagnose` says by how much"
+        )
+        said.append(f"{log.source}: {line}")
     return tuple(said)
 
 

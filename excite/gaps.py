@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from excite import log, logcheck
-from excite.log import Log
+from excite.log import Log, LogError
 from model.machine import Machine
 
 LONG = 5.0  # s that a stretch must last: a start and some seconds of motion
@@ -36,12 +37,15 @@ def split(
 ) -> tuple[list[Log], list[str]]:
     """The same of one table of columns."""
     logcheck.refuse(table, machine, needs, source)
-    cuts = log.gap_rows(table, machine, source)
+    t = np.empty(0)
+    if machine.time_column in table.columns:
+        with suppress(LogError):  # `log.check` says it
+            t = log.times(table, machine, source)
+    cuts = log.gap_rows(t, machine)
     rate = float(machine.sampling_hz)
     rows = [0, *cuts, len(table)]
     if not cuts or len(cuts) > MOST or min(np.diff(rows)) < LONG * rate:
         return [log.check(table, machine, needs, source)], []
-    t = log.times(table, machine, source)
     stretches = [
         log.check(table.iloc[first:last].reset_index(drop=True), machine, needs, f"{source} from row {first + 1}")
         for first, last in itertools.pairwise(rows)

@@ -147,15 +147,11 @@ def too_short(rows: int, machine: Machine) -> str:
     return f"only {rows} rows, at least {least} are needed: is the file complete?" if rows < least else ""
 
 
-def gap_rows(table: pd.DataFrame, machine: Machine, source: str) -> list[int]:
-    """First rows (from 0) after each gap; none where time is not what it should be in other ways."""
-    if machine.time_column not in table.columns or len(table) < 2:
-        return []
-    try:
-        dt = np.diff(times(table, machine, source)) * float(machine.sampling_hz)
-    except LogError:
-        return []
-    if (dt <= 0).any() or abs(float(np.median(dt)) - 1) > OFF_RATE:
+def gap_rows(t: np.ndarray, machine: Machine) -> list[int]:
+    """First rows (from 0) after each gap in times (N,) [s]; none where these are not what they should be in other
+    ways."""
+    dt = np.diff(t) * float(machine.sampling_hz)
+    if not len(dt) or (dt <= 0).any() or abs(float(np.median(dt)) - 1) > OFF_RATE:
         return []
     return [int(k) + 1 for k in np.flatnonzero(dt > GAP)]
 

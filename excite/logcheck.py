@@ -98,7 +98,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
     signals: dict[str, tuple[np.ndarray, np.ndarray, str]] = {}
     readings: dict[str, np.ndarray] = {}
     rate = float(machine.sampling_hz)
-    unbroken = _unbroken(table, machine)
+    unbroken = _unbroken(t, machine) if len(t) else slice(None)
     after = tuple(f"row {int(np.searchsorted(t, gap)) + 2}," for gap in gaps)
     absent: list[str] = []
     for sensor in machine.sensors("full"):
@@ -178,7 +178,8 @@ def refuse(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sou
     t = _caught(lambda: log.times(table, machine, source), None)
     if t is not None and (clock := _clock(t, machine)):
         raise LogError(f"{source}: {clock}")
-    table = table.iloc[_unbroken(table, machine)].reset_index(drop=True)
+    if t is not None:
+        table = table.iloc[_unbroken(t, machine)].reset_index(drop=True)
     for sensor in machine.sensors("full"):
         if sensor.kind != "angle" or not set(sensor.columns) <= set(table.columns):
             continue
@@ -187,9 +188,9 @@ def refuse(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sou
             raise LogError(f"{source}: {speed}")
 
 
-def _unbroken(table: pd.DataFrame, machine: Machine) -> slice:
-    """Rows of the longest stretch without a gap: across one an angle may jump."""
-    edges = [0, *log.gap_rows(table, machine, ""), len(table)]
+def _unbroken(t: np.ndarray, machine: Machine) -> slice:
+    """Rows of the longest stretch of times (N,) [s] without a gap: across one an angle may jump."""
+    edges = [0, *log.gap_rows(t, machine), len(t)]
     return slice(*max(itertools.pairwise(edges), key=lambda ends: ends[1] - ends[0]))
 
 

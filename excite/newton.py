@@ -273,10 +273,10 @@ def iterate(
         # What this step will have left undone, if steps go on shrinking as they do.
         ratio = min(max(step / before, 1 - whole), 0.9)
         if (step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED) or (disturbed > 0 and step < enough):
-            if (np.abs(there[1] - X) > FREE * np.maximum(np.abs(X), model.scale)).any():
-                # What is hardly known may have gone where no motion is: other fits must be able to go on from here.
-                found = linearised(c, records, there[0], starts, there[1], disturbed)
-                there = here if found is None else there
+            # What is hardly known may have gone where no motion is: other fits must be able to go on from here.
+            far = (np.abs(there[1] - X) > FREE * np.maximum(np.abs(X), model.scale)).any()
+            if far and linearised(c, records, there[0], starts, there[1], disturbed) is None:
+                there = here
             return Fit(there[1], in_si(c, covariance), unseen, known, tuple(there[0]), tuple(linear), cost, disturbed)
     stood = None
     if linear is not None:

@@ -101,7 +101,7 @@ def effects_page() -> str:
 
 
 def _typical(machine: Machine, e: Effect, bodies: tuple[int, ...]) -> float:
-    return e.amount(Site(machine, machine.find(bodies[0]), DURATION))
+    return e.amount(Site.of(machine, bodies))
 
 
 def _amount(e: Effect) -> str:

@@ -143,7 +143,7 @@ def _placed(stage: Stage, name: str) -> Placed:
     effect = effects.CATALOGUE[name]
     bodies, sensor = placing.places(stage.machine, effect)[where]
     log = stage.prepared.logs[0]
-    site = Site(stage.machine, stage.machine.find(bodies[0]), float(log.t[-1] - log.t[0]))
+    site = Site.of(stage.machine, bodies, float(log.t[-1] - log.t[0]))
     shapes = {n: s.default * s.size(site) for n, s in effect.shapes.items()}
     return Placed(effect, where, bodies, sensor, {"A": effect.amount(site), **shapes})
 

@@ -57,11 +57,17 @@ class Slip:
     vn: ca.SX
 
 
-def slip(contact: Contact, Vx: ca.SX, Vy: ca.SX, spin: ca.SX) -> Slip:
-    """Slips of a contact whose centre moves at Vx, Vy [m/s] in its chassis' axes and which spins at `spin` [rad/s]."""
-    rim = float(contact.radius) * spin
-    vn = ca.sqrt(rim**2 + float(contact.v_eps) ** 2)
-    return Slip((Vx - rim) / vn, Vy / vn, vn)
+def rim(contact: Contact, spin: ca.SX, further: ca.SX | float = 0.0) -> ca.SX:
+    """Speed of the rim at the ground [m/s], of a contact that spins at `spin` [rad/s]; further [m]: by how much the
+    ground is further from its axle than its radius."""
+    return (float(contact.radius) + further) * spin
+
+
+def slip(contact: Contact, Vx: ca.SX, Vy: ca.SX, spin: ca.SX, further: ca.SX | float = 0.0) -> Slip:
+    """Slips of a contact whose centre moves at Vx, Vy [m/s] in its chassis' axes, its rim as `rim` has it."""
+    at_ground = rim(contact, spin, further)
+    vn = ca.sqrt(at_ground**2 + float(contact.v_eps) ** 2)
+    return Slip((Vx - at_ground) / vn, Vy / vn, vn)
 
 
 def wrench(

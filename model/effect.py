@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -34,11 +34,11 @@ class Rolling:
     @property
     def rim(self) -> ca.SX:
         """Speed of the rim at the ground [m/s]."""
-        return (float(self.contact.radius) + self.further) * self.spin
+        return law.rim(self.contact, self.spin, self.further)
 
     @property
     def slip(self) -> law.Slip:
-        return law.slip(self.contact, self.Vx, self.Vy, self.rim / float(self.contact.radius))
+        return law.slip(self.contact, self.Vx, self.Vy, self.spin, self.further)
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,11 @@ class Site:
     machine: Machine
     body: Body
     duration: float
+
+    @classmethod
+    def of(cls, machine: Machine, bodies: Sequence[int], duration: float = DURATION) -> Site:
+        """Where an effect acts on these bodies."""
+        return cls(machine, machine.find(bodies[0]), duration)
 
 
 def one(site: Site) -> float:

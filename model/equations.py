@@ -184,8 +184,7 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Pla
         added = _added(s, own, inertia)
         if e.effect.further is not None or e.effect.soil is not None:
             for k in e.bodies:
-                body, lever = machine.find(k), rollings[k][1]
-                plain, rolling = rollings[k][0], own.scene.rolling[k]
+                body, rolling, (plain, lever) = machine.find(k), own.scene.rolling[k], rollings[k]
                 added += _pushed(body, _changed(s, [own], body, rolling), lever, rolling)
                 added -= _pushed(body, _soil(s, body, plain), lever, plain)
         force.append(added)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping, Sequence
 
 import casadi as ca
@@ -104,14 +105,14 @@ def without(machine: Machine, name: str) -> Machine:
 
 def possible(machine: Machine, effect: Placed) -> bool:
     """Whether an effect's shapes are such as there are at its place."""
-    site = Site(machine, machine.find(effect.bodies[0]), DURATION)
+    site = Site.of(machine, effect.bodies)
     ranges = {n: [x * s.size(site) for x in s.within] for n, s in effect.shapes.items() if s.within is not None}
     return all(low <= effect.values[n] <= high for n, (low, high) in ranges.items())
 
 
 def doubtful(machine: Machine, effect: Placed) -> str | None:
     """What is said of an effect that is far larger than such effects are at its place."""
-    usual, amount = effect.effect.amount(Site(machine, machine.find(effect.bodies[0]), DURATION)), effect.values["A"]
+    usual, amount = effect.effect.amount(Site.of(machine, effect.bodies)), effect.values["A"]
     large, small = (usual, abs(amount)) if effect.effect.inverse else (abs(amount), usual)
     unit = effect.effect.unit
     if large < HUGE * small or (usual < SMALLEST and unit.startswith("N m")):
@@ -127,7 +128,9 @@ def placed(machine: Machine, entry: EffectEntry, duration: float = DURATION) -> 
     """
     effect = CATALOGUE.get(entry.name)
     if effect is None:
-        raise MachineError(f"{machine.name}: effect {entry.name}: unknown, allowed: {', '.join(CATALOGUE)}")
+        like = difflib.get_close_matches(entry.name, CATALOGUE, n=3)
+        hint = f"is {' or '.join(like)} meant?" if like else f"not one of {len(CATALOGUE)}"
+        raise MachineError(f"{machine.name}: effect {entry.name}: unknown, {hint} (`excite docs` tells of all)")
     allowed = places(machine, effect)
     where = entry.where or (next(iter(allowed)) if len(allowed) == 1 else "")
     if where not in allowed:
@@ -142,7 +145,7 @@ def placed(machine: Machine, entry: EffectEntry, duration: float = DURATION) -> 
     bodies, sensor = allowed[where]
     if effect.sensed and sensor is None:
         raise MachineError(f"{machine.name}: effect {entry.name}: {where} has no sensor that it could sit in")
-    site = Site(machine, machine.find(bodies[0]), duration)
+    site = Site.of(machine, bodies, duration)
     values = {"A": float(entry.amount)}
     for name, shape in effect.shapes.items():
         given = entry.shape.get(name)

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from model import placing, tree
-from model.effect import DURATION, Placed, Site
+from model.effect import Placed, Site
 from model.equations import Equations, equations, kinematics
 from model.machine import Machine, MachineError
 
@@ -342,7 +342,7 @@ def _amounts(machine: Machine, placed: Sequence[Placed], shapes: bool) -> dict[s
     """Value, unit and typical size of every shape and amount that is a parameter, by name: amounts last."""
     found: dict[str, tuple[float, str, float]] = {}
     for e in placed:
-        site = Site(machine, machine.find(e.bodies[0]), DURATION)
+        site = Site.of(machine, e.bodies)
         for name, (key, unit) in e.parameters.items():
             if key == "A":
                 size = abs(e.effect.amount(site))

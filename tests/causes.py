@@ -425,7 +425,6 @@ _TABLE: tuple[tuple[Hide, tuple[str, ...], str, dict[str, tuple[float, float]], 
     (torque_deadband, ROLLS, "N m", {"": (20, 150)}, {}),
     (pump_coupling, ("drive",), "-", {"": (0.02, 0.12)}, {"signed": True}),
     (roll_unbalance, ROLLS, "N m", {"": (10, 100)}, {}),
-    (roll_out_of_round, ROLLS, "m", {"": (0.0002, 0.004)}, {}),
     (encoder_eccentricity, _WHEELED, "rad", {"": (0.001, 0.01)}, {}),
     (torque_ripple, ROLLS, "N m", {"": (20, 150)}, {}),
     (shear_saturation, ROLLS, "-", {"": (0.8, 0.15)}, {"none": np.inf}),
@@ -443,6 +442,8 @@ _TABLE: tuple[tuple[Hide, tuple[str, ...], str, dict[str, tuple[float, float]], 
     (payload_shift, ("machine",), "kg m", {"": (120, 1000)}, {"signed": True}),
     (relief_valve, ROLLS, "-", {"": (0.15, 1.0)}, {}),
     (friction_transition, _JOINTS, "-", {"": (0.6, 3), "articulation": (0.2, 1.5)}, {"signed": True}),
+    # New ones come last: cases are drawn by a cause's place in this table.
+    (roll_out_of_round, ROLLS, "m", {"": (0.0002, 0.004)}, {}),
 )
 CAUSES: dict[str, Cause] = {
     f.__name__: Cause(places, unit, amounts, f, **more) for f, places, unit, amounts, more in _TABLE

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from excite import profiles
 from excite.simulate import Motion, simulate
 from model import machine, prediction
 from model.prediction import Model
@@ -39,6 +40,12 @@ def drive(model: Model, duration: float, seed: int, amplitude: dict[str, float])
         for frequency in (0.05, 0.08, 0.13, 0.2, 0.3):
             torque[:, k] += amplitude[name] * np.sin(2 * np.pi * frequency * t + rng.uniform(0, 2 * np.pi))
     return torque * np.minimum(1, np.minimum(t, duration - t) / 2)[:, None]
+
+
+def designed(name: str, model: Model) -> Motion:
+    """A committed design, its torques on a machine."""
+    torque, q0, nu0 = profiles.read(RESULTS / name / "design" / "profile.csv", model)
+    return simulate(model, torque, q0=q0, nu0=nu0)
 
 
 def study(name: str) -> ModuleType:

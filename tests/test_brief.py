@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Excite
+from conftest import Excite, designed
 
 from excite import profiles, sensors, stored
 from excite.brief import POOR, Brief, advice
-from excite.simulate import Motion, simulate
+from excite.simulate import Motion
 from excite.smoothing import cramer_rao
 from model.machine import load
 from model.prediction import Model, build
@@ -82,8 +82,7 @@ def test_what_sits_in_a_sensor_is_no_part_of_a_design_that_is_read_back(excite: 
         'amount = { value = 0.001, source = "identified" }\n'
     )
     model = build(load(own))
-    torque, q0, nu0 = profiles.read(S40 / "profile.csv", model)
-    sensors.measure(model, simulate(model, torque, q0=q0, nu0=nu0), seed=5).to_csv(path, index=False)
+    sensors.measure(model, designed("S40", model), seed=5).to_csv(path, index=False)
     code, _, err = excite("design", own, "--after", path, "--duration", 12, "--starts", 1, "--out", out)
     assert code == 0, err
     assert "measuring_wheel_radius@measuring_wheel_left" in stored.read(out).model.base.names

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import Excite
+from conftest import Excite, designed
 
 from excite import checkup, choosing, diagnose, findings, gain, log, misfit, newton, profiles, sensors, stages
 from excite.separate import Rivals
@@ -24,8 +24,6 @@ from model import machine, placing, prediction
 from model.file import Quantity
 from model.machine import EffectEntry
 from model.prediction import Model
-
-ROOT = Path(__file__).parents[1]
 
 
 def logged(model: Model, motion: Motion, path: Path, seed: int, *texts: str) -> Path:
@@ -366,10 +364,9 @@ def test_what_is_found_stands_beside_what_the_file_has(
 @pytest.mark.parametrize("seed", [1, 6, 10])
 def test_a_drive_that_hardly_shows_the_machine_still_shows_a_cause(seed: int, straight: Model) -> None:
     """Along S40 masses are known to a half: a fit goes where no motion is (6), or stops short of the cause (1, 10)."""
-    torque, q0, nu0 = profiles.read(ROOT / "results" / "S40" / "design" / "profile.csv", straight)
     hidden = placing.parse("stribeck_friction@front_roll=150", straight.machine, 40.0)
     truth = prediction.build(placing.extended(straight.machine, hidden))
-    table = sensors.measure(truth, simulate(truth, torque, q0=q0, nu0=nu0), seed=seed)
+    table = sensors.measure(truth, designed("S40", truth), seed=seed)
     (found,) = diagnose.diagnose(straight, [log.check(table, straight.machine)], straight.machine.filter).findings
     assert found.name == "stribeck_friction@front_roll"
     assert abs(found.amount - 150) < 3 * found.amount_std

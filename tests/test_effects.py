@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from types import MappingProxyType
 
 import casadi as ca
 import numpy as np
 import pytest
+from conftest import designed
 
-from excite import choosing, evidence, log, profiles, sensors, stages
+from excite import choosing, evidence, log, sensors, stages
 from excite.diagnose import opposite
 from excite.processing import implicit
 from excite.simulate import simulate
@@ -53,7 +53,6 @@ CONTRACT = (  # CONTRACT.md section 4: the names that others rely on, and their 
     ("payload_shift", "kg m"),
 )
 VA12 = machine.load("va12")
-ROOT = Path(__file__).parents[1]
 
 
 def where(effect: Effect) -> str:
@@ -369,7 +368,8 @@ def test_a_signature_is_what_the_extended_model_has_more(effect: Effect, va12: M
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("no_such_thing=1", "unknown, allowed: stribeck_friction"),
+        ("no_such_thing=1", "effect no_such_thing: unknown, not one of"),
+        ("torque_ripples@front_roll=1", "unknown, is torque_ripple .*meant[?]"),
         ("shear_saturation=0.2", "where must be one of front_roll, rear_roll"),
         ("shear_saturation@articulation=0.2", "where must be one of front_roll, rear_roll"),
         ("torque_deadband@rear_roll=-3", "amount must be > 0"),
@@ -677,8 +677,7 @@ def test_noise_of_torques_is_no_gain_and_no_delay() -> None:
     """Along a drive that asks little of the articulation, whose torque sensor's noise is a good part of its reading:
     taken from noisy torques, what a gain or a delay would do follows that noise (z of 5.7, gain of 27 on this log)."""
     known = build(VA12)
-    torque, q0, nu0 = profiles.read(ROOT / "results" / "R60" / "design" / "profile.csv", known)
-    measured = log.check(sensors.measure(known, simulate(known, torque, q0=q0, nu0=nu0), seed=3), VA12)
+    measured = log.check(sensors.measure(known, designed("R60", known), seed=3), VA12)
     plain = stages.fitted(VA12, [measured], VA12.filter)
     entry = EffectEntry(name="torque_gain", where="articulation", amount=Quantity(value=0.005, source="assumed"))
     found = stages.refitted(placing.extended(VA12, entry), plain, 0.0)

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import designed
 
-from excite import examine, identify, log, profiles, sensors
+from excite import examine, identify, log, sensors
 from excite.log import Log, LogError
-from excite.simulate import Motion, simulate
+from excite.simulate import Motion
 from model.prediction import Model
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -160,8 +159,7 @@ def test_early_channels_of_the_whole_machine(va12: Model, va12_motion: Motion) -
 def test_noise_of_slips_is_no_delay(va12: Model) -> None:
     """Along R60 slips are small: what their noise leaves in the rows seems 15 ms early, in every log. It hides a part
     of 80 ms that a channel is late."""
-    torque, q0, nu0 = profiles.read(ROOT / "results" / "R60" / "design" / "profile.csv", va12)
-    one = log.check(sensors.measure(va12, simulate(va12, torque, q0=q0, nu0=nu0), seed=3), va12.machine)
+    one = log.check(sensors.measure(va12, designed("R60", va12), seed=3), va12.machine)
     assert any(d.significant for d in examine.delays(va12, one))
     for X in (va12.nominal, None):
         assert examine.late_channels(va12, one, X=X) == ()

@@ -8,15 +8,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import Excite
+from conftest import Excite, designed
 
-from excite import gaps, logcheck, profiles, sensors
+from excite import gaps, logcheck, sensors
 from excite.identify import identify
 from excite.log import LogError
 from excite.simulate import simulate
 from model.prediction import Model
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +53,7 @@ def test_gaps_beside_which_too_little_is_left(straight: Model, table: pd.DataFra
 @pytest.mark.parametrize("lost", [20, 300, 900])
 def test_a_gap_is_a_gap_wherever_it_is(straight: Model, lost: int) -> None:
     """What a joint does while nothing is seen is neither too fast for it nor a speed."""
-    torque, q0, nu0 = profiles.read(ROOT / "results" / "S40" / "design" / "profile.csv", straight)
-    table = sensors.measure(straight, simulate(straight, torque, q0=q0, nu0=nu0), seed=1)
+    table = sensors.measure(straight, designed("S40", straight), seed=1)
     for first in range(600, 2500, 50):
         holed = table.drop(index=range(first, first + lost)).reset_index(drop=True)
         logs, _ = gaps.split(holed, straight.machine)

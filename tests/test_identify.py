@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Excite
+from conftest import Excite, designed
 
-from excite import identify, log, profiles, regression, sensors
+from excite import identify, log, regression, sensors
 from excite.estimate import NotIdentifiable
 from excite.simulate import Motion, simulate
 from model import machine, prediction
@@ -157,9 +157,7 @@ def test_an_empty_log_is_not_an_estimate(straight: Model, straight_motion: Motio
 
 def test_a_machine_file_far_off_in_one_value_does_not_mislead(straight: Model) -> None:
     """The S40 design goes one way, so friction and offset are hard to tell apart; the file says Fs4 = 20, not 143."""
-    stored = Path(__file__).parents[1] / "results" / "S40" / "design" / "profile.csv"
-    torque, q0, nu0 = profiles.read(stored, straight)
-    motion = simulate(straight, torque, q0=q0, nu0=nu0)
+    motion = designed("S40", straight)
     bodies = []
     for body in straight.machine.body:
         if body.index == 4 and body.friction is not None:

@@ -144,8 +144,8 @@ def test_a_new_effect_is_one_declaration(
     # documented, offered, named in errors, allowed in studies
     assert "## sticky_spot" in reference.effects_page()
     assert "sticky_spot" in asked.choices("effect")
-    with pytest.raises(MachineError, match=r"allowed: stribeck_friction.*sticky_spot"):
-        placing.parse("no_such_thing=1", va12.machine, 10.0)
+    with pytest.raises(MachineError, match=r"is sticky_spot meant[?]"):
+        placing.parse("sticky_spots=1", va12.machine, 10.0)
     assert plan.ready(study(effects=[[], wanted])).total == 2
     # tested by the same tests as every other
     for test in (
