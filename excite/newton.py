@@ -49,17 +49,25 @@ SPREAD_SPEED, SPREAD_ANGLE = 0.05, 0.1
 
 
 class NotConverged(NoEstimate):
-    """Joint smoothing found no estimate; the message says how far it came and what to do, `fit` where it stood and
-    `step` the next step, in standard deviations."""
+    """Joint smoothing found no estimate; the message says how far it came and what to do, `fit` where it stood best and
+    `step` the step from there, in standard deviations. level: costs had ceased to fall."""
 
-    def __init__(self, message: str, fit: Fit | None = None, step: float = np.inf) -> None:
+    def __init__(self, message: str, fit: Fit | None = None, step: float = np.inf, level: bool = False) -> None:
         super().__init__(message)
-        self.fit, self.step = fit, step
+        self.fit, self.step, self.level = fit, step, level
 
     @property
     def nearly(self) -> Fit | None:
         """The fit where it stood, if that is as good as found."""
         return self.fit if self.step <= NEARLY else None
+
+    @property
+    def swinging(self) -> Fit | None:
+        """The fit where it stood, if steps swing without end about what costs alike, under disturbing forces, whose
+        deviations are no promise."""
+        if self.fit is None or self.fit.disturbed == 0 or self.step > HOPELESS[1]:
+            return None
+        return self.fit if self.level else None
 
 
 @dataclass(frozen=True)
@@ -217,6 +225,7 @@ def iterate(
     sizes, costs = list[float](), list[float]()
     shorter, here = 0, (list(points), X)
     there = here
+    stood, nearest = None, np.inf
     whole, last = 1.0, np.zeros(len(X))
     unseen = held.copy()
     for k in range(passes):
@@ -242,6 +251,9 @@ def iterate(
                 covariance, move, left, cost = newton_step(c, records, linear, points, X, known, damping)
         damping *= DAMPING[1]
         before, step = step, left
+        if k <= SETTLED or step < nearest:
+            stood = Fit(X, in_si(c, covariance), unseen, known, tuple(points), tuple(linear), cost, disturbed)
+            nearest = step
         sizes.append(step)
         if k >= HOPELESS[0]:
             shrinking = min((step / sizes[-1 - LATELY]) ** (1 / LATELY), 1.0) if len(sizes) > LATELY else 0.0
@@ -278,14 +290,12 @@ def iterate(
             if far and linearised(c, records, there[0], starts, there[1], disturbed) is None:
                 there = here
             return Fit(there[1], in_si(c, covariance), unseen, known, tuple(there[0]), tuple(linear), cost, disturbed)
-    stood = None
-    if linear is not None:
-        stood = Fit(X, in_si(c, covariance), unseen, known, tuple(points), tuple(linear), cost, disturbed)
     raise NotConverged(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
         " log with `excite log check` and `excite diagnose`, or start from better values in the machine file",
         stood,
-        float(step),
+        float(nearest),
+        len(costs) > SETTLED + 2 and _level(costs),
     )
 
 
@@ -297,7 +307,12 @@ def _idle(steps: Sequence[float], costs: Sequence[float]) -> bool:
     if steps[-1] <= NEARLY:
         return steps[-1] > IDLE[0] * steps[-3]
     still = steps[-1] > IDLE[1] * steps[-3] and steps[-2] > IDLE[1] * steps[-4]
-    return len(steps) > SETTLED + 2 and still and costs[-1] > (1 - FALLING) * costs[-3]
+    return len(steps) > SETTLED + 2 and still and _level(costs)
+
+
+def _level(costs: Sequence[float]) -> bool:
+    """Whether costs have ceased to fall."""
+    return costs[-1] > (1 - FALLING) * costs[-3]
 
 
 def linearised(

@@ -392,9 +392,10 @@ def _nearly(prepared: Prepared, points: Sequence[Point], X: np.ndarray, disturbe
     try:
         return _iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES, most)
     except NotConverged as failed:
-        if failed.nearly is None:
+        found = failed.nearly or failed.swinging
+        if found is None:
             raise
-        return failed.nearly
+        return found
 
 
 def _iterated(

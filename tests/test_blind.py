@@ -264,6 +264,7 @@ def test_most_plain_causes_are_named_and_hardly_any_wrongly(half: int) -> None:
     [
         ("articulation_backlash", 1),
         ("articulation_backlash", 2),
+        ("articulation_backlash", 16),
         ("ground_slope", 3),
         ("articulation_stop_spring", 1),
         ("payload_shift", 0),
