@@ -104,6 +104,7 @@ def judged(one: Case, kept: Path) -> None:
     log, seen = driven(one)
     row: Row = {
         "key": one.key,
+        "program": version(),
         "kind": one.kind,
         "hidden": [h.label for h in one.hidden],
         "amount": [h.amount for h in one.hidden],
@@ -156,7 +157,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     walls = [r["wall_s"] for r in rows]
     return {
         "study": "diagnosis",
-        "program": version(),
+        "program": dict(Counter(r["program"] for r in rows)),
         "cases": len(rows),
         "visible_chi2": VISIBLE,
         "false_alarms": rate(of["nothing"], lambda r: r["outcome"] != "clean"),
@@ -245,15 +246,16 @@ def told(s: dict[str, Any], planned: int, options: Sequence[str]) -> str:
     )
     walls = s["wall_s"]
     part = (
-        f" These are {s['cases']} of its {planned} cases; the command goes on from there."
+        f" These are {s['cases']} of {planned} cases, as far as the time went."
         if s["cases"] < planned
         else ""
     )
     command = " ".join(["python results/diagnosis/study.py", *options])
+    programs = " and ".join(f"{name} ({count} cases)" for name, count in s["program"].items())
     return f"""# Does the diagnosis name what was hidden?
 
 `{command}`
-makes this page, of program {s["program"]} (`version` in study.py); [summary.json](summary.json) has every rate,
+makes this page, of program {programs} (`version` in study.py); [summary.json](summary.json) has every rate,
 [cases.csv](cases.csv) every case.{part} Nobody had looked at any of them while the diagnosis was written: their numbers
 begin where those end that it was mended by, which `--seen` runs instead, so that every round has others. What came of
 them and of the other rounds is in [docs/derivations.md](../../docs/derivations.md).
