@@ -36,6 +36,7 @@ FORMULA = 0.5  # of an amount, times the root of the share of a gain that its fo
 # the amounts in results/diagnosis are within intervals that allow for so much.
 OTHERWISE = 0.05
 FURTHER = 0.8  # SHARE for names after the first: what nature has beside its formula looks like many a cause
+UNSURE = 2.0  # deviations from none, with every doubt, below which an amount may be none
 SURELY, WRONG = 3.0, 0.5  # deviations, and a share of its usual size, by which a parameter's sign is wrong
 ODD = 50.0  # misfit that every line of what is odd beside names stands for, at least
 
@@ -365,6 +366,9 @@ def concluded(
         share = _share(sum(x.gain for x in chosen), after, odd)
         left = max(left, _rest(after, odd))
     findings = tuple(_finding(x, after, left, alone=len(chosen) == 1) for x in chosen)
+    if len(chosen) == 1 and not _any(chosen[0].name, after, findings[0]):
+        explained = chosen[0].gain / (chosen[0].gain + left)
+        return concluded(before, before, [], _odd(before), 0.0, Nearest(chosen[0].name, explained))
     nearest = None if findings else nearest
     verdict = "clean"
     if findings:
@@ -375,6 +379,15 @@ def concluded(
         verdict, share = "unexplained", 0.0
     stages = tuple(x.stage for x in chosen)
     return Diagnosis(verdict, findings, before, after, share, odd, stages, nearest)
+
+
+def _any(name: str, after: Stage, finding: Finding) -> bool:
+    """Whether an effect is surely any, with what is left of the misfit as a doubt of its formula: its amount, or a
+    shape that is none by default. One that is nothing at infinity is taken for sure."""
+    effect = after.placed(name).effect
+    told = [finding.shapes[s][:2] for s, shape in effect.shapes.items() if shape.signed and not shape.circular]
+    doubtful = all(abs(x) < UNSURE * std for x, std in ((finding.amount, finding.amount_std), *told) if std > 0)
+    return effect.inverse or not doubtful
 
 
 def opposite(phase: float) -> float:

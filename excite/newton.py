@@ -225,7 +225,7 @@ def iterate(
     sizes, costs = list[float](), list[float]()
     shorter, here = 0, (list(points), X)
     there = here
-    stood, nearest = None, np.inf
+    best, nearest = None, np.inf
     whole, last = 1.0, np.zeros(len(X))
     unseen = held.copy()
     for k in range(passes):
@@ -252,8 +252,7 @@ def iterate(
         damping *= DAMPING[1]
         before, step = step, left
         if k <= SETTLED or step < nearest:
-            stood = Fit(X, in_si(c, covariance), unseen, known, tuple(points), tuple(linear), cost, disturbed)
-            nearest = step
+            best, nearest = (X, covariance, unseen, known, points, cost), step
         sizes.append(step)
         if k >= HOPELESS[0]:
             shrinking = min((step / sizes[-1 - LATELY]) ** (1 / LATELY), 1.0) if len(sizes) > LATELY else 0.0
@@ -290,6 +289,13 @@ def iterate(
             if far and linearised(c, records, there[0], starts, there[1], disturbed) is None:
                 there = here
             return Fit(there[1], in_si(c, covariance), unseen, known, tuple(there[0]), tuple(linear), cost, disturbed)
+    stood = None
+    if best is not None:
+        X, covariance, unseen, known, chosen, cost = best
+        if linear is None or chosen is not points:  # the linearised logs are large: none is kept on the way
+            linear = linearised(c, records, chosen, starts, X, disturbed)
+        assert linear is not None
+        stood = Fit(X, in_si(c, covariance), unseen, known, tuple(chosen), tuple(linear), cost, disturbed)
     raise NotConverged(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
         " log with `excite log check` and `excite diagnose`, or start from better values in the machine file",

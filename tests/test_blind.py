@@ -313,6 +313,7 @@ def test_hardly_any_clean_log_is_accused() -> None:
         ("stuck_bit", 2),
         ("cg_drift", 2),
         ("cg_drift", 4),
+        ("cg_drift", 7),
         ("worn_roll", 1),
     ],
 )

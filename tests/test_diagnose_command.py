@@ -447,11 +447,11 @@ def test_what_no_machine_has_is_no_name(straight: Model, straight_motion: Motion
     after = stages.refitted(placing.extended(straight.machine, entry), before, 0.0)
     names = after.model.base.names
 
-    def said(name: str, value: float) -> diagnose.Diagnosis:
+    def said(name: str, value: float, unsure: float = 0.01) -> diagnose.Diagnosis:
         X = after.fit.X.copy()
         X[names.index("rolling_resistance@rear_roll")] = 400.0
         X[names.index(name)] = value
-        stage = replace(after, fit=replace(after.fit, X=X, covariance=np.diag((0.01 * X) ** 2)))
+        stage = replace(after, fit=replace(after.fit, X=X, covariance=np.diag((unsure * X) ** 2)))
         chosen = [choosing.Choice("rolling_resistance@rear_roll", stage, 1000.0, 1.0, 100, (), 1.0)]
         kept, odd, nearest = diagnose.weighed(before, chosen)
         return diagnose.concluded(before, kept[-1].stage if kept else before, kept, odd, 0.0, nearest)
@@ -464,6 +464,11 @@ def test_what_no_machine_has_is_no_name(straight: Model, straight_motion: Motion
         assert (d.nearest.name, len(d.nearest.impossible)) == ("rolling_resistance@rear_roll", 1)
         assert d.nearest.impossible[0].startswith(f"{name} = -" if value < 0 else f"{name} = 1e+05")
         assert "which no machine has" in findings.answer(findings.account(d))
+    # Nor is one whose amount may be none.
+    assert said("Fs4", 150.0, unsure=0.3).verdict == "named"
+    d = said("Fs4", 150.0, unsure=0.6)
+    assert (d.verdict, d.findings, d.after) == ("unexplained", (), before)
+    assert d.nearest == diagnose.Nearest("rolling_resistance@rear_roll", 1.0)
 
 
 def test_a_vibration_shakes_a_sensor_in_one_log_at_least(straight: Model) -> None:

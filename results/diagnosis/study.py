@@ -245,11 +245,7 @@ def told(s: dict[str, Any], planned: int, options: Sequence[str]) -> str:
         for name, c in s["surprises"].items()
     )
     walls = s["wall_s"]
-    part = (
-        f" These are {s['cases']} of {planned} cases, as far as the time went."
-        if s["cases"] < planned
-        else ""
-    )
+    part = f" These are {s['cases']} of {planned} cases, as far as the time went." if s["cases"] < planned else ""
     command = " ".join(["python results/diagnosis/study.py", *options])
     programs = " and ".join(f"{name} ({count} cases)" for name, count in s["program"].items())
     return f"""# Does the diagnosis name what was hidden?
