@@ -36,7 +36,7 @@ FORMULA = 0.5  # of an amount, times the root of the share of a gain that its fo
 # the amounts in results/diagnosis are within intervals that allow for so much.
 OTHERWISE = 0.05
 FURTHER = 0.8  # SHARE for names after the first: what nature has beside its formula looks like many a cause
-UNSURE = 2.0  # deviations from none, with every doubt, below which an amount may be none
+FAINT = 0.1  # of what another effect promises beside a name, that the name must gain where it needs disturbing forces
 SURELY, WRONG = 3.0, 0.5  # deviations, and a share of its usual size, by which a parameter's sign is wrong
 ODD = 50.0  # misfit that every line of what is odd beside names stands for, at least
 
@@ -120,7 +120,7 @@ def diagnose(
         tell(0.15, "fitting effects from the beginning")
         before, chosen, tried = choosing.unfollowed(before, together)
     chosen, left = extended(before, chosen, together, tell)
-    chosen, odd, nearest = weighed(before, chosen)
+    chosen, odd, nearest = weighed(before, chosen, left)
     if not chosen and (before.prepared.coarse > 1 or not before.near):
         tell(0.85, "fitting less likely effects from the beginning")
         old = before if before.prepared.coarse == 1 else forced(before, together)
@@ -128,11 +128,11 @@ def diagnose(
         if anew or before is not old:
             anew, left = extended(before, anew, together, lambda share, what: tell(max(share, 0.85), what))
             nearest = None if before is not old else nearest
-        chosen, odd, closer = weighed(before, anew)
+        chosen, odd, closer = weighed(before, anew, left)
         nearest = closer or nearest
     if len(chosen) > 1:
         tell(0.9, "judging each given the others")
-        chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)))
+        chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)), left)
     if (largest := _patched(chosen, odd)) is not None:
         chosen, odd, nearest = [], _odd(before), largest
     stage = chosen[-1].stage if chosen else before
@@ -158,10 +158,13 @@ def extended(before: Stage, first: Sequence[Choice], together: Together, tell: A
     return chosen, left
 
 
-def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tuple[str, ...], Nearest | None]:
+def weighed(
+    before: Stage, chosen: Sequence[Choice], left: float = 0.0
+) -> tuple[list[Choice], tuple[str, ...], Nearest | None]:
     """Effects without the last ones that are no names: one that leaves most of the misfit where it was is none, unless
-    with what came after it nothing is left, or with the disturbing forces that it was judged with; nor is one with
-    which no machine is possible. Also what is odd beside those that stay, and the last one that doesn't."""
+    with what came after it nothing is left, or with the disturbing forces that it was judged with, which may have left
+    nothing without it as well: it must not be faint beside what another one would gain, left; nor is one with which no
+    machine is possible. Also what is odd beside those that stay, and the last one that doesn't."""
     kept, nearest = list(chosen), None
     while True:
         stage = kept[-1].stage if kept else before
@@ -174,7 +177,12 @@ def weighed(before: Stage, chosen: Sequence[Choice]) -> tuple[list[Choice], tupl
         if explained >= enough and not impossible:
             break
         loose = kept[-1].loose
-        if loose is not None and not impossible and _share(kept[-1].gain, loose, odd_loose := _odd(loose)) >= enough:
+        faint = kept[-1].gain < FAINT * left
+        if (
+            loose is not None
+            and not (impossible or faint)
+            and _share(kept[-1].gain, loose, odd_loose := _odd(loose)) >= enough
+        ):
             # Exact dynamics make a large misfit of a formula that is nearly right; it was judged with forces.
             kept[-1], odd = replace(kept[-1], stage=loose), odd_loose
             break
@@ -366,9 +374,6 @@ def concluded(
         share = _share(sum(x.gain for x in chosen), after, odd)
         left = max(left, _rest(after, odd))
     findings = tuple(_finding(x, after, left, alone=len(chosen) == 1) for x in chosen)
-    if len(chosen) == 1 and not _any(chosen[0].name, after, findings[0]):
-        explained = chosen[0].gain / (chosen[0].gain + left)
-        return concluded(before, before, [], _odd(before), 0.0, Nearest(chosen[0].name, explained))
     nearest = None if findings else nearest
     verdict = "clean"
     if findings:
@@ -379,15 +384,6 @@ def concluded(
         verdict, share = "unexplained", 0.0
     stages = tuple(x.stage for x in chosen)
     return Diagnosis(verdict, findings, before, after, share, odd, stages, nearest)
-
-
-def _any(name: str, after: Stage, finding: Finding) -> bool:
-    """Whether an effect is surely any, with what is left of the misfit as a doubt of its formula: its amount, or a
-    shape that is none by default. One that is nothing at infinity is taken for sure."""
-    effect = after.placed(name).effect
-    told = [finding.shapes[s][:2] for s, shape in effect.shapes.items() if shape.signed and not shape.circular]
-    doubtful = all(abs(x) < UNSURE * std for x, std in ((finding.amount, finding.amount_std), *told) if std > 0)
-    return effect.inverse or not doubtful
 
 
 def opposite(phase: float) -> float:

@@ -22,6 +22,7 @@ from model.machine import EffectEntry, Machine, shipped
 
 DIGITS = 8  # of amounts in a machine file
 STRIKING = 3  # lines of what is odd that come before all others
+NEAR = 0.05  # of the misfit, that what comes nearest explains to be worth a word
 NEARLY_ALL = 0.9  # of the misfit: names that explain less are told with the share that they do
 
 
@@ -188,7 +189,7 @@ def answer(a: Account) -> str:
             more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
             first = words(rows[0]["effect"], rows[0]["where"])
             text += f"; {first}{more} would account for {100 * d.share:.0f} % of it, too little to be its name"
-        elif d.nearest:
+        elif d.nearest and (d.nearest.share >= NEAR or d.nearest.impossible):
             text += f"; nearest comes {words(*d.nearest.name.split('@'))} with {100 * d.nearest.share:.0f} % of it"
             if d.nearest.impossible:
                 text += f", but then {', '.join(d.nearest.impossible)}, which no machine has (check its dimensions)"

@@ -87,7 +87,7 @@ def check(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sour
 def times(table: pd.DataFrame, machine: Machine, source: str) -> np.ndarray:
     """The time column (N,) [s]: numbers in the machine file's unit, or dates from the first on. Raises LogError."""
     raw = table[machine.time_column]
-    if raw.dtype.kind in "OTU" and pd.to_numeric(raw, errors="coerce").isna().all():
+    if len(raw) and raw.dtype.kind in "OTU" and pd.to_numeric(raw, errors="coerce").isna().all():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # a format that pandas has to guess
             raw = pd.to_datetime(raw, errors="coerce", utc=True)

@@ -30,6 +30,7 @@ HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in stan
 LATELY = 4  # passes whose steps tell how small the last one will be
 IDLE = 0.5, 0.8  # share of a step two passes earlier above which it hardly shrinks: near an answer, far from any
 FALLING = 0.01  # of a cost, in two passes
+ALIKE = 0.05  # of a cost: what swinging steps change
 NEARLY = 1.0  # a step, in standard deviations, at which a fit that runs out of passes is as good as found
 CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviations
 ENOUGH = 0.2  # likewise with disturbing forces, whose deviations are no promise
@@ -49,12 +50,13 @@ SPREAD_SPEED, SPREAD_ANGLE = 0.05, 0.1
 
 
 class NotConverged(NoEstimate):
-    """Joint smoothing found no estimate; the message says how far it came and what to do, `fit` where it stood best and
-    `step` the step from there, in standard deviations. level: costs had ceased to fall."""
+    """Joint smoothing found no estimate; the message says how far it came and what to do, `fit` where it stood, last or
+    as good as found, and `step` the step from there, in standard deviations. swung: the last steps led to and fro
+    between what costs alike."""
 
-    def __init__(self, message: str, fit: Fit | None = None, step: float = np.inf, level: bool = False) -> None:
+    def __init__(self, message: str, fit: Fit | None = None, step: float = np.inf, swung: bool = False) -> None:
         super().__init__(message)
-        self.fit, self.step, self.level = fit, step, level
+        self.fit, self.step, self.swung = fit, step, swung
 
     @property
     def nearly(self) -> Fit | None:
@@ -63,11 +65,11 @@ class NotConverged(NoEstimate):
 
     @property
     def swinging(self) -> Fit | None:
-        """The fit where it stood, if steps swing without end about what costs alike, under disturbing forces, whose
+        """The fit where it stood, if steps swing without end between what costs alike, under disturbing forces, whose
         deviations are no promise."""
         if self.fit is None or self.fit.disturbed == 0 or self.step > HOPELESS[1]:
             return None
-        return self.fit if self.level else None
+        return self.fit if self.swung else None
 
 
 @dataclass(frozen=True)
@@ -225,7 +227,7 @@ def iterate(
     sizes, costs = list[float](), list[float]()
     shorter, here = 0, (list(points), X)
     there = here
-    best, nearest = None, np.inf
+    best, nearest, waited = None, NEARLY, False
     whole, last = 1.0, np.zeros(len(X))
     unseen = held.copy()
     for k in range(passes):
@@ -251,7 +253,7 @@ def iterate(
                 covariance, move, left, cost = newton_step(c, records, linear, points, X, known, damping)
         damping *= DAMPING[1]
         before, step = step, left
-        if k <= SETTLED or step < nearest:
+        if k >= SETTLED and step <= nearest:
             best, nearest = (X, covariance, unseen, known, points, cost), step
         sizes.append(step)
         if k >= HOPELESS[0]:
@@ -262,6 +264,7 @@ def iterate(
         if k >= SETTLED and cost > most and step > NEARLY:
             break
         if not patient and _idle(sizes, costs):
+            waited = True
             break
         # Where Gauss-Newton swings about the answer, shorter steps end it.
         turned = move[0][: len(X)] / np.sqrt(np.diag(covariance))[: len(X)]
@@ -289,19 +292,21 @@ def iterate(
             if far and linearised(c, records, there[0], starts, there[1], disturbed) is None:
                 there = here
             return Fit(there[1], in_si(c, covariance), unseen, known, tuple(there[0]), tuple(linear), cost, disturbed)
-    stood = None
+    else:
+        waited = True
+    stood, size = None, step
     if best is not None:
-        X, covariance, unseen, known, chosen, cost = best
-        if linear is None or chosen is not points:  # the linearised logs are large: none is kept on the way
-            linear = linearised(c, records, chosen, starts, X, disturbed)
-        assert linear is not None
-        stood = Fit(X, in_si(c, covariance), unseen, known, tuple(chosen), tuple(linear), cost, disturbed)
+        X, covariance, unseen, known, points, cost = best
+        size = nearest
+        linear = linearised(c, records, points, starts, X, disturbed)  # large: none is kept on the way
+    if linear is not None:
+        stood = Fit(X, in_si(c, covariance), unseen, known, tuple(points), tuple(linear), cost, disturbed)
     raise NotConverged(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
         " log with `excite log check` and `excite diagnose`, or start from better values in the machine file",
         stood,
-        float(nearest),
-        len(costs) > SETTLED + 2 and _level(costs),
+        float(size),
+        waited and len(costs) > SETTLED + 2 and np.ptp(costs[-3:]) < ALIKE * costs[-1],
     )
 
 
@@ -313,12 +318,7 @@ def _idle(steps: Sequence[float], costs: Sequence[float]) -> bool:
     if steps[-1] <= NEARLY:
         return steps[-1] > IDLE[0] * steps[-3]
     still = steps[-1] > IDLE[1] * steps[-3] and steps[-2] > IDLE[1] * steps[-4]
-    return len(steps) > SETTLED + 2 and still and _level(costs)
-
-
-def _level(costs: Sequence[float]) -> bool:
-    """Whether costs have ceased to fall."""
-    return costs[-1] > (1 - FALLING) * costs[-3]
+    return len(steps) > SETTLED + 2 and still and costs[-1] > (1 - FALLING) * costs[-3]
 
 
 def linearised(

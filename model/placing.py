@@ -128,9 +128,11 @@ def placed(machine: Machine, entry: EffectEntry, duration: float = DURATION) -> 
     """
     effect = CATALOGUE.get(entry.name)
     if effect is None:
+        parts = {part for part in entry.name.split("_") if len(part) > 2}
         like = difflib.get_close_matches(entry.name, CATALOGUE, n=3)
-        hint = f"is {' or '.join(like)} meant?" if like else f"not one of {len(CATALOGUE)}"
-        raise MachineError(f"{machine.name}: effect {entry.name}: unknown, {hint} (`excite docs` tells of all)")
+        like = like or [n for n in CATALOGUE if parts & set(n.split("_"))]
+        hint = f", is {' or '.join(like)} meant?" if like else ":"
+        raise MachineError(f"{machine.name}: effect {entry.name}: unknown{hint} `excite docs` tells of all")
     allowed = places(machine, effect)
     where = entry.where or (next(iter(allowed)) if len(allowed) == 1 else "")
     if where not in allowed:

@@ -368,7 +368,8 @@ def test_a_signature_is_what_the_extended_model_has_more(effect: Effect, va12: M
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("no_such_thing=1", "effect no_such_thing: unknown, not one of"),
+        ("no_such_thing=1", "effect no_such_thing: unknown: `excite docs` tells of all"),
+        ("backlash=0.01", "is articulation_backlash meant[?]"),
         ("torque_ripples@front_roll=1", "unknown, is torque_ripple .*meant[?]"),
         ("shear_saturation=0.2", "where must be one of front_roll, rear_roll"),
         ("shear_saturation@articulation=0.2", "where must be one of front_roll, rear_roll"),

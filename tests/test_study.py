@@ -141,7 +141,7 @@ WRONG = {
     ),
     "objective unknown": (GRID + 'objective = "best"', "objective: best is unknown, allowed: cond"),
     "problem unknown": (GRID + 'problem = "S41"', "problem: S41 is unknown, allowed: R60, S40"),
-    "effect unknown": (GRID + 'effects = "magic=1"', "effect magic: unknown, not one of"),
+    "effect unknown": (GRID + 'effects = "magic=1"', "effect magic: unknown: `excite docs`"),
     "effect without amount": (GRID + 'effects = "ground_slope"', "must be NAME[@WHERE]=AMOUNT"),
     "effect twice": (GRID + 'effects = [["ground_slope=0.1", "ground_slope=0.2"]]', "an effect is given twice"),
     "effect twice, at the one place that it has": (

@@ -248,6 +248,7 @@ def told(s: dict[str, Any], planned: int, options: Sequence[str]) -> str:
     part = f" These are {s['cases']} of {planned} cases, as far as the time went." if s["cases"] < planned else ""
     command = " ".join(["python results/diagnosis/study.py", *options])
     programs = " and ".join(f"{name} ({count} cases)" for name, count in s["program"].items())
+    programs += ", put together by hand" if len(s["program"]) > 1 else ""
     return f"""# Does the diagnosis name what was hidden?
 
 `{command}`
@@ -310,7 +311,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if given.jobs:
         joblib.Parallel(n_jobs=given.jobs, verbose=5)(joblib.delayed(judged)(c, kept) for c in wanted)
     files = [kept / f"{c.key}.json" for c in wanted]
-    rows = [json.loads(file.read_text()) for file in files if file.is_file()]
+    rows = [{"program": kept.name} | json.loads(file.read_text()) for file in files if file.is_file()]
     if given.only:
         shown = ("key", "visibility", "amount", "manoeuvre", "duration_s", "kit", "outcome", "named", "error", "wall_s")
         print(pd.DataFrame(rows).reindex(columns=shown).to_string(index=False))
