@@ -57,6 +57,14 @@ def stribeck_friction(s: Scene, place: str, A: float, draw: DRAW) -> None:
     )
 
 
+def brake_drag(s: Scene, place: str, A: float, draw: DRAW) -> None:
+    """A shoe that lies against its drum for a while, and fades a little as it warms."""
+    begin, length, fade = draw.uniform(8, 25), draw.uniform(12, 25), draw.uniform(0, 0.08)
+    window = (ca.tanh((s.t - begin) / 0.1) - ca.tanh((s.t - begin - length) / 0.1)) / 2
+    warm = 1 - ca.exp(-ca.fmax(s.t - begin, 0) / 8)
+    s.friction[JOINTS[place]].append(lambda w, U: A * (1 - fade * warm) * window * ca.tanh(w / SMOOTH[place]))
+
+
 def load_dependent_friction(s: Scene, place: str, A: float, draw: DRAW) -> None:
     soft = draw.uniform(20, 100)  # pre-load of the mesh: no friction is exactly proportional down to nothing
     s.friction[JOINTS[place]].append(lambda w, U: A * (ca.sqrt(U**2 + soft**2) - soft) * ca.tanh(w / SMOOTH[place]))
@@ -444,6 +452,7 @@ _TABLE: tuple[tuple[Hide, tuple[str, ...], str, dict[str, tuple[float, float]], 
     (friction_transition, _JOINTS, "-", {"": (0.6, 3), "articulation": (0.2, 1.5)}, {"signed": True}),
     # New ones come last: cases are drawn by a cause's place in this table.
     (roll_out_of_round, ROLLS, "m", {"": (0.0002, 0.004)}, {}),
+    (brake_drag, ROLLS, "N m", {"": (40, 400)}, {}),
 )
 CAUSES: dict[str, Cause] = {
     f.__name__: Cause(places, unit, amounts, f, **more) for f, places, unit, amounts, more in _TABLE

@@ -231,6 +231,7 @@ PLAIN = {  # of each cause the first minute of driving in which it is ten times 
     "relief_valve": 0,
     "friction_transition": 0,
     "roll_out_of_round": 0,
+    "brake_drag": 0,
 }
 
 
