@@ -19,7 +19,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import joblib
 
 AHEAD = 2  # pieces in flight per worker: one at work, one at hand
-TRIES = 2  # deaths of a worker that had a piece alone, before the piece is to blame
+TRIES = 3  # deaths of a worker that had a piece alone before the piece is to blame: others kill workers too
 LOGGERS = ("distributed", "distributed.client")  # of Dask, with levels of their own
 GONE = "the cluster's scheduler is gone; start it and repeat the command"
 THREADS = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
