@@ -227,7 +227,7 @@ def iterate(
     sizes, costs = list[float](), list[float]()
     shorter, here = 0, (list(points), X)
     there = here
-    best, nearest, waited = None, NEARLY, False
+    latest, best, nearest, waited = None, None, NEARLY, False
     whole, last = 1.0, np.zeros(len(X))
     unseen = held.copy()
     for k in range(passes):
@@ -253,8 +253,9 @@ def iterate(
                 covariance, move, left, cost = newton_step(c, records, linear, points, X, known, damping)
         damping *= DAMPING[1]
         before, step = step, left
+        latest = X, covariance, unseen, known, points, cost
         if k >= SETTLED and step <= nearest:
-            best, nearest = (X, covariance, unseen, known, points, cost), step
+            best, nearest = latest, step
         sizes.append(step)
         if k >= HOPELESS[0]:
             shrinking = min((step / sizes[-1 - LATELY]) ** (1 / LATELY), 1.0) if len(sizes) > LATELY else 0.0
@@ -294,10 +295,9 @@ def iterate(
             return Fit(there[1], in_si(c, covariance), unseen, known, tuple(there[0]), tuple(linear), cost, disturbed)
     else:
         waited = True
-    stood, size = None, step
-    if best is not None:
+    stood = None
+    if best is not None and (linear is None or best is not latest):
         X, covariance, unseen, known, points, cost = best
-        size = nearest
         linear = linearised(c, records, points, starts, X, disturbed)  # large: none is kept on the way
     if linear is not None:
         stood = Fit(X, in_si(c, covariance), unseen, known, tuple(points), tuple(linear), cost, disturbed)
@@ -305,7 +305,7 @@ def iterate(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
         " log with `excite log check` and `excite diagnose`, or start from better values in the machine file",
         stood,
-        float(size),
+        float(step if best is None else nearest),
         waited and len(costs) > SETTLED + 2 and np.ptp(costs[-3:]) < ALIKE * costs[-1],
     )
 

@@ -90,8 +90,8 @@ def effects_page() -> str:
         if typical:
             lines += [f"On va12, at a typical size: {', '.join(typical)}", ""]
         if e.shapes:
-            (first, *_), _ = next(iter(sites.values()), ((1,), None))
-            beside = e.beside(Site(va12, va12.find(first), DURATION))
+            bodies, _ = next(iter(sites.values()), ((1,), None))
+            beside = e.beside(Site.of(va12, bodies))
             lines += _table(
                 "shape | unit | default | looked for at | meaning",
                 (_shape(n, s) for n, s in e.shapes.items()),

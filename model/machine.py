@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
-from model import hydraulics, units
+from model import extends, hydraulics, units
 from model.file import (
     Flag,
     Negative,
@@ -28,11 +28,9 @@ from model.file import (
     Source,
     Vector3,
     one_line,
-    read_toml,
 )
 
 MACHINES = Path(__file__).parent / "machines"
-NAMED = ("body", "sensor")  # lists of what has a name of its own
 Index = Annotated[int, Field(strict=True, ge=0, le=99)]
 
 
@@ -552,7 +550,7 @@ class Machine(Record):
 
 def shipped() -> tuple[str, ...]:
     """Names of the machines that come with the package."""
-    return tuple(sorted(p.stem for p in MACHINES.glob("*.toml")))
+    return extends.names_in(MACHINES)
 
 
 def load(name: str | Path) -> Machine:
@@ -563,7 +561,10 @@ def load(name: str | Path) -> Machine:
     Raises MachineError: one line with file, key, what is wrong, what is allowed.
     """
     path = _find(str(name))
-    raw = _read(path)
+    try:
+        raw = extends.read(path, MACHINES)
+    except ValueError as err:
+        raise MachineError(str(err)) from None
     try:
         return Machine.model_validate(raw)
     except ValidationError as err:
@@ -579,55 +580,3 @@ def _find(name: str) -> Path:
     if not path.is_file():
         raise MachineError(f"{name}: no such file")
     return path
-
-
-def _read(path: Path, depth: int = 0) -> dict[str, Any]:
-    if depth > 4:
-        raise MachineError(f"{path}: extends: more than 4 files deep, a loop?")
-    try:
-        raw = read_toml(path)
-    except ValueError as err:
-        raise MachineError(str(err)) from None
-    parent = raw.pop("extends", None)
-    if parent is None:
-        return raw
-    if not isinstance(parent, str):
-        raise MachineError(f"{path}: extends: must be a shipped name or a file name")
-    base = MACHINES / f"{parent}.toml" if parent in shipped() else path.parent / parent
-    if parent not in shipped() and (Path(parent).name != parent or "\x00" in parent or not base.is_file()):
-        raise MachineError(
-            f"{path}: extends: no machine {parent}, allowed: {', '.join(shipped())}, or a file beside it"
-        )
-    whole = _read(base, depth + 1)
-    own, known = (x if isinstance(x, list) else [] for x in (raw.get("sensor"), whole.get("sensor")))
-    names = [x.get("name") for x in known if isinstance(x, dict)]
-    if any(isinstance(x, dict) and x.get("name") in names and "kind" not in x for x in own):
-        raise MachineError(
-            f"{path}: sensor: the list takes the place of that of {parent}, so that every sensor needs all its keys;"
-            " [sensor.NAME] changes one, `excite machine new NAME --like` writes all"
-        )
-    for key in NAMED:
-        if isinstance(raw.get(key), dict) and isinstance(whole.get(key), list):
-            raw[key] = _changed(path, key, whole[key], raw[key])
-    return _merge(whole, raw)
-
-
-def _changed(path: Path, key: str, known: list[Any], changes: dict[str, Any]) -> list[Any]:
-    """A list of named tables with some of them changed, each by a table of its name."""
-    names = [x.get("name") if isinstance(x, dict) else None for x in known]
-    for name, change in changes.items():
-        if name not in names:
-            allowed = ", ".join(str(x) for x in names)
-            raise MachineError(f"{path}: {key}.{name}: no such {key}, allowed: {allowed}")
-        if not isinstance(change, dict):
-            raise MachineError(f"{path}: {key}.{name}: must be a table of what differs (got {change!r})")
-    return [_merge(x, changes[n]) if n in changes else x for n, x in zip(names, known, strict=True)]
-
-
-def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in change.items():
-        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        # A quantity is replaced as a whole: source and note are those of its value.
-        merged[key] = _merge(merged[key], value) if both and "value" not in value else value
-    return merged

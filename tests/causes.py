@@ -57,10 +57,15 @@ def stribeck_friction(s: Scene, place: str, A: float, draw: DRAW) -> None:
     )
 
 
+def _window(s: Scene, begin: float, length: float, soft: float) -> ca.SX:
+    """One while something acts, for so long [s], and nothing before and after."""
+    return (ca.tanh((s.t - begin) / soft) - ca.tanh((s.t - begin - length) / soft)) / 2
+
+
 def brake_drag(s: Scene, place: str, A: float, draw: DRAW) -> None:
     """A shoe that lies against its drum for a while, and fades a little as it warms."""
     begin, length, fade = draw.uniform(8, 25), draw.uniform(12, 25), draw.uniform(0, 0.08)
-    window = (ca.tanh((s.t - begin) / 0.1) - ca.tanh((s.t - begin - length) / 0.1)) / 2
+    window = _window(s, begin, length, 0.1)
     warm = 1 - ca.exp(-ca.fmax(s.t - begin, 0) / 8)
     s.friction[JOINTS[place]].append(lambda w, U: A * (1 - fade * warm) * window * ca.tanh(w / SMOOTH[place]))
 
@@ -331,7 +336,7 @@ def ground_slope(s: Scene, place: str, A: float, draw: DRAW) -> None:
 def vibration_on(s: Scene, place: str, A: float, draw: DRAW) -> None:
     begin, length = draw.uniform(8, 25), draw.uniform(12, 25)
     frequency, size = draw.uniform(22, 38), draw.uniform(80, 250) * (A > 0)
-    window = (ca.tanh((s.t - begin) / 0.15) - ca.tanh((s.t - begin - length) / 0.15)) / 2
+    window = _window(s, begin, length, 0.15)
 
     def change(c: Any) -> None:
         c.Kx, c.Ky = c.Kx * (1 - A * window), c.Ky * (1 - A * window)

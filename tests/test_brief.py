@@ -16,8 +16,6 @@ from excite.smoothing import cramer_rao
 from model.machine import load
 from model.prediction import Model, build
 
-S40 = Path(__file__).parents[1] / "results" / "S40" / "design"
-
 
 def test_advice_names_what_to_do() -> None:
     assert advice(Brief(), "Kx1", POOR) is None

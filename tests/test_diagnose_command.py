@@ -184,15 +184,14 @@ def test_many_names_are_none(
     names: tuple[str, ...], verdict: str, straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What takes four kinds of causes, none of which explains most, is something that isn't known."""
-    one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
-    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    stage = calm(straight)
     gains = {"ground_slope@machine": 1000.0} if verdict == "named" else {}
     chosen = [choosing.Choice(n, stage, gains.get(n, 100.0 + k), 1.0, 200, (), 1.0) for k, n in enumerate(names)]
     kept = {"fitted": stage, "extended": (chosen, 0.0), "reviewed": chosen, "needed": chosen}
     for name, answer in (*kept.items(), ("weighed", (chosen, (), None))):
         monkeypatch.setattr(f"excite.diagnose.{name}", lambda *asked, answer=answer: answer)
     monkeypatch.setattr("excite.diagnose._finding", lambda *asked, **more: SimpleNamespace(tied_with=()))
-    found = diagnose.diagnose(straight, [one], straight.machine.filter)
+    found = diagnose.diagnose(straight, stage.prepared.logs, straight.machine.filter)
     assert (found.verdict, len(found.findings)) == (verdict, len(names) if verdict == "named" else 0)
     if verdict == "unexplained":
         assert found.after is stage
@@ -553,8 +552,7 @@ def test_ways_that_are_not_needed_are_given_up(straight: Model) -> None:
 
 def test_a_fit_whose_steps_cease_to_shrink_ends(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Near an answer as one that is as good as found, far from any without; whoever is patient goes on for longer."""
-    one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
-    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    stage = calm(straight)
     p, true = stage.prepared, newton.newton_step
     steps: list[float] = []
 
@@ -580,8 +578,7 @@ def test_a_fit_that_fails_stands_where_it_was_as_good_as_found(
 ) -> None:
     """Otherwise where it was last. Steps that swing between what costs alike end a fit under disturbing forces as well:
     none by exact dynamics, none whose costs rise or still fall."""
-    one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
-    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    stage = calm(straight)
     p, true = stage.prepared, newton.newton_step
     seen: list[np.ndarray] = []
     far = [500.0, 90.0, 80.0]
@@ -620,8 +617,7 @@ def test_a_fit_that_fails_stands_where_it_was_as_good_as_found(
 def test_a_fit_that_came_near_the_log_is_gone_on_with(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """By exact dynamics: with disturbing forces every fit comes near. Far from the log it is given up, behind what was
     found already as well, and where a stage was near before."""
-    one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
-    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    stage = calm(straight)
     true, steps, times = newton.newton_step, list[float](), [1.0]
 
     def scripted(*args: Any) -> Any:
@@ -652,8 +648,7 @@ def test_forces_hide_which_of_two_is_right(
     straight: Model, monkeypatch: pytest.MonkeyPatch, excess: tuple[float, float], chosen: int
 ) -> None:
     """Where the better one explains little without them, the other is tried without them too."""
-    one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
-    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    stage = calm(straight)
     best, other = ("ground_slope=0.009", "rolling_resistance@rear_roll=200")
     scores = {s.candidate.name: s for s in choosing.scored(stage, in_turn)}
     noise, tries = stage.noise, []
@@ -730,6 +725,12 @@ def gentle(model: Model, seconds: float) -> Motion:
     return simulate(model, np.column_stack([1500 * np.sin(1.7 * t) * slow, 1200 * np.sin(2.6 * t) * slow]))
 
 
+def calm(model: Model) -> stages.Stage:
+    """The model fitted to a log of that without anything hidden."""
+    one = log.check(sensors.measure(model, gentle(model, 12.0), seed=3), model.machine)
+    return stages.fitted(model.machine, [one], model.machine.filter)
+
+
 def unfit(monkeypatch: pytest.MonkeyPatch, refused: Callable[[Any, int], bool], coarse: float = 1.0) -> None:
     """Some fits to sensors as they are, or up to so coarse, find nothing: told are chart and number of passes."""
     iterate = newton.iterate
@@ -799,8 +800,7 @@ def test_coarse_sensors_blur_no_estimate(straight: Model) -> None:
 
 def unneeded(model: Model, *texts: str) -> tuple[stages.Stage, list[choosing.Choice]]:
     """A clean log's stage, and effects chosen for it all the same, all in one fit."""
-    one = log.check(sensors.measure(model, gentle(model, 12.0), seed=3), model.machine)
-    clean = stages.fitted(model.machine, [one], model.machine.filter)
+    clean = calm(model)
     entries = [placing.parse(text, model.machine, 12.0) for text in texts]
     both = stages.refitted(placing.extended(model.machine, *entries), clean, 0.0)
     return clean, [choosing.Choice(e.name, both, 1000.0, 1.0, 100, (), 1.0) for e in both.model.effects]

@@ -61,7 +61,7 @@ def where(effect: Effect) -> str:
 
 def typical(effect: Effect) -> float:
     bodies, _ = placing.places(VA12, effect)[where(effect)]
-    return effect.amount(Site(VA12, VA12.find(bodies[0]), DURATION))
+    return effect.amount(Site.of(VA12, bodies))
 
 
 def shaped(text: str, shapes: Mapping[str, float], known: machine.Machine = VA12) -> EffectEntry:
@@ -257,7 +257,7 @@ def forms(effect: Effect) -> list[dict[str, float]]:
     """The shapes of every form that an effect has, the plain one first: the first of each that is tried."""
     bodies, _ = placing.places(VA12, effect)[where(effect)]
     found: dict[tuple[tuple[str, float], ...], dict[str, float]] = {(): {}}
-    for shapes in effect.beside(Site(VA12, VA12.find(bodies[0]), DURATION)):
+    for shapes in effect.beside(Site.of(VA12, bodies)):
         form = tuple((n, x) for n, x in shapes.items() if n != "A" and effect.shapes[n].only)
         found.setdefault(form, {n: x for n, x in shapes.items() if n != "A"})
     return list(found.values())
@@ -655,7 +655,7 @@ def test_what_needs_no_motor_may_sit_at_a_contact_that_has_none() -> None:
 def test_at_a_towed_contact_prediction_is_dynamics(effect: Effect) -> None:
     """No torque acts on its joint, whatever the effect does there; and the effect does something."""
     place = next(w for w, (bodies, _) in placing.places(THREE, effect).items() if 4 in bodies)
-    amount = effect.amount(Site(THREE, THREE.find(4), 10.0))
+    amount = effect.amount(Site.of(THREE, (4,), 10.0))
     model = build(placing.extended(THREE, placing.parse(f"{effect.name}@{place}={amount}", THREE, 10.0)))
     plain, rng, n = build(THREE), np.random.default_rng(2), 40
     q, nu = rng.uniform(-1, 1, (2, len(model.coordinates), n))

@@ -1,0 +1,65 @@
+"""A file that gives only what differs from another: `extends`, and how the two become one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from model.file import read_toml
+
+NAMED = ("body", "sensor")  # lists of what has a name of its own
+
+
+def names_in(folder: Path) -> tuple[str, ...]:
+    """Names of the files in a folder that others may extend by name."""
+    return tuple(sorted(p.stem for p in folder.glob("*.toml")))
+
+
+def read(path: Path, shipped: Path, depth: int = 0) -> dict[str, Any]:
+    """What is in a TOML file, with what it differs from: another beside it, or one of the folder of shipped ones by its
+    name. Raises ValueError, one line."""
+    if depth > 4:
+        raise ValueError(f"{path}: extends: more than 4 files deep, a loop?")
+    raw = read_toml(path)
+    parent = raw.pop("extends", None)
+    if parent is None:
+        return raw
+    if not isinstance(parent, str):
+        raise ValueError(f"{path}: extends: must be a shipped name or a file name")
+    known = names_in(shipped)
+    base = shipped / f"{parent}.toml" if parent in known else path.parent / parent
+    if parent not in known and (Path(parent).name != parent or "\x00" in parent or not base.is_file()):
+        raise ValueError(f"{path}: extends: no machine {parent}, allowed: {', '.join(known)}, or a file beside it")
+    whole = read(base, shipped, depth + 1)
+    own, listed = (x if isinstance(x, list) else [] for x in (raw.get("sensor"), whole.get("sensor")))
+    sensors = [x.get("name") for x in listed if isinstance(x, dict)]
+    if any(isinstance(x, dict) and x.get("name") in sensors and "kind" not in x for x in own):
+        raise ValueError(
+            f"{path}: sensor: the list takes the place of that of {parent}, so that every sensor needs all its keys;"
+            " [sensor.NAME] changes one, `excite machine new NAME --like` writes all"
+        )
+    for key in NAMED:
+        if isinstance(raw.get(key), dict) and isinstance(whole.get(key), list):
+            raw[key] = _changed(path, key, whole[key], raw[key])
+    return _merge(whole, raw)
+
+
+def _changed(path: Path, key: str, known: list[Any], changes: dict[str, Any]) -> list[Any]:
+    """A list of named tables with some of them changed, each by a table of its name."""
+    names = [x.get("name") if isinstance(x, dict) else None for x in known]
+    for name, change in changes.items():
+        if name not in names:
+            allowed = ", ".join(str(x) for x in names)
+            raise ValueError(f"{path}: {key}.{name}: no such {key}, allowed: {allowed}")
+        if not isinstance(change, dict):
+            raise ValueError(f"{path}: {key}.{name}: must be a table of what differs (got {change!r})")
+    return [_merge(x, changes[n]) if n in changes else x for n, x in zip(names, known, strict=True)]
+
+
+def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in change.items():
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
+        # A quantity is replaced as a whole: source and note are those of its value.
+        merged[key] = _merge(merged[key], value) if both and "value" not in value else value
+    return merged
