@@ -488,15 +488,13 @@ def _radau(chart: Chart, local: list[np.ndarray], h: float, force: bool) -> Slop
     J, B, JX, JF, R = local
     n, c, n_u, n_p = chart.n, chart.core, B.shape[2], JX.shape[2]
     direct = h * np.concatenate([B, JX, JF] if force else [B, JX], axis=2)
-    K, eye, J = len(J), np.eye(c), h * J
-    # Columns: the start, then what acts directly. The mean over the interval leads to the end.
-    known = np.concatenate([eye - J / 6, direct / 2 - J @ direct / 6], axis=2)
-    mean = np.linalg.inv(eye - J * (2 / 3) + J @ J / 6) @ known
-    end = J @ mean
-    end[:, :, :c] += eye
-    end[:, :, c:] += direct
-    moved = np.concatenate([end, h * (R @ mean)], axis=1)
-    A = np.zeros((K, n, n))
-    A[:, :, :c] = moved[:, :, :c]
-    A[:, range(c, n), range(c, n)] = 1.0
-    return Slopes(A, moved[:, :, c : c + n_u], moved[:, :, c + n_u : c + n_u + n_p], moved[:, :, c + n_u + n_p :])
+    eye, across, J = np.eye(c), h * np.concatenate([J, R], axis=1), h * J
+    # The mean over the interval, of the start and of what acts directly, leads to the end.
+    mean = np.linalg.inv(eye - J * (2 / 3) + J @ J / 6)
+    A = np.zeros((len(J), n, n))
+    A[:, :, :c] = across @ (mean @ (eye - J / 6))
+    A[:, range(n), range(n)] += 1.0
+    through = across @ (mean @ (eye / 2 - J / 6))
+    through[:, range(c), range(c)] += 1.0
+    moved = through @ direct
+    return Slopes(A, moved[:, :, :n_u], moved[:, :, n_u : n_u + n_p], moved[:, :, n_u + n_p :])
