@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+UNMOVED = "the log says nothing of any parameter: does the machine move in it?"
+
 
 class NoEstimate(RuntimeError):
     """A method found no estimate, or none that it stands by; the message says why and what to do."""

@@ -17,8 +17,7 @@ from excite.hidden import explained
 from excite.instruments import iv
 from excite.log import Log
 from excite.outputerror import oe
-from excite.processing import filtered_regression
-from excite.regression import ols, tls, wls
+from excite.regression import ols, regressions, tls, wls
 from excite.smoothing import joint
 from model.machine import Filter, MachineError
 from model.prediction import Model
@@ -148,8 +147,7 @@ def possible(plain: Find) -> Find:
         """The same, held to physically possible machines: the nearest one, by a convex program."""
         from excite.consistent import constrained  # cvxpy takes a second to load
 
-        blocks = [filtered_regression(model, log, filter) for log in logs]
-        return constrained(model, plain(model, logs, filter), blocks)
+        return constrained(model, plain(model, logs, filter), regressions(model, logs, filter))
 
     return method
 

@@ -14,10 +14,11 @@ import numpy as np
 import scipy
 
 from excite.estimate import Estimate, NotIdentifiable
+from excite.hidden import unmoved
 from excite.log import Log
 from excite.noise import Spread, spread, whitener
 from excite.processing import Samples, lowpass, regression, samples, unmeasured
-from excite.regression import Block, assembled, effective, scatter, solved, whitened
+from excite.regression import Block, assembled, effective, scatter, shown, solved, whitened
 from excite.simulate import SimulationError, simulate
 from model.machine import Filter
 from model.prediction import Model
@@ -41,14 +42,15 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     """
     measured = [samples(model, log, filter) for log in logs]
     unseen = [unmeasured(model, log) for log in logs]
-    blocks = [regression(model, s, filter) for s in measured]
+    still = unmoved(model, logs, filter, slow=False)
+    blocks = shown([regression(model, s, filter) for s in measured], still)
     noise = [_with_unseen(spread(model, log, filter), rows) for log, rows in zip(logs, unseen, strict=True)]
     if any(unseen):
         measured = [
             _completed(s, observe(model, s, model.nominal, filter, rows), rows)
             for s, rows in zip(measured, unseen, strict=True)
         ]
-        blocks = [regression(model, s, filter) for s in measured]
+        blocks = shown([regression(model, s, filter) for s in measured], still)
     first = solved(blocks)
     kept = list(first.kept)
     x, step = model.nominal.copy(), np.full(len(model.nominal), np.nan)
@@ -56,7 +58,7 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         seen, x = _observed(model, measured, unseen, x, step, filter)
         if any(unseen):
             measured = [_completed(s, o, rows) for s, o, rows in zip(measured, seen, unseen, strict=True)]
-            blocks = [regression(model, s, filter) for s in measured]
+            blocks = shown([regression(model, s, filter) for s in measured], still)
         turned = [whitener(model, s, x, n, filter) for s, n in zip(seen, noise, strict=True)]
         Z = [whitened(regression(model, s, filter), L)[0] for s, L in zip(seen, turned, strict=True)]
         own = [whitened(b, L) for b, L in zip(blocks, turned, strict=True)]

@@ -17,8 +17,8 @@ from excite.estimate import Estimate, NotIdentifiable
 from excite.leastsquares import Triangle, merge, solve
 from excite.linearise import Chart, chart
 from excite.log import Log
-from excite.processing import filtered_regression, lowpass, samples, white_noise
-from excite.regression import assembled, solved
+from excite.processing import lowpass, samples, white_noise
+from excite.regression import assembled, regressions, solved
 from excite.simulate import SimulationError, simulate
 from model.machine import Filter
 from model.prediction import Model
@@ -67,7 +67,7 @@ def oe(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     pieces = [p for log in logs for p in _stretches(c, log, filter)]
     torque_noise = _torque_noise(model, logs)
     sensor_noise = np.array([_sensor_noise(s.resolution, [log.values[s.name] for log in logs]) for s in c.sensors])
-    blocks = [filtered_regression(model, log, filter) for log in logs]
+    blocks = regressions(model, logs, filter)
     kept = list(solved(blocks).kept)
     x, level = model.nominal.copy(), sensor_noise
     runs = _simulated(c, pieces, x)

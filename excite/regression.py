@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
-from excite.estimate import Estimate, NotIdentifiable, noted
+from excite.estimate import UNMOVED, Estimate, NotIdentifiable, noted
+from excite.hidden import unmoved
 from excite.leastsquares import Solution, Triangle, lag_one, merge, reduce, scores_covariance, solve
 from excite.log import Log
 from excite.noise import EXACT, row_errors, row_levels, second_moments, spread, whitener
@@ -29,7 +30,7 @@ def ols(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     itself is measured with noise, as slips are, and the deviations then are too small. A note says how much too small
     the autocorrelation of the residuals alone makes them.
     """
-    blocks = [filtered_regression(model, log, filter) for log in logs]
+    blocks = regressions(model, logs, filter)
     solution = solved(blocks)
     estimate = textbook(model, blocks, solution, "ols")
     return noted(estimate, *_too_small(blocks, solution, estimate, sandwich(blocks, solution)))
@@ -43,7 +44,7 @@ def wls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     that varies along the log (kernel estimate of the scores). Biased like ols where the regressor is measured with
     noise, though less where noisy rows then count less.
     """
-    blocks = [filtered_regression(model, log, filter) for log in logs]
+    blocks = regressions(model, logs, filter)
     least = row_levels([row_errors(model, log, filter, 1) for log in logs], model.nominal)
     least = np.maximum(least, EXACT * size(blocks))  # exact logs have no residual to weigh by
     count = sum(Y.shape[1] for _, Y in blocks)
@@ -69,7 +70,7 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     noise, if C has the right shape (Van Huffel and Vandewalle, "The total least squares problem", 1991, ch. 10).
     Columns are scaled by the triangle of [W Y]. Raises NotIdentifiable where nothing has noise.
     """
-    blocks = [filtered_regression(model, log, filter) for log in logs]
+    blocks = regressions(model, logs, filter)
     first = solved(blocks)
     turned = [
         whitener(model, samples(model, log, filter), model.nominal, spread(model, log, filter), filter) for log in logs
@@ -101,6 +102,17 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
 # ------------------------------------------------------------------------------------------------ the core
 
 
+def regressions(model: Model, logs: Sequence[Log], filter: Filter) -> list[Block]:
+    """Filtered rows of every log, without parameters of what stands still in all of them."""
+    still = unmoved(model, logs, filter, slow=False)
+    return shown([filtered_regression(model, log, filter) for log in logs], still)
+
+
+def shown(blocks: Sequence[Block], still: np.ndarray) -> list[Block]:
+    """Rows without some of the parameters (n_base,): the noise of sensors that stand still would pass for motion."""
+    return [(np.where(still, 0.0, W), Y) for W, Y in blocks] if still.any() else list(blocks)
+
+
 def least_squares(model: Model, W: np.ndarray, Y: np.ndarray, method: str) -> Estimate:
     """QR least squares of W (n_rows, n, n_base) X = Y (n_rows, n), columns in dependence named and left out."""
     blocks = [(W, Y)]
@@ -120,7 +132,7 @@ def solved(blocks: Sequence[Block]) -> Solution:
         raise NotIdentifiable(f"{rows} filtered rows for {n_base} parameters: the log is too short")
     solution = solve(triangle(blocks))
     if not solution.kept:
-        raise NotIdentifiable("the log says nothing of any parameter: does the machine move in it?")
+        raise NotIdentifiable(UNMOVED)
     return solution
 
 

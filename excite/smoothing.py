@@ -16,7 +16,7 @@ import numpy as np
 
 from excite import hidden
 from excite.deviations import sure
-from excite.estimate import Estimate, NotIdentifiable
+from excite.estimate import UNMOVED, Estimate, NotIdentifiable
 from excite.innovations import innovation_sizes
 from excite.linearise import Chart, chart
 from excite.log import Log
@@ -180,7 +180,7 @@ def _estimate(
     model = c.model
     weak = fit.unseen | (fit.std > UNSEEN * np.maximum(np.abs(fit.X), model.scale))
     if weak.all():
-        raise NotIdentifiable("the log says nothing of any parameter: does the machine move in it?")
+        raise NotIdentifiable(UNMOVED)
     if fit.unseen.any():
         held = ", ".join(n for n, yes in zip(model.base.names, fit.unseen, strict=True) if yes)
         notes = (*notes, f"held at the machine file's value: {held}; the other deviations hold if that value does")

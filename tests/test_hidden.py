@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from excite import identify, log, sensors
 from excite.simulate import Motion, simulate
@@ -18,6 +19,19 @@ def test_a_machine_at_rest_is_told_to_drive_and_steer(va12: Model) -> None:
     assert "never move" in reasons["M"]
     assert "steer (move the articulation) while driving" in reasons["ZZ2"]
     assert "theta2" in reasons["Fv2"]
+
+
+@pytest.mark.parametrize("method", ["ols", "wls", "tls", "iv", "oe", "ols+consistent"])
+def test_noise_of_a_machine_at_rest_is_no_motion(va12: Model, method: str) -> None:
+    """Offsets are all that it shows; the sensors' noise says nothing of its mass."""
+    table = sensors.measure(va12, simulate(va12, np.zeros((2001, 3))), seed=1)
+    estimate = identify.identify(va12, [log.check(table, va12.machine)], method)
+    offsets = {"u10", "u20", "u40"}
+    assert set(va12.base.names) - set(estimate.unidentifiable) == offsets
+    for name in offsets:
+        k = va12.base.names.index(name)
+        assert abs(estimate.value[k] - va12.nominal[k]) < 4 * estimate.std[k]
+    assert "never move" in estimate.unidentifiable["M"]
 
 
 def test_a_straight_drive_hides_what_steering_shows(va12: Model, straight: Model, straight_motion: Motion) -> None:
