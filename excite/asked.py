@@ -93,6 +93,24 @@ def known(what: str, value: str, allowed: Sequence[str]) -> None:
         raise UsageError(f"{what}: {value} is unknown, allowed: {', '.join(allowed)}")
 
 
+def objective(name: str, machine: Machine) -> None:
+    """Refuses a design objective that there isn't, or that has nothing to do with a machine. Raises MachineError for
+    effects that can't be had."""
+    from excite.objective import OBJECTIVES
+    from model.prediction import build
+
+    known("--objective", name, tuple(OBJECTIVES))
+    if name != "discrimination":
+        return
+    model = build(machine, flaws=False)
+    shown = sum(e.name in model.base.names for e in model.effects)
+    if shown < 2:
+        raise UsageError(
+            f"--objective: discrimination: needs two effects to tell apart, {machine.name} has {shown or 'none'} that a"
+            " drive shows; give its machine file two ([[effect]]), or `excite design` --between twice"
+        )
+
+
 def positive(option: str, value: float | None, unit: str) -> None:
     if value is not None and not value > 0:
         raise UsageError(f"{option}: must be > 0 {unit} (got {value:g})")

@@ -43,7 +43,6 @@ from excite import asked, identify, profiles
 from excite.asked import UsageError
 from excite.limit import KINDS
 from excite.log import LogError
-from excite.objective import OBJECTIVES
 from model import machine as machines
 from model import placing, prediction
 from model.effect import DURATION
@@ -430,12 +429,7 @@ def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:
         if d.profile is not None:
             profiles.read(plan.base / d.profile, prediction.build(machine))
         else:
-            asked.known("--objective", d.objective, tuple(OBJECTIVES))
-            if d.objective == "discrimination" and len(machine.effect) < 2:
-                raise StudyError(
-                    f"objective: discrimination: needs two effects to tell apart, {machine.name} has"
-                    f" {len(machine.effect) or 'none'}; give its machine file two ([[effect]])"
-                )
+            asked.objective(d.objective, machine)
             asked.problem(plan.designed(d), d.problem, d.duration_s)
     if fresh(d.machine, cell.effects):
         own = [placing.placed(machine, entry).name for entry in machine.effect]

@@ -31,7 +31,6 @@ from excite.brief import Brief
 from excite.estimate import Estimate, NotIdentifiable
 from excite.log import Log
 from excite.meaning import meanings
-from excite.objective import OBJECTIVES
 from excite.simulate import SimulationError
 from model.machine import Filter, MachineError, Problem
 from model.prediction import Model
@@ -41,11 +40,9 @@ def design(place: Path, machine: str, problem: str | None, duration: float | Non
     """A drive for a machine as a brief asks for it."""
     model = asked.model(machine, flaws=False)
     name, chosen = asked.problem(model.machine, problem, duration)
-    asked.known("--objective", brief.objective, tuple(OBJECTIVES))
     if brief.between:
         model = briefs.rivals(model, brief.between, float(chosen.duration_s))
-    elif brief.objective == "discrimination" and len(model.effects) < 2:
-        raise UsageError("--objective discrimination: needs two effects to tell apart, give --between twice")
+    asked.objective(brief.objective, model.machine)
     asked.positive("--budget", brief.budget_s, "s")
     asked.positive("--sigma-max", brief.sigma_max, "%")
     return designed(place, model, name, chosen, brief)

@@ -126,6 +126,15 @@ name = "sloping"
 name = "ground_slope"
 amount = { value = 0.005, source = "assumed" }
 """
+ECCENTRIC = (
+    SLOPING.replace("sloping", "sloping_eccentric")
+    + """
+[[effect]]
+name = "encoder_eccentricity"
+where = "front_roll"
+amount = { value = 0.001, source = "assumed" }
+"""
+)
 WRONG = {
     "no file": (None, "can't be read"),
     "not TOML": ("= 3", "not a TOML file"),
@@ -158,7 +167,11 @@ WRONG = {
     ),
     "one effect to tell apart": (
         '[grid]\nmachine = "sloping.toml"\nobjective = "discrimination"',
-        "needs two effects to tell apart, sloping has 1; give its machine file two ([[effect]])",
+        "needs two effects to tell apart, sloping has 1 that a drive shows; give its machine file two ([[effect]])",
+    ),
+    "two effects to tell apart, one in a sensor": (
+        '[grid]\nmachine = "sloping_eccentric.toml"\nobjective = "discrimination"',
+        "needs two effects to tell apart, sloping_eccentric has 1 that a drive shows",
     ),
     "duration too short": (GRID + "duration_s = 0.1", "duration_s: must be between 0.8 and 3600 s (got 0.1)"),
     "duration not a number": (GRID + 'duration_s = "long"', "grid[0].duration_s[0]: must be a number"),
@@ -205,13 +218,15 @@ def test_a_wrong_study_is_one_clear_line(name: str, tmp_path: Path, excite: Exci
     if text is not None:
         title = "../../away" if name == "name that leads away" else "wrong"
         path.write_text(f'name = "{title}"\n{text}\n')
-    (tmp_path / "sloping.toml").write_text(SLOPING)
+    files = {"sloping.toml": SLOPING, "sloping_eccentric.toml": ECCENTRIC}
+    for file, content in files.items():
+        (tmp_path / file).write_text(content)
     code, stdout, stderr = excite("study", path, "--out", tmp_path / "out")
     assert (code, stdout) == (2, ""), stderr
     assert stderr.count("\n") == 1
     assert str(path) in stderr
     assert words in stderr
-    assert {p.name for p in tmp_path.iterdir()} <= {"wrong.toml", "sloping.toml"}
+    assert {p.name for p in tmp_path.iterdir()} <= {"wrong.toml", *files}
 
 
 def test_what_a_sample_draws_from_may_weigh_twice() -> None:
