@@ -142,7 +142,7 @@ def _path(ax: Axes, model: Model, problem: Problem, motion: Motion) -> None:
     ax.set_aspect("equal")
     ax.set_xlabel("x on the lane [m]")
     ax.set_ylabel("y [m]")
-    ax.legend(fontsize=8)
+    ax.legend(loc="lower right", bbox_to_anchor=(1, 1.0), ncols=2, fontsize=8, frameon=False, borderaxespad=0.2)
     ax.grid(alpha=0.3)
 
 
