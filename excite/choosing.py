@@ -18,7 +18,7 @@ from excite.anomaly import shakes
 from excite.log import Log
 from excite.newton import NotConverged
 from excite.sidebyside import Together
-from excite.stages import FAR, SMALL, Stage, begun, exact_if_near, freed, opening, refits, refitted, sharpened
+from excite.stages import FAR, SMALL, Stage, begun, exact_if_near, freed, refits, refitted, sharpened
 from model import placing
 from model.effect import Effect, Placed
 from model.file import Quantity
@@ -35,7 +35,6 @@ TRIED = 5  # candidates that are fitted
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
 PLAIN = 0.5  # the same for the variant without unusual shapes, which the others may mimic before a fit
 ANEW = 12  # effects that begin anew where nothing was found
-OPENING = 40.0  # [s] of long logs, with which they have to come to an end first
 PAIR = 2  # candidates whose fits are begun in any case
 BEHIND = 0.5  # share of what was gained already that further candidates must have come to after a few passes
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
@@ -330,17 +329,8 @@ def unlikely(scanned: Stage, stage: Stage, tried: Container[str], together: Toge
     scores = scored(scanned, together)
     best = {s.candidate.name: s for s in reversed(scores) if s.gain > 0 and s.values["A"] != 0}
     most = sorted(best.values(), key=lambda s: -s.gain)[:ANEW]
-    most = _surviving(stage, [s for s in most if s.candidate.name not in tried], together)
+    most = [s for s in most if s.candidate.name not in tried]
     return _followed(stage, most, (0.0,), len(scores), together) or (stage, [])
-
-
-def _surviving(stage: Stage, scores: Sequence[evidence.Score], together: Together) -> list[evidence.Score]:
-    """Those with which exact dynamics are not far off in the beginning of the logs already, where these are long."""
-    if _duration(stage.prepared.logs) < 2 * OPENING:
-        return list(scores)
-    machines = [placing.extended(stage.machine, _entry(s)) for s in scores]
-    found = begun(machines, opening(stage, OPENING), 0.0, together)
-    return [s for s, x in zip(scores, found, strict=True) if x is not None]
 
 
 def _followed(

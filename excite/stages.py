@@ -201,16 +201,6 @@ def _noisy(prepared: Prepared, coarse: float) -> Prepared:
     return replace(prepared, records=tuple(replace(r, coarse=coarse) for r in prepared.records))
 
 
-def opening(stage: Stage, duration: float) -> Stage:
-    """A stage with the first seconds of its logs, to begin anew with: its fit is still that of the whole."""
-    p = stage.prepared
-    rows = slice(0, round(duration * float(stage.machine.sampling_hz)) + 1)
-    logs = tuple(replace(x, t=x.t[rows], values={n: v[rows] for n, v in x.values.items()}) for x in p.logs)
-    records = tuple(replace(r, torque=r.torque[rows], reading=r.reading[rows], used=r.used[rows]) for r in p.records)
-    starts = tuple(replace(x, s=x.s[rows], w=x.w[rows][: len(x.s[rows]) - 1]) for x in p.starts)
-    return replace(stage, prepared=replace(p, logs=logs, records=records, starts=starts))
-
-
 def as_measured(stage: Stage) -> Stage:
     """A stage's motion and parameters against the sensors as noisy as they are."""
     if stage.prepared.coarse == 1:

@@ -133,13 +133,10 @@ def test_a_slope_from_log_to_extended_machine(
     assert np.abs(right.q - again.q).max() < 0.05 * np.abs(wrong.q - again.q).max()
 
 
-@pytest.mark.parametrize("opening", [choosing.OPENING, 10.0])
 def test_where_nothing_promises_anything_effects_begin_anew(
-    sloping: Path, straight: Model, opening: float, monkeypatch: pytest.MonkeyPatch
+    sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Far from any fit first-order gains say little. The right cause is found by what it makes of exact dynamics, in
-    the first seconds of a long log already."""
-    monkeypatch.setattr("excite.choosing.OPENING", opening)
+    """Far from any fit first-order gains say little. The right cause is found by what it makes of exact dynamics."""
     for way in ("choose", "sharp"):
         monkeypatch.setattr(f"excite.choosing.{way}", lambda *asked: None)
     monkeypatch.setattr("excite.choosing.unfollowed", lambda stage, together: (stage, [], frozenset()))
