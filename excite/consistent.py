@@ -68,7 +68,7 @@ def consistent(model: Model, estimate: Estimate) -> Estimate:
 def constrained(model: Model, estimate: Estimate, blocks: Sequence[Block]) -> Estimate:
     """`consistent`, with residual and relative error of the filtered rows at the possible values."""
     found = consistent(model, estimate)
-    x = np.nan_to_num(found.value)
+    x = np.where(np.isnan(found.value), model.nominal, found.value)
     e = np.concatenate([residual(b, x) for b in blocks], axis=1)
     return replace(found, residual=e, relative_error_percent=100 * float(np.sqrt(np.mean(e**2))) / size(blocks))
 

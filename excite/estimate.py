@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
 
 UNMOVED = "the log says nothing of any parameter: does the machine move in it?"
+
+
+def held_note(names: Sequence[str]) -> str:
+    """What an estimate says of parameters that it took from the machine file."""
+    return f"held at the machine file's value: {', '.join(names)}; the others hold if the file is right there"
 
 
 class NoEstimate(RuntimeError):

@@ -10,7 +10,7 @@ import scipy
 
 from excite.estimate import Estimate, noted
 from excite.log import Log
-from excite.processing import BLOCK, Samples, samples
+from excite.processing import BLOCK, Samples, samples, unmeasured
 from model.machine import Filter
 from model.prediction import Model
 
@@ -47,43 +47,85 @@ def explained(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Fil
 
 
 def unmoved(model: Model, logs: Sequence[Log], filter: Filter, slow: bool) -> np.ndarray:
-    """Parameters (n_base,) that logs say nothing of because something on the machine stands still in all of them.
+    """Parameters (n_base,) that logs don't show apart from the others because something on the machine stands still in
+    all of them: see `at_rest`."""
+    return np.diag(at_rest(model, logs, filter, slow)) == 0
 
-    Along the logs as they are the noise of a joint at rest would pass for motion. Here what stands still does so
-    exactly: a joint whose encoder counts no further than COUNTS, and with it whatever moves slower than STILL on
-    average over a second; with `slow` that alone is enough.
+
+def at_rest(
+    model: Model, logs: Sequence[Log], filter: Filter, slow: bool = False, motions: Sequence[Samples] | None = None
+) -> np.ndarray:
+    """What a regressor W is multiplied by, (n_base, n_base), so that what stands still in all logs does so exactly.
+
+    Along the logs as they are the noise of a joint at rest would pass for motion. A column that says nothing then is
+    zero, one that is a combination of those before it is that combination, all others are their own. A joint stands
+    still if its encoder counts no further than COUNTS; if one does, so does the root if it moves slower than STILL on
+    average over a second; with `slow` whatever is that slow. `motions`: of the logs, if they are known better. The
+    identity for a machine with effects, and for one none of whose joints with a resolution stands still.
     """
-    none = np.zeros(len(model.base.names), bool)
+    whole = np.eye(len(model.base.names))
     if not model.plain:
-        return none
-    machine = model.machine
-    at_rest = {
-        model.coordinates.index(machine.find(s.body).coordinates[0])
+        return whole
+    machine, at = model.machine, model.coordinates.index
+    joints = [
+        at(machine.find(s.body).coordinates[0])
         for s in machine.sensors("full")
         if s.kind == "angle"
         and s.resolution is not None
         and all(s.name in log.values and np.ptp(log.values[s.name]) <= COUNTS * s.resolution for log in logs)
-    }
-    if not at_rest and not slow:
-        return none
-    motions = [samples(model, log, filter) for log in logs]
-    second = round(float(machine.sampling_hz))
-    speed = np.max([np.abs(scipy.ndimage.uniform_filter1d(s.nu, second, axis=1)).max(axis=1) for s in motions], axis=0)
-    still = speed < STILL
-    still[list(at_rest)] = True
+    ]
+    if not joints and not slow:
+        return whole
+    seen = motions or [_with_unmeasured(model, log, samples(model, log, filter)) for log in logs]
+    root = [at(c) for c in machine.body[0].coordinates if c in model.coordinates] if machine.planar else []
+    still = np.max([_speeds(model, s) for s in seen], axis=0) < STILL
+    still &= slow | np.isin(np.arange(len(still)), root)
+    still[joints] = True
     if not still.any():
-        return none
-    R = np.zeros((0, len(none)))
-    for s in motions:
+        return whole
+    R = np.zeros((0, len(whole)))
+    for s in seen:
         q = np.where(still[:, None], s.q.mean(axis=1, keepdims=True), s.q)
         nu, a = np.where(still[:, None], 0.0, s.nu), np.where(still[:, None], 0.0, s.a)
         for k in range(0, q.shape[1], BLOCK):
             own = slice(k, k + BLOCK)
             rows = _rows(model, q[:, own], nu[:, own], a[:, own])
             R = np.asarray(np.linalg.qr(np.concatenate([R, rows]), mode="r"))
-    R = R * model.scale
-    largest = np.linalg.norm(R, axis=0).max()
-    return np.array([_apart(R, k) * np.sqrt(len(R)) <= NOTHING * largest for k in range(len(none))])
+    return _independent(R * model.scale) * model.scale[:, None] / model.scale
+
+
+def _with_unmeasured(model: Model, log: Log, s: Samples) -> Samples:
+    """Samples in which a speed that nothing measures is any speed at all, so that nothing is left out on its account:
+    unless nothing else moves either, or it is sideways and the machine doesn't turn."""
+    moves = _speeds(model, s) >= STILL
+    rows = [k for k in unmeasured(model, log) if moves.any()]
+    if model.machine.planar:
+        _, across, turn = model.machine.body[0].coordinates
+        rows = [k for k in rows if model.coordinates[k] != across or moves[model.coordinates.index(turn)]]
+    nu, a = s.nu.copy(), s.a.copy()
+    nu[rows], a[rows] = np.abs(nu).max() * np.random.default_rng(0).standard_normal((2, len(rows), nu.shape[1]))
+    return replace(s, nu=nu, a=a)
+
+
+def _speeds(model: Model, s: Samples) -> np.ndarray:
+    """Largest speed of each coordinate (n_q,) on average over a second."""
+    second = round(float(model.machine.sampling_hz))
+    return np.asarray(np.abs(scipy.ndimage.uniform_filter1d(s.nu, second, axis=1)).max(axis=1))
+
+
+def _independent(R: np.ndarray) -> np.ndarray:
+    """T (n, n) with R T = R to within NOTHING, by which a column of R that those before it make up is made of them."""
+    T = np.eye(R.shape[1])
+    nothing = NOTHING * np.linalg.norm(R, axis=0).max()
+    kept: list[int] = []
+    for k in range(R.shape[1]):
+        c = np.linalg.lstsq(R[:, kept], R[:, k], rcond=None)[0]
+        if np.linalg.norm(R[:, k] - R[:, kept] @ c) > nothing:
+            kept.append(k)
+        else:
+            T[k, k] = 0.0
+            T[kept, k] = c if np.linalg.norm(R[:, k]) > nothing else 0.0
+    return T
 
 
 def advice(model: Model, logs: Sequence[Samples], names: Sequence[str]) -> dict[str, str]:

@@ -14,11 +14,11 @@ import numpy as np
 import scipy
 
 from excite.estimate import Estimate, NotIdentifiable
-from excite.hidden import unmoved
+from excite.hidden import at_rest
 from excite.log import Log
 from excite.noise import Spread, spread, whitener
 from excite.processing import Samples, lowpass, regression, samples, unmeasured
-from excite.regression import Block, assembled, effective, scatter, shown, solved, whitened
+from excite.regression import Block, assembled, effective, residual, scatter, solved, stilled, whitened
 from excite.simulate import SimulationError, simulate
 from model.machine import Filter
 from model.prediction import Model
@@ -42,15 +42,14 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     """
     measured = [samples(model, log, filter) for log in logs]
     unseen = [unmeasured(model, log) for log in logs]
-    still = unmoved(model, logs, filter, slow=False)
-    blocks = shown([regression(model, s, filter) for s in measured], still)
     noise = [_with_unseen(spread(model, log, filter), rows) for log, rows in zip(logs, unseen, strict=True)]
     if any(unseen):
         measured = [
             _completed(s, observe(model, s, model.nominal, filter, rows), rows)
             for s, rows in zip(measured, unseen, strict=True)
         ]
-        blocks = shown([regression(model, s, filter) for s in measured], still)
+    rest = at_rest(model, logs, filter, motions=measured)
+    blocks = stilled([regression(model, s, filter) for s in measured], rest)
     first = solved(blocks)
     kept = list(first.kept)
     x, step = model.nominal.copy(), np.full(len(model.nominal), np.nan)
@@ -58,9 +57,10 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         seen, x = _observed(model, measured, unseen, x, step, filter)
         if any(unseen):
             measured = [_completed(s, o, rows) for s, o, rows in zip(measured, seen, unseen, strict=True)]
-            blocks = shown([regression(model, s, filter) for s in measured], still)
+            blocks = stilled([regression(model, s, filter) for s in measured], rest)
         turned = [whitener(model, s, x, n, filter) for s, n in zip(seen, noise, strict=True)]
-        Z = [whitened(regression(model, s, filter), L)[0] for s, L in zip(seen, turned, strict=True)]
+        ahead = stilled([regression(model, s, filter) for s in seen], rest)
+        Z = [whitened(b, L)[0] for b, L in zip(ahead, turned, strict=True)]
         own = [whitened(b, L) for b, L in zip(blocks, turned, strict=True)]
         found, covariance = _square(own, Z, kept, x)
         step = found - x
@@ -119,7 +119,9 @@ def _square(
     """x (n_base,) of Z'(Y - W x) = 0, and the covariance (k, k) of the kept parameters."""
     tall = np.concatenate([z[:, :, kept].reshape(-1, len(kept)) for z in Z])
     W = np.concatenate([w[:, :, kept].reshape(-1, len(kept)) for w, _ in blocks])
-    y = np.concatenate([v.reshape(-1) for _, v in blocks])
+    given = x.copy()
+    given[kept] = 0.0
+    y = np.concatenate([residual(b, given).reshape(-1) for b in blocks])
     size = np.linalg.norm(tall, axis=0)
     if not (size > 0).all():
         raise NotIdentifiable("iv: along the simulated motion nothing depends on one of the parameters")

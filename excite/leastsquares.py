@@ -49,6 +49,11 @@ class Solution:
         return self.rows - len(self.kept)
 
     @property
+    def tied(self) -> list[int]:
+        """Columns left out that are combinations of kept ones."""
+        return [k for k, partner in self.dependent.items() if partner is not None]
+
+    @property
     def inverse(self) -> np.ndarray:
         """(A'A)^-1 of the kept columns, (k, k)."""
         half = scipy.linalg.solve_triangular(self.R, np.eye(len(self.kept)))

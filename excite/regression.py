@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
-from excite.estimate import UNMOVED, Estimate, NotIdentifiable, noted
-from excite.hidden import unmoved
+from excite.estimate import UNMOVED, Estimate, NotIdentifiable, held_note, noted
+from excite.hidden import at_rest
 from excite.leastsquares import Solution, Triangle, lag_one, merge, reduce, scores_covariance, solve
 from excite.log import Log
 from excite.noise import EXACT, row_errors, row_levels, second_moments, spread, whitener
@@ -58,7 +58,9 @@ def wls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         own = scaled(blocks, level)
     covariance = sandwich(own, solution)
     degrees = effective(solution, covariance)
-    return assembled(model, blocks, solution, "wls", solution.x, covariance, degrees, ())
+    return assembled(
+        model, blocks, solution, "wls", at_file(model, blocks, solution, solution.x), covariance, degrees, ()
+    )
 
 
 def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
@@ -96,6 +98,7 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     bread = np.linalg.inv(R[:, :-1].T @ R[:, :-1] - level * C[:-1, :-1])
     covariance = bread @ scatter(own, x, kept) @ bread
     note = f"tls: misfit {np.sqrt(level):.2f} times what the sensors' noise and counts explain"
+    x = at_file(model, blocks, first, x)
     return assembled(model, blocks, first, "tls", x, covariance, effective(solved(own), covariance), (note,))
 
 
@@ -103,14 +106,28 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
 
 
 def regressions(model: Model, logs: Sequence[Log], filter: Filter) -> list[Block]:
-    """Filtered rows of every log, without parameters of what stands still in all of them."""
-    still = unmoved(model, logs, filter, slow=False)
-    return shown([filtered_regression(model, log, filter) for log in logs], still)
+    """Filtered rows of every log; what stands still in all of them does so exactly."""
+    rest = at_rest(model, logs, filter)
+    return stilled([filtered_regression(model, log, filter) for log in logs], rest)
 
 
-def shown(blocks: Sequence[Block], still: np.ndarray) -> list[Block]:
-    """Rows without some of the parameters (n_base,): the noise of sensors that stand still would pass for motion."""
-    return [(np.where(still, 0.0, W), Y) for W, Y in blocks] if still.any() else list(blocks)
+def stilled(blocks: Sequence[Block], rest: np.ndarray) -> list[Block]:
+    """Rows of a machine some of which stands still, by `at_rest` (n_base, n_base)."""
+    return [(W @ rest, Y) for W, Y in blocks] if (np.diag(rest) == 0).any() else list(blocks)
+
+
+def at_file(model: Model, blocks: Sequence[Block], solution: Solution, x: np.ndarray) -> np.ndarray:
+    """x (n_base,) with parameters that move together with others at the machine file's values instead of zero, and the
+    others such that all rows stay explained as they are: written to the machine file, they say the same of the log."""
+    tied, kept = solution.tied, list(solution.kept)
+    if not tied:
+        return x
+    R = triangle(blocks).R[:, :-1] * model.scale
+    found = x.copy()
+    found[tied] = model.nominal[tied]
+    along = np.linalg.lstsq(R[:, kept], R[:, tied] @ (found[tied] / model.scale[tied]), rcond=None)[0]
+    found[kept] -= along * model.scale[kept]
+    return found
 
 
 def least_squares(model: Model, W: np.ndarray, Y: np.ndarray, method: str) -> Estimate:
@@ -190,7 +207,8 @@ def effective(solution: Solution, covariance: np.ndarray) -> int:
 def textbook(model: Model, blocks: Sequence[Block], solution: Solution, method: str) -> Estimate:
     """The estimate with deviations by (33), which hold for white noise on Y alone."""
     covariance = solution.residual_norm**2 / solution.degrees * solution.inverse
-    return assembled(model, blocks, solution, method, solution.x, covariance, solution.degrees, ())
+    x = at_file(model, blocks, solution, solution.x)
+    return assembled(model, blocks, solution, method, x, covariance, solution.degrees, ())
 
 
 def assembled(
@@ -217,6 +235,8 @@ def assembled(
         else f"moves together with {names[partner]} and others in this log"
         for k, partner in solution.dependent.items()
     }
+    if solution.tied:
+        notes = (*notes, held_note([names[k] for k in solution.tied]))
     return Estimate(
         method,
         names,

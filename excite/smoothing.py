@@ -16,7 +16,7 @@ import numpy as np
 
 from excite import hidden
 from excite.deviations import sure
-from excite.estimate import UNMOVED, Estimate, NotIdentifiable
+from excite.estimate import UNMOVED, Estimate, NotIdentifiable, held_note
 from excite.innovations import innovation_sizes
 from excite.linearise import Chart, chart
 from excite.log import Log
@@ -182,8 +182,8 @@ def _estimate(
     if weak.all():
         raise NotIdentifiable(UNMOVED)
     if fit.unseen.any():
-        held = ", ".join(n for n, yes in zip(model.base.names, fit.unseen, strict=True) if yes)
-        notes = (*notes, f"held at the machine file's value: {held}; the other deviations hold if that value does")
+        held = [n for n, yes in zip(model.base.names, fit.unseen, strict=True) if yes]
+        notes = (*notes, held_note(held))
     reasons = {
         name: "this log hardly moves with it: what is known of it is the machine file's value"
         for name, yes in zip(model.base.names, weak, strict=True)

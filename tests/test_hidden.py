@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
 
-from excite import identify, log, sensors
+from excite import hidden, identify, log, sensors
 from excite.simulate import Motion, simulate
 from model.prediction import Model
 
@@ -32,6 +34,49 @@ def test_noise_of_a_machine_at_rest_is_no_motion(va12: Model, method: str) -> No
         k = va12.base.names.index(name)
         assert abs(estimate.value[k] - va12.nominal[k]) < 4 * estimate.std[k]
     assert "never move" in estimate.unidentifiable["M"]
+
+
+def braked(va12: Model, angle: float) -> log.Log:
+    """A drive, forward only, its articulation held at an angle [rad] by a brake, a torque besides the log's."""
+    held = np.where(np.array(va12.base.names) == "Fv2", 1e8, va12.nominal)
+    t = np.arange(6001) / 100
+    push = 900 + 500 * np.sin(2 * np.pi * 0.2 * t) + 200 * np.sin(2 * np.pi * 0.07 * t)
+    q0 = np.where(np.array(va12.coordinates) == "theta2", angle, 0.0)
+    motion = simulate(va12, push[:, None] * [1, 0, 0.8], held, q0, np.array([0.65, 0, 0, 1, 0, 1]))
+    brake = (1e8 - va12.nominal[va12.base.names.index("Fv2")]) * motion.nu[:, va12.coordinates.index("theta2")]
+    known = replace(motion, u=motion.u - brake[:, None] * [0, 1, 0])
+    return log.check(sensors.measure(va12, known, seed=1), va12.machine)
+
+
+@pytest.fixture(scope="module")
+def one_way(va12: Model) -> log.Log:
+    return braked(va12, 0.0)
+
+
+@pytest.mark.parametrize("method", ["wls", "iv", "joint"])
+def test_what_moves_together_beside_a_joint_at_rest_is_held_alone(va12: Model, one_way: log.Log, method: str) -> None:
+    """Driving one way dry friction and offset are one constant: the machine file says how much of it is the offset, and
+    no other parameter has to pay for it if the file is wrong there."""
+    at = va12.base.names.index
+    wrong = va12.nominal.copy()
+    wrong[at("u10")] += 100
+    for file in (va12, replace(va12, nominal=wrong)):
+        estimate = identify.identify(file, [one_way], method)
+        assert {"Fs2", "Fv2", "ZZ2", "u10", "u40"} <= set(estimate.unidentifiable)
+        assert any(n.startswith("held at the machine file's value") and "u10" in n for n in estimate.notes)
+        constant = estimate.value[at("Fs1")] + file.nominal[at("u10")]
+        assert abs(constant - va12.nominal[at("Fs1")] - va12.nominal[at("u10")]) < 4 * estimate.std[at("Fs1")]
+        for name in ("M", "Fv1"):
+            assert abs(estimate.value[at(name)] - va12.nominal[at(name)]) < 4 * estimate.std[at(name)]
+
+
+def test_a_speed_that_nothing_measures_is_not_at_rest(va12: Model) -> None:
+    """In a bend with the articulation held rolls slip sideways, even if no sensor says so."""
+    bend = braked(va12, 0.35)
+    lateral = next(s.name for s in va12.machine.sensors("full") if s.kind == "lateral_speed")
+    bend = replace(bend, values={n: v for n, v in bend.values.items() if n != lateral})
+    shown = np.diag(hidden.at_rest(va12, [bend], va12.machine.filter)) > 0
+    assert {n for n, yes in zip(va12.base.names, shown, strict=True) if not yes} == {"Fv2", "Fs2", "u10", "u40"}
 
 
 def test_a_straight_drive_hides_what_steering_shows(va12: Model, straight: Model, straight_motion: Motion) -> None:
