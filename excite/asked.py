@@ -94,8 +94,8 @@ def known(what: str, value: str, allowed: Sequence[str]) -> None:
 
 
 def objective(name: str, machine: Machine) -> None:
-    """Refuses a design objective that there isn't, or that has nothing to do with a machine. Raises MachineError for
-    effects that can't be had."""
+    """Refuses a design objective that there isn't, and `discrimination` without two effects that a drive shows. Raises
+    MachineError for effects that can't be had."""
     from excite.objective import OBJECTIVES
     from model.prediction import build
 

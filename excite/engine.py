@@ -248,10 +248,13 @@ def spread(
                 if not workers.died(err):
                     raise
                 dead = True
-                if alone and deaths + 1 >= TRIES and len(split(piece)) == 1:
+                parts = split(piece)
+                if len(parts) > 1:
+                    suspects += [(p, 0) for p in parts]
+                elif alone and deaths + 1 >= TRIES:
                     yield Result(piece, None, 0.0)
                 else:
-                    suspects += [(p, deaths + alone) for p in split(piece)]
+                    suspects.append((piece, deaths + alone))
             else:
                 yield Result(piece, value, seconds)
         if dead and workers.shared:

@@ -395,25 +395,13 @@ def ready(study: Study, base: Path | str = Path()) -> Plan:
         for name in dict.fromkeys(axes.machine):
             if name not in known:
                 place = name if name in machines.shipped() else base / name
-                known[name], texts[name] = machines.load(place), _texts(place)
+                known[name] = machines.load(place)
+                texts[name] = {p.name: p.read_text(encoding="utf-8-sig") for p in machines.own_files(place)}
     plan = Plan(study, base, tuple(study.cells()), known, texts)
     seen: set[Any] = set()
     for cell in plan.cells:
         _check(plan, cell, seen)
     return plan
-
-
-def _texts(place: str | Path) -> dict[str, str]:
-    """A machine's own files by name, those that it extends included; none of a shipped one."""
-    found: dict[str, str] = {}
-    while str(place) not in machines.shipped():
-        path = Path(place)
-        found[path.name] = path.read_text(encoding="utf-8-sig")
-        parent = read_toml(path).get("extends")
-        if parent is None or parent in machines.shipped():
-            break
-        place = path.parent / parent
-    return found
 
 
 def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:

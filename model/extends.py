@@ -22,14 +22,9 @@ def read(path: Path, shipped: Path, depth: int = 0) -> dict[str, Any]:
         raise ValueError(f"{path}: extends: more than 4 files deep, a loop?")
     raw = read_toml(path)
     parent = raw.pop("extends", None)
-    if parent is None:
+    base = _base(path, parent, shipped)
+    if base is None:
         return raw
-    if not isinstance(parent, str):
-        raise ValueError(f"{path}: extends: must be a shipped name or a file name")
-    known = names_in(shipped)
-    base = shipped / f"{parent}.toml" if parent in known else path.parent / parent
-    if parent not in known and (Path(parent).name != parent or "\x00" in parent or not base.is_file()):
-        raise ValueError(f"{path}: extends: no machine {parent}, allowed: {', '.join(known)}, or a file beside it")
     whole = read(base, shipped, depth + 1)
     own, listed = (x if isinstance(x, list) else [] for x in (raw.get("sensor"), whole.get("sensor")))
     sensors = [x.get("name") for x in listed if isinstance(x, dict)]
@@ -42,6 +37,29 @@ def read(path: Path, shipped: Path, depth: int = 0) -> dict[str, Any]:
         if isinstance(raw.get(key), dict) and isinstance(whole.get(key), list):
             raw[key] = _changed(path, key, whole[key], raw[key])
     return _merge(whole, raw)
+
+
+def chain(path: Path, shipped: Path) -> list[Path]:
+    """A file and those that it extends, up to a shipped one. Raises ValueError, one line."""
+    found = [path]
+    while (base := _base(found[-1], read_toml(found[-1]).get("extends"), shipped)) and base.parent != shipped:
+        if base in found:
+            break
+        found.append(base)
+    return found
+
+
+def _base(path: Path, parent: object, shipped: Path) -> Path | None:
+    """The file that one extends, None for none. Raises ValueError."""
+    if parent is None:
+        return None
+    if not isinstance(parent, str):
+        raise ValueError(f"{path}: extends: must be a shipped name or a file name")
+    known = names_in(shipped)
+    base = shipped / f"{parent}.toml" if parent in known else path.parent / parent
+    if parent not in known and (Path(parent).name != parent or "\x00" in parent or not base.is_file()):
+        raise ValueError(f"{path}: extends: no machine {parent}, allowed: {', '.join(known)}, or a file beside it")
+    return base
 
 
 def _changed(path: Path, key: str, known: list[Any], changes: dict[str, Any]) -> list[Any]:

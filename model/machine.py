@@ -571,6 +571,15 @@ def load(name: str | Path) -> Machine:
         raise MachineError(one_line(path, err, Machine)) from None
 
 
+def own_files(name: str | Path) -> list[Path]:
+    """The files of a machine of one's own, those that it extends included; none of a shipped name. Raises
+    MachineError."""
+    try:
+        return [] if str(name) in shipped() else extends.chain(_find(str(name)), MACHINES)
+    except ValueError as err:
+        raise MachineError(str(err)) from None
+
+
 def _find(name: str) -> Path:
     if name in shipped():
         return MACHINES / f"{name}.toml"
