@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 
 from excite.estimate import Estimate, noted
+from excite.leastsquares import exchanged
 from excite.log import Log
 from excite.processing import BLOCK, Samples, samples, unmeasured
 from model.machine import Filter
@@ -47,8 +48,8 @@ def explained(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Fil
 
 
 def unmoved(model: Model, logs: Sequence[Log], filter: Filter, slow: bool) -> np.ndarray:
-    """Parameters (n_base,) that logs don't show apart from the others because something on the machine stands still in
-    all of them: see `at_rest`."""
+    """Parameters (n_base,) that logs don't show, or not apart from those left, because something on the machine stands
+    still in all of them: see `at_rest`."""
     return np.diag(at_rest(model, logs, filter, slow)) == 0
 
 
@@ -58,10 +59,10 @@ def at_rest(
     """What a regressor W is multiplied by, (n_base, n_base), so that what stands still in all logs does so exactly.
 
     Along the logs as they are the noise of a joint at rest would pass for motion. A column that says nothing then is
-    zero, one that is a combination of those before it is that combination, all others are their own. A joint stands
-    still if its encoder counts no further than COUNTS; if one does, so does the root if it moves slower than STILL on
-    average over a second; with `slow` whatever is that slow. `motions`: of the logs, if they are known better. The
-    identity for a machine with effects, and for one none of whose joints with a resolution stands still.
+    zero, one that is a combination of others (see `exchanged`) is that combination, all others are their own. A joint
+    stands still if its encoder counts no further than COUNTS; if one does, so does the root if it moves slower than
+    STILL on average over a second; with `slow` whatever is that slow. `motions`: of the logs, if they are known better.
+    The identity for a machine with effects and where nothing stands still.
     """
     whole = np.eye(len(model.base.names))
     if not model.plain:
@@ -101,9 +102,10 @@ def _with_unmeasured(model: Model, log: Log, s: Samples) -> Samples:
     rows = [k for k in unmeasured(model, log) if moves.any()]
     if model.machine.planar:
         _, across, turn = model.machine.body[0].coordinates
-        rows = [k for k in rows if model.coordinates[k] != across or moves[model.coordinates.index(turn)]]
+        turns = turn in model.coordinates and moves[model.coordinates.index(turn)]
+        rows = [k for k in rows if model.coordinates[k] != across or turns]
     nu, a = s.nu.copy(), s.a.copy()
-    nu[rows], a[rows] = np.abs(nu).max() * np.random.default_rng(0).standard_normal((2, len(rows), nu.shape[1]))
+    nu[rows], a[rows] = 1 + np.random.default_rng(0).standard_normal((2, len(rows), nu.shape[1]))
     return replace(s, nu=nu, a=a)
 
 
@@ -114,17 +116,19 @@ def _speeds(model: Model, s: Samples) -> np.ndarray:
 
 
 def _independent(R: np.ndarray) -> np.ndarray:
-    """T (n, n) with R T = R to within NOTHING, by which a column of R that those before it make up is made of them."""
-    T = np.eye(R.shape[1])
-    nothing = NOTHING * np.linalg.norm(R, axis=0).max()
+    """T (n, n) with R T = R to within NOTHING, by which a column of R that others make up is made of them."""
+    size = np.linalg.norm(R, axis=0)
+    nothing = NOTHING * size.max()
     kept: list[int] = []
-    for k in range(R.shape[1]):
+    left: list[int] = []
+    for k in np.flatnonzero(size > nothing):
         c = np.linalg.lstsq(R[:, kept], R[:, k], rcond=None)[0]
-        if np.linalg.norm(R[:, k] - R[:, kept] @ c) > nothing:
-            kept.append(k)
-        else:
-            T[k, k] = 0.0
-            T[kept, k] = c if np.linalg.norm(R[:, k]) > nothing else 0.0
+        (kept if np.linalg.norm(R[:, k] - R[:, kept] @ c) > nothing else left).append(int(k))
+    kept = exchanged(R, kept, left)
+    T = np.zeros((R.shape[1], R.shape[1]))
+    shown = size > nothing
+    T[np.ix_(kept, shown)] = np.linalg.lstsq(R[:, kept], R[:, shown], rcond=None)[0]
+    T[:, kept] = np.eye(len(T))[:, kept]
     return T
 
 

@@ -50,7 +50,7 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         ]
     rest = at_rest(model, logs, filter, motions=measured)
     blocks = stilled([regression(model, s, filter) for s in measured], rest)
-    first = solved(blocks)
+    first = solved(blocks, model.scale)
     kept = list(first.kept)
     x, step = model.nominal.copy(), np.full(len(model.nominal), np.nan)
     for _ in range(PASSES):
@@ -67,7 +67,9 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         x = found
         ratio = np.abs(step[kept]) / np.sqrt(np.diag(covariance))
         if ratio.max() < CONVERGED:
-            return assembled(model, blocks, first, "iv", x, covariance, effective(solved(own), covariance), ())
+            return assembled(
+                model, blocks, first, "iv", x, covariance, effective(solved(own, model.scale), covariance), ()
+            )
     worst = kept[int(np.argmax(ratio))]
     raise NotIdentifiable(
         f"iv: no estimate reproduces itself after {PASSES} passes, {model.base.names[worst]} still moves by"

@@ -10,7 +10,7 @@ in Andrews and Monahan, Econometrica 60, 1992).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ import scipy
 
 DEPENDENT = 1e-10  # a column this close to a combination of the others carries nothing [relative]
 BLOCK = 20_000  # rows of a tall matrix that are reduced at once
+MOST = 10.0  # times a column that is kept, of one that is left out
 MOST_LAGS = 20  # of the autoregression that describes noise
 
 
@@ -89,8 +90,27 @@ def _stack(R: np.ndarray, block: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(both, mode="r"))
 
 
-def solve(t: Triangle, tolerance: float = DEPENDENT) -> Solution:
-    """Least squares from a triangle; a column within `tolerance` of those before it is left out.
+def exchanged(A: np.ndarray, kept: Sequence[int], left: Sequence[int]) -> list[int]:
+    """Of columns that make up one another those to keep, in order: none left out may be more than MOST times a kept
+    one, which would stand for it and make its errors larger by that (a pivot rule of maximum volume).
+
+    `kept` are independent, `left` combinations of them; a column that counts for nothing is in neither.
+    """
+    kept, left = list(kept), list(left)
+    size = np.linalg.norm(A, axis=0)
+    while left:
+        C = np.linalg.lstsq(A[:, kept] / size[kept], A[:, left] / size[left], rcond=None)[0]
+        C *= size[left] / size[kept][:, None]
+        i, j = np.unravel_index(np.argmax(np.abs(C)), C.shape)
+        if abs(C[i, j]) <= MOST:
+            break
+        kept[i], left[j] = left[j], kept[i]
+    return sorted(kept)
+
+
+def solve(t: Triangle, tolerance: float = DEPENDENT, scale: np.ndarray | None = None) -> Solution:
+    """Least squares from a triangle; a column within `tolerance` of those before it is left out; with the size
+    `scale` (n,) of the unknowns, maybe another of them (see `exchanged`).
 
     `dependent` names for each of these the kept column that it is most like, None for a column of zeros. Columns are
     scaled to unit length first, so that units don't matter.
@@ -100,19 +120,23 @@ def solve(t: Triangle, tolerance: float = DEPENDENT) -> Solution:
     size = np.linalg.norm(A, axis=0)
     scaled = A / np.where(size > 0, size, 1.0)
     kept: list[int] = []
-    dependent: dict[int, int | None] = {}
+    left: list[int] = []
     Q = np.zeros((len(A), 0))
-    for k in range(n):
-        if size[k] == 0:
-            dependent[k] = None
-            continue
+    for k in np.flatnonzero(size > 0):
         rest = scaled[:, k] - Q @ (Q.T @ scaled[:, k])
         rest -= Q @ (Q.T @ rest)
         if np.linalg.norm(rest) < tolerance:
-            dependent[k] = kept[int(np.argmax(np.abs(scaled[:, kept].T @ scaled[:, k])))]
+            left.append(int(k))
             continue
-        kept.append(k)
+        kept.append(int(k))
         Q = np.column_stack([Q, rest / np.linalg.norm(rest)])
+    if scale is not None:
+        kept = exchanged(A * scale, kept, left)
+    dependent: dict[int, int | None] = {
+        k: kept[int(np.argmax(np.abs(scaled[:, kept].T @ scaled[:, k])))] if size[k] > 0 else None
+        for k in range(n)
+        if k not in kept
+    }
     x = np.zeros(n)
     if not kept:
         return Solution(x, (), dependent, np.zeros((0, 0)), float(np.linalg.norm(y)), t.rows)

@@ -489,12 +489,12 @@ def _radau(chart: Chart, local: list[np.ndarray], h: float, force: bool) -> Slop
     n, c, n_u, n_p = chart.n, chart.core, B.shape[2], JX.shape[2]
     direct = h * np.concatenate([B, JX, JF] if force else [B, JX], axis=2)
     eye, across, J = np.eye(c), h * np.concatenate([J, R], axis=1), h * J
-    # What is solved for the mean over the interval, of the start and of what acts directly, leads to the end.
-    solved = np.linalg.inv(eye - J * (2 / 3) + J @ J / 6)
+    # The inverse gives the mean over the interval, of the start and of what acts directly, and that leads to the end.
+    inverse = np.linalg.inv(eye - J * (2 / 3) + J @ J / 6)
     A = np.zeros((len(J), n, n))
-    A[:, :, :c] = across @ (solved @ (eye - J / 6))
+    A[:, :, :c] = across @ (inverse @ (eye - J / 6))
     A[:, range(n), range(n)] += 1.0
-    through = across @ (solved @ (eye / 2 - J / 6))
+    through = across @ (inverse @ (eye / 2 - J / 6))
     through[:, range(c), range(c)] += 1.0
     moved = through @ direct
     return Slopes(A, moved[:, :, :n_u], moved[:, :, n_u : n_u + n_p], moved[:, :, n_u + n_p :])

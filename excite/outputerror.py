@@ -68,7 +68,7 @@ def oe(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     torque_noise = _torque_noise(model, logs)
     sensor_noise = np.array([_sensor_noise(s.resolution, [log.values[s.name] for log in logs]) for s in c.sensors])
     blocks = regressions(model, logs, filter)
-    kept = list(solved(blocks).kept)
+    kept = list(solved(blocks, model.scale).kept)
     x, level = model.nominal.copy(), sensor_noise
     runs = _simulated(c, pieces, x)
     if runs is None:
@@ -109,7 +109,7 @@ def oe(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
 def _answer(
     model: Model, blocks: Sequence[tuple[np.ndarray, np.ndarray]], x: np.ndarray, covariance: np.ndarray, pieces: int
 ) -> Estimate:
-    solution = solved(blocks)
+    solution = solved(blocks, model.scale)
     note = f"oe: {pieces} stretches of {STRETCH:g} s, each from a state of its own"
     return assembled(model, blocks, solution, "oe", x, covariance, solution.degrees, (note,))
 

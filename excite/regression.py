@@ -31,7 +31,7 @@ def ols(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     the autocorrelation of the residuals alone makes them.
     """
     blocks = regressions(model, logs, filter)
-    solution = solved(blocks)
+    solution = solved(blocks, model.scale)
     estimate = textbook(model, blocks, solution, "ols")
     return noted(estimate, *_too_small(blocks, solution, estimate, sandwich(blocks, solution)))
 
@@ -50,7 +50,7 @@ def wls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     count = sum(Y.shape[1] for _, Y in blocks)
     level, own = least, scaled(blocks, least)
     for _ in range(TURNS):
-        solution = solved(own)
+        solution = solved(own, model.scale)
         energy = sum((residual(b, solution.x) ** 2).sum(axis=1) for b in blocks)
         before, level = level, np.maximum(np.sqrt(energy / count), least)
         if np.abs(level / before - 1).max() < SETTLED:
@@ -58,9 +58,8 @@ def wls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         own = scaled(blocks, level)
     covariance = sandwich(own, solution)
     degrees = effective(solution, covariance)
-    return assembled(
-        model, blocks, solution, "wls", at_file(model, blocks, solution, solution.x), covariance, degrees, ()
-    )
+    x = at_file(model, blocks, solution, solution.x)
+    return assembled(model, blocks, solution, "wls", x, covariance, degrees, ())
 
 
 def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
@@ -73,7 +72,7 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     Columns are scaled by the triangle of [W Y]. Raises NotIdentifiable where nothing has noise.
     """
     blocks = regressions(model, logs, filter)
-    first = solved(blocks)
+    first = solved(blocks, model.scale)
     turned = [
         whitener(model, samples(model, log, filter), model.nominal, spread(model, log, filter), filter) for log in logs
     ]
@@ -99,7 +98,9 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     covariance = bread @ scatter(own, x, kept) @ bread
     note = f"tls: misfit {np.sqrt(level):.2f} times what the sensors' noise and counts explain"
     x = at_file(model, blocks, first, x)
-    return assembled(model, blocks, first, "tls", x, covariance, effective(solved(own), covariance), (note,))
+    return assembled(
+        model, blocks, first, "tls", x, covariance, effective(solved(own, model.scale), covariance), (note,)
+    )
 
 
 # ------------------------------------------------------------------------------------------------ the core
@@ -133,11 +134,11 @@ def at_file(model: Model, blocks: Sequence[Block], solution: Solution, x: np.nda
 def least_squares(model: Model, W: np.ndarray, Y: np.ndarray, method: str) -> Estimate:
     """QR least squares of W (n_rows, n, n_base) X = Y (n_rows, n), columns in dependence named and left out."""
     blocks = [(W, Y)]
-    return textbook(model, blocks, solved(blocks), method)
+    return textbook(model, blocks, solved(blocks, model.scale), method)
 
 
-def solved(blocks: Sequence[Block]) -> Solution:
-    """Least squares of all rows of all logs. Raises NotIdentifiable."""
+def solved(blocks: Sequence[Block], scale: np.ndarray | None = None) -> Solution:
+    """Least squares of all rows of all logs, the parameters being of size `scale` (n_base,). Raises NotIdentifiable."""
     n_base = blocks[0][0].shape[2]
     for W, Y in blocks:
         if not (np.isfinite(W).all() and np.isfinite(Y).all()):
@@ -147,7 +148,7 @@ def solved(blocks: Sequence[Block]) -> Solution:
         raise NotIdentifiable("every torque is zero all along: are their sensors connected?")
     if rows <= n_base:
         raise NotIdentifiable(f"{rows} filtered rows for {n_base} parameters: the log is too short")
-    solution = solve(triangle(blocks))
+    solution = solve(triangle(blocks), scale=scale)
     if not solution.kept:
         raise NotIdentifiable(UNMOVED)
     return solution

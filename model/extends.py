@@ -44,7 +44,7 @@ def chain(path: Path, shipped: Path) -> list[Path]:
     found = [path]
     while (base := _base(found[-1], read_toml(found[-1]).get("extends"), shipped)) and base.parent != shipped:
         if base in found:
-            break
+            raise ValueError(f"{path}: extends: a loop")
         found.append(base)
     return found
 

@@ -53,6 +53,29 @@ def one_way(va12: Model) -> log.Log:
     return braked(va12, 0.0)
 
 
+@pytest.mark.parametrize("method", ["ols", "wls", "tls", "oe"])
+def test_a_parameter_hardly_there_does_not_stand_for_what_the_log_shows(va12: Model, method: str) -> None:
+    """With the articulation a milliradian off straight MX2 is a thousandth of MY2 in every row."""
+    estimate = identify.identify(va12, [braked(va12, 1e-3)], method)
+    assert {"MX2", "u10", "u40"} <= set(estimate.unidentifiable)
+    assert "MY2" not in estimate.unidentifiable
+
+
+@pytest.mark.parametrize("method", ["ols", "wls"])
+def test_what_is_held_is_reckoned_with(va12: Model, method: str) -> None:
+    """Another value in the file moves what goes with it, by as much as the log asks, and nothing else."""
+    at = va12.base.names.index
+    more = dict.fromkeys(va12.base.names, 0.0) | {"MX2": -4000.0, "u10": 100.0}
+    slight = braked(va12, 1e-3)
+    angle = float(np.mean(slight.values["theta2"]))
+    other = replace(va12, nominal=va12.nominal + list(more.values()))
+    change = np.subtract(*(identify.identify(m, [slight], method).value for m in (other, va12)))
+    assert change[at("Fs1")] == pytest.approx(-100, rel=1e-3)
+    assert change[at("MY2")] == pytest.approx(4000 * np.sin(angle), rel=0.05)  # wls weighs by the file
+    assert abs(change[at("Fv1")]) < 1e-3
+    assert abs(change[at("M")]) < 1
+
+
 @pytest.mark.parametrize("method", ["wls", "iv", "joint"])
 def test_what_moves_together_beside_a_joint_at_rest_is_held_alone(va12: Model, one_way: log.Log, method: str) -> None:
     """Driving one way dry friction and offset are one constant: the machine file says how much of it is the offset, and
