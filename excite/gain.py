@@ -51,10 +51,12 @@ class Withheld:
         doesn't hide the rest; of some stretches where drawn."""
         at = slice(None) if draw is None else draw
         error = self.squares[at].sum(axis=0) / np.maximum(self.counts[at].sum(axis=0), 1)
-        told = (self.counts[at].sum(axis=0) > 0) & (self.motion > 0)
+        told = (self.counts[at].sum(axis=0) > 0) & (self.motion > 0) & (self.noise > 0)
         if not told.any():
             return float("nan")
-        return float(100 * np.sqrt(np.sum((error / self.noise)[told]) / np.sum((self.motion / self.noise)[told])))
+        return float(
+            100 * np.sqrt(np.sum(error[told] / self.noise[told]) / np.sum(self.motion[told] / self.noise[told]))
+        )
 
     def rms(self) -> dict[str, tuple[float, str]]:
         """Root mean square error of every signal, with its unit."""
