@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from excite.estimate import Estimate, noted
-from excite.leastsquares import exchanged
+from excite.leastsquares import exchanged, independent
 from excite.log import Log
 from excite.processing import BLOCK, Samples, samples, unmeasured
 from model.machine import Filter
@@ -92,7 +92,7 @@ def at_rest(
             own = slice(k, k + BLOCK)
             rows = _rows(model, q[:, own], nu[:, own], a[:, own])
             R = np.asarray(np.linalg.qr(np.concatenate([R, rows]), mode="r"))
-    return _independent(R * model.scale) * model.scale[:, None] / model.scale
+    return _exactly(R * model.scale) * model.scale[:, None] / model.scale
 
 
 def _with_unmeasured(model: Model, log: Log, s: Samples) -> Samples:
@@ -115,20 +115,15 @@ def _speeds(model: Model, s: Samples) -> np.ndarray:
     return np.asarray(np.abs(scipy.ndimage.uniform_filter1d(s.nu, second, axis=1)).max(axis=1))
 
 
-def _independent(R: np.ndarray) -> np.ndarray:
+def _exactly(R: np.ndarray) -> np.ndarray:
     """T (n, n) with R T = R to within NOTHING, by which a column of R that others make up is made of them."""
     size = np.linalg.norm(R, axis=0)
     nothing = NOTHING * size.max()
-    kept: list[int] = []
-    left: list[int] = []
-    for k in np.flatnonzero(size > nothing):
-        c = np.linalg.lstsq(R[:, kept], R[:, k], rcond=None)[0]
-        (kept if np.linalg.norm(R[:, k] - R[:, kept] @ c) > nothing else left).append(int(k))
-    kept = exchanged(R, kept, left)
+    kept = np.array(exchanged(R, *independent(R, nothing)))
+    made = np.setdiff1d(np.flatnonzero(size > nothing), kept)
     T = np.zeros((R.shape[1], R.shape[1]))
-    shown = size > nothing
-    T[np.ix_(kept, shown)] = np.linalg.lstsq(R[:, kept], R[:, shown], rcond=None)[0]
-    T[:, kept] = np.eye(len(T))[:, kept]
+    T[kept, kept] = 1.0
+    T[np.ix_(kept, made)] = np.linalg.lstsq(R[:, kept], R[:, made], rcond=None)[0]
     return T
 
 

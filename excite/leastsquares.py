@@ -90,6 +90,22 @@ def _stack(R: np.ndarray, block: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(both, mode="r"))
 
 
+def independent(A: np.ndarray, nothing: float) -> tuple[list[int], list[int]]:
+    """Columns of A longer than `nothing`: those of which as much is left beside the ones before, and the others."""
+    kept: list[int] = []
+    left: list[int] = []
+    Q = np.zeros((len(A), 0))
+    for k in np.flatnonzero(np.linalg.norm(A, axis=0) > nothing):
+        rest = A[:, k] - Q @ (Q.T @ A[:, k])
+        rest -= Q @ (Q.T @ rest)
+        if np.linalg.norm(rest) > nothing:
+            kept.append(int(k))
+            Q = np.column_stack([Q, rest / np.linalg.norm(rest)])
+        else:
+            left.append(int(k))
+    return kept, left
+
+
 def exchanged(A: np.ndarray, kept: Sequence[int], left: Sequence[int]) -> list[int]:
     """Of columns that make up one another those to keep, in order: none left out may be more than MOST times a kept
     one, which would stand for it and make its errors larger by that (a pivot rule of maximum volume).
@@ -119,17 +135,7 @@ def solve(t: Triangle, tolerance: float = DEPENDENT, scale: np.ndarray | None = 
     A, y = t.R[:, :n], t.R[:, n]
     size = np.linalg.norm(A, axis=0)
     scaled = A / np.where(size > 0, size, 1.0)
-    kept: list[int] = []
-    left: list[int] = []
-    Q = np.zeros((len(A), 0))
-    for k in np.flatnonzero(size > 0):
-        rest = scaled[:, k] - Q @ (Q.T @ scaled[:, k])
-        rest -= Q @ (Q.T @ rest)
-        if np.linalg.norm(rest) < tolerance:
-            left.append(int(k))
-            continue
-        kept.append(int(k))
-        Q = np.column_stack([Q, rest / np.linalg.norm(rest)])
+    kept, left = independent(scaled, tolerance)
     if scale is not None:
         kept = exchanged(A * scale, kept, left)
     dependent: dict[int, int | None] = {
