@@ -7,6 +7,7 @@ from typing import Any
 
 from model.file import read_toml
 
+DEEPEST = 4  # files that one may extend, one through another
 NAMED = ("body", "sensor")  # lists of what has a name of its own
 
 
@@ -15,38 +16,24 @@ def names_in(folder: Path) -> tuple[str, ...]:
     return tuple(sorted(p.stem for p in folder.glob("*.toml")))
 
 
-def read(path: Path, shipped: Path, depth: int = 0) -> dict[str, Any]:
-    """What is in a TOML file, with what it differs from: another beside it, or one of the folder of shipped ones by its
-    name. Raises ValueError, one line."""
-    if depth > 4:
-        raise ValueError(f"{path}: extends: more than 4 files deep, a loop?")
-    raw = read_toml(path)
-    parent = raw.pop("extends", None)
-    base = _base(path, parent, shipped)
-    if base is None:
-        return raw
-    whole = read(base, shipped, depth + 1)
-    own, listed = (x if isinstance(x, list) else [] for x in (raw.get("sensor"), whole.get("sensor")))
-    sensors = [x.get("name") for x in listed if isinstance(x, dict)]
-    if any(isinstance(x, dict) and x.get("name") in sensors and "kind" not in x for x in own):
-        raise ValueError(
-            f"{path}: sensor: the list takes the place of that of {parent}, so that every sensor needs all its keys;"
-            " [sensor.NAME] changes one, `excite machine new NAME --like` writes all"
-        )
-    for key in NAMED:
-        if isinstance(raw.get(key), dict) and isinstance(whole.get(key), list):
-            raw[key] = _changed(path, key, whole[key], raw[key])
-    return _merge(whole, raw)
-
-
 def chain(path: Path, shipped: Path) -> list[Path]:
-    """A file and those that it extends, up to a shipped one. Raises ValueError, one line."""
+    """A TOML file and what it differs from, one after another: a file beside it, or a shipped one by its name. Raises
+    ValueError, one line."""
     found = [path]
-    while (base := _base(found[-1], read_toml(found[-1]).get("extends"), shipped)) and base.parent != shipped:
-        if base in found:
-            raise ValueError(f"{path}: extends: a loop")
+    while (base := _base(found[-1], read_toml(found[-1]).get("extends"), shipped)) is not None:
         found.append(base)
+        if len(found) > DEEPEST + 1:
+            raise ValueError(f"{base}: extends: more than {DEEPEST} files deep, a loop?")
     return found
+
+
+def read(path: Path, shipped: Path) -> dict[str, Any]:
+    """What is in a TOML file, with what it differs from (see `chain`). Raises ValueError, one line."""
+    whole: dict[str, Any] = {}
+    for one in reversed(chain(path, shipped)):
+        raw = read_toml(one)
+        whole = _over(one, whole, raw, raw.pop("extends", None))
+    return whole
 
 
 def _base(path: Path, parent: object, shipped: Path) -> Path | None:
@@ -60,6 +47,21 @@ def _base(path: Path, parent: object, shipped: Path) -> Path | None:
     if parent not in known and (Path(parent).name != parent or "\x00" in parent or not base.is_file()):
         raise ValueError(f"{path}: extends: no machine {parent}, allowed: {', '.join(known)}, or a file beside it")
     return base
+
+
+def _over(path: Path, whole: dict[str, Any], raw: dict[str, Any], parent: str | None) -> dict[str, Any]:
+    """What a file extends, changed by what is in it."""
+    own, listed = (x if isinstance(x, list) else [] for x in (raw.get("sensor"), whole.get("sensor")))
+    sensors = [x.get("name") for x in listed if isinstance(x, dict)]
+    if any(isinstance(x, dict) and x.get("name") in sensors and "kind" not in x for x in own):
+        raise ValueError(
+            f"{path}: sensor: the list takes the place of that of {parent}, so that every sensor needs all its keys;"
+            " [sensor.NAME] changes one, `excite machine new NAME --like` writes all"
+        )
+    for key in NAMED:
+        if isinstance(raw.get(key), dict) and isinstance(whole.get(key), list):
+            raw[key] = _changed(path, key, whole[key], raw[key])
+    return _merge(whole, raw)
 
 
 def _changed(path: Path, key: str, known: list[Any], changes: dict[str, Any]) -> list[Any]:

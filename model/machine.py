@@ -575,9 +575,10 @@ def own_files(name: str | Path) -> list[Path]:
     """The files of a machine of one's own, those that it extends included; none of a shipped name. Raises
     MachineError."""
     try:
-        return [] if str(name) in shipped() else extends.chain(_find(str(name)), MACHINES)
+        whole = [] if str(name) in shipped() else extends.chain(_find(str(name)), MACHINES)
     except ValueError as err:
         raise MachineError(str(err)) from None
+    return [p for k, p in enumerate(whole) if k == 0 or p.parent != MACHINES]
 
 
 def _find(name: str) -> Path:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from model.machine import MACHINES, Body, Machine, MachineError, load, shipped
+from model.machine import MACHINES, Body, Machine, MachineError, load, own_files, shipped
 from model.prediction import build, standard_parameters
 
 VA12 = (MACHINES / "va12.toml").read_text(encoding="utf-8")
@@ -558,6 +558,13 @@ def test_files_that_extend_each_other_are_refused(tmp_path: Path) -> None:
     write(tmp_path, 'extends = "mine.toml"\n', "other.toml")
     path = write(tmp_path, 'extends = "other.toml"\n')
     assert "extends: more than 4 files deep, a loop?" in complaint(lambda: load(path), MachineError)
+
+
+def test_own_files_are_those_that_a_machine_is_made_of(tmp_path: Path) -> None:
+    other = write(tmp_path, 'extends = "va12"\n', "other.toml")
+    path = write(tmp_path, 'extends = "other.toml"\n')
+    assert own_files(path) == [path, other]
+    assert own_files("va12") == []
 
 
 @pytest.mark.parametrize(
