@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -509,6 +510,27 @@ def test_a_worker_that_dies_costs_nothing_and_a_deadly_piece_is_found(tmp_path: 
     assert sorted(r.piece for r in results) == list(range(8))
     assert {r.piece for r in results if r.value is None} == {3}
     assert chance.value == 9, "workers that were killed twice from outside are not the fault of what they had alone"
+
+
+def test_a_batch_that_dies_is_no_fault_of_its_runs() -> None:
+    """Two runs whose batch kills its worker, and each of them alone as often as may be by chance."""
+    deaths: dict[tuple[int, ...], int] = {}
+
+    class Dying(engine.Here):
+        shared = True
+
+        def died(self, err: BaseException) -> bool:
+            return isinstance(err, BrokenExecutor)
+
+    def dies(batch: tuple[int, ...]) -> int:
+        deaths[batch] = deaths.get(batch, 0) + 1
+        if len(batch) > 1 or deaths[batch] < engine.TRIES:
+            raise BrokenExecutor
+        return sum(batch)
+
+    results = engine.spread(dies, [(1, 2)], Dying(), lambda batch: [(k,) for k in batch])
+    assert {r.piece: r.value for r in results} == {(1,): 1, (2,): 2}
+    assert deaths == {(1, 2): 1, (1,): engine.TRIES, (2,): engine.TRIES}
 
 
 def test_pieces_are_taken_as_they_are_needed() -> None:
