@@ -119,7 +119,7 @@ def _exactly(R: np.ndarray) -> np.ndarray:
     """T (n, n) with R T = R to within NOTHING, by which a column of R that others make up is made of them."""
     size = np.linalg.norm(R, axis=0)
     nothing = NOTHING * size.max()
-    kept = np.array(exchanged(R, *independent(R, nothing)))
+    kept = np.array(exchanged(R, *independent(R, nothing)), int)  # also where there is none
     made = np.setdiff1d(np.flatnonzero(size > nothing), kept)
     T = np.zeros((R.shape[1], R.shape[1]))
     T[kept, kept] = 1.0

@@ -91,7 +91,7 @@ def _stack(R: np.ndarray, block: np.ndarray) -> np.ndarray:
 
 
 def independent(A: np.ndarray, nothing: float) -> tuple[list[int], list[int]]:
-    """Columns of A longer than `nothing`: those of which as much is left beside the ones before, and the others."""
+    """Columns of A longer than `nothing`: those whose part that no earlier ones make up is so too, and the others."""
     kept: list[int] = []
     left: list[int] = []
     Q = np.zeros((len(A), 0))

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from excite import hidden, identify, log, sensors
+from excite.estimate import NoEstimate
 from excite.simulate import Motion, simulate
 from model.prediction import Model
 
@@ -91,6 +92,16 @@ def test_what_moves_together_beside_a_joint_at_rest_is_held_alone(va12: Model, o
         assert abs(constant - va12.nominal[at("Fs1")] - va12.nominal[at("u10")]) < 4 * estimate.std[at("Fs1")]
         for name in ("M", "Fv1"):
             assert abs(estimate.value[at(name)] - va12.nominal[at(name)]) < 4 * estimate.std[at(name)]
+
+
+@pytest.mark.parametrize("method", ["ols", "joint"])
+def test_a_log_out_of_range_is_said_of_a_joint_at_rest_too(va12: Model, one_way: log.Log, method: str) -> None:
+    """Filtered it is no number, so that nothing is known of what moves."""
+    values = {name: x.copy() for name, x in one_way.values.items()}
+    values["theta2"][:] = 0.0
+    values["vy"][1500:1700] = 1.797e308
+    with pytest.raises(NoEstimate):
+        identify.identify(va12, [replace(one_way, values=values)], method)
 
 
 def test_a_speed_that_nothing_measures_is_not_at_rest(va12: Model) -> None:

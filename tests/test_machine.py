@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from model import extends
 from model.machine import MACHINES, Body, Machine, MachineError, load, own_files, shipped
 from model.prediction import build, standard_parameters
 
@@ -560,11 +561,23 @@ def test_files_that_extend_each_other_are_refused(tmp_path: Path) -> None:
     assert "extends: more than 4 files deep, a loop?" in complaint(lambda: load(path), MachineError)
 
 
+def test_so_many_files_may_extend_one_another_and_no_more(tmp_path: Path) -> None:
+    path = write(tmp_path, 'extends = "va12"\n', "deep1.toml")
+    for k in range(2, extends.DEEPEST + 1):
+        path = write(tmp_path, f'extends = "deep{k - 1}.toml"\n', f"deep{k}.toml")
+    assert load(path) == load("va12")
+    assert len(own_files(path)) == extends.DEEPEST
+    path = write(tmp_path, f'extends = "{path.name}"\n', "deeper.toml")
+    for read in (load, own_files):
+        assert "extends: more than 4 files deep" in complaint(lambda read=read: read(path), MachineError)
+
+
 def test_own_files_are_those_that_a_machine_is_made_of(tmp_path: Path) -> None:
     other = write(tmp_path, 'extends = "va12"\n', "other.toml")
     path = write(tmp_path, 'extends = "other.toml"\n')
     assert own_files(path) == [path, other]
     assert own_files("va12") == []
+    assert own_files(MACHINES / "va12.toml") == [MACHINES / "va12.toml"], "given as a file it is one"
 
 
 @pytest.mark.parametrize(

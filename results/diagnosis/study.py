@@ -61,7 +61,7 @@ def version() -> str:
     files = sorted([*(ROOT / "model").rglob("*.py"), *(ROOT / "model").rglob("*.toml")])
     names = ("diagnose", "choosing", "stages", "misfit", "findings", "evidence", "innovations", "smoothing", "newton")
     names += ("linearise", "chain", "record", "gain", "hidden", "processing", "sensors", "anomaly", "log", "estimate")
-    names += ("examine", "doubts", "gaps")
+    names += ("examine", "doubts", "gaps", "leastsquares")
     return _digits([*files, *(ROOT / "excite" / f"{n}.py" for n in names), *ROLLER])
 
 
@@ -274,7 +274,7 @@ can be told from everything else.
 {table}
 
 A diagnosis took {walls["median"]:.1f} s (median), {walls["p95"]:.1f} s (95 %), {walls["max"]:.1f} s (longest),
-the start of the program included, with two cases at a time on the two cores of `--jobs 2`: one alone takes about half.
+the start of the program included, with another case at work beside it (`--jobs`).
 
 ![hidden against named](confusion.png)
 
