@@ -455,7 +455,8 @@ def infeasibility(s: State, p: Point) -> float:
 def _merit(tr: Transcription, task: Task, p: Point, s: State, mu: float) -> float:
     a, b, bc = task.floor(tr), task.wall, 1 - task.marginc
     inside = (p.t + a, b - p.t, p.tc + bc, bc - p.tc, p.te + 1, 1 - p.te)
-    return s.f + _hinge(task, s.g, mu)[0] - mu * sum(float(np.log(x).sum()) for x in inside)
+    with np.errstate(divide="ignore"):  # at the edge itself it is infinite: no step goes there
+        return s.f + _hinge(task, s.g, mu)[0] - mu * sum(float(np.log(x).sum()) for x in inside)
 
 
 def _acceptable(
