@@ -16,22 +16,21 @@ def names_in(folder: Path) -> tuple[str, ...]:
     return tuple(sorted(p.stem for p in folder.glob("*.toml")))
 
 
-def chain(path: Path, shipped: Path) -> list[Path]:
-    """A TOML file and what it differs from, one after another: a file beside it, or a shipped one by its name. Raises
-    ValueError, one line."""
-    found = [path]
-    while (base := _base(found[-1], read_toml(found[-1]).get("extends"), shipped)) is not None:
-        found.append(base)
-        if len(found) > DEEPEST + 1:
+def chain(path: Path, shipped: Path) -> list[tuple[Path, dict[str, Any]]]:
+    """A TOML file and what it differs from, one after another, with what is in each: a file beside it, or a shipped one
+    by its name. Raises ValueError, one line."""
+    found = [(path, read_toml(path))]
+    while (base := _base(found[-1][0], found[-1][1].get("extends"), shipped)) is not None:
+        if len(found) > DEEPEST:
             raise ValueError(f"{base}: extends: more than {DEEPEST} files deep, a loop?")
+        found.append((base, read_toml(base)))
     return found
 
 
 def read(path: Path, shipped: Path) -> dict[str, Any]:
     """What is in a TOML file, with what it differs from (see `chain`). Raises ValueError, one line."""
     whole: dict[str, Any] = {}
-    for one in reversed(chain(path, shipped)):
-        raw = read_toml(one)
+    for one, raw in reversed(chain(path, shipped)):
         whole = _over(one, whole, raw, raw.pop("extends", None))
     return whole
 

@@ -578,7 +578,7 @@ def own_files(name: str | Path) -> list[Path]:
         whole = [] if str(name) in shipped() else extends.chain(_find(str(name)), MACHINES)
     except ValueError as err:
         raise MachineError(str(err)) from None
-    return [p for k, p in enumerate(whole) if k == 0 or p.parent != MACHINES]
+    return [p for k, (p, _) in enumerate(whole) if k == 0 or p.parent != MACHINES]
 
 
 def _find(name: str) -> Path:

@@ -267,8 +267,8 @@ late, slowly and not quite, and compares at equal time, two drives of 30 s each,
 
 Told: cond(Phi) of both drives together and the Cramer-Rao bound, at the true machine; the limit that the true machine
 exceeds most (lane and rest, which people see to themselves, left out), kept up to 0.1 % of its range; and for six machines the
-errors of `--method joint` from both logs over the bound, rms over all parameters. Three quarters of an hour of two cores. Machines are written to
-`runs/` as they are done, and a study that was stopped goes on from there.
+errors of `--method joint` from both logs over the bound, rms over all parameters. Three quarters of an hour
+of two cores. Machines are written to `runs/` as they are done, and a study that was stopped goes on from there.
 """  # noqa: E501
 
 
