@@ -18,8 +18,8 @@ import casadi as ca
 import numpy as np
 
 from excite import newton
-from excite.innovations import whitened
-from excite.linearise import BATCH, Batch, Chart, Slopes, differentiate
+from excite.innovations import signed, whitened
+from excite.linearise import BATCH, Batch, Chart, differentiate
 from excite.processing import implicit
 from excite.record import Point, Record, smoothed
 from excite.sensors import torque_behind
@@ -179,12 +179,31 @@ def renumbered(found: Sequence[Candidate]) -> list[Candidate]:
     return [replace(x, columns=tuple(range(end - len(x.columns), end))) for x, end in zip(found, ends, strict=True)]
 
 
+class Way:
+    """One fitted log, as every candidate finds it."""
+
+    def __init__(self, c: Chart, r: Record, fit: newton.Fit, log: int) -> None:
+        model, p = c.model, fit.points[log]
+        self.chart, self.linear, self.offsets = c, fit.linear[log], len(r.origin)
+        self.q, self.nu, z, self.u, self.a = smoothed(c, r, p, fit.X)
+        self.t = np.arange(len(self.u)) / float(model.machine.sampling_hz)
+        wheels = np.zeros((len(self.u), sum(s.kind == "wheel" for s in model.machine.sensor)))
+        n_q = self.q.shape[1]
+        for k, at in enumerate(c.index):
+            if 2 * n_q <= at < 2 * n_q + wheels.shape[1]:
+                wheels[:, at - 2 * n_q] = p.s[:, k]
+        self.exact = model.read(self.q.T, self.nu.T, wheels.T, self.u.T, z.T, fit.X).full().T
+        self.p = model.expand @ fit.X
+        self.slopes = _slopes(c, p, self.u, fit.X)
+        self.white = whitened(self.linear, c.flawed)
+
+
 class Signatures:
     """The signatures of candidates along one fitted log."""
 
-    def __init__(self, c: Chart, r: Record, fit: newton.Fit, log: int, found: Sequence[Candidate]) -> None:
-        model, p = c.model, fit.points[log]
-        self.chart, self.columns = c, sum(len(x.columns) for x in found)
+    def __init__(self, way: Way, found: Sequence[Candidate]) -> None:
+        c, model = way.chart, way.chart.model
+        self.way, self.columns = way, sum(len(x.columns) for x in found)
         every: list[Placed] = []
         for x in found:
             circular = [n for n, s in x.placed.effect.shapes.items() if s.circular]
@@ -196,38 +215,28 @@ class Signatures:
         made = signatures(model.machine, standard, every)
         self.force, self.reading = Batch(made.force, (7,)), Batch(made.reading, (7,))
         self.rows = [model.readable.index(s.name) for s in c.sensors]
-        self.p = (model.expand @ fit.X)[: len(standard)]
-        q, nu, z, u, a = smoothed(c, r, p, fit.X)
-        t = np.arange(len(u)) / float(model.machine.sampling_hz)
-        wheels = np.zeros((len(u), sum(s.kind == "wheel" for s in model.machine.sensor)))
-        n_q = q.shape[1]
-        for k, at in enumerate(c.index):
-            if 2 * n_q <= at < 2 * n_q + wheels.shape[1]:
-                wheels[:, at - 2 * n_q] = p.s[:, k]
-        exact = model.read(q.T, nu.T, wheels.T, u.T, z.T, fit.X).full().T
-        memory = remembered(made, q, nu, u, t, self.p)
-        self.samples = (q, nu, a, u, t[:, None], memory, exact)
-        self.torque = np.zeros((*u.shape, self.columns))
+        self.p = way.p[: len(standard)]
+        memory = remembered(made, way.q, way.nu, way.u, way.t, self.p)
+        self.samples = (way.q, way.nu, way.a, way.u, way.t[:, None], memory, way.exact)
+        self.torque = np.zeros((*way.u.shape, self.columns))
         for k, e in enumerate(every):
             if e.effect.channel is not None:
-                self.torque[:, :, k] = _misread(c, e, u, t)
+                self.torque[:, :, k] = _misread(c, e, way.u, way.t)
 
-    def along(self, X: np.ndarray, p: Point) -> tuple[np.ndarray, np.ndarray]:
-        """What signatures do to the scaled state behind each sample (N - 1, n, C), and to readings (N, m, C). Nothing
-        where one has no bounds: what it would remember along a motion that is far off may come apart."""
-        c, N = self.chart, len(p.s)
-        u, scale = self.samples[3], newton.state_scale(c)
-        push = np.empty((N - 1, c.n, self.columns), np.float32)
+    def along(self) -> tuple[np.ndarray, np.ndarray]:
+        """What signatures do to the scaled state behind each sample (N, n, C), and to readings (N, m, C). Nothing where
+        one has no bounds: what it would remember along a motion that is far off may come apart."""
+        c, N = self.way.chart, len(self.way.t)
+        push = np.zeros((N, c.n, self.columns), np.float32)
         reading = np.empty((N, len(c.sensors), self.columns), np.float32)
         bounded = np.ones(self.columns, bool)
         for at in range(0, N - 1, BATCH):
             until = min(at + BATCH, N - 1)
-            by = differentiate(c, p.s[at : until + 1], u[at:until], u[at + 1 : until + 1], X, force=True)
             held = tuple(x[at : until + 1] for x in self.samples)
             force = self.force(*held, self.p)[0]
             torque = self.torque[at : until + 1]
             with np.errstate(over="ignore", invalid="ignore"):
-                push[at:until] = _pushed(c, by, force, torque, scale)
+                push[at:until] = _pushed(c, self.way.slopes[at:until], force, torque)
                 reading[at : until + 1] = self.reading(*held, self.p)[0][:, self.rows]
             for part in (push[at:until], reading[at : until + 1]):
                 bounded &= np.abs(part).max(axis=(0, 1), initial=0.0) < HUGE
@@ -235,13 +244,28 @@ class Signatures:
         return push, reading
 
 
-def _pushed(c: Chart, by: Slopes, force: np.ndarray, torque: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def _free(c: Chart) -> list[int]:
+    """Which of the rows that disturbing forces act on have no actuator."""
+    return [k for k, row in enumerate(c.pushed) if row not in c.model.actuated]
+
+
+def _slopes(c: Chart, p: Point, u: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """What half a torque and half a force on each row without an actuator, at both ends of each interval, do to the
+    scaled state behind it (N - 1, n, n_u + n_free)."""
+    N, scale = len(p.s), newton.state_scale(c)
+    found = np.empty((N - 1, c.n, u.shape[1] + len(_free(c))), np.float32)
+    for at in range(0, N - 1, BATCH):
+        until = min(at + BATCH, N - 1)
+        by = differentiate(c, p.s[at : until + 1], u[at:until], u[at + 1 : until + 1], X, force=True)
+        found[at:until] = np.concatenate([by.B, by.F[:, :, _free(c)]], axis=2) / (2 * scale[:, None])
+    return found
+
+
+def _pushed(c: Chart, slopes: np.ndarray, force: np.ndarray, torque: np.ndarray) -> np.ndarray:
     """What forces (K + 1, n_q, C) and torques (K + 1, n_u, C) do to the scaled states behind K intervals (K, n, C)."""
-    free = [k for k, row in enumerate(c.pushed) if row not in c.model.actuated]
-    slopes = np.concatenate([by.B, by.F[:, :, free]], axis=2) / (2 * scale[:, None])
-    acting = np.concatenate([force[:, list(c.model.actuated)] + torque, force[:, [c.pushed[k] for k in free]]], axis=1)
-    acting = acting.astype(np.float32)
-    moved: np.ndarray = slopes.astype(np.float32) @ (acting[:-1] + acting[1:])
+    free = [c.pushed[k] for k in _free(c)]
+    acting = np.concatenate([force[:, list(c.model.actuated)] + torque, force[:, free]], axis=1).astype(np.float32)
+    moved: np.ndarray = slopes @ (acting[:-1] + acting[1:])
     return moved
 
 
@@ -271,16 +295,20 @@ def remembered(
     return implicit(flow, np.zeros(n_z), np.hstack([q, nu, u, t[:, None]]), float(t[1] - t[0]))
 
 
-def scan(
-    c: Chart, records: Sequence[Record], fit: newton.Fit, found: Sequence[Candidate], together: Together = in_turn
-) -> tuple[Score, ...]:
-    """The score of every candidate along fitted logs, best first. together: how its parts are computed."""
+class Scan:
+    """Fitted logs, along which candidates are scored."""
+
+    def __init__(self, c: Chart, records: Sequence[Record], fit: newton.Fit) -> None:
+        self.ways = [Way(c, r, fit, k) for k, r in enumerate(records)]
+        self.prior, self.off = fit.prior, (fit.X - c.model.nominal) / c.model.scale
+
+
+def scan(along: Scan, found: Sequence[Candidate], together: Together = in_turn) -> tuple[Score, ...]:
+    """The score of every candidate, best first. together: how its parts are computed."""
     ends = np.cumsum([len(x.columns) for x in found])
     middle = int(np.searchsorted(ends, ends[-1] / 2)) if len(found) and ends[-1] > ALONE else 0
     parts = [part for part in (found[:middle], found[middle:]) if part]
-    for linear in fit.linear:
-        _ = linear.filter  # computed here, once for all parts
-    told = together([partial(_told, c, records, fit, renumbered(part)) for part in parts])
+    told = together([partial(_told, along, renumbered(part)) for part in parts])
     every = zip(found, (x for part in told for x in part), strict=True)
     scores = [Score(x, *seen) for x, seen in every if seen is not None]
     return tuple(sorted(scores, key=lambda s: -s.gain))
@@ -289,24 +317,22 @@ def scan(
 Told = tuple[float, dict[str, float], float]  # of a score all but the candidate
 
 
-def _told(c: Chart, records: Sequence[Record], fit: newton.Fit, found: Sequence[Candidate]) -> list[Told | None]:
+def _told(along: Scan, found: Sequence[Candidate]) -> list[Told | None]:
     """What logs tell of candidates, each beside the parameters alone."""
-    total, n = sum(len(x.columns) for x in found), len(fit.X)
-    prior = fit.prior
+    total, prior = sum(len(x.columns) for x in found), along.prior
+    n = len(prior)
     Z = np.zeros((1 + n + total, 1 + n + total))
-    for k, (r, linear) in enumerate(zip(records, fit.linear, strict=True)):
-        made = Signatures(c, r, fit, k, found)
-        push, reading = made.along(fit.X, fit.points[k])
-        E = whitened(linear, c.flawed, push, reading)
+    for way in along.ways:
+        E = np.concatenate([way.white.E, signed(way.linear, way.white, *Signatures(way, found).along())], axis=2)
+        E = E.reshape(-1, E.shape[2])
         form = sum((_square(E[at : at + CHUNK]) for at in range(0, len(E), CHUNK)), np.zeros((E.shape[1],) * 2))
         # Offsets of counts belong to one log: integrate them out.
-        n_o = len(r.origin)
-        o, keep = slice(1 + n, 1 + n + n_o), np.r_[0 : 1 + n, 1 + n + n_o : len(form)]
-        inner = form[o, o] + np.eye(n_o)
+        o, keep = slice(1 + n, 1 + n + way.offsets), np.r_[0 : 1 + n, 1 + n + way.offsets : len(form)]
+        inner = form[o, o] + np.eye(way.offsets)
         Z += form[np.ix_(keep, keep)] - form[keep, o] @ np.linalg.solve(inner, form[o, keep])
     own, p = slice(1 + n, None), slice(1, 1 + n)
     base, cross = Z[p, p] + np.diag(prior), Z[p, own]
-    g_base = Z[p, 0] + prior * (fit.X - c.model.nominal) / c.model.scale
+    g_base = Z[p, 0] + prior * along.off
     solved = np.linalg.solve(base, np.column_stack([cross, g_base]))
     S = Z[own, own] - cross.T @ solved[:, :-1]
     g = Z[own, 0] - cross.T @ solved[:, -1]

@@ -19,10 +19,12 @@ SLOW = 25  # readings whose mean counts as slow
 
 @dataclass(frozen=True)
 class Step:
-    """A filter's step j in all parts that are as long: samples `at`, which parts `going`, gain K, whitening root."""
+    """A filter's step j in all parts that are as long: samples `at`, which parts `going`, the transition A behind them,
+    gain K, whitening root."""
 
     at: np.ndarray
     going: np.ndarray
+    A: np.ndarray
     gain: np.ndarray
     root: np.ndarray
     used: np.ndarray
@@ -70,11 +72,11 @@ def innovations(linear: Linear) -> np.ndarray:
     """Each reading less its prediction from all before it, over its standard deviation (N, m); NaN where unused."""
     z = np.full(linear.residual.shape, np.nan)
     x = _before(linear)
+    drift = np.concatenate([stages.b[:, :, :1] for stages in linear.stages])
     for step in linear.filter:
         e = linear.residual[step.at, :, None] - linear.H[step.at] @ x[step.going, :, None]
         z[step.at] = np.where(step.used, e[:, :, 0] / np.sqrt(step.variance), np.nan)
-        A, b = _leading(linear, step)
-        x[step.going] = (A @ (x[step.going, :, None] + step.gain @ e))[:, :, 0] + b[:, :, 0]
+        x[step.going] = (step.A @ (x[step.going, :, None] + step.gain @ e) + drift[step.at])[:, :, 0]
     return z
 
 
@@ -95,47 +97,64 @@ def innovation_sizes(linear: Linear) -> np.ndarray:
     return sizes
 
 
-def whitened(linear: Linear, flawed: tuple[int, ...], push: np.ndarray, reading: np.ndarray) -> np.ndarray:
-    """Innovations of data, parameters, offsets and signatures, white and of variance one: (N m, 1 + n_p + n_o + C).
+@dataclass(frozen=True)
+class White:
+    """Innovations of one log, white and of variance one: E (N, m, 1 + n_p + n_o) of data, parameters and offsets. And
+    what an error of the state where a part begins does to its innovations, reach (N, m, n), and to the state where it
+    ends, through (parts, n, n)."""
 
-    push (N - 1, n, C): what signatures do to the scaled state behind each sample; reading (N, m, C): to readings.
-    flawed: parameters that readings depend on directly. Where data = sum of columns times steps, the columns' products
-    are the information about the steps, all states integrated out. Single precision.
-    """
-    N, m, n = linear.H.shape
-    own = linear.solved.Z.shape[0]
-    n_f = len(flawed)
-    columns = own + push.shape[2]
-    E = np.zeros((N, m, columns), np.float32)
-    reach = np.zeros((N, m, n), np.float32)  # what an error of the state where the part begins does
-    parts = len(linear.stages)
-    x = np.zeros((parts, n, columns + n))
-    x[:, :, columns:] = np.eye(n)
-    told = np.concatenate([1 + np.array(flawed, int), np.arange(own - linear.direct.shape[2] + n_f, own)])
+    E: np.ndarray
+    reach: np.ndarray
+    through: np.ndarray
+
+
+def whitened(linear: Linear, flawed: tuple[int, ...]) -> White:
+    """Where data = sum of columns times steps, the columns' products are the information about the steps, all states
+    integrated out. flawed: parameters that readings depend on directly. Single precision."""
+    (N, m, n), own = linear.H.shape, linear.solved.Z.shape[0]
+    told = np.concatenate([1 + np.array(flawed, int), np.arange(own - linear.direct.shape[2] + len(flawed), own)])
+    reading, push = np.zeros((N, m, own + n)), np.zeros((N, n, own + n))
+    reading[:, :, 0] = linear.residual
+    reading[:, :, told] = -linear.direct
+    push[:, :, :own] = np.concatenate([stages.b for stages in linear.stages])
+    x = np.zeros((len(linear.stages), n, own + n))
+    x[:, :, own:] = np.eye(n)
+    E = _filtered(linear, x, push, reading)
+    white = White(np.ascontiguousarray(E[:, :, :own]), np.ascontiguousarray(E[:, :, own:]), x[:, :, own:])
+    _begin(linear, white.E, white, x[:, :, :own], linear.solved.parts[0].whole.b[0])
+    return white
+
+
+def signed(linear: Linear, white: White, push: np.ndarray, reading: np.ndarray) -> np.ndarray:
+    """Likewise of signatures (N, m, C). push (N, n, C): what they do to the scaled state behind each sample, nothing
+    behind the last; reading (N, m, C): to readings."""
+    parts, (_, n, columns) = len(linear.stages), push.shape
+    x = np.zeros((parts, n, columns))
+    E = _filtered(linear, x, push, -reading)
+    _begin(linear, E, white, x, np.zeros((n, columns)))
+    return E
+
+
+def _filtered(linear: Linear, x: np.ndarray, push: np.ndarray, reading: np.ndarray) -> np.ndarray:
+    """Whitened innovations (N, m, k) of columns x (parts, n, k) of the states where parts begin, which are led to where
+    these end."""
+    E = np.empty(reading.shape, np.float32)
     for step in linear.filter:
-        y = np.zeros((len(step.going), m, columns + n))
-        y[:, :, 0] = linear.residual[step.at]
-        y[:, :, told] = -linear.direct[step.at]
-        y[:, :, own:columns] = -reading[step.at]
-        e = y - linear.H[step.at] @ x[step.going]
-        white = np.linalg.solve(step.root, e) * step.used[:, :, None]
-        E[step.at], reach[step.at] = white[:, :, :columns], white[:, :, columns:]
-        A, b = _leading(linear, step)
-        x[step.going] = A @ (x[step.going] + step.gain @ e)
-        x[step.going, :, :own] += b
-        last = step.at[-1] == N - 1
-        inner = step.going[:-1] if last else step.going
-        x[inner, :, own:columns] += push[step.at[: len(inner)]]
-    # Where each part really begins follows from the part before.
-    begin = np.zeros((n, columns))
-    begin[:, :own] = linear.solved.parts[0].whole.b[0]
+        e = reading[step.at] - linear.H[step.at] @ x[step.going]
+        E[step.at] = np.linalg.solve(step.root, e) * step.used[:, :, None]
+        x[step.going] = step.A @ (x[step.going] + step.gain @ e) + push[step.at]
+    return E
+
+
+def _begin(linear: Linear, E: np.ndarray, white: White, ends: np.ndarray, begin: np.ndarray) -> None:
+    """Adds to innovations E (N, m, k) that each part really begins where the one before ends, the first with begin
+    (n, k). ends (parts, n, k): where parts that begin with nothing end."""
     at = 0
     for k, stages in enumerate(linear.stages):
         stretch = slice(at, at + len(stages))
-        E[stretch] += (reach[stretch].reshape(-1, n) @ begin.astype(np.float32)).reshape(-1, m, columns)
-        begin = x[k, :, :columns] + x[k, :, columns:] @ begin
+        E[stretch] += white.reach[stretch] @ begin.astype(np.float32)
+        begin = ends[k] + white.through[k] @ begin
         at += len(stages)
-    return E.reshape(-1, columns)
 
 
 def _before(linear: Linear) -> np.ndarray:
@@ -176,15 +195,5 @@ def steps(linear: Linear) -> list[Step]:
         A, C = (np.stack([getattr(linear.stages[i], f)[j] for i in going]) for f in ("A", "C"))
         left = P[going] - K @ PH.transpose(0, 2, 1)
         P[going] = A @ ((left + left.transpose(0, 2, 1)) / 2) @ A.transpose(0, 2, 1) + C
-        found.append(Step(at, going, K, np.linalg.cholesky(S), weight > 0))
+        found.append(Step(at, going, A, K, np.linalg.cholesky(S), weight > 0))
     return found
-
-
-def _leading(linear: Linear, step: Step) -> tuple[np.ndarray, np.ndarray]:
-    """Transition and drift (n, 1 + n_p + n_o) behind a step, of the parts that go on."""
-    starts = np.cumsum([0, *(len(s) for s in linear.stages)])
-    j = int(step.at[0] - starts[step.going[0]])
-    return (
-        np.stack([linear.stages[i].A[j] for i in step.going]),
-        np.stack([linear.stages[i].b[j] for i in step.going]),
-    )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import casadi as ca
 import numpy as np
@@ -88,37 +88,71 @@ class Batch:
 
 
 class _Block:
-    """A CasADi function's own list of instructions, each on BATCH samples; its registers are rows of samples."""
+    """A CasADi function's own list of instructions, each on BATCH samples; its registers are rows of samples.
+
+    Inputs and constants are read where they are, and an output is computed where it belongs: to copy a row takes as
+    long as to multiply two.
+    """
 
     def __init__(self, function: ca.Function, shared: tuple[int, ...]) -> None:
         registers = np.zeros((function.sz_w(), BATCH))
-        self.inputs = [np.zeros((function.nnz_in(k), BATCH)) for k in range(function.n_in())]
+        each = [() if k in shared else (BATCH,) for k in range(function.n_in())]
+        self.inputs = [np.zeros((function.nnz_in(k), *size)) for k, size in enumerate(each)]
         self.outputs = [np.zeros((function.nnz_out(k), BATCH)) for k in range(function.n_out())]
         self.shared = shared
-        self.calls: list[tuple[Callable[..., object], tuple[object, ...], np.ndarray]] = []
+        self.calls: list[tuple[Callable[..., object], tuple[np.ndarray, ...]]] = []
+        kept = _kept(function)
+        at: dict[int, np.ndarray] = {}  # where the value of each of CasADi's registers is now
+        constant: set[int] = set()  # those that hold one
         for k in range(function.n_instructions()):
             code, into, of = function.instruction_id(k), function.instruction_output(k), function.instruction_input(k)
+            if code != ca.OP_OUTPUT:
+                (constant.add if code == ca.OP_CONST else constant.discard)(into[0])
             if code == ca.OP_INPUT:
-                self.calls.append((np.positive, (self.inputs[of[0]][of[1]],), registers[into[0]]))
-            elif code == ca.OP_OUTPUT:
-                self.calls.append((np.positive, (registers[of[0]],), self.outputs[into[0]][into[1]]))
+                at[into[0]] = self.inputs[of[0]][of[1], ...]
             elif code == ca.OP_CONST:
-                self.calls.append((np.positive, (function.instruction_constant(k),), registers[into[0]]))
-            elif code == ca.OP_TWICE:
-                self.calls.append((np.add, (registers[of[0]], registers[of[0]]), registers[into[0]]))
+                at[into[0]] = np.array(function.instruction_constant(k))
+            elif code == ca.OP_OUTPUT:
+                there = self.outputs[into[0]][into[1]]
+                if of[0] in constant:
+                    there[:] = at[of[0]]
+                elif at[of[0]] is not there:
+                    self.calls.append((np.positive, (at[of[0]], there)))
             else:
-                call = _OPERATIONS[code]
-                self.calls.append((call, tuple(registers[i] for i in of[: call.nin]), registers[into[0]]))
+                call = np.add if code == ca.OP_TWICE else _OPERATIONS[code]
+                given = tuple(at[i] for i in (of[:1] * 2 if code == ca.OP_TWICE else of[: call.nin]))
+                output = kept.get(k)
+                at[into[0]] = registers[into[0]] if output is None else self.outputs[output[0]][output[1]]
+                if call in (np.maximum, np.minimum):  # take no output by its place
+                    self.calls.append((partial(call, *given, out=at[into[0]]), ()))
+                else:
+                    self.calls.append((call, (*given, at[into[0]])))
 
     def __call__(self, held: list[np.ndarray], results: list[np.ndarray], at: int, count: int) -> None:
-        for k, (a, rows) in enumerate(zip(held, self.inputs, strict=True)):
-            rows[:, :count] = a.reshape(-1, 1) if k in self.shared else a[at : at + count].T
-            rows[:, count:] = rows[:, count - 1 : count]
+        for k, (a, own) in enumerate(zip(held, self.inputs, strict=True)):
+            if k in self.shared:
+                own[:] = a
+            else:
+                own[:, :count] = a[at : at + count].T
+                own[:, count:] = own[:, count - 1 : count]
         with np.errstate(all="ignore"):
-            for call, of, into in self.calls:
-                call(*of, out=into)
-        for r, rows in zip(results, self.outputs, strict=True):
-            r[at : at + count] = rows[:, :count].T.reshape(count, *r.shape[1:])
+            for call, rows in self.calls:
+                call(*rows)
+        for r, of in zip(results, self.outputs, strict=True):
+            r[at : at + count] = of[:, :count].T.reshape(count, *r.shape[1:])
+
+
+def _kept(function: ca.Function) -> dict[int, tuple[int, int]]:
+    """Instructions whose result is an output, by their numbers: which, and where in it; the first that takes it."""
+    last: dict[int, int] = {}  # the instruction that wrote a register last
+    found: dict[int, tuple[int, int]] = {}
+    for k in range(function.n_instructions()):
+        into = function.instruction_output(k)
+        if function.instruction_id(k) == ca.OP_OUTPUT:
+            found.setdefault(last[function.instruction_input(k)[0]], (into[0], into[1]))
+        else:
+            last[into[0]] = k
+    return found
 
 
 _OPERATIONS: dict[int, np.ufunc] = {
@@ -203,7 +237,7 @@ class Chart:
     readings: Batch
     step: Batch
     pivots: Batch
-    channels: ca.Function
+    channels: Batch
 
     @property
     def n(self) -> int:
@@ -226,16 +260,14 @@ class Chart:
         """
         if not any(e.effect.channel for e in self.model.effects):
             return torque - X @ self.offsets.T, np.broadcast_to(-self.offsets, (len(torque), *self.offsets.shape))
-        N, n_u = torque.shape
         step = 1 / float(self.model.machine.sampling_hz)
-        t = np.arange(N) * step
-        out = [e.full() for e in self.channels(t[None], X)]
-        gain, offset = (e.T for e in out[:2])
-        by = [e.reshape(n_u, N, len(X)).transpose(1, 0, 2) for e in out[3:]]
-        u = torques_behind(t, torque, out[:3])
+        t = np.arange(len(torque)) * step
+        *channels, by_gain, by_offset, by_delay = self.channels(t[:, None], X)
+        gain, offset, delay = (e[:, :, 0] for e in channels)
+        u = torques_behind(t, torque, (gain.T, offset.T, delay.T))
         true = u + errors
         rise = np.gradient(gain * true + offset, step, axis=0)
-        slope = (rise[:, :, None] * by[2] - by[1] - true[:, :, None] * by[0]) / gain[:, :, None]
+        slope = (rise[:, :, None] * by_delay - by_offset - true[:, :, None] * by_gain) / gain[:, :, None]
         return u, slope
 
     def felt(self, noise: np.ndarray, X: np.ndarray) -> np.ndarray:
@@ -367,7 +399,7 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
         Batch(readings, (2,)),
         Batch(step, (3, 4)),
         Batch(ca.Function("pivots", [state, X], [along(ca.vec(factors[0]))]), (1,)),
-        ca.Function("channels", [t, X], [*channels, *[ca.densify(ca.jacobian(e, X)) for e in channels]]),
+        Batch(ca.Function("channels", [t, X], [*channels, *[ca.jacobian(e, X) for e in channels]]), (1,)),
     )
 
 

@@ -1,25 +1,29 @@
 """Work side by side in processes that share this one's memory, so that models need not be built again.
 
-A forked process begins where this one stands: what it is to do is passed without copying, only its answer is sent. That
-takes milliseconds, where a fresh process takes seconds to load the program. Forking is sound on Linux alone; elsewhere
-all is done in this process, with the same answer.
+A forked process begins where this one stands: what it is to do is passed without copying, only its answer is sent, its
+arrays in memory that this one maps. That takes milliseconds, where a fresh process takes seconds to load the program.
+Forking is sound on Linux alone; elsewhere all is done in this process, with the same answer.
 """
 
 from __future__ import annotations
 
 import ctypes
+import mmap
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 R = TypeVar("R")
 
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>: the signal that a process gets when its parent ends
+ALIGNED = 64  # bytes: where an array may begin
 LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None  # loaded before any fork
 
 
@@ -51,7 +55,7 @@ def forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
     if min(at_once, len(calls)) < 2:
         yield from in_turn(calls)
         return
-    running: dict[Connection, tuple[int, BaseProcess]] = {}
+    running: dict[Connection, tuple[int, _Worker]] = {}
     done: dict[int, R] = {}
     left: set[int] = set()  # to this process
     begun = 0
@@ -60,8 +64,8 @@ def forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
             while k not in done:
                 for number in range(begun, min(begun + at_once - len(running), len(calls))):
                     try:
-                        worker, answer = _started(calls[number], list(running))
-                        running[answer] = number, worker
+                        worker = _started(calls[number], list(running))
+                        running[worker.answer] = number, worker
                     except OSError:  # no memory, processes or files left
                         left.add(number)
                     begun += 1
@@ -72,41 +76,79 @@ def forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
                 for answer in [a for a in running if a in ready]:
                     number, worker = running.pop(answer)
                     try:
-                        done[number] = answer.recv()
+                        done[number] = _received(worker)
                     except (EOFError, OSError):
                         left.add(number)
-                    answer.close()
-                    worker.join()
+                    worker.process.join()
+                    worker.close()
             yield done.pop(k)
     finally:
-        for answer, (_, worker) in running.items():
-            worker.kill()
-            worker.join()
-            answer.close()
+        for _, worker in running.values():
+            worker.process.kill()
+            worker.process.join()
+            worker.close()
 
 
-def _started(call: Callable[[], R], others: Sequence[Connection]) -> tuple[BaseProcess, Connection]:
-    """A process at work and where its answer comes. others: where those of earlier processes come."""
+@dataclass(frozen=True)
+class _Worker:
+    """A process at work, where its answer comes, and the file in memory that takes the arrays of it."""
+
+    process: BaseProcess
+    answer: Connection
+    arrays: int
+
+    def close(self) -> None:
+        self.answer.close()
+        os.close(self.arrays)
+
+
+def _started(call: Callable[[], R], others: Sequence[Connection]) -> _Worker:
+    """A process at work. others: where the answers of earlier processes come."""
     fork = multiprocessing.get_context("fork")
-    answer, own = fork.Pipe(duplex=False)
+    arrays = os.memfd_create("answer")
+    try:
+        answer, own = fork.Pipe(duplex=False)
+    except OSError:
+        os.close(arrays)
+        raise
     with own:  # here it is closed in any case: the process has its own
-        worker = fork.Process(target=_carry, args=(call, own, [answer, *others], os.getpid()), daemon=True)
+        process = fork.Process(target=_carry, args=(call, own, arrays, [answer, *others], os.getpid()), daemon=True)
+        worker = _Worker(process, answer, arrays)
         try:
-            worker.start()
+            process.start()
         except OSError:
-            answer.close()
+            worker.close()
             raise
-    return worker, answer
+    return worker
 
 
-def _carry(call: Callable[[], object], answer: Connection, others: Sequence[Connection], parent: int) -> None:
+def _received(worker: _Worker) -> Any:
+    """The answer of a process, its arrays where it left them. Raises EOFError or OSError where there is none."""
+    rest, spans = worker.answer.recv()
+    if not spans or spans[-1][1] == 0:
+        return pickle.loads(rest, buffers=[bytearray()] * len(spans))
+    # Private: what is written to an array is seen here alone. The memory lives as long as one of the arrays.
+    memory = memoryview(mmap.mmap(worker.arrays, spans[-1][1], access=mmap.ACCESS_COPY))
+    return pickle.loads(rest, buffers=[memory[a:b] for a, b in spans])
+
+
+def _carry(
+    call: Callable[[], object], answer: Connection, memory: int, others: Sequence[Connection], parent: int
+) -> None:
     """In the forked process. It ends without the clean-up of a Python program: files and buffers are not its own."""
     try:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the process that waits, which ends this one
         _end_with(parent)
         for read in others:  # a pipe breaks only when nobody can read it: this process must not keep any open
             read.close()
-        answer.send(call())
+        arrays: list[pickle.PickleBuffer] = []
+        rest = pickle.dumps(call(), 5, buffer_callback=arrays.append)
+        spans: list[tuple[int, int]] = []
+        with open(memory, "wb") as file:
+            for array in arrays:
+                begin = file.seek(-(-file.tell() // ALIGNED) * ALIGNED)
+                spans.append((begin, begin + file.write(array.raw())))
+        answer.send((rest, spans))
     finally:
         os._exit(0)
 

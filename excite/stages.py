@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
-from excite import hidden, newton, smoothing
+from excite import evidence, hidden, newton, smoothing
 from excite.innovations import innovation_sizes
 from excite.linearise import Chart, chart
 from excite.log import Log
@@ -101,6 +101,11 @@ class Stage:
     def near(self) -> bool:
         """Whether the misfit is not far from what noise makes."""
         return self.fit.cost <= STRONG * self.noise
+
+    @cached_property
+    def along(self) -> evidence.Scan:
+        """Along which candidates are scored."""
+        return evidence.Scan(self.prepared.c, self.prepared.records, self.fit)
 
     @property
     def follows(self) -> bool:

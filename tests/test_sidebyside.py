@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from excite.sidebyside import cores, forked, in_turn
@@ -29,6 +30,32 @@ def test_answers_come_in_order_and_from_elsewhere() -> None:
         assert not any(own for _, own in forked(calls))
     assert list(forked(calls[:1])) == [(0, True)]
     assert list(forked([])) == []
+
+
+def test_arrays_come_whole_and_are_ones_own() -> None:
+    def made(k: int) -> dict[str, np.ndarray]:
+        whole = np.random.default_rng(k).normal(size=(300, 7, 50))
+        parts = {
+            "turned": whole.T,
+            "part": whole[::3, 1:],
+            "none": whole[:0],
+            "small": whole[0, 0, :3],
+            "k": np.array(k),
+        }
+        return parts if k else {"none": np.empty(0)}
+
+    calls = [partial(made, k) for k in range(5)]
+    answers = list(forked(calls))
+    for found, here in zip(answers, in_turn(calls), strict=True):
+        for name, array in here.items():
+            np.testing.assert_array_equal(found[name], array, strict=True)
+            assert found[name].flags.writeable
+            assert found[name].ctypes.data % 8 == 0
+    answers[1]["turned"][:] = 0.0
+    assert answers[1]["small"].any()  # its own memory beside the other array's
+    open_files = len(os.listdir("/proc/self/fd")) if cores() > 1 else 0
+    list(forked(calls))
+    assert not open_files or len(os.listdir("/proc/self/fd")) == open_files
 
 
 def test_what_a_process_does_not_finish_is_done_here(tmp_path: Path) -> None:

@@ -148,6 +148,19 @@ def test_an_effect_may_use_any_elementary_function() -> None:
     )
 
 
+@pytest.mark.parametrize("N", [3, 200, 2300], ids=["few", "block", "blocks"])
+def test_what_many_samples_share_and_what_is_no_calculation(N: int) -> None:
+    """Inputs that all samples share, and outputs that are an input, a constant, each other or a step on the way."""
+    x, p = ca.SX.sym("x", 2), ca.SX.sym("p", 2)
+    step = x[0] * p[1]
+    f = ca.Function("f", [x, p], [ca.vertcat(step, p[0], 3, x[1], step, 0), ca.exp(step) + step, ca.vertcat(p, 3)])
+    made = Batch(f, (1,))
+    for given in (np.array([0.5, -2.0]), np.array([4.0, 0.1])):  # nothing stays of what was shared before
+        at = np.random.default_rng(0).uniform(-1, 1, (N, 2))
+        for found, exact in zip(made(at, given), zip(*(f(row, given) for row in at), strict=True), strict=True):
+            np.testing.assert_allclose(found[:, :, 0], np.array([e.full()[:, 0] for e in exact]), rtol=1e-14)
+
+
 def test_where_samples_lead_and_how_that_moves(va12: Model) -> None:
     X = perturbed(va12, 2)
     motion = simulate(va12, energetic(20), X)
