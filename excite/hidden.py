@@ -9,9 +9,10 @@ import numpy as np
 import scipy
 
 from excite.estimate import Estimate, noted
-from excite.leastsquares import exchanged, independent
+from excite.leastsquares import exchanged
 from excite.log import Log
 from excite.processing import BLOCK, Samples, samples, unmeasured
+from model.columns import independent
 from model.machine import Filter
 from model.prediction import Model
 

@@ -20,19 +20,15 @@ SLOW = 25  # readings whose mean counts as slow
 @dataclass(frozen=True)
 class Step:
     """A filter's step j in all parts that are as long: samples `at`, which parts `going`, the transition A behind them,
-    gain K, whitening root."""
+    gain K; what makes the innovations white (K, m, m), and their variance before that (K, m)."""
 
     at: np.ndarray
     going: np.ndarray
     A: np.ndarray
     gain: np.ndarray
-    root: np.ndarray
+    white: np.ndarray
+    variance: np.ndarray
     used: np.ndarray
-
-    @property
-    def variance(self) -> np.ndarray:
-        """Of the innovations before whitening (K, m)."""
-        return np.diagonal(self.root @ self.root.transpose(0, 2, 1), axis1=1, axis2=2)
 
 
 @dataclass(frozen=True)
@@ -141,7 +137,7 @@ def _filtered(linear: Linear, x: np.ndarray, push: np.ndarray, reading: np.ndarr
     E = np.empty(reading.shape, np.float32)
     for step in linear.filter:
         e = reading[step.at] - linear.H[step.at] @ x[step.going]
-        E[step.at] = np.linalg.solve(step.root, e) * step.used[:, :, None]
+        E[step.at] = (step.white * step.used[:, :, None]) @ e
         x[step.going] = step.A @ (x[step.going] + step.gain @ e) + push[step.at]
     return E
 
@@ -195,5 +191,6 @@ def steps(linear: Linear) -> list[Step]:
         A, C = (np.stack([getattr(linear.stages[i], f)[j] for i in going]) for f in ("A", "C"))
         left = P[going] - K @ PH.transpose(0, 2, 1)
         P[going] = A @ ((left + left.transpose(0, 2, 1)) / 2) @ A.transpose(0, 2, 1) + C
-        found.append(Step(at, going, A, K, np.linalg.cholesky(S), weight > 0))
+        white = np.linalg.inv(np.linalg.cholesky(S))
+        found.append(Step(at, going, A, K, white, np.diagonal(S, axis1=1, axis2=2), weight > 0))
     return found

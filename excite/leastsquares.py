@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from model.columns import independent
+
 DEPENDENT = 1e-10  # a column this close to a combination of the others carries nothing [relative]
 BLOCK = 20_000  # rows of a tall matrix that are reduced at once
 MOST = 10.0  # times a column that is kept, of one that is left out
@@ -88,22 +90,6 @@ def merge(triangles: Iterable[Triangle]) -> Triangle:
 def _stack(R: np.ndarray, block: np.ndarray) -> np.ndarray:
     both = np.concatenate([R, block])
     return np.asarray(np.linalg.qr(both, mode="r"))
-
-
-def independent(A: np.ndarray, nothing: float) -> tuple[list[int], list[int]]:
-    """Columns of A longer than `nothing`: those whose part that no earlier ones make up is so too, and the others."""
-    kept: list[int] = []
-    left: list[int] = []
-    Q = np.zeros((len(A), 0))
-    for k in np.flatnonzero(np.linalg.norm(A, axis=0) > nothing):
-        rest = A[:, k] - Q @ (Q.T @ A[:, k])
-        rest -= Q @ (Q.T @ rest)
-        if np.linalg.norm(rest) > nothing:
-            kept.append(int(k))
-            Q = np.column_stack([Q, rest / np.linalg.norm(rest)])
-        else:
-            left.append(int(k))
-    return kept, left
 
 
 def exchanged(A: np.ndarray, kept: Sequence[int], left: Sequence[int]) -> list[int]:

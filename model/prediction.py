@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from model import placing, tree
+from model.columns import independent
 from model.effect import Placed, Site
 from model.equations import Equations, equations, kinematics
 from model.machine import Machine, MachineError
@@ -422,33 +423,22 @@ def base_parameters(machine: Machine, W: ca.Function, p: np.ndarray, units: dict
     flat = W(q, nu, a, p).full().reshape(n, samples, len(standard))
     A = flat.transpose(1, 0, 2).reshape(-1, len(standard))
     size = np.linalg.norm(A, axis=0)
-    floor = 1e-12 * size.max()
-    independent: list[int] = []
-    invisible: list[str] = []
+    visible = np.flatnonzero(size > 1e-12 * size.max())
+    kept, left = (visible[k] for k in independent(A[:, visible] / size[visible], 1e-9))
     matrix = np.zeros((len(standard), len(standard)))
-    Q = np.zeros((A.shape[0], 0))
-    for j in range(len(standard)):
-        if size[j] <= floor:
-            invisible.append(standard[j])
-            continue
-        rest = A[:, j] - Q @ (Q.T @ A[:, j])
-        rest -= Q @ (Q.T @ rest)
-        if np.linalg.norm(rest) > 1e-9 * size[j]:
-            matrix[j, j] = 1.0
-            independent.append(j)
-            Q = np.column_stack([Q, rest / np.linalg.norm(rest)])
-            continue
-        coefficients = np.linalg.lstsq(A[:, independent], A[:, j], rcond=None)[0]
-        coefficients = np.where(np.abs(coefficients) < 1e-9, 0.0, np.round(coefficients, 12))
-        matrix[independent, j] = coefficients
-    if not independent:
+    matrix[kept, kept] = 1.0
+    for j in left:
+        before = kept[kept < j]
+        coefficients = np.linalg.lstsq(A[:, before], A[:, j], rcond=None)[0]
+        matrix[before, j] = np.where(np.abs(coefficients) < 1e-9, 0.0, np.round(coefficients, 12))
+    if not len(kept):
         raise MachineError(
             f"{machine.name}: no parameter can be seen in any motion, check the table and what is locked"
         )
-    chosen = matrix[independent]
+    chosen = matrix[kept]
     names = tuple(
         machine.parameter_names.get(standard[j], standard[j] + ("R" if np.count_nonzero(row) > 1 else ""))
-        for j, row in zip(independent, chosen, strict=True)
+        for j, row in zip(kept, chosen, strict=True)
     )
     twice = sorted({s for s in names if names.count(s) > 1})
     if twice:
@@ -456,5 +446,10 @@ def base_parameters(machine: Machine, W: ca.Function, p: np.ndarray, units: dict
             f"{machine.name}: parameter_names: two base parameters get the same name: {', '.join(twice)}"
         )
     return BaseParameters(
-        names, tuple(units[standard[j]] for j in independent), tuple(independent), chosen, tuple(invisible), standard
+        names,
+        tuple(units[standard[j]] for j in kept),
+        tuple(kept.tolist()),
+        chosen,
+        tuple(name for j, name in enumerate(standard) if j not in visible),
+        standard,
     )
