@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from excite import newton
-from excite.innovations import signed, whitened
+from excite.innovations import whitened, whitened_signatures
 from excite.linearise import BATCH, Batch, Chart, differentiate
 from excite.processing import implicit
 from excite.record import Point, Record, smoothed
@@ -323,9 +323,7 @@ def _told(along: Scan, found: Sequence[Candidate]) -> list[Told | None]:
     n = len(prior)
     Z = np.zeros((1 + n + total, 1 + n + total))
     for way in along.ways:
-        E = np.concatenate([way.white.E, signed(way.linear, way.white, *Signatures(way, found).along())], axis=2)
-        E = E.reshape(-1, E.shape[2])
-        form = sum((_square(E[at : at + CHUNK]) for at in range(0, len(E), CHUNK)), np.zeros((E.shape[1],) * 2))
+        form = _products(way.white.E, whitened_signatures(way.linear, way.white, *Signatures(way, found).along()))
         # Offsets of counts belong to one log: integrate them out.
         o, keep = slice(1 + n, 1 + n + way.offsets), np.r_[0 : 1 + n, 1 + n + way.offsets : len(form)]
         inner = form[o, o] + np.eye(way.offsets)
@@ -339,8 +337,13 @@ def _told(along: Scan, found: Sequence[Candidate]) -> list[Told | None]:
     return [_score(x, S, g, Z[own, own]) for x in found]
 
 
-def _square(E: np.ndarray) -> np.ndarray:
-    form: np.ndarray = (E.T @ E).astype(float)
+def _products(own: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Of all columns of two sets of innovations (N, m, k) with each other."""
+    size, step = own.shape[2] + other.shape[2], max(1, CHUNK // own.shape[1])
+    form = np.zeros((size, size))
+    for at in range(0, len(own), step):
+        E = np.concatenate([own[at : at + step], other[at : at + step]], axis=2).reshape(-1, size)
+        form += E.T @ E
     return form
 
 

@@ -110,8 +110,8 @@ def whitened(linear: Linear, flawed: tuple[int, ...]) -> White:
     (N, m, n), own = linear.H.shape, linear.solved.Z.shape[0]
     told = np.concatenate([1 + np.array(flawed, int), np.arange(own - linear.direct.shape[2] + len(flawed), own)])
     reading, push = np.zeros((N, m, own + n)), np.zeros((N, n, own + n))
-    reading[:, :, 0] = linear.residual
-    reading[:, :, told] = -linear.direct
+    reading[:, :, 0] = -linear.residual
+    reading[:, :, told] = linear.direct
     push[:, :, :own] = np.concatenate([stages.b for stages in linear.stages])
     x = np.zeros((len(linear.stages), n, own + n))
     x[:, :, own:] = np.eye(n)
@@ -121,22 +121,22 @@ def whitened(linear: Linear, flawed: tuple[int, ...]) -> White:
     return white
 
 
-def signed(linear: Linear, white: White, push: np.ndarray, reading: np.ndarray) -> np.ndarray:
+def whitened_signatures(linear: Linear, white: White, push: np.ndarray, reading: np.ndarray) -> np.ndarray:
     """Likewise of signatures (N, m, C). push (N, n, C): what they do to the scaled state behind each sample, nothing
     behind the last; reading (N, m, C): to readings."""
     parts, (_, n, columns) = len(linear.stages), push.shape
     x = np.zeros((parts, n, columns))
-    E = _filtered(linear, x, push, -reading)
+    E = _filtered(linear, x, push, reading)
     _begin(linear, E, white, x, np.zeros((n, columns)))
     return E
 
 
 def _filtered(linear: Linear, x: np.ndarray, push: np.ndarray, reading: np.ndarray) -> np.ndarray:
     """Whitened innovations (N, m, k) of columns x (parts, n, k) of the states where parts begin, which are led to where
-    these end."""
+    these end; push (N, n, k) and reading (N, m, k): what the columns add to states and readings on the way."""
     E = np.empty(reading.shape, np.float32)
     for step in linear.filter:
-        e = reading[step.at] - linear.H[step.at] @ x[step.going]
+        e = -(reading[step.at] + linear.H[step.at] @ x[step.going])
         E[step.at] = (step.white * step.used[:, :, None]) @ e
         x[step.going] = step.A @ (x[step.going] + step.gain @ e) + push[step.at]
     return E
