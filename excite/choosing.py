@@ -125,7 +125,7 @@ def _has_harmonics(effect: Effect) -> bool:
 
 
 def _scanned(stage: Stage, found: Sequence[evidence.Candidate], together: Together) -> tuple[evidence.Score, ...]:
-    return evidence.scan(stage.along, found, together)
+    return evidence.scan(stage.ways, stage.fit, found, together)
 
 
 def _duration(logs: Sequence[Log]) -> float:

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from excite import newton
-from excite.innovations import whitened, whitened_signatures
+from excite.innovations import Linear, White, whitened, whitened_signatures
 from excite.linearise import BATCH, Batch, Chart, differentiate
 from excite.processing import implicit
 from excite.record import Point, Record, smoothed
@@ -179,23 +179,43 @@ def renumbered(found: Sequence[Candidate]) -> list[Candidate]:
     return [replace(x, columns=tuple(range(end - len(x.columns), end))) for x, end in zip(found, ends, strict=True)]
 
 
+@dataclass(frozen=True, eq=False)
 class Way:
-    """One fitted log, as every candidate finds it."""
+    """One fitted log, as every candidate finds it: the motion q, nu, accelerations a (N, n_q), delivered torques u
+    (N, n_u) at times t (N,) [s], exact readings (N, readable), the standard parameters, `slopes` as `_slopes` has them,
+    and the whitened innovations. origins: how many offsets of counts the log has."""
 
-    def __init__(self, c: Chart, r: Record, fit: newton.Fit, log: int) -> None:
-        model, p = c.model, fit.points[log]
-        self.chart, self.linear, self.offsets = c, fit.linear[log], len(r.origin)
-        self.q, self.nu, z, self.u, self.a = smoothed(c, r, p, fit.X)
-        self.t = np.arange(len(self.u)) / float(model.machine.sampling_hz)
-        wheels = np.zeros((len(self.u), sum(s.kind == "wheel" for s in model.machine.sensor)))
-        n_q = self.q.shape[1]
-        for k, at in enumerate(c.index):
-            if 2 * n_q <= at < 2 * n_q + wheels.shape[1]:
-                wheels[:, at - 2 * n_q] = p.s[:, k]
-        self.exact = model.read(self.q.T, self.nu.T, wheels.T, self.u.T, z.T, fit.X).full().T
-        self.p = model.expand @ fit.X
-        self.slopes = _slopes(c, p, self.u, fit.X)
-        self.white = whitened(self.linear, c.flawed)
+    chart: Chart
+    linear: Linear
+    origins: int
+    q: np.ndarray
+    nu: np.ndarray
+    a: np.ndarray
+    u: np.ndarray
+    t: np.ndarray
+    exact: np.ndarray
+    standard: np.ndarray
+    slopes: np.ndarray
+    white: White
+
+
+def ways(c: Chart, records: Sequence[Record], fit: newton.Fit) -> tuple[Way, ...]:
+    """Of every log."""
+    return tuple(_way(c, r, p, linear, fit.X) for r, p, linear in zip(records, fit.points, fit.linear, strict=True))
+
+
+def _way(c: Chart, r: Record, p: Point, linear: Linear, X: np.ndarray) -> Way:
+    model = c.model
+    q, nu, z, u, a = smoothed(c, r, p, X)
+    t = np.arange(len(u)) / float(model.machine.sampling_hz)
+    wheels = np.zeros((len(u), sum(s.kind == "wheel" for s in model.machine.sensor)))
+    n_q = q.shape[1]
+    for k, at in enumerate(c.index):
+        if 2 * n_q <= at < 2 * n_q + wheels.shape[1]:
+            wheels[:, at - 2 * n_q] = p.s[:, k]
+    exact = model.read(q.T, nu.T, wheels.T, u.T, z.T, X).full().T
+    slopes, white = _slopes(c, p, u, X), whitened(linear, c.flawed)
+    return Way(c, linear, len(r.origin), q, nu, a, u, t, exact, model.expand @ X, slopes, white)
 
 
 class Signatures:
@@ -215,7 +235,7 @@ class Signatures:
         made = signatures(model.machine, standard, every)
         self.force, self.reading = Batch(made.force, (7,)), Batch(made.reading, (7,))
         self.rows = [model.readable.index(s.name) for s in c.sensors]
-        self.p = way.p[: len(standard)]
+        self.p = way.standard[: len(standard)]
         memory = remembered(made, way.q, way.nu, way.u, way.t, self.p)
         self.samples = (way.q, way.nu, way.a, way.u, way.t[:, None], memory, way.exact)
         self.torque = np.zeros((*way.u.shape, self.columns))
@@ -295,20 +315,14 @@ def remembered(
     return implicit(flow, np.zeros(n_z), np.hstack([q, nu, u, t[:, None]]), float(t[1] - t[0]))
 
 
-class Scan:
-    """Fitted logs, along which candidates are scored."""
-
-    def __init__(self, c: Chart, records: Sequence[Record], fit: newton.Fit) -> None:
-        self.ways = [Way(c, r, fit, k) for k, r in enumerate(records)]
-        self.prior, self.off = fit.prior, (fit.X - c.model.nominal) / c.model.scale
-
-
-def scan(along: Scan, found: Sequence[Candidate], together: Together = in_turn) -> tuple[Score, ...]:
-    """The score of every candidate, best first. together: how its parts are computed."""
+def scan(
+    along: Sequence[Way], fit: newton.Fit, found: Sequence[Candidate], together: Together = in_turn
+) -> tuple[Score, ...]:
+    """The score of every candidate along fitted logs, best first. together: how its parts are computed."""
     ends = np.cumsum([len(x.columns) for x in found])
     middle = int(np.searchsorted(ends, ends[-1] / 2)) if len(found) and ends[-1] > ALONE else 0
     parts = [part for part in (found[:middle], found[middle:]) if part]
-    told = together([partial(_told, along, renumbered(part)) for part in parts])
+    told = together([partial(_told, along, fit, renumbered(part)) for part in parts])
     every = zip(found, (x for part in told for x in part), strict=True)
     scores = [Score(x, *seen) for x, seen in every if seen is not None]
     return tuple(sorted(scores, key=lambda s: -s.gain))
@@ -317,20 +331,20 @@ def scan(along: Scan, found: Sequence[Candidate], together: Together = in_turn) 
 Told = tuple[float, dict[str, float], float]  # of a score all but the candidate
 
 
-def _told(along: Scan, found: Sequence[Candidate]) -> list[Told | None]:
+def _told(along: Sequence[Way], fit: newton.Fit, found: Sequence[Candidate]) -> list[Told | None]:
     """What logs tell of candidates, each beside the parameters alone."""
-    total, prior = sum(len(x.columns) for x in found), along.prior
-    n = len(prior)
+    total, n = sum(len(x.columns) for x in found), len(fit.X)
+    model, prior = along[0].chart.model, fit.prior
     Z = np.zeros((1 + n + total, 1 + n + total))
-    for way in along.ways:
+    for way in along:
         form = _products(way.white.E, whitened_signatures(way.linear, way.white, *Signatures(way, found).along()))
         # Offsets of counts belong to one log: integrate them out.
-        o, keep = slice(1 + n, 1 + n + way.offsets), np.r_[0 : 1 + n, 1 + n + way.offsets : len(form)]
-        inner = form[o, o] + np.eye(way.offsets)
+        o, keep = slice(1 + n, 1 + n + way.origins), np.r_[0 : 1 + n, 1 + n + way.origins : len(form)]
+        inner = form[o, o] + np.eye(way.origins)
         Z += form[np.ix_(keep, keep)] - form[keep, o] @ np.linalg.solve(inner, form[o, keep])
     own, p = slice(1 + n, None), slice(1, 1 + n)
     base, cross = Z[p, p] + np.diag(prior), Z[p, own]
-    g_base = Z[p, 0] + prior * along.off
+    g_base = Z[p, 0] + prior * (fit.X - model.nominal) / model.scale
     solved = np.linalg.solve(base, np.column_stack([cross, g_base]))
     S = Z[own, own] - cross.T @ solved[:, :-1]
     g = Z[own, 0] - cross.T @ solved[:, -1]

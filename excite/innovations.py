@@ -19,8 +19,9 @@ SLOW = 25  # readings whose mean counts as slow
 
 @dataclass(frozen=True)
 class Step:
-    """A filter's step j in all parts that are as long: samples `at`, which parts `going`, the transition A behind them,
-    gain K; what makes the innovations white (K, m, m), and their variance before that (K, m)."""
+    """A filter's step j in all P parts that are as long: samples `at` (P,), which parts `going` (P,), the transition
+    behind them A (P, n, n), the gain (P, n, m), what makes the innovations white (P, m, m), and their variance before
+    that (P, m)."""
 
     at: np.ndarray
     going: np.ndarray
@@ -192,5 +193,5 @@ def steps(linear: Linear) -> list[Step]:
         left = P[going] - K @ PH.transpose(0, 2, 1)
         P[going] = A @ ((left + left.transpose(0, 2, 1)) / 2) @ A.transpose(0, 2, 1) + C
         white = np.linalg.inv(np.linalg.cholesky(S))
-        found.append(Step(at, going, A, K, white, np.diagonal(S, axis1=1, axis2=2), weight > 0))
+        found.append(Step(at, going, A, K, white, np.diagonal(S, axis1=1, axis2=2).copy(), weight > 0))
     return found

@@ -101,7 +101,7 @@ class _Block:
         self.outputs = [np.zeros((function.nnz_out(k), BATCH)) for k in range(function.n_out())]
         self.shared = shared
         self.calls: list[tuple[Callable[..., object], tuple[np.ndarray, ...]]] = []
-        kept = _kept(function)
+        kept, there = _kept(function), [list(rows) for rows in self.outputs]
         at: dict[int, np.ndarray] = {}  # where the value of each of CasADi's registers is now
         constant: set[int] = set()  # those that hold one
         for k in range(function.n_instructions()):
@@ -113,17 +113,17 @@ class _Block:
             elif code == ca.OP_CONST:
                 at[into[0]] = np.array(function.instruction_constant(k))
             elif code == ca.OP_OUTPUT:
-                there = self.outputs[into[0]][into[1]]
+                row = there[into[0]][into[1]]
                 if of[0] in constant:
-                    there[:] = at[of[0]]
-                elif at[of[0]] is not there:
-                    self.calls.append((np.positive, (at[of[0]], there)))
+                    row[:] = at[of[0]]
+                elif at[of[0]] is not row:
+                    self.calls.append((np.positive, (at[of[0]], row)))
             else:
                 call = np.add if code == ca.OP_TWICE else _OPERATIONS[code]
                 given = tuple(at[i] for i in (of[:1] * 2 if code == ca.OP_TWICE else of[: call.nin]))
                 output = kept.get(k)
-                at[into[0]] = registers[into[0]] if output is None else self.outputs[output[0]][output[1]]
-                if call in (np.maximum, np.minimum):  # take no output by its place
+                at[into[0]] = registers[into[0]] if output is None else there[output[0]][output[1]]
+                if call in (np.maximum, np.minimum):  # numpy wants their output by its name
                     self.calls.append((partial(call, *given, out=at[into[0]]), ()))
                 else:
                     self.calls.append((call, (*given, at[into[0]])))

@@ -14,6 +14,7 @@ import os
 import pickle
 import signal
 import sys
+import tempfile
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -74,13 +75,14 @@ def forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
                     break
                 ready = wait(list(running))
                 for answer in [a for a in running if a in ready]:
-                    number, worker = running.pop(answer)
+                    number, worker = running[answer]
                     try:
                         done[number] = _received(worker)
                     except (EOFError, OSError):
                         left.add(number)
                     worker.process.join()
                     worker.close()
+                    del running[answer]
             yield done.pop(k)
     finally:
         for _, worker in running.values():
@@ -91,7 +93,7 @@ def forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
 
 @dataclass(frozen=True)
 class _Worker:
-    """A process at work, where its answer comes, and the file in memory that takes the arrays of it."""
+    """A process at work, where its answer comes, and the file that takes the arrays of it."""
 
     process: BaseProcess
     answer: Connection
@@ -105,7 +107,7 @@ class _Worker:
 def _started(call: Callable[[], R], others: Sequence[Connection]) -> _Worker:
     """A process at work. others: where the answers of earlier processes come."""
     fork = multiprocessing.get_context("fork")
-    arrays = os.memfd_create("answer")
+    arrays = _file()
     try:
         answer, own = fork.Pipe(duplex=False)
     except OSError:
@@ -122,13 +124,22 @@ def _started(call: Callable[[], R], others: Sequence[Connection]) -> _Worker:
     return worker
 
 
+def _file() -> int:
+    """A file in memory, or where a Python knows none, a temporary one without a name."""
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("answer")
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
+
+
 def _received(worker: _Worker) -> Any:
     """The answer of a process, its arrays where it left them. Raises EOFError or OSError where there is none."""
     rest, spans = worker.answer.recv()
-    if not spans or spans[-1][1] == 0:
+    if not any(end > begin for begin, end in spans):
         return pickle.loads(rest, buffers=[bytearray()] * len(spans))
-    # Private: what is written to an array is seen here alone. The memory lives as long as one of the arrays.
-    memory = memoryview(mmap.mmap(worker.arrays, spans[-1][1], access=mmap.ACCESS_COPY))
+    # Private: what is written to an array is seen here alone. The memory, and a descriptor of it, lives as long as one
+    # of the arrays.
+    memory = memoryview(mmap.mmap(worker.arrays, 0, access=mmap.ACCESS_COPY))
     return pickle.loads(rest, buffers=[memory[a:b] for a, b in spans])
 
 

@@ -103,9 +103,9 @@ class Stage:
         return self.fit.cost <= STRONG * self.noise
 
     @cached_property
-    def along(self) -> evidence.Scan:
-        """Along which candidates are scored."""
-        return evidence.Scan(self.prepared.c, self.prepared.records, self.fit)
+    def ways(self) -> tuple[evidence.Way, ...]:
+        """The fitted logs, along which candidates are scored."""
+        return evidence.ways(self.prepared.c, self.prepared.records, self.fit)
 
     @property
     def follows(self) -> bool:

@@ -686,7 +686,7 @@ def test_noise_of_torques_is_no_gain_and_no_delay() -> None:
     assert abs(found.fit.X[at]) < 3.5 * found.fit.std[at]
     assert found.fit.cost < plain.fit.cost + 1  # both are found to so much
     every = evidence.candidates(VA12, [s.name for s in plain.prepared.c.sensors], 60.0)
-    scores = evidence.scan(plain.along, every)
+    scores = evidence.scan(plain.ways, plain.fit, every)
     assert max(s.gain for s in scores if s.candidate.name == "channel_delay@articulation") < 12
 
 

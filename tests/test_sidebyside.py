@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from excite import sidebyside
 from excite.sidebyside import cores, forked, in_turn
 
 
@@ -53,9 +54,32 @@ def test_arrays_come_whole_and_are_ones_own() -> None:
             assert found[name].ctypes.data % 8 == 0
     answers[1]["turned"][:] = 0.0
     assert answers[1]["small"].any()  # its own memory beside the other array's
-    open_files = len(os.listdir("/proc/self/fd")) if cores() > 1 else 0
-    list(forked(calls))
-    assert not open_files or len(os.listdir("/proc/self/fd")) == open_files
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
+def test_no_descriptor_stays_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(worker: object) -> None:
+        raise MemoryError
+
+    def opened() -> list[str]:
+        return sorted(os.listdir("/proc/self/fd"))
+
+    monkeypatch.setattr(sidebyside, "cores", lambda: 2)
+    calls = [partial(np.full, 1000, k) for k in range(4)]
+    before = opened()
+    assert [x[0] for x in forked(calls)] == [0, 1, 2, 3]
+    assert opened() == before
+    monkeypatch.setattr(sidebyside, "_received", fails)
+    with pytest.raises(MemoryError):
+        list(forked(calls))
+    assert opened() == before
+
+
+def test_a_python_without_files_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those built against an old C library lack them."""
+    monkeypatch.delattr(os, "memfd_create", raising=False)
+    found = list(forked([partial(np.full, 1000, k) for k in range(4)]))
+    assert [x.sum() for x in found] == [0, 1000, 2000, 3000]
 
 
 def test_what_a_process_does_not_finish_is_done_here(tmp_path: Path) -> None:

@@ -150,10 +150,12 @@ def test_an_effect_may_use_any_elementary_function() -> None:
 
 @pytest.mark.parametrize("N", [3, 200, 2300], ids=["few", "block", "blocks"])
 def test_what_many_samples_share_and_what_is_no_calculation(N: int) -> None:
-    """Inputs that all samples share, and outputs that are an input, a constant, each other or a step on the way."""
+    """Inputs that all samples share, and outputs that are an input, a constant, each other, a step on the way or of
+    what is shared alone."""
     x, p = ca.SX.sym("x", 2), ca.SX.sym("p", 2)
-    step = x[0] * p[1]
-    f = ca.Function("f", [x, p], [ca.vertcat(step, p[0], 3, x[1], step, 0), ca.exp(step) + step, ca.vertcat(p, 3)])
+    step, least = x[0] * p[1], ca.fmin(p[0], p[1])
+    many = ca.vertcat(step, p[0], 3, x[1], step, 0, least, ca.fmax(x[0], least))
+    f = ca.Function("f", [x, p], [many, ca.exp(step) + step, ca.vertcat(p, 3)])
     made = Batch(f, (1,))
     for given in (np.array([0.5, -2.0]), np.array([4.0, 0.1])):  # nothing stays of what was shared before
         at = np.random.default_rng(0).uniform(-1, 1, (N, 2))
