@@ -35,6 +35,7 @@ TRIED = 5  # candidates that are fitted
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
 PLAIN = 0.5  # the same for the variant without unusual shapes, which the others may mimic before a fit
 ANEW = 12  # effects that begin anew where nothing was found
+MAIN = 0.3  # of the excess misfit that such a one must explain beside exact dynamics: the largest of three effects does
 PAIR = 2  # candidates whose fits are begun in any case
 BEHIND = 0.5  # share of what was gained already that further candidates must have come to after a few passes
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
@@ -336,10 +337,12 @@ def unlikely(scanned: Stage, stage: Stage, tried: Container[str], together: Toge
 def _followed(
     stage: Stage, likely: Sequence[evidence.Score], forces: Sequence[float], tried: int, together: Together
 ) -> tuple[Stage, list[Choice]] | None:
-    """The effect with which a model can follow the logs from the beginning, with the first forces that do."""
+    """The effect with which a model can follow the logs from the beginning, with the first forces that do. Where exact
+    dynamics were fitted without any, one that takes less than MAIN of what they leave isn't waited for."""
     machines = [placing.extended(stage.machine, _entry(s)) for s in likely]
+    worth = stage.fit.cost - MAIN * stage.excess if stage.settled and stage.exact else np.inf
     for disturbed in forces if likely else ():
-        found = begun(machines, stage, disturbed, together)
+        found = begun(machines, stage, disturbed, together, worth)
         follow = [(s, x) for s, x in zip(likely, found, strict=True) if x is not None and x.follows]
         follow = [(s, x) for s, x in follow if _felt(s.candidate.name, x)]
         if not follow:

@@ -23,6 +23,7 @@ PRIOR = 3.0  # standard deviation of a parameter before any data, in its scale; 
 PASSES = 15  # at most
 UNSEEN = 1.0  # a parameter that a log tells less than this well, in its scale, stays at the machine file's value
 HELD = 1e-6  # standard deviation of such a parameter, in its scale
+AWAY = 1e-3  # of its scale, from which it isn't where it is held yet
 SETTLED = 3  # passes until the states fit the dynamics well enough to tell which these are
 DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's scale, and its share from pass to pass
 RESUMED = DAMPING[0] * DAMPING[1] ** 2  # damping of a fit that goes on from another
@@ -214,11 +215,13 @@ def iterate(
     enough: float = ENOUGH,
     most: float = np.inf,
     patient: bool = True,
+    worth: float = np.inf,
 ) -> Fit:
     """Gauss-Newton from points and X; the prior stands about the machine file's values and the states of `starts`.
-    Parameters `held` (n_base,) stay at their values. damping: of the first step; passes: at most; enough: a step, in
-    standard deviations, at which a fit with disturbing forces is found; most: cost above which a fit is given up once
-    the states fit the dynamics. Not `patient`: no passes are spent on steps that have ceased to shrink.
+    Parameters `held` (n_base,) stay at the file's values. damping: of the first step; passes: at most; enough: a step,
+    in standard deviations, at which a fit with disturbing forces is found; most: cost above which a fit is given up
+    once the states fit the dynamics; worth: cost above which it is given up as soon as costs fall no more. Not
+    `patient`: no passes are spent on steps that have ceased to shrink.
 
     Raises NotConverged.
     """
@@ -254,7 +257,8 @@ def iterate(
         damping *= DAMPING[1]
         before, step = step, left
         latest = X, covariance, unseen, known, points, cost
-        if k >= SETTLED and step <= nearest:
+        away = bool((np.abs(X - model.nominal) > AWAY * model.scale)[unseen].any())
+        if k >= SETTLED and step <= nearest and not away:
             best, nearest = latest, step
         sizes.append(step)
         if k >= HOPELESS[0]:
@@ -264,11 +268,13 @@ def iterate(
         costs.append(cost)
         if k >= SETTLED and cost > most and step > NEARLY:
             break
+        if k >= SETTLED and cost > worth and len(costs) > 2 and cost > (1 - FALLING) * costs[-3]:
+            break
         if not patient and _idle(sizes, costs):
             waited = True
             break
         # Where Gauss-Newton swings about the answer, shorter steps end it.
-        turned = move[0][: len(X)] / np.sqrt(np.diag(covariance))[: len(X)]
+        turned = np.where(unseen, 0.0, move[0][: len(X)] / np.sqrt(np.diag(covariance))[: len(X)])
         swings = turned @ last < 0 and step > SLOW * before
         whole = max(TURNED * min(whole, 1.0), 0.3) if swings else min(SHARE * whole, 1.0)
         creeps = turned @ last > ALONG * np.linalg.norm(turned) * np.linalg.norm(last) and step < 1.0
@@ -277,17 +283,19 @@ def iterate(
         last = turned
         limit = LARGEST_STEP * np.maximum(np.abs(X) / model.scale, 1.0)
         for m in move:
-            m[: len(X)] = np.clip(whole * m[: len(X)], -limit, limit)
+            # What is held from now on goes back to its value at once, and the others along as far as they may.
+            free = np.clip((1.0 if away else whole) * m[: len(X)], -limit, limit)
             # Amounts that make sense above zero only stay there.
-            low = -0.8 * X[model.positive] / model.scale[model.positive]
-            m[: len(X)][model.positive] = np.maximum(m[: len(X)][model.positive], low)
+            low = np.where(model.positive, -0.8 * X / model.scale, -np.inf)
+            m[: len(X)] = np.where(unseen, m[: len(X)], np.maximum(free, low))
         there = (
             [moved(c, r, p, f, m) for r, p, f, m in zip(records, points, linear, move, strict=True)],
             X + move[0][: len(X)] * model.scale,
         )
         # What this step will have left undone, if steps go on shrinking as they do.
         ratio = min(max(step / before, 1 - whole), 0.9)
-        if (step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED) or (disturbed > 0 and step < enough):
+        done = step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED
+        if not away and (done or (disturbed > 0 and step < enough)):
             # What is hardly known may have gone where no motion is: other fits must be able to go on from here.
             far = (np.abs(there[1] - X) > FREE * np.maximum(np.abs(X), model.scale)).any()
             if far and linearised(c, records, there[0], starts, there[1], disturbed) is None:
@@ -354,8 +362,9 @@ def newton_step(
     damping: float,
 ) -> tuple[np.ndarray, list[np.ndarray], float, float]:
     """Covariance of all parameters and offsets (scaled), the step of those of each log, the largest of a parameter in
-    standard deviations as it would be undamped, and the cost behind that step. Damping (Levenberg): what a log shows
-    badly moves in small steps while the rest is still wrong. prior (n_base,): information about nominal."""
+    standard deviations as it would be undamped, of one that isn't held where there is one, and the cost behind that
+    step. Damping (Levenberg): what a log shows badly moves in small steps while the rest is still wrong. prior
+    (n_base,): information about nominal."""
     n, found_at = len(X), places(c, records)
     size = n + sum(len(r.origin) for r in records)
     information, slope = np.zeros((size, size)), np.zeros(size)
@@ -375,7 +384,8 @@ def newton_step(
     if not (np.diag(covariance) > 0).all():
         raise NotConverged("joint smoothing lost its numbers: check the log with `excite log check`")
     sigma = np.sqrt(np.diag(covariance))[:n]
-    left = float(np.abs((covariance @ slope)[:n] / sigma).max())
+    free = prior < HELD**-2
+    left = float(np.abs((covariance @ slope)[:n] / sigma)[free if free.any() else slice(None)].max())
     cost -= float(slope @ covariance @ slope)
     information[range(n), range(n)] += damping
     step = -np.linalg.solve(information, slope)

@@ -58,6 +58,10 @@ class Record:
     unbiased: bool = False
     coarse: float = 1.0
 
+    def until(self, samples: int) -> Record:
+        """The first samples only."""
+        return replace(self, torque=self.torque[:samples], reading=self.reading[:samples], used=self.used[:samples])
+
 
 @dataclass(frozen=True)
 class Point:
@@ -71,6 +75,10 @@ class Point:
     def errors(self) -> np.ndarray:
         """Torque errors of every sample (N, n_u); no interval leads on from the last, which has the one before."""
         return np.concatenate([self.w, self.w[-1:]])
+
+    def until(self, samples: int) -> Point:
+        """The first samples only."""
+        return replace(self, s=self.s[:samples], w=self.w[: samples - 1])
 
 
 def common_sensors(model: Model, logs: Sequence[Log]) -> tuple[str, ...]:

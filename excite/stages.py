@@ -32,6 +32,7 @@ FOLLOWED = 2.5  # misfit over readings up to which exact dynamics follow logs wh
 FAR = 10.0  # misfit over readings, a few passes after the beginning, from which no fit comes near
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 PASSES = 14  # of a fit that goes on from another
+ONSET = 30.0  # [s] that the beginning of a log has at least
 COARSE = 10.0, 30.0  # times their noise that sensors are taken to have where nothing follows the logs, in turn
 LESS = 0.1, 0.3  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
 SMALL = LESS[0] * smoothing.DISTURBED[0]  # the smallest that are tried
@@ -227,22 +228,26 @@ def sharpened(found: Sequence[Stage], disturbed: float, together: Together) -> I
         yield None if fit is None else Stage(x.machine, p, fit)
 
 
-def begun(machines: Sequence[Machine], of: Stage, disturbed: float, together: Together) -> Iterator[Stage | None]:
+def begun(
+    machines: Sequence[Machine], of: Stage, disturbed: float, together: Together, worth: float = np.inf
+) -> Iterator[Stage | None]:
     """Machines with other effects, each fitted to the logs of a stage from the beginning, with so large disturbing
-    forces or smaller ones, side by side; None where no fit is found. Where exact dynamics leave much, with small
-    disturbing forces after all, if they bring it near or it doesn't follow."""
+    forces or smaller ones, side by side; None where no fit is found. By exact dynamics none either where it costs more
+    than it is worth, or its beginning is FAR off already; where they leave much, with small disturbing forces after
+    all, if they bring it near or it doesn't follow."""
     prepared = [_noisy(_resumed(machine, of), 1.0) for machine in machines]
-    made = partial(_loosened, disturbed=disturbed) if disturbed > 0 else _plain
+    made = partial(_loosened, disturbed=disturbed) if disturbed > 0 else partial(_plain, worth=worth)
     calls = [partial(made, m, p) for m, p in zip(machines, prepared, strict=True)]
     for m, p, fits in zip(machines, prepared, together(calls), strict=True):
         yield _stage(m, p, fits) if fits else None
 
 
-def _from_first(prepared: Prepared, disturbed: float, most: float = np.inf) -> Fit | None:
-    """A fit from first guesses; None where none is found or it is given up, as it still costs more than `most`."""
+def _from_first(prepared: Prepared, disturbed: float, most: float = np.inf, worth: float = np.inf) -> Fit | None:
+    """A fit from first guesses; None where none is found or it is given up, as it still costs more than `most`, or
+    more than it is worth and no less than before."""
+    p, patient = prepared, disturbed == 0  # nearly is not enough then
     try:
-        nominal, patient = prepared.c.model.nominal, disturbed == 0  # nearly is not enough then
-        return light(_iterated(prepared, prepared.starts, nominal, disturbed, most=most, patient=patient))
+        return light(_iterated(p, p.starts, p.c.model.nominal, disturbed, most=most, patient=patient, worth=worth))
     except NotConverged as failed:
         return light(failed.nearly) if failed.nearly is not None and disturbed > 0 else None
 
@@ -306,10 +311,31 @@ def _with_less(stage: Stage) -> Stage | None:
     return None
 
 
-def _plain(machine: Machine, prepared: Prepared) -> Fits | None:
-    """A fit from first guesses by exact dynamics, or by small disturbing forces from there where much is left."""
-    fit = _from_first(prepared, 0.0, FAR * prepared.readings)
-    if fit is None:
+def _sets_out(prepared: Prepared) -> bool:
+    """Whether a model may follow the logs by exact dynamics, as far as the first quarter of each tells, which takes a
+    fraction of the time: what stays FAR off that is too far off the whole to follow it."""
+    rate = float(prepared.c.model.machine.sampling_hz)
+    samples = [max(round(ONSET * rate), len(r.used) // 4) for r in prepared.records]
+    records = tuple(r.until(n) for r, n in zip(prepared.records, samples, strict=True))
+    if sum(len(r.used) for r in records) > sum(len(r.used) for r in prepared.records) / 2:
+        return True
+    onset = replace(prepared, records=records, starts=tuple(map(Point.until, prepared.starts, samples)))
+    most = FAR * onset.readings
+    try:
+        _iterated(onset, onset.starts, onset.c.model.nominal, 0.0, passes=newton.SETTLED + 1, most=most)
+    except NotConverged as failed:
+        return failed.fit is None or failed.fit.cost <= most or failed.nearly is not None
+    return True
+
+
+def _plain(machine: Machine, prepared: Prepared, worth: float) -> Fits | None:
+    """A fit from first guesses by exact dynamics, or by small disturbing forces from there where much is left; None of
+    one that costs more than it is worth, or where it is worth any cost, as nothing else follows the logs, of one that
+    doesn't set out."""
+    if np.isinf(worth) and not _sets_out(prepared):
+        return None
+    fit = _from_first(prepared, 0.0, FAR * prepared.readings, worth)
+    if fit is None or fit.cost > worth:
         return None
     stage = Stage(machine, prepared, fit)
     if stage.near:
@@ -412,12 +438,13 @@ def _iterated(
     passes: int = newton.PASSES,
     most: float = np.inf,
     patient: bool = False,
+    worth: float = np.inf,
 ) -> Fit:
     """A fit from points and X. With disturbing forces it is found as soon as it is nearly: gains are larger by far than
     what another pass would change. Raises NotConverged."""
     p = prepared
     return newton.iterate(
-        p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, newton.NEARLY, most, patient
+        p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, newton.NEARLY, most, patient, worth
     )
 
 

@@ -157,7 +157,7 @@ def test_a_second_cause_with_which_exact_dynamics_follow_is_no_flaw_of_the_first
     both = prediction.build(placing.extended(straight.machine, slope))
     motion = simulate(both, gentle(straight, 30.0).u)
     one = log.check(sensors.measure(both, motion, seed=3), straight.machine)
-    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    stage = stages.forced(stages.fitted(straight.machine, [one], straight.machine.filter), in_turn)
     assert stage.fit.disturbed > 0
     scores = choosing.scored(stage, in_turn)
     first = choosing.Choice("torque_gain@rear_roll", stage, 6 * scores[0].gain, 1.0, 200, (), 1.0)
@@ -571,6 +571,122 @@ def test_a_fit_whose_steps_cease_to_shrink_ends(straight: Model, monkeypatch: py
             hopeless = newton.HOPELESS[0] + 1 if patient and not found else passes
             assert 14 - len(steps) == hopeless
             assert (failed.value.nearly is not None) == found
+
+
+def test_a_fit_that_is_not_worth_more_passes_is_given_up(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As soon as its cost doesn't fall in two passes, from the fourth on; not while it falls, nor where it costs no
+    more."""
+    stage = calm(straight)
+    p, true = stage.prepared, newton.newton_step
+    seen: list[Any] = []
+
+    def scripted(c: Any, records: Any, linear: Any, *asked: Any) -> Any:
+        covariance, move, *_ = true(c, records, linear, *asked)
+        if not any(linear is x for x in seen):  # one pass is computed twice
+            seen.append(linear)
+        return covariance, move, 50.0, costs[min(len(seen), len(costs)) - 1]
+
+    monkeypatch.setattr(newton, "newton_step", scripted)
+    for costs, spent in (
+        ([900.0, 900.0], 4),
+        ([900.0, 800.0, 700.0, 600.0, 550.0, 549.0, 548.0], 7),
+        ([900.0, 400.0, 300.0, 450.0], 8),
+        ([900.0, 400.0, 300.0, 600.0], 4),
+    ):
+        seen.clear()
+        with pytest.raises(newton.NotConverged) as failed:
+            newton.iterate(p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.0, p.held, passes=8, worth=500.0)
+        assert len(seen) == spent
+        assert failed.value.fit is not None
+        assert failed.value.fit.cost == costs[-1]
+
+
+def test_what_is_held_is_where_it_is_held_a_pass_later(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However far it went until the log was known not to show it, and however much it makes sense above zero only; how
+    far it is from there is no step, but nothing is found, not even nearly, before it is there."""
+    stage = calm(straight)
+    p, true, scale = stage.prepared, newton.newton_step, stage.model.scale
+    nominal = stage.model.nominal
+    sure = stage.fit.std / np.maximum(np.abs(stage.fit.X), scale)
+    worst = int(np.argmax(np.where(p.held, 0.0, sure)))
+    seen: list[tuple[float, float]] = []
+    steps: list[float] = []
+
+    def blind(c: Any, records: Any, linear: Any, points: Any, X: np.ndarray, prior: np.ndarray, damping: float) -> Any:
+        covariance, move, step, cost = true(c, records, linear, points, X, prior, damping)
+        if prior[worst] < newton.HELD**-2:
+            covariance[worst, worst] = 1e6
+        seen.append((X[worst], step))
+        return covariance, move, steps.pop(0) if steps else step, cost
+
+    monkeypatch.setattr(newton, "newton_step", blind)
+    monkeypatch.setattr(newton, "LARGEST_STEP", 0.01)
+    monkeypatch.setattr(type(stage.model), "positive", np.arange(len(scale)) == worst)
+    X = stage.fit.X + 30 * scale * (np.arange(len(scale)) == worst)
+    for told, disturbed in (([], 0.0), ([50.0, 50.0, 50.0, 50.0, 0.005], 0.0), ([50.0, 50.0, 50.0, 50.0, 0.1], 0.1)):
+        seen.clear()
+        steps[:] = [*told, *[50.0 for _ in told]]
+        with pytest.raises(newton.NotConverged) as failed:  # the others only creep
+            newton.iterate(p.c, p.records, stage.fit.points, X, p.starts, disturbed, p.held, 0.0, passes=7)
+        assert abs(seen[newton.SETTLED][0] - nominal[worst]) > 20 * scale[worst]
+        # The pass in which it is held is computed twice.
+        assert seen[newton.SETTLED + 2][0] == pytest.approx(nominal[worst], abs=newton.AWAY * scale[worst])
+        assert max(step for _, step in seen[newton.SETTLED + 1 :]) < 1e4
+        assert failed.value.fit is not None
+        assert failed.value.fit.unseen[worst]
+        assert failed.value.nearly is None or not told
+
+
+def test_the_whole_log_is_fitted_where_its_beginning_can_be(
+    sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cause that leaves a quarter of a log far off leaves all of it so. A log that is hardly longer is fitted at
+    once, and so is one that is followed without any cause: then none is waited for that costs more than it is worth."""
+    one = log.read(sloping, straight.machine)
+    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    true, lengths = newton.iterate, list[int]()
+
+    def counted(c: Any, records: Any, *asked: Any) -> newton.Fit:
+        lengths.append(len(records[0].used))
+        return true(c, records, *asked)
+
+    monkeypatch.setattr(newton, "iterate", counted)
+    right = placing.extended(straight.machine, _slope(straight))
+    wrong = placing.extended(straight.machine, placing.parse("brake_drag@rear_roll=50", straight.machine, 40.0))
+    (good,) = stages.begun([right], stage, 0.0, in_turn)
+    assert good is not None
+    cost, whole = good.fit.cost, len(one)
+    for onset, worth, first, follows in (
+        (5.0, np.inf, whole // 4, True),
+        (15.0, np.inf, 1500, True),
+        (30.0, np.inf, whole, True),
+        (5.0, cost + 1, whole, True),
+        (5.0, cost - 1, whole, False),
+    ):
+        monkeypatch.setattr(stages, "ONSET", onset)
+        for machines, found in ((right, follows), (wrong, False)):
+            lengths.clear()
+            (made,) = stages.begun([machines], stage, 0.0, in_turn, worth)
+            assert (made is not None and made.near) == found
+            assert lengths[0] == first
+            assert (max(lengths) == whole) == (found or first == whole)
+
+
+def test_what_begins_anew_beside_exact_dynamics_must_take_a_good_part_of_the_misfit(
+    straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where none could be fitted, or forces had to help, anything that lets the model follow the log will do."""
+    stage, asked = calm(straight), list[float]()
+
+    def begin(machines: Any, of: Any, disturbed: float, together: Any, worth: float) -> list[None]:
+        asked.append(worth)
+        return [None for _ in machines]
+
+    monkeypatch.setattr("excite.choosing.begun", begin)
+    far = replace(stage, fit=replace(stage.fit, cost=2 * stage.noise))
+    for of in (far, replace(far, settled=False), replace(far, fit=replace(far.fit, disturbed=0.1))):
+        assert choosing.unlikely(of, of, (), in_turn) == (of, [])
+    assert asked == [pytest.approx(2 * stage.noise - 0.3 * 0.98 * stage.noise), np.inf, np.inf]
 
 
 def test_a_fit_that_fails_stands_where_it_was_as_good_as_found(
