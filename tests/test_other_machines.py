@@ -454,7 +454,13 @@ def test_a_diagnosis_names_what_a_robot_has(biased: tuple[Motion, Diagnosis]) ->
         assert np.quantile(np.abs(own - slip), 0.99) < 0.1 * np.ptp(slip)  # not at rest, where a log says little
 
 
-@pytest.mark.parametrize("cause", ["rolling_resistance@front_roll=300", "shear_saturation@front_roll=0.2"])
+@pytest.mark.parametrize(
+    "cause",
+    [
+        pytest.param("rolling_resistance@front_roll=300", marks=pytest.mark.slow),
+        "shear_saturation@front_roll=0.2",
+    ],
+)
 def test_a_diagnosis_names_what_a_roll_has_that_nothing_drives(cause: str) -> None:
     """On the three-wheel roller's designed drive, by the right name, place and amount."""
     model = model_of("three_wheel")
