@@ -621,7 +621,7 @@ def test_what_is_held_is_where_it_is_held_a_pass_later(straight: Model, monkeypa
 
     monkeypatch.setattr(newton, "newton_step", blind)
     monkeypatch.setattr(newton, "LARGEST_STEP", 0.01)
-    monkeypatch.setattr(type(stage.model), "positive", np.arange(len(scale)) == worst)
+    monkeypatch.setitem(vars(p.c.model), "positive", np.arange(len(scale)) == worst)
     X = stage.fit.X + 30 * scale * (np.arange(len(scale)) == worst)
     for told, disturbed in (([], 0.0), ([50.0, 50.0, 50.0, 50.0, 0.005], 0.0), ([50.0, 50.0, 50.0, 50.0, 0.1], 0.1)):
         seen.clear()
