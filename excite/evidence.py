@@ -272,12 +272,12 @@ def _free(c: Chart) -> list[int]:
 def _slopes(c: Chart, p: Point, u: np.ndarray, X: np.ndarray) -> np.ndarray:
     """What half a torque and half a force on each row without an actuator, at both ends of each interval, do to the
     scaled state behind it (N - 1, n, n_u + n_free)."""
-    N, scale = len(p.s), newton.state_scale(c)
-    found = np.empty((N - 1, c.n, u.shape[1] + len(_free(c))), np.float32)
+    N, scale, free = len(p.s), newton.state_scale(c), _free(c)
+    found = np.empty((N - 1, c.n, u.shape[1] + len(free)), np.float32)
     for at in range(0, N - 1, BATCH):
         until = min(at + BATCH, N - 1)
         by = differentiate(c, p.s[at : until + 1], u[at:until], u[at + 1 : until + 1], X, force=True)
-        found[at:until] = np.concatenate([by.B, by.F[:, :, _free(c)]], axis=2) / (2 * scale[:, None])
+        found[at:until] = np.concatenate([by.B, by.F[:, :, free]], axis=2) / (2 * scale[:, None])
     return found
 
 

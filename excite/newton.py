@@ -268,7 +268,7 @@ def iterate(
         costs.append(cost)
         if k >= SETTLED and cost > most and step > NEARLY:
             break
-        if k >= SETTLED and cost > worth and len(costs) > 2 and cost > (1 - FALLING) * costs[-3]:
+        if k >= SETTLED and cost > worth and _level(costs):
             break
         if not patient and _idle(sizes, costs):
             waited = True
@@ -284,10 +284,10 @@ def iterate(
         limit = LARGEST_STEP * np.maximum(np.abs(X) / model.scale, 1.0)
         for m in move:
             # What is held from now on goes back to its value at once, and the others along as far as they may.
-            free = np.clip((1.0 if away else whole) * m[: len(X)], -limit, limit)
+            own = np.clip((1.0 if away else whole) * m[: len(X)], -limit, limit)
             # Amounts that make sense above zero only stay there.
             low = np.where(model.positive, -0.8 * X / model.scale, -np.inf)
-            m[: len(X)] = np.where(unseen, m[: len(X)], np.maximum(free, low))
+            m[: len(X)] = np.where(unseen, m[: len(X)], np.maximum(own, low))
         there = (
             [moved(c, r, p, f, m) for r, p, f, m in zip(records, points, linear, move, strict=True)],
             X + move[0][: len(X)] * model.scale,
@@ -326,7 +326,12 @@ def _idle(steps: Sequence[float], costs: Sequence[float]) -> bool:
     if steps[-1] <= NEARLY:
         return steps[-1] > IDLE[0] * steps[-3]
     still = steps[-1] > IDLE[1] * steps[-3] and steps[-2] > IDLE[1] * steps[-4]
-    return len(steps) > SETTLED + 2 and still and costs[-1] > (1 - FALLING) * costs[-3]
+    return len(steps) > SETTLED + 2 and still and _level(costs)
+
+
+def _level(costs: Sequence[float]) -> bool:
+    """Whether costs have ceased to fall."""
+    return len(costs) > 2 and costs[-1] > (1 - FALLING) * costs[-3]
 
 
 def linearised(
