@@ -107,6 +107,12 @@ def _sureness(stage: Stage) -> float:
 def scored(stage: Stage, together: Together) -> tuple[evidence.Score, ...]:
     """What every effect that a model does not have promises, best first. None that is as well a harmonic of what it
     has: of a ripple of one contact, say, when all turn at about the same speed."""
+    if not stage.scores:
+        stage.scores.append(_scored(stage, together))
+    return stage.scores[0]
+
+
+def _scored(stage: Stage, together: Together) -> tuple[evidence.Score, ...]:
     known = [e.name for e in stage.model.effects]
     sensors = [s.name for s in stage.prepared.c.sensors]
     found = evidence.candidates(stage.machine, sensors, _duration(stage.prepared.logs))

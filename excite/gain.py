@@ -122,7 +122,7 @@ def _hidden(
                 disturbed,
                 held,
                 newton.RESUMED,
-                enough=newton.NEARLY,
+                enough=newton.NEARLY if disturbed > 0 else newton.ENOUGH,
                 patient=False,
             )
         except NotConverged as failed:

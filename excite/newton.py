@@ -34,7 +34,7 @@ FALLING = 0.01  # of a cost, in two passes
 ALIKE = 0.05  # of a cost: what swinging steps change
 NEARLY = 1.0  # a step, in standard deviations, at which a fit that runs out of passes is as good as found
 CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviations
-ENOUGH = 0.2  # likewise with disturbing forces, whose deviations are no promise
+ENOUGH = 0.2  # a step, in standard deviations, with disturbing forces, whose deviations are no promise
 # Steps that turn back and hardly shrink are shortened by TURNED; others grow by SHARE up to the whole.
 TURNED, SHARE, SLOW = 0.7, 1.15, 0.3
 FREE = 0.05  # of a parameter's size, in the last step: it is hardly known
@@ -212,20 +212,23 @@ def iterate(
     held: np.ndarray,
     damping: float = DAMPING[0],
     passes: int = PASSES,
-    enough: float = ENOUGH,
+    enough: float | None = None,
     most: float = np.inf,
     patient: bool = True,
     worth: float = np.inf,
 ) -> Fit:
     """Gauss-Newton from points and X; the prior stands about the machine file's values and the states of `starts`.
     Parameters `held` (n_base,) stay at the file's values. damping: of the first step; passes: at most; enough: a step,
-    in standard deviations, at which a fit with disturbing forces is found; most: cost above which a fit is given up
-    once the states fit the dynamics; worth: cost above which it is given up as soon as costs fall no more. Not
-    `patient`: no passes are spent on steps that have ceased to shrink.
+    in standard deviations, at which a fit is found, however much is left undone: ENOUGH with disturbing forces, none
+    without, if not given; most: cost above which a fit is given up once the states fit the dynamics; worth: cost above
+    which it is given up as soon as costs fall no more. Not `patient`: no passes are spent on steps that have ceased to
+    shrink.
 
     Raises NotConverged.
     """
     model = c.model
+    if enough is None:
+        enough = ENOUGH if disturbed > 0 else 0.0
     step, before = np.inf, np.inf
     sizes, costs = list[float](), list[float]()
     shorter, here = 0, (list(points), X)
@@ -295,7 +298,7 @@ def iterate(
         # What this step will have left undone, if steps go on shrinking as they do.
         ratio = min(max(step / before, 1 - whole), 0.9)
         done = step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED
-        if not away and (done or (disturbed > 0 and step < enough)):
+        if not away and (done or step < enough):
             # What is hardly known may have gone where no motion is: other fits must be able to go on from here.
             far = (np.abs(there[1] - X) > FREE * np.maximum(np.abs(X), model.scale)).any()
             if far and linearised(c, records, there[0], starts, there[1], disturbed) is None:

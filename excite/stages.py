@@ -108,6 +108,11 @@ class Stage:
         """The fitted logs, along which candidates are scored."""
         return evidence.ways(self.prepared.c, self.prepared.records, self.fit)
 
+    @cached_property
+    def scores(self) -> list[tuple[evidence.Score, ...]]:
+        """What candidates scored along them, once that was asked."""
+        return []
+
     @property
     def follows(self) -> bool:
         """Whether exact dynamics follow the logs, by far better than where nothing does: a formula that is nearly right
@@ -176,16 +181,17 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Toge
 
 
 def forced(stage: Stage, together: Together) -> Stage:
-    """In place of a fit with coarse sensors one with disturbing forces, no matter how much they leave. Where not even
-    large ones let the model follow, with the file's parameters: what these leave shows where to look. Raises
-    NotConverged where those don't either."""
+    """In place of a fit with coarse sensors one with disturbing forces, however much they leave that isn't FAR off.
+    Where not even large ones let the model follow, with the file's parameters: what these leave shows where to look.
+    Raises NotConverged where those don't either."""
     if stage.loose is not None:
         return _with_least(stage.loose)
     return _forced(stage.machine, _noisy(stage.prepared, 1.0), smoothing.DISTURBED[1:], together)
 
 
 def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float], together: Together) -> Stage:
-    with closing(together([partial(_loosened, machine, prepared, d) for d in forces])) as ways:
+    calls = [partial(_disturbed, machine, prepared, d, FAR * prepared.readings) for d in forces]
+    with closing(together(calls)) as ways:
         found = next((fits for fits in ways if fits), None)
     if found is not None:
         return exact_if_near(_stage(machine, prepared, found))
@@ -232,11 +238,11 @@ def begun(
     machines: Sequence[Machine], of: Stage, disturbed: float, together: Together, worth: float = np.inf
 ) -> Iterator[Stage | None]:
     """Machines with other effects, each fitted to the logs of a stage from the beginning, with so large disturbing
-    forces or smaller ones, side by side; None where no fit is found. By exact dynamics none either where it costs more
-    than it is worth, or its beginning is FAR off already; where they leave much, with small disturbing forces after
-    all, if they bring it near or it doesn't follow."""
+    forces or smaller ones, side by side; None where no fit is found, nor with forces one that is near. By exact
+    dynamics none either where it costs more than it is worth, or its beginning is FAR off already; where they leave
+    much, with small disturbing forces after all, if they bring it near or it doesn't follow."""
     prepared = [_noisy(_resumed(machine, of), 1.0) for machine in machines]
-    made = partial(_loosened, disturbed=disturbed) if disturbed > 0 else partial(_plain, worth=worth)
+    made = partial(_near, disturbed=disturbed) if disturbed > 0 else partial(_plain, worth=worth)
     calls = [partial(made, m, p) for m, p in zip(machines, prepared, strict=True)]
     for m, p, fits in zip(machines, prepared, together(calls), strict=True):
         yield _stage(m, p, fits) if fits else None
@@ -267,19 +273,14 @@ def _coarsely(prepared: Prepared) -> tuple[Fit, float] | None:
     return None
 
 
-def _disturbed(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
-    """A fit from first guesses with disturbing forces, and from there with smaller ones where it is near."""
-    fit = _from_first(prepared, disturbed)
-    if fit is None:
+def _disturbed(machine: Machine, prepared: Prepared, disturbed: float, worth: float = np.inf) -> Fits | None:
+    """A fit from first guesses with disturbing forces, and from there with smaller ones where it is near; None of one
+    that costs more than it is worth."""
+    fit = _from_first(prepared, disturbed, worth=worth)
+    if fit is None or fit.cost > worth:
         return None
     stage = Stage(machine, prepared, fit)
     return _lessened(stage) if stage.near else (fit, None)
-
-
-def _loosened(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
-    """The same with smaller ones no matter how near it is."""
-    fit = _from_first(prepared, disturbed)
-    return None if fit is None else _lessened(Stage(machine, prepared, fit))
 
 
 def _with_least(stage: Stage) -> Stage:
@@ -311,28 +312,35 @@ def _with_less(stage: Stage) -> Stage | None:
     return None
 
 
-def _sets_out(prepared: Prepared) -> bool:
-    """Whether a model may follow the logs by exact dynamics, as far as the first quarter of each tells, which takes a
-    fraction of the time: what stays FAR off that is too far off the whole to follow it."""
+def _sets_out(prepared: Prepared, disturbed: float) -> bool:
+    """Whether a model may follow the logs by exact dynamics, or come near them with disturbing forces, as far as the
+    first quarter of each tells, which takes a fraction of the time: what stays FAR off that is too far off the whole to
+    follow it, and what costs more there than noise costs near the whole isn't near it."""
     rate = float(prepared.c.model.machine.sampling_hz)
     samples = [max(round(ONSET * rate), len(r.used) // 4) for r in prepared.records]
     records = tuple(r.until(n) for r, n in zip(prepared.records, samples, strict=True))
     if sum(len(r.used) for r in records) > sum(len(r.used) for r in prepared.records) / 2:
         return True
     onset = replace(prepared, records=records, starts=tuple(map(Point.until, prepared.starts, samples)))
-    most = FAR * onset.readings
+    most = FAR * onset.noise if disturbed == 0 else onset.noise + (STRONG - 1) * prepared.noise
     try:
-        _iterated(onset, onset.starts, onset.c.model.nominal, 0.0, passes=newton.SETTLED + 1, most=most)
+        _iterated(onset, onset.starts, onset.c.model.nominal, disturbed, passes=newton.SETTLED + 1, most=most)
     except NotConverged as failed:
         return failed.fit is None or failed.fit.cost <= most or failed.nearly is not None
     return True
+
+
+def _near(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
+    """A fit from first guesses with disturbing forces, or with smaller ones from there; None of one that isn't near the
+    logs."""
+    return _disturbed(machine, prepared, disturbed, STRONG * prepared.noise) if _sets_out(prepared, disturbed) else None
 
 
 def _plain(machine: Machine, prepared: Prepared, worth: float) -> Fits | None:
     """A fit from first guesses by exact dynamics, or by small disturbing forces from there where much is left; None of
     one that costs more than it is worth, or where it is worth any cost, as nothing else follows the logs, of one that
     doesn't set out."""
-    if np.isinf(worth) and not _sets_out(prepared):
+    if np.isinf(worth) and not _sets_out(prepared, 0.0):
         return None
     fit = _from_first(prepared, 0.0, FAR * prepared.readings, worth)
     if fit is None or fit.cost > worth:
@@ -377,7 +385,7 @@ def freed(found: Sequence[Stage], together: Together) -> Iterator[Stage | None]:
 
 def exact_if_near(stage: Stage) -> Stage:
     """A stage without its disturbing forces where exact dynamics come near the logs, otherwise as it is."""
-    without = None if stage.exact else next(freed([stage], in_turn))
+    without = None if stage.exact or not stage.near else next(freed([stage], in_turn))
     return without if without is not None and without.near else stage
 
 
@@ -442,9 +450,9 @@ def _iterated(
 ) -> Fit:
     """A fit from points and X. With disturbing forces it is found as soon as it is nearly: gains are larger by far than
     what another pass would change. Raises NotConverged."""
-    p = prepared
+    p, enough = prepared, newton.NEARLY if disturbed > 0 else None
     return newton.iterate(
-        p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, newton.NEARLY, most, patient, worth
+        p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, enough, most, patient, worth
     )
 
 

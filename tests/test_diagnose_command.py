@@ -573,6 +573,25 @@ def test_a_fit_whose_steps_cease_to_shrink_ends(straight: Model, monkeypatch: py
             assert (failed.value.nearly is not None) == found
 
 
+def test_a_fit_is_found_where_its_steps_are_small_enough(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With disturbing forces, whose deviations are no promise, sooner than without, unless that is asked for."""
+    stage = calm(straight)
+    p, true = stage.prepared, newton.newton_step
+    steps: list[float] = []
+
+    def scripted(*args: Any) -> Any:
+        covariance, move, _, cost = true(*args)
+        return covariance, move, steps.pop(0), cost
+
+    monkeypatch.setattr(newton, "newton_step", scripted)
+    for disturbed, enough, spent in ((0.0, None, 5), (0.1, None, 4), (0.0, newton.ENOUGH, 4), (0.1, newton.NEARLY, 3)):
+        steps[:] = [5.0, 1.5, 0.5, 0.15, 1e-4, 1e-4]
+        newton.iterate(
+            p.c, p.records, stage.fit.points, stage.fit.X, p.starts, disturbed, p.held, passes=6, enough=enough
+        )
+        assert 6 - len(steps) == spent
+
+
 def test_a_fit_that_is_not_worth_more_passes_is_given_up(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """As soon as its cost doesn't fall in two passes, from the fourth on; not while it falls, nor where it costs no
     more."""
@@ -670,6 +689,55 @@ def test_the_whole_log_is_fitted_where_its_beginning_can_be(
             assert (made is not None and made.near) == found
             assert lengths[0] == first
             assert (max(lengths) == whole) == (found or first == whole)
+    # Disturbing forces must bring it near, and so they must the quarter.
+    for onset, first in ((5.0, whole // 4), (30.0, whole)):
+        monkeypatch.setattr(stages, "ONSET", onset)
+        for machines, found in ((right, True), (wrong, False)):
+            lengths.clear()
+            (made,) = stages.begun([machines], stage, 1.0, in_turn)
+            assert (made is not None and made.near) == found
+            assert lengths[0] == first
+            assert (max(lengths) == whole) == (found or first == whole)
+
+
+def test_forces_that_leave_much_have_nothing_left_to_give_up(
+    sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Smaller ones, or none, leave more. Where they leave the model far off, the file's parameters show where to
+    look."""
+    one = log.read(sloping, straight.machine)
+    far = stages.fitted(straight.machine, [one], straight.machine.filter)
+    assert far.prepared.coarse > 1
+    assert far.loose is not None
+    far = replace(far, loose=None)
+    told = stages.forced(far, in_turn)
+    assert told.settled
+    assert told.fit.disturbed > 0
+    assert told.fit.cost > 0.5 * told.prepared.readings
+    monkeypatch.setattr(stages, "freed", lambda *asked: pytest.fail("tried without"))
+    much = replace(told, fit=replace(told.fit, cost=1.01 * stages.STRONG * told.noise))
+    assert stages.exact_if_near(much) is much
+    monkeypatch.setattr(stages, "FAR", 0.5)
+    left = stages.forced(far, in_turn)
+    assert not left.settled
+    np.testing.assert_allclose(left.fit.X, straight.nominal, rtol=1e-3)
+
+
+def test_candidates_are_scored_once_along_a_fit(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Along another one anew, however alike."""
+    stage, scans = calm(straight), list[newton.Fit]()
+    true = choosing.evidence.scan
+
+    def noted(along: Any, fit: newton.Fit, *asked: Any) -> Any:
+        scans.append(fit)
+        return true(along, fit, *asked)
+
+    monkeypatch.setattr(choosing.evidence, "scan", noted)
+    first = choosing.scored(stage, in_turn)
+    assert choosing.scored(stage, in_turn) is first
+    other = replace(stage, fit=replace(stage.fit, cost=2 * stage.fit.cost))
+    assert [s.gain for s in choosing.scored(other, in_turn)] == [s.gain for s in first]
+    assert scans == [stage.fit, other.fit]
 
 
 def test_what_begins_anew_beside_exact_dynamics_must_take_a_good_part_of_the_misfit(
