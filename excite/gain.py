@@ -122,6 +122,7 @@ def _hidden(
                 disturbed,
                 held,
                 newton.RESUMED,
+                # What it predicts is asked for, not its deviations.
                 enough=newton.NEARLY if disturbed > 0 else newton.ENOUGH,
                 patient=False,
             )

@@ -34,7 +34,7 @@ FALLING = 0.01  # of a cost, in two passes
 ALIKE = 0.05  # of a cost: what swinging steps change
 NEARLY = 1.0  # a step, in standard deviations, at which a fit that runs out of passes is as good as found
 CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviations
-ENOUGH = 0.2  # a step, in standard deviations, with disturbing forces, whose deviations are no promise
+ENOUGH = 0.2  # a step, in standard deviations, at which a fit is found whose deviations are no promise
 # Steps that turn back and hardly shrink are shortened by TURNED; others grow by SHARE up to the whole.
 TURNED, SHARE, SLOW = 0.7, 1.15, 0.3
 FREE = 0.05  # of a parameter's size, in the last step: it is hardly known

@@ -110,7 +110,7 @@ class Stage:
 
     @cached_property
     def scores(self) -> list[tuple[evidence.Score, ...]]:
-        """What candidates scored along them, once that was asked."""
+        """What candidates score along this fit: empty until `choosing.scored` puts it here."""
         return []
 
     @property
@@ -181,9 +181,9 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Toge
 
 
 def forced(stage: Stage, together: Together) -> Stage:
-    """In place of a fit with coarse sensors one with disturbing forces, however much they leave that isn't FAR off.
-    Where not even large ones let the model follow, with the file's parameters: what these leave shows where to look.
-    Raises NotConverged where those don't either."""
+    """In place of a fit with coarse sensors one with disturbing forces, no matter how much the smaller ones leave.
+    Where large ones find none, or leave the model FAR off, one with the file's parameters: what these leave shows where
+    to look. Raises NotConverged where those don't either."""
     if stage.loose is not None:
         return _with_least(stage.loose)
     return _forced(stage.machine, _noisy(stage.prepared, 1.0), smoothing.DISTURBED[1:], together)
@@ -238,11 +238,12 @@ def begun(
     machines: Sequence[Machine], of: Stage, disturbed: float, together: Together, worth: float = np.inf
 ) -> Iterator[Stage | None]:
     """Machines with other effects, each fitted to the logs of a stage from the beginning, with so large disturbing
-    forces or smaller ones, side by side; None where no fit is found, nor with forces one that is near. By exact
-    dynamics none either where it costs more than it is worth, or its beginning is FAR off already; where they leave
-    much, with small disturbing forces after all, if they bring it near or it doesn't follow."""
+    forces or smaller ones, side by side; None where no fit is found. With forces none either where so large ones don't
+    bring it near, or its beginning tells that they won't. By exact dynamics none where it costs more than it is worth,
+    or its beginning is FAR off already; where they leave much, with small disturbing forces after all, if they bring it
+    near or it doesn't follow."""
     prepared = [_noisy(_resumed(machine, of), 1.0) for machine in machines]
-    made = partial(_near, disturbed=disturbed) if disturbed > 0 else partial(_plain, worth=worth)
+    made = partial(_brought_near, disturbed=disturbed) if disturbed > 0 else partial(_plain, worth=worth)
     calls = [partial(made, m, p) for m, p in zip(machines, prepared, strict=True)]
     for m, p, fits in zip(machines, prepared, together(calls), strict=True):
         yield _stage(m, p, fits) if fits else None
@@ -291,8 +292,8 @@ def _with_least(stage: Stage) -> Stage:
 
 
 def _lessened(first: Stage) -> Fits:
-    """A fit with smaller disturbing forces, as long as these let the model come near the logs: large ones hide what
-    else there is. And the one that it came from."""
+    """A fit with smaller disturbing forces, and smaller ones yet as long as these let the model come near the logs:
+    large ones hide what else there is. And the one that it came from."""
     stage = _with_less(first)
     if stage is None:
         return first.fit, None
@@ -314,25 +315,29 @@ def _with_less(stage: Stage) -> Stage | None:
 
 def _sets_out(prepared: Prepared, disturbed: float) -> bool:
     """Whether a model may follow the logs by exact dynamics, or come near them with disturbing forces, as far as the
-    first quarter of each tells, which takes a fraction of the time: what stays FAR off that is too far off the whole to
-    follow it, and what costs more there than noise costs near the whole isn't near it."""
+    first quarter of each tells, which takes a fraction of the time. What stays FAR off that is too far off the whole to
+    follow it; what leaves more there, beside noise, than the whole may leave and still be near, isn't near the whole.
+    """
     rate = float(prepared.c.model.machine.sampling_hz)
     samples = [max(round(ONSET * rate), len(r.used) // 4) for r in prepared.records]
     records = tuple(r.until(n) for r, n in zip(prepared.records, samples, strict=True))
     if sum(len(r.used) for r in records) > sum(len(r.used) for r in prepared.records) / 2:
         return True
     onset = replace(prepared, records=records, starts=tuple(map(Point.until, prepared.starts, samples)))
-    most = FAR * onset.noise if disturbed == 0 else onset.noise + (STRONG - 1) * prepared.noise
+    most = onset.noise + (STRONG - 1) * prepared.noise if disturbed > 0 else FAR * onset.noise
     try:
-        _iterated(onset, onset.starts, onset.c.model.nominal, disturbed, passes=newton.SETTLED + 1, most=most)
+        fit = _iterated(onset, onset.starts, onset.c.model.nominal, disturbed, passes=newton.SETTLED + 1, most=most)
     except NotConverged as failed:
-        return failed.fit is None or failed.fit.cost <= most or failed.nearly is not None
-    return True
+        if failed.fit is None:
+            return True
+        fit, found = failed.fit, failed.nearly is not None
+    else:
+        found = True
+    return fit.cost <= most or (found and disturbed == 0)
 
 
-def _near(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
-    """A fit from first guesses with disturbing forces, or with smaller ones from there; None of one that isn't near the
-    logs."""
+def _brought_near(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
+    """A fit from first guesses with disturbing forces that bring it near the logs, and from there with smaller ones."""
     return _disturbed(machine, prepared, disturbed, STRONG * prepared.noise) if _sets_out(prepared, disturbed) else None
 
 
