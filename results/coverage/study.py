@@ -229,9 +229,8 @@ they give then allows for disturbing forces, and its intervals are said not to h
 Asked for: coverage of the 95 % intervals 93-97 % on average and 88 % for every parameter; rms error 0.9-1.15 predicted
 deviations; at most 2 % of logs without an estimate, 10 % from far off; worst and median true error 1.2 and 0.25 %
 (R60_accuracy), 2.0 and 0.4 % (human), 10 and 1.6 % (R60). Of 60 runs one parameter's coverage is known to 6 % only
-(two deviations): the least of 22 of them misses 88 % in two sets, of 400 runs in none. True error is the rms over runs
-relative to the true value; the bound is Cramer and Rao's along the first drive. Seconds are of one core's own time on a
-machine that other work kept busy.
+(two deviations). True error is the rms over runs relative to the true value; the bound is Cramer and Rao's along the
+first drive. Seconds are of one core's own time on a machine that other work kept busy.
 """
 EDGES = """
 ## One-way drives: why Fs and u0 are stated too wide
