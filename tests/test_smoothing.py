@@ -437,7 +437,7 @@ def test_the_likelihood_is_followed_where_a_drive_shows_little(va12: Model) -> N
             replace(c, model=there), records, fit.points, X, starts, 0.0, way[:n] > 0, damping=newton.RESUMED
         )
         assert width == pytest.approx(2 / np.sqrt(held.cost - fit.cost), rel=0.05)
-    assert max(widths) > 1.3 * min(widths)
+    assert max(widths) > 1.2 * min(widths)
     estimate = identify(va12, [log], "joint")
     low, high = np.abs(estimate.interval95 - estimate.value)
     assert (high[k] - low[k]) * (widths[1] - widths[0]) > 0
