@@ -42,9 +42,10 @@ OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
 # Of what is explained already, that a further effect must gain, as nature is never exactly the formula: by the fits'
 # gains, and by how many deviations the amounts are from none; the more where parameters absorb most of an effect, as
-# they absorb none of its formula's error; for what acts at some time only; where forces hide how good the formula is.
+# they absorb none of its formula's error; for what acts at some time only; where forces hide how good the formula is;
+# beside what a map of the ground tells, as two maps of one ground differ by up to 1.3 %.
 SHAPE = 0.005, 0.002
-ABSORBED, TIMED, HIDDEN = 0.1, 0.1, 0.25
+ABSORBED, TIMED, HIDDEN, MAPPED = 0.1, 0.1, 0.25, 0.02
 MUCH = 0.1  # misfit beside noise, over what noise makes, of which one further effect takes away all only as a cause
 ALIKE = 0.03  # of an amount: what two formulas of one effect differ by; those of results/diagnosis do by 1 to 6 %
 BESIDE = 250.0  # a gain that by the latter no effect can be denied, nor counted as a rival
@@ -373,7 +374,9 @@ def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate
     """What an effect must gain to be worth a place beside those that were chosen. hidden: of what they gained, where
     forces hide how good their formulas are; none where exact dynamics come near the logs with it."""
     part = max(SHAPE[0], TIMED * candidate.placed.effect.timed, hidden * (not stage.exact))
-    shape = sum(max(part, min(ALIKE**2 / x.left, ABSORBED)) * x.gain for x in chosen)
+    mapped = {e.name for e in stage.model.effects if e.mapped}
+    own = (max(min(ALIKE**2 / x.left, ABSORBED), MAPPED * (x.name in mapped)) for x in chosen)
+    shape = sum(max(part, share) * x.gain for share, x in zip(own, chosen, strict=True))
     return max(LEAST[stage.rough] * stage.excess, shape, min(SHAPE[1] * _sureness(stage), BESIDE))
 
 

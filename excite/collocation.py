@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from excite.limit import REST_POSITION, Limit, Symbols, limits, of_lane, rest_tolerances, resting, symbols
+from excite.simulate import Motion
 from model.machine import Problem
 from model.prediction import Model
 
@@ -55,7 +56,8 @@ class Transcription:
     """The nonlinear program's data. K intervals, J nodes in each, states z (n_z,), torques u (n_u,).
 
     A node's sample is s = (z, dz/dt, u), all scaled; `spread` (J, n_s, n_z + J n_z + 2 n_u) makes it from an interval's
-    left state, node states, left and right torque. Functions of it: residual (n_z,) of the equations of motion,
+    left state, node states, left and right torque. over (K J, n_over): what a map of the ground tells at the nodes,
+    which is taken as known. Functions of a sample and of that: residual (n_z,) of the equations of motion,
     limits (n_g,) scaled to -1..1, entries (n_a,) of the information matrices on and above their diagonals, one matrix
     after the other; `weight` (K J,) sums them as if over every sample of a motion.
     """
@@ -82,6 +84,7 @@ class Transcription:
     band: np.ndarray
     loose: np.ndarray
     spread: np.ndarray
+    over: np.ndarray
     values: Mapped = field(repr=False)
     first: Mapped = field(repr=False)
     second: Mapped = field(repr=False)
@@ -139,10 +142,10 @@ def settle(tr: Transcription, start: np.ndarray, U: np.ndarray, guess: np.ndarra
     Z = np.empty_like(guess)
     left = start
     for k in range(tr.intervals):
-        u = U[k : k + 2].ravel()
-        x, size = _follow(tr, left, guess[k].ravel(), u)
+        u, over = U[k : k + 2].ravel(), tr.over[k * tr.nodes : (k + 1) * tr.nodes]
+        x, size = _follow(tr, left, guess[k].ravel(), u, over)
         if size > SETTLED:
-            x, size = _follow(tr, left, np.tile(left, tr.nodes), u)
+            x, size = _follow(tr, left, np.tile(left, tr.nodes), u, over)
         if size > SETTLED:
             raise UnsettledError(f"no motion follows these torques in interval {k} (residual {size:.1e})")
         Z[k] = x.reshape(tr.nodes, tr.n_z)
@@ -150,12 +153,14 @@ def settle(tr: Transcription, start: np.ndarray, U: np.ndarray, guess: np.ndarra
     return Z
 
 
-def _follow(tr: Transcription, left: np.ndarray, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, float]:
+def _follow(
+    tr: Transcription, left: np.ndarray, x: np.ndarray, u: np.ndarray, over: np.ndarray
+) -> tuple[np.ndarray, float]:
     """Node states (J n_z,) of one interval and the largest residual, by Newton's method with step halving."""
     n_z, J = tr.n_z, tr.nodes
     L, inner = tr.spread, tr.spread[:, :, n_z : n_z * (J + 1)]
     known = L @ np.concatenate([left, np.zeros(J * n_z), u])
-    c, slope = tr.step(known + inner @ x)
+    c, slope = tr.step(known + inner @ x, over)
     size = float(np.abs(c).max())
     for _ in range(25):
         if size < 1e-9:
@@ -163,7 +168,7 @@ def _follow(tr: Transcription, left: np.ndarray, x: np.ndarray, u: np.ndarray) -
         dx = np.linalg.solve(np.matmul(slope, inner).reshape(J * n_z, -1), -c.ravel())
         share = 1.0
         for _ in range(8):
-            c, slope = tr.step(known + inner @ (x + share * dx))
+            c, slope = tr.step(known + inner @ (x + share * dx), over)
             trial = float(np.abs(c).max())
             if trial < size:
                 break
@@ -196,6 +201,7 @@ def transcribe(
     problem: Problem,
     state_size: Mapping[str, float],
     intervals: int,
+    motion: Motion,
     elements: int = 1,
     with_pose: bool = False,
     rest: float = 1.0,
@@ -203,9 +209,10 @@ def transcribe(
 ) -> Transcription:
     """The nonlinear program of a problem on `intervals` equal intervals, each of `elements` collocation elements.
 
-    state_size: the typical size of every coordinate and velocity (named c and c') and of what effects remember. The
-    pose is a state only where `with_pose`: nothing but the lane depends on it. weights (n_blocks, n_rows): of the
-    regressor's rows [1/SI], one information matrix for each; all 1 by default, none for a program without an aim.
+    state_size: the typical size of every coordinate and velocity (named c and c') and of what effects remember. motion:
+    one nearby, from which what a map of the ground tells is taken. The pose is a state only where `with_pose`: nothing
+    but the lane depends on it. weights (n_blocks, n_rows): of the regressor's rows [1/SI], one information matrix for
+    each; all 1 by default, none for a program without an aim.
     """
     every = limits(model, problem)
     s = symbols(model)
@@ -216,7 +223,7 @@ def transcribe(
     pose = model.machine.body[0].coordinates if with_pose else ()
     needed = {*pose, *model.felt, *(model.coordinates[k] for k in resting(model))}
     used = [c for c in model.coordinates if c in needed]
-    names = (*used, *[c + "'" for c in model.coordinates], *model.memory)
+    names = (*used, *[c + "'" for c in model.coordinates], *model.memory[: len(model.memory) - len(model.mapped)])
     z_size = np.array([state_size[c] for c in names])
     u_size = np.array([float(b.limit.torque) if b.limit.torque is not None else 1.0 for b in model.machine.actuated])
     knot = float(problem.duration_s) / intervals
@@ -233,14 +240,16 @@ def transcribe(
     memory = len(used) + n_q
     nu, a = (ca.vertcat(*ca.vertsplit(x)[len(used) : memory]) for x in (z, rate))
     kept, kept_rate = (ca.vertcat(*ca.vertsplit(x)[memory:], ca.SX(0, 1)) for x in (z, rate))
-    beside = () if model.plain else (u, kept)
+    over = ca.SX.sym("over", len(model.mapped))
+    beside = () if model.plain else (u, ca.vertcat(kept, over))
     p = model.expand @ model.nominal
     drive = ca.SX(n_q, 1)
     for k, row in enumerate(model.actuated):
         drive[row] = u[k]
     dq = model.kinematics(q, nu)[0]
     turns = [(rate[k] - dq[model.coordinates.index(c)]) * knot / z_size[k] for k, c in enumerate(used)]
-    going = (kept_rate - model.flow(q, nu, u, kept, model.nominal)) * knot / ca.DM(z_size[memory:])
+    flow = model.flow(q, nu, u, ca.vertcat(kept, over), model.nominal)[: len(names) - memory]
+    going = (kept_rate - flow) * knot / ca.DM(z_size[memory:])
     balance = (model.balance(q, nu, a, p, *beside) - drive) / float(u_size.max())
     residual = ca.vertcat(*turns, balance, going)
     g = ca.vertcat(*[(g.expression(q, nu, u, 0) - g.centre) * (2 / g.range) for g in staged], ca.SX(0, 1))
@@ -258,11 +267,13 @@ def transcribe(
     N = intervals * len(place)
     samples = float(problem.duration_s) * float(model.machine.sampling_hz)
     options = {"cse": True}
-    values = ca.Function("values", [sample], [residual, g, entries], options)
+    values = ca.Function("values", [sample, over], [residual, g, entries], options)
     slopes = [ca.densify(ca.jacobian(x, sample).T) for x in (residual, g, entries)]
-    first = ca.Function("first", [sample], [residual, g, entries, *slopes], options)
-    second = ca.Function("second", [sample, multipliers], [ca.densify(H)], options)
+    first = ca.Function("first", [sample, over], [residual, g, entries, *slopes], options)
+    second = ca.Function("second", [sample, over, multipliers], [ca.densify(H)], options)
 
+    nodes = ((np.arange(intervals)[:, None] + place) * knot).ravel()
+    told = motion.memory[:, len(model.memory) - len(model.mapped) :]
     control, centre = _control(steered, s, u_size, knot)
     resting_states = [names.index(model.coordinates[k]) for k in resting(model)] + [
         names.index(c + "'") for c in model.coordinates
@@ -293,10 +304,11 @@ def transcribe(
         band,
         np.array([k for k, c in enumerate(names) if c in pose and k not in resting_states], int),
         _spread(place, derivative, n_z, n_u),
+        np.array([np.interp(nodes, motion.t, x) for x in told.T]).T.reshape(N, -1),
         Mapped(values, N, [(n_z,), (n_g,), (n_a,)]),
         Mapped(first, N, [(n_z,), (n_g,), (n_a,), (n_z, n_s), (n_g, n_s), (n_a, n_s)]),
         Mapped(second, N, [(n_s, n_s)]),
-        Mapped(ca.Function("step", [sample], [residual, slopes[0]], options), len(place), [(n_z,), (n_z, n_s)]),
+        Mapped(ca.Function("step", [sample, over], [residual, slopes[0]], options), len(place), [(n_z,), (n_z, n_s)]),
     )
 
 

@@ -363,6 +363,7 @@ def _nearest(
             problem,
             track.sizes,
             len(at) - 1,
+            track.motion,
             elements=1 if attempt == 0 else 3,
             with_pose=with_pose,
             rest=rest_band(friction),

@@ -321,6 +321,7 @@ def _advance(
         problem,
         track.sizes,
         intervals,
+        track.motion,
         elements=stage.elements,
         with_pose=track.pose is not None,
         rest=rest_band(stage.friction),

@@ -69,7 +69,7 @@ def counted(c: Chart, r: Record, p: Point, X: np.ndarray, found: Linear) -> tupl
     sample = 1 / float(c.model.machine.sampling_hz)
     u = c.delivered(r.torque, X)[0] + p.errors
     weight = readings(c, replace(r, used=np.ones_like(r.used)), p, u, X)[2]
-    angle, _, rate, *_ = c.readings(p.s, u, X)
+    angle, _, rate, *_ = c.readings(p.s, c.inputs(u, p.over), X)
     encoders = np.flatnonzero(r.counts)
     step = r.noise.sensor[encoders]
     by = _slopes(found, c.flawed, encoders)

@@ -20,7 +20,7 @@ import numpy as np
 from excite import newton
 from excite.innovations import Linear, White, whitened, whitened_signatures
 from excite.linearise import BATCH, Batch, Chart, differentiate
-from excite.processing import implicit
+from excite.processing import implicit, passes
 from excite.record import Point, Record, smoothed
 from excite.sensors import torque_behind
 from excite.sidebyside import Together, in_turn
@@ -183,7 +183,8 @@ def renumbered(found: Sequence[Candidate]) -> list[Candidate]:
 class Way:
     """One fitted log, as every candidate finds it: the motion q, nu, accelerations a (N, n_q), delivered torques u
     (N, n_u) at times t (N,) [s], exact readings (N, readable), the standard parameters, `slopes` as `_slopes` has them,
-    and the whitened innovations. origins: how many offsets of counts the log has."""
+    the whitened innovations, and what a map of the ground tells, over (N, n_over). origins: how many offsets of counts
+    the log has."""
 
     chart: Chart
     linear: Linear
@@ -197,6 +198,7 @@ class Way:
     standard: np.ndarray
     slopes: np.ndarray
     white: White
+    over: np.ndarray
 
 
 def ways(c: Chart, records: Sequence[Record], fit: newton.Fit) -> tuple[Way, ...]:
@@ -215,7 +217,8 @@ def _way(c: Chart, r: Record, p: Point, linear: Linear, X: np.ndarray) -> Way:
             wheels[:, at - 2 * n_q] = p.s[:, k]
     exact = model.read(q.T, nu.T, wheels.T, u.T, z.T, X).full().T
     slopes, white = _slopes(c, p, u, X), whitened(linear, c.flawed)
-    return Way(c, linear, len(r.origin), q, nu, a, u, t, exact, model.expand @ X, slopes, white)
+    over = passes(model, q, nu, 1 / float(model.machine.sampling_hz))
+    return Way(c, linear, len(r.origin), q, nu, a, u, t, exact, model.expand @ X, slopes, white, over)
 
 
 class Signatures:
@@ -236,7 +239,7 @@ class Signatures:
         self.force, self.reading = Batch(made.force, (7,)), Batch(made.reading, (7,))
         self.rows = [model.readable.index(s.name) for s in c.sensors]
         self.p = way.standard[: len(standard)]
-        memory = remembered(made, way.q, way.nu, way.u, way.t, self.p)
+        memory = remembered(made, way.q, way.nu, way.u, way.t, self.p, way.over)
         self.samples = (way.q, way.nu, way.a, way.u, way.t[:, None], memory, way.exact)
         self.torque = np.zeros((*way.u.shape, self.columns))
         for k, e in enumerate(every):
@@ -272,11 +275,11 @@ def _free(c: Chart) -> list[int]:
 def _slopes(c: Chart, p: Point, u: np.ndarray, X: np.ndarray) -> np.ndarray:
     """What half a torque and half a force on each row without an actuator, at both ends of each interval, do to the
     scaled state behind it (N - 1, n, n_u + n_free)."""
-    N, scale, free = len(p.s), newton.state_scale(c), _free(c)
+    N, scale, free, inputs = len(p.s), newton.state_scale(c), _free(c), c.inputs(u, p.over)
     found = np.empty((N - 1, c.n, u.shape[1] + len(free)), np.float32)
     for at in range(0, N - 1, BATCH):
         until = min(at + BATCH, N - 1)
-        by = differentiate(c, p.s[at : until + 1], u[at:until], u[at + 1 : until + 1], X, force=True)
+        by = differentiate(c, p.s[at : until + 1], inputs[at:until], inputs[at + 1 : until + 1], X, force=True)
         found[at:until] = np.concatenate([by.B, by.F[:, :, free]], axis=2) / (2 * scale[:, None])
     return found
 
@@ -303,16 +306,28 @@ def _misread(c: Chart, e: Placed, u: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def remembered(
-    made: MadeSignatures, q: np.ndarray, nu: np.ndarray, u: np.ndarray, t: np.ndarray, p: np.ndarray
+    made: MadeSignatures,
+    q: np.ndarray,
+    nu: np.ndarray,
+    u: np.ndarray,
+    t: np.ndarray,
+    p: np.ndarray,
+    over: np.ndarray,
 ) -> np.ndarray:
-    """What effects with these signatures remember (N, n_z) along a motion, from rest."""
+    """What effects with these signatures remember (N, n_z) along a motion, from rest; and, if any looks at it, what a
+    map of the ground tells there, over (N, n_over)."""
     n_q, n_u, n_z = q.shape[1], u.shape[1], made.flow.size1_in(4)
     if n_z == 0:
         return np.zeros((len(t), 0))
+    if n_z == made.mapped:
+        return over
     at, z = ca.SX.sym("at", 2 * n_q + n_u + 1), ca.SX.sym("z", n_z)
     rate = made.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q : -1], at[-1], z, ca.DM(p))
     flow = ca.Function("flow", [z, at], [rate])
-    return implicit(flow, np.zeros(n_z), np.hstack([q, nu, u, t[:, None]]), float(t[1] - t[0]))
+    found = implicit(flow, np.zeros(n_z), np.hstack([q, nu, u, t[:, None]]), float(t[1] - t[0]))
+    if made.mapped:
+        found[:, n_z - made.mapped :] = over
+    return found
 
 
 def scan(

@@ -169,7 +169,7 @@ def minimise(
 
 
 def _evaluate(tr: Transcription, task: Task, start: np.ndarray, Z: np.ndarray, U: np.ndarray, sharp: float) -> State:
-    _, g, entries = tr.values(tr.samples(start, Z, U))
+    _, g, entries = tr.values(tr.samples(start, Z, U), tr.over)
     return _state(tr, task, Z, U, g, tr.weight @ entries, sharp)
 
 
@@ -199,7 +199,7 @@ def _linearise(tr: Transcription, task: Task, point: Point, level: Level) -> Qua
     L = tr.spread
     outer, inner = np.r_[0:n_z, n_z * (J + 1) : n_z * (J + 1) + 2 * n_u], np.r_[n_z : n_z * (J + 1)]
     s = tr.samples(point.start, point.Z, point.U)
-    _, g, a, cs, gs, as_ = tr.first(s)
+    _, g, a, cs, gs, as_ = tr.first(s, tr.over)
     state = _state(tr, task, point.Z, point.U, g, tr.weight @ a, level.sharp)
     slope, F = np.zeros(n_a), np.zeros((n_a, 0))
     if task.aim is not None:
@@ -225,7 +225,7 @@ def _linearise(tr: Transcription, task: Task, point: Point, level: Level) -> Qua
     y = (point.high - point.low + hinge).reshape(K * J, n_g)
     grad = pulled + np.matmul(y[:, None], gs)[:, 0]
     lam = _adjoint(tr, CZ, T, grad.reshape(K, J, -1), (point.highe - point.lowe) / tr.band)
-    (H,) = tr.second(s, np.concatenate([lam.reshape(K * J, n_z), y, tr.weight[:, None] * slope], axis=1))
+    (H,) = tr.second(s, tr.over, np.concatenate([lam.reshape(K * J, n_z), y, tr.weight[:, None] * slope], axis=1))
     H += np.matmul(gs.transpose(0, 2, 1) * (sigma + bend).reshape(K * J, 1, n_g), gs)
 
     # all of it in the steps of the intervals

@@ -216,7 +216,8 @@ class Chart:
     then measured angles that are integrals of these. `index` (n,): their places in simulate's state (q, nu, wheels, z),
     whose size is `full`. `sensors`: those with a reading h(s), in order; `angle`: the state that each encoder reads, -1
     for another sensor. `offsets` (n_u, n_base) takes the torque offsets u0 out of X. `flawed`: parameters that readings
-    depend on directly. `known` (n,): states whose start is known, and how well; NaN for the others. `leaning`: whether
+    depend on directly. `known` (n,): states whose start is known, and how well; NaN for the others. What a map of the
+    ground tells is no state: it comes in beside the torques (`inputs`). `leaning`: whether
     readings depend on torques at once. `pushed`: rows on which disturbing forces may act, the unactuated ones, or all
     where there are none; `inertia`: theirs, nominal [kg, kg m2].
     """
@@ -244,11 +245,16 @@ class Chart:
         return len(self.index)
 
     def parts(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Coordinates, velocities (N, n_q) and memory (N, n_z) of states (N, n); what nothing depends on is zero."""
+        """Coordinates, velocities (N, n_q) and memory (N, n_z) of states (N, n); what nothing depends on is zero, and
+        what a map of the ground tells."""
         n_q, n_z = len(self.model.coordinates), len(self.model.memory)
         full = np.zeros((len(s), self.full))
         full[:, self.index] = s
         return full[:, :n_q], full[:, n_q : 2 * n_q], full[:, self.full - n_z :]
+
+    def inputs(self, torque: np.ndarray, over: np.ndarray) -> np.ndarray:
+        """Torques (N, n_u) and what a map of the ground tells, over (N, n_over), as functions of a sample take them."""
+        return np.concatenate([torque, over], axis=1) if self.model.mapped else torque
 
     def delivered(
         self, torque: np.ndarray, X: np.ndarray, errors: np.ndarray | float = 0.0
@@ -313,7 +319,9 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     flow = model.flow(q, nu, u, z, X)
     rates = ca.vertcat(dq, a, wheel_rates, flow)
     core = [k for k, c in enumerate(model.coordinates) if c in model.felt] + list(range(n_q, 2 * n_q))
-    core += range(full.numel() - len(model.memory), full.numel())
+    over = ca.SX.sym("over", len(model.mapped))
+    last = full.numel() - len(model.mapped)
+    core += range(full.numel() - len(model.memory), last)
 
     sensors = tuple(s for s in machine.sensors("full") if s.name in names and s.kind not in ("torque", "x", "y"))
     index, angle = list(core), []
@@ -333,6 +341,8 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     where = ca.SX.zeros(full.numel(), 1)
     for k, at in enumerate(index):
         where[at] = state[k]
+    where[last:] = over
+    inputs = ca.vertcat(u, over)
 
     def along(e: ca.SX) -> ca.SX:
         """An expression of the full state, in terms of the chart's."""
@@ -363,14 +373,15 @@ def chart(model: Model, names: tuple[str, ...]) -> Chart:
     every = model.read(q, nu, wheels, u, z, X)
     seen = ca.vertcat(*[every[model.readable.index(s.name)] for s in sensors])
     flawed = tuple(k for k in range(X.numel()) if ca.depends_on(seen, X[k]))
-    slopes = ca.Function("slopes", [state, u, X], local)
+    slopes = ca.Function("slopes", [state, inputs, X], local)
     known = np.full(len(index), np.nan)
-    known[len(core) - len(model.memory) : len(core)] = model.remembered
+    known[len(core) - len(model.remembered) : len(core)] = model.remembered
     size = np.fmax(known, 1.0)  # what effects remember may be torques, thousands of N m
-    step = _step(state, u, X, len(core), along(rates[index]), local[0], local[1], local[4], size)
+    driven = ca.horzcat(local[1], along(moved(full[last:])))
+    step = _step(state, inputs, X, len(core), along(rates[index]), local[0], driven, local[4], size)
     readings = ca.Function(
         "readings",
-        [state, u, X],
+        [state, inputs, X],
         [
             along(seen),
             along(ca.jacobian(seen, full[index])),
@@ -437,7 +448,7 @@ def _step(
 
 
 def advance(chart: Chart, s: np.ndarray, left: np.ndarray, right: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """Where K states s (K, n) lead in one sample (K, n) under torques from left to right (K, n_u) [N m].
+    """Where K states s (K, n) lead in one sample (K, n) under inputs from left to right (K, n_u + n_over).
 
     Not finite where an interval can't be integrated, or where so many take so many steps that it isn't worth it.
     """
@@ -466,8 +477,8 @@ def _intervals(
 def differentiate(
     chart: Chart, s: np.ndarray, left: np.ndarray, right: np.ndarray, X: np.ndarray, force: bool = False
 ) -> Slopes:
-    """How the ends of the K intervals between states s (K + 1, n) move, to about 1 %, under torques from left to right
-    (K, n_u) [N m].
+    """How the ends of the K intervals between states s (K + 1, n) move, to about 1 %, under inputs from left to right
+    (K, n_u + n_over).
 
     Slopes are those of an interval's middle.
     F is filled with `force` only. Where a joint reverses, its friction turns within a sample and leaves a mark on
@@ -503,7 +514,7 @@ def _reversals(chart: Chart, s: np.ndarray) -> np.ndarray:
     turn in it."""
     model = chart.model
     found = np.zeros(len(s) - 1, int)
-    first = chart.core - len(model.coordinates) - len(model.memory)
+    first = chart.core - len(model.coordinates) - len(model.remembered)
     for body in model.machine.body:
         if body.friction is None or body.coordinates[0] not in model.coordinates:
             continue

@@ -109,7 +109,7 @@ def _course(stage: Stage, k: int) -> Course:
         missing[label] = w[:, j], "N m" if body.joint == "revolute" else "N", float(r.noise.torque[j])
         own[label] = body.index
     if not stage.exact:
-        for label, force, unit, index in _forces(stage, p.s, u):
+        for label, force, unit, index in _forces(stage, p.s, c.inputs(u, p.over)):
             before = missing.get(label)
             # Where forces act on a driven joint they are its missing torque as well.
             missing[label] = (before[0] + force, unit, float("nan")) if before else (force, unit, float("nan"))
@@ -125,7 +125,7 @@ def _course(stage: Stage, k: int) -> Course:
 
 
 def _forces(stage: Stage, s: np.ndarray, u: np.ndarray) -> list[tuple[str, np.ndarray, str, int | None]]:
-    """The smoothed disturbing forces: label, values (N,), unit, driven body or None."""
+    """The smoothed disturbing forces along states s under inputs u: label, values (N,), unit, driven body or None."""
     c, X, model = stage.prepared.c, stage.fit.X, stage.model
     defect = (s[1:] - advance(c, s[:-1], u[:-1], u[1:], X)) / state_scale(c)
     F = differentiate(c, s, u[:-1], u[1:], X, force=True).F / state_scale(c)[:, None]

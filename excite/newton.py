@@ -16,7 +16,7 @@ from excite import chain
 from excite.estimate import NoEstimate
 from excite.innovations import Linear
 from excite.linearise import BATCH, Chart, advance, differentiate
-from excite.record import Point, Record, one_count, readings
+from excite.record import Point, Record, driven_over, one_count, readings
 from model.prediction import Model
 
 PRIOR = 3.0  # standard deviation of a parameter before any data, in its scale; of one that is further off, its size
@@ -116,7 +116,7 @@ def linearise(
     """
     delivered, behind = c.delivered(r.torque, X, p.errors)
     noise = c.felt(r.noise.torque, X)
-    left, right = delivered[:-1] + p.w, delivered[1:] + p.w
+    left, right = (c.inputs(d + p.w, o) for d, o in ((delivered[:-1], p.over[:-1]), (delivered[1:], p.over[1:])))
     if exact:
         defect = np.zeros_like(p.s[1:])
     else:
@@ -125,7 +125,8 @@ def linearise(
             return None
     u = delivered + p.errors
     if not r.unbiased:
-        left, right = u[:-1], u[1:]
+        both = c.inputs(u, p.over)
+        left, right = both[:-1], both[1:]
     h, H, weight, D, flaws, beats = readings(c, r, p, u, X)
     residual = np.zeros_like(h) if exact else np.where(r.used > 0, r.reading - h, 0.0)
     flaws = flaws * c.model.scale[list(c.flawed)]
@@ -418,7 +419,8 @@ def moved(c: Chart, r: Record, p: Point, linear: Linear, move: np.ndarray) -> Po
     x, slope = linear.solved.states(move)
     w = (linear.gain.transpose(0, 2, 1) @ slope[1:, :, None])[:, :, 0] * linear.noise
     offset = move[len(move) - len(r.origin) :]
-    return Point(p.s + x * state_scale(c), w, p.offset + offset * one_count(c, r))
+    s = p.s + x * state_scale(c)
+    return Point(s, w, p.offset + offset * one_count(c, r), driven_over(c, s))
 
 
 def _between(
@@ -428,7 +430,7 @@ def _between(
         return a + share * (b - a)
 
     points = [
-        Point(mixed(a.s, b.s), mixed(a.w, b.w), mixed(a.offset, b.offset))
+        Point(mixed(a.s, b.s), mixed(a.w, b.w), mixed(a.offset, b.offset), mixed(a.over, b.over))
         for a, b in zip(here[0], there[0], strict=True)
     ]
     return points, mixed(here[1], there[1])

@@ -111,12 +111,44 @@ def _beside(model: Model, q: np.ndarray, nu: np.ndarray, Y: np.ndarray) -> tuple
 
 
 def remember(model: Model, q: np.ndarray, nu: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """What a model's effects remember (N, n_z) along a motion, from rest."""
+    """What a model's effects remember (N, n_z) along a motion, from rest, and what a map of the ground tells."""
     n_q, n_u = len(model.coordinates), len(model.inputs)
     at, z = ca.SX.sym("at", 2 * n_q + n_u), ca.SX.sym("z", len(model.memory))
     rate = model.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q :], z, ca.DM(X))
     flow = ca.Function("flow", [z, at], [rate])
-    return implicit(flow, model.fresh, np.hstack([q, nu, u]), 1 / float(model.machine.sampling_hz))
+    sample = 1 / float(model.machine.sampling_hz)
+    z = implicit(flow, model.fresh, np.hstack([q, nu, u]), sample)
+    if model.mapped:
+        z[:, len(model.memory) - len(model.mapped) :] = passes(model, q, nu, sample)
+    return z
+
+
+def passes(model: Model, q: np.ndarray, nu: np.ndarray, step: float) -> np.ndarray:
+    """What a map of the ground tells (N, n_contacts MOST) along a motion with samples `step` [s] apart, whose pose
+    follows from its velocities."""
+    if not model.machine.contacts:
+        return np.zeros((len(q), 0))
+    at = q.copy()
+    if model.machine.planar:
+        x, y, turn = (
+            model.coordinates.index(c) if c in model.coordinates else None for c in model.machine.body[0].coordinates
+        )
+
+        def summed(v: np.ndarray) -> np.ndarray:
+            return np.asarray(scipy.integrate.cumulative_trapezoid(v, dx=step, initial=0))
+
+        none = np.zeros(len(q))
+        heading = none if turn is None else summed(nu[:, turn])
+        ahead, aside = (none if k is None else nu[:, k] for k in (x, y))
+        for k, own in (
+            (turn, heading),
+            (x, summed(ahead * np.cos(heading) - aside * np.sin(heading))),
+            (y, summed(ahead * np.sin(heading) + aside * np.cos(heading))),
+        ):
+            if k is not None:
+                at[:, k] = own
+    ground = model.ground()
+    return np.array([ground(one) for one in at])
 
 
 def implicit(flow: ca.Function, start: np.ndarray, along: np.ndarray, step: float) -> np.ndarray:

@@ -16,7 +16,7 @@ import scipy.integrate
 from excite.estimate import NotIdentifiable
 from excite.linearise import Chart
 from excite.log import Log
-from excite.processing import remember, samples, white_noise
+from excite.processing import passes, remember, samples, white_noise
 from model.machine import Filter, Sensor
 from model.prediction import Model
 
@@ -65,11 +65,13 @@ class Record:
 
 @dataclass(frozen=True)
 class Point:
-    """Where an iteration stands: states (N, n), torque errors (N - 1, n_u), offsets (m_o,) of one log."""
+    """Where an iteration stands: states (N, n), torque errors (N - 1, n_u), offsets (m_o,) of one log, and over (N,
+    n_over), what a map of the ground tells along these states."""
 
     s: np.ndarray
     w: np.ndarray
     offset: np.ndarray
+    over: np.ndarray
 
     @property
     def errors(self) -> np.ndarray:
@@ -78,7 +80,7 @@ class Point:
 
     def until(self, samples: int) -> Point:
         """The first samples only."""
-        return replace(self, s=self.s[:samples], w=self.w[: samples - 1])
+        return replace(self, s=self.s[:samples], w=self.w[: samples - 1], over=self.over[:samples])
 
 
 def common_sensors(model: Model, logs: Sequence[Log]) -> tuple[str, ...]:
@@ -137,15 +139,23 @@ def first_point(c: Chart, r: Record, log: Log, filter: Filter) -> Point:
     if n_z:
         u, _ = c.delivered(r.torque, c.model.nominal)
         full[:, c.full - n_z :] = remember(c.model, guess.q.T, guess.nu.T, u, c.model.nominal)
-    s = full[:, c.index]
+    s, over = full[:, c.index], full[:, c.full - len(c.model.mapped) :]
     rate = float(c.model.machine.sampling_hz)
     for j, k in enumerate(c.angle):
         if c.index[k] >= 2 * n_q and k >= 0:
-            speed = c.readings(s, r.torque, c.model.nominal)[2][:, j, 0]
+            speed = c.readings(s, c.inputs(r.torque, over), c.model.nominal)[2][:, j, 0]
             s[:, k] = log.values[c.sensors[j].name][0] + np.concatenate(
                 [[0], np.cumsum(speed[1:] + speed[:-1]) / (2 * rate)]
             )
-    return Point(s, np.zeros_like(r.torque[1:]), np.zeros(len(r.origin)))
+    return Point(s, np.zeros_like(r.torque[1:]), np.zeros(len(r.origin)), over)
+
+
+def driven_over(c: Chart, s: np.ndarray) -> np.ndarray:
+    """What a map of the ground tells (N, n_over) along states (N, n)."""
+    if not c.model.mapped:
+        return np.zeros((len(s), 0))
+    q, nu, _ = c.parts(s)
+    return passes(c.model, q, nu, 1 / float(c.model.machine.sampling_hz))
 
 
 def smoothed(
@@ -154,6 +164,7 @@ def smoothed(
     """The motion at a point: q, nu (N, n_q), what effects remember (N, n_z), delivered torques u (N, n_u), and the
     accelerations (N, n_q) that follow from these."""
     q, nu, z = c.parts(p.s)
+    z[:, z.shape[1] - p.over.shape[1] :] = p.over
     u = c.delivered(r.torque, X)[0] + p.errors
     known = () if c.model.plain else (z.T,)
     return q, nu, z, u, c.model.acceleration(q.T, nu.T, u.T, *known, X).full().T
@@ -176,7 +187,8 @@ def carried(c: Chart, r: Record, p: Point, of: Chart, X: np.ndarray) -> Point:
         u, _ = c.delivered(r.torque, X)
         full[:, c.full - n_z :] = remember(c.model, q, nu, u, X)
     old = dict(zip(origins(of, r.counts), p.offset, strict=True))
-    return Point(full[:, c.index], p.w, np.array([old.get(j, 0.0) for j in r.origin]))
+    offset = np.array([old.get(j, 0.0) for j in r.origin])
+    return Point(full[:, c.index], p.w, offset, full[:, c.full - len(c.model.mapped) :])
 
 
 def one_count(c: Chart, r: Record) -> np.ndarray:
@@ -194,7 +206,7 @@ def readings(
     Right after a count the angle is past the edge by half of what it travels in a sample, at most half a step.
     """
     sample = 1 / float(c.model.machine.sampling_hz)
-    h, H, rate, Hrate, *flaws = c.readings(p.s, u, X)
+    h, H, rate, Hrate, *flaws = c.readings(p.s, c.inputs(u, p.over), X)
     h, H, travel = h[:, :, 0].copy(), H.copy(), rate[:, :, 0] * sample
     step = r.noise.sensor
     slow = (np.abs(travel) < step) & r.counts
@@ -243,14 +255,14 @@ def _through(c: Chart, r: Record, p: Point, u: np.ndarray, X: np.ndarray) -> np.
     parts = []
     for k, noise in enumerate(c.felt(r.noise.torque, X)):
         shift = np.eye(u.shape[1])[k] * noise
-        high, low = (c.readings(p.s, u + sign * shift, X)[0][:, :, 0] for sign in (1, -1))
+        high, low = (c.readings(p.s, c.inputs(u + sign * shift, p.over), X)[0][:, :, 0] for sign in (1, -1))
         parts.append((high - low) / 2)
     return np.linalg.norm(parts, axis=0)
 
 
 def expected(c: Chart, r: Record, p: Point, u: np.ndarray, X: np.ndarray) -> Record:
     """The record with how often each encoder counts, on average, in place of when."""
-    travel = np.abs(c.readings(p.s, u, X)[2][:, :, 0]) / float(c.model.machine.sampling_hz)
+    travel = np.abs(c.readings(p.s, c.inputs(u, p.over), X)[2][:, :, 0]) / float(c.model.machine.sampling_hz)
     return replace(r, used=np.where(r.counts, np.minimum(travel / r.noise.sensor, 1.0), 1.0))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from excite.diagnose import Diagnosis
 from excite.evidence import remembered
+from excite.processing import passes
 from excite.record import smoothed
 from excite.stages import Stage
 from model import effects, placing
@@ -169,7 +170,7 @@ class _Asked:
     def __init__(self, stage: Stage, placed: Sequence[Placed]) -> None:
         model = stage.model
         standard = tuple(n for n in model.base.standard if "@" not in n)
-        self.machine, self.placed = stage.machine, placed
+        self.model, self.machine, self.placed = model, stage.machine, placed
         self.made: Signatures = signatures(stage.machine, standard, placed)
         self.p = (model.expand @ stage.fit.X)[: len(standard)]
         self.rows = {b.index: k for b, k in zip(stage.machine.actuated, model.actuated, strict=True)}
@@ -177,7 +178,8 @@ class _Asked:
 
     def __call__(self, m: Motion) -> np.ndarray:
         N, C = len(m.t), len(self.placed)
-        z = remembered(self.made, m.q, m.nu, m.u, m.t, self.p)
+        over = passes(self.model, m.q, m.nu, float(m.t[1] - m.t[0]))
+        z = remembered(self.made, m.q, m.nu, m.u, m.t, self.p, over)
         exact = np.broadcast_to(np.abs(m.t)[:, None], (N, self.readings)) * 0.1
         exact = exact * np.sign(m.nu.sum() or 1.0)
         given = [x.T for x in (m.q, m.nu, m.a, m.u, m.t[:, None], z, exact)]

@@ -113,7 +113,7 @@ def respond(
     state[n_q : 2 * n_q] = 0.0 if nu0 is None else nu0
     state[2 * n_q + n_w :] = model.fresh
     driven = np.empty((samples, n_u))
-    history = _integrate(step, state, driven, torque, parameters, 1.0 / rate)
+    history = _integrate(step, state, driven, torque, parameters, 1.0 / rate, _looking(model))
     finite = np.isfinite(history).all(axis=1)  # an error estimate of many states overlooks one that is no number
     if not finite.all():
         raise SimulationError(
@@ -140,7 +140,9 @@ def _integrate(
     torque: Callable[[int, np.ndarray], np.ndarray],
     parameters: np.ndarray,
     sample: float,
+    look: Callable[[np.ndarray], None],
 ) -> np.ndarray:
+    look(state)
     start, end, error = state.copy(), np.zeros_like(state), np.zeros(1)
     left, slope, length = np.zeros(driven.shape[1]), np.zeros(driven.shape[1]), np.zeros(1)
     buffer, advance = step.buffer()
@@ -176,9 +178,22 @@ def _integrate(
                     " check the torques and that the masses and inertias are positive"
                 )
             share *= min(4.0, max(0.1, 0.9 * (e + 1e-12) ** -0.25)) if np.isfinite(e) else 0.1
+        look(start)
         history[k + 1] = start
         share = max(share, 1e-3)
     return history
+
+
+def _looking(model: Model) -> Callable[[np.ndarray], None]:
+    """Puts into a state what a map of the ground tells there, and the contacts onto the map."""
+    if not model.mapped:
+        return lambda state: None
+    ground, n_q = model.ground(), len(model.coordinates)
+
+    def look(state: np.ndarray) -> None:
+        state[len(state) - len(model.mapped) :] = ground(state[:n_q])
+
+    return look
 
 
 @lru_cache(maxsize=8)
@@ -198,7 +213,7 @@ def _step(model: Model) -> tuple[ca.Function, int]:
     a = model.accelerate(q, nu, u, X, z)
     rhs = ca.vertcat(dq, a, wheels, model.flow(q, nu, u, z, X))
     core = [k for k, c in enumerate(model.coordinates) if c in model.felt] + list(range(n_q, 2 * n_q))
-    core += range(2 * n_q + n_w, state.numel())
+    core += range(2 * n_q + n_w, state.numel() - len(model.mapped))
     rest = [k for k in range(state.numel()) if k not in core]
     rate = ca.Function("rate", [state, u, X], [rhs[core]], {"cse": True})
     jacobian = ca.Function(

@@ -247,7 +247,8 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
                 f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file"
             )
     c = chart(model, tuple(s.name for s in model.machine.sensors("full") if s in sensors))
-    state = np.hstack([motion.q, motion.nu, motion.wheels, motion.memory])[:, c.index]
+    full = np.hstack([motion.q, motion.nu, motion.wheels, motion.memory])
+    state, over = full[:, c.index], full[:, full.shape[1] - len(model.mapped) :]
     counts = np.array([s.resolution is not None for s in c.sensors])
     noise = Noise(
         np.array([float(torque_sensor(model, b.index).noise or 0) for b in model.machine.actuated]),
@@ -255,7 +256,7 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
     )
     none = np.zeros((len(state), len(c.sensors)))
     r = Record(torques_read(model, motion.t, motion.u, X), none, none, counts, origins(c, counts), noise)
-    p = Point(state, np.zeros_like(motion.u[1:]), np.zeros(len(r.origin)))
+    p = Point(state, np.zeros_like(motion.u[1:]), np.zeros(len(r.origin)), over)
     linear = linearise(c, expected(c, r, p, motion.u, X), p, state[0], X, 0.0, exact=True)
     assert linear is not None
     information = linear.Z[1:, 1:].copy()

@@ -64,7 +64,9 @@ class Scene:
     q, w: angle and rate of a joint [rad, rad/s] by body; u: torque that its sensor feels, flaws aside [N m]; friction:
     Fv w + Fs sgn w [N m]; coulomb: Fs [N m]; smooth: the rate over which sgn turns [rad/s]; full: what counts as a
     large torque [N m]; rolling: of contacts; ahead: V_x of each body's origin in its own axes [m/s]; time [s] since the
-    log began; z: what this effect remembers, by name; zero what it does in another form only.
+    log began; z: what this effect remembers, by name; zero what it does in another form only; over: the shares of each
+    contact's width that were passed over before, at least once, twice and so on, as a map of the ground has them
+    (`lane.Ground`); zero for an effect that doesn't look at it.
     """
 
     q: Mapping[int, ca.SX]
@@ -78,6 +80,7 @@ class Scene:
     ahead: Mapping[int, ca.SX]
     time: ca.SX
     z: Mapping[str, ca.SX] = field(default_factory=dict)
+    over: Mapping[int, ca.SX] = field(default_factory=dict)
 
     def sign(self, k: int) -> ca.SX:
         """sgn of a joint's rate, smoothed as its friction is."""
@@ -170,7 +173,7 @@ class Effect:
     `angular`: a reading's error that only a sensor of an angle has, none of a rate. `recoil`: the shape that says which
     share of a changing `inertia`, of MX and ZZ, comes of a load that slides along x on its body and pushes it back.
     `shaking`: while it acts, 0 to 1 over time [s], the torque sensor shakes as well; where it doesn't, something else
-    acts.
+    acts. `ground`: the shape and its value with which alone it sees a map of the ground.
     Hooks take the scene, the body they act on, and the values; `further` [m] changes the contacts of the scene that all
     effects see.
     """
@@ -199,6 +202,7 @@ class Effect:
     channel: Callable[[ca.SX, Values], Channel] | None = None
     shaking: Callable[[ca.SX, Values], ca.SX] | None = None
     memory: Mapping[str, Memory] = field(default_factory=dict)
+    ground: Form | None = None
     timed: bool = False
     angular: bool = False
 
@@ -249,6 +253,11 @@ class Placed:
         for name, own in self.effect.memory.items():
             found |= {f"{name}{k}": (k, own) for k in self.bodies} if own.each else {name: (self.bodies[0], own)}
         return found
+
+    @property
+    def mapped(self) -> bool:
+        """Whether it sees a map of the ground in the form that it has here."""
+        return self.effect.ground is not None and self._has(self.effect.ground)
 
     def shaking(self, t: np.ndarray) -> np.ndarray:
         """How much the effect shakes a torque sensor, 0 to 1, at times t (N,) [s]."""

@@ -448,13 +448,14 @@ _declare(
         {
             "pass": Shape("m", 15.0, (5.0, 15.0, 50.0)),
             "counted": _forms(
-                f"0: n is the way; 1: passes are counted by reversals; 2: place by place along the lane, for"
+                f"0: n is the way; 1: passes are counted by reversals; 2: place by place, on a map of the ground, for"
                 f" every contact; a pass is worth {lane.PASS:g} m of way",
                 (0.0, 1.0, 2.0),
             ),
         },
         soil=soil.compacted,
         memory=lane.MEMORY,
+        ground=("counted", 2.0),
         beside=lambda site: [{"pass": x, "counted": form} for form in (1.0, 2.0) for x in (5.0, 15.0, 50.0)],
         positive=True,
     ),

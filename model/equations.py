@@ -13,7 +13,7 @@ from functools import cached_property
 import casadi as ca
 
 from model import contact as law
-from model import placing, sizes, tree
+from model import lane, placing, sizes, tree
 from model.effect import Placed, Rolling, Scene, Soil, Values
 from model.machine import Body, Machine, MachineError
 
@@ -75,17 +75,20 @@ class Equations:
     channels: ca.Function
     readable: tuple[str, ...]
     memory: tuple[str, ...]
+    mapped: tuple[str, ...]
     nonlinear: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Signatures:
     """What C effects add, each alone, at samples (q, nu, a, u, t, z, exact readings, p): generalised forces (n_q, C)
-    and readings (n_readable, C); and the rates (q, nu, u, t, z, p) -> dz of all that they remember."""
+    and readings (n_readable, C); and the rates (q, nu, u, t, z, p) -> dz of all that they remember. mapped: how many of
+    z, the last ones, a map of the ground tells."""
 
     force: ca.Function
     reading: ca.Function
     flow: ca.Function
+    mapped: int
 
 
 def sample_of(machine: Machine, standard: tuple[str, ...]) -> Sample:
@@ -121,7 +124,7 @@ def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Plac
     for body in machine.contacts:
         _check_axis(machine, body)
     s = sample_of(machine, standard)
-    memory, z, acting = _acting(s, placed)
+    memory, mapped, z, acting = _acting(s, placed)
     balance, slips = _balance(s, acting)
     time = ca.SX.sym("t")
     gain, offset, delay = _channels(s, acting, time)
@@ -134,6 +137,7 @@ def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Plac
     rates = [ca.SX(1)] if "time" in memory else []
     for e in acting:
         rates += _rates(e)
+    rates += [ca.SX(0)] * len(mapped)
     beside = [s.u, z] if placed else []
     labels = ["q", "nu", "a", "p", "u", "z"][: 4 + len(beside)]
     sample = [s.q, s.nu, s.a, s.p, *beside]
@@ -150,6 +154,7 @@ def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Plac
         ca.Function("channels", [time, s.p], [gain, offset, delay]),
         readable,
         memory,
+        mapped,
         tuple(name for name, bent in zip(standard, curved, strict=True) if bent),
     )
 
@@ -177,10 +182,11 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Pla
     force, reading, rates = [], [], list[ca.SX]()
     states: list[ca.SX] = []
     scene = _scene(s, time)
+    counts = [ca.SX.sym(name) for name in _mapped(machine, placed)]
     rollings = {b.index: _rolling(s, b) for b in machine.contacts}
     for e in placed:
         z = {m: ca.SX.sym(m) for m in e.memory}
-        (own,) = _rolled([_seeing(s, scene, e, z)])
+        (own,) = _rolled([_seeing(s, scene, e, z, counts)])
         added = _added(s, own, inertia)
         if e.effect.further is not None or e.effect.soil is not None:
             for k in e.bodies:
@@ -196,24 +202,38 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Pla
         reading.append(read)
         states += z.values()
         rates += _rates(own)
-    held = ca.vertcat(*states, ca.SX(0, 1))
+    held = ca.vertcat(*states, *counts, ca.SX(0, 1))
     arguments = [s.q, s.nu, s.a, s.u, time, held, exact, s.p]
     return Signatures(
         ca.Function("force", arguments, [ca.horzcat(*force)]),
         ca.Function("reading", arguments, [ca.horzcat(*reading)]),
-        ca.Function("flow", [s.q, s.nu, s.u, time, held, s.p], [ca.vertcat(*rates, ca.SX(0, 1))]),
+        ca.Function(
+            "flow", [s.q, s.nu, s.u, time, held, s.p], [ca.vertcat(*rates, *[ca.SX(0)] * len(counts), ca.SX(0, 1))]
+        ),
+        len(counts),
     )
 
 
-def _acting(s: Sample, placed: Sequence[Placed]) -> tuple[tuple[str, ...], ca.SX, list[Acting]]:
-    """What effects remember, its symbols z, and the effects with what they see of a sample."""
+def _mapped(machine: Machine, placed: Sequence[Placed]) -> tuple[str, ...]:
+    """What a map of the ground tells, by name, if any of these effects look at it."""
+    if not any(e.mapped for e in placed):
+        return ()
+    return tuple(f"over{b.index}.{n + 1}" for b in machine.contacts for n in range(lane.MOST))
+
+
+def _acting(s: Sample, placed: Sequence[Placed]) -> tuple[tuple[str, ...], tuple[str, ...], ca.SX, list[Acting]]:
+    """What effects remember, that which a map of the ground tells last; the latter; symbols z of all of it; and the
+    effects with what they see of a sample."""
+    mapped = _mapped(s.machine, placed)
     memory = ["time"] if any(e.effect.timed for e in placed) else []
     memory += [f"{e.name}.{m}" for e in placed for m in e.memory]
+    memory += mapped
     z = ca.SX.sym("z", len(memory))
     known = dict(zip(memory, ca.vertsplit(z), strict=True))
     scene = _scene(s, known.get("time", ca.SX(0)))
-    acting = [_seeing(s, scene, e, {m: known[f"{e.name}.{m}"] for m in e.memory}) for e in placed]
-    return tuple(memory), z, _rolled(acting)
+    counts = [known[name] for name in mapped]
+    acting = [_seeing(s, scene, e, {m: known[f"{e.name}.{m}"] for m in e.memory}, counts) for e in placed]
+    return tuple(memory), mapped, z, _rolled(acting)
 
 
 def _rolled(acting: list[Acting]) -> list[Acting]:
@@ -247,10 +267,14 @@ def _scene(s: Sample, time: ca.SX) -> Scene:
     )
 
 
-def _seeing(s: Sample, scene: Scene, e: Placed, z: dict[str, ca.SX]) -> Acting:
+def _seeing(s: Sample, scene: Scene, e: Placed, z: dict[str, ca.SX], counts: Sequence[ca.SX]) -> Acting:
+    """An effect that remembers z, and sees what a map of the ground tells where it looks at one."""
     values = {key: ca.SX(x) for key, x in e.values.items()}
     values |= {key: s.by_name[name] for name, (key, _) in e.parameters.items() if name in s.by_name}
-    return Acting(e, replace(scene, z=dict.fromkeys(e.memories, ca.SX(0)) | z), values)
+    over = {b.index: ca.SX.zeros(lane.MOST) for b in s.machine.contacts}
+    if e.mapped:
+        over = {k: ca.vertcat(*counts[lane.MOST * i : lane.MOST * (i + 1)]) for i, k in enumerate(over)}
+    return Acting(e, replace(scene, z=dict.fromkeys(e.memories, ca.SX(0)) | z, over=over), values)
 
 
 def _rates(e: Acting) -> list[ca.SX]:
@@ -408,6 +432,20 @@ def _readings(s: Sample, acting: Sequence[Acting]) -> tuple[ca.SX, tuple[str, ..
                 value = value + e.placed.effect.reading(e.scene, exact, body.index, e.values)
         readings[sensor.name] = value
     return ca.vertcat(*readings.values(), ca.SX(0, 1)), tuple(readings)
+
+
+def axles(s: Sample) -> ca.Function:
+    """q -> (4, n_contacts): where the middle of each contact is on the ground, x, y, and the way from its right end to
+    its left one [m]."""
+    machine, R = s.machine, tree.rot_z(s.heading)
+    root = ca.vertcat(*[s.at[c] for c in machine.body[0].coordinates[:2]], 0) if machine.planar else ca.SX(3, 1)
+    found = []
+    for body in machine.contacts:
+        assert body.contact is not None
+        frame = s.frames[body.index]
+        across = float(body.contact.width) * frame.rotation[:, 2]
+        found.append(ca.vertcat((root + R @ frame.position)[:2], (R @ across)[:2]))
+    return ca.Function("axles", [s.q], [ca.densify(ca.horzcat(*found, ca.SX(4, 0)))], ["q"], ["axles"])
 
 
 def kinematics(s: Sample, slips: Mapping[str, ca.SX]) -> ca.Function:

@@ -1,18 +1,23 @@
-"""How often the ground under a contact has been driven over: what compaction remembers of the way along a lane."""
+"""How often the ground under a contact has been driven over: the way, reversals, or a map of the ground."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import log
+from collections.abc import Sequence
+from math import exp, floor, hypot, log
 
 import casadi as ca
+import numpy as np
 
 from model.effect import Memory, Scene, Values
 
 PASS = 10.0  # [m] of way that a pass is worth where these are counted
 STANDSTILL = 0.02  # [m/s] over which the way turns
 BACK = 0.1  # [m] of way back, within which a reversal counts
-EDGE = 0.3  # [m] within which the end of a lane is felt
+MOST = 12  # passes that are told apart
+CELL = 0.2  # [m] of the map's cells
+FINE = 1.5  # places looked at across a contact for each cell
+NEXT = 0.03  # [m] of way from which a contact is looked at again
+PATCH = 0.15  # [m] of way over which what is under a contact becomes another
 
 
 def _way(s: Scene, k: int) -> tuple[ca.SX, ca.SX]:
@@ -34,39 +39,51 @@ def _reversing(s: Scene, k: int, p: Values) -> ca.SX:
     return ca.fmax(-way * ahead * s.z["facing"], 0) / (BACK * (1 - log(2)))
 
 
-def _beyond(name: str, side: float) -> Callable[[Scene, int, Values], ca.SX]:
-    """How fast an end of the lane is moved on by the contact that is there, a little behind it."""
-
-    def rate(s: Scene, k: int, p: Values) -> ca.SX:
-        return side * _way(s, k)[0] * ca.fmax(side * (s.z["place"] - s.z[name]), 0) / EDGE
-
-    return rate
-
-
-def passes(s: Scene, k: int) -> ca.SX:
-    """How often contacts have passed over the place where one is: every one has been on a stretch of the lane of its
-    own, about as often anywhere on it, and where the lane ends the ground is new. Contacts behind each other follow one
-    track, also in a bend; those beside each other count as far as they overlap."""
-    own = s.rolling[k]
-    length = s.z["farthest"] - s.z["nearest"]
-    often = s.z["distance"] / (length + EDGE)
-    over = ca.SX(0)
-    for j, other in s.rolling.items():
-        width = max((float(own.contact.width) + float(other.contact.width)) / 2, EDGE)
-        overlap = max(0.0, 1 - abs(own.y - other.y) / width)
-        ahead = own.x - other.x + s.z["place"]
-        low, high = (
-            (1 + ca.tanh(3 * (room / EDGE + 0.5))) / 2 for room in (s.z["farthest"] - ahead, ahead - s.z["nearest"])
-        )
-        over += overlap * low * high * ca.fmax(often - 0.5 * (j == k), 1)  # its own last one isn't complete
-    return over * length / (length + EDGE)
-
-
 MEMORY = {
-    "distance": Memory(lambda s, k, p: _way(s, k)[0], 1e-6),
-    "facing": Memory(_facing, 1e-6),
-    "reversals": Memory(_reversing, 1e-6),
-    "place": Memory(lambda s, k, p: s.rolling[k].Vx, 1e-6),
-    "farthest": Memory(_beyond("farthest", 1.0), 1e-6),
-    "nearest": Memory(_beyond("nearest", -1.0), 1e-6),
+    "distance": Memory(lambda s, k, p: _way(s, k)[0], 1e-6, form=("counted", 0.0)),
+    "facing": Memory(_facing, 1e-6, form=("counted", 1.0)),
+    "reversals": Memory(_reversing, 1e-6, form=("counted", 1.0)),
 }
+
+
+def passed(over: ca.SX, each: ca.SX) -> ca.SX:
+    """What passes have made of the soil under a contact, 0 to 1, where each leaves exp(-PASS / each) of what was still
+    to come; over (MOST,): as a scene has it."""
+    left = ca.exp(-PASS / each)
+    return (1 - left) * ca.dot(over, ca.vertcat(*[left**n for n in range(MOST)]))
+
+
+class Ground:
+    """A map of the ground that counts how often contacts have entered each of its cells: of every contact, the shares
+    of its width that were passed over at least 1, 2, ... MOST times before, each time by any of them.
+
+    widths (n,) [m]: of the contacts. Where a contact comes to new ground its shares follow over PATCH, the length of
+    its own footprint.
+    """
+
+    def __init__(self, widths: Sequence[float]) -> None:
+        self.places = [np.linspace(-0.5, 0.5, max(2, round(FINE * w / CELL) + 1)).tolist() for w in widths]
+        self.entered: dict[tuple[int, int], int] = {}
+        self.under: list[set[tuple[int, int]]] = [set() for _ in widths]
+        self.shares = np.zeros((len(widths), MOST))
+        self.last: list[tuple[float, float] | None] = [None] * len(widths)
+
+    def come(self, axles: np.ndarray) -> np.ndarray:
+        """The shares (n MOST,), contact after contact, when the contacts have come to axles (n, 4): x, y of the middle
+        and of the way from one end to the other [m]."""
+        for k, (x, y, across, along) in enumerate(axles.tolist()):
+            last = self.last[k]
+            moved = np.inf if last is None else hypot(x - last[0], y - last[1])
+            if moved < NEXT:
+                continue
+            self.last[k] = x, y
+            cells = [(floor((x + p * across) / CELL), floor((y + p * along) / CELL)) for p in self.places[k]]
+            now = set(cells)
+            for cell in now - self.under[k]:
+                self.entered[cell] = self.entered.get(cell, 0) + 1
+            self.under[k] = now
+            before = [min(self.entered[cell] - 1, MOST) for cell in cells]  # but for the pass that it is in
+            often = np.bincount(before, minlength=MOST + 1)
+            target = often[:0:-1].cumsum()[::-1] / len(cells)
+            self.shares[k] += (1 - exp(-moved / PATCH)) * (target - self.shares[k])
+        return self.shares.ravel().copy()

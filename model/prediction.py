@@ -8,17 +8,17 @@ the prediction, and their amounts are parameters like the others.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
 
-from model import placing, tree
+from model import lane, placing, tree
 from model.columns import independent
 from model.effect import Placed, Site
-from model.equations import Equations, equations, kinematics
+from model.equations import Equations, axles, equations, kinematics
 from model.machine import Machine, MachineError
 
 
@@ -101,7 +101,9 @@ class Model:
     derivatives, those of a planar root in its own axes; u (n_u,) torques that the motors deliver [N m]. Functions
     take (n_q, N) batches as they are. `nominal`, `scale`: (n_base,), of the base parameters X, behind which come the
     amounts of the machine's effects. With effects, functions of a sample take two more arguments, `beside`: u, and
-    what the effects remember, z (n_z,), whose rates are `flow` (q, nu, u, z, X) and which starts as `fresh`.
+    what the effects remember, z (n_z,), whose rates are `flow` (q, nu, u, z, X) and which starts as `fresh`. The last
+    ones of z, `mapped`, have no rate: a map of the ground tells them, at every sample anew (`ground`, axles: q -> where
+    contacts are).
 
     read: (q, nu, wheels, u, z, X) -> exact readings of the sensors that `readable` names. channels: (t, X) -> gain,
     offset, delay (n_u,) of the torque sensors.
@@ -124,6 +126,8 @@ class Model:
     channels: ca.Function
     readable: tuple[str, ...]
     memory: tuple[str, ...]
+    mapped: tuple[str, ...]
+    axles: ca.Function
     effects: tuple[Placed, ...]
     flaws: bool
     shapes: bool
@@ -145,9 +149,26 @@ class Model:
         above |= {f"{e.name}.{s}" for e in self.effects for s, shape in e.effect.shapes.items() if not shape.signed}
         return np.array([name in above for name in self.base.names])
 
+    def ground(self) -> Callable[[np.ndarray], np.ndarray]:
+        """A map of ground on which no contact has been yet: what it tells (n_contacts MOST,) when the machine has come
+        to coordinates (n_q,), called for one sample of a motion after the other."""
+        contacts = [b.contact for b in self.machine.contacts if b.contact is not None]
+        ground = lane.Ground([float(c.width) for c in contacts])
+        q, axles = np.zeros(len(self.coordinates)), np.zeros((len(contacts), 4))
+        told = self.axles.buffer()
+        told[0].set_arg(0, q.data)
+        told[0].set_res(0, axles.data)
+
+        def come(to: np.ndarray) -> np.ndarray:
+            q[:] = to
+            told[1]()  # not by itself: its buffer must not be gone
+            return ground.come(axles)
+
+        return come
+
     @property
     def remembered(self) -> np.ndarray:
-        """How well `fresh` is known at the start of a log (n_z,)."""
+        """How well `fresh` is known at the start of a log, of what is not `mapped`."""
         own = [m.spread for e in self.effects for _, m in e.memory.values()]
         return np.array([1e-6] * ("time" in self.memory) + own)
 
@@ -321,6 +342,8 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
         _of_base(found.channels, base),
         found.readable,
         found.memory,
+        found.mapped,
+        axles(found.sample),
         placed,
         flaws,
         shapes,
@@ -349,7 +372,7 @@ def _amounts(machine: Machine, placed: Sequence[Placed], shapes: bool) -> dict[s
                 size = abs(e.effect.amount(site))
             elif shapes and not e.effect.shapes[key].whole:
                 shape = e.effect.shapes[key]
-                size = 1.0 if shape.signed else abs(shape.default * shape.size(site)) / 4
+                size = 1.0 if shape.signed else max(abs(shape.default * shape.size(site)), abs(e.values[key])) / 4
             else:
                 continue
             found[name] = e.values[key], unit, max(size, abs(e.values[key]) if key == "A" else 0.0)

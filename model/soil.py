@@ -51,8 +51,9 @@ def _of_three(form: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
 def compacted(s: Scene, k: int, p: Values, soil: Soil) -> Soil:
     """Stiffer with what went over it: way, reversals or passes."""
     driven, reversed_, passed = _of_three(p["counted"])
-    way = driven * s.z["distance"] + lane.PASS * (reversed_ * s.z["reversals"] + passed * lane.passes(s, k))
-    return scaled(soil, 1 + p["A"] * (1 - ca.exp(-way / p["pass"])))
+    way = driven * s.z["distance"] + reversed_ * lane.PASS * s.z["reversals"]
+    grown = 1 - ca.exp(-way / p["pass"]) + passed * lane.passed(s.over[k], p["pass"])
+    return scaled(soil, 1 + p["A"] * grown)
 
 
 def saturated(s: Scene, k: int, p: Values, soil: Soil) -> Soil:

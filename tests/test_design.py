@@ -300,7 +300,7 @@ def test_settled_states_follow_the_accurate_simulation(roller: Model) -> None:
     drive = multisine(roller, problem, 2)
     motion = simulate(roller, drive.torque[:1] * 0 + drive.sample(100) * 0.3)
     sizes = dict.fromkeys(roller.coordinates, 1.0) | {c + "'": 1.0 for c in roller.coordinates}
-    tr = collocation.transcribe(roller, problem, sizes, 30, elements=4)
+    tr = collocation.transcribe(roller, problem, sizes, 30, motion, elements=4)
     at = (np.arange(30)[:, None] + tr.place) * tr.knot
     Z = collocation.settle(tr, np.zeros(tr.n_z), 0.3 * drive.torque / tr.torque_scale, np.zeros((30, 12, tr.n_z)))
     for k, name in enumerate(tr.state_names):

@@ -249,9 +249,10 @@ def test_a_new_limit_is_one_function(monkeypatch: pytest.MonkeyPatch, straight: 
     monkeypatch.setitem(limit.KINDS, "wheelspin", Kind(wheelspin, ("body.limit.rim_speed",)))
     torque = drive(straight, 6, 1, {"u1": 3000, "u4": -3000})
     assert limit.check(straight, problem, simulate(straight, torque))["wheelspin"] > 0.01
-    assert limit.check(straight, problem, simulate(straight, 0 * torque))["wheelspin"] == 0
+    still = simulate(straight, 0 * torque)
+    assert limit.check(straight, problem, still)["wheelspin"] == 0
     sizes = dict.fromkeys(straight.coordinates, 1.0) | {c + "'": 1.0 for c in straight.coordinates}
-    assert "wheelspin" in collocation.transcribe(straight, problem, sizes, 10).limit_names
+    assert "wheelspin" in collocation.transcribe(straight, problem, sizes, 10, still).limit_names
     assert "| wheelspin | How much faster the front roll turns than the rear one. |" in reference.choices_page()
     assert plan.ready(study(limits=[{"wheelspin": 0.5}])).total == 1
     with pytest.raises(ValueError, match=r"allowed: torque.*wheelspin"):
