@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import exp, floor, hypot, log
+from math import exp, floor, hypot, inf, isfinite, log
 
 import casadi as ca
 import numpy as np
@@ -73,8 +73,8 @@ class Ground:
         and of the way from one end to the other [m]."""
         for k, (x, y, across, along) in enumerate(axles.tolist()):
             last = self.last[k]
-            moved = np.inf if last is None else hypot(x - last[0], y - last[1])
-            if moved < NEXT:
+            moved = inf if last is None else hypot(x - last[0], y - last[1])
+            if moved < NEXT or not isfinite(x + y + across + along):  # a fit that goes astray may lead anywhere
                 continue
             self.last[k] = x, y
             cells = [(floor((x + p * across) / CELL), floor((y + p * along) / CELL)) for p in self.places[k]]

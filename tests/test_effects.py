@@ -562,6 +562,13 @@ def test_standing_still_or_a_breath_to_and_fro_is_no_pass() -> None:
     assert told.sum() == 0
 
 
+def test_what_is_nowhere_is_on_no_map() -> None:
+    ground = lane.Ground([2.1])
+    for x in (0.013, np.nan, np.inf, 1.013, 0.013):
+        told = ground.come(np.array([[x, 0.0, 0.0, 2.1]]))
+    assert told.sum() == pytest.approx(1, abs=0.01)
+
+
 def test_a_simulation_and_a_smoothed_motion_look_at_the_same_map(va12: Model) -> None:
     """In a bend, to and fro: the pose that follows from velocities is the one that was integrated."""
     model = compacting(va12.machine, 2.0)
