@@ -36,7 +36,7 @@ LIKE = 0.7  # share of a name's best first-order gain from which another variant
 PLAIN = 0.5  # the same for the variant without unusual shapes, which the others may mimic before a fit
 ANEW = 12  # effects that begin anew where nothing was found
 MAIN = 0.3  # of the excess misfit that such a one must explain beside exact dynamics: the largest of three effects does
-PAIR = 2  # candidates whose fits are begun in any case
+PAIR = 2  # candidates whose fits are begun in any case, or with forces so large that they take up part of any cause
 BEHIND = 0.5  # share of what was gained already that further candidates must have come to after a few passes
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
@@ -349,8 +349,9 @@ def _followed(
     machines = [placing.extended(stage.machine, _entry(s)) for s in likely]
     worth = stage.fit.cost - MAIN * stage.excess if stage.settled and stage.exact else np.inf
     for disturbed in forces if likely else ():
-        found = begun(machines, stage, disturbed, together, worth)
-        follow = [(s, x) for s, x in zip(likely, found, strict=True) if x is not None and x.follows]
+        most = PAIR if disturbed > smoothing.DISTURBED[0] else len(likely)
+        found = begun(machines[:most], stage, disturbed, together, worth)
+        follow = [(s, x) for s, x in zip(likely[:most], found, strict=True) if x is not None and x.follows]
         follow = [(s, x) for s, x in follow if _felt(s.candidate.name, x)]
         if not follow:
             continue

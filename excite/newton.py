@@ -28,6 +28,7 @@ SETTLED = 3  # passes until the states fit the dynamics well enough to tell whic
 DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's scale, and its share from pass to pass
 RESUMED = DAMPING[0] * DAMPING[1] ** 2  # damping of a fit that goes on from another
 HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
+LOST = (4, 30.0, 0.9)  # after so many with a step so large that is such a share of the one two passes earlier
 LATELY = 4  # passes whose steps tell how small the last one will be
 IDLE = 0.5, 0.8  # share of a step two passes earlier above which it hardly shrinks: near an answer, far from any
 FALLING = 0.01  # of a cost, in two passes
@@ -265,6 +266,8 @@ def iterate(
         if k >= SETTLED and step <= nearest and not away:
             best, nearest = latest, step
         sizes.append(step)
+        if len(sizes) > LOST[0] and step > max(LOST[1], LOST[2] * sizes[-3]):
+            break
         if k >= HOPELESS[0]:
             shrinking = min((step / sizes[-1 - LATELY]) ** (1 / LATELY), 1.0) if len(sizes) > LATELY else 0.0
             if step > HOPELESS[1] or step * shrinking ** (passes - 1 - k) > NEARLY:

@@ -33,6 +33,9 @@ FAR = 10.0  # misfit over readings, a few passes after the beginning, from which
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 PASSES = 14  # of a fit that goes on from another
 ONSET = 30.0  # [s] that the beginning of a log has at least
+ONSETS = 0.25, 0.33, 0.4, 0.5  # shares of logs that are taken for their beginning, in turn
+TELLING = 0.15  # of what exact dynamics leave, that is as much as a beginning must hold of it
+LENIENT = 0.5  # of what a fit must take, that it must take of what is left of the beginning
 COARSE = 10.0, 30.0  # times their noise that sensors are taken to have where nothing follows the logs, in turn
 LESS = 0.1, 0.3  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
 SMALL = LESS[0] * smoothing.DISTURBED[0]  # the smallest that are tried
@@ -243,7 +246,8 @@ def begun(
     or its beginning is FAR off already; where they leave much, with small disturbing forces after all, if they bring it
     near or it doesn't follow."""
     prepared = [_noisy(_resumed(machine, of), 1.0) for machine in machines]
-    made = partial(_brought_near, disturbed=disturbed) if disturbed > 0 else partial(_plain, worth=worth)
+    onset = _onset(of, worth) if np.isfinite(worth) else None
+    made = partial(_brought_near, disturbed=disturbed) if disturbed > 0 else partial(_plain, worth=worth, onset=onset)
     calls = [partial(made, m, p) for m, p in zip(machines, prepared, strict=True)]
     for m, p, fits in zip(machines, prepared, together(calls), strict=True):
         yield _stage(m, p, fits) if fits else None
@@ -313,27 +317,63 @@ def _with_less(stage: Stage) -> Stage | None:
     return None
 
 
+@dataclass(frozen=True)
+class Onset:
+    """How many samples of each log are its beginning, and the most that a fit may cost there, from which it isn't worth
+    the whole."""
+
+    samples: tuple[int, ...]
+    most: float
+
+
+def _begins(prepared: Prepared, share: float) -> tuple[int, ...] | None:
+    """How many samples such a share of each log has, ONSET at least; None where that is more than half of them all."""
+    rate, lengths = float(prepared.c.model.machine.sampling_hz), [len(r.used) for r in prepared.records]
+    samples = tuple(min(n, max(round(ONSET * rate), round(share * n))) for n in lengths)
+    return samples if sum(samples) <= (sum(lengths) + 1) / 2 else None
+
+
+def _onset(of: Stage, worth: float) -> Onset | None:
+    """The beginning of the logs that tells whether a fit may come to what it is worth: the shortest that holds a good
+    part of what a stage's exact dynamics leave beside noise. None where no half of the logs does."""
+    part = LENIENT * (of.fit.cost - worth) / max(of.excess, 1e-9)
+    missed = [np.square(way.white.E[:, :, 0]).sum(axis=1, dtype=float) for way in of.ways]
+    for share in ONSETS:
+        samples = _begins(of.prepared, share)
+        if samples is None:
+            return None
+        cost = sum(float(x[:n].sum()) for x, n in zip(missed, samples, strict=True))
+        noise = sum(float(r.used[:n].sum()) for r, n in zip(of.prepared.records, samples, strict=True))
+        left = cost - (1 + SLACK) * noise
+        if left >= TELLING * of.excess:
+            return Onset(samples, cost - part * left)
+    return None
+
+
 def _sets_out(prepared: Prepared, disturbed: float) -> bool:
     """Whether a model may follow the logs by exact dynamics, or come near them with disturbing forces, as far as the
     first quarter of each tells, which takes a fraction of the time. What stays FAR off that is too far off the whole to
     follow it; what leaves more there, beside noise, than the whole may leave and still be near, isn't near the whole.
     """
-    rate = float(prepared.c.model.machine.sampling_hz)
-    samples = [max(round(ONSET * rate), len(r.used) // 4) for r in prepared.records]
-    records = tuple(r.until(n) for r, n in zip(prepared.records, samples, strict=True))
-    if sum(len(r.used) for r in records) > sum(len(r.used) for r in prepared.records) / 2:
+    samples = _begins(prepared, ONSETS[0])
+    if samples is None:
         return True
-    onset = replace(prepared, records=records, starts=tuple(map(Point.until, prepared.starts, samples)))
-    most = onset.noise + (STRONG - 1) * prepared.noise if disturbed > 0 else FAR * onset.noise
+    noise = sum(float(r.used[:n].sum()) for r, n in zip(prepared.records, samples, strict=True))
+    most = noise + (STRONG - 1) * prepared.noise if disturbed > 0 else FAR * noise
+    cost, found = _set_out(prepared, Onset(samples, most), disturbed)
+    return cost <= most or (found and disturbed == 0)
+
+
+def _set_out(prepared: Prepared, begin: Onset, disturbed: float) -> tuple[float, bool]:
+    """What a fit to the beginning of the logs costs after a few passes, nothing where it has none, and whether it is as
+    good as found then."""
+    records = tuple(r.until(n) for r, n in zip(prepared.records, begin.samples, strict=True))
+    onset = replace(prepared, records=records, starts=tuple(map(Point.until, prepared.starts, begin.samples)))
+    X, passes = onset.c.model.nominal, newton.SETTLED + 1
     try:
-        fit = _iterated(onset, onset.starts, onset.c.model.nominal, disturbed, passes=newton.SETTLED + 1, most=most)
+        return _iterated(onset, onset.starts, X, disturbed, passes=passes, most=begin.most).cost, True
     except NotConverged as failed:
-        if failed.fit is None:
-            return True
-        fit, found = failed.fit, failed.nearly is not None
-    else:
-        found = True
-    return fit.cost <= most or (found and disturbed == 0)
+        return (0.0 if failed.fit is None else failed.fit.cost), failed.nearly is not None
 
 
 def _brought_near(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
@@ -341,11 +381,13 @@ def _brought_near(machine: Machine, prepared: Prepared, disturbed: float) -> Fit
     return _disturbed(machine, prepared, disturbed, STRONG * prepared.noise) if _sets_out(prepared, disturbed) else None
 
 
-def _plain(machine: Machine, prepared: Prepared, worth: float) -> Fits | None:
+def _plain(machine: Machine, prepared: Prepared, worth: float, onset: Onset | None) -> Fits | None:
     """A fit from first guesses by exact dynamics, or by small disturbing forces from there where much is left; None of
-    one that costs more than it is worth, or where it is worth any cost, as nothing else follows the logs, of one that
-    doesn't set out."""
+    one that costs more than it is worth, or more than it may on the logs' onset, or where it is worth any cost, as
+    nothing else follows the logs, of one that doesn't set out."""
     if np.isinf(worth) and not _sets_out(prepared, 0.0):
+        return None
+    if onset is not None and _set_out(prepared, onset, 0.0)[0] > onset.most:
         return None
     fit = _from_first(prepared, 0.0, FAR * prepared.readings, worth)
     if fit is None or fit.cost > worth:
