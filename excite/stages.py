@@ -335,7 +335,8 @@ def _begins(prepared: Prepared, share: float) -> tuple[int, ...] | None:
 
 def _onset(of: Stage, worth: float) -> Onset | None:
     """The beginning of the logs that tells whether a fit may come to what it is worth: the shortest that holds a good
-    part of what a stage's exact dynamics leave beside noise. None where no half of the logs does."""
+    part of what a stage's exact dynamics leave beside noise, and what its own model comes to there. None where no half
+    of the logs holds so much."""
     part = LENIENT * (of.fit.cost - worth) / max(of.excess, 1e-9)
     missed = [np.square(way.white.E[:, :, 0]).sum(axis=1, dtype=float) for way in of.ways]
     for share in ONSETS:
@@ -344,9 +345,10 @@ def _onset(of: Stage, worth: float) -> Onset | None:
             return None
         cost = sum(float(x[:n].sum()) for x, n in zip(missed, samples, strict=True))
         noise = sum(float(r.used[:n].sum()) for r, n in zip(of.prepared.records, samples, strict=True))
-        left = cost - (1 + SLACK) * noise
-        if left >= TELLING * of.excess:
-            return Onset(samples, cost - part * left)
+        if cost - (1 + SLACK) * noise >= TELLING * of.excess:
+            without, _ = _set_out(of.prepared, Onset(samples, np.inf), 0.0)
+            cost = min(cost, without or np.inf)
+            return Onset(samples, cost - part * max(0.0, cost - (1 + SLACK) * noise))
     return None
 
 
