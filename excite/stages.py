@@ -246,7 +246,7 @@ def begun(
     or its beginning is FAR off already; where they leave much, with small disturbing forces after all, if they bring it
     near or it doesn't follow."""
     prepared = [_noisy(_resumed(machine, of), 1.0) for machine in machines]
-    onset = _onset(of, worth) if np.isfinite(worth) else None
+    onset = _onset(of, worth) if np.isfinite(worth) and of.settled and of.exact else None
     made = partial(_brought_near, disturbed=disturbed) if disturbed > 0 else partial(_plain, worth=worth, onset=onset)
     calls = [partial(made, m, p) for m, p in zip(machines, prepared, strict=True)]
     for m, p, fits in zip(machines, prepared, together(calls), strict=True):
@@ -333,6 +333,12 @@ def _begins(prepared: Prepared, share: float) -> tuple[int, ...] | None:
     return samples if sum(samples) <= (sum(lengths) + 1) / 2 else None
 
 
+def _until(prepared: Prepared, samples: Sequence[int]) -> Prepared:
+    """The first samples of each log only."""
+    records = tuple(r.until(n) for r, n in zip(prepared.records, samples, strict=True))
+    return replace(prepared, records=records, starts=tuple(map(Point.until, prepared.starts, samples)))
+
+
 def _onset(of: Stage, worth: float) -> Onset | None:
     """The beginning of the logs that tells whether a fit may come to what it is worth: the shortest that holds a good
     part of what a stage's exact dynamics leave beside noise, and what its own model comes to there. None where no half
@@ -343,12 +349,12 @@ def _onset(of: Stage, worth: float) -> Onset | None:
         samples = _begins(of.prepared, share)
         if samples is None:
             return None
+        begin = _until(of.prepared, samples)
         cost = sum(float(x[:n].sum()) for x, n in zip(missed, samples, strict=True))
-        noise = sum(float(r.used[:n].sum()) for r, n in zip(of.prepared.records, samples, strict=True))
-        if cost - (1 + SLACK) * noise >= TELLING * of.excess:
-            without, _ = _set_out(of.prepared, Onset(samples, np.inf), 0.0)
+        if cost - (1 + SLACK) * begin.noise >= TELLING * of.excess:
+            without, _ = _set_out(begin, 0.0, np.inf)
             cost = min(cost, without or np.inf)
-            return Onset(samples, cost - part * max(0.0, cost - (1 + SLACK) * noise))
+            return Onset(samples, cost - part * max(0.0, cost - (1 + SLACK) * begin.noise))
     return None
 
 
@@ -360,20 +366,18 @@ def _sets_out(prepared: Prepared, disturbed: float) -> bool:
     samples = _begins(prepared, ONSETS[0])
     if samples is None:
         return True
-    noise = sum(float(r.used[:n].sum()) for r, n in zip(prepared.records, samples, strict=True))
-    most = noise + (STRONG - 1) * prepared.noise if disturbed > 0 else FAR * noise
-    cost, found = _set_out(prepared, Onset(samples, most), disturbed)
+    begin = _until(prepared, samples)
+    most = begin.noise + (STRONG - 1) * prepared.noise if disturbed > 0 else FAR * begin.noise
+    cost, found = _set_out(begin, disturbed, most)
     return cost <= most or (found and disturbed == 0)
 
 
-def _set_out(prepared: Prepared, begin: Onset, disturbed: float) -> tuple[float, bool]:
-    """What a fit to the beginning of the logs costs after a few passes, nothing where it has none, and whether it is as
-    good as found then."""
-    records = tuple(r.until(n) for r, n in zip(prepared.records, begin.samples, strict=True))
-    onset = replace(prepared, records=records, starts=tuple(map(Point.until, prepared.starts, begin.samples)))
-    X, passes = onset.c.model.nominal, newton.SETTLED + 1
+def _set_out(begin: Prepared, disturbed: float, most: float) -> tuple[float, bool]:
+    """What a fit to the beginning of logs costs after a few passes, nothing where there is none, and whether it is as
+    good as found then. most: what it is given up above."""
+    X, passes = begin.c.model.nominal, newton.SETTLED + 1
     try:
-        return _iterated(onset, onset.starts, X, disturbed, passes=passes, most=begin.most).cost, True
+        return _iterated(begin, begin.starts, X, disturbed, passes=passes, most=most).cost, True
     except NotConverged as failed:
         return (0.0 if failed.fit is None else failed.fit.cost), failed.nearly is not None
 
@@ -389,7 +393,7 @@ def _plain(machine: Machine, prepared: Prepared, worth: float, onset: Onset | No
     nothing else follows the logs, of one that doesn't set out."""
     if np.isinf(worth) and not _sets_out(prepared, 0.0):
         return None
-    if onset is not None and _set_out(prepared, onset, 0.0)[0] > onset.most:
+    if onset is not None and _set_out(_until(prepared, onset.samples), 0.0, onset.most)[0] > onset.most:
         return None
     fit = _from_first(prepared, 0.0, FAR * prepared.readings, worth)
     if fit is None or fit.cost > worth:

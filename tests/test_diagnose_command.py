@@ -606,6 +606,7 @@ def test_a_fit_that_is_not_worth_more_passes_is_given_up(straight: Model, monkey
         return covariance, move, 50.0, costs[min(len(seen), len(costs)) - 1]
 
     monkeypatch.setattr(newton, "newton_step", scripted)
+    monkeypatch.setattr(newton, "LOST", (8, np.inf, 1.0))
     for costs, spent in (
         ([900.0, 900.0], 4),
         ([900.0, 800.0, 700.0, 600.0, 550.0, 549.0, 548.0], 7),
@@ -618,6 +619,65 @@ def test_a_fit_that_is_not_worth_more_passes_is_given_up(straight: Model, monkey
         assert len(seen) == spent
         assert failed.value.fit is not None
         assert failed.value.fit.cost == costs[-1]
+
+
+@pytest.mark.parametrize(
+    ("steps", "spent"),
+    [
+        ([400.0, 300.0, 200.0, 100.0, 190.0], 5),  # hardly less than two passes before
+        ([400.0, 300.0, 200.0, 100.0, 170.0, 91.0], 6),
+        ([400.0, 300.0, 200.0, 100.0, 170.0, 80.0, 29.0, 29.0], 8),  # large no more
+        ([400.0, 300.0, 200.0, 100.0, 170.0, 80.0, 140.0, 70.0], 8),
+    ],
+)
+def test_steps_that_stay_large_end_a_fit(
+    steps: list[float], spent: int, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = calm(straight)
+    p, true = stage.prepared, newton.newton_step
+    seen: list[Any] = []
+
+    def scripted(c: Any, records: Any, linear: Any, *asked: Any) -> Any:
+        covariance, move, *_ = true(c, records, linear, *asked)
+        if not any(linear is x for x in seen):
+            seen.append(linear)
+        return covariance, move, steps[min(len(seen), len(steps)) - 1], 500.0
+
+    monkeypatch.setattr(newton, "newton_step", scripted)
+    monkeypatch.setattr(newton, "HOPELESS", (8, 10.0))
+    with pytest.raises(newton.NotConverged):
+        newton.iterate(p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.0, p.held, passes=8)
+    assert len(seen) == spent
+
+
+def test_what_takes_too_little_of_a_beginning_is_not_fitted_to_the_whole(
+    straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exact dynamics follow the log without its cause and leave much: of what begins anew only what takes a good part
+    of that from the first quarter, beside what the model without it comes to there, is fitted to all of it."""
+    stuck = prediction.build(
+        placing.extended(straight.machine, placing.parse("torque_deadband@rear_roll=150", straight.machine, 40.0))
+    )
+    one = log.check(sensors.measure(stuck, simulate(stuck, gentle(straight, 40.0).u), seed=3), straight.machine)
+    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    assert stage.exact
+    assert stage.excess > 1000
+    true, lengths = newton.iterate, list[int]()
+
+    def counted(c: Any, records: Any, *asked: Any) -> newton.Fit:
+        lengths.append(len(records[0].used))
+        return true(c, records, *asked)
+
+    monkeypatch.setattr(newton, "iterate", counted)
+    monkeypatch.setattr(stages, "ONSET", 5.0)
+    worth, whole = stage.fit.cost - 0.3 * stage.excess, len(one)
+    for effect, found in (("torque_deadband@rear_roll=100", True), ("torque_offset_drift@front_roll=0.1", False)):
+        lengths.clear()
+        machine = placing.extended(straight.machine, placing.parse(effect, straight.machine, 40.0))
+        (made,) = stages.begun([machine], stage, 0.0, in_turn, worth)
+        assert (made is not None) == found
+        assert lengths[:2] == [whole // 4] * 2  # without it, and with it
+        assert (max(lengths) == whole) == found
 
 
 def test_what_is_held_is_where_it_is_held_a_pass_later(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
