@@ -43,7 +43,7 @@ CLOSE = 10.0  # a rival that is worse by less than this is a tie
 # Of what is explained already, that a further effect must gain, as nature is never exactly the formula: by the fits'
 # gains, and by how many deviations the amounts are from none; the more where parameters absorb most of an effect, as
 # they absorb none of its formula's error; for what acts at some time only; where forces hide how good the formula is;
-# beside what a map of the ground tells, as two maps of one ground differ by up to 1.3 %.
+# beside what a map of the ground tells, as of a gain two maps of one ground leave each other up to 1.3 %.
 SHAPE = 0.005, 0.002
 ABSORBED, TIMED, HIDDEN, MAPPED = 0.1, 0.1, 0.25, 0.02
 MUCH = 0.1  # misfit beside noise, over what noise makes, of which one further effect takes away all only as a cause
@@ -349,9 +349,11 @@ def _followed(
     machines = [placing.extended(stage.machine, _entry(s)) for s in likely]
     worth = stage.fit.cost - MAIN * stage.excess if stage.settled and stage.exact else np.inf
     for disturbed in forces if likely else ():
-        most = PAIR if disturbed > smoothing.DISTURBED[0] else len(likely)
-        found = begun(machines[:most], stage, disturbed, together, worth)
-        follow = [(s, x) for s, x in zip(likely[:most], found, strict=True) if x is not None and x.follows]
+        few = disturbed > smoothing.DISTURBED[0]
+        names = list(dict.fromkeys(s.candidate.name for s in likely))[: PAIR if few else None]
+        begin = [(s, m) for s, m in zip(likely, machines, strict=True) if s.candidate.name in names]
+        found = begun([m for _, m in begin], stage, disturbed, together, worth)
+        follow = [(s, x) for (s, _), x in zip(begin, found, strict=True) if x is not None and x.follows]
         follow = [(s, x) for s, x in follow if _felt(s.candidate.name, x)]
         if not follow:
             continue

@@ -11,7 +11,7 @@ those that promise less where nothing explains the logs.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -115,7 +115,7 @@ def diagnose(
         tell(0.15, "fitting effects with coarse sensors")
         sharp = choosing.sharp(before, together)
         before, chosen = sharp or (forced(before, together), chosen)
-    tried: Collection[str] = ()
+    tried: Container[str] = ()
     if not (before.settled or chosen):
         tell(0.15, "fitting effects from the beginning")
         before, chosen, tried = choosing.unfollowed(before, together)
@@ -124,10 +124,7 @@ def diagnose(
     if not chosen and (before.prepared.coarse > 1 or not before.near):
         tell(0.85, "fitting less likely effects from the beginning")
         old = before if before.prepared.coarse == 1 else forced(before, together)
-        tried = tried if old is first else ()
-        if nearest is not None and nearest.share < choosing.MAIN and before.exact:
-            tried = {*tried, nearest.name}  # it was fitted so, and takes too little
-        before, anew = choosing.unlikely(first, old, tried, together)
+        before, anew = choosing.unlikely(first, old, tried if old is first else (), together)
         if anew or before is not old:
             anew, left = extended(before, anew, together, lambda share, what: tell(max(share, 0.85), what))
             nearest = None if before is not old else nearest

@@ -217,7 +217,7 @@ def _way(c: Chart, r: Record, p: Point, linear: Linear, X: np.ndarray) -> Way:
             wheels[:, at - 2 * n_q] = p.s[:, k]
     exact = model.read(q.T, nu.T, wheels.T, u.T, z.T, X).full().T
     slopes, white = _slopes(c, p, u, X), whitened(linear, c.flawed)
-    over = passes(model, q, nu, 1 / float(model.machine.sampling_hz))
+    over = p.over if model.mapped else passes(model, q, nu, 1 / float(model.machine.sampling_hz))
     return Way(c, linear, len(r.origin), q, nu, a, u, t, exact, model.expand @ X, slopes, white, over)
 
 

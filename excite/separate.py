@@ -178,7 +178,7 @@ class _Asked:
 
     def __call__(self, m: Motion) -> np.ndarray:
         N, C = len(m.t), len(self.placed)
-        over = passes(self.model, m.q, m.nu, float(m.t[1] - m.t[0]))
+        over = passes(self.model, m.q, m.nu, float(m.t[1] - m.t[0])) if self.made.mapped else np.zeros((N, 0))
         z = remembered(self.made, m.q, m.nu, m.u, m.t, self.p, over)
         exact = np.broadcast_to(np.abs(m.t)[:, None], (N, self.readings)) * 0.1
         exact = exact * np.sign(m.nu.sum() or 1.0)

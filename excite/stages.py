@@ -243,8 +243,8 @@ def begun(
     """Machines with other effects, each fitted to the logs of a stage from the beginning, with so large disturbing
     forces or smaller ones, side by side; None where no fit is found. With forces none either where so large ones don't
     bring it near, or its beginning tells that they won't. By exact dynamics none where it costs more than it is worth,
-    or its beginning is FAR off already; where they leave much, with small disturbing forces after all, if they bring it
-    near or it doesn't follow."""
+    or its beginning tells that it will, or is FAR off already; where they leave much, with small disturbing forces
+    after all, if they bring it near or it doesn't follow."""
     prepared = [_noisy(_resumed(machine, of), 1.0) for machine in machines]
     onset = _onset(of, worth) if np.isfinite(worth) and of.settled and of.exact else None
     made = partial(_brought_near, disturbed=disturbed) if disturbed > 0 else partial(_plain, worth=worth, onset=onset)
@@ -329,8 +329,8 @@ class Onset:
 def _begins(prepared: Prepared, share: float) -> tuple[int, ...] | None:
     """How many samples such a share of each log has, ONSET at least; None where that is more than half of them all."""
     rate, lengths = float(prepared.c.model.machine.sampling_hz), [len(r.used) for r in prepared.records]
-    samples = tuple(min(n, max(round(ONSET * rate), round(share * n))) for n in lengths)
-    return samples if sum(samples) <= (sum(lengths) + 1) / 2 else None
+    samples = tuple(min(n, max(round(ONSET * rate), int(share * n))) for n in lengths)
+    return samples if 2 * sum(samples) <= sum(lengths) else None
 
 
 def _until(prepared: Prepared, samples: Sequence[int]) -> Prepared:
@@ -352,8 +352,7 @@ def _onset(of: Stage, worth: float) -> Onset | None:
         begin = _until(of.prepared, samples)
         cost = sum(float(x[:n].sum()) for x, n in zip(missed, samples, strict=True))
         if cost - (1 + SLACK) * begin.noise >= TELLING * of.excess:
-            without, _ = _set_out(begin, 0.0, np.inf)
-            cost = min(cost, without or np.inf)
+            cost = _set_out(begin, 0.0, np.inf)[0] or cost  # after as few passes as others have
             return Onset(samples, cost - part * max(0.0, cost - (1 + SLACK) * begin.noise))
     return None
 

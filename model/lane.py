@@ -17,6 +17,7 @@ MOST = 12  # passes that are told apart
 CELL = 0.2  # [m] of the map's cells
 FINE = 1.5  # places looked at across a contact for each cell
 NEXT = 0.03  # [m] of way from which a contact is looked at again
+LEFT = 0.06  # [m] of way from a cell, after which it may be entered again
 PATCH = 0.15  # [m] of way over which what is under a contact becomes another
 
 
@@ -55,16 +56,17 @@ def passed(over: ca.SX, each: ca.SX) -> ca.SX:
 
 class Ground:
     """A map of the ground that counts how often contacts have entered each of its cells: of every contact, the shares
-    of its width that were passed over at least 1, 2, ... MOST times before, each time by any of them.
+    of its width that were passed over at least 1, 2, ... MOST times before, each time by any of them. A cell counts as
+    left once a contact is LEFT away from where it was on it, so that who swings about a border doesn't pass over it.
 
-    widths (n,) [m]: of the contacts. Where a contact comes to new ground its shares follow over PATCH, the length of
-    its own footprint.
+    widths (n,) [m]: of the contacts; what is narrower than a cell is told as coarsely as that. Where a contact comes to
+    new ground its shares follow over PATCH, about the length of a footprint.
     """
 
     def __init__(self, widths: Sequence[float]) -> None:
         self.places = [np.linspace(-0.5, 0.5, max(2, round(FINE * w / CELL) + 1)).tolist() for w in widths]
         self.entered: dict[tuple[int, int], int] = {}
-        self.under: list[set[tuple[int, int]]] = [set() for _ in widths]
+        self.trail: list[list[tuple[float, float, set[tuple[int, int]]]]] = [[] for _ in widths]
         self.shares = np.zeros((len(widths), MOST))
         self.last: list[tuple[float, float] | None] = [None] * len(widths)
 
@@ -79,9 +81,10 @@ class Ground:
             self.last[k] = x, y
             cells = [(floor((x + p * across) / CELL), floor((y + p * along) / CELL)) for p in self.places[k]]
             now = set(cells)
-            for cell in now - self.under[k]:
+            near = [one for one in self.trail[k] if hypot(x - one[0], y - one[1]) < LEFT]
+            for cell in now.difference(*(under for _, _, under in near)):
                 self.entered[cell] = self.entered.get(cell, 0) + 1
-            self.under[k] = now
+            self.trail[k] = [*near, (x, y, now)]
             before = [min(self.entered[cell] - 1, MOST) for cell in cells]  # but for the pass that it is in
             often = np.bincount(before, minlength=MOST + 1)
             target = often[:0:-1].cumsum()[::-1] / len(cells)
