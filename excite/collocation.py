@@ -46,7 +46,8 @@ class Mapped:
     def __call__(self, *arguments: np.ndarray) -> list[np.ndarray]:
         held = [np.ascontiguousarray(a, float) for a in arguments]
         for k, a in enumerate(held):
-            self._buffer.set_arg(k, _view(a))
+            if a.size:  # memory that isn't there may seem to lie in CasADi's own
+                self._buffer.set_arg(k, _view(a))
         self._run()
         return [r.copy() for r in self._results]
 
