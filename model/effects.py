@@ -449,7 +449,7 @@ _declare(
             "pass": Shape("m", 15.0, (5.0, 15.0, 50.0)),
             "counted": _forms(
                 f"0: n is the way; 1: passes are counted by reversals; 2: place by place, on a map of the ground, for"
-                f" every contact; a pass is worth {lane.PASS:g} m of way",
+                f" every contact; a pass is worth {lane.PASS:g} m of way, and each log begins on new ground",
                 (0.0, 1.0, 2.0),
             ),
         },

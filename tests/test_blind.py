@@ -284,7 +284,7 @@ def test_what_is_so_strong_that_nothing_follows_the_log_is_named(name: str, numb
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1, 2, 3, 5])
-def test_compaction_that_a_map_of_the_lane_counts_is_named(number: int) -> None:
+def test_compaction_that_a_map_of_the_ground_counts_is_named(number: int) -> None:
     """In a slalom, one way, in circles, to and fro, in an eight: tracks that fan out and cross; and the front roll
     on new ground, the rear one on what that has passed over, which tells what a pass does and not how many are to come.
     """
