@@ -19,16 +19,13 @@ Form = tuple[str, float]  # a shape that an effect's way of acting is chosen by,
 @dataclass(frozen=True)
 class Rolling:
     """How a contact, a roll or a wheel, moves: its centre's velocity along and across its chassis [m/s], spin and yaw
-    rate [rad/s]; x, y: where its centre is when the machine stands straight, along and across the root [m]; further: by
-    how much the ground is further from its axle than its radius [m]."""
+    rate [rad/s]; further: by how much the ground is further from its axle than its radius [m]."""
 
     contact: Contact
     Vx: ca.SX
     Vy: ca.SX
     spin: ca.SX
     yaw: ca.SX
-    x: float = 0.0
-    y: float = 0.0
     further: ca.SX | float = 0.0
 
     @property

@@ -361,8 +361,7 @@ def _rolling(s: Sample, body: Body) -> tuple[Rolling, ca.SX]:
     spin = (R[:, 2].T @ turn) @ own.omega
     yaw = carrier.omega[2]
     lever = ca.jacobian(ca.vertcat(centre[0], centre[1], spin, yaw), s.nu)
-    straight = ca.evalf(ca.substitute(own.position, s.q, ca.DM.zeros(*s.q.shape))).full()[:, 0]
-    return Rolling(body.contact, centre[0], centre[1], spin, yaw, float(straight[0]), float(straight[1])), lever
+    return Rolling(body.contact, centre[0], centre[1], spin, yaw), lever
 
 
 def _soil(s: Sample, body: Body, rolling: Rolling) -> Soil:
