@@ -35,7 +35,7 @@ TRIED = 5  # candidates that are fitted
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
 PLAIN = 0.5  # the same for the variant without unusual shapes, which the others may mimic before a fit
 ANEW = 12  # effects that begin anew where nothing was found
-MAIN = 0.3  # of the excess misfit that such a one must explain beside exact dynamics: the largest of three effects does
+MAIN = 0.3  # of the excess misfit that the largest of three effects explains, which is to be found first
 PAIR = 2  # candidates whose fits are begun in any case, or with forces so large that they take up part of any cause
 BEHIND = 0.5  # share of what was gained already that further candidates must have come to after a few passes
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
@@ -227,7 +227,9 @@ def choose(
     def told(k: int) -> None:
         tell(done + 0.03 * k, f"fitting {likely[k].candidate.name}")
 
-    tries, refused = _tries(stage, likely, together, told)
+    least = min(_least(stage, chosen, s.candidate, 0.0) for s in likely)
+    vain = stage.fit.cost - BEHIND * least if _hides(stage) else np.inf
+    tries, refused = _tries(stage, likely, together, told, vain)
     if stage.exact and likely[0].candidate.name not in {*refused, *(s.candidate.name for s, _ in tries)}:
         # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
         try:
@@ -380,7 +382,13 @@ def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate
     mapped = {e.name for e in stage.model.effects if e.mapped}
     own = (max(min(ALIKE**2 / x.left, ABSORBED), MAPPED * (x.name in mapped)) for x in chosen)
     shape = sum(max(part, share) * x.gain for share, x in zip(own, chosen, strict=True))
-    return max(LEAST[stage.rough] * stage.excess, shape, min(SHAPE[1] * _sureness(stage), BESIDE))
+    explained = MAIN if _hides(stage) and not chosen else LEAST[stage.rough]
+    return max(explained * stage.excess, shape, min(SHAPE[1] * _sureness(stage), BESIDE))
+
+
+def _hides(stage: Stage) -> bool:
+    """Whether disturbing forces leave much: then they are as large as can be, and go far with any model."""
+    return not (stage.exact or stage.near)
 
 
 def _completes(found: Stage, before: Stage) -> bool:
@@ -395,11 +403,16 @@ def _much(stage: Stage) -> bool:
 
 
 def _tries(
-    stage: Stage, likely: Sequence[evidence.Score], together: Together, tell: Callable[[int], None]
+    stage: Stage,
+    likely: Sequence[evidence.Score],
+    together: Together,
+    tell: Callable[[int], None],
+    vain: float = np.inf,
 ) -> tuple[list[_Try], set[str]]:
     """The candidates whose fits were found, as the model without them was fitted: the likeliest first, the others as
     long as they don't stay far behind what it gains. Those that promise far less than the best come last, and only
-    where they may still come near what was gained. And the names that were fitted and are none: they are not felt."""
+    where they may still come near what was gained. And the names that were fitted and are none: they are not felt.
+    vain: cost that no fit may stay above."""
     tries, refused = list[_Try](), set[str]()
     near = max(PAIR, sum(OVER * s.gain >= likely[0].gain for s in likely))
     for at, batch in ((0, likely[:1]), (1, likely[1:near]), (near, likely[near:])):
@@ -408,7 +421,7 @@ def _tries(
             continue
         wishes = [(placing.extended(stage.machine, _entry(s)), stage, stage.fit.disturbed) for s in batch]
         tell(at)
-        most = stage.fit.cost - BEHIND * gained if tries else np.inf
+        most = min(vain, stage.fit.cost - BEHIND * gained if tries else np.inf)
         for k, (score, found) in enumerate(zip(batch, refits(wishes, together, most), strict=True)):
             tell(min(at + k + 1, len(likely) - 1))
             if found is not None and _felt(score.candidate.name, found):

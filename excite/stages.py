@@ -246,8 +246,12 @@ def begun(
     or its beginning tells that it will, or is FAR off already; where they leave much, with small disturbing forces
     after all, if they bring it near or it doesn't follow."""
     prepared = [_noisy(_resumed(machine, of), 1.0) for machine in machines]
-    onset = _onset(of, worth) if np.isfinite(worth) and of.settled and of.exact else None
-    made = partial(_brought_near, disturbed=disturbed) if disturbed > 0 else partial(_plain, worth=worth, onset=onset)
+    onset = _onset(of, disturbed, worth)
+    made = (
+        partial(_brought_near, disturbed=disturbed, onset=onset)
+        if disturbed > 0
+        else partial(_plain, worth=worth, onset=onset)
+    )
     calls = [partial(made, m, p) for m, p in zip(machines, prepared, strict=True)]
     for m, p, fits in zip(machines, prepared, together(calls), strict=True):
         yield _stage(m, p, fits) if fits else None
@@ -320,10 +324,11 @@ def _with_less(stage: Stage) -> Stage | None:
 @dataclass(frozen=True)
 class Onset:
     """How many samples of each log are its beginning, and the most that a fit may cost there, from which it isn't worth
-    the whole."""
+    the whole; unless it is as good as found, where that is enough."""
 
     samples: tuple[int, ...]
     most: float
+    found: bool = False
 
 
 def _begins(prepared: Prepared, share: float) -> tuple[int, ...] | None:
@@ -339,10 +344,44 @@ def _until(prepared: Prepared, samples: Sequence[int]) -> Prepared:
     return replace(prepared, records=records, starts=tuple(map(Point.until, prepared.starts, samples)))
 
 
-def _onset(of: Stage, worth: float) -> Onset | None:
-    """The beginning of the logs that tells whether a fit may come to what it is worth: the shortest that holds a good
-    part of what a stage's exact dynamics leave beside noise, and what its own model comes to there. None where no half
-    of the logs holds so much."""
+def _onset(of: Stage, disturbed: float, worth: float) -> Onset | None:
+    """The beginning of the logs that tells which fits are worth the whole, with so large disturbing forces, of what
+    must not cost more than it is worth, if that is known. It takes a fraction of the time. None where no half of the
+    logs does."""
+    if disturbed > 0:
+        return _near(of)
+    if np.isinf(worth):
+        return _far(of)
+    return _telling(of, worth) if of.settled and of.exact else None
+
+
+def _near(of: Stage) -> Onset | None:
+    """A quarter of the logs: what leaves more there, beside noise, than the whole may leave and still be near, isn't
+    near the whole."""
+    samples = _begins(of.prepared, ONSETS[0])
+    if samples is None:
+        return None
+    return Onset(samples, _until(of.prepared, samples).readings + (STRONG - 1) * of.prepared.readings)
+
+
+def _far(of: Stage) -> Onset | None:
+    """The shortest beginning that exact dynamics of a stage's own model stay FAR off, as they do off the whole: what
+    does as well is too far off the whole to follow it. A quarter where none is."""
+    first = None
+    for share in ONSETS:
+        samples = _begins(of.prepared, share)
+        if samples is None:
+            break
+        onset = Onset(samples, FAR * _until(of.prepared, samples).readings, True)
+        first = first or onset
+        if not _sets_out(_noisy(of.prepared, 1.0), onset, 0.0):
+            return onset
+    return first
+
+
+def _telling(of: Stage, worth: float) -> Onset | None:
+    """The shortest beginning that holds a good part of what a stage's exact dynamics leave beside noise: there a fit
+    must take as fair a part of what its own model comes to as of the whole."""
     part = LENIENT * (of.fit.cost - worth) / max(of.excess, 1e-9)
     missed = [np.square(way.white.E[:, :, 0]).sum(axis=1, dtype=float) for way in of.ways]
     for share in ONSETS:
@@ -357,18 +396,12 @@ def _onset(of: Stage, worth: float) -> Onset | None:
     return None
 
 
-def _sets_out(prepared: Prepared, disturbed: float) -> bool:
-    """Whether a model may follow the logs by exact dynamics, or come near them with disturbing forces, as far as the
-    first quarter of each tells, which takes a fraction of the time. What stays FAR off that is too far off the whole to
-    follow it; what leaves more there, beside noise, than the whole may leave and still be near, isn't near the whole.
-    """
-    samples = _begins(prepared, ONSETS[0])
-    if samples is None:
+def _sets_out(prepared: Prepared, onset: Onset | None, disturbed: float) -> bool:
+    """Whether a fit may come to what it is worth, as far as the beginning of the logs tells, if any does."""
+    if onset is None:
         return True
-    begin = _until(prepared, samples)
-    most = begin.noise + (STRONG - 1) * prepared.noise if disturbed > 0 else FAR * begin.noise
-    cost, found = _set_out(begin, disturbed, most)
-    return cost <= most or (found and disturbed == 0)
+    cost, found = _set_out(_until(prepared, onset.samples), disturbed, onset.most)
+    return cost <= onset.most or (found and onset.found)
 
 
 def _set_out(begin: Prepared, disturbed: float, most: float) -> tuple[float, bool]:
@@ -381,18 +414,17 @@ def _set_out(begin: Prepared, disturbed: float, most: float) -> tuple[float, boo
         return (0.0 if failed.fit is None else failed.fit.cost), failed.nearly is not None
 
 
-def _brought_near(machine: Machine, prepared: Prepared, disturbed: float) -> Fits | None:
+def _brought_near(machine: Machine, prepared: Prepared, disturbed: float, onset: Onset | None) -> Fits | None:
     """A fit from first guesses with disturbing forces that bring it near the logs, and from there with smaller ones."""
-    return _disturbed(machine, prepared, disturbed, STRONG * prepared.noise) if _sets_out(prepared, disturbed) else None
+    if not _sets_out(prepared, onset, disturbed):
+        return None
+    return _disturbed(machine, prepared, disturbed, STRONG * prepared.noise)
 
 
 def _plain(machine: Machine, prepared: Prepared, worth: float, onset: Onset | None) -> Fits | None:
     """A fit from first guesses by exact dynamics, or by small disturbing forces from there where much is left; None of
-    one that costs more than it is worth, or more than it may on the logs' onset, or where it is worth any cost, as
-    nothing else follows the logs, of one that doesn't set out."""
-    if np.isinf(worth) and not _sets_out(prepared, 0.0):
-        return None
-    if onset is not None and _set_out(_until(prepared, onset.samples), 0.0, onset.most)[0] > onset.most:
+    one that costs more than it is worth, or doesn't set out."""
+    if not _sets_out(prepared, onset, 0.0):
         return None
     fit = _from_first(prepared, 0.0, FAR * prepared.readings, worth)
     if fit is None or fit.cost > worth:

@@ -781,17 +781,48 @@ def test_what_the_beginning_of_a_log_may_cost(
     """By exact dynamics ten times its noise, unless a fit is found; with forces no more beside its noise than the whole
     log may: three tenths of what is four times as much. What can't be integrated may set out."""
     stage = calm(straight)
-    monkeypatch.setattr(stages, "ONSET", len(stage.prepared.logs[0]) // 4 / 100)
-    monkeypatch.setattr(stages.Prepared, "noise", property(lambda p: float(len(p.records[0].used))))
+    quarter = len(stage.prepared.logs[0]) // 4
+    monkeypatch.setattr(stages, "ONSET", quarter / 100)
+    costs = iterated(stage, monkeypatch, lambda samples: None if cost is None else cost, found)
+    onset = stages._onset(stage, disturbed, np.inf)
+    assert onset is not None
+    assert (onset.samples, costs[:1]) == ((quarter,), [] if disturbed else [quarter])
+    assert stages._sets_out(stage.prepared, onset, disturbed) == expected
 
-    def iterated(onset: stages.Prepared, *asked: Any, most: float, **more: Any) -> newton.Fit:
-        fit = None if cost is None else replace(stage.fit, cost=cost * onset.noise)
+
+def test_a_beginning_tells_where_the_model_as_it_is_stays_far_off(
+    straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The shortest such one: what stays off it too is no cause. A quarter, where none is up to a half."""
+    stage = calm(straight)
+    n = len(stage.prepared.logs[0])
+    monkeypatch.setattr(stages, "ONSET", n / 400)
+    for late, share in ((0.0, 0.25), (0.3, 0.33), (0.45, 0.5), (0.9, 0.25)):
+        with monkeypatch.context() as patch:
+            iterated(stage, patch, lambda samples, late=late: 20.0 if samples > late * n else 5.0, False)
+            onset = stages._onset(stage, 0.0, np.inf)
+        assert onset is not None
+        assert onset.samples == (int(share * n),)
+
+
+def iterated(
+    stage: stages.Stage, monkeypatch: pytest.MonkeyPatch, cost: Callable[[int], float | None], found: bool
+) -> list[int]:
+    """In place of fits: what each costs, times its noise, by how many samples it has, and whether it is found. How many
+    samples were asked for, one after the other."""
+    asked = list[int]()
+    monkeypatch.setattr(stages.Prepared, "readings", property(lambda p: float(len(p.records[0].used))))
+
+    def fitted(onset: stages.Prepared, *given: Any, **more: Any) -> newton.Fit:
+        asked.append(len(onset.records[0].used))
+        told = cost(asked[-1])
+        fit = None if told is None else replace(stage.fit, cost=told * onset.readings)
         if found and fit is not None:
             return fit
         raise newton.NotConverged("no fit", fit, 50.0)
 
-    monkeypatch.setattr(stages, "_iterated", iterated)
-    assert stages._sets_out(stage.prepared, disturbed) == expected
+    monkeypatch.setattr(stages, "_iterated", fitted)
+    return asked
 
 
 def test_smaller_forces_are_tried_where_the_model_is_near(
@@ -989,7 +1020,8 @@ def test_a_harmonic_is_no_ripple_elsewhere(straight: Model, straight_motion: Mot
 
 
 def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The likeliest candidate is fitted for what it gains, the others as long as they come to half of that."""
+    """Where forces leave much a candidate is fitted as long as it comes to half of what it must gain, and where one
+    gained that, the others as long as they come to half of what that one did."""
     iterate = newton.iterate
     bars: list[tuple[str, float]] = []
 
@@ -1004,7 +1036,8 @@ def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatc
     choice = choosing.choose(stage, likely, (), in_turn, lambda share, what: None, 0.0)
     assert choice is not None
     assert choice.name == "ground_slope@machine"
-    assert bars[0] == (choice.name, np.inf)
+    assert not (stage.exact or stage.near)
+    assert bars[0] == (choice.name, stage.fit.cost - choosing.BEHIND * choosing.MAIN * stage.excess)
     (bar,) = {bar for name, bar in bars if name != choice.name}
     assert bar == pytest.approx(stage.fit.cost - choosing.BEHIND * choice.gain)
     texts = ("ground_slope=0.009", "roll_unbalance@rear_roll=500")
