@@ -287,7 +287,8 @@ def sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None
     if plain is not None and plain.near:
         return plain, []
     scores = scored(stage, together)
-    tries, _ = _tries(stage, _likely(stage, scores, (), together), together, lambda k: None)
+    vain = stage.fit.cost - BEHIND * LEAST[1] * stage.excess
+    tries, _ = _tries(stage, _likely(stage, scores, (), together), together, lambda k: None, vain)
     if not tries:
         return None
     _, best = tries[0]

@@ -224,7 +224,7 @@ def transcribe(
     pose = model.machine.body[0].coordinates if with_pose else ()
     needed = {*pose, *model.felt, *(model.coordinates[k] for k in resting(model))}
     used = [c for c in model.coordinates if c in needed]
-    names = (*used, *[c + "'" for c in model.coordinates], *model.memory[: len(model.memory) - len(model.mapped)])
+    names = (*used, *[c + "'" for c in model.coordinates], *model.memory[: model.lasting])
     z_size = np.array([state_size[c] for c in names])
     u_size = np.array([float(b.limit.torque) if b.limit.torque is not None else 1.0 for b in model.machine.actuated])
     knot = float(problem.duration_s) / intervals
@@ -274,7 +274,7 @@ def transcribe(
     second = ca.Function("second", [sample, over, multipliers], [ca.densify(H)], options)
 
     nodes = ((np.arange(intervals)[:, None] + place) * knot).ravel()
-    told = motion.memory[:, len(model.memory) - len(model.mapped) :]
+    told = motion.memory[:, model.lasting :]
     control, centre = _control(steered, s, u_size, knot)
     resting_states = [names.index(model.coordinates[k]) for k in resting(model)] + [
         names.index(c + "'") for c in model.coordinates

@@ -319,7 +319,7 @@ def remembered(
     n_q, n_u, n_z = q.shape[1], u.shape[1], made.flow.size1_in(4)
     if n_z == 0:
         return np.zeros((len(t), 0))
-    if n_z == made.mapped:
+    if n_z == made.mapped:  # none of them has a rate
         return over
     at, z = ca.SX.sym("at", 2 * n_q + n_u + 1), ca.SX.sym("z", n_z)
     rate = made.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q : -1], at[-1], z, ca.DM(p))

@@ -112,15 +112,15 @@ def _beside(model: Model, q: np.ndarray, nu: np.ndarray, Y: np.ndarray) -> tuple
 
 def remember(model: Model, q: np.ndarray, nu: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
     """What a model's effects remember (N, n_z) along a motion, from rest, and what a map of the ground tells."""
-    n_q, n_u = len(model.coordinates), len(model.inputs)
-    at, z = ca.SX.sym("at", 2 * n_q + n_u), ca.SX.sym("z", len(model.memory))
-    rate = model.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q :], z, ca.DM(X))
-    flow = ca.Function("flow", [z, at], [rate])
-    sample = 1 / float(model.machine.sampling_hz)
-    z = implicit(flow, model.fresh, np.hstack([q, nu, u]), sample)
+    n_q, n_u, sample = len(model.coordinates), len(model.inputs), 1 / float(model.machine.sampling_hz)
+    found = np.zeros((len(q), len(model.memory)))
+    if model.lasting:
+        at, z = ca.SX.sym("at", 2 * n_q + n_u), ca.SX.sym("z", len(model.memory))
+        rate = model.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q :], z, ca.DM(X))
+        found = implicit(ca.Function("flow", [z, at], [rate]), model.fresh, np.hstack([q, nu, u]), sample)
     if model.mapped:
-        z[:, len(model.memory) - len(model.mapped) :] = passes(model, q, nu, sample)
-    return z
+        found[:, model.lasting :] = passes(model, q, nu, sample)
+    return found
 
 
 def passes(model: Model, q: np.ndarray, nu: np.ndarray, step: float) -> np.ndarray:

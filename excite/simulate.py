@@ -214,7 +214,7 @@ def _step(model: Model) -> tuple[ca.Function, int]:
     rhs = ca.vertcat(dq, a, wheels, model.flow(q, nu, u, z, X))
     core = [k for k, c in enumerate(model.coordinates) if c in model.felt] + list(range(n_q, 2 * n_q))
     core += range(2 * n_q + n_w, state.numel() - len(model.mapped))
-    rest = [k for k in range(state.numel()) if k not in core]
+    rest = [k for k in range(2 * n_q + n_w) if k not in core]
     rate = ca.Function("rate", [state, u, X], [rhs[core]], {"cse": True})
     jacobian = ca.Function(
         "jacobian", [state, u, X], [ca.jacobian(rhs[core], state[core]), ca.jacobian(rhs[core], u)], {"cse": True}

@@ -32,7 +32,7 @@ FOLLOWED = 2.5  # misfit over readings up to which exact dynamics follow logs wh
 FAR = 10.0  # misfit over readings, a few passes after the beginning, from which no fit comes near
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 PASSES = 14  # of a fit that goes on from another
-ONSET = 30.0  # [s] that the beginning of a log has at least
+SHORTEST = 30.0  # [s] that the beginning of a log has at least
 ONSETS = 0.25, 0.33, 0.4, 0.5  # shares of logs that are taken for their beginning, in turn
 TELLING = 0.15  # of what exact dynamics leave, that is as much as a beginning must hold of it
 LENIENT = 0.5  # of what a fit must take, that it must take of what is left of the beginning
@@ -332,9 +332,9 @@ class Onset:
 
 
 def _begins(prepared: Prepared, share: float) -> tuple[int, ...] | None:
-    """How many samples such a share of each log has, ONSET at least; None where that is more than half of them all."""
+    """How many samples such a share of each log has, SHORTEST at least; None where that is more than half of all."""
     rate, lengths = float(prepared.c.model.machine.sampling_hz), [len(r.used) for r in prepared.records]
-    samples = tuple(min(n, max(round(ONSET * rate), int(share * n))) for n in lengths)
+    samples = tuple(min(n, max(round(SHORTEST * rate), int(share * n))) for n in lengths)
     return samples if 2 * sum(samples) <= sum(lengths) else None
 
 
@@ -391,7 +391,7 @@ def _telling(of: Stage, worth: float) -> Onset | None:
         begin = _until(of.prepared, samples)
         cost = sum(float(x[:n].sum()) for x, n in zip(missed, samples, strict=True))
         if cost - (1 + SLACK) * begin.noise >= TELLING * of.excess:
-            cost = _set_out(begin, 0.0, np.inf)[0] or cost  # after as few passes as others have
+            cost = _began(begin, 0.0, np.inf)[0] or cost  # after as few passes as others have
             return Onset(samples, cost - part * max(0.0, cost - (1 + SLACK) * begin.noise))
     return None
 
@@ -400,11 +400,11 @@ def _sets_out(prepared: Prepared, onset: Onset | None, disturbed: float) -> bool
     """Whether a fit may come to what it is worth, as far as the beginning of the logs tells, if any does."""
     if onset is None:
         return True
-    cost, found = _set_out(_until(prepared, onset.samples), disturbed, onset.most)
+    cost, found = _began(_until(prepared, onset.samples), disturbed, onset.most)
     return cost <= onset.most or (found and onset.found)
 
 
-def _set_out(begin: Prepared, disturbed: float, most: float) -> tuple[float, bool]:
+def _began(begin: Prepared, disturbed: float, most: float) -> tuple[float, bool]:
     """What a fit to the beginning of logs costs after a few passes, nothing where there is none, and whether it is as
     good as found then. most: what it is given up above."""
     X, passes = begin.c.model.nominal, newton.SETTLED + 1

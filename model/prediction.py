@@ -167,8 +167,13 @@ class Model:
         return come
 
     @property
+    def lasting(self) -> int:
+        """How many of z have a rate: those before what is `mapped`."""
+        return len(self.memory) - len(self.mapped)
+
+    @property
     def remembered(self) -> np.ndarray:
-        """How well `fresh` is known at the start of a log, of what is not `mapped`."""
+        """How well `fresh` is known at the start of a log, of what is `lasting`."""
         own = [m.spread for e in self.effects for _, m in e.memory.values()]
         return np.array([1e-6] * ("time" in self.memory) + own)
 

@@ -669,7 +669,7 @@ def test_what_takes_too_little_of_a_beginning_is_not_fitted_to_the_whole(
         return true(c, records, *asked)
 
     monkeypatch.setattr(newton, "iterate", counted)
-    monkeypatch.setattr(stages, "ONSET", 5.0)
+    monkeypatch.setattr(stages, "SHORTEST", 5.0)
     worth, whole = stage.fit.cost - 0.3 * stage.excess, len(one)
     for effect, found in (("torque_deadband@rear_roll=100", True), ("torque_offset_drift@front_roll=0.1", False)):
         lengths.clear()
@@ -743,7 +743,7 @@ def test_the_whole_log_is_fitted_where_its_beginning_can_be(
         (5.0, cost + 1, whole, True),
         (5.0, cost - 1, whole, False),
     ):
-        monkeypatch.setattr(stages, "ONSET", onset)
+        monkeypatch.setattr(stages, "SHORTEST", onset)
         for machines, found in ((right, follows), (wrong, False)):
             lengths.clear()
             (made,) = stages.begun([machines], stage, 0.0, in_turn, worth)
@@ -752,7 +752,7 @@ def test_the_whole_log_is_fitted_where_its_beginning_can_be(
             assert (max(lengths) == whole) == (found or first == whole)
     # What forces don't bring near isn't either, nor is the whole log fitted where they don't bring its beginning near.
     for onset, first in ((5.0, whole // 4), (30.0, whole)):
-        monkeypatch.setattr(stages, "ONSET", onset)
+        monkeypatch.setattr(stages, "SHORTEST", onset)
         for machines, found in ((right, True), (wrong, False)):
             lengths.clear()
             forces.clear()
@@ -782,7 +782,7 @@ def test_what_the_beginning_of_a_log_may_cost(
     log may: three tenths of what is four times as much. What can't be integrated may set out."""
     stage = calm(straight)
     quarter = len(stage.prepared.logs[0]) // 4
-    monkeypatch.setattr(stages, "ONSET", quarter / 100)
+    monkeypatch.setattr(stages, "SHORTEST", quarter / 100)
     costs = iterated(stage, monkeypatch, lambda samples: None if cost is None else cost, found)
     onset = stages._onset(stage, disturbed, np.inf)
     assert onset is not None
@@ -796,7 +796,7 @@ def test_a_beginning_tells_where_the_model_as_it_is_stays_far_off(
     """The shortest such one: what stays off it too is no cause. A quarter, where none is up to a half."""
     stage = calm(straight)
     n = len(stage.prepared.logs[0])
-    monkeypatch.setattr(stages, "ONSET", n / 400)
+    monkeypatch.setattr(stages, "SHORTEST", n / 400)
     for late, share in ((0.0, 0.25), (0.3, 0.33), (0.45, 0.5), (0.9, 0.25)):
         with monkeypatch.context() as patch:
             iterated(stage, patch, lambda samples, late=late: 20.0 if samples > late * n else 5.0, False)
@@ -1036,7 +1036,8 @@ def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatc
     choice = choosing.choose(stage, likely, (), in_turn, lambda share, what: None, 0.0)
     assert choice is not None
     assert choice.name == "ground_slope@machine"
-    assert not (stage.exact or stage.near)
+    assert not stage.exact
+    assert not stage.near
     assert bars[0] == (choice.name, stage.fit.cost - choosing.BEHIND * choosing.MAIN * stage.excess)
     (bar,) = {bar for name, bar in bars if name != choice.name}
     assert bar == pytest.approx(stage.fit.cost - choosing.BEHIND * choice.gain)
