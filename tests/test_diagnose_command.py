@@ -1019,6 +1019,32 @@ def test_a_harmonic_is_no_ripple_elsewhere(straight: Model, straight_motion: Mot
     assert rippled.keys() >= bare.keys() - {"torque_ripple@front_roll", "torque_ripple@rear_roll"}
 
 
+@pytest.mark.parametrize(
+    ("forces", "near", "gained", "mapped", "least"),
+    [
+        (False, True, 0.0, False, 0.05 * 1e4),
+        (False, False, 0.0, False, 0.15 * 1e4),
+        (True, False, 0.0, False, 0.3 * 1e4),
+        (True, False, 1e3, False, 0.15 * 1e4),
+        (False, True, 1e6, False, 0.005 * 1e6),
+        (False, True, 1e6, True, 0.02 * 1e6),
+    ],
+)
+def test_what_an_effect_must_gain_to_be_worth_a_place(
+    forces: bool, near: bool, gained: float, mapped: bool, least: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of an excess of 1e4: a part; where large forces leave much the first must explain what the largest of three does.
+    Of what another gained: what its formula is off by, the more where that looks at a map of the ground."""
+    monkeypatch.setattr(choosing, "_sureness", lambda stage: 0.0)
+    known = SimpleNamespace(name="a@b", mapped=mapped)
+    stage: Any = SimpleNamespace(
+        model=SimpleNamespace(effects=[known]), exact=not forces, near=near, rough=forces or not near, excess=1e4
+    )
+    chosen: Any = [SimpleNamespace(name=known.name, gain=gained, left=1.0)] if gained else []
+    candidate: Any = SimpleNamespace(placed=SimpleNamespace(effect=SimpleNamespace(timed=False)))
+    assert choosing._least(stage, chosen, candidate, 0.0) == pytest.approx(least)
+
+
 def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where forces leave much a candidate is fitted as long as it comes to half of what it must gain, and where one
     gained that, the others as long as they come to half of what that one did."""

@@ -291,7 +291,7 @@ def test_what_an_effect_predicts_is_what_it_does(effect: Effect) -> None:
 FORMED = {
     f"{e.name}-{k}": (e, shapes)
     for e in CATALOGUE.values()
-    if any(s.form for s in e.shapes.values())
+    if any(x.form for x in (*e.shapes.values(), *e.memory.values()))
     for k, shapes in enumerate(forms(e))
 }
 
@@ -316,7 +316,12 @@ def test_an_effect_has_the_parameters_and_the_memory_of_its_form(effect: Effect,
                 told(model.nominal + 0.1 * model.scale[k] * np.eye(len(model.nominal))[k]) - told(model.nominal)
             )
             assert moved.max() > 0, name
-    assert bool(model.memory) == any(shapes.get(m.form[0]) == m.form[1] for m in effect.memory.values() if m.form)
+
+    def has(form: tuple[str, float] | None) -> bool:
+        return form is not None and shapes.get(form[0], effect.shapes[form[0]].default) == form[1]
+
+    assert bool(model.lasting) == any(has(m.form) for m in effect.memory.values())
+    assert bool(model.mapped) == has(effect.ground)
 
 
 @pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
@@ -579,7 +584,7 @@ def test_a_simulation_and_a_smoothed_motion_look_at_the_same_map(va12: Model) ->
     push, steer = 2500 * np.sin(2 * np.pi * t / 10), 2000 * np.sin(2 * np.pi * t / 20)
     motion = simulate(model, np.column_stack([push, steer, push]))
     told = passes(model, motion.q, motion.nu, 0.01)
-    kept = motion.memory[:, len(model.memory) - len(model.mapped) :]
+    kept = motion.memory[:, model.lasting :]
     assert kept.max() > 0.9
     assert np.abs(motion.q[:, 2]).max() > 0.2
     assert np.mean(np.abs(told - kept)) < 0.002
@@ -599,11 +604,23 @@ def test_what_a_map_tells_is_identified_and_designed_with(straight: Model) -> No
     problem = model.machine.problems["S40"].model_copy(update={"duration_s": Quantity(value=24.0, source="assumed")})
     tr = transcribe(model, problem, sizes, 48, motion)
     assert not set(tr.state_names) & set(model.mapped)
-    told = motion.memory[:, len(model.memory) - len(model.mapped) :]
+    told = motion.memory[:, model.lasting :]
     assert tr.over[2:-1:3] == pytest.approx(told[50::50], abs=0.1)
     entries = tr.values(np.full((48 * tr.nodes, tr.n_s), 0.3), tr.over)[2]
     amount = np.array([len(model.scale) - 1 in (a, b) for a, b in zip(tr.rows, tr.columns, strict=True)])
     assert np.abs(entries[-3:, amount]).max() > 100 * np.abs(entries[:3, amount]).max()
+
+
+def test_every_log_begins_on_ground_of_its_own(straight: Model) -> None:
+    """Two logs of the same ways tell the amount as two of one map each; put onto one map, the second would begin on
+    what the first has left, and tell another one."""
+    model = compacting(straight.machine, 2.0)
+    motion = to_and_fro(model)
+    logs = [log.check(sensors.measure(model, motion, kit="full", seed=k), model.machine) for k in (2, 5)]
+    one, two = (identify(model, some, "joint") for some in (logs[:1], logs))
+    k = two.names.index("compaction_per_pass@drive")
+    assert abs(two.value[k] - 0.3) < 3 * two.std[k]
+    assert 0.5 < two.std[k] / one.std[k] < 0.85
 
 
 def test_wheels_beside_each_other_pass_over_ground_of_their_own() -> None:
@@ -621,6 +638,15 @@ def test_wheels_beside_each_other_pass_over_ground_of_their_own() -> None:
     assert often(0.0, 1.2) == pytest.approx(1)
     assert often(0.0, 0.5) == pytest.approx(1 + 0.5 * 2, abs=0.2)
     assert often(0.0, 0.0) == pytest.approx(3, abs=0.2)
+
+
+def test_a_shape_is_as_unsure_as_where_it_begins(straight: Model) -> None:
+    """A quarter of that, or of its usual size where that is more: 15 m a pass."""
+    for each, unsure in ((5.0, 3.75), (60.0, 15.0)):
+        entry = placing.parse("compaction_per_pass=0.3", straight.machine, 24.0)
+        entry = entry.model_copy(update={"shape": entry.shape | {"pass": Quantity(value=each, source="assumed")}})
+        model = build(placing.extended(straight.machine, entry), shapes=True)
+        assert model.scale[model.base.names.index("compaction_per_pass@drive.pass")] == unsure
 
 
 def test_a_way_of_counting_that_there_is_not(straight: Model) -> None:
