@@ -446,6 +446,18 @@ def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
     return Stage(machine, prepared, _resume(prepared, of, disturbed), prepared.coarse == 1)
 
 
+def pinned(wishes: Sequence[tuple[Machine, str]], of: Stage, most: float, together: Together) -> Iterator[Stage | None]:
+    """The model of each machine fitted to the logs of a stage, from its fit and with its disturbing forces, while the
+    parameter of that name stays at the machine file's value, side by side; None where no fit is found or it still costs
+    more than `most` after a few passes."""
+    ready = [_resumed(machine, of) for machine, _ in wishes]
+    held = [p.held | (np.array(p.c.model.base.names) == name) for p, (_, name) in zip(ready, wishes, strict=True)]
+    prepared = [replace(p, held=own) for p, own in zip(ready, held, strict=True)]
+    calls = [partial(_resumable, p, of, of.fit.disturbed, most) for p in prepared]
+    for p, (machine, _), fit in zip(prepared, wishes, together(calls), strict=True):
+        yield None if fit is None else Stage(machine, p, fit, p.coarse == 1)
+
+
 Wish = tuple[Machine, Stage, float]  # what `refitted` is called with
 
 
@@ -494,6 +506,7 @@ def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.in
     c = prepared.c
     old = dict(zip(of.model.base.names, of.fit.X, strict=True))
     X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, c.model.nominal, strict=True)])
+    X = np.where(prepared.held, c.model.nominal, X)
     points = [carried(c, r, p, of.prepared.c, X) for r, p in zip(prepared.records, of.fit.points, strict=True)]
     try:
         fit = _nearly(prepared, points, X, disturbed, most)

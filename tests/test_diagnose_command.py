@@ -437,6 +437,42 @@ def test_what_gets_a_name_is_no_chance(straight: Model, straight_motion: Motion)
         assert diagnose.concluded(stage, stage, chosen, (), 0.0).findings[0].p_value <= choosing.CHANCE * 1.000001
 
 
+def test_an_amount_is_as_unsure_as_shapes_that_a_log_hardly_tells(straight: Model) -> None:
+    """Of a soil that one way of three metres has hardly packed: how much of it is to come nothing tells, while about a
+    short way that a pass takes its deviation says that all of it has."""
+    name = "compaction_per_pass@drive"
+
+    def packed(amount: float, each: float) -> machine.Machine:
+        entry = placing.parse(f"compaction_per_pass={amount}", straight.machine, 15.0)
+        values = {**entry.shape, "pass": told(each), "counted": told(2.0)}
+        return placing.extended(straight.machine, entry.model_copy(update={"shape": values}))
+
+    def told(value: float) -> Quantity:
+        return Quantity(value=value, source="assumed")
+
+    hidden, t = prediction.build(packed(0.06, 60.0)), np.arange(0, 15.01, 0.01)
+    slow = np.minimum(1, np.minimum(t, 15 - t) / 2)
+    push = (2500 * np.sin(2 * np.pi * t / 7.5) + 600 * np.sin(2.6 * t)) * slow
+    motion = simulate(hidden, np.column_stack([push, 0.8 * push]))
+    assert 2 < np.ptp(motion.q[:, 0]) < 4
+    one = log.check(sensors.measure(hidden, motion, seed=3), straight.machine)
+    before = stages.fitted(straight.machine, [one], straight.machine.filter)
+    after = stages.refitted(packed(0.05, 3.0), before, 0.0)
+    k = after.model.base.names.index(name)
+    assert 0.06 - after.fit.X[k] > 4 * after.fit.std[k]
+    chosen = [choosing.Choice(name, after, 1000.0, 1.0, 100, (), 1.0)]
+    (found,) = diagnose.concluded(before, after, chosen, (), 0.0).findings
+    assert 0.06 - found.amount < 2.5 * found.amount_std
+    assert found.amount_std < found.amount
+    # Nor does it where the shape is held, as nothing shows it at all; a shape that is told needs no other fit.
+    shape = after.model.base.names.index(f"{name}.pass")
+    held = replace(after.fit, unseen=np.arange(len(after.fit.X)) == shape)
+    sure = after.fit.covariance.copy()
+    sure[shape] = sure[:, shape] = 0.0
+    for fit, more in ((replace(held, covariance=sure), True), (replace(after.fit, covariance=sure), False)):
+        assert (diagnose._elsewhere(after.placed(name), replace(after, fit=fit), in_turn) > 0) == more
+
+
 def test_what_no_machine_has_is_no_name(straight: Model, straight_motion: Motion) -> None:
     """Friction that drives, by whatever name the file calls it, or a resistance that pushes: unexplained, with what
     comes nearest and why it is none; as plain as it may be otherwise, and with nothing left that is odd."""
