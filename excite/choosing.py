@@ -35,9 +35,8 @@ TRIED = 5  # candidates that are fitted
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
 PLAIN = 0.5  # the same for the variant without unusual shapes, which the others may mimic before a fit
 ANEW = 12  # effects that begin anew where nothing was found
-MAIN = 0.3  # of the excess misfit that the largest of three effects explains, which is to be found first
 PAIR = 2  # candidates whose fits are begun in any case, or with forces so large that they take up part of any cause
-BEHIND = 0.5  # share of what was gained already that further candidates must have come to after a few passes
+BEHIND = 0.5  # share of what must be gained, or was already, that candidates must have come to after a few passes
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
 # Of what is explained already, that a further effect must gain, as nature is never exactly the formula: by the fits'
@@ -52,6 +51,7 @@ BESIDE = 250.0  # a gain that by the latter no effect can be denied, nor counted
 CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
 INSTANT = 0.5  # [s] about which instants are known before a fit, which finds them from near only
 LEAST = 0.05, 0.15  # of the excess misfit that an effect must explain to be worth a place: weak misfit, strong misfit
+MAIN = 0.3  # the same of the first effect beside exact dynamics or large forces: the largest of three explains so much
 SHARE = 0.7  # of the excess misfit that names must explain, or it is unexplained
 FORCED = 0.02  # of what is gained with disturbing forces, by which a rival is a tie: they take up part of a difference
 NEAR = 0.3  # of what the best name leaves unexplained, by which a rival may be worse and still is a tie
@@ -388,8 +388,8 @@ def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate
 
 
 def _hides(stage: Stage) -> bool:
-    """Whether disturbing forces leave much: then they are as large as can be, and go far with any model."""
-    return not (stage.exact or stage.near)
+    """Whether large disturbing forces leave much: these go far with any model, and with many an effect further."""
+    return stage.fit.disturbed >= smoothing.DISTURBED[0] and not stage.near
 
 
 def _completes(found: Stage, before: Stage) -> bool:

@@ -18,18 +18,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from excite import choosing
+from excite import amounts, choosing
 from excite import gain as gains
 from excite.anomaly import anomalies
 from excite.choosing import Advance, Choice
 from excite.log import Log
 from excite.newton import NotConverged
 from excite.sidebyside import Together, in_turn
-from excite.stages import SMALL, Stage, as_measured, fitted, forced, pinned, refitted
+from excite.stages import SMALL, Stage, as_measured, fitted, forced, refitted
 from model import placing
-from model.effect import Placed, Site
-from model.file import Quantity
-from model.machine import EffectEntry, Filter, Machine
+from model.machine import EffectEntry, Filter
 from model.prediction import Model, signs
 
 MOST = 4  # effects that are looked for; so many kinds, none of which explains SHARE, patch up what has no name
@@ -37,8 +35,6 @@ FORMULA = 0.5  # of an amount, times the root of the share of a gain that its fo
 # Of an amount: what another formula of the same effect makes of it. ALIKE is what it does in the middle; nine in ten of
 # the amounts in results/diagnosis are within intervals that allow for so much.
 OTHERWISE = 0.05
-HARDLY = 0.5  # deviation of a shape, as a share of its value, from which logs hardly tell it
-AS_WELL = 4.0  # cost by which another shape may be worse that logs like about as well: two deviations
 FURTHER = 0.8  # SHARE for names after the first: what nature has beside its formula looks like many a cause
 FAINT = 0.1  # of what another effect promises beside a name, that the name must gain where it needs disturbing forces
 SURELY, WRONG = 3.0, 0.5  # deviations, and a share of its usual size, by which a parameter's sign is wrong
@@ -406,40 +402,16 @@ def _beside(choice: Choice, after: Stage) -> float:
     return choosing.wald(choice.name, after) / choice.spread
 
 
-def _elsewhere(placed: Placed, after: Stage, together: Together) -> float:
-    """How far off an effect's amount would be with shapes that the logs hardly tell at either end of their usual range,
-    as far as the logs like these about as well: about that value of a shape its deviation says nothing of such."""
-    entry, site = choosing.entry_of(after, placed.name), Site.of(after.machine, placed.bodies)
-    names, fit = after.model.base.names, after.fit
-    std = np.where(fit.unseen, np.inf, fit.std)
-    told = dict(zip(names, zip(fit.X, std, strict=True), strict=True))
-    wishes: list[tuple[Machine, str]] = []
-    for s, shape in placed.shapes.items():
-        name = f"{placed.name}.{s}"
-        if shape.signed or name not in told or told[name][1] <= HARDLY * abs(told[name][0]):
-            continue
-        for share in {shape.grid[0], shape.grid[-1]} - {0.0}:
-            end = Quantity(value=share * shape.size(site), source="assumed")
-            other = entry.model_copy(update={"shape": {**entry.shape, s: end}})
-            wishes.append((placing.extended(placing.without(after.machine, placed.name), other), name))
-    most, off = fit.cost + AS_WELL * after.spread, 0.0
-    for stage in pinned(wishes, after, most, together):
-        if stage is not None and stage.fit.cost < most:
-            amount = stage.fit.X[stage.model.base.names.index(placed.name)]
-            off = max(off, abs(float(amount - told[placed.name][0])))
-    return off
-
-
 def _finding(choice: Choice, after: Stage, left: float, alone: bool, together: Together = in_turn) -> Finding:
     """A choice with amount and shapes as the last fit has them. The amount is as unsure as what is left says of the
-    formula: where that is a part of what the effect gains, about half its root is a part of the amount; and never surer
-    than another formula of the same effect would leave it."""
+    formula: where that is a part of what the effect gains, about half its root is a part of the amount; as shapes that
+    the logs hardly tell; and never surer than another formula of the same effect would leave it."""
     placed = after.placed(choice.name)
     std = after.fit.std * after.doubt
     values = dict(zip(after.model.base.names, zip(after.fit.X, std, strict=True), strict=True))
     amount, sure = values[placed.name]
     formula = FORMULA * amount * np.sqrt(left / max(choice.gain, left, 1.0))
-    sure = float(np.linalg.norm([sure, OTHERWISE * amount, formula, _elsewhere(placed, after, together) / 2]))
+    sure = float(np.linalg.norm([sure, OTHERWISE * amount, formula, amounts.unsure(placed, after, together)]))
     shapes = {
         s: (*values.get(f"{placed.name}.{s}", (placed.values[s], 0.0)), shape.unit)
         for s, shape in placed.shapes.items()

@@ -324,11 +324,11 @@ def _with_less(stage: Stage) -> Stage | None:
 @dataclass(frozen=True)
 class Onset:
     """How many samples of each log are its beginning, and the most that a fit may cost there, from which it isn't worth
-    the whole; unless it is as good as found, where that is enough."""
+    the whole; with `or_found` unless it is as good as found there."""
 
     samples: tuple[int, ...]
     most: float
-    found: bool = False
+    or_found: bool = False
 
 
 def _begins(prepared: Prepared, share: float) -> tuple[int, ...] | None:
@@ -345,17 +345,16 @@ def _until(prepared: Prepared, samples: Sequence[int]) -> Prepared:
 
 
 def _onset(of: Stage, disturbed: float, worth: float) -> Onset | None:
-    """The beginning of the logs that tells which fits are worth the whole, with so large disturbing forces, of what
-    must not cost more than it is worth, if that is known. It takes a fraction of the time. None where no half of the
-    logs does."""
+    """The beginning of the logs that tells, in a fraction of the time, which fits with such disturbing forces come to
+    nothing; worth: the most that one may cost. None where no half of the logs tells."""
     if disturbed > 0:
-        return _near(of)
+        return _where_near(of)
     if np.isinf(worth):
-        return _far(of)
-    return _telling(of, worth) if of.settled and of.exact else None
+        return _where_far(of)
+    return _where_gained(of, worth) if of.settled and of.exact else None
 
 
-def _near(of: Stage) -> Onset | None:
+def _where_near(of: Stage) -> Onset | None:
     """A quarter of the logs: what leaves more there, beside noise, than the whole may leave and still be near, isn't
     near the whole."""
     samples = _begins(of.prepared, ONSETS[0])
@@ -364,22 +363,16 @@ def _near(of: Stage) -> Onset | None:
     return Onset(samples, _until(of.prepared, samples).readings + (STRONG - 1) * of.prepared.readings)
 
 
-def _far(of: Stage) -> Onset | None:
-    """The shortest beginning that exact dynamics of a stage's own model stay FAR off, as they do off the whole: what
-    does as well is too far off the whole to follow it. A quarter where none is."""
-    first = None
-    for share in ONSETS:
-        samples = _begins(of.prepared, share)
-        if samples is None:
-            break
-        onset = Onset(samples, FAR * _until(of.prepared, samples).readings, True)
-        first = first or onset
-        if not _sets_out(_noisy(of.prepared, 1.0), onset, 0.0):
-            return onset
-    return first
+def _where_far(of: Stage) -> Onset | None:
+    """The shortest beginning that exact dynamics of a stage's own model stay FAR off: what does as well doesn't follow
+    the logs either. A quarter where none is."""
+    begins = [samples for share in ONSETS if (samples := _begins(of.prepared, share)) is not None]
+    onsets = [Onset(x, FAR * _until(of.prepared, x).readings, True) for x in dict.fromkeys(begins)]
+    sharp = _noisy(of.prepared, 1.0)
+    return next((x for x in onsets if not _sets_out(sharp, x, 0.0)), onsets[0] if onsets else None)
 
 
-def _telling(of: Stage, worth: float) -> Onset | None:
+def _where_gained(of: Stage, worth: float) -> Onset | None:
     """The shortest beginning that holds a good part of what a stage's exact dynamics leave beside noise: there a fit
     must take as fair a part of what its own model comes to as of the whole."""
     part = LENIENT * (of.fit.cost - worth) / max(of.excess, 1e-9)
@@ -401,7 +394,7 @@ def _sets_out(prepared: Prepared, onset: Onset | None, disturbed: float) -> bool
     if onset is None:
         return True
     cost, found = _began(_until(prepared, onset.samples), disturbed, onset.most)
-    return cost <= onset.most or (found and onset.found)
+    return cost <= onset.most or (found and onset.or_found)
 
 
 def _began(begin: Prepared, disturbed: float, most: float) -> tuple[float, bool]:
@@ -446,30 +439,26 @@ def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
     return Stage(machine, prepared, _resume(prepared, of, disturbed), prepared.coarse == 1)
 
 
-def pinned(wishes: Sequence[tuple[Machine, str]], of: Stage, most: float, together: Together) -> Iterator[Stage | None]:
-    """The model of each machine fitted to the logs of a stage, from its fit and with its disturbing forces, while the
-    parameter of that name stays at the machine file's value, side by side; None where no fit is found or it still costs
-    more than `most` after a few passes."""
-    ready = [_resumed(machine, of) for machine, _ in wishes]
-    held = [p.held | (np.array(p.c.model.base.names) == name) for p, (_, name) in zip(ready, wishes, strict=True)]
-    prepared = [replace(p, held=own) for p, own in zip(ready, held, strict=True)]
-    calls = [partial(_resumable, p, of, of.fit.disturbed, most) for p in prepared]
-    for p, (machine, _), fit in zip(prepared, wishes, together(calls), strict=True):
-        yield None if fit is None else Stage(machine, p, fit, p.coarse == 1)
-
-
 Wish = tuple[Machine, Stage, float]  # what `refitted` is called with
 
 
-def refits(wishes: Sequence[Wish], together: Together, most: float = np.inf) -> Iterator[Stage | None]:
+def refits(
+    wishes: Sequence[Wish], together: Together, most: float = np.inf, held: Sequence[str] = ()
+) -> Iterator[Stage | None]:
     """Several refitted, side by side; None where no fit is found or it is given up, as it still costs more than `most`
-    after a few passes."""
+    after a few passes. held: of each a parameter that stays at the machine file's value, if any are."""
     prepared = [_resumed(machine, of) for machine, of, _ in wishes]
+    if held:
+        prepared = [_holding(p, name) for p, name in zip(prepared, held, strict=True)]
     calls = [
         partial(_resumable, p, of, disturbed, most) for p, (_, of, disturbed) in zip(prepared, wishes, strict=True)
     ]
     for p, (machine, _, _), fit in zip(prepared, wishes, together(calls), strict=True):
         yield None if fit is None else Stage(machine, p, fit, p.coarse == 1)
+
+
+def _holding(prepared: Prepared, name: str) -> Prepared:
+    return replace(prepared, held=prepared.held | (np.array(prepared.c.model.base.names) == name))
 
 
 def freed(found: Sequence[Stage], together: Together) -> Iterator[Stage | None]:

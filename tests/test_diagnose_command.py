@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 from conftest import Excite, designed
 
-from excite import checkup, choosing, diagnose, findings, gain, log, misfit, newton, profiles, sensors, stages
+from excite import amounts, checkup, choosing, diagnose, findings, gain, log, misfit, newton, profiles, sensors, stages
 from excite.separate import Rivals
 from excite.sidebyside import forked, in_turn
 from excite.simulate import Motion, simulate
@@ -457,20 +457,39 @@ def test_an_amount_is_as_unsure_as_shapes_that_a_log_hardly_tells(straight: Mode
     assert 2 < np.ptp(motion.q[:, 0]) < 4
     one = log.check(sensors.measure(hidden, motion, seed=3), straight.machine)
     before = stages.fitted(straight.machine, [one], straight.machine.filter)
-    after = stages.refitted(packed(0.05, 3.0), before, 0.0)
-    k = after.model.base.names.index(name)
-    assert 0.06 - after.fit.X[k] > 4 * after.fit.std[k]
-    chosen = [choosing.Choice(name, after, 1000.0, 1.0, 100, (), 1.0)]
-    (found,) = diagnose.concluded(before, after, chosen, (), 0.0).findings
-    assert 0.06 - found.amount < 2.5 * found.amount_std
-    assert found.amount_std < found.amount
+    for amount, each in ((0.05, 3.0), (0.05, 15.0), (0.05, 50.0)):
+        after = stages.refitted(packed(amount, each), before, 0.0)
+        k = after.model.base.names.index(name)
+        assert each == 50.0 or 0.06 - after.fit.X[k] > 3 * after.fit.std[k]
+        chosen = [choosing.Choice(name, after, 1000.0, 1.0, 100, (), 1.0)]
+        (found,) = diagnose.concluded(before, after, chosen, (), 0.0).findings
+        assert 0.06 - found.amount < 2.5 * found.amount_std
+        assert found.amount_std < found.amount
     # Nor does it where the shape is held, as nothing shows it at all; a shape that is told needs no other fit.
     shape = after.model.base.names.index(f"{name}.pass")
     held = replace(after.fit, unseen=np.arange(len(after.fit.X)) == shape)
     sure = after.fit.covariance.copy()
     sure[shape] = sure[:, shape] = 0.0
     for fit, more in ((replace(held, covariance=sure), True), (replace(after.fit, covariance=sure), False)):
-        assert (diagnose._elsewhere(after.placed(name), replace(after, fit=fit), in_turn) > 0) == more
+        assert (amounts.unsure(after.placed(name), replace(after, fit=fit), in_turn) > 0) == more
+
+
+def test_the_usual_range_of_a_shape(va12: Model) -> None:
+    """Of all that is tried in its form, and of what there is; an instant has none."""
+
+    def usual(text: str, shape: str, **values: float) -> tuple[float, ...]:
+        entry = placing.parse(text, va12.machine, 40.0)
+        own = {**entry.shape, **{n: Quantity(value=x, source="assumed") for n, x in values.items()}}
+        (placed,) = prediction.build(placing.extended(va12.machine, entry.model_copy(update={"shape": own}))).effects
+        return amounts._usual(placed, shape, va12.machine)
+
+    assert usual("compaction_per_pass=0.3", "pass") == (5.0, 50.0)
+    assert usual("slip_relaxation@front_roll=0.05", "moment") == (0.0, 1.0)
+    assert usual("pump_coupling@drive=0.1", "lag", hose=1.0) == (0.03, 0.3)
+    assert usual("vibration_on@front_roll=0.3", "begin") == ()
+    assert usual("shear_saturation@front_roll=0.3", "bend") == ()
+    low, high = usual("roll_out_of_round@front_roll=0.002", "load")
+    assert 0 < low < high
 
 
 def test_what_no_machine_has_is_no_name(straight: Model, straight_motion: Motion) -> None:
@@ -819,10 +838,10 @@ def test_what_the_beginning_of_a_log_may_cost(
     stage = calm(straight)
     quarter = len(stage.prepared.logs[0]) // 4
     monkeypatch.setattr(stages, "SHORTEST", quarter / 100)
-    costs = iterated(stage, monkeypatch, lambda samples: None if cost is None else cost, found)
+    asked = iterated(stage, monkeypatch, lambda samples: cost, found)
     onset = stages._onset(stage, disturbed, np.inf)
     assert onset is not None
-    assert (onset.samples, costs[:1]) == ((quarter,), [] if disturbed else [quarter])
+    assert (onset.samples, asked[:1]) == ((quarter,), [] if disturbed else [quarter])
     assert stages._sets_out(stage.prepared, onset, disturbed) == expected
 
 
@@ -849,15 +868,15 @@ def iterated(
     asked = list[int]()
     monkeypatch.setattr(stages.Prepared, "readings", property(lambda p: float(len(p.records[0].used))))
 
-    def fitted(onset: stages.Prepared, *given: Any, **more: Any) -> newton.Fit:
-        asked.append(len(onset.records[0].used))
+    def fit_of(prepared: stages.Prepared, *given: Any, **more: Any) -> newton.Fit:
+        asked.append(len(prepared.records[0].used))
         told = cost(asked[-1])
-        fit = None if told is None else replace(stage.fit, cost=told * onset.readings)
+        fit = None if told is None else replace(stage.fit, cost=told * prepared.readings)
         if found and fit is not None:
             return fit
         raise newton.NotConverged("no fit", fit, 50.0)
 
-    monkeypatch.setattr(stages, "_iterated", fitted)
+    monkeypatch.setattr(stages, "_iterated", fit_of)
     return asked
 
 
@@ -1058,23 +1077,30 @@ def test_a_harmonic_is_no_ripple_elsewhere(straight: Model, straight_motion: Mot
 @pytest.mark.parametrize(
     ("forces", "near", "gained", "mapped", "least"),
     [
-        (False, True, 0.0, False, 0.05 * 1e4),
-        (False, False, 0.0, False, 0.15 * 1e4),
-        (True, False, 0.0, False, 0.3 * 1e4),
-        (True, False, 1e3, False, 0.15 * 1e4),
-        (False, True, 1e6, False, 0.005 * 1e6),
-        (False, True, 1e6, True, 0.02 * 1e6),
+        (1.0, True, 0.0, False, 0.15 * 1e4),
+        (0.1, False, 0.0, False, 0.15 * 1e4),
+        (0.0, True, 0.0, False, 0.05 * 1e4),
+        (0.0, False, 0.0, False, 0.15 * 1e4),
+        (1.0, False, 0.0, False, 0.3 * 1e4),
+        (1.0, False, 1e3, False, 0.15 * 1e4),
+        (0.0, True, 1e6, False, 0.005 * 1e6),
+        (0.0, True, 1e6, True, 0.02 * 1e6),
     ],
 )
 def test_what_an_effect_must_gain_to_be_worth_a_place(
-    forces: bool, near: bool, gained: float, mapped: bool, least: float, monkeypatch: pytest.MonkeyPatch
+    forces: float, near: bool, gained: float, mapped: bool, least: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of an excess of 1e4: a part; where large forces leave much the first must explain what the largest of three does.
     Of what another gained: what its formula is off by, the more where that looks at a map of the ground."""
     monkeypatch.setattr(choosing, "_sureness", lambda stage: 0.0)
     known = SimpleNamespace(name="a@b", mapped=mapped)
     stage: Any = SimpleNamespace(
-        model=SimpleNamespace(effects=[known]), exact=not forces, near=near, rough=forces or not near, excess=1e4
+        model=SimpleNamespace(effects=[known]),
+        fit=SimpleNamespace(disturbed=forces),
+        exact=forces == 0,
+        near=near,
+        rough=forces > 0 or not near,
+        excess=1e4,
     )
     chosen: Any = [SimpleNamespace(name=known.name, gain=gained, left=1.0)] if gained else []
     candidate: Any = SimpleNamespace(placed=SimpleNamespace(effect=SimpleNamespace(timed=False)))

@@ -61,7 +61,7 @@ def version() -> str:
     files = sorted([*(ROOT / "model").rglob("*.py"), *(ROOT / "model").rglob("*.toml")])
     names = ("diagnose", "choosing", "stages", "misfit", "findings", "evidence", "innovations", "smoothing", "newton")
     names += ("linearise", "chain", "record", "gain", "hidden", "processing", "sensors", "anomaly", "log", "estimate")
-    names += ("examine", "doubts", "gaps", "leastsquares")
+    names += ("examine", "doubts", "gaps", "leastsquares", "amounts")
     return _digits([*files, *(ROOT / "excite" / f"{n}.py" for n in names), *ROLLER])
 
 
