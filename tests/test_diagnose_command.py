@@ -1107,6 +1107,25 @@ def test_what_an_effect_must_gain_to_be_worth_a_place(
     assert choosing._least(stage, chosen, candidate, 0.0) == pytest.approx(least)
 
 
+def test_who_gains_too_little_with_coarse_sensors_is_given_up(
+    straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the first candidate on; the right one isn't."""
+    stage = stages.fitted(straight.machine, [log.read(sloping, straight.machine)], straight.machine.filter)
+    true, bars = choosing.refits, list[float]()
+
+    def noted(wishes: Any, together: Any, most: float) -> Any:
+        bars.append(most)
+        return true(wishes, together, most)
+
+    monkeypatch.setattr(choosing, "refits", noted)
+    found = choosing.sharp(stage, in_turn)
+    assert found is not None
+    assert [x.name for x in found[1]] == ["ground_slope@machine"]
+    assert bars[0] == stage.fit.cost - choosing.BEHIND * choosing.LEAST[1] * stage.excess
+    assert stage.prepared.coarse > 1
+
+
 def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where forces leave much a candidate is fitted as long as it comes to half of what it must gain, and where one
     gained that, the others as long as they come to half of what that one did."""
