@@ -30,12 +30,14 @@ from model import placing
 from model.machine import EffectEntry, Filter
 from model.prediction import Model, signs
 
-MOST = 4  # effects that are looked for; so many kinds, none of which explains SHARE, patch up what has no name
+MOST = 4  # effects that are looked for; so many kinds, none of which explains ENOUGH, patch up what has no name
 FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
 # Of an amount: what another formula of the same effect makes of it. ALIKE is what it does in the middle; nine in ten of
 # the amounts in results/diagnosis are within intervals that allow for so much.
 OTHERWISE = 0.05
-FURTHER = 0.8  # SHARE for names after the first: what nature has beside its formula looks like many a cause
+# Of the excess misfit that names must explain, or it is unexplained: what nature has beside its formula looks like many
+# a cause. Right names of results/diagnosis explain 0.85 and more, a slope that liquid in a tank was taken for 0.83.
+ENOUGH = 0.85
 FAINT = 0.1  # of what another effect promises beside a name, that the name must gain where it needs disturbing forces
 SURELY, WRONG = 3.0, 0.5  # deviations, and a share of its usual size, by which a parameter's sign is wrong
 ODD = 50.0  # misfit that every line of what is odd beside names stands for, at least
@@ -172,16 +174,15 @@ def weighed(
         impossible = _impossible(stage) if kept and stage.settled else ()
         if not kept or (stage.exact and not odd and not impossible):
             break
-        enough = choosing.SHARE if len(kept) == 1 else FURTHER
         explained = _share(kept[-1].gain, stage, odd)
-        if explained >= enough and not impossible:
+        if explained >= ENOUGH and not impossible:
             break
         loose = kept[-1].loose
         faint = kept[-1].gain < FAINT * left
         if (
             loose is not None
             and not (impossible or faint)
-            and _share(kept[-1].gain, loose, odd_loose := _odd(loose)) >= enough
+            and _share(kept[-1].gain, loose, odd_loose := _odd(loose)) >= ENOUGH
         ):
             # Exact dynamics make a large misfit of a formula that is nearly right; it was judged with forces.
             kept[-1], odd = replace(kept[-1], stage=loose), odd_loose
@@ -196,7 +197,7 @@ def _patched(chosen: Sequence[Choice], odd: Sequence[str]) -> Nearest | None:
         return None
     most, gained = max(chosen, key=lambda x: x.gain), sum(x.gain for x in chosen)
     share = _share(gained, chosen[-1].stage, odd) * most.gain / gained
-    return Nearest(most.name, share) if share < choosing.SHARE else None
+    return Nearest(most.name, share) if share < ENOUGH else None
 
 
 def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_turn) -> list[Choice]:
@@ -379,7 +380,7 @@ def concluded(
     verdict = "clean"
     if findings:
         verdict = "tied" if any(f.tied_with for f in findings) else "named"
-    if not after.settled or (odd and (share < choosing.SHARE or not findings)) or (not after.exact and not findings):
+    if not after.settled or (odd and (share < ENOUGH or not findings)) or (not after.exact and not findings):
         verdict = "unexplained"
     if nearest is not None:
         verdict, share = "unexplained", 0.0
