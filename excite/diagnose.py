@@ -30,7 +30,8 @@ from model import placing
 from model.machine import EffectEntry, Filter
 from model.prediction import Model, signs
 
-MOST = 4  # effects that are looked for; so many kinds, none of which explains ENOUGH, patch up what has no name
+MOST = 4  # effects that are looked for; so many kinds, none of which explains MOSTLY, patch up what has no name
+MOSTLY = 0.7  # of the misfit
 FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
 # Of an amount: what another formula of the same effect makes of it. ALIKE is what it does in the middle; nine in ten of
 # the amounts in results/diagnosis are within intervals that allow for so much.
@@ -197,7 +198,7 @@ def _patched(chosen: Sequence[Choice], odd: Sequence[str]) -> Nearest | None:
         return None
     most, gained = max(chosen, key=lambda x: x.gain), sum(x.gain for x in chosen)
     share = _share(gained, chosen[-1].stage, odd) * most.gain / gained
-    return Nearest(most.name, share) if share < ENOUGH else None
+    return Nearest(most.name, share) if share < MOSTLY else None
 
 
 def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_turn) -> list[Choice]:
