@@ -165,7 +165,8 @@ def _edges(x: np.ndarray) -> np.ndarray:
 
 
 def signals_figure(a: Account, signals: Mapping[str, Mapping[str, Any]], title: str) -> Figure:
-    """Signal by signal: how much of the error is systematic, and errors on withheld stretches, before and after."""
+    """Signal by signal: how much of the error is systematic, and errors on withheld stretches, before and after, if there
+    are any."""
     names = list(signals)
     found = bool(a.diagnosis.stages)
     figure = Figure(figsize=(11, 0.5 * len(names) + 1.9), layout="constrained")
@@ -197,6 +198,12 @@ def signals_figure(a: Account, signals: Mapping[str, Mapping[str, Any]], title: 
     left.set_xlim(0, 100)
     left.set_xlabel("systematic share of the error one step ahead [%]")
     right.set_xlabel("error on withheld stretches [% of that without]")
+    if not any(np.isfinite(row["rms_before"] or np.nan) for row in signals.values()):
+        right.set_axis_off()
+        none = (
+            "no error on withheld stretches:\nno fit to the rest of the log was found,\nor it is too short to hide any"
+        )
+        right.text(0.5, 0.5, none, transform=right.transAxes, ha="center", va="center", fontsize=9)
     for ax in (left, right):
         ax.grid(axis="x", alpha=0.3)
         ax.set_axisbelow(True)

@@ -16,7 +16,21 @@ import pandas as pd
 import pytest
 from conftest import Excite, designed
 
-from excite import amounts, checkup, choosing, diagnose, findings, gain, log, misfit, newton, profiles, sensors, stages
+from excite import (
+    amounts,
+    checkup,
+    choosing,
+    diagnose,
+    findings,
+    gain,
+    log,
+    misfit,
+    newton,
+    portrait,
+    profiles,
+    sensors,
+    stages,
+)
 from excite.separate import Rivals
 from excite.sidebyside import forked, in_turn
 from excite.simulate import Motion, simulate
@@ -472,6 +486,16 @@ def test_an_amount_is_as_unsure_as_shapes_that_a_log_hardly_tells(straight: Mode
     sure[shape] = sure[:, shape] = 0.0
     for fit, more in ((replace(held, covariance=sure), True), (replace(after.fit, covariance=sure), False)):
         assert (amounts.unsure(after.placed(name), replace(after, fit=fit), in_turn) > 0) == more
+
+
+def test_a_figure_says_that_nothing_could_be_withheld() -> None:
+    """In place of an axis without bars."""
+    account: Any = SimpleNamespace(diagnosis=SimpleNamespace(stages=()))
+    for rms, shown in ((1e-3, True), (np.nan, False), (None, False)):
+        row = {"unit": "rad", "rms_before": rms, "rms_after": rms, "systematic_before_percent": 40.0}
+        right = portrait.signals_figure(account, {"theta1": row}, "a roller").axes[1]
+        assert right.axison == shown
+        assert any("no fit to the rest" in text.get_text() for text in right.texts) != shown
 
 
 def test_the_usual_range_of_a_shape(va12: Model) -> None:
