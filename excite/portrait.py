@@ -165,8 +165,7 @@ def _edges(x: np.ndarray) -> np.ndarray:
 
 
 def signals_figure(a: Account, signals: Mapping[str, Mapping[str, Any]], title: str) -> Figure:
-    """Signal by signal: how much of the error is systematic, and errors on withheld stretches, before and after, if there
-    are any."""
+    """Signal by signal: how much of the error is systematic, and errors on withheld stretches, before and after."""
     names = list(signals)
     found = bool(a.diagnosis.stages)
     figure = Figure(figsize=(11, 0.5 * len(names) + 1.9), layout="constrained")
