@@ -501,7 +501,14 @@ def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.in
         fit = _nearly(prepared, points, X, disturbed, most)
     except NotConverged as failed:
         found = failed.fit
-        if found is None or disturbed > 0:
+        if found is None:
+            raise
+        if disturbed > 0:
+            # It came near the logs as the stage that it began from did not with such forces: what began or ended at an
+            # instant may keep it from settling, and exact dynamics tell later what it is worth.
+            alike = of.fit.disturbed >= disturbed and of.prepared.coarse == prepared.coarse
+            if alike and not of.near and found.cost <= min(STRONG * prepared.noise, most):
+                return light(found)
             raise
         # By exact dynamics it came near the logs as the stage that it began from did not, or nearer by far: what does
         # that is right, from however far it came, and is gone on with.
