@@ -52,13 +52,12 @@ def unsure(placed: Placed, after: Stage, together: Together) -> float:
 def _usual(placed: Placed, name: str, machine: Machine) -> tuple[float, ...]:
     """The ends of the range that a shape is usually in: of all that is tried in this form, and of what there is. None
     of an instant, which a log tells or not."""
-    effect, site, own = placed.effect, Site.of(machine, placed.bodies), placed.values
-    shape = effect.shapes[name]
+    shape, site = placed.effect.shapes[name], Site.of(machine, placed.bodies)
     if shape.signed or shape.size is sizes.duration:
         return ()
     size = shape.size(site)
-    forms = [b for b in effect.beside(site) if all(b[n] == own[n] for n in b if n != "A" and effect.shapes[n].whole)]
-    every = [*(x * size for x in (*shape.grid, *(shape.within or ()))), *(b[name] for b in forms if name in b)]
+    every = [x * size for x in (*shape.grid, *(shape.within or ()))]
+    every += [b[name] for b in placed.beside(site) if name in b]
     return min(every), max(every)
 
 

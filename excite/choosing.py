@@ -227,8 +227,9 @@ def choose(
     def told(k: int) -> None:
         tell(done + 0.03 * k, f"fitting {likely[k].candidate.name}")
 
-    least = min(_least(stage, chosen, s.candidate, 0.0) for s in likely)
-    vain = stage.fit.cost - BEHIND * least if _hides(stage) else np.inf
+    vain = np.inf
+    if _hides(stage):
+        vain = stage.fit.cost - BEHIND * min(_least(stage, chosen, s.candidate, 0.0) for s in likely)
     tries, refused = _tries(stage, likely, together, told, vain)
     if stage.exact and likely[0].candidate.name not in {*refused, *(s.candidate.name for s, _ in tries)}:
         # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
@@ -286,14 +287,14 @@ def sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None
     plain = next(sharpened([stage], 0.0, together))
     if plain is not None and plain.near:
         return plain, []
-    scores = scored(stage, together)
-    vain = stage.fit.cost - BEHIND * LEAST[1] * stage.excess
-    tries, _ = _tries(stage, _likely(stage, scores, (), together), together, lambda k: None, vain)
+    scores, least = scored(stage, together), LEAST[1] * stage.excess
+    likely = _likely(stage, scores, (), together)
+    tries, _ = _tries(stage, likely, together, lambda k: None, stage.fit.cost - BEHIND * least)
     if not tries:
         return None
     _, best = tries[0]
     gain = stage.fit.cost - best.fit.cost
-    if gain < max(LEVEL * best.spread, LEAST[1] * stage.excess):
+    if gain < max(LEVEL * best.spread, least):
         return None
     alike = [x for x in tries if stage.fit.cost - x[1].fit.cost >= LIKE * gain]
     follow: list[_Try] = []

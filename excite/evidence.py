@@ -138,9 +138,8 @@ def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
     if len(effect.grid) > 1:
         families.append([{"A": own["A"] * f**reach} for f in NEARBY])
     unusual = _unusual(effect, own)
-    alike = [b for b in effect.beside(site) if unusual and _unusual(effect, b) == unusual]
+    alike = [b for b in placed.beside(site) if unusual and _unusual(effect, b) == unusual]
     alike = [b for b in alike if all(b[n] * own[n] > 0 for n in unusual)]
-    alike = [b for b in alike if all(b[n] == own[n] for n in b if n != "A" and effect.shapes[n].whole)]
     if alike:
         tried = {n: {b[n] for b in alike} for n, s in effect.shapes.items() if not s.whole}
         varying = [n for n, values in tried.items() if len(values) > 1]
@@ -317,17 +316,11 @@ def remembered(
     """What effects with these signatures remember (N, n_z) along a motion, from rest; and, if any looks at it, what a
     map of the ground tells there, over (N, n_over)."""
     n_q, n_u, n_z = q.shape[1], u.shape[1], made.flow.size1_in(4)
-    if n_z == 0:
-        return np.zeros((len(t), 0))
-    if n_z == made.mapped:  # none of them has a rate
-        return over
     at, z = ca.SX.sym("at", 2 * n_q + n_u + 1), ca.SX.sym("z", n_z)
     rate = made.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q : -1], at[-1], z, ca.DM(p))
     flow = ca.Function("flow", [z, at], [rate])
-    found = implicit(flow, np.zeros(n_z), np.hstack([q, nu, u, t[:, None]]), float(t[1] - t[0]))
-    if made.mapped:
-        found[:, n_z - made.mapped :] = over
-    return found
+    along = np.hstack([q, nu, u, t[:, None]])
+    return implicit(flow, np.zeros(n_z), along, float(t[1] - t[0]), over[:, : made.mapped])
 
 
 def scan(

@@ -113,14 +113,10 @@ def _beside(model: Model, q: np.ndarray, nu: np.ndarray, Y: np.ndarray) -> tuple
 def remember(model: Model, q: np.ndarray, nu: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
     """What a model's effects remember (N, n_z) along a motion, from rest, and what a map of the ground tells."""
     n_q, n_u, sample = len(model.coordinates), len(model.inputs), 1 / float(model.machine.sampling_hz)
-    found = np.zeros((len(q), len(model.memory)))
-    if model.lasting:
-        at, z = ca.SX.sym("at", 2 * n_q + n_u), ca.SX.sym("z", len(model.memory))
-        rate = model.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q :], z, ca.DM(X))
-        found = implicit(ca.Function("flow", [z, at], [rate]), model.fresh, np.hstack([q, nu, u]), sample)
-    if model.mapped:
-        found[:, model.lasting :] = passes(model, q, nu, sample)
-    return found
+    at, z = ca.SX.sym("at", 2 * n_q + n_u), ca.SX.sym("z", len(model.memory))
+    rate = model.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q :], z, ca.DM(X))
+    over = passes(model, q, nu, sample) if model.mapped else np.zeros((len(q), 0))
+    return implicit(ca.Function("flow", [z, at], [rate]), model.fresh, np.hstack([q, nu, u]), sample, over)
 
 
 def passes(model: Model, q: np.ndarray, nu: np.ndarray, step: float) -> np.ndarray:
@@ -151,8 +147,11 @@ def passes(model: Model, q: np.ndarray, nu: np.ndarray, step: float) -> np.ndarr
     return np.array([ground(one) for one in at])
 
 
-def implicit(flow: ca.Function, start: np.ndarray, along: np.ndarray, step: float) -> np.ndarray:
-    """z (N, n_z) of dz/dt = flow(z, along) for given signals (N, k): linearly implicit Euler, a step [s] a sample."""
+def implicit(flow: ca.Function, start: np.ndarray, along: np.ndarray, step: float, told: np.ndarray) -> np.ndarray:
+    """z (N, n_z) of dz/dt = flow(z, along) for given signals (N, k): linearly implicit Euler, a step [s] a sample. told
+    (N, n_told): the last ones of z, which have no rate."""
+    if told.shape[1] == len(start):
+        return told
     z, at = ca.SX.sym("z", len(start)), ca.SX.sym("at", along.shape[1])
     rate = flow(z, at)
     ahead = z + ca.solve(ca.SX.eye(len(start)) - step * ca.jacobian(rate, z), step * rate)
@@ -168,6 +167,7 @@ def implicit(flow: ca.Function, start: np.ndarray, along: np.ndarray, step: floa
         here[:] = along[k]
         evaluate()
         path[k + 1] = now[:] = after
+    path[:, len(start) - told.shape[1] :] = told
     return path
 
 

@@ -331,11 +331,12 @@ class Onset:
     or_found: bool = False
 
 
-def _begins(prepared: Prepared, share: float) -> tuple[int, ...] | None:
-    """How many samples such a share of each log has, SHORTEST at least; None where that is more than half of all."""
+def _beginnings(prepared: Prepared) -> list[tuple[int, ...]]:
+    """How many samples of each log such beginnings have, SHORTEST at least, the shortest first; none that is more than
+    half of them all."""
     rate, lengths = float(prepared.c.model.machine.sampling_hz), [len(r.used) for r in prepared.records]
-    samples = tuple(min(n, max(round(SHORTEST * rate), int(share * n))) for n in lengths)
-    return samples if 2 * sum(samples) <= sum(lengths) else None
+    every = (tuple(min(n, max(round(SHORTEST * rate), int(share * n))) for n in lengths) for share in ONSETS)
+    return [samples for samples in dict.fromkeys(every) if 2 * sum(samples) <= sum(lengths)]
 
 
 def _until(prepared: Prepared, samples: Sequence[int]) -> Prepared:
@@ -355,9 +356,9 @@ def _onset(of: Stage, disturbed: float, worth: float) -> Onset | None:
 
 
 def _where_near(of: Stage) -> Onset | None:
-    """A quarter of the logs: what leaves more there, beside noise, than the whole may leave and still be near, isn't
+    """The shortest beginning: what leaves more there, beside noise, than the whole may leave and still be near, isn't
     near the whole."""
-    samples = _begins(of.prepared, ONSETS[0])
+    samples = next(iter(_beginnings(of.prepared)), None)
     if samples is None:
         return None
     return Onset(samples, _until(of.prepared, samples).readings + (STRONG - 1) * of.prepared.readings)
@@ -365,9 +366,8 @@ def _where_near(of: Stage) -> Onset | None:
 
 def _where_far(of: Stage) -> Onset | None:
     """The shortest beginning that exact dynamics of a stage's own model stay FAR off: what does as well doesn't follow
-    the logs either. A quarter where none is."""
-    begins = [samples for share in ONSETS if (samples := _begins(of.prepared, share)) is not None]
-    onsets = [Onset(x, FAR * _until(of.prepared, x).readings, True) for x in dict.fromkeys(begins)]
+    the logs either. The shortest where none is."""
+    onsets = [Onset(x, FAR * _until(of.prepared, x).readings, True) for x in _beginnings(of.prepared)]
     sharp = _noisy(of.prepared, 1.0)
     return next((x for x in onsets if not _sets_out(sharp, x, 0.0)), onsets[0] if onsets else None)
 
@@ -377,10 +377,7 @@ def _where_gained(of: Stage, worth: float) -> Onset | None:
     must take as fair a part of what its own model comes to as of the whole."""
     part = LENIENT * (of.fit.cost - worth) / max(of.excess, 1e-9)
     missed = [np.square(way.white.E[:, :, 0]).sum(axis=1, dtype=float) for way in of.ways]
-    for share in ONSETS:
-        samples = _begins(of.prepared, share)
-        if samples is None:
-            return None
+    for samples in _beginnings(of.prepared):
         begin = _until(of.prepared, samples)
         cost = sum(float(x[:n].sum()) for x, n in zip(missed, samples, strict=True))
         if cost - (1 + SLACK) * begin.noise >= TELLING * of.excess:

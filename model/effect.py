@@ -251,6 +251,11 @@ class Placed:
             found |= {f"{name}{k}": (k, own) for k in self.bodies} if own.each else {name: (self.bodies[0], own)}
         return found
 
+    def beside(self, site: Site) -> list[dict[str, float]]:
+        """Of what is tried beside the effect's grid, that of the form that it has here."""
+        whole = {n: x for n, x in self.values.items() if n != "A" and self.effect.shapes[n].whole}
+        return [b for b in self.effect.beside(site) if all(whole.get(n, x) == x for n, x in b.items())]
+
     @property
     def mapped(self) -> bool:
         """Whether it sees a map of the ground in the form that it has here."""
