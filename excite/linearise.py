@@ -252,6 +252,10 @@ class Chart:
         full[:, self.index] = s
         return full[:, :n_q], full[:, n_q : 2 * n_q], full[:, self.full - n_z :]
 
+    def charted(self, full: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of simulate's states (N, full) those of the chart (N, n), and what a map of the ground tells (N, n_over)."""
+        return full[:, self.index], full[:, self.full - len(self.model.mapped) :]
+
     def inputs(self, torque: np.ndarray, over: np.ndarray) -> np.ndarray:
         """Torques (N, n_u) and what a map of the ground tells, over (N, n_over), as functions of a sample take them."""
         return np.concatenate([torque, over], axis=1) if self.model.mapped else torque

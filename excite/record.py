@@ -139,7 +139,7 @@ def first_point(c: Chart, r: Record, log: Log, filter: Filter) -> Point:
     if n_z:
         u, _ = c.delivered(r.torque, c.model.nominal)
         full[:, c.full - n_z :] = remember(c.model, guess.q.T, guess.nu.T, u, c.model.nominal)
-    s, over = full[:, c.index], full[:, c.full - len(c.model.mapped) :]
+    s, over = c.charted(full)
     rate = float(c.model.machine.sampling_hz)
     for j, k in enumerate(c.angle):
         if c.index[k] >= 2 * n_q and k >= 0:
@@ -188,7 +188,8 @@ def carried(c: Chart, r: Record, p: Point, of: Chart, X: np.ndarray) -> Point:
         full[:, c.full - n_z :] = remember(c.model, q, nu, u, X)
     old = dict(zip(origins(of, r.counts), p.offset, strict=True))
     offset = np.array([old.get(j, 0.0) for j in r.origin])
-    return Point(full[:, c.index], p.w, offset, full[:, c.full - len(c.model.mapped) :])
+    s, over = c.charted(full)
+    return Point(s, p.w, offset, over)
 
 
 def one_count(c: Chart, r: Record) -> np.ndarray:

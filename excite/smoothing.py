@@ -248,7 +248,7 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
             )
     c = chart(model, tuple(s.name for s in model.machine.sensors("full") if s in sensors))
     full = np.hstack([motion.q, motion.nu, motion.wheels, motion.memory])
-    state, over = full[:, c.index], full[:, full.shape[1] - len(model.mapped) :]
+    state, over = c.charted(full)
     counts = np.array([s.resolution is not None for s in c.sensors])
     noise = Noise(
         np.array([float(torque_sensor(model, b.index).noise or 0) for b in model.machine.actuated]),

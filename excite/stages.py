@@ -247,12 +247,7 @@ def begun(
     after all, if they bring it near or it doesn't follow."""
     prepared = [_noisy(_resumed(machine, of), 1.0) for machine in machines]
     onset = _onset(of, disturbed, worth)
-    made = (
-        partial(_brought_near, disturbed=disturbed, onset=onset)
-        if disturbed > 0
-        else partial(_plain, worth=worth, onset=onset)
-    )
-    calls = [partial(made, m, p) for m, p in zip(machines, prepared, strict=True)]
+    calls = [partial(_begun, m, p, onset, disturbed, worth) for m, p in zip(machines, prepared, strict=True)]
     for m, p, fits in zip(machines, prepared, together(calls), strict=True):
         yield _stage(m, p, fits) if fits else None
 
@@ -404,18 +399,18 @@ def _began(begin: Prepared, disturbed: float, most: float) -> tuple[float, bool]
         return (0.0 if failed.fit is None else failed.fit.cost), failed.nearly is not None
 
 
-def _brought_near(machine: Machine, prepared: Prepared, disturbed: float, onset: Onset | None) -> Fits | None:
-    """A fit from first guesses with disturbing forces that bring it near the logs, and from there with smaller ones."""
+def _begun(machine: Machine, prepared: Prepared, onset: Onset | None, disturbed: float, worth: float) -> Fits | None:
+    """A fit from first guesses, as `begun` has it; None of one that doesn't set out."""
     if not _sets_out(prepared, onset, disturbed):
         return None
-    return _disturbed(machine, prepared, disturbed, STRONG * prepared.noise)
+    if disturbed > 0:
+        return _disturbed(machine, prepared, disturbed, STRONG * prepared.noise)
+    return _plain(machine, prepared, worth)
 
 
-def _plain(machine: Machine, prepared: Prepared, worth: float, onset: Onset | None) -> Fits | None:
+def _plain(machine: Machine, prepared: Prepared, worth: float) -> Fits | None:
     """A fit from first guesses by exact dynamics, or by small disturbing forces from there where much is left; None of
-    one that costs more than it is worth, or doesn't set out."""
-    if not _sets_out(prepared, onset, 0.0):
-        return None
+    one that costs more than it is worth."""
     fit = _from_first(prepared, 0.0, FAR * prepared.readings, worth)
     if fit is None or fit.cost > worth:
         return None
