@@ -35,7 +35,7 @@ TRIED = 5  # candidates that are fitted
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
 PLAIN = 0.5  # the same for the variant without unusual shapes, which the others may mimic before a fit
 ANEW = 12  # effects that begin anew where nothing was found
-PAIR = 2  # candidates whose fits are begun in any case, or with forces so large that they take up part of any cause
+PAIR = 2  # candidates whose fits are made in any case, or with forces so large that they take up part of any cause
 BEHIND = 0.5  # share of what must be gained, or was already, that candidates must have come to after a few passes
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
@@ -51,7 +51,9 @@ BESIDE = 250.0  # a gain that by the latter no effect can be denied, nor counted
 CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candidates are tried again, in turn
 INSTANT = 0.5  # [s] about which instants are known before a fit, which finds them from near only
 LEAST = 0.05, 0.15  # of the excess misfit that an effect must explain to be worth a place: weak misfit, strong misfit
-MAIN = 0.3  # the same of the first effect beside exact dynamics or large forces: the largest of three explains so much
+# The same of the first effect beside exact dynamics or large forces, as the largest of three explains so much, and of a
+# further one where much is left, as the larger of two does: what takes less leads to no name, one patch after another.
+MAIN = 0.3
 SHARE = 0.7  # of the excess misfit beside coarse sensors, from which a fit with sharp ones is worth disturbing forces
 FORCED = 0.02  # of what is gained with disturbing forces, by which a rival is a tie: they take up part of a difference
 NEAR = 0.3  # of what the best name leaves unexplained, by which a rival may be worse and still is a tie
@@ -384,7 +386,8 @@ def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate
     mapped = {e.name for e in stage.model.effects if e.mapped}
     own = (max(min(ALIKE**2 / x.left, ABSORBED), MAPPED * (x.name in mapped)) for x in chosen)
     shape = sum(max(part, share) * x.gain for share, x in zip(own, chosen, strict=True))
-    explained = MAIN if _hides(stage) and not chosen else LEAST[stage.rough]
+    main = not stage.near if chosen else _hides(stage)
+    explained = MAIN if main else LEAST[stage.rough]
     return max(explained * stage.excess, shape, min(SHAPE[1] * _sureness(stage), BESIDE))
 
 
@@ -411,13 +414,13 @@ def _tries(
     tell: Callable[[int], None],
     vain: float = np.inf,
 ) -> tuple[list[_Try], set[str]]:
-    """The candidates whose fits were found, as the model without them was fitted: the likeliest first, the others as
-    long as they don't stay far behind what it gains. Those that promise far less than the best come last, and only
+    """The candidates whose fits were found, as the model without them was fitted: the likeliest two first, the others
+    as long as they don't stay far behind what these gain. Those that promise far less than the best come last, and only
     where they may still come near what was gained. And the names that were fitted and are none: they are not felt.
     vain: cost that no fit may stay above."""
     tries, refused = list[_Try](), set[str]()
     near = max(PAIR, sum(OVER * s.gain >= likely[0].gain for s in likely))
-    for at, batch in ((0, likely[:1]), (1, likely[1:near]), (near, likely[near:])):
+    for at, batch in ((0, likely[:PAIR]), (PAIR, likely[PAIR:near]), (near, likely[near:])):
         gained = max((stage.fit.cost - found.fit.cost for _, found in tries), default=0.0)
         if not batch or (at >= near and gained > OVER * batch[0].gain):
             continue

@@ -165,7 +165,7 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Toge
     calls: list[Callable[[], Any]] = [
         partial(_strictly, prepared),
         partial(_disturbed, machine, prepared, smoothing.DISTURBED[0]),
-        partial(_coarsely, prepared),
+        *(partial(_from_first, _noisy(prepared, times), smoothing.DISTURBED[0]) for times in COARSE),
     ]
     ways = together(calls)
     with closing(ways):
@@ -174,12 +174,12 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Toge
             return _stage(machine, prepared, exact)
         disturbed = next(ways)
         stage = None if disturbed is None else _stage(machine, prepared, disturbed)
-        noisy = None if stage is not None and stage.near else next(ways)
+        if stage is None or not stage.near:
+            for times, fit in zip(COARSE, ways, strict=True):
+                if fit is not None:
+                    return Stage(machine, _noisy(prepared, times), fit, False, stage)
     if stage is not None and stage.near:
         return exact_if_near(stage)
-    if noisy is not None:
-        fit, times = noisy
-        return Stage(machine, _noisy(prepared, times), fit, False, stage)
     return _forced(machine, prepared, smoothing.DISTURBED[1:], together) if stage is None else _with_least(stage)
 
 
@@ -244,12 +244,20 @@ def begun(
     forces or smaller ones, side by side; None where no fit is found. With forces none either where so large ones don't
     bring it near, or its beginning tells that they won't. By exact dynamics none where it costs more than it is worth,
     or its beginning tells that it will, or is FAR off already; where they leave much, with small disturbing forces
-    after all, if they bring it near or it doesn't follow."""
-    prepared = [_noisy(_resumed(machine, of), 1.0) for machine in machines]
-    onset = _onset(of, disturbed, worth)
-    calls = [partial(_begun, m, p, onset, disturbed, worth) for m, p in zip(machines, prepared, strict=True)]
-    for m, p, fits in zip(machines, prepared, together(calls), strict=True):
-        yield _stage(m, p, fits) if fits else None
+    after all, if they bring it near or it doesn't follow; where one came near, none of which the beginning tells that
+    it won't as well."""
+    onset, rest = _onset(of, disturbed, worth), list(machines)
+    while rest:
+        with closing(together([partial(_begun, m, of, onset, disturbed, worth) for m in rest])) as ways:
+            for k, fits in enumerate(ways, 1):
+                machine = rest[k - 1]
+                stage = _stage(machine, _anew(machine, of), fits) if fits else None
+                yield stage
+                nearer = _where_near(of) or onset
+                if stage is not None and stage.near and onset != nearer:
+                    onset = nearer
+                    break
+        rest = rest[k:]
 
 
 def _from_first(prepared: Prepared, disturbed: float, most: float = np.inf, worth: float = np.inf) -> Fit | None:
@@ -266,15 +274,6 @@ def _strictly(prepared: Prepared) -> Fits | None:
     """A fit from first guesses by exact dynamics; None where it is given up, as it stays FAR off."""
     fit = _from_first(prepared, 0.0, FAR * prepared.readings)
     return None if fit is None else (fit, None)
-
-
-def _coarsely(prepared: Prepared) -> tuple[Fit, float] | None:
-    """A fit from first guesses with disturbing forces and sensors as coarse as it takes to find one, and how coarse."""
-    for times in COARSE:
-        fit = _from_first(_noisy(prepared, times), smoothing.DISTURBED[0])
-        if fit is not None:
-            return fit, times
-    return None
 
 
 def _disturbed(machine: Machine, prepared: Prepared, disturbed: float, worth: float = np.inf) -> Fits | None:
@@ -399,8 +398,9 @@ def _began(begin: Prepared, disturbed: float, most: float) -> tuple[float, bool]
         return (0.0 if failed.fit is None else failed.fit.cost), failed.nearly is not None
 
 
-def _begun(machine: Machine, prepared: Prepared, onset: Onset | None, disturbed: float, worth: float) -> Fits | None:
+def _begun(machine: Machine, of: Stage, onset: Onset | None, disturbed: float, worth: float) -> Fits | None:
     """A fit from first guesses, as `begun` has it; None of one that doesn't set out."""
+    prepared = _anew(machine, of)
     if not _sets_out(prepared, onset, disturbed):
         return None
     if disturbed > 0:
@@ -485,6 +485,7 @@ def _resumable(prepared: Prepared, of: Stage, disturbed: float, most: float = np
 def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.inf) -> Fit:
     """The fit of a stage gone on with, for logs made ready for another model. Raises NotConverged."""
     c = prepared.c
+    prepared = replace(prepared, held=prepared.held | _untold(prepared, of, disturbed))
     old = dict(zip(of.model.base.names, of.fit.X, strict=True))
     X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, c.model.nominal, strict=True)])
     X = np.where(prepared.held, c.model.nominal, X)
@@ -509,6 +510,17 @@ def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.in
             raise
         fit = _nearly(prepared, found.points, found.X, disturbed, most)
     return light(fit)
+
+
+def _untold(prepared: Prepared, of: Stage, disturbed: float) -> np.ndarray:
+    """Parameters (n_base,) that the logs don't show in the fit of a stage, and not with more effects, disturbing forces
+    no smaller and sensors as coarse either: left free they would first lead each of these fits astray."""
+    names = prepared.c.model.base.names
+    less = of.fit.disturbed > disturbed or of.prepared.coarse != prepared.coarse
+    if less or not of.settled or not set(of.model.base.names) <= set(names):
+        return np.zeros(len(names), bool)
+    unseen = {n for n, yes in zip(of.model.base.names, of.fit.unseen, strict=True) if yes}
+    return np.array([n in unseen for n in names])
 
 
 def _nearly(prepared: Prepared, points: Sequence[Point], X: np.ndarray, disturbed: float, most: float) -> Fit:
@@ -569,3 +581,8 @@ def _resumed(machine: Machine, of: Stage) -> Prepared:
     starts = tuple(carried(c, r, p, before.c, model.nominal) for r, p in zip(records, before.starts, strict=True))
     held = dict(zip(of.model.base.names, before.held, strict=True))
     return Prepared(c, before.logs, records, starts, np.array([held.get(n, False) for n in model.base.names]))
+
+
+def _anew(machine: Machine, of: Stage) -> Prepared:
+    """The same with sensors as they are."""
+    return _noisy(_resumed(machine, of), 1.0)

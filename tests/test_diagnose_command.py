@@ -842,6 +842,72 @@ def test_the_whole_log_is_fitted_where_its_beginning_can_be(
             assert forces[0] == 1.0
 
 
+def test_beside_what_came_near_only_that_is_fitted_whose_beginning_tells_that_it_may(
+    sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What stays off is of no use any more; a rival that comes near as well is still found."""
+    one = log.read(sloping, straight.machine)
+    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    true, lengths = newton.iterate, list[int]()
+
+    def counted(c: Any, records: Any, *asked: Any) -> newton.Fit:
+        lengths.append(len(records[0].used))
+        return true(c, records, *asked)
+
+    monkeypatch.setattr(newton, "iterate", counted)
+    monkeypatch.setattr(stages, "SHORTEST", 5.0)
+    monkeypatch.setattr(stages, "FAR", np.inf)
+    right = placing.extended(straight.machine, _slope(straight))
+    wrong = placing.extended(straight.machine, placing.parse("torque_gain@front_roll=0.1", straight.machine, 40.0))
+    for machines, near, tried in (
+        ([wrong], [False], True),
+        ([right, wrong], [True, False], False),
+        ([wrong, right], [False, True], True),
+        ([right, wrong, right], [True, False, True], False),
+    ):
+        lengths.clear()
+        found: list[bool] = []
+        whole = [0]
+        for made in stages.begun(machines, stage, 0.0, in_turn):
+            found.append(made is not None and made.near)
+            whole.append(lengths.count(len(one)))
+        assert found == near
+        at = machines.index(wrong)
+        assert (whole[at + 1] > whole[at]) == tried
+
+
+@pytest.mark.parametrize(
+    ("forces", "asked", "coarse", "settled", "held"),
+    [
+        (0.0, 0.0, 1.0, True, True),
+        (0.1, 0.1, 1.0, True, True),
+        (0.1, 1.0, 1.0, True, True),
+        (1.0, 0.1, 1.0, True, False),  # smaller forces may show it
+        (0.1, 0.0, 1.0, True, False),
+        (1.0, 1.0, 10.0, True, False),  # and so may finer sensors
+        (0.0, 0.0, 1.0, False, False),
+    ],
+)
+def test_what_a_log_does_not_show_it_shows_no_better_with_more_effects(
+    forces: float, asked: float, coarse: float, settled: bool, held: bool, straight: Model
+) -> None:
+    """So a fit with one more doesn't begin by letting it go anywhere. With fewer it may be seen."""
+    stage = calm(straight)
+    names, unseen = stage.model.base.names, stage.fit.unseen.copy()
+    unseen[names.index("u10")] = True
+    of = replace(stage, settled=settled, fit=replace(stage.fit, unseen=unseen, disturbed=forces))
+    of = replace(of, prepared=stages._noisy(of.prepared, coarse))
+    slope = placing.extended(straight.machine, _slope(straight))
+    more = stages._noisy(stages._resumed(slope, stage), 1.0)
+    told = stages._untold(more, of, asked)
+    assert [n for n, yes in zip(more.c.model.base.names, told, strict=True) if yes] == (["u10"] if held else [])
+    if held and asked == 0:
+        fit = stages._resume(more, of, asked)
+        assert fit.unseen[more.c.model.base.names.index("u10")]
+    fewer = stages.refitted(slope, stage, forces)
+    assert not stages._untold(stage.prepared, replace(fewer, fit=replace(fewer.fit, unseen=~told)), asked).any()
+
+
 @pytest.mark.parametrize(
     ("disturbed", "cost", "found", "expected"),
     [
@@ -1113,7 +1179,10 @@ def test_a_harmonic_is_no_ripple_elsewhere(straight: Model, straight_motion: Mot
         (0.0, True, 0.0, False, 0.05 * 1e4),
         (0.0, False, 0.0, False, 0.15 * 1e4),
         (1.0, False, 0.0, False, 0.3 * 1e4),
-        (1.0, False, 1e3, False, 0.15 * 1e4),
+        (1.0, False, 1e3, False, 0.3 * 1e4),
+        (1.0, True, 1e3, False, 0.15 * 1e4),
+        (0.0, False, 1e3, False, 0.3 * 1e4),
+        (0.0, True, 1e3, False, 0.05 * 1e4),
         (0.0, True, 1e6, False, 0.005 * 1e6),
         (0.0, True, 1e6, True, 0.02 * 1e6),
     ],
@@ -1121,8 +1190,9 @@ def test_a_harmonic_is_no_ripple_elsewhere(straight: Model, straight_motion: Mot
 def test_what_an_effect_must_gain_to_be_worth_a_place(
     forces: float, near: bool, gained: float, mapped: bool, least: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of an excess of 1e4: a part; where large forces leave much the first must explain what the largest of three does.
-    Of what another gained: what its formula is off by, the more where that looks at a map of the ground."""
+    """Of an excess of 1e4: a part; where large forces leave much the first must explain what the largest of three does,
+    and where the first left much the next what the larger of two does. Of what another gained: what its formula is off
+    by, the more where that looks at a map of the ground."""
     monkeypatch.setattr(choosing, "_sureness", lambda stage: 0.0)
     known = SimpleNamespace(name="a@b", mapped=mapped)
     stage: Any = SimpleNamespace(
@@ -1158,8 +1228,8 @@ def test_who_gains_too_little_with_coarse_sensors_is_given_up(
 
 
 def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where forces leave much a candidate is fitted as long as it comes to half of what it must gain, and where one
-    gained that, the others as long as they come to half of what that one did."""
+    """Where forces leave much a candidate is fitted as long as it comes to half of what it must gain, and where those
+    that were fitted first gained that, the others as long as they come to half of what these did."""
     iterate = newton.iterate
     bars: list[tuple[str, float]] = []
 
@@ -1171,14 +1241,19 @@ def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatc
     monkeypatch.setattr(newton, "iterate", noted)
     stage = stages.fitted(straight.machine, [log.read(sloping, straight.machine)], straight.machine.filter)
     likely = choosing.scored(stage, in_turn)
-    choice = choosing.choose(stage, likely, (), in_turn, lambda share, what: None, 0.0)
-    assert choice is not None
-    assert choice.name == "ground_slope@machine"
-    assert not stage.exact
-    assert not stage.near
-    assert bars[0] == (choice.name, stage.fit.cost - choosing.BEHIND * choosing.MAIN * stage.excess)
-    (bar,) = {bar for name, bar in bars if name != choice.name}
-    assert bar == pytest.approx(stage.fit.cost - choosing.BEHIND * choice.gain)
+    for pair, over in ((2, choosing.OVER), (1, 1e3)):
+        monkeypatch.setattr(choosing, "PAIR", pair)
+        monkeypatch.setattr(choosing, "OVER", over)
+        bars.clear()
+        choice = choosing.choose(stage, likely, (), in_turn, lambda share, what: None, 0.0)
+        assert choice is not None
+        assert choice.name == "ground_slope@machine"
+        assert not stage.exact
+        assert not stage.near
+        first = stage.fit.cost - choosing.BEHIND * choosing.MAIN * stage.excess
+        assert bars[0] == (choice.name, first)
+        bar = next(bar for name, bar in bars if name != choice.name)
+        assert bar == pytest.approx(first if pair > 1 else stage.fit.cost - choosing.BEHIND * choice.gain)
     texts = ("ground_slope=0.009", "roll_unbalance@rear_roll=500")
     machines = [placing.extended(straight.machine, placing.parse(t, straight.machine, 40.0)) for t in texts]
     for most, found in ((np.inf, [True, True]), (bar, [True, False])):
