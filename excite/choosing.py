@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.stats
@@ -35,7 +36,9 @@ TRIED = 5  # candidates that are fitted
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
 PLAIN = 0.5  # the same for the variant without unusual shapes, which the others may mimic before a fit
 ANEW = 12  # effects that begin anew where nothing was found
-PAIR = 2  # candidates whose fits are made in any case, or with forces so large that they take up part of any cause
+# Candidates that are fitted before any is compared with another, or with forces so large that they take up part of any
+# cause.
+PAIR = 2
 BEHIND = 0.5  # share of what must be gained, or was already, that candidates must have come to after a few passes
 OVER = 2.5  # by which what a candidate gains may exceed its first-order gain
 CLOSE = 10.0  # a rival that is worse by less than this is a tie
@@ -52,7 +55,7 @@ CLOSER = 1.0, 0.35  # way to the grid's next points within which the best candid
 INSTANT = 0.5  # [s] about which instants are known before a fit, which finds them from near only
 LEAST = 0.05, 0.15  # of the excess misfit that an effect must explain to be worth a place: weak misfit, strong misfit
 # The same of the first effect beside exact dynamics or large forces, as the largest of three explains so much, and of a
-# further one where much is left, as the larger of two does: what takes less leads to no name, one patch after another.
+# further one where the model isn't near the logs yet: what takes less leads to no name, one patch after another.
 MAIN = 0.3
 SHARE = 0.7  # of the excess misfit beside coarse sensors, from which a fit with sharp ones is worth disturbing forces
 FORCED = 0.02  # of what is gained with disturbing forces, by which a rival is a tie: they take up part of a difference
@@ -358,7 +361,8 @@ def _followed(
         few = disturbed > smoothing.DISTURBED[0]
         names = list(dict.fromkeys(s.candidate.name for s in likely))[: PAIR if few else None]
         begin = [(s, m) for s, m in zip(likely, machines, strict=True) if s.candidate.name in names]
-        found = begun([m for _, m in begin], stage, disturbed, together, worth)
+        enough = partial(_settles, [s.candidate.name for s, _ in begin])
+        found = begun([m for _, m in begin], stage, disturbed, together, worth, enough)
         follow = [(s, x) for (s, _), x in zip(begin, found, strict=True) if x is not None and x.follows]
         follow = [(s, x) for s, x in follow if _felt(s.candidate.name, x)]
         if not follow:
@@ -377,6 +381,11 @@ def _followed(
             return exact_if_near(stage), []
         return stage, [_chosen(tries, gain, tried, together)]
     return None
+
+
+def _settles(names: Sequence[str], k: int, stage: Stage) -> bool:
+    """Whether one of several effects, begun anew, is a cause: beside it only what brings the model as near is any."""
+    return stage.near and stage.exact and _felt(names[k], stage)
 
 
 def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate, hidden: float = HIDDEN) -> float:

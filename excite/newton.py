@@ -218,13 +218,15 @@ def iterate(
     most: float = np.inf,
     patient: bool = True,
     worth: float = np.inf,
+    untold: np.ndarray | None = None,
 ) -> Fit:
     """Gauss-Newton from points and X; the prior stands about the machine file's values and the states of `starts`.
     Parameters `held` (n_base,) stay at the file's values. damping: of the first step; passes: at most; enough: a step,
     in standard deviations, at which a fit is found, however much is left undone: ENOUGH with disturbing forces, none
     without, if not given; most: cost above which a fit is given up once the states fit the dynamics; worth: cost above
     which it is given up as soon as costs fall no more. Not `patient`: no passes are spent on steps that have ceased to
-    shrink.
+    shrink. untold (n_base,): parameters that start held, as they weren't seen in the fit that this one goes on from,
+    and are judged like the others.
 
     Raises NotConverged.
     """
@@ -237,7 +239,7 @@ def iterate(
     there = here
     latest, best, nearest, waited = None, None, NEARLY, False
     whole, last = 1.0, np.zeros(len(X))
-    unseen = held.copy()
+    unseen = held.copy() if untold is None else held | untold
     for k in range(passes):
         linear = linearised(c, records, there[0], starts, there[1], disturbed)
         if linear is None:
@@ -252,9 +254,9 @@ def iterate(
         known = prior(model, unseen, X)
         covariance, move, left, cost = newton_step(c, records, linear, points, X, known, damping)
         if k == SETTLED:
-            # Against the estimate as well: a file's value that is far too small must not make a parameter unseen.
-            sigma = np.sqrt(np.diag(covariance))[: len(X)]
-            unseen |= sigma > UNSEEN * np.maximum(np.abs(X) / model.scale, 1.0)
+            if (unseen != held).any():
+                covariance, *_ = newton_step(c, records, linear, points, X, prior(model, held, X), damping)
+            unseen = _unseen(model, X, held, covariance)
             if unseen.any():
                 # Left free they would go anywhere, and take the mass matrix and the slips with them.
                 known = prior(model, unseen, X)
@@ -303,6 +305,11 @@ def iterate(
         ratio = min(max(step / before, 1 - whole), 0.9)
         done = step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED
         if not away and (done or step < enough):
+            if k < SETTLED and (unseen != held).any():
+                free, *_ = newton_step(c, records, linear, points, X, prior(model, held, X), damping)
+                if ((told := _unseen(model, X, held, free)) != unseen).any():
+                    unseen = told
+                    continue
             # What is hardly known may have gone where no motion is: other fits must be able to go on from here.
             far = (np.abs(there[1] - X) > FREE * np.maximum(np.abs(X), model.scale)).any()
             if far and linearised(c, records, there[0], starts, there[1], disturbed) is None:
@@ -323,6 +330,14 @@ def iterate(
         float(step if best is None else nearest),
         waited and len(costs) > SETTLED + 2 and np.ptp(costs[-3:]) < ALIKE * costs[-1],
     )
+
+
+def _unseen(model: Model, X: np.ndarray, held: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Parameters (n_base,) that the logs don't show, by their deviations where only those are held that must be, and
+    these. Against the estimate as well: a file's value that is far too small must not make a parameter unseen."""
+    sigma = np.sqrt(np.diag(covariance))[: len(X)]
+    found: np.ndarray = held | (sigma > UNSEEN * np.maximum(np.abs(X) / model.scale, 1.0))
+    return found
 
 
 def _idle(steps: Sequence[float], costs: Sequence[float]) -> bool:

@@ -238,26 +238,32 @@ def sharpened(found: Sequence[Stage], disturbed: float, together: Together) -> I
 
 
 def begun(
-    machines: Sequence[Machine], of: Stage, disturbed: float, together: Together, worth: float = np.inf
+    machines: Sequence[Machine],
+    of: Stage,
+    disturbed: float,
+    together: Together,
+    worth: float = np.inf,
+    enough: Callable[[int, Stage], bool] = lambda k, stage: False,
 ) -> Iterator[Stage | None]:
     """Machines with other effects, each fitted to the logs of a stage from the beginning, with so large disturbing
     forces or smaller ones, side by side; None where no fit is found. With forces none either where so large ones don't
     bring it near, or its beginning tells that they won't. By exact dynamics none where it costs more than it is worth,
     or its beginning tells that it will, or is FAR off already; where they leave much, with small disturbing forces
-    after all, if they bring it near or it doesn't follow; where one came near, none of which the beginning tells that
-    it won't as well."""
-    onset, rest = _onset(of, disturbed, worth), list(machines)
-    while rest:
-        with closing(together([partial(_begun, m, of, onset, disturbed, worth) for m in rest])) as ways:
-            for k, fits in enumerate(ways, 1):
-                machine = rest[k - 1]
+    after all, if they bring it near or it doesn't follow. enough: whether a stage, of the machine of that number, is
+    one beside which those that come after it are of use only where they come near as well: none of these whose
+    beginning tells that it won't."""
+    onsets, at = [_onset(of, disturbed, worth)], 0
+    while at < len(machines):
+        calls = [partial(_begun, m, of, tuple(onsets), disturbed, worth) for m in machines[at:]]
+        with closing(together(calls)) as ways:
+            for fits in ways:
+                machine, at = machines[at], at + 1
                 stage = _stage(machine, _anew(machine, of), fits) if fits else None
                 yield stage
-                nearer = _where_near(of) or onset
-                if stage is not None and stage.near and onset != nearer:
-                    onset = nearer
+                if len(onsets) == 1 and stage is not None and enough(at - 1, stage):
+                    near = _where_near(of)
+                    onsets.append(near and replace(near, whole=True))
                     break
-        rest = rest[k:]
 
 
 def _from_first(prepared: Prepared, disturbed: float, most: float = np.inf, worth: float = np.inf) -> Fit | None:
@@ -318,11 +324,13 @@ def _with_less(stage: Stage) -> Stage | None:
 @dataclass(frozen=True)
 class Onset:
     """How many samples of each log are its beginning, and the most that a fit may cost there, from which it isn't worth
-    the whole; with `or_found` unless it is as good as found there."""
+    the whole; with `or_found` unless it is as good as found there. whole: not after a few passes, but as far as it
+    comes."""
 
     samples: tuple[int, ...]
     most: float
     or_found: bool = False
+    whole: bool = False
 
 
 def _beginnings(prepared: Prepared) -> list[tuple[int, ...]]:
@@ -384,24 +392,25 @@ def _sets_out(prepared: Prepared, onset: Onset | None, disturbed: float) -> bool
     """Whether a fit may come to what it is worth, as far as the beginning of the logs tells, if any does."""
     if onset is None:
         return True
-    cost, found = _began(_until(prepared, onset.samples), disturbed, onset.most)
+    begin = _until(prepared, onset.samples)
+    cost, found = _began(begin, disturbed, *((np.inf, newton.PASSES) if onset.whole else (onset.most,)))
     return cost <= onset.most or (found and onset.or_found)
 
 
-def _began(begin: Prepared, disturbed: float, most: float) -> tuple[float, bool]:
+def _began(begin: Prepared, disturbed: float, most: float, passes: int = newton.SETTLED + 1) -> tuple[float, bool]:
     """What a fit to the beginning of logs costs after a few passes, nothing where there is none, and whether it is as
     good as found then. most: what it is given up above."""
-    X, passes = begin.c.model.nominal, newton.SETTLED + 1
+    X = begin.c.model.nominal
     try:
         return _iterated(begin, begin.starts, X, disturbed, passes=passes, most=most).cost, True
     except NotConverged as failed:
         return (0.0 if failed.fit is None else failed.fit.cost), failed.nearly is not None
 
 
-def _begun(machine: Machine, of: Stage, onset: Onset | None, disturbed: float, worth: float) -> Fits | None:
+def _begun(machine: Machine, of: Stage, onsets: Sequence[Onset | None], disturbed: float, worth: float) -> Fits | None:
     """A fit from first guesses, as `begun` has it; None of one that doesn't set out."""
     prepared = _anew(machine, of)
-    if not _sets_out(prepared, onset, disturbed):
+    if not all(_sets_out(prepared, onset, disturbed) for onset in onsets):
         return None
     if disturbed > 0:
         return _disturbed(machine, prepared, disturbed, STRONG * prepared.noise)
@@ -484,14 +493,13 @@ def _resumable(prepared: Prepared, of: Stage, disturbed: float, most: float = np
 
 def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.inf) -> Fit:
     """The fit of a stage gone on with, for logs made ready for another model. Raises NotConverged."""
-    c = prepared.c
-    prepared = replace(prepared, held=prepared.held | _untold(prepared, of, disturbed))
+    c, untold = prepared.c, _untold(prepared, of, disturbed)
     old = dict(zip(of.model.base.names, of.fit.X, strict=True))
     X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, c.model.nominal, strict=True)])
     X = np.where(prepared.held, c.model.nominal, X)
     points = [carried(c, r, p, of.prepared.c, X) for r, p in zip(prepared.records, of.fit.points, strict=True)]
     try:
-        fit = _nearly(prepared, points, X, disturbed, most)
+        fit = _nearly(prepared, points, X, disturbed, most, untold)
     except NotConverged as failed:
         found = failed.fit
         if found is None:
@@ -508,25 +516,27 @@ def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.in
         near = of.fit.cost - NEARER if of.near else STRONG * prepared.noise
         if found.cost > min(near, most):
             raise
-        fit = _nearly(prepared, found.points, found.X, disturbed, most)
+        fit = _nearly(prepared, found.points, found.X, disturbed, most, untold)
     return light(fit)
 
 
 def _untold(prepared: Prepared, of: Stage, disturbed: float) -> np.ndarray:
-    """Parameters (n_base,) that the logs don't show in the fit of a stage, and not with more effects, disturbing forces
-    no smaller and sensors as coarse either: left free they would first lead each of these fits astray."""
+    """Parameters (n_base,) that the logs don't show in the fit of a stage, where neither smaller disturbing forces nor
+    finer sensors may show them now. Most often they don't with other effects either: left free they would first lead
+    each of these fits astray."""
     names = prepared.c.model.base.names
-    less = of.fit.disturbed > disturbed or of.prepared.coarse != prepared.coarse
-    if less or not of.settled or not set(of.model.base.names) <= set(names):
+    if of.fit.disturbed > disturbed or of.prepared.coarse != prepared.coarse or not of.settled:
         return np.zeros(len(names), bool)
     unseen = {n for n, yes in zip(of.model.base.names, of.fit.unseen, strict=True) if yes}
     return np.array([n in unseen for n in names])
 
 
-def _nearly(prepared: Prepared, points: Sequence[Point], X: np.ndarray, disturbed: float, most: float) -> Fit:
+def _nearly(
+    prepared: Prepared, points: Sequence[Point], X: np.ndarray, disturbed: float, most: float, untold: np.ndarray
+) -> Fit:
     """A fit that goes on from another, as far as it came if that is as good as found. Raises NotConverged."""
     try:
-        return _iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES, most)
+        return _iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES, most, untold=untold)
     except NotConverged as failed:
         found = failed.nearly or failed.swinging
         if found is None:
@@ -544,12 +554,13 @@ def _iterated(
     most: float = np.inf,
     patient: bool = False,
     worth: float = np.inf,
+    untold: np.ndarray | None = None,
 ) -> Fit:
     """A fit from points and X. With disturbing forces it is found as soon as it is nearly: gains are larger by far than
     what another pass would change. Raises NotConverged."""
     p, enough = prepared, newton.NEARLY if disturbed > 0 else None
     return newton.iterate(
-        p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, enough, most, patient, worth
+        p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, enough, most, patient, worth, untold
     )
 
 
@@ -584,5 +595,5 @@ def _resumed(machine: Machine, of: Stage) -> Prepared:
 
 
 def _anew(machine: Machine, of: Stage) -> Prepared:
-    """The same with sensors as they are."""
+    """The logs of a stage made ready for a machine with other effects, with sensors as noisy as they are."""
     return _noisy(_resumed(machine, of), 1.0)

@@ -20,6 +20,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ from excite.folder import writing_file
 Row = dict[str, Any]
 FRESH = {"nothing": 1830, "cause": 29, "surprise": 14, "pair": 70}  # numbers below were looked at when mending
 GOOD = ("right", "tied")  # a tie that holds the cause sends nobody to repair the wrong thing
-LOADED = """import sys, excite.checkup
+LOADED = """import sys, excite.findings, excite.examine
 print(*(m.__file__ for n, m in sys.modules.items() if n.partition(".")[0] in ("excite", "model")), sep="\\n")"""
 ROLLER = [ROOT / "tests" / n for n in ("plant.py", "causes.py", "surprises.py", "blind.py", "visibility.py")]
 
@@ -54,11 +55,11 @@ ROLLER = [ROOT / "tests" / n for n in ("plant.py", "causes.py", "surprises.py", 
 def _digits(files: Sequence[Path]) -> str:
     seen = hashlib.sha1()
     for file in dict.fromkeys(files):
-        if file.is_file():
-            seen.update(file.read_bytes())
+        seen.update(file.read_bytes())
     return seen.hexdigest()[:8]
 
 
+@cache
 def version() -> str:
     """Eight digits that change when the program, as far as a diagnosis loads it, or the second roller does."""
     done = subprocess.run([sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True, check=True)
