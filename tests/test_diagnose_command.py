@@ -876,6 +876,9 @@ def test_beside_a_cause_only_that_is_fitted_whose_beginning_tells_that_it_comes_
         assert found == near
         at = machines.index(wrong)
         assert (whole[at + 1] > whole[at]) == tried
+    ways = stages.begun([right, wrong, right], stage, 0.0, forked, np.inf, lambda k, x: x.near)
+    assert [x is not None for x in ways] == [True, False, True]
+    assert not multiprocessing.active_children()
     for felt in (True, False):
         monkeypatch.setattr(choosing, "_felt", lambda name, x, felt=felt: felt and name == "b")
         (made,) = stages.begun([right], stage, 0.0, in_turn)
