@@ -254,9 +254,7 @@ def iterate(
         known = prior(model, unseen, X)
         covariance, move, left, cost = newton_step(c, records, linear, points, X, known, damping)
         if k == SETTLED:
-            if (unseen != held).any():
-                covariance, *_ = newton_step(c, records, linear, points, X, prior(model, held, X), damping)
-            unseen = _unseen(model, X, held, covariance)
+            unseen = _unseen(c, records, linear, points, X, held, unseen, covariance)
             if unseen.any():
                 # Left free they would go anywhere, and take the mass matrix and the slips with them.
                 known = prior(model, unseen, X)
@@ -306,9 +304,8 @@ def iterate(
         done = step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED
         if not away and (done or step < enough):
             if k < SETTLED and (unseen != held).any():
-                free, *_ = newton_step(c, records, linear, points, X, prior(model, held, X), damping)
-                if ((told := _unseen(model, X, held, free)) != unseen).any():
-                    unseen = told
+                started, unseen = unseen, _unseen(c, records, linear, points, X, held, unseen, covariance)
+                if (unseen != started).any():
                     continue
             # What is hardly known may have gone where no motion is: other fits must be able to go on from here.
             far = (np.abs(there[1] - X) > FREE * np.maximum(np.abs(X), model.scale)).any()
@@ -332,11 +329,23 @@ def iterate(
     )
 
 
-def _unseen(model: Model, X: np.ndarray, held: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Parameters (n_base,) that the logs don't show, by their deviations where only those are held that must be, and
-    these. Against the estimate as well: a file's value that is far too small must not make a parameter unseen."""
+def _unseen(
+    c: Chart,
+    records: Sequence[Record],
+    linear: Sequence[Linear],
+    points: Sequence[Point],
+    X: np.ndarray,
+    held: np.ndarray,
+    unseen: np.ndarray,
+    covariance: np.ndarray,
+) -> np.ndarray:
+    """Parameters (n_base,) that the logs don't show, by their deviations were all free but those that must be held,
+    and these. covariance: of a step with `unseen` held. Against the estimate as well: a file's value that is far too
+    small must not make a parameter unseen."""
+    if (unseen != held).any():
+        covariance, *_ = newton_step(c, records, linear, points, X, prior(c.model, held, X), 0.0)
     sigma = np.sqrt(np.diag(covariance))[: len(X)]
-    found: np.ndarray = held | (sigma > UNSEEN * np.maximum(np.abs(X) / model.scale, 1.0))
+    found: np.ndarray = held | (sigma > UNSEEN * np.maximum(np.abs(X) / c.model.scale, 1.0))
     return found
 
 

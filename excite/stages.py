@@ -252,7 +252,7 @@ def begun(
     after all, if they bring it near or it doesn't follow. enough: whether a stage, of the machine of that number, is
     one beside which those that come after it are of use only where they come near as well: none of these whose
     beginning tells that it won't."""
-    onsets, at = [_onset(of, disturbed, worth)], 0
+    onsets, near, at = [_onset(of, disturbed, worth)], _where_near(of), 0
     while at < len(machines):
         calls = [partial(_begun, m, of, tuple(onsets), disturbed, worth) for m in machines[at:]]
         with closing(together(calls)) as ways:
@@ -260,9 +260,8 @@ def begun(
                 machine, at = machines[at], at + 1
                 stage = _stage(machine, _anew(machine, of), fits) if fits else None
                 yield stage
-                if len(onsets) == 1 and stage is not None and enough(at - 1, stage):
-                    near = _where_near(of)
-                    onsets.append(near and replace(near, whole=True))
+                if near is not None and len(onsets) == 1 and stage is not None and enough(at - 1, stage):
+                    onsets.append(replace(near, whole=True))
                     break
 
 
@@ -393,7 +392,10 @@ def _sets_out(prepared: Prepared, onset: Onset | None, disturbed: float) -> bool
     if onset is None:
         return True
     begin = _until(prepared, onset.samples)
-    cost, found = _began(begin, disturbed, *((np.inf, newton.PASSES) if onset.whole else (onset.most,)))
+    if onset.whole:
+        cost, found = _began(begin, disturbed, np.inf, newton.PASSES)
+    else:
+        cost, found = _began(begin, disturbed, onset.most)
     return cost <= onset.most or (found and onset.or_found)
 
 

@@ -741,13 +741,7 @@ def test_what_takes_too_little_of_a_beginning_is_not_fitted_to_the_whole(
     stage = stages.fitted(straight.machine, [one], straight.machine.filter)
     assert stage.exact
     assert stage.excess > 1000
-    true, lengths = newton.iterate, list[int]()
-
-    def counted(c: Any, records: Any, *asked: Any) -> newton.Fit:
-        lengths.append(len(records[0].used))
-        return true(c, records, *asked)
-
-    monkeypatch.setattr(newton, "iterate", counted)
+    lengths, _ = fits(monkeypatch)
     monkeypatch.setattr(stages, "SHORTEST", 5.0)
     worth, whole = stage.fit.cost - 0.3 * stage.excess, len(one)
     for effect, found in (("torque_deadband@rear_roll=100", True), ("torque_offset_drift@front_roll=0.1", False)):
@@ -802,14 +796,7 @@ def test_the_whole_log_is_fitted_where_its_beginning_can_be(
     once, and so is one that is followed without any cause: then none is waited for that costs more than it is worth."""
     one = log.read(sloping, straight.machine)
     stage = stages.fitted(straight.machine, [one], straight.machine.filter)
-    true, lengths, forces = newton.iterate, list[int](), list[float]()
-
-    def counted(c: Any, records: Any, *asked: Any) -> newton.Fit:
-        lengths.append(len(records[0].used))
-        forces.append(asked[3])
-        return true(c, records, *asked)
-
-    monkeypatch.setattr(newton, "iterate", counted)
+    lengths, forces = fits(monkeypatch)
     right = placing.extended(straight.machine, _slope(straight))
     wrong = placing.extended(straight.machine, placing.parse("brake_drag@rear_roll=50", straight.machine, 40.0))
     (good,) = stages.begun([right], stage, 0.0, in_turn)
@@ -849,13 +836,7 @@ def test_beside_a_cause_only_that_is_fitted_whose_beginning_tells_that_it_comes_
     cause all others are fitted."""
     one = log.read(sloping, straight.machine)
     stage = stages.fitted(straight.machine, [one], straight.machine.filter)
-    true, lengths = newton.iterate, list[int]()
-
-    def counted(c: Any, records: Any, *asked: Any) -> newton.Fit:
-        lengths.append(len(records[0].used))
-        return true(c, records, *asked)
-
-    monkeypatch.setattr(newton, "iterate", counted)
+    lengths, _ = fits(monkeypatch)
     monkeypatch.setattr(stages, "SHORTEST", 5.0)
     monkeypatch.setattr(stages, "FAR", np.inf)
     right = placing.extended(straight.machine, _slope(straight))
@@ -1224,7 +1205,7 @@ def test_what_an_effect_must_gain_to_be_worth_a_place(
     forces: float, near: bool, gained: float, mapped: bool, least: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of an excess of 1e4: a part; where large forces leave much the first must explain what the largest of three does,
-    and where the first left much the next what the larger of two does. Of what another gained: what its formula is off
+    and where the model isn't near the log yet a further one as much. Of what another gained: what its formula is off
     by, the more where that looks at a map of the ground."""
     monkeypatch.setattr(choosing, "_sureness", lambda stage: 0.0)
     known = SimpleNamespace(name="a@b", mapped=mapped)
@@ -1305,6 +1286,19 @@ def calm(model: Model) -> stages.Stage:
     """The model fitted to a log of that without anything hidden."""
     one = log.check(sensors.measure(model, gentle(model, 12.0), seed=3), model.machine)
     return stages.fitted(model.machine, [one], model.machine.filter)
+
+
+def fits(monkeypatch: pytest.MonkeyPatch) -> tuple[list[int], list[float]]:
+    """Of every fit from now on: how many samples of the first log it is made to, and with which disturbing forces."""
+    iterate, lengths, forces = newton.iterate, list[int](), list[float]()
+
+    def noted(c: Any, records: Any, *asked: Any) -> newton.Fit:
+        lengths.append(len(records[0].used))
+        forces.append(asked[3])
+        return iterate(c, records, *asked)
+
+    monkeypatch.setattr(newton, "iterate", noted)
+    return lengths, forces
 
 
 def unfit(monkeypatch: pytest.MonkeyPatch, refused: Callable[[Any, int], bool], coarse: float = 1.0) -> None:
