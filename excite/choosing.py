@@ -236,7 +236,7 @@ def choose(
     if _hides(stage):
         vain = stage.fit.cost - BEHIND * min(_least(stage, chosen, s.candidate, 0.0) for s in likely)
     tries, refused = _tries(stage, likely, together, told, vain)
-    if stage.exact and likely[0].candidate.name not in {*refused, *(s.candidate.name for s, _ in tries)}:
+    if stage.exact and _lost(likely, tries, refused):
         # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
         try:
             stage = refitted(stage.machine, stage, SMALL)
@@ -289,10 +289,11 @@ def sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None
     """Where the model follows the logs with coarse sensors only: the effect with which it follows them with sensors as
     they are, and the stage without. Coarse sensors leave of a misfit what shows its cause, and are followed by what is
     nearly right. No effect where the model does without after all, None where nothing comes near."""
-    plain = next(sharpened([stage], 0.0, together))
+    begun_without = sharpened([stage], 0.0, together)
+    scores, least = scored(stage, together), LEAST[1] * stage.excess
+    plain = next(begun_without)
     if plain is not None and plain.near:
         return plain, []
-    scores, least = scored(stage, together), LEAST[1] * stage.excess
     likely = _likely(stage, scores, (), together)
     tries, _ = _tries(stage, likely, together, lambda k: None, stage.fit.cost - BEHIND * least)
     if not tries:
@@ -359,7 +360,7 @@ def _followed(
     worth = stage.fit.cost - MAIN * stage.excess if stage.settled and stage.exact else np.inf
     for disturbed in forces if likely else ():
         few = disturbed > smoothing.DISTURBED[0]
-        names = list(dict.fromkeys(s.candidate.name for s in likely))[: PAIR if few else None]
+        names = _names(likely)[: PAIR if few else None]
         begin = [(s, m) for s, m in zip(likely, machines, strict=True) if s.candidate.name in names]
         enough = partial(_settles, [s.candidate.name for s, _ in begin])
         found = begun([m for _, m in begin], stage, disturbed, together, worth, enough)
@@ -442,7 +443,21 @@ def _tries(
                 tries.append((score, found))
             elif found is not None:
                 refused.add(score.candidate.name)
+        others = likely[at + len(batch) :]
+        if stage.exact and _lost(likely, tries, refused) and likely[0].candidate.name not in _names(others):
+            break
     return _one_each(tries), refused
+
+
+def _names(scores: Sequence[evidence.Score]) -> list[str]:
+    """Of candidates, each once."""
+    return list(dict.fromkeys(s.candidate.name for s in scores))
+
+
+def _lost(likely: Sequence[evidence.Score], tries: Sequence[_Try], refused: Container[str]) -> bool:
+    """Whether no way was found to the likeliest cause."""
+    name = likely[0].candidate.name
+    return name not in refused and all(s.candidate.name != name for s, _ in tries)
 
 
 def _felt(name: str, stage: Stage) -> bool:

@@ -146,7 +146,7 @@ def extended(before: Stage, first: Sequence[Choice], together: Together, tell: A
     """Effects one after the other, after those that were chosen first, until nothing is left that has a name; and what
     a further one would gain that was not worth one."""
     chosen, stage, left = list(first), first[-1].stage if first else before, 0.0
-    while stage.settled and len(chosen) < MOST:
+    while stage.settled and len(chosen) < MOST and not _vain(stage):
         turn = len(chosen)
         tell(0.15 + 0.2 * turn, "scoring effects")
         scores = choosing.scored(stage, together)
@@ -159,6 +159,12 @@ def extended(before: Stage, first: Sequence[Choice], together: Together, tell: A
         chosen.append(choice)
         stage = choice.stage
     return chosen, left
+
+
+def _vain(stage: Stage) -> bool:
+    """Whether effects leave nothing but noise, and no machine is possible with them: there is nothing by which others
+    could tell better."""
+    return bool(stage.model.effects) and stage.exact and stage.excess == 0 and bool(_impossible(stage))
 
 
 def weighed(

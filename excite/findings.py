@@ -52,6 +52,8 @@ def account(d: Diagnosis, advance: Advance | None = None, together: Together = i
     stages = [d.before, *d.stages]
     held = []
     tell(0.0, "measuring the gain")
+    # Forces that the one needs must be shown for the other too.
+    alike = misfit.loosened((d.before, d.after) if d.before.exact != d.after.exact else (), together)
     for k, found in enumerate(together([partial(gain.withheld, s) for s in stages])):
         tell((k + 1) / (len(stages) + 1), "measuring the gain")
         held.append(found)
@@ -59,17 +61,13 @@ def account(d: Diagnosis, advance: Advance | None = None, together: Together = i
     whole = gain.gain(held[0], held[-1])
     before = misfit.courses(d.before)
     after = misfit.courses(d.after) if d.stages else before
-    missing = before, after
-    if d.before.exact != d.after.exact:
-        # Forces that the one needs must be shown for the other too.
-        loose_before, loose_after = misfit.loosened((d.before, d.after), together)
-        missing = misfit.courses(loose_before), misfit.courses(loose_after)
+    was, now = tuple(misfit.courses(stage) for stage in alike) or (before, after)
     located = d.located
     if d.verdict == "unexplained":  # which signals, and how much more than noise there is in them, is in these lines
         measured = as_measured(d.after)
         odd = [line for line in d.located if line not in measured.suspects]
         located = (*odd[:STRIKING], *misfit.located(measured), *odd[STRIKING:])
-    return Account(d, whole, single, before, after, missing, tuple(dict.fromkeys(located)), separate.run(d))
+    return Account(d, whole, single, before, after, (was, now), tuple(dict.fromkeys(located)), separate.run(d))
 
 
 def summary(a: Account) -> dict[str, Any]:

@@ -7,7 +7,7 @@ missing; the innovations say in which signal and when, and how much of each sign
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,16 +75,18 @@ class Size:
         return 100 * (1 - 1 / worst) if worst > EXCESS else 0.0
 
 
-def loosened(stages: Sequence[Stage], together: Together) -> list[Stage]:
-    """The same models with disturbing forces of some size; as they are where those find no fit."""
+def loosened(stages: Sequence[Stage], together: Together) -> Iterator[Stage]:
+    """The same models with disturbing forces of some size, set out upon at once; as they are where those find no
+    fit."""
     least = smoothing.DISTURBED[0]
 
     def loose(s: Stage | None) -> Stage | None:
         return s if s is None or (s.fit.disturbed >= least and s.prepared.coarse == 1) else loose(s.loose)
 
     known = [loose(s) for s in stages]
-    found = refits([(s.machine, s, least) for s, k in zip(stages, known, strict=True) if k is None], together)
-    return [k or next(found) or s for s, k in zip(stages, known, strict=True)]
+    wishes = [(s.machine, s, least) for s, k in zip(stages, known, strict=True) if k is None]
+    found = refits(wishes, together, at_once=True)
+    return (k or next(found) or s for s, k in zip(stages, known, strict=True))
 
 
 def courses(stage: Stage) -> tuple[Course, ...]:

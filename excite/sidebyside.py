@@ -46,6 +46,18 @@ def in_turn(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
     return (call() for call in calls)
 
 
+def ahead(calls: Sequence[Callable[[], R]], together: Together) -> Generator[R, None, None]:
+    """What calls return, where the first is set out upon at once if there are processes for it, while this one goes
+    on."""
+    ways: Generator[Any, None, None] = together([_nothing, *calls])
+    next(ways)
+    return ways
+
+
+def _nothing() -> None:
+    pass
+
+
 def forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
     """The same from as many processes at a time as there are cores, in the order of the calls.
 

@@ -21,7 +21,7 @@ from excite.linearise import Chart, chart
 from excite.log import Log
 from excite.newton import Fit, NotConverged
 from excite.record import Point, Record, carried, common_sensors, first_point, origins, record
-from excite.sidebyside import Together, in_turn
+from excite.sidebyside import Together, ahead, in_turn
 from model.effect import Placed
 from model.machine import Filter, Machine
 from model.prediction import Model, build
@@ -33,6 +33,8 @@ FAR = 10.0  # misfit over readings, a few passes after the beginning, from which
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 PASSES = 14  # of a fit that goes on from another
 SHORTEST = 30.0  # [s] that the beginning of a log has at least
+BRIEF = 2  # passes after which what a model would do without an effect, but for ALIKE, is known
+ALIKE = 0.1
 ONSETS = 0.25, 0.33, 0.4, 0.5  # shares of logs that are taken for their beginning, in turn
 TELLING = 0.15  # of what exact dynamics leave, that is as much as a beginning must hold of it
 LENIENT = 0.5  # of what a fit must take, that it must take of what is left of the beginning
@@ -193,11 +195,19 @@ def forced(stage: Stage, together: Together) -> Stage:
 
 
 def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float], together: Together) -> Stage:
-    calls = [partial(_disturbed, machine, prepared, d, FAR * prepared.readings) for d in forces]
+    calls: list[Callable[[], Any]] = [
+        *(partial(_disturbed, machine, prepared, d, FAR * prepared.readings) for d in forces),
+        partial(_as_filed, prepared),
+    ]
     with closing(together(calls)) as ways:
-        found = next((fits for fits in ways if fits), None)
-    if found is not None:
-        return exact_if_near(_stage(machine, prepared, found))
+        for _ in forces:
+            if fits := next(ways):
+                return exact_if_near(_stage(machine, prepared, fits))
+        return Stage(machine, prepared, next(ways), settled=False)
+
+
+def _as_filed(prepared: Prepared) -> Fit:
+    """A fit with the file's parameters and small disturbing forces."""
     asis = replace(prepared, held=np.ones_like(prepared.held))
     try:
         fit = _iterated(asis, prepared.starts, prepared.c.model.nominal, smoothing.DISTURBED[0])
@@ -207,8 +217,7 @@ def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float], toget
         fit = failed.fit
     unknown = np.full_like(fit.covariance, np.nan)
     known = newton.prior(prepared.c.model, prepared.held, fit.X)
-    fit = replace(fit, unseen=prepared.held, prior=known, covariance=unknown)
-    return Stage(machine, prepared, light(fit), settled=False)
+    return light(replace(fit, unseen=prepared.held, prior=known, covariance=unknown))
 
 
 def _noisy(prepared: Prepared, coarse: float) -> Prepared:
@@ -229,12 +238,12 @@ def as_measured(stage: Stage) -> Stage:
 
 
 def sharpened(found: Sequence[Stage], disturbed: float, together: Together) -> Iterator[Stage | None]:
-    """Stages with coarse sensors gone on with, with sensors as they are and so large disturbing forces, side by side;
-    None where no fit comes anywhere near."""
+    """Stages with coarse sensors gone on with, with sensors as they are and so large disturbing forces, side by side
+    and set out upon at once; None where no fit comes anywhere near."""
     prepared = [_noisy(x.prepared, 1.0) for x in found]
     calls = [partial(_resumable, p, x, disturbed, FAR * p.readings) for p, x in zip(prepared, found, strict=True)]
-    for p, x, fit in zip(prepared, found, together(calls), strict=True):
-        yield None if fit is None else Stage(x.machine, p, fit)
+    every = zip(prepared, found, ahead(calls, together), strict=True)
+    return (None if fit is None else Stage(x.machine, p, fit) for p, x, fit in every)
 
 
 def begun(
@@ -265,19 +274,21 @@ def begun(
                     break
 
 
-def _from_first(prepared: Prepared, disturbed: float, most: float = np.inf, worth: float = np.inf) -> Fit | None:
+def _from_first(
+    prepared: Prepared, disturbed: float, most: float = np.inf, worth: float = np.inf, patient: bool = False
+) -> Fit | None:
     """A fit from first guesses; None where none is found or it is given up, as it still costs more than `most`, or
-    more than it is worth and no less than before."""
-    p, patient = prepared, disturbed == 0  # nearly is not enough then
+    more than it is worth and no less than before. To the patient one that is as good as found is none."""
+    p = prepared
     try:
         return light(_iterated(p, p.starts, p.c.model.nominal, disturbed, most=most, patient=patient, worth=worth))
     except NotConverged as failed:
-        return light(failed.nearly) if failed.nearly is not None and disturbed > 0 else None
+        return None if failed.nearly is None or patient else light(failed.nearly)
 
 
 def _strictly(prepared: Prepared) -> Fits | None:
     """A fit from first guesses by exact dynamics; None where it is given up, as it stays FAR off."""
-    fit = _from_first(prepared, 0.0, FAR * prepared.readings)
+    fit = _from_first(prepared, 0.0, FAR * prepared.readings, patient=True)
     return None if fit is None else (fit, None)
 
 
@@ -324,12 +335,13 @@ def _with_less(stage: Stage) -> Stage | None:
 class Onset:
     """How many samples of each log are its beginning, and the most that a fit may cost there, from which it isn't worth
     the whole; with `or_found` unless it is as good as found there. whole: not after a few passes, but as far as it
-    comes."""
+    comes. without: what the model that has no further effect costs there after BRIEF passes, if that is known."""
 
     samples: tuple[int, ...]
     most: float
     or_found: bool = False
     whole: bool = False
+    without: float = np.inf
 
 
 def _beginnings(prepared: Prepared) -> list[tuple[int, ...]]:
@@ -350,10 +362,15 @@ def _onset(of: Stage, disturbed: float, worth: float) -> Onset | None:
     """The beginning of the logs that tells, in a fraction of the time, which fits with such disturbing forces come to
     nothing; worth: the most that one may cost. None where no half of the logs tells."""
     if disturbed > 0:
-        return _where_near(of)
-    if np.isinf(worth):
-        return _where_far(of)
-    return _where_gained(of, worth) if of.settled and of.exact else None
+        onset = _where_near(of)
+    elif np.isinf(worth):
+        onset = _where_far(of)
+    else:
+        onset = _where_gained(of, worth) if of.settled and of.exact else None
+    if onset is None:
+        return None
+    cost, _ = _began(_until(_noisy(of.prepared, 1.0), onset.samples), disturbed, np.inf, BRIEF)
+    return replace(onset, without=cost or np.inf)
 
 
 def _where_near(of: Stage) -> Onset | None:
@@ -392,6 +409,9 @@ def _sets_out(prepared: Prepared, onset: Onset | None, disturbed: float) -> bool
     if onset is None:
         return True
     begin = _until(prepared, onset.samples)
+    brief = max(onset.most, (1 - ALIKE) * onset.without)
+    if not np.isinf(brief) and _began(begin, disturbed, np.inf, BRIEF)[0] > brief:
+        return False
     if onset.whole:
         cost, found = _began(begin, disturbed, np.inf, newton.PASSES)
     else:
@@ -446,18 +466,24 @@ Wish = tuple[Machine, Stage, float]  # what `refitted` is called with
 
 
 def refits(
-    wishes: Sequence[Wish], together: Together, most: float = np.inf, held: Sequence[str] = ()
+    wishes: Sequence[Wish],
+    together: Together,
+    most: float = np.inf,
+    held: Sequence[str] = (),
+    at_once: bool = False,
 ) -> Iterator[Stage | None]:
     """Several refitted, side by side; None where no fit is found or it is given up, as it still costs more than `most`
-    after a few passes. held: of each a parameter that stays at the machine file's value, if any are."""
+    after a few passes. held: of each a parameter that stays at the machine file's value, if any are. at_once: the first
+    is set out upon before it is asked for."""
     prepared = [_resumed(machine, of) for machine, of, _ in wishes]
     if held:
         prepared = [_holding(p, name) for p, name in zip(prepared, held, strict=True)]
     calls = [
         partial(_resumable, p, of, disturbed, most) for p, (_, of, disturbed) in zip(prepared, wishes, strict=True)
     ]
-    for p, (machine, _, _), fit in zip(prepared, wishes, together(calls), strict=True):
-        yield None if fit is None else Stage(machine, p, fit, p.coarse == 1)
+    fits = ahead(calls, together) if at_once else together(calls)
+    every = zip(prepared, wishes, fits, strict=True)
+    return (None if fit is None else Stage(machine, p, fit, p.coarse == 1) for p, (machine, _, _), fit in every)
 
 
 def _holding(prepared: Prepared, name: str) -> Prepared:
@@ -515,7 +541,8 @@ def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.in
             raise
         # By exact dynamics it came near the logs as the stage that it began from did not, or nearer by far: what does
         # that is right, from however far it came, and is gone on with.
-        near = of.fit.cost - NEARER if of.near else STRONG * prepared.noise
+        alike = of.near and of.prepared.coarse == prepared.coarse
+        near = of.fit.cost - NEARER if alike else STRONG * prepared.noise
         if found.cost > min(near, most):
             raise
         fit = _nearly(prepared, found.points, found.X, disturbed, most, untold)
@@ -559,8 +586,9 @@ def _iterated(
     untold: np.ndarray | None = None,
 ) -> Fit:
     """A fit from points and X. With disturbing forces it is found as soon as it is nearly: gains are larger by far than
-    what another pass would change. Raises NotConverged."""
-    p, enough = prepared, newton.NEARLY if disturbed > 0 else None
+    what another pass would change. By exact dynamics nothing is left to do for the patient only. Raises
+    NotConverged."""
+    p, enough = prepared, newton.NEARLY if disturbed > 0 else 0.0 if patient else newton.ENOUGH
     return newton.iterate(
         p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, enough, most, patient, worth, untold
     )

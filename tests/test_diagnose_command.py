@@ -945,8 +945,30 @@ def test_what_the_beginning_of_a_log_may_cost(
     asked = iterated(stage, monkeypatch, lambda samples: cost, found)
     onset = stages._onset(stage, disturbed, np.inf)
     assert onset is not None
-    assert (onset.samples, asked[:1]) == ((quarter,), [] if disturbed else [quarter])
-    assert stages._sets_out(stage.prepared, onset, disturbed) == expected
+    # Exact dynamics were asked first where they are far off, and both what they do after a few passes.
+    assert (onset.samples, asked[0], asked[-1]) == ((quarter,), quarter, quarter)
+    assert (len(asked) == 1) == (disturbed > 0)
+    assert stages._sets_out(stage.prepared, replace(onset, without=np.inf), disturbed) == expected
+
+
+@pytest.mark.parametrize(("cost", "before", "passes"), [(9.0, 9.9, 1), (9.0, 10.1, 2), (2.0, 1.0, 2)])
+def test_what_a_few_passes_show_to_do_nothing_goes_no_further(
+    cost: float, before: float, passes: int, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That is, nine tenths and more of what the model leaves without it, and more than there may be; what is less than
+    that is given all passes."""
+    stage = calm(straight)
+    quarter = len(stage.prepared.logs[0]) // 4
+    monkeypatch.setattr(stages, "SHORTEST", quarter / 100)
+    told = [before]
+    asked = iterated(stage, monkeypatch, lambda samples: told[-1], False)
+    onset = stages._onset(stage, 1.0, np.inf)
+    assert onset is not None
+    assert onset.without == pytest.approx(before * quarter)
+    asked.clear()
+    told.append(cost)
+    assert stages._sets_out(stage.prepared, onset, 1.0) == (cost < 2.2)
+    assert asked == [quarter] * passes
 
 
 def test_a_beginning_tells_where_the_model_as_it_is_stays_far_off(
