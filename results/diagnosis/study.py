@@ -20,7 +20,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +58,6 @@ def _digits(files: Sequence[Path]) -> str:
     return seen.hexdigest()[:8]
 
 
-@cache
 def version() -> str:
     """Eight digits that change when the program, as far as a diagnosis loads it, or the second roller does."""
     done = subprocess.run([sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True, check=True)
@@ -106,7 +104,7 @@ def judged(one: Case, kept: Path) -> None:
     log, seen = driven(one)
     row: Row = {
         "key": one.key,
-        "program": version(),
+        "program": kept.name,
         "kind": one.kind,
         "hidden": [h.label for h in one.hidden],
         "amount": [h.amount for h in one.hidden],
