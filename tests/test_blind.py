@@ -6,6 +6,8 @@ The logs come from a second roller that shares no code with the program (`plant`
 from __future__ import annotations
 
 import importlib.util
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -328,3 +330,15 @@ def test_a_surprise_gets_no_name(name: str, number: int) -> None:
     assert name in SURPRISES
     one = case("surprise", name, number)
     assert score(one, ask(blind(one).log)).outcome in ("unexplained", "clean")
+
+
+@pytest.mark.slow
+def test_the_study_runs_with_several_at_a_time(tmp_path: Path) -> None:
+    """A case is driven, diagnosed, judged and told of."""
+    study = ROOT / "results" / "diagnosis" / "study.py"
+    asked = "--seen --nothing 2 --per-cause 0 --per-surprise 0 --pairs 0 --jobs 2".split()
+    done = subprocess.run([sys.executable, study, *asked, "--out", tmp_path], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    cases = pd.read_csv(tmp_path / "cases.csv")
+    assert list(cases.outcome) == ["clean", "clean"]
+    assert (tmp_path / "README.md").is_file()

@@ -611,6 +611,75 @@ def test_what_a_process_found_can_be_sent_back(straight: Model, straight_motion:
     assert found is not None
 
 
+def test_a_cause_without_which_nothing_is_left_and_no_machine_possible_stays_alone(
+    straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There is nothing by which a further effect could tell that it makes the machine possible again."""
+    stage = calm(prediction.build(placing.extended(straight.machine, _slope(straight))))
+    choice = choosing.Choice("ground_slope@machine", stage, 1e4, 1.0, 1, (), 1.0)
+    asked = list[stages.Stage]()
+
+    def scored(of: stages.Stage, *given: Any) -> tuple[()]:
+        asked.append(of)
+        return ()
+
+    monkeypatch.setattr(choosing, "scored", scored)
+    for lines, left, goes_on in ((("M = -1",), 0.0, False), ((), 0.0, True), (("M = -1",), 1e4, True)):
+        asked.clear()
+        monkeypatch.setattr(diagnose, "_impossible", lambda of, lines=lines: lines)
+        more = replace(choice, stage=replace(stage, fit=replace(stage.fit, cost=stage.fit.cost + left)))
+        found, _ = diagnose.extended(stage, [more], in_turn, lambda share, what: None)
+        assert found == [more]
+        assert bool(asked) == goes_on
+
+
+@pytest.mark.parametrize(("found", "asked"), [((True, True), 3), ((False, True), 2)])
+def test_where_no_way_to_the_likeliest_cause_is_found_no_others_are_tried(
+    found: Sequence[bool], asked: int, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By exact dynamics: all are judged with disturbing forces then."""
+    stage = calm(straight)
+    likely = choosing.scored(stage, in_turn)
+    likely = list({s.candidate.name: s for s in likely if s.values["A"] != 0}.values())[:3]
+    assert len(likely) == 3
+    wished = list[str]()
+
+    def refits(wishes: Sequence[stages.Wish], *given: Any) -> list[stages.Stage | None]:
+        told = [*found[len(wished) :], True]
+        wished.extend(machine.effect[-1].label for machine, _, _ in wishes)
+        return [stage if yes else None for yes, _ in zip(told, wishes, strict=False)]
+
+    monkeypatch.setattr(choosing, "refits", refits)
+    monkeypatch.setattr(choosing, "_felt", lambda name, of: True)
+    choosing._tries(stage, likely, in_turn, lambda k: None)
+    assert len(wished) == asked
+
+
+def test_coarse_sensors_are_no_measure_of_how_near_sharp_ones_come(
+    straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fit that goes on from one with coarse sensors, and comes near the logs, is gone on with; from one with sensors
+    as they are it must come nearer by far than that."""
+    stage = calm(straight)
+    calls = list[float]()
+
+    def nearly(*given: Any) -> newton.Fit:
+        calls.append(given[3])
+        if len(calls) == 1:
+            raise newton.NotConverged("no fit", replace(stage.fit, cost=1.1 * stage.noise), 5.0)
+        return stage.fit
+
+    monkeypatch.setattr(stages, "_nearly", nearly)
+    coarse = replace(stage, prepared=stages._noisy(stage.prepared, 10.0))
+    coarse = replace(coarse, fit=replace(stage.fit, cost=coarse.noise))
+    assert coarse.near
+    assert stages._resume(stage.prepared, coarse, 0.0).cost == stage.fit.cost
+    assert calls == [0.0, 0.0]
+    calls.clear()
+    with pytest.raises(newton.NotConverged):
+        stages._resume(stage.prepared, stage, 0.0)
+
+
 def test_ways_that_are_not_needed_are_given_up(straight: Model) -> None:
     """Of the ways to a fit the first one is enough for a clean log, whatever has been begun beside it."""
     one = log.check(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
@@ -787,6 +856,22 @@ def test_what_is_held_is_where_it_is_held_a_pass_later(straight: Model, monkeypa
         assert failed.value.fit is not None
         assert failed.value.fit.unseen[worst]
         assert failed.value.nearly is None or not told
+
+
+def test_a_step_that_was_cut_short_goes_further_when_it_is_told_again(
+    straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fit is found from a torque offset forty times its scale off, which without that is given up on the way."""
+    stage = calm(straight)
+    p, k = stage.prepared, stage.model.base.names.index("u10")
+    start = stage.fit.X - 40 * stage.model.scale * (np.arange(len(stage.fit.X)) == k)
+    asked = p.c, p.records, stage.fit.points, start, p.starts, 0.0, p.held, 0.0
+    monkeypatch.setattr(newton, "LARGEST_STEP", 0.1)
+    found = newton.iterate(*asked)
+    assert (np.abs(found.X - stage.fit.X) < stage.fit.std).all()
+    monkeypatch.setattr(newton, "FURTHER", 1.0)
+    with pytest.raises(newton.NotConverged):
+        newton.iterate(*asked)
 
 
 def test_the_whole_log_is_fitted_where_its_beginning_can_be(

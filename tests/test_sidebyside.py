@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from excite import sidebyside
-from excite.sidebyside import cores, forked, in_turn
+from excite.sidebyside import ahead, cores, forked, in_turn
 
 
 def test_answers_come_in_order_and_from_elsewhere() -> None:
@@ -31,6 +31,25 @@ def test_answers_come_in_order_and_from_elsewhere() -> None:
         assert not any(own for _, own in forked(calls))
     assert list(forked(calls[:1])) == [(0, True)]
     assert list(forked([])) == []
+
+
+def test_a_call_is_set_out_upon_before_it_is_asked_for(tmp_path: Path) -> None:
+    """Where there are processes for it; its answer and those after it come as ever, and nothing of it stays behind."""
+
+    def told(k: int) -> int:
+        (tmp_path / str(k)).write_text(f"{os.getpid()}\n")
+        return k
+
+    calls = [partial(told, k) for k in range(3)]
+    here, there = ahead(calls, in_turn), ahead(calls, forked)
+    if cores() > 1:
+        assert _pids(tmp_path, 1) != {os.getpid()}
+    assert list(there) == [0, 1, 2]
+    for file in tmp_path.iterdir():
+        file.unlink()
+    assert not list(tmp_path.iterdir())
+    assert list(here) == [0, 1, 2]
+    assert list(ahead([], forked)) == []
 
 
 def test_arrays_come_whole_and_are_ones_own() -> None:
