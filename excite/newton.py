@@ -48,6 +48,7 @@ FURTHER, AGAIN = 3.0, 0.3
 # roller of 11 t they are 500 N.
 DISTURBANCE = 0.045
 SHORTER = 8  # times that a step is halved
+REJECTED = 4  # points in all that can't be integrated, of a fit on which no more passes are spent than it is worth
 PART = 200  # samples at a time: their chain stays in the processor's cache
 # Of the first state about the filtered log. Not wider: where the contact is stiff, at standstill, nothing is seen of
 # the first speeds, which are gone within milliseconds, and an iteration would play with them for ever.
@@ -238,7 +239,7 @@ def iterate(
         enough = ENOUGH if disturbed > 0 else 0.0
     step, before = np.inf, np.inf
     sizes, costs = list[float](), list[float]()
-    shorter, here = 0, (list(points), X)
+    shorter, rejected, here = 0, 0, (list(points), X)
     there = here
     latest, best, nearest, waited = None, None, NEARLY, False
     whole, last = 1.0, np.zeros(len(X))
@@ -248,8 +249,8 @@ def iterate(
         linear = linearised(c, records, there[0], starts, there[1], disturbed)
         if linear is None:
             # Too far: the mass matrix is not positive or a motion can't be integrated.
-            shorter += 1
-            if shorter > SHORTER or here is there:
+            shorter, rejected = shorter + 1, rejected + 1
+            if shorter > SHORTER or here is there or (rejected > REJECTED and not patient):
                 break
             there = _between(here, there, 0.5)
             continue
