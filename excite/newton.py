@@ -41,8 +41,8 @@ TURNED, SHARE, SLOW = 0.7, 1.15, 0.3
 FREE = 0.05  # of a parameter's size, in the last step: it is hardly known
 ALONG = 0.9  # cosine between two steps that go the same way
 LARGEST_STEP = 0.5  # of a parameter in one pass, relative to its size
-# What was cut short and is told again in the next pass goes FURTHER times as far, as a model that is linear in it does;
-# again: the rest of a step, but for a share of what was gone.
+# Where a step was cut short and the next pass asks for the rest of it, but for a share AGAIN of what was gone, the way
+# is straight, and the limit FURTHER times as far.
 FURTHER, AGAIN = 3.0, 0.3
 # Disturbing forces where the model is not trusted, white from sample to sample, as accelerations [m/s2, rad/s2]: on a
 # roller of 11 t they are 500 N.
@@ -297,14 +297,15 @@ def iterate(
         straight = (rest != 0) & (np.abs(wanted - rest) < AGAIN * np.abs(gone))
         reach = np.where(straight, FURTHER * reach, 1.0)
         limit = reach * LARGEST_STEP * np.maximum(np.abs(X) / model.scale, 1.0)
+        share = 1.0 if away else whole
         for m in move:
             # What is held from now on goes back to its value at once, and the others along as far as they may.
-            own = np.clip((1.0 if away else whole) * m[: len(X)], -limit, limit)
+            own = np.clip(share * m[: len(X)], -limit, limit)
             # Amounts that make sense above zero only stay there.
             low = np.where(model.positive, -0.8 * X / model.scale, -np.inf)
             m[: len(X)] = np.where(unseen, m[: len(X)], np.maximum(own, low))
         gone = move[0][: len(X)]
-        rest = np.where(np.abs(wanted) > limit, wanted - gone, 0.0)
+        rest = np.where(np.abs(share * wanted) > limit, wanted - gone, 0.0)
         there = (
             [moved(c, r, p, f, m) for r, p, f, m in zip(records, points, linear, move, strict=True)],
             X + move[0][: len(X)] * model.scale,

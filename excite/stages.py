@@ -33,8 +33,8 @@ FAR = 10.0  # misfit over readings, a few passes after the beginning, from which
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 PASSES = 14  # of a fit that goes on from another
 SHORTEST = 30.0  # [s] that the beginning of a log has at least
-BRIEF = 2  # passes after which what a model would do without an effect, but for ALIKE, is known
-ALIKE = 0.1
+# Passes after which an effect that leaves as much as the model without it, but for a share, is known to do nothing.
+BRIEF, SAME = 2, 0.1
 ONSETS = 0.25, 0.33, 0.4, 0.5  # shares of logs that are taken for their beginning, in turn
 TELLING = 0.15  # of what exact dynamics leave, that is as much as a beginning must hold of it
 LENIENT = 0.5  # of what a fit must take, that it must take of what is left of the beginning
@@ -409,7 +409,7 @@ def _sets_out(prepared: Prepared, onset: Onset | None, disturbed: float) -> bool
     if onset is None:
         return True
     begin = _until(prepared, onset.samples)
-    brief = max(onset.most, (1 - ALIKE) * onset.without)
+    brief = max(onset.most, (1 - SAME) * onset.without)
     if not np.isinf(brief) and _began(begin, disturbed, np.inf, BRIEF)[0] > brief:
         return False
     if onset.whole:
@@ -586,8 +586,8 @@ def _iterated(
     untold: np.ndarray | None = None,
 ) -> Fit:
     """A fit from points and X. With disturbing forces it is found as soon as it is nearly: gains are larger by far than
-    what another pass would change. By exact dynamics nothing is left to do for the patient only. Raises
-    NotConverged."""
+    what another pass would change. By exact dynamics the patient leave nothing undone, others what is less
+    than an amount is ever known to. Raises NotConverged."""
     p, enough = prepared, newton.NEARLY if disturbed > 0 else 0.0 if patient else newton.ENOUGH
     return newton.iterate(
         p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, enough, most, patient, worth, untold
