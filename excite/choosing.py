@@ -179,7 +179,8 @@ def identified(effect: str, where: str, amount: float, shapes: Mapping[str, floa
 
 
 def _shortlist(stage: Stage, scores: Sequence[evidence.Score], chosen: Sequence[Choice]) -> list[evidence.Score]:
-    """The best candidate of each name, best first, as far as worth a fit; another variant where it scores alike."""
+    """The best candidate of each name, best first, as far as worth a fit; another variant where it scores alike. TRIED
+    in all, beside further variants of the likeliest PAIR of names."""
     best: dict[tuple[str, ...], evidence.Score] = {}
     most: dict[str, float] = {}
     hope = max(WORTH, HOPE[stage.rough] * scores[0].gain) if scores else 0.0
@@ -190,7 +191,9 @@ def _shortlist(stage: Stage, scores: Sequence[evidence.Score], chosen: Sequence[
         like = LIKE if len(s.candidate.variant) > 1 else PLAIN
         if worth and s.gain >= like * most.setdefault(s.candidate.name, s.gain):
             best.setdefault(s.candidate.variant, s)
-    return list(best.values())[:TRIED]
+    likely = list(best.values())
+    first = _names(likely)[:PAIR]
+    return [*likely[:TRIED], *(s for s in likely[TRIED:] if s.candidate.name in first)]
 
 
 def _likely(

@@ -22,6 +22,7 @@ from excite import amounts, choosing
 from excite import gain as gains
 from excite.anomaly import anomalies
 from excite.choosing import Advance, Choice
+from excite.evidence import Score
 from excite.log import Log
 from excite.newton import NotConverged
 from excite.sidebyside import Together, in_turn
@@ -150,7 +151,8 @@ def extended(before: Stage, first: Sequence[Choice], together: Together, tell: A
         turn = len(chosen)
         tell(0.15 + 0.2 * turn, "scoring effects")
         scores = choosing.scored(stage, together)
-        choice = choosing.choose(stage, scores, chosen, together, tell, 0.2 + 0.2 * turn)
+        hopeless = _hopeless(stage, chosen, scores)
+        choice = None if hopeless else choosing.choose(stage, scores, chosen, together, tell, 0.2 + 0.2 * turn)
         if choice is not None and before.settled and _outgrows(choice, chosen):
             return [], 0.0
         if choice is None or _makes_good(choice, chosen):
@@ -165,6 +167,17 @@ def _vain(stage: Stage) -> bool:
     """Whether effects leave nothing but noise, and no machine is possible with them: there is nothing by which others
     could tell better."""
     return bool(stage.model.effects) and stage.exact and stage.excess == 0 and bool(_impossible(stage))
+
+
+def _hopeless(stage: Stage, chosen: Sequence[Choice], scores: Sequence[Score]) -> bool:
+    """Whether effects leave more than all that may still come beside them would explain: then none has a name."""
+    if not (chosen and stage.exact):
+        return False
+    gained, most = (
+        sum(x.gain for x in chosen),
+        (MOST - len(chosen)) * choosing.OVER * max((s.gain for s in scores), default=0.0),
+    )
+    return gained + min(most, stage.excess) < ENOUGH * (gained + stage.excess)
 
 
 def weighed(

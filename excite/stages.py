@@ -588,7 +588,7 @@ def _iterated(
     """A fit from points and X. With disturbing forces it is found as soon as it is nearly: gains are larger by far than
     what another pass would change. By exact dynamics the patient leave nothing undone, others what is less
     than an amount is ever known to. Raises NotConverged."""
-    p, enough = prepared, newton.NEARLY if disturbed > 0 else 0.0 if patient else newton.ENOUGH
+    p, enough = prepared, newton.NEARLY if disturbed > SMALL else 0.0 if patient else newton.ENOUGH
     return newton.iterate(
         p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, enough, most, patient, worth, untold
     )

@@ -178,7 +178,7 @@ _declare(
                 "-", 0.0, (0.0,), meaning="0: as tanh does; 1: as slowly as the arc tangent; in between or beyond"
             )
         },
-        grid=(1.0, 3.0, -1.0),
+        grid=(1.0, 3.0, -1.0, -3.0),
         beside=lambda site: [{"A": 0.05, "slow": 0.5}, {"A": 0.05, "slow": -0.5}],
         torque=friction.turned,
     ),
