@@ -19,7 +19,18 @@ from excite.anomaly import shakes
 from excite.log import Log
 from excite.newton import NotConverged
 from excite.sidebyside import Together
-from excite.stages import FAR, SMALL, Stage, begun, exact_if_near, freed, refits, refitted, sharpened
+from excite.stages import (
+    FAR,
+    SMALL,
+    Stage,
+    begun,
+    exact_if_near,
+    freed,
+    refits,
+    refitted,
+    refitted_and_freed,
+    sharpened,
+)
 from model import placing
 from model.effect import Effect, Placed
 from model.file import Quantity
@@ -241,10 +252,14 @@ def choose(
     tries, refused = _tries(stage, likely, together, told, vain)
     if stage.exact and _lost(likely, tries, refused):
         # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
-        try:
-            stage = refitted(stage.machine, stage, SMALL)
-        except NotConverged:
-            return None
+        known = chosen[-1].loose if chosen else None
+        if known is not None and known.machine is stage.machine and known.fit.disturbed == SMALL:
+            stage = known
+        else:
+            try:
+                stage = refitted(stage.machine, stage, SMALL)
+            except NotConverged:
+                return None
         found = evidence.renumbered([s.candidate for s in likely])
         likely = _shortlist(stage, _scanned(stage, found, together), chosen)
         if not likely:
@@ -373,14 +388,14 @@ def _followed(
             continue
         tries = _one_each([x for x in follow if x[1].near] or follow)
         score, best = tries[0]
-        tries = [x for x in tries if x[1].fit.disturbed == best.fit.disturbed]
         comparable = stage.settled and stage.fit.disturbed == best.fit.disturbed
-        try:
-            without = refitted(stage.machine, best, best.fit.disturbed)
+        without, best = refitted_and_freed(stage.machine, best, together)
+        tries = [(score, best), *(x for x in tries[1:] if x[1].fit.disturbed == best.fit.disturbed)]
+        if without is not None:
             stage = stage if comparable and stage.fit.cost < without.fit.cost else without
-            gain = stage.fit.cost - best.fit.cost
-        except NotConverged:  # Wald's statistic is of the same kind, and smaller where much is gained
-            gain = stage.fit.cost - best.fit.cost if comparable else wald(score.candidate.name, best)
+        # Wald's statistic is of the same kind, and smaller where much is gained.
+        alike = without is not None or comparable
+        gain = stage.fit.cost - best.fit.cost if alike else wald(score.candidate.name, best)
         if gain < LEVEL * best.spread:
             return exact_if_near(stage), []
         return stage, [_chosen(tries, gain, tried, together)]

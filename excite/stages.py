@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -74,13 +75,14 @@ class Stage:
     """A model with the effects found so far, fitted. `exact`: without disturbing forces. Not `settled`: no fit was
     found, parameters are the file's or, with coarse sensors, those of sensors noisier than they are. loose: the same
     model with the larger disturbing forces that this fit came from, if it did; beside a fit with coarse sensors the one
-    with disturbing forces that leave much, if there is one."""
+    with disturbing forces that leave much, if there is one. bare: what `freed` makes of it, if that is known."""
 
     machine: Machine
     prepared: Prepared
     fit: Fit
     settled: bool = True
     loose: Stage | None = None
+    bare: Fit | None = None
 
     @property
     def model(self) -> Model:
@@ -182,7 +184,9 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Toge
                     return Stage(machine, _noisy(prepared, times), fit, False, stage)
     if stage is not None and stage.near:
         return exact_if_near(stage)
-    return _forced(machine, prepared, smoothing.DISTURBED[1:], together) if stage is None else _with_least(stage)
+    return (
+        _forced(machine, prepared, smoothing.DISTURBED[1:], together) if stage is None else _with_least(stage, together)
+    )
 
 
 def forced(stage: Stage, together: Together) -> Stage:
@@ -190,20 +194,21 @@ def forced(stage: Stage, together: Together) -> Stage:
     Where large ones find none, or leave the model FAR off, one with the file's parameters: what these leave shows where
     to look. Raises NotConverged where those don't either."""
     if stage.loose is not None:
-        return _with_least(stage.loose)
+        return _with_least(stage.loose, together)
     return _forced(stage.machine, _noisy(stage.prepared, 1.0), smoothing.DISTURBED[1:], together)
 
 
 def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float], together: Together) -> Stage:
     calls: list[Callable[[], Any]] = [
-        *(partial(_disturbed, machine, prepared, d, FAR * prepared.readings) for d in forces),
+        *(partial(_worthy, prepared, d, FAR * prepared.readings) for d in forces),
         partial(_as_filed, prepared),
     ]
     with closing(together(calls)) as ways:
-        for _ in forces:
-            if fits := next(ways):
-                return exact_if_near(_stage(machine, prepared, fits))
-        return Stage(machine, prepared, next(ways), settled=False)
+        fit = next((fit for fit in islice(ways, len(forces)) if fit is not None), None)
+        if fit is None:
+            return Stage(machine, prepared, next(ways), settled=False)
+    stage = Stage(machine, prepared, fit)
+    return exact_if_near(_stage(machine, prepared, _lessened(stage, together))) if stage.near else stage
 
 
 def _as_filed(prepared: Prepared) -> Fit:
@@ -295,40 +300,42 @@ def _strictly(prepared: Prepared) -> Fits | None:
 def _disturbed(machine: Machine, prepared: Prepared, disturbed: float, worth: float = np.inf) -> Fits | None:
     """A fit from first guesses with disturbing forces, and from there with smaller ones where it is near; None of one
     that costs more than it is worth."""
-    fit = _from_first(prepared, disturbed, worth=worth)
-    if fit is None or fit.cost > worth:
+    fit = _worthy(prepared, disturbed, worth)
+    if fit is None:
         return None
     stage = Stage(machine, prepared, fit)
     return _lessened(stage) if stage.near else (fit, None)
 
 
-def _with_least(stage: Stage) -> Stage:
+def _worthy(prepared: Prepared, disturbed: float, worth: float) -> Fit | None:
+    """A fit from first guesses with disturbing forces, None of one that costs more than it is worth."""
+    fit = _from_first(prepared, disturbed, worth=worth)
+    return None if fit is None or fit.cost > worth else fit
+
+
+def _with_least(stage: Stage, together: Together) -> Stage:
     """A stage gone on with with the smallest disturbing forces that it takes, without any where that is near."""
     if stage.loose is not None:
         return exact_if_near(stage)
-    return exact_if_near(_stage(stage.machine, stage.prepared, _lessened(stage)))
+    return exact_if_near(_stage(stage.machine, stage.prepared, _lessened(stage, together)))
 
 
-def _lessened(first: Stage) -> Fits:
+def _lessened(first: Stage, together: Together = in_turn) -> Fits:
     """A fit with smaller disturbing forces, and smaller ones yet as long as these let the model come near the logs:
     large ones hide what else there is. And the one that it came from."""
-    stage = _with_less(first)
+    stage = _with_less(first, together)
     if stage is None:
         return first.fit, None
-    while (smaller := _with_less(stage)) is not None and smaller.near:
+    while (smaller := _with_less(stage, together)) is not None and smaller.near:
         stage = smaller
     return stage.fit, first.fit
 
 
-def _with_less(stage: Stage) -> Stage | None:
+def _with_less(stage: Stage, together: Together) -> Stage | None:
     """The fit of a stage gone on with with smaller disturbing forces, None where there is none."""
-    for forces in (less * stage.fit.disturbed for less in LESS):
-        if forces >= SMALL:
-            try:
-                return replace(stage, fit=_resume(stage.prepared, stage, forces))
-            except NotConverged:
-                continue
-    return None
+    smaller = [less * stage.fit.disturbed for less in LESS if less * stage.fit.disturbed >= SMALL]
+    with closing(together([partial(_resumable, stage.prepared, stage, forces) for forces in smaller])) as fits:
+        return next((replace(stage, fit=fit) for fit in fits if fit is not None), None)
 
 
 @dataclass(frozen=True)
@@ -486,6 +493,16 @@ def refits(
     return (None if fit is None else Stage(machine, p, fit, p.coarse == 1) for p, (machine, _, _), fit in every)
 
 
+def refitted_and_freed(machine: Machine, of: Stage, together: Together) -> tuple[Stage | None, Stage]:
+    """The model of a machine with other effects fitted from the fit of a stage, None where no fit is found, and beside
+    it the stage itself without its disturbing forces, if it has any and is near, as it will be asked for."""
+    prepared, frees = _resumed(machine, of), of.near and not of.exact
+    calls = [partial(_resumable, prepared, of, of.fit.disturbed), *([partial(_exact, of)] if frees else [])]
+    fit, *bare = together(calls)
+    other = None if fit is None else Stage(machine, prepared, fit, prepared.coarse == 1)
+    return other, replace(of, bare=bare[0]) if frees else of
+
+
 def _holding(prepared: Prepared, name: str) -> Prepared:
     return replace(prepared, held=prepared.held | (np.array(prepared.c.model.base.names) == name))
 
@@ -494,7 +511,7 @@ def freed(found: Sequence[Stage], together: Together) -> Iterator[Stage | None]:
     """Stages without their disturbing forces, side by side; None where exact dynamics are far from the logs: they make
     a large misfit of a formula that is nearly right."""
     for stage, fit in zip(found, together([partial(_exact, x) for x in found]), strict=True):
-        yield None if fit is None else replace(stage, fit=fit)
+        yield None if fit is None else replace(stage, fit=fit, bare=None)
 
 
 def exact_if_near(stage: Stage) -> Stage:
@@ -504,6 +521,8 @@ def exact_if_near(stage: Stage) -> Stage:
 
 
 def _exact(stage: Stage) -> Fit | None:
+    if stage.bare is not None:
+        return stage.bare
     most = FAR * stage.prepared.readings
     try:
         fit = _resume(stage.prepared, stage, 0.0, most)
