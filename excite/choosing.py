@@ -295,6 +295,7 @@ def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) 
         others, _ = _without_forces([x for x in left if x[1].fit.cost - lowest <= (1 - LIKE) * gain], together)
         exact = sorted([*exact, *others], key=lambda x: x[1].fit.cost)
     judged = [*_close(exact, gain, SHAPE[0] if forced else SHAPE[1]), *unknown] if exact else close
+    judged = [x for x in judged if not x[1].vain] or judged
     score, best = judged[0]
     rivals = tuple(entry_of(other, s.candidate.name) for s, other in judged[1:])
     loose = forced.get(score.candidate.name) if best.exact else None

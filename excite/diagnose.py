@@ -29,7 +29,7 @@ from excite.sidebyside import Together, in_turn
 from excite.stages import SMALL, Stage, as_measured, fitted, forced, refitted
 from model import placing
 from model.machine import EffectEntry, Filter
-from model.prediction import Model, signs
+from model.prediction import Model
 
 MOST = 4  # effects that are looked for; so many kinds, none of which explains MOSTLY, patch up what has no name
 MOSTLY = 0.7  # of the misfit
@@ -41,7 +41,6 @@ OTHERWISE = 0.05
 # a cause. Right names of results/diagnosis explain 0.85 and more, a slope that liquid in a tank was taken for 0.83.
 ENOUGH = 0.85
 FAINT = 0.1  # of what another effect promises beside a name, that the name must gain where it needs disturbing forces
-SURELY, WRONG = 3.0, 0.5  # deviations, and a share of its usual size, by which a parameter's sign is wrong
 ODD = 50.0  # misfit that every line of what is odd beside names stands for, at least
 
 
@@ -147,7 +146,7 @@ def extended(before: Stage, first: Sequence[Choice], together: Together, tell: A
     """Effects one after the other, after those that were chosen first, until nothing is left that has a name; and what
     a further one would gain that was not worth one."""
     chosen, stage, left = list(first), first[-1].stage if first else before, 0.0
-    while stage.settled and len(chosen) < MOST and not _vain(stage):
+    while stage.settled and len(chosen) < MOST and not stage.vain:
         turn = len(chosen)
         tell(0.15 + 0.2 * turn, "scoring effects")
         scores = choosing.scored(stage, together)
@@ -161,12 +160,6 @@ def extended(before: Stage, first: Sequence[Choice], together: Together, tell: A
         chosen.append(choice)
         stage = choice.stage
     return chosen, left
-
-
-def _vain(stage: Stage) -> bool:
-    """Whether effects leave nothing but noise, and no machine is possible with them: there is nothing by which others
-    could tell better."""
-    return bool(stage.model.effects) and stage.exact and stage.excess == 0 and bool(_impossible(stage))
 
 
 def _hopeless(stage: Stage, chosen: Sequence[Choice], scores: Sequence[Score]) -> bool:
@@ -191,7 +184,7 @@ def weighed(
     while True:
         stage = kept[-1].stage if kept else before
         odd = _odd(stage)
-        impossible = _impossible(stage) if kept and stage.settled else ()
+        impossible = stage.impossible if kept and stage.settled else ()
         if not kept or (stage.exact and not odd and not impossible):
             break
         explained = _share(kept[-1].gain, stage, odd)
@@ -350,22 +343,6 @@ def _odd(stage: Stage) -> tuple[str, ...]:
         for a in anomalies(stage.machine, stage.prepared.c.sensors, log, stage.fit, k)
     ]
     return tuple(dict.fromkeys([*stage.suspects, *(line for line, _ in sorted(found, key=lambda x: -x[1]))]))
-
-
-def _impossible(stage: Stage) -> tuple[str, ...]:
-    """Parameters of a fit that surely have a sign that no machine has, friction that drives or soil that pulls, a line
-    each. What makes them so is no cause, however much it explains."""
-    fit, base = stage.fit, stage.model.base
-    of = signs(stage.machine) | {e.name: 1.0 for e in stage.model.effects if e.effect.resisting}
-    sure = np.maximum(SURELY * stage.doubt * fit.std, WRONG * stage.model.scale)
-    found: list[str] = []
-    for k, (name, unit) in enumerate(zip(base.names, base.units, strict=True)):
-        # What stands for one standard parameter alone has its sign, whatever the machine file calls it.
-        alone = np.count_nonzero(base.matrix[k]) == 1
-        sign = of.get(base.standard[base.independent[k]], 0.0) if alone else 0.0
-        if sign * fit.X[k] < -sure[k]:
-            found.append(f"{name} = {fit.X[k]:.4g} {unit}")
-    return tuple(found)
 
 
 def _share(gained: float, stage: Stage, odd: Sequence[str]) -> float:

@@ -38,6 +38,7 @@ CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviati
 ENOUGH = 0.2  # a step, in standard deviations, at which a fit is found whose deviations are no promise
 # Steps that turn back and hardly shrink are shortened by TURNED; others grow by SHARE up to the whole.
 TURNED, SHARE, SLOW = 0.7, 1.15, 0.3
+STRONG = 1.3  # misfit over readings from which first-order gains are rough
 FREE = 0.05  # of a parameter's size, in the last step: it is hardly known
 ALONG = 0.9  # cosine between two steps that go the same way
 LARGEST_STEP = 0.5  # of a parameter in one pass, relative to its size
@@ -229,7 +230,8 @@ def iterate(
     in standard deviations, at which a fit is found, however much is left undone: ENOUGH with disturbing forces, none
     without, if not given; most: cost above which a fit is given up once the states fit the dynamics; worth: cost above
     which it is given up as soon as costs fall no more. Not `patient`: no passes are spent on steps that have ceased to
-    shrink. untold (n_base,): parameters that start held, as they weren't seen in the fit that this one goes on from,
+    shrink, unless they lead on downhill, and far from the logs a step of NEARLY is small enough under disturbing
+    forces. untold (n_base,): parameters that start held, as they weren't seen in the fit that this one goes on from,
     and are judged like the others.
 
     Raises NotConverged.
@@ -241,6 +243,7 @@ def iterate(
     sizes, costs = list[float](), list[float]()
     shorter, rejected, here = 0, 0, (list(points), X)
     there = here
+    noise = sum(float(r.used.sum()) / r.coarse**2 for r in records)
     latest, best, nearest, waited = None, None, NEARLY, False
     whole, last = 1.0, np.zeros(len(X))
     reach, gone, rest = np.ones(len(X)), np.zeros(len(X)), np.zeros(len(X))
@@ -268,6 +271,12 @@ def iterate(
         before, step = step, left
         latest = X, covariance, unseen, known, points, cost
         away = bool((np.abs(X - model.nominal) > AWAY * model.scale)[unseen].any())
+        costs.append(cost)
+        turned = np.where(unseen, 0.0, move[0][: len(X)] / np.sqrt(np.diag(covariance))[: len(X)])
+        along = turned @ last > ALONG * np.linalg.norm(turned) * np.linalg.norm(last)
+        downhill = along and len(costs) > 1 and cost < min(costs[-2] - NEARLY, STRONG * noise)
+        if downhill and step > before:
+            best, nearest = None, NEARLY  # the way was longer than it seemed
         if k >= SETTLED and step <= nearest and not away:
             best, nearest = latest, step
         sizes.append(step)
@@ -275,21 +284,19 @@ def iterate(
             break
         if k >= HOPELESS[0]:
             shrinking = min((step / sizes[-1 - LATELY]) ** (1 / LATELY), 1.0) if len(sizes) > LATELY else 0.0
-            if step > HOPELESS[1] or step * shrinking ** (passes - 1 - k) > NEARLY:
+            if step > HOPELESS[1] or (step * shrinking ** (passes - 1 - k) > NEARLY and not downhill):
                 break
-        costs.append(cost)
         if k >= SETTLED and cost > most and step > NEARLY:
             break
         if k >= SETTLED and cost > worth and _level(costs):
             break
-        if not patient and _idle(sizes, costs):
+        if not patient and _idle(sizes, costs) and not downhill:
             waited = True
             break
         # Where Gauss-Newton swings about the answer, shorter steps end it.
-        turned = np.where(unseen, 0.0, move[0][: len(X)] / np.sqrt(np.diag(covariance))[: len(X)])
         swings = turned @ last < 0 and step > SLOW * before
         whole = max(TURNED * min(whole, 1.0), 0.3) if swings else min(SHARE * whole, 1.0)
-        creeps = turned @ last > ALONG * np.linalg.norm(turned) * np.linalg.norm(last) and step < 1.0
+        creeps = along and step < 1.0
         if creeps and SLOW * before < step < 0.7 * before:
             whole = 1 / (1 - step / before)  # Aitken: all the steps to come at once
         last = turned
@@ -313,7 +320,8 @@ def iterate(
         # What this step will have left undone, if steps go on shrinking as they do.
         ratio = min(max(step / before, 1 - whole), 0.9)
         done = step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED
-        if not away and (done or step < enough):
+        rough = not patient and disturbed > 0 and cost > STRONG * noise
+        if not away and (done or step < (NEARLY if rough else enough)):
             if k < SETTLED and (unseen != held).any():
                 started, unseen = unseen, _unseen(c, records, linear, points, X, held, unseen, covariance)
                 if (unseen != started).any():

@@ -25,13 +25,13 @@ from excite.record import Point, Record, carried, common_sensors, first_point, o
 from excite.sidebyside import Together, ahead, in_turn
 from model.effect import Placed
 from model.machine import Filter, Machine
-from model.prediction import Model, build
+from model.prediction import Model, build, signs
 
 NEARER = 100.0  # of a cost, by which what was not found comes nearer to logs that are near already
-STRONG = 1.3  # misfit over readings from which first-order gains are rough
 FOLLOWED = 2.5  # misfit over readings up to which exact dynamics follow logs where nothing else does
 FAR = 10.0  # misfit over readings, a few passes after the beginning, from which no fit comes near
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
+SURELY, WRONG = 3.0, 0.5  # deviations, and a share of its usual size, by which a parameter's sign is wrong
 PASSES = 14  # of a fit that goes on from another
 SHORTEST = 30.0  # [s] that the beginning of a log has at least
 # Passes after which an effect that leaves as much as the model without it, but for a share, is known to do nothing.
@@ -108,7 +108,7 @@ class Stage:
     @property
     def near(self) -> bool:
         """Whether the misfit is not far from what noise makes."""
-        return self.fit.cost <= STRONG * self.noise
+        return self.fit.cost <= newton.STRONG * self.noise
 
     @cached_property
     def ways(self) -> tuple[evidence.Way, ...]:
@@ -142,6 +142,28 @@ class Stage:
         sizes = np.concatenate([innovation_sizes(linear) for linear in self.fit.linear])
         told = sizes[:, 2] > 0
         return float(np.sqrt(max(1.0, sizes[told, 1].mean()))) if told.any() else 1.0
+
+    @cached_property
+    def impossible(self) -> tuple[str, ...]:
+        """Parameters that surely have a sign that no machine has, friction that drives or soil that pulls, a line each.
+        What makes them so is no cause, however much it explains."""
+        fit, base = self.fit, self.model.base
+        of = signs(self.machine) | {e.name: 1.0 for e in self.model.effects if e.effect.resisting}
+        sure = np.maximum(SURELY * self.doubt * fit.std, WRONG * self.model.scale)
+        found: list[str] = []
+        for k, (name, unit) in enumerate(zip(base.names, base.units, strict=True)):
+            # What stands for one standard parameter alone has its sign, whatever the machine file calls it.
+            alone = np.count_nonzero(base.matrix[k]) == 1
+            sign = of.get(base.standard[base.independent[k]], 0.0) if alone else 0.0
+            if sign * fit.X[k] < -sure[k]:
+                found.append(f"{name} = {fit.X[k]:.4g} {unit}")
+        return tuple(found)
+
+    @property
+    def vain(self) -> bool:
+        """Whether effects leave nothing but noise, and no machine is possible with them: there is nothing by which
+        others could tell better."""
+        return bool(self.model.effects) and self.exact and self.excess == 0 and bool(self.impossible)
 
     @property
     def suspects(self) -> list[str]:
@@ -386,7 +408,7 @@ def _where_near(of: Stage) -> Onset | None:
     samples = next(iter(_beginnings(of.prepared)), None)
     if samples is None:
         return None
-    return Onset(samples, _until(of.prepared, samples).readings + (STRONG - 1) * of.prepared.readings)
+    return Onset(samples, _until(of.prepared, samples).readings + (newton.STRONG - 1) * of.prepared.readings)
 
 
 def _where_far(of: Stage) -> Onset | None:
@@ -442,7 +464,7 @@ def _begun(machine: Machine, of: Stage, onsets: Sequence[Onset | None], disturbe
     if not all(_sets_out(prepared, onset, disturbed) for onset in onsets):
         return None
     if disturbed > 0:
-        return _disturbed(machine, prepared, disturbed, STRONG * prepared.noise)
+        return _disturbed(machine, prepared, disturbed, newton.STRONG * prepared.noise)
     return _plain(machine, prepared, worth)
 
 
@@ -555,13 +577,13 @@ def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.in
             # It came near the logs as the stage that it began from did not with such forces: what began or ended at an
             # instant may keep it from settling, and exact dynamics tell later what it is worth.
             alike = of.fit.disturbed >= disturbed and of.prepared.coarse == prepared.coarse
-            if alike and not of.near and found.cost <= min(STRONG * prepared.noise, most):
+            if alike and not of.near and found.cost <= min(newton.STRONG * prepared.noise, most):
                 return light(found)
             raise
         # By exact dynamics it came near the logs as the stage that it began from did not, or nearer by far: what does
         # that is right, from however far it came, and is gone on with.
         alike = of.near and of.prepared.coarse == prepared.coarse
-        near = of.fit.cost - NEARER if alike else STRONG * prepared.noise
+        near = of.fit.cost - NEARER if alike else newton.STRONG * prepared.noise
         if found.cost > min(near, most):
             raise
         fit = _nearly(prepared, found.points, found.X, disturbed, most, untold)
@@ -604,8 +626,8 @@ def _iterated(
     worth: float = np.inf,
     untold: np.ndarray | None = None,
 ) -> Fit:
-    """A fit from points and X. With disturbing forces it is found as soon as it is nearly: gains are larger by far than
-    what another pass would change. By exact dynamics the patient leave nothing undone, others what is less
+    """A fit from points and X. With large disturbing forces it is found as soon as it nearly is: gains are larger
+    by far than what another pass would change. By exact dynamics the patient leave nothing undone, others what is less
     than an amount is ever known to. Raises NotConverged."""
     p, enough = prepared, newton.NEARLY if disturbed > SMALL else 0.0 if patient else newton.ENOUGH
     return newton.iterate(

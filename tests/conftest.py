@@ -19,9 +19,10 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from excite import profiles
+from excite import log, profiles, sensors, stages
 from excite.simulate import Motion, simulate
-from model import machine, prediction
+from model import machine, placing, prediction
+from model.machine import EffectEntry
 from model.prediction import Model
 
 settings.register_profile("calm", deadline=None)  # other work on the machine is no fault of the code
@@ -59,6 +60,33 @@ def study(name: str) -> ModuleType:
     return module
 
 
+def logged(model: Model, motion: Motion, path: Path, seed: int, *texts: str) -> Path:
+    """The log of a motion's torques on a machine with effects, as the sensors write it."""
+    entries = [placing.parse(text, model.machine, float(motion.t[-1])) for text in texts]
+    extended = prediction.build(placing.extended(model.machine, *entries)) if entries else model
+    driven = simulate(extended, motion.u, q0=motion.q[0], nu0=motion.nu[0])
+    sensors.measure(extended, driven, seed=seed).to_csv(path, index=False)
+    return path
+
+
+def gentle(model: Model, seconds: float) -> Motion:
+    """Little torque for a short time."""
+    t = np.arange(0, seconds + 0.01, 0.01)
+    slow = np.minimum(1, np.minimum(t, seconds - t) / 2)
+    return simulate(model, np.column_stack([1500 * np.sin(1.7 * t) * slow, 1200 * np.sin(2.6 * t) * slow]))
+
+
+def calm(model: Model) -> stages.Stage:
+    """The model fitted to a log of that without anything hidden."""
+    one = log.check(sensors.measure(model, gentle(model, 12.0), seed=3), model.machine)
+    return stages.fitted(model.machine, [one], model.machine.filter)
+
+
+def slope(straight: Model) -> EffectEntry:
+    """What `sloping` has hidden."""
+    return placing.parse("ground_slope=0.01", straight.machine, 40.0)
+
+
 @pytest.fixture(scope="session")
 def va12() -> Model:
     return prediction.build(machine.load("va12"))
@@ -82,6 +110,13 @@ def va12_motion(va12: Model) -> Motion:
 @pytest.fixture(scope="session")
 def straight_motion(straight: Model) -> Motion:
     return simulate(straight, drive(straight, 40, 1, {"u1": 1200, "u4": 1200}))
+
+
+@pytest.fixture(scope="session")
+def sloping(straight: Model, straight_motion: Motion, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of a straight drive up a slope that the model doesn't know."""
+    place = tmp_path_factory.mktemp("sloping")
+    return logged(straight, straight_motion, place / "sloping.csv", 7, "ground_slope=0.01")
 
 
 @pytest.fixture(scope="session")
