@@ -37,13 +37,13 @@ from model.file import Quantity
 from model.machine import EffectEntry
 
 # Of twice the log-likelihood that an effect must gain; logs without any stayed below 16. Chi-squared gives 2.1 % of
-# logs of a minute above what `threshold` makes of it, 2.7 % of longer ones, at most: summed over the 368 and 438
+# logs of a minute above what `threshold` makes of it, 2.7 % of longer ones, at most: summed over the 371 and 441
 # candidates of va12 as if these had nothing in common, with all their shapes.
 LEVEL = 22.0
 CHANCE = 0.05  # p-value above which no effect has a name: those with many shapes must gain more than LEVEL
 WORTH = 15.0  # a first-order gain below which a candidate isn't fitted
 HOPE = 0.4, 0.15  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
-TRIED = 5  # candidates that are fitted
+TRIED = 5  # candidates that are fitted, beside further variants of the likeliest names
 LIKE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
 PLAIN = 0.5  # the same for the variant without unusual shapes, which the others may mimic before a fit
 ANEW = 12  # effects that begin anew where nothing was found
@@ -244,7 +244,7 @@ def choose(
         return None
 
     def told(k: int) -> None:
-        tell(done + 0.03 * k, f"fitting {likely[k].candidate.name}")
+        tell(done + 0.03 * min(k, TRIED), f"fitting {likely[k].candidate.name}")
 
     vain = np.inf
     if _hides(stage):
@@ -284,7 +284,7 @@ def choose(
 
 def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) -> Choice:
     """The best of tries without disturbing forces where that can be, and what is close to it as its rivals: those as
-    well that only with such forces are known to be as good."""
+    well that only with such forces are known to be as good. With a machine that can be where one of them has one."""
     spread, forced = tries[0][1].spread, {s.candidate.name: stage for s, stage in tries if not stage.exact}
     close = _close(tries, gain)
     exact, unknown = _without_forces(close, together)
@@ -295,7 +295,8 @@ def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) 
         others, _ = _without_forces([x for x in left if x[1].fit.cost - lowest <= (1 - LIKE) * gain], together)
         exact = sorted([*exact, *others], key=lambda x: x[1].fit.cost)
     judged = [*_close(exact, gain, SHAPE[0] if forced else SHAPE[1]), *unknown] if exact else close
-    judged = [x for x in judged if not x[1].vain] or judged
+    if judged[0][1].vain:
+        judged = [x for x in judged if x[1].exact and x[1].near and not x[1].impossible] or judged
     score, best = judged[0]
     rivals = tuple(entry_of(other, s.candidate.name) for s, other in judged[1:])
     loose = forced.get(score.candidate.name) if best.exact else None

@@ -32,13 +32,14 @@ LOST = (4, 30.0, 0.9)  # after more than so many with one so large that is more 
 LATELY = 4  # passes whose steps tell how small the last one will be
 IDLE = 0.5, 0.8  # share of a step two passes earlier above which it hardly shrinks: near an answer, far from any
 FALLING = 0.01  # of a cost, in two passes
+FELL = 1.0  # of a cost, in one pass: a parameter's way of one standard deviation
 ALIKE = 0.05  # of a cost: what swinging steps change
 NEARLY = 1.0  # a step, in standard deviations, at which a fit that runs out of passes is as good as found
 CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviations
 ENOUGH = 0.2  # a step, in standard deviations, at which a fit is found whose deviations are no promise
 # Steps that turn back and hardly shrink are shortened by TURNED; others grow by SHARE up to the whole.
 TURNED, SHARE, SLOW = 0.7, 1.15, 0.3
-STRONG = 1.3  # misfit over readings from which first-order gains are rough
+STRONG = 1.3  # misfit over what noise makes of it from which a fit isn't near the logs, and first-order gains are rough
 FREE = 0.05  # of a parameter's size, in the last step: it is hardly known
 ALONG = 0.9  # cosine between two steps that go the same way
 LARGEST_STEP = 0.5  # of a parameter in one pass, relative to its size
@@ -230,8 +231,9 @@ def iterate(
     in standard deviations, at which a fit is found, however much is left undone: ENOUGH with disturbing forces, none
     without, if not given; most: cost above which a fit is given up once the states fit the dynamics; worth: cost above
     which it is given up as soon as costs fall no more. Not `patient`: no passes are spent on steps that have ceased to
-    shrink, unless they lead on downhill, and far from the logs a step of NEARLY is small enough under disturbing
-    forces. untold (n_base,): parameters that start held, as they weren't seen in the fit that this one goes on from,
+    shrink, and far from the logs a step of NEARLY is small enough under disturbing forces, whatever is asked for. No
+    fit is given up for its steps, nor found where they grow again, as long as they lead on downhill near the logs.
+    untold (n_base,): parameters that start held, as they weren't seen in the fit that this one goes on from,
     and are judged like the others.
 
     Raises NotConverged.
@@ -274,7 +276,7 @@ def iterate(
         costs.append(cost)
         turned = np.where(unseen, 0.0, move[0][: len(X)] / np.sqrt(np.diag(covariance))[: len(X)])
         along = turned @ last > ALONG * np.linalg.norm(turned) * np.linalg.norm(last)
-        downhill = along and len(costs) > 1 and cost < min(costs[-2] - NEARLY, STRONG * noise)
+        downhill = along and len(costs) > 1 and cost < min(costs[-2] - FELL, STRONG * noise)
         if downhill and step > before:
             best, nearest = None, NEARLY  # the way was longer than it seemed
         if k >= SETTLED and step <= nearest and not away:

@@ -75,14 +75,15 @@ class Stage:
     """A model with the effects found so far, fitted. `exact`: without disturbing forces. Not `settled`: no fit was
     found, parameters are the file's or, with coarse sensors, those of sensors noisier than they are. loose: the same
     model with the larger disturbing forces that this fit came from, if it did; beside a fit with coarse sensors the one
-    with disturbing forces that leave much, if there is one. bare: what `freed` makes of it, if that is known."""
+    with disturbing forces that leave much, if there is one. bare: the fit without its disturbing forces, or that there
+    is none, if that is known."""
 
     machine: Machine
     prepared: Prepared
     fit: Fit
     settled: bool = True
     loose: Stage | None = None
-    bare: Fit | None = None
+    bare: tuple[Fit | None, ...] = ()
 
     @property
     def model(self) -> Model:
@@ -261,7 +262,7 @@ def as_measured(stage: Stage) -> Stage:
     if linear is None:
         return stage
     cost = sum(float(x.Z[0, 0]) for x in linear)
-    return replace(stage, prepared=prepared, fit=light(replace(fit, linear=tuple(linear), cost=cost)))
+    return replace(stage, prepared=prepared, fit=light(replace(fit, linear=tuple(linear), cost=cost)), bare=())
 
 
 def sharpened(found: Sequence[Stage], disturbed: float, together: Together) -> Iterator[Stage | None]:
@@ -355,9 +356,9 @@ def _lessened(first: Stage, together: Together = in_turn) -> Fits:
 
 def _with_less(stage: Stage, together: Together) -> Stage | None:
     """The fit of a stage gone on with with smaller disturbing forces, None where there is none."""
-    smaller = [less * stage.fit.disturbed for less in LESS if less * stage.fit.disturbed >= SMALL]
+    smaller = [d for d in (less * stage.fit.disturbed for less in LESS) if d >= SMALL]
     with closing(together([partial(_resumable, stage.prepared, stage, forces) for forces in smaller])) as fits:
-        return next((replace(stage, fit=fit) for fit in fits if fit is not None), None)
+        return next((replace(stage, fit=fit, bare=()) for fit in fits if fit is not None), None)
 
 
 @dataclass(frozen=True)
@@ -522,7 +523,7 @@ def refitted_and_freed(machine: Machine, of: Stage, together: Together) -> tuple
     calls = [partial(_resumable, prepared, of, of.fit.disturbed), *([partial(_exact, of)] if frees else [])]
     fit, *bare = together(calls)
     other = None if fit is None else Stage(machine, prepared, fit, prepared.coarse == 1)
-    return other, replace(of, bare=bare[0]) if frees else of
+    return other, replace(of, bare=tuple(bare)) if frees else of
 
 
 def _holding(prepared: Prepared, name: str) -> Prepared:
@@ -533,7 +534,7 @@ def freed(found: Sequence[Stage], together: Together) -> Iterator[Stage | None]:
     """Stages without their disturbing forces, side by side; None where exact dynamics are far from the logs: they make
     a large misfit of a formula that is nearly right."""
     for stage, fit in zip(found, together([partial(_exact, x) for x in found]), strict=True):
-        yield None if fit is None else replace(stage, fit=fit, bare=None)
+        yield None if fit is None else replace(stage, fit=fit, bare=())
 
 
 def exact_if_near(stage: Stage) -> Stage:
@@ -543,8 +544,8 @@ def exact_if_near(stage: Stage) -> Stage:
 
 
 def _exact(stage: Stage) -> Fit | None:
-    if stage.bare is not None:
-        return stage.bare
+    if stage.bare:
+        return stage.bare[0]
     most = FAR * stage.prepared.readings
     try:
         fit = _resume(stage.prepared, stage, 0.0, most)
@@ -627,8 +628,8 @@ def _iterated(
     untold: np.ndarray | None = None,
 ) -> Fit:
     """A fit from points and X. With large disturbing forces it is found as soon as it nearly is: gains are larger
-    by far than what another pass would change. By exact dynamics the patient leave nothing undone, others what is less
-    than an amount is ever known to. Raises NotConverged."""
+    by far than what another pass would change. With the smallest, whose gains may be small, and by exact dynamics it
+    leaves undone what is less than an amount is ever known to, the patient one nothing. Raises NotConverged."""
     p, enough = prepared, newton.NEARLY if disturbed > SMALL else 0.0 if patient else newton.ENOUGH
     return newton.iterate(
         p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, enough, most, patient, worth, untold

@@ -591,24 +591,34 @@ def test_a_cause_without_which_nothing_is_left_and_no_machine_possible_stays_alo
 
 
 @pytest.mark.parametrize(
-    ("left", "promised", "forces", "goes_on"),
-    [(0.1, 10.0, 0.0, True), (0.9, 10.0, 0.0, False), (0.9, 1200.0, 0.0, True), (0.9, 10.0, 0.1, True)],
+    ("left", "promised", "forces", "named", "goes_on"),
+    [
+        (0.1, 10.0, 0.0, "", True),
+        (0.9, 10.0, 0.0, "", False),
+        (0.9, 1200.0, 0.0, "", True),
+        (0.9, 10.0, 0.1, "", True),
+        (0.9, 10.0, 0.0, "nothing odd", True),
+        (0.9, 10.0, 0.0, "with forces", True),
+    ],
 )
 def test_nothing_is_looked_for_beside_names_where_no_more_could_explain_the_misfit(
     left: float,
     promised: float,
     forces: float,
+    named: str,
     goes_on: bool,
     straight: Model,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Names that explain 0.85 of it between them are needed, and only so many are looked for; what forces hide could be
-    anything."""
+    anything, and what has a name already keeps it."""
     stage = calm(prediction.build(placing.extended(straight.machine, slope(straight))))
     excess = left / (1 - left) * 1000.0  # after a gain of 1000
     far = replace(stage, fit=replace(stage.fit, cost=(1 + stages.SLACK) * stage.noise + excess, disturbed=forces))
     score = next(s for s in choosing.scored(stage, in_turn) if s.values["A"] != 0)
-    choice = choosing.Choice("ground_slope@machine", far, 1000.0, 1.0, 1, (), 1.0)
+    forced = replace(stage, fit=replace(stage.fit, disturbed=stages.SMALL)) if named == "with forces" else None
+    choice = choosing.Choice("ground_slope@machine", far, 1000.0, 1.0, 1, (), 1.0, forced)
+    monkeypatch.setattr(diagnose, "_odd", lambda of: () if named == "nothing odd" else ("a roll that hops",))
     asked = list[int]()
     monkeypatch.setattr(choosing, "scored", lambda *given: (replace(score, gain=promised),))
     monkeypatch.setattr(choosing, "choose", lambda *given: asked.append(1))
@@ -637,22 +647,26 @@ def test_further_variants_of_the_likeliest_names_are_tried(straight: Model) -> N
     assert told == [*firsts, *others[: choosing.PAIR]]
 
 
-@pytest.mark.parametrize(("so", "left", "chosen"), [((), 0.0, 0), (("Fv1 = -1",), 0.0, 1), (("Fv1 = -1",), 1e4, 0)])
+@pytest.mark.parametrize(
+    ("impossible", "forces", "left", "chosen"),
+    [(0, 0.0, 0.0, 0), (1, 0.0, 0.0, 1), (1, 0.0, 1e4, 0), (2, 0.0, 0.0, 0), (1, stages.SMALL, 0.0, 0)],
+)
 def test_a_machine_that_can_be_is_preferred(
-    so: tuple[str, ...], left: float, chosen: int, straight: Model, monkeypatch: pytest.MonkeyPatch
+    impossible: int, forces: float, left: float, chosen: int, straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of effects that explain all that a log shows about as well; where more is left, more may come."""
+    """Of effects that explain all that a log shows about as well; where more is left, more may come. Not one with which
+    no machine can be either, and that explains less, nor one that only forces let explain as much."""
     stage = calm(straight)
     scores = {s.candidate.name: s for s in choosing.scored(stage, in_turn)}
     tries = []
     for k, text in enumerate(("ground_slope=0.009", "rolling_resistance@rear_roll=200")):
         extended = placing.extended(straight.machine, placing.parse(text, straight.machine, 40.0))
         found = stages.refitted(extended, stage, 0.0)
-        fit = replace(found.fit, cost=stage.noise + left + k)
-        tries.append((scores[found.model.effects[0].name], replace(found, fit=fit)))
-    first = tries[0][0].candidate.name
-    impossible = property(lambda of: so if of.model.effects[0].name == first else ())
-    monkeypatch.setattr(stages.Stage, "impossible", impossible)
+        fit = replace(found.fit, cost=(1 + stages.SLACK) * stage.noise - 1 + left + 3 * k, disturbed=forces * k)
+        tries.append((scores[found.model.effects[0].name], replace(found, fit=fit, bare=(None,) * (forces > 0))))
+    names = [s.candidate.name for s, _ in tries[:impossible]]
+    lines = property(lambda of: ("Fv1 = -1",) if of.model.effects[0].name in names else ())
+    monkeypatch.setattr(stages.Stage, "impossible", lines)
     choice = choosing._chosen(tries, 1000.0, 100, in_turn)
     assert choice.name == tries[chosen][0].candidate.name
     assert [e.label for e in choice.rivals] == ([] if chosen else [tries[1][0].candidate.name])

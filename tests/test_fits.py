@@ -149,9 +149,15 @@ def test_a_fit_that_goes_downhill_goes_on(
     steps[:] = [500.0, 90.0, 3.0, 0.9, 1.0, 1.4, 1.8, 2.1, 1.9, 1.2, 0.3, 0.1, 0.01, 1e-4]
     given = p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.0, p.held
     if found:
+        told = steps.copy()
         fit = newton.iterate(*given, passes=14, patient=False)
         assert fit.cost == costs[-1]
         assert len(costs) >= 13
+        # Where passes run out on the way, what was passed is not as good as found.
+        steps[:], costs[:] = told, []
+        with pytest.raises(newton.NotConverged) as failed:
+            newton.iterate(*given, passes=8, patient=False)
+        assert (failed.value.step, failed.value.nearly) == (2.1, None)
     else:
         with pytest.raises(newton.NotConverged) as failed:
             newton.iterate(*given, passes=14, patient=False)
@@ -240,8 +246,17 @@ def test_a_stage_is_freed_once(straight: Model, monkeypatch: pytest.MonkeyPatch)
     (again,) = stages.freed([known], in_turn)
     assert asked == [1.0, 0.0]
     assert again is not None
-    assert (again.bare, again.fit.cost) == (None, plain.fit.cost)
+    assert (again.bare, again.fit.cost) == ((), plain.fit.cost)
     np.testing.assert_array_equal(again.fit.X, plain.fit.X)
+    # Nor is it asked twice for what can't be had; with other forces it is another fit.
+    monkeypatch.setattr(stages, "FAR", 1e-3)
+    _, known = stages.refitted_and_freed(sloped, loose, in_turn)
+    asked.clear()
+    assert list(stages.freed([known], in_turn)) == [None]
+    assert asked == []
+    less = stages._with_less(known, in_turn)
+    assert less is not None
+    assert less.bare == ()
     # Nothing is freed that has no forces.
     asked.clear()
     _, same = stages.refitted_and_freed(sloped, stage, in_turn)
