@@ -150,7 +150,7 @@ def extended(before: Stage, first: Sequence[Choice], together: Together, tell: A
         turn = len(chosen)
         tell(0.15 + 0.2 * turn, "scoring effects")
         scores = choosing.scored(stage, together)
-        hopeless = _hopeless(stage, chosen, scores) and len(weighed(before, chosen)[0]) < len(chosen)
+        hopeless = _hopeless(before, chosen, scores)
         choice = None if hopeless else choosing.choose(stage, scores, chosen, together, tell, 0.2 + 0.2 * turn)
         if choice is not None and before.settled and _outgrows(choice, chosen):
             return [], 0.0
@@ -162,14 +162,16 @@ def extended(before: Stage, first: Sequence[Choice], together: Together, tell: A
     return chosen, left
 
 
-def _hopeless(stage: Stage, chosen: Sequence[Choice], scores: Sequence[Score]) -> bool:
-    """Whether effects leave more than all that may still come beside them would explain: where the last of them has no
-    name by itself, nothing else gives it one."""
-    if not (chosen and stage.exact):
+def _hopeless(before: Stage, chosen: Sequence[Choice], scores: Sequence[Score]) -> bool:
+    """Whether effects leave more than all that may still come beside them would explain, and the last of them has no
+    name as it is: then nothing gives it one."""
+    if not (chosen and chosen[-1].stage.exact):
         return False
+    stage = chosen[-1].stage
     gained = sum(x.gain for x in chosen)
     most = (MOST - len(chosen)) * choosing.OVER * max((s.gain for s in scores), default=0.0)
-    return gained + min(most, stage.excess) < ENOUGH * (gained + stage.excess)
+    too_little = gained + min(most, stage.excess) < ENOUGH * (gained + stage.excess)
+    return too_little and len(weighed(before, chosen)[0]) < len(chosen)
 
 
 def weighed(
