@@ -11,6 +11,7 @@ from excite import asked, brief, doubts, examine, findings, gaps, identify, port
 from excite.brief import Brief
 from excite.diagnose import Diagnosis, diagnose
 from excite.estimate import NotIdentifiable
+from excite.figures import save
 from excite.limit import InfeasibleError
 from excite.separate import Rivals
 from excite.sidebyside import forked
@@ -56,7 +57,8 @@ def write(
 
     with doubts.told(doubtful):
         found = diagnose(model, mended, chosen, tell(0.0, PARTS), forked)
-    account = findings.account(found, tell(PARTS, 1.0), forked)
+    title = model.machine.title
+    account = findings.account(found, tell(PARTS, 1.0), forked, portrait.drawings(place, found, title))
     text = findings.machine_file(machine, model.machine, found)
     if text is not None:
         (place / MACHINE).write_text(text, encoding="utf-8")
@@ -70,7 +72,7 @@ def write(
         "notes": [*notes, *_followed(found)],
         "versions": asked.versions(),
     }
-    portrait.write(place, account, summary["signals"], model.machine.title, forked)
+    save(portrait.signals_figure(account, summary["signals"], title), place / "signals.png")
     return summary, separate.rivals(found)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -14,7 +14,7 @@ import tomli_w
 from excite import gain, misfit, separate
 from excite.choosing import Advance
 from excite.diagnose import Diagnosis, Finding
-from excite.gain import Gain
+from excite.gain import Gain, Withheld
 from excite.misfit import Course
 from excite.sidebyside import Together, in_turn
 from excite.stages import as_measured
@@ -31,8 +31,8 @@ class Account:
     """What is to be told of a diagnosis.
 
     whole, single: gains of all findings and of each, on stretches that were withheld; None where no model could be
-    fitted to what these leave. before, after: the courses of the logs; missing: those that show what is missing in both
-    alike. located: where the misfit sits. run: what would separate causes that are tied.
+    fitted to what these leave. before, after: the courses of the logs. located: where the misfit sits. run: what would
+    separate causes that are tied.
     """
 
     diagnosis: Diagnosis
@@ -40,34 +40,37 @@ class Account:
     single: tuple[Gain | None, ...]
     before: tuple[Course, ...]
     after: tuple[Course, ...]
-    missing: tuple[tuple[Course, ...], tuple[Course, ...]]
     located: tuple[str, ...]
     run: str | None
 
 
-def account(d: Diagnosis, advance: Advance | None = None, together: Together = in_turn) -> Account:
+def account(
+    d: Diagnosis,
+    advance: Advance | None = None,
+    together: Together = in_turn,
+    beside: Sequence[Callable[[], None]] = (),
+) -> Account:
     """Measures gains and locates the misfit. Each finding's gain is that of the model with it over the model with those
-    found before it."""
+    found before it. beside: what else is to be done of the diagnosis, while there are processes for it."""
     tell = advance or (lambda share, what: None)
     stages = [d.before, *d.stages]
-    held = []
+    calls: list[Callable[[], Withheld | None]] = [*beside, *(partial(gain.withheld, s) for s in stages)]
+    done = list[Withheld | None]()
     tell(0.0, "measuring the gain")
-    # Forces that the one needs must be shown for the other too.
-    alike = misfit.loosened((d.before, d.after) if d.before.exact != d.after.exact else (), together)
-    for k, found in enumerate(together([partial(gain.withheld, s) for s in stages])):
-        tell((k + 1) / (len(stages) + 1), "measuring the gain")
-        held.append(found)
+    for one in together(calls):
+        done.append(one)
+        tell(len(done) / (len(calls) + 1), "measuring the gain")
+    held = done[len(beside) :]
     single = tuple(gain.gain(a, b) for a, b in pairwise(held))
     whole = gain.gain(held[0], held[-1])
     before = misfit.courses(d.before)
     after = misfit.courses(d.after) if d.stages else before
-    was, now = tuple(misfit.courses(stage) for stage in alike) or (before, after)
     located = d.located
     if d.verdict == "unexplained":  # which signals, and how much more than noise there is in them, is in these lines
         measured = as_measured(d.after)
         odd = [line for line in d.located if line not in measured.suspects]
         located = (*odd[:STRIKING], *misfit.located(measured), *odd[STRIKING:])
-    return Account(d, whole, single, before, after, (was, now), tuple(dict.fromkeys(located)), separate.run(d))
+    return Account(d, whole, single, before, after, tuple(dict.fromkeys(located)), separate.run(d))
 
 
 def summary(a: Account) -> dict[str, Any]:

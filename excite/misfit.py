@@ -17,7 +17,7 @@ from excite import smoothing
 from excite.innovations import Linear
 from excite.linearise import advance, differentiate
 from excite.newton import state_scale
-from excite.sidebyside import Together
+from excite.sidebyside import in_turn
 from excite.stages import Stage, as_measured, refits
 
 BLOCK_S = 0.25  # [s] over which slow errors are means
@@ -75,18 +75,14 @@ class Size:
         return 100 * (1 - 1 / worst) if worst > EXCESS else 0.0
 
 
-def loosened(stages: Sequence[Stage], together: Together) -> Iterator[Stage]:
-    """The same models with disturbing forces of some size, set out upon at once; as they are where those find no
-    fit."""
+def loosened(stages: Sequence[Stage]) -> Iterator[Stage]:
+    """The same models with disturbing forces of some size; as they are where those find no fit."""
     least = smoothing.DISTURBED[0]
 
     def loose(s: Stage | None) -> Stage | None:
         return s if s is None or (s.fit.disturbed >= least and s.prepared.coarse == 1) else loose(s.loose)
 
-    known = [loose(s) for s in stages]
-    wishes = [(s.machine, s, least) for s, k in zip(stages, known, strict=True) if k is None]
-    found = refits(wishes, together, at_once=True)
-    return (k or next(found) or s for s, k in zip(stages, known, strict=True))
+    return (loose(s) or next(refits([(s.machine, s, least)], in_turn)) or s for s in stages)
 
 
 def courses(stage: Stage) -> tuple[Course, ...]:

@@ -13,36 +13,38 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from excite import misfit
+from excite.diagnose import Diagnosis
 from excite.figures import COLOURS, plain, save
 from excite.findings import Account
 from excite.misfit import Course
-from excite.sidebyside import Together, in_turn
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 SHOWN, WIDE = 3, 4  # torques and forces in a figure, panels side by side
+# In inches: a panel, what its labels take left, below, right and above, the line over the panels of one torque, title
+# and legend. Given, as to measure all labels takes as long as to draw them.
+PANEL, INSET, HEAD, EDGE = (2.9, 1.75), (0.52, 0.4, 0.08, 0.07), 0.3, 0.35
 CLEAR = 4.0  # strength from which a quantity is pointed out
 HIGHEST = 30.0  # mean square of innovations at which the colours end
 
 
-def write(
-    place: Path, a: Account, signals: Mapping[str, Mapping[str, Any]], title: str, together: Together = in_turn
-) -> None:
-    """The figures of a diagnosis into its folder: misfit.png and when.png for each log, signals.png for all."""
-    several = len(a.before) > 1
-    found = bool(a.diagnosis.stages)
-    drawn: dict[str, Callable[[], Figure]] = {}
-    for k, before in enumerate(a.before):
-        name, words = f"-{k + 1}" if several else "", f"{title}: {Path(before.source).name}"
-        shown = [side[k] for side in a.missing]
-        drawn[f"misfit{name}.png"] = partial(misfit_figure, shown[0], shown[1] if found else None, words)
-        drawn[f"when{name}.png"] = partial(when_figure, before, a.after[k] if found else None, words)
-    drawn["signals.png"] = partial(signals_figure, a, signals, title)
-    for _ in together([partial(_drawn, figure, place / name) for name, figure in drawn.items()]):
-        pass
+def drawings(place: Path, d: Diagnosis, title: str) -> list[Callable[[], None]]:
+    """Calls that draw into the folder of a diagnosis, for each log, misfit.png and when.png: each has no need of the
+    other, nor of what was gained."""
+    return [partial(_drawn, place, d, title, kind) for kind in ("misfit", "when")]
 
 
-def _drawn(figure: Callable[[], Figure], path: Path) -> None:
-    save(figure(), path)
+def _drawn(place: Path, d: Diagnosis, title: str, kind: str) -> None:
+    """One of the two figures of every log."""
+    before, after = d.before, d.after
+    if kind == "misfit" and before.exact != after.exact:
+        # Forces that the one needs must be shown for the other too.
+        before, after = misfit.loosened((before, after))
+    was = misfit.courses(before)
+    now = misfit.courses(after) if d.stages else [None] * len(was)
+    figure = misfit_figure if kind == "misfit" else when_figure
+    for k, (without, beside) in enumerate(zip(was, now, strict=True)):
+        name = f"{kind}-{k + 1}.png" if len(was) > 1 else f"{kind}.png"
+        save(figure(without, beside, f"{title}: {Path(without.source).name}"), place / name)
 
 
 def misfit_figure(before: Course, after: Course | None, title: str) -> Figure:
@@ -51,35 +53,38 @@ def misfit_figure(before: Course, after: Course | None, title: str) -> Figure:
     evidence = {row: {q: misfit.strength(before, row, q) for q in before.quantities} for row in before.missing}
     rows = sorted(evidence, key=lambda row: -max(evidence[row].values()))[:SHOWN]
     panels = max(sum(row in v for _, v in before.quantities.values()) for row in rows) + 1
-    lines = -(-panels // WIDE)
-    figure = Figure(figsize=(11.5, (1.75 * lines + 0.35) * len(rows) + 0.7), layout="constrained")
-    figure.suptitle(plain(title), fontsize=11)
-    parts = figure.subfigures(len(rows), 1, squeeze=False)[:, 0]
-    for part, row in zip(parts, rows, strict=True):
-        unit = before.missing[row][1]
-        part.suptitle(f"missing {row} [{unit}]", fontsize=9.5, x=0.01, ha="left")
-        axes = part.subplots(lines, WIDE).ravel()
+    block = HEAD + -(-panels // WIDE) * PANEL[1]
+    width, height = WIDE * PANEL[0], len(rows) * block + 2 * EDGE
+    figure = Figure(figsize=(width, height))
+    figure.suptitle(plain(title), fontsize=11, y=1 - EDGE / 2 / height, va="center")
+    left, below, right, above = INSET
+    share = (PANEL[0] - left - right) / width, (PANEL[1] - below - above) / height
+    for k, row in enumerate(rows):
+        top = height - EDGE - k * block - HEAD
+        words = f"missing {row} [{before.missing[row][1]}]"
+        figure.text(0.01, (top + HEAD / 2) / height, words, fontsize=9.5, va="center")
         own = [q for q, (_, values) in before.quantities.items() if row in values]
         clearest = max(own, key=lambda q: evidence[row][q])
-        for ax, name in zip(axes, own, strict=False):
-            _against(ax, before, after, row, name)
-            ax.set_xlabel(f"{name.replace('_', ' ')} [{before.quantities[name][0]}]", fontsize=8, labelpad=1)
+        for n, name in enumerate([*own, None]):
+            down, across = divmod(n, WIDE)
+            x, y = across * PANEL[0] + left, top - (down + 1) * PANEL[1] + below
+            ax = figure.add_axes((x / width, y / height, *share))
+            if name is None:
+                _spectrum(ax, before, after, row)
+            else:
+                _against(ax, before, after, row, name)
             if name == clearest and evidence[row][name] > CLEAR:
                 for spine in ax.spines.values():
                     spine.set_linewidth(2.2)
-        _spectrum(axes[len(own)], before, after, row)
-        for ax in axes[: len(own) + 1]:
-            ax.tick_params(labelsize=7)
-        for ax in axes[len(own) + 1 :]:
-            ax.axis("off")
-    first = figure.add_axes((0, 0, 0.001, 0.001))
-    first.axis("off")
-    first.plot([], [], color=BEFORE, label="without what was found" if after is not None else "missing (mean)")
+            ax.tick_params(which="both", labelsize=7)
+    names = figure.add_axes((0, 0, 0.001, 0.001))
+    names.axis("off")
+    names.plot([], [], color=BEFORE, label="without what was found" if after is not None else "missing (mean)")
     if after is not None:
-        first.plot([], [], color=AFTER, linestyle="--", label="with it")
+        names.plot([], [], color=AFTER, linestyle="--", label="with it")
     if any(np.isfinite(before.missing[row][2]) for row in rows):
-        first.fill_between([], [], [], color="0.8", label="what noise alone leaves")
-    figure.legend(*first.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+        names.fill_between([], [], [], color="0.8", label="what noise alone leaves")
+    figure.legend(*names.get_legend_handles_labels(), loc="lower center", ncols=3, fontsize=9, frameon=False)
     return figure
 
 
@@ -96,6 +101,7 @@ def _against(ax: Axes, before: Course, after: Course | None, row: str, column: s
         if at is not None:
             centre, mean, _ = misfit.binned(at, after.missing[row][0], 0.0)
             ax.plot(centre, mean, color=AFTER, linewidth=1.4, linestyle="--")
+    ax.set_xlabel(f"{column.replace('_', ' ')} [{before.quantities[column][0]}]", fontsize=8, labelpad=1)
     ax.grid(alpha=0.3)
 
 

@@ -500,19 +500,16 @@ def refits(
     together: Together,
     most: float = np.inf,
     held: Sequence[str] = (),
-    at_once: bool = False,
 ) -> Iterator[Stage | None]:
     """Several refitted, side by side; None where no fit is found or it is given up, as it still costs more than `most`
-    after a few passes. held: of each a parameter that stays at the machine file's value, if any are. at_once: the first
-    is set out upon before it is asked for."""
+    after a few passes. held: of each a parameter that stays at the machine file's value, if any are."""
     prepared = [_resumed(machine, of) for machine, of, _ in wishes]
     if held:
         prepared = [_holding(p, name) for p, name in zip(prepared, held, strict=True)]
     calls = [
         partial(_resumable, p, of, disturbed, most) for p, (_, of, disturbed) in zip(prepared, wishes, strict=True)
     ]
-    fits = ahead(calls, together) if at_once else together(calls)
-    every = zip(prepared, wishes, fits, strict=True)
+    every = zip(prepared, wishes, together(calls), strict=True)
     return (None if fit is None else Stage(machine, p, fit, p.coarse == 1) for p, (machine, _, _), fit in every)
 
 
