@@ -33,7 +33,6 @@ from model.machine import Machine
 
 NEARBY = 0.6, 0.8, 1.0, 1.3, 1.7  # amounts that are tried about the grid's, where they aren't a factor
 ALONE = 100  # columns that aren't worth a second process
-CHUNK = 20_000  # innovations whose products are summed at once
 HUGE = 1e9  # of a state's or a reading's scale: what is remembered of a far-off motion has no bounds
 ABSORBED = 1e-5  # share of a signature that is left, below which it is but single precision's error
 
@@ -240,29 +239,40 @@ class Signatures:
         self.p = way.standard[: len(standard)]
         memory = remembered(made, way.q, way.nu, way.u, way.t, self.p, way.over)
         self.samples = (way.q, way.nu, way.a, way.u, way.t[:, None], memory, way.exact)
-        self.torque = np.zeros((*way.u.shape, self.columns))
-        for k, e in enumerate(every):
-            if e.effect.channel is not None:
-                self.torque[:, :, k] = _misread(c, e, way.u, way.t)
+        self.misread = [k for k, e in enumerate(every) if e.effect.channel is not None]
+        self.torque = np.zeros((*way.u.shape, len(self.misread)), np.float32)
+        for at, k in enumerate(self.misread):
+            self.torque[:, :, at] = _misread(c, every[k], way.u, way.t)
+        self.bounded = np.ones(self.columns, bool)
 
-    def along(self) -> tuple[np.ndarray, np.ndarray]:
-        """What signatures do to the scaled state behind each sample (N, n, C), and to readings (N, m, C). Nothing where
-        one has no bounds: what it would remember along a motion that is far off may come apart."""
-        c, N = self.way.chart, len(self.way.t)
-        push = np.zeros((N, c.n, self.columns), np.float32)
-        reading = np.empty((N, len(c.sensors), self.columns), np.float32)
-        bounded = np.ones(self.columns, bool)
-        for at in range(0, N - 1, BATCH):
-            until = min(at + BATCH, N - 1)
-            held = tuple(x[at : until + 1] for x in self.samples)
-            force = self.force(*held, self.p)[0]
-            torque = self.torque[at : until + 1]
-            with np.errstate(over="ignore", invalid="ignore"):
-                push[at:until] = _pushed(c, self.way.slopes[at:until], force, torque)
-                reading[at : until + 1] = self.reading(*held, self.p)[0][:, self.rows]
-            for part in (push[at:until], reading[at : until + 1]):
-                bounded &= np.abs(part).max(axis=(0, 1), initial=0.0) < HUGE
-        push[:, :, ~bounded] = reading[:, :, ~bounded] = 0
+    def products(self) -> np.ndarray:
+        """Of the whitened innovations of data, parameters and offsets and of all signatures, each with each. Nothing of
+        one that has no bounds: what it would remember along a motion that is far off may come apart."""
+        way = self.way
+        own = way.white.E.shape[2]
+        form = np.zeros((own + self.columns, own + self.columns))
+        for at, E in whitened_signatures(way.linear, way.white, self._along):
+            both = np.concatenate([way.white.E[at], E], axis=2).reshape(-1, len(form))
+            form += both.T @ both
+        unbounded = own + np.flatnonzero(~self.bounded)
+        form[unbounded] = form[:, unbounded] = 0
+        return form
+
+    def _along(self, at: slice) -> tuple[np.ndarray, np.ndarray]:
+        """What signatures do to the scaled state behind each of K samples (K, n, C), and to readings (K, m, C)."""
+        c, K = self.way.chart, at.stop - at.start
+        to = slice(at.start, at.stop + 1)  # to the end of the last interval
+        held = tuple(x[to] for x in self.samples)
+        push = np.zeros((K, c.n, self.columns), np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):
+            acting = _acting(c, self.force(*held, self.p)[0])
+            acting[:, : self.torque.shape[1], self.misread] += self.torque[to]
+            moved = self.way.slopes[at] @ (acting[:-1] + acting[1:])
+            push[: len(moved)] = moved
+            reading = self.reading(*held, self.p)[0][:K, self.rows].astype(np.float32)
+        for part in (push, reading):
+            self.bounded &= np.abs(part).max(axis=(0, 1)) < HUGE
+        push[:, :, ~self.bounded] = reading[:, :, ~self.bounded] = 0
         return push, reading
 
 
@@ -283,12 +293,10 @@ def _slopes(c: Chart, p: Point, u: np.ndarray, X: np.ndarray) -> np.ndarray:
     return found
 
 
-def _pushed(c: Chart, slopes: np.ndarray, force: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """What forces (K + 1, n_q, C) and torques (K + 1, n_u, C) do to the scaled states behind K intervals (K, n, C)."""
-    free = [c.pushed[k] for k in _free(c)]
-    acting = np.concatenate([force[:, list(c.model.actuated)] + torque, force[:, free]], axis=1).astype(np.float32)
-    moved: np.ndarray = slopes @ (acting[:-1] + acting[1:])
-    return moved
+def _acting(c: Chart, force: np.ndarray) -> np.ndarray:
+    """Of forces (K, n_q, C) those of actuators, then those on rows without one, as `_slopes` has them."""
+    rows = [*c.model.actuated, *(c.pushed[k] for k in _free(c))]
+    return force[:, rows].astype(np.float32)
 
 
 def _misread(c: Chart, e: Placed, u: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -345,7 +353,7 @@ def _told(along: Sequence[Way], fit: newton.Fit, found: Sequence[Candidate]) -> 
     model, prior = along[0].chart.model, fit.prior
     Z = np.zeros((1 + n + total, 1 + n + total))
     for way in along:
-        form = _products(way.white.E, whitened_signatures(way.linear, way.white, *Signatures(way, found).along()))
+        form = Signatures(way, found).products()
         # Offsets of counts belong to one log: integrate them out.
         o, keep = slice(1 + n, 1 + n + way.origins), np.r_[0 : 1 + n, 1 + n + way.origins : len(form)]
         inner = form[o, o] + np.eye(way.origins)
@@ -357,16 +365,6 @@ def _told(along: Sequence[Way], fit: newton.Fit, found: Sequence[Candidate]) -> 
     S = Z[own, own] - cross.T @ solved[:, :-1]
     g = Z[own, 0] - cross.T @ solved[:, -1]
     return [_score(x, S, g, Z[own, own]) for x in found]
-
-
-def _products(own: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Of all columns of two sets of innovations (N, m, k) with each other."""
-    size, step = own.shape[2] + other.shape[2], max(1, CHUNK // own.shape[1])
-    form = np.zeros((size, size))
-    for at in range(0, len(own), step):
-        E = np.concatenate([own[at : at + step], other[at : at + step]], axis=2).reshape(-1, size)
-        form += E.T @ E
-    return form
 
 
 def _score(x: Candidate, S: np.ndarray, g: np.ndarray, own: np.ndarray) -> Told | None:

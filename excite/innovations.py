@@ -7,6 +7,7 @@ to them. The joined parts of the chain say what is known where each part begins,
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,6 +16,7 @@ import numpy as np
 from excite import chain
 
 SLOW = 25  # readings whose mean counts as slow
+STRETCH = 1000  # samples that are computed along at once
 
 
 @dataclass(frozen=True)
@@ -105,53 +107,95 @@ class White:
     through: np.ndarray
 
 
+def stretches(linear: Linear) -> Iterator[tuple[slice, slice]]:
+    """The log in stretches of some STRETCH samples: which parts each is, and which samples. What is computed along one
+    stays near the processor; what is computed along a whole log at once waits for memory."""
+    ends = np.cumsum([len(stages) for stages in linear.stages])
+    first = begin = 0
+    while first < len(ends):
+        last = max(first + 1, int(np.searchsorted(ends, begin + STRETCH, "right")))
+        if last == len(ends) - 1:  # the one without transition
+            last += 1
+        yield slice(first, last), slice(begin, int(ends[last - 1]))
+        first, begin = last, int(ends[last - 1])
+
+
 def whitened(linear: Linear, flawed: tuple[int, ...]) -> White:
     """Where data = sum of columns times steps, the columns' products are the information about the steps, all states
     integrated out. flawed: parameters that readings depend on directly. Single precision."""
     (N, m, n), own = linear.H.shape, linear.solved.Z.shape[0]
     told = np.concatenate([1 + np.array(flawed, int), np.arange(own - linear.direct.shape[2] + len(flawed), own)])
-    reading, push = np.zeros((N, m, own + n)), np.zeros((N, n, own + n))
-    reading[:, :, 0] = -linear.residual
-    reading[:, :, told] = linear.direct
-    push[:, :, :own] = np.concatenate([stages.b for stages in linear.stages])
-    x = np.zeros((len(linear.stages), n, own + n))
-    x[:, :, own:] = np.eye(n)
-    E = _filtered(linear, x, push, reading)
-    white = White(np.ascontiguousarray(E[:, :, :own]), np.ascontiguousarray(E[:, :, own:]), x[:, :, own:])
-    _begin(linear, white.E, white, x[:, :, :own], linear.solved.parts[0].whole.b[0])
-    return white
+    E, reach = np.empty((N, m, own), np.float32), np.empty((N, m, n), np.float32)
+    begin, through = linear.solved.parts[0].whole.b[0], list[np.ndarray]()
+    for parts, samples in stretches(linear):
+        stages = linear.stages[parts]
+        K = samples.stop - samples.start
+        reading, push = np.zeros((K, m, own + n)), np.zeros((K, n, own + n))
+        reading[:, :, 0] = -linear.residual[samples]
+        reading[:, :, told] = linear.direct[samples]
+        push[:, :, :own] = np.concatenate([x.b for x in stages])
+        x = np.zeros((len(stages), n, own + n))
+        x[:, :, own:] = np.eye(n)
+        both = _filtered(linear, parts, samples.start, x, push, reading)
+        E[samples], reach[samples] = both[:, :, :own], both[:, :, own:]
+        through.append(x[:, :, own:])
+        begin = _begun(linear, parts, E[samples], reach[samples], through[-1], x[:, :, :own], begin)
+    return White(E, reach, np.concatenate(through))
 
 
-def whitened_signatures(linear: Linear, white: White, push: np.ndarray, reading: np.ndarray) -> np.ndarray:
-    """Likewise of signatures (N, m, C). push (N, n, C): what they do to the scaled state behind each sample, nothing
-    behind the last; reading (N, m, C): to readings."""
-    parts, (_, n, columns) = len(linear.stages), push.shape
-    x = np.zeros((parts, n, columns))
-    E = _filtered(linear, x, push, reading)
-    _begin(linear, E, white, x, np.zeros((n, columns)))
-    return E
+def whitened_signatures(
+    linear: Linear, white: White, along: Callable[[slice], tuple[np.ndarray, np.ndarray]]
+) -> Iterator[tuple[slice, np.ndarray]]:
+    """Likewise of signatures, stretch by stretch: which samples these are, and (K, m, C). along: of K samples what
+    signatures do to the scaled state behind each, push (K, n, C), nothing behind the last of the log, and to readings
+    (K, m, C)."""
+    begin: np.ndarray | None = None
+    for parts, samples in stretches(linear):
+        push, reading = along(samples)
+        x = np.zeros((parts.stop - parts.start, *push.shape[1:]))
+        E = _filtered(linear, parts, samples.start, x, push, reading)
+        begin = np.zeros(push.shape[1:]) if begin is None else begin
+        begin = _begun(linear, parts, E, white.reach[samples], white.through[parts], x, begin)
+        yield samples, E
 
 
-def _filtered(linear: Linear, x: np.ndarray, push: np.ndarray, reading: np.ndarray) -> np.ndarray:
-    """Whitened innovations (N, m, k) of columns x (parts, n, k) of the states where parts begin, which are led to where
-    these end; push (N, n, k) and reading (N, m, k): what the columns add to states and readings on the way."""
+def _filtered(
+    linear: Linear, parts: slice, first: int, x: np.ndarray, push: np.ndarray, reading: np.ndarray
+) -> np.ndarray:
+    """Whitened innovations (K, m, k) of columns x (parts, n, k) of the states where parts begin, which are led to where
+    these end; push (K, n, k) and reading (K, m, k): what the columns add to states and readings on the way. first: the
+    sample with which the parts begin."""
     E = np.empty(reading.shape, np.float32)
     for step in linear.filter:
-        e = -(reading[step.at] + linear.H[step.at] @ x[step.going])
-        E[step.at] = (step.white * step.used[:, :, None]) @ e
-        x[step.going] = step.A @ (x[step.going] + step.gain @ e) + push[step.at]
+        own = slice(*np.searchsorted(step.going, (parts.start, parts.stop)))
+        if own.start == own.stop:
+            break  # all of them have ended
+        at, going = step.at[own] - first, step.going[own] - parts.start
+        e = -(reading[at] + linear.H[step.at[own]] @ x[going])
+        E[at] = (step.white[own] * step.used[own, :, None]) @ e
+        x[going] = step.A[own] @ (x[going] + step.gain[own] @ e) + push[at]
     return E
 
 
-def _begin(linear: Linear, E: np.ndarray, white: White, ends: np.ndarray, begin: np.ndarray) -> None:
-    """Adds to innovations E (N, m, k) that each part really begins where the one before ends, the first with begin
-    (n, k). ends (parts, n, k): where parts that begin with nothing end."""
+def _begun(
+    linear: Linear,
+    parts: slice,
+    E: np.ndarray,
+    reach: np.ndarray,
+    through: np.ndarray,
+    ends: np.ndarray,
+    begin: np.ndarray,
+) -> np.ndarray:
+    """Adds to innovations E (K, m, k) that each part really begins where the one before ends, the first with begin
+    (n, k); and where the last one ends (n, k). ends (parts, n, k): where parts that begin with nothing end; reach
+    (K, m, n), through (parts, n, n): as White has them."""
     at = 0
-    for k, stages in enumerate(linear.stages):
-        stretch = slice(at, at + len(stages))
-        E[stretch] += white.reach[stretch] @ begin.astype(np.float32)
-        begin = ends[k] + white.through[k] @ begin
+    for k, stages in enumerate(linear.stages[parts]):
+        own = slice(at, at + len(stages))
+        E[own] += reach[own] @ begin.astype(np.float32)
+        begin = ends[k] + through[k] @ begin
         at += len(stages)
+    return begin
 
 
 def _before(linear: Linear) -> np.ndarray:
