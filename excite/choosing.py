@@ -18,12 +18,12 @@ from excite import evidence, smoothing
 from excite.anomaly import shakes
 from excite.log import Log
 from excite.newton import NotConverged
+from excite.onsets import begun
 from excite.sidebyside import Together
 from excite.stages import (
     FAR,
     SMALL,
     Stage,
-    begun,
     exact_if_near,
     freed,
     refits,
@@ -246,10 +246,10 @@ def choose(
     def told(k: int) -> None:
         tell(done + 0.03 * min(k, TRIED), f"fitting {likely[k].candidate.name}")
 
-    vain = np.inf
+    ceiling = np.inf
     if _hides(stage):
-        vain = stage.fit.cost - BEHIND * min(_least(stage, chosen, s.candidate, 0.0) for s in likely)
-    tries, refused = _tries(stage, likely, together, told, vain)
+        ceiling = stage.fit.cost - BEHIND * min(_least(stage, chosen, s.candidate, 0.0) for s in likely)
+    tries, refused = _tries(stage, likely, together, told, ceiling)
     if stage.exact and _lost(likely, tries, refused):
         # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
         known = chosen[-1].loose if chosen else None
@@ -442,12 +442,12 @@ def _tries(
     likely: Sequence[evidence.Score],
     together: Together,
     tell: Callable[[int], None],
-    vain: float = np.inf,
+    ceiling: float = np.inf,
 ) -> tuple[list[_Try], set[str]]:
     """The candidates whose fits were found, as the model without them was fitted: the likeliest two first, the others
     as long as they don't stay far behind what these gain. Those that promise far less than the best come last, and only
     where they may still come near what was gained. And the names that were fitted and are none: they are not felt.
-    vain: cost that no fit may stay above."""
+    ceiling: cost that no fit may stay above."""
     tries, refused = list[_Try](), set[str]()
     near = max(PAIR, sum(OVER * s.gain >= likely[0].gain for s in likely))
     for at, batch in ((0, likely[:PAIR]), (PAIR, likely[PAIR:near]), (near, likely[near:])):
@@ -456,7 +456,7 @@ def _tries(
             continue
         wishes = [(placing.extended(stage.machine, _entry(s)), stage, stage.fit.disturbed) for s in batch]
         tell(at)
-        most = min(vain, stage.fit.cost - BEHIND * gained if tries else np.inf)
+        most = min(ceiling, stage.fit.cost - BEHIND * gained if tries else np.inf)
         for k, (score, found) in enumerate(zip(batch, refits(wishes, together, most), strict=True)):
             tell(min(at + k + 1, len(likely) - 1))
             if found is not None and _felt(score.candidate.name, found):

@@ -33,12 +33,6 @@ FAR = 10.0  # misfit over readings, a few passes after the beginning, from which
 SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
 SURELY, WRONG = 3.0, 0.5  # deviations, and a share of its usual size, by which a parameter's sign is wrong
 PASSES = 14  # of a fit that goes on from another
-SHORTEST = 30.0  # [s] that the beginning of a log has at least
-# Passes after which an effect that leaves as much as the model without it, but for a share, is known to do nothing.
-BRIEF, SAME = 2, 0.1
-ONSETS = 0.25, 0.33, 0.4, 0.5  # shares of logs that are taken for their beginning, in turn
-TELLING = 0.15  # of what exact dynamics leave, that is as much as a beginning must hold of it
-LENIENT = 0.5  # of what a fit must take, that it must take of what is left of the beginning
 COARSE = 10.0, 30.0  # times their noise that sensors are taken to have where nothing follows the logs, in turn
 LESS = 0.1, 0.3  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
 SMALL = LESS[0] * smoothing.DISTURBED[0]  # the smallest that are tried
@@ -174,9 +168,10 @@ class Stage:
 Fits = tuple[Fit, Fit | None]  # of a stage and of the one with larger disturbing forces that it came from, if it did
 
 
-def _stage(machine: Machine, prepared: Prepared, fits: Fits) -> Stage:
-    fit, loose = fits
-    return Stage(machine, prepared, fit, loose=None if loose is None else Stage(machine, prepared, loose))
+def staged(machine: Machine, prepared: Prepared, fit: Fit, loose: Fit | None = None) -> Stage:
+    """A stage from fits: its own, and that with larger disturbing forces that it came from, if it did."""
+    came_from = None if loose is None else Stage(machine, prepared, loose)
+    return Stage(machine, prepared, fit, prepared.coarse == 1, came_from)
 
 
 def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Together = in_turn) -> Stage:
@@ -191,20 +186,20 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Toge
     prepared = _prepared(machine, logs, filter)
     calls: list[Callable[[], Any]] = [
         partial(_strictly, prepared),
-        partial(_disturbed, machine, prepared, smoothing.DISTURBED[0]),
-        *(partial(_from_first, _noisy(prepared, times), smoothing.DISTURBED[0]) for times in COARSE),
+        partial(with_forces, machine, prepared, smoothing.DISTURBED[0]),
+        *(partial(from_first, noisy(prepared, times), smoothing.DISTURBED[0]) for times in COARSE),
     ]
     ways = together(calls)
     with closing(ways):
         exact = next(ways)
         if exact is not None:
-            return _stage(machine, prepared, exact)
+            return staged(machine, prepared, *exact)
         disturbed = next(ways)
-        stage = None if disturbed is None else _stage(machine, prepared, disturbed)
+        stage = None if disturbed is None else staged(machine, prepared, *disturbed)
         if stage is None or not stage.near:
             for times, fit in zip(COARSE, ways, strict=True):
                 if fit is not None:
-                    return Stage(machine, _noisy(prepared, times), fit, False, stage)
+                    return Stage(machine, noisy(prepared, times), fit, False, stage)
     if stage is not None and stage.near:
         return exact_if_near(stage)
     return (
@@ -218,7 +213,7 @@ def forced(stage: Stage, together: Together) -> Stage:
     to look. Raises NotConverged where those don't either."""
     if stage.loose is not None:
         return _with_least(stage.loose, together)
-    return _forced(stage.machine, _noisy(stage.prepared, 1.0), smoothing.DISTURBED[1:], together)
+    return _forced(stage.machine, noisy(stage.prepared, 1.0), smoothing.DISTURBED[1:], together)
 
 
 def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float], together: Together) -> Stage:
@@ -231,14 +226,14 @@ def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float], toget
         if fit is None:
             return Stage(machine, prepared, next(ways), settled=False)
     stage = Stage(machine, prepared, fit)
-    return exact_if_near(_stage(machine, prepared, _lessened(stage, together))) if stage.near else stage
+    return exact_if_near(staged(machine, prepared, *_lessened(stage, together))) if stage.near else stage
 
 
 def _as_filed(prepared: Prepared) -> Fit:
     """A fit with the file's parameters and small disturbing forces."""
     asis = replace(prepared, held=np.ones_like(prepared.held))
     try:
-        fit = _iterated(asis, prepared.starts, prepared.c.model.nominal, smoothing.DISTURBED[0])
+        fit = iterated(asis, prepared.starts, prepared.c.model.nominal, smoothing.DISTURBED[0])
     except NotConverged as failed:
         if failed.fit is None:
             raise
@@ -248,7 +243,7 @@ def _as_filed(prepared: Prepared) -> Fit:
     return light(replace(fit, unseen=prepared.held, prior=known, covariance=unknown))
 
 
-def _noisy(prepared: Prepared, coarse: float) -> Prepared:
+def noisy(prepared: Prepared, coarse: float) -> Prepared:
     """The same logs with sensors so coarse."""
     return replace(prepared, records=tuple(replace(r, coarse=coarse) for r in prepared.records))
 
@@ -257,7 +252,7 @@ def as_measured(stage: Stage) -> Stage:
     """A stage's motion and parameters against the sensors as noisy as they are."""
     if stage.prepared.coarse == 1:
         return stage
-    prepared, fit = _noisy(stage.prepared, 1.0), stage.fit
+    prepared, fit = noisy(stage.prepared, 1.0), stage.fit
     linear = newton.linearised(prepared.c, prepared.records, fit.points, prepared.starts, fit.X, fit.disturbed)
     if linear is None:
         return stage
@@ -268,59 +263,31 @@ def as_measured(stage: Stage) -> Stage:
 def sharpened(found: Sequence[Stage], disturbed: float, together: Together) -> Iterator[Stage | None]:
     """Stages with coarse sensors gone on with, with sensors as they are and so large disturbing forces, side by side
     and set out upon at once; None where no fit comes anywhere near."""
-    prepared = [_noisy(x.prepared, 1.0) for x in found]
+    prepared = [noisy(x.prepared, 1.0) for x in found]
     calls = [partial(_resumable, p, x, disturbed, FAR * p.readings) for p, x in zip(prepared, found, strict=True)]
     every = zip(prepared, found, ahead(calls, together), strict=True)
     return (None if fit is None else Stage(x.machine, p, fit) for p, x, fit in every)
 
 
-def begun(
-    machines: Sequence[Machine],
-    of: Stage,
-    disturbed: float,
-    together: Together,
-    worth: float = np.inf,
-    enough: Callable[[int, Stage], bool] = lambda k, stage: False,
-) -> Iterator[Stage | None]:
-    """Machines with other effects, each fitted to the logs of a stage from the beginning, with so large disturbing
-    forces or smaller ones, side by side; None where no fit is found. With forces none either where so large ones don't
-    bring it near, or its beginning tells that they won't. By exact dynamics none where it costs more than it is worth,
-    or its beginning tells that it will, or is FAR off already; where they leave much, with small disturbing forces
-    after all, if they bring it near or it doesn't follow. enough: whether a stage, of the machine of that number, is
-    one beside which those that come after it are of use only where they come near as well: none of these whose
-    beginning tells that it won't."""
-    onsets, near, at = [_onset(of, disturbed, worth)], _where_near(of), 0
-    while at < len(machines):
-        calls = [partial(_begun, m, of, tuple(onsets), disturbed, worth) for m in machines[at:]]
-        with closing(together(calls)) as ways:
-            for fits in ways:
-                machine, at = machines[at], at + 1
-                stage = _stage(machine, _anew(machine, of), fits) if fits else None
-                yield stage
-                if near is not None and len(onsets) == 1 and stage is not None and enough(at - 1, stage):
-                    onsets.append(replace(near, whole=True))
-                    break
-
-
-def _from_first(
+def from_first(
     prepared: Prepared, disturbed: float, most: float = np.inf, worth: float = np.inf, patient: bool = False
 ) -> Fit | None:
     """A fit from first guesses; None where none is found or it is given up, as it still costs more than `most`, or
     more than it is worth and no less than before. To the patient one that is as good as found is none."""
     p = prepared
     try:
-        return light(_iterated(p, p.starts, p.c.model.nominal, disturbed, most=most, patient=patient, worth=worth))
+        return light(iterated(p, p.starts, p.c.model.nominal, disturbed, most=most, patient=patient, worth=worth))
     except NotConverged as failed:
         return None if failed.nearly is None or patient else light(failed.nearly)
 
 
 def _strictly(prepared: Prepared) -> Fits | None:
     """A fit from first guesses by exact dynamics; None where it is given up, as it stays FAR off."""
-    fit = _from_first(prepared, 0.0, FAR * prepared.readings, patient=True)
+    fit = from_first(prepared, 0.0, FAR * prepared.readings, patient=True)
     return None if fit is None else (fit, None)
 
 
-def _disturbed(machine: Machine, prepared: Prepared, disturbed: float, worth: float = np.inf) -> Fits | None:
+def with_forces(machine: Machine, prepared: Prepared, disturbed: float, worth: float = np.inf) -> Fits | None:
     """A fit from first guesses with disturbing forces, and from there with smaller ones where it is near; None of one
     that costs more than it is worth."""
     fit = _worthy(prepared, disturbed, worth)
@@ -332,7 +299,7 @@ def _disturbed(machine: Machine, prepared: Prepared, disturbed: float, worth: fl
 
 def _worthy(prepared: Prepared, disturbed: float, worth: float) -> Fit | None:
     """A fit from first guesses with disturbing forces, None of one that costs more than it is worth."""
-    fit = _from_first(prepared, disturbed, worth=worth)
+    fit = from_first(prepared, disturbed, worth=worth)
     return None if fit is None or fit.cost > worth else fit
 
 
@@ -340,7 +307,7 @@ def _with_least(stage: Stage, together: Together) -> Stage:
     """A stage gone on with with the smallest disturbing forces that it takes, without any where that is near."""
     if stage.loose is not None:
         return exact_if_near(stage)
-    return exact_if_near(_stage(stage.machine, stage.prepared, _lessened(stage, together)))
+    return exact_if_near(staged(stage.machine, stage.prepared, *_lessened(stage, together)))
 
 
 def _lessened(first: Stage, together: Together = in_turn) -> Fits:
@@ -361,135 +328,11 @@ def _with_less(stage: Stage, together: Together) -> Stage | None:
         return next((replace(stage, fit=fit, bare=()) for fit in fits if fit is not None), None)
 
 
-@dataclass(frozen=True)
-class Onset:
-    """How many samples of each log are its beginning, and the most that a fit may cost there, from which it isn't worth
-    the whole; with `or_found` unless it is as good as found there. whole: not after a few passes, but as far as it
-    comes. without: what the model that has no further effect costs there after BRIEF passes, if that is known."""
-
-    samples: tuple[int, ...]
-    most: float
-    or_found: bool = False
-    whole: bool = False
-    without: float = np.inf
-
-
-def _beginnings(prepared: Prepared) -> list[tuple[int, ...]]:
-    """How many samples of each log such beginnings have, SHORTEST at least, the shortest first; none that is more than
-    half of them all."""
-    rate, lengths = float(prepared.c.model.machine.sampling_hz), [len(r.used) for r in prepared.records]
-    every = (tuple(min(n, max(round(SHORTEST * rate), int(share * n))) for n in lengths) for share in ONSETS)
-    return [samples for samples in dict.fromkeys(every) if 2 * sum(samples) <= sum(lengths)]
-
-
-def _until(prepared: Prepared, samples: Sequence[int]) -> Prepared:
-    """The first samples of each log only."""
-    records = tuple(r.until(n) for r, n in zip(prepared.records, samples, strict=True))
-    return replace(prepared, records=records, starts=tuple(map(Point.until, prepared.starts, samples)))
-
-
-def _onset(of: Stage, disturbed: float, worth: float) -> Onset | None:
-    """The beginning of the logs that tells, in a fraction of the time, which fits with such disturbing forces come to
-    nothing; worth: the most that one may cost. None where no half of the logs tells."""
-    if disturbed > 0:
-        onset = _where_near(of)
-    elif np.isinf(worth):
-        onset = _where_far(of)
-    else:
-        onset = _where_gained(of, worth) if of.settled and of.exact else None
-    if onset is None:
-        return None
-    cost, _ = _began(_until(_noisy(of.prepared, 1.0), onset.samples), disturbed, np.inf, BRIEF)
-    return replace(onset, without=cost or np.inf)
-
-
-def _where_near(of: Stage) -> Onset | None:
-    """The shortest beginning: what leaves more there, beside noise, than the whole may leave and still be near, isn't
-    near the whole."""
-    samples = next(iter(_beginnings(of.prepared)), None)
-    if samples is None:
-        return None
-    return Onset(samples, _until(of.prepared, samples).readings + (newton.STRONG - 1) * of.prepared.readings)
-
-
-def _where_far(of: Stage) -> Onset | None:
-    """The shortest beginning that exact dynamics of a stage's own model stay FAR off: what does as well doesn't follow
-    the logs either. The shortest where none is."""
-    onsets = [Onset(x, FAR * _until(of.prepared, x).readings, True) for x in _beginnings(of.prepared)]
-    sharp = _noisy(of.prepared, 1.0)
-    return next((x for x in onsets if not _sets_out(sharp, x, 0.0)), onsets[0] if onsets else None)
-
-
-def _where_gained(of: Stage, worth: float) -> Onset | None:
-    """The shortest beginning that holds a good part of what a stage's exact dynamics leave beside noise: there a fit
-    must take as fair a part of what its own model comes to as of the whole."""
-    part = LENIENT * (of.fit.cost - worth) / max(of.excess, 1e-9)
-    missed = [np.square(way.white.E[:, :, 0]).sum(axis=1, dtype=float) for way in of.ways]
-    for samples in _beginnings(of.prepared):
-        begin = _until(of.prepared, samples)
-        cost = sum(float(x[:n].sum()) for x, n in zip(missed, samples, strict=True))
-        if cost - (1 + SLACK) * begin.noise >= TELLING * of.excess:
-            cost = _began(begin, 0.0, np.inf)[0] or cost  # after as few passes as others have
-            return Onset(samples, cost - part * max(0.0, cost - (1 + SLACK) * begin.noise))
-    return None
-
-
-def _sets_out(prepared: Prepared, onset: Onset | None, disturbed: float) -> bool:
-    """Whether a fit may come to what it is worth, as far as the beginning of the logs tells, if any does."""
-    if onset is None:
-        return True
-    begin = _until(prepared, onset.samples)
-    brief = max(onset.most, (1 - SAME) * onset.without)
-    if not np.isinf(brief) and _began(begin, disturbed, np.inf, BRIEF)[0] > brief:
-        return False
-    if onset.whole:
-        cost, found = _began(begin, disturbed, np.inf, newton.PASSES)
-    else:
-        cost, found = _began(begin, disturbed, onset.most)
-    return cost <= onset.most or (found and onset.or_found)
-
-
-def _began(begin: Prepared, disturbed: float, most: float, passes: int = newton.SETTLED + 1) -> tuple[float, bool]:
-    """What a fit to the beginning of logs costs after a few passes, nothing where there is none, and whether it is as
-    good as found then. most: what it is given up above."""
-    X = begin.c.model.nominal
-    try:
-        return _iterated(begin, begin.starts, X, disturbed, passes=passes, most=most).cost, True
-    except NotConverged as failed:
-        return (0.0 if failed.fit is None else failed.fit.cost), failed.nearly is not None
-
-
-def _begun(machine: Machine, of: Stage, onsets: Sequence[Onset | None], disturbed: float, worth: float) -> Fits | None:
-    """A fit from first guesses, as `begun` has it; None of one that doesn't set out."""
-    prepared = _anew(machine, of)
-    if not all(_sets_out(prepared, onset, disturbed) for onset in onsets):
-        return None
-    if disturbed > 0:
-        return _disturbed(machine, prepared, disturbed, newton.STRONG * prepared.noise)
-    return _plain(machine, prepared, worth)
-
-
-def _plain(machine: Machine, prepared: Prepared, worth: float) -> Fits | None:
-    """A fit from first guesses by exact dynamics, or by small disturbing forces from there where much is left; None of
-    one that costs more than it is worth."""
-    fit = _from_first(prepared, 0.0, FAR * prepared.readings, worth)
-    if fit is None or fit.cost > worth:
-        return None
-    stage = Stage(machine, prepared, fit)
-    if stage.near:
-        return fit, None
-    try:
-        loose = _resume(prepared, stage, SMALL)
-    except NotConverged:
-        return fit, None
-    return (fit if stage.follows and not replace(stage, fit=loose).near else loose), None
-
-
 def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
     """The model of a machine with other effects fitted to the logs of a stage, from its fit, with so large disturbing
     forces. Raises NotConverged."""
-    prepared = _resumed(machine, of)
-    return Stage(machine, prepared, _resume(prepared, of, disturbed), prepared.coarse == 1)
+    prepared = resumed(machine, of)
+    return staged(machine, prepared, resume(prepared, of, disturbed))
 
 
 Wish = tuple[Machine, Stage, float]  # what `refitted` is called with
@@ -503,23 +346,23 @@ def refits(
 ) -> Iterator[Stage | None]:
     """Several refitted, side by side; None where no fit is found or it is given up, as it still costs more than `most`
     after a few passes. held: of each a parameter that stays at the machine file's value, if any are."""
-    prepared = [_resumed(machine, of) for machine, of, _ in wishes]
+    prepared = [resumed(machine, of) for machine, of, _ in wishes]
     if held:
         prepared = [_holding(p, name) for p, name in zip(prepared, held, strict=True)]
     calls = [
         partial(_resumable, p, of, disturbed, most) for p, (_, of, disturbed) in zip(prepared, wishes, strict=True)
     ]
     every = zip(prepared, wishes, together(calls), strict=True)
-    return (None if fit is None else Stage(machine, p, fit, p.coarse == 1) for p, (machine, _, _), fit in every)
+    return (None if fit is None else staged(machine, p, fit) for p, (machine, _, _), fit in every)
 
 
 def refitted_and_freed(machine: Machine, of: Stage, together: Together) -> tuple[Stage | None, Stage]:
     """The model of a machine with other effects fitted from the fit of a stage, None where no fit is found, and beside
     it the stage itself without its disturbing forces, if it has any and is near, as it will be asked for."""
-    prepared, frees = _resumed(machine, of), of.near and not of.exact
+    prepared, frees = resumed(machine, of), of.near and not of.exact
     calls = [partial(_resumable, prepared, of, of.fit.disturbed), *([partial(_exact, of)] if frees else [])]
     fit, *bare = together(calls)
-    other = None if fit is None else Stage(machine, prepared, fit, prepared.coarse == 1)
+    other = None if fit is None else staged(machine, prepared, fit)
     return other, replace(of, bare=tuple(bare)) if frees else of
 
 
@@ -545,7 +388,7 @@ def _exact(stage: Stage) -> Fit | None:
         return stage.bare[0]
     most = FAR * stage.prepared.readings
     try:
-        fit = _resume(stage.prepared, stage, 0.0, most)
+        fit = resume(stage.prepared, stage, 0.0, most)
     except NotConverged:
         return None
     return fit if fit.cost < most else None
@@ -553,12 +396,12 @@ def _exact(stage: Stage) -> Fit | None:
 
 def _resumable(prepared: Prepared, of: Stage, disturbed: float, most: float = np.inf) -> Fit | None:
     try:
-        return _resume(prepared, of, disturbed, most)
+        return resume(prepared, of, disturbed, most)
     except NotConverged:
         return None
 
 
-def _resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.inf) -> Fit:
+def resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.inf) -> Fit:
     """The fit of a stage gone on with, for logs made ready for another model. Raises NotConverged."""
     c, untold = prepared.c, _untold(prepared, of, disturbed)
     old = dict(zip(of.model.base.names, of.fit.X, strict=True))
@@ -604,7 +447,7 @@ def _nearly(
 ) -> Fit:
     """A fit that goes on from another, as far as it came if that is as good as found. Raises NotConverged."""
     try:
-        return _iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES, most, untold=untold)
+        return iterated(prepared, points, X, disturbed, newton.RESUMED, PASSES, most, untold=untold)
     except NotConverged as failed:
         found = failed.nearly or failed.swinging
         if found is None:
@@ -612,7 +455,7 @@ def _nearly(
         return found
 
 
-def _iterated(
+def iterated(
     prepared: Prepared,
     points: Sequence[Point],
     X: np.ndarray,
@@ -650,7 +493,7 @@ def _prepared(machine: Machine, logs: Sequence[Log], filter: Filter) -> Prepared
     return Prepared(c, tuple(logs), records, starts, hidden.unmoved(c.model, logs, filter, slow=False))
 
 
-def _resumed(machine: Machine, of: Stage) -> Prepared:
+def resumed(machine: Machine, of: Stage) -> Prepared:
     """The logs of a stage made ready for a machine with other effects."""
     before = of.prepared
     if machine is of.machine:
@@ -661,8 +504,3 @@ def _resumed(machine: Machine, of: Stage) -> Prepared:
     starts = tuple(carried(c, r, p, before.c, model.nominal) for r, p in zip(records, before.starts, strict=True))
     held = dict(zip(of.model.base.names, before.held, strict=True))
     return Prepared(c, before.logs, records, starts, np.array([held.get(n, False) for n in model.base.names]))
-
-
-def _anew(machine: Machine, of: Stage) -> Prepared:
-    """The logs of a stage made ready for a machine with other effects, with sensors as noisy as they are."""
-    return _noisy(_resumed(machine, of), 1.0)

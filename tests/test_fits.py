@@ -17,6 +17,7 @@ from excite import (
     choosing,
     log,
     newton,
+    onsets,
     sensors,
     stages,
 )
@@ -36,7 +37,7 @@ def test_what_a_process_found_can_be_sent_back(straight: Model, straight_motion:
     stage = stages.fitted(straight.machine, [one], straight.machine.filter)
     sloped = placing.extended(straight.machine, placing.parse("ground_slope=0.001", straight.machine, 10.0))
     for disturbed in (0.0, 1.0):
-        (found,) = stages.begun([sloped], stage, disturbed, sent)
+        (found,) = onsets.begun([sloped], stage, disturbed, sent)
         assert found is not None
         assert found.fit.disturbed < max(disturbed, 0.01)
         assert (found.loose is None) == found.exact
@@ -59,14 +60,14 @@ def test_coarse_sensors_are_no_measure_of_how_near_sharp_ones_come(
         return stage.fit
 
     monkeypatch.setattr(stages, "_nearly", nearly)
-    coarse = replace(stage, prepared=stages._noisy(stage.prepared, 10.0))
+    coarse = replace(stage, prepared=stages.noisy(stage.prepared, 10.0))
     coarse = replace(coarse, fit=replace(stage.fit, cost=coarse.noise))
     assert coarse.near
-    assert stages._resume(stage.prepared, coarse, 0.0).cost == stage.fit.cost
+    assert stages.resume(stage.prepared, coarse, 0.0).cost == stage.fit.cost
     assert calls == [0.0, 0.0]
     calls.clear()
     with pytest.raises(newton.NotConverged):
-        stages._resume(stage.prepared, stage, 0.0)
+        stages.resume(stage.prepared, stage, 0.0)
 
 
 def test_ways_that_are_not_needed_are_given_up(straight: Model) -> None:
@@ -227,14 +228,14 @@ def test_smaller_forces_side_by_side_are_the_smallest_that_do(straight: Model, m
 def test_a_stage_is_freed_once(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it was freed beside another fit, that is what it is without its forces."""
     stage, asked = calm(straight), list[float]()
-    true = stages._resume
+    true = stages.resume
 
     def resume(prepared: Any, of: stages.Stage, disturbed: float, *given: Any) -> newton.Fit:
         asked.append(disturbed)
         return true(prepared, of, disturbed, *given)
 
     loose = stages.refitted(straight.machine, stage, 1.0)
-    monkeypatch.setattr(stages, "_resume", resume)
+    monkeypatch.setattr(stages, "resume", resume)
     (plain,) = stages.freed([loose], in_turn)
     assert plain is not None
     sloped = placing.extended(straight.machine, slope(straight))
@@ -334,12 +335,12 @@ def test_what_takes_too_little_of_a_beginning_is_not_fitted_to_the_whole(
     assert stage.exact
     assert stage.excess > 1000
     lengths, _ = fits(monkeypatch)
-    monkeypatch.setattr(stages, "SHORTEST", 5.0)
+    monkeypatch.setattr(onsets, "SHORTEST", 5.0)
     worth, whole = stage.fit.cost - 0.3 * stage.excess, len(one)
     for effect, found in (("torque_deadband@rear_roll=100", True), ("torque_offset_drift@front_roll=0.1", False)):
         lengths.clear()
         machine = placing.extended(straight.machine, placing.parse(effect, straight.machine, 40.0))
-        (made,) = stages.begun([machine], stage, 0.0, in_turn, worth)
+        (made,) = onsets.begun([machine], stage, 0.0, in_turn, worth)
         assert (made is not None) == found
         assert lengths[:2] == [whole // 4] * 2  # without it, and with it
         assert (max(lengths) == whole) == found
@@ -407,7 +408,7 @@ def test_the_whole_log_is_fitted_where_its_beginning_can_be(
     lengths, forces = fits(monkeypatch)
     right = placing.extended(straight.machine, slope(straight))
     wrong = placing.extended(straight.machine, placing.parse("brake_drag@rear_roll=50", straight.machine, 40.0))
-    (good,) = stages.begun([right], stage, 0.0, in_turn)
+    (good,) = onsets.begun([right], stage, 0.0, in_turn)
     assert good is not None
     cost, whole = good.fit.cost, len(one)
     for onset, worth, first, follows in (
@@ -417,20 +418,20 @@ def test_the_whole_log_is_fitted_where_its_beginning_can_be(
         (5.0, cost + 1, whole, True),
         (5.0, cost - 1, whole, False),
     ):
-        monkeypatch.setattr(stages, "SHORTEST", onset)
+        monkeypatch.setattr(onsets, "SHORTEST", onset)
         for machines, found in ((right, follows), (wrong, False)):
             lengths.clear()
-            (made,) = stages.begun([machines], stage, 0.0, in_turn, worth)
+            (made,) = onsets.begun([machines], stage, 0.0, in_turn, worth)
             assert (made is not None and made.near) == found
             assert lengths[0] == first
             assert (max(lengths) == whole) == (found or first == whole)
     # What forces don't bring near isn't either, nor is the whole log fitted where they don't bring its beginning near.
     for onset, first in ((5.0, whole // 4), (30.0, whole)):
-        monkeypatch.setattr(stages, "SHORTEST", onset)
+        monkeypatch.setattr(onsets, "SHORTEST", onset)
         for machines, found in ((right, True), (wrong, False)):
             lengths.clear()
             forces.clear()
-            (made,) = stages.begun([machines], stage, 1.0, in_turn)
+            (made,) = onsets.begun([machines], stage, 1.0, in_turn)
             assert (made is not None) == found
             assert lengths[0] == first
             assert (max(lengths) == whole) == (found or first == whole)
@@ -445,8 +446,8 @@ def test_beside_a_cause_only_that_is_fitted_whose_beginning_tells_that_it_comes_
     one = log.read(sloping, straight.machine)
     stage = stages.fitted(straight.machine, [one], straight.machine.filter)
     lengths, _ = fits(monkeypatch)
-    monkeypatch.setattr(stages, "SHORTEST", 5.0)
-    monkeypatch.setattr(stages, "FAR", np.inf)
+    monkeypatch.setattr(onsets, "SHORTEST", 5.0)
+    monkeypatch.setattr(onsets, "FAR", np.inf)
     right = placing.extended(straight.machine, slope(straight))
     wrong = placing.extended(straight.machine, placing.parse("torque_gain@front_roll=0.1", straight.machine, 40.0))
     for machines, near, enough, tried in (
@@ -459,19 +460,19 @@ def test_beside_a_cause_only_that_is_fitted_whose_beginning_tells_that_it_comes_
         lengths.clear()
         found: list[bool] = []
         whole = [0]
-        for made in stages.begun(machines, stage, 0.0, in_turn, np.inf, lambda k, x, so=enough: so and x.near):
+        for made in onsets.begun(machines, stage, 0.0, in_turn, np.inf, lambda k, x, so=enough: so and x.near):
             found.append(made is not None and made.near)
             whole.append(lengths.count(len(one)))
         assert found == near
         at = machines.index(wrong)
         assert (whole[at + 1] > whole[at]) == tried
     running = {x.pid for x in multiprocessing.active_children()}  # of other tests
-    ways = stages.begun([right, wrong, right], stage, 0.0, forked, np.inf, lambda k, x: x.near)
+    ways = onsets.begun([right, wrong, right], stage, 0.0, forked, np.inf, lambda k, x: x.near)
     assert [x is not None for x in ways] == [True, False, True]
     assert {x.pid for x in multiprocessing.active_children()} <= running
     for felt in (True, False):
         monkeypatch.setattr(choosing, "_felt", lambda name, x, felt=felt: felt and name == "b")
-        (made,) = stages.begun([right], stage, 0.0, in_turn)
+        (made,) = onsets.begun([right], stage, 0.0, in_turn)
         assert made is not None
         assert choosing._settles(["a", "b"], 1, made) == felt
         assert not choosing._settles(["a", "b"], 0, made)
@@ -497,8 +498,8 @@ def test_a_fit_goes_on_without_what_was_not_seen(
     names, unseen = stage.model.base.names, stage.fit.unseen.copy()
     unseen[names.index("u10")] = True
     of = replace(stage, settled=settled, fit=replace(stage.fit, unseen=unseen, disturbed=forces))
-    of = replace(of, prepared=stages._noisy(of.prepared, coarse))
-    more = stages._noisy(stages._resumed(placing.extended(straight.machine, slope(straight)), stage), 1.0)
+    of = replace(of, prepared=stages.noisy(of.prepared, coarse))
+    more = stages.noisy(stages.resumed(placing.extended(straight.machine, slope(straight)), stage), 1.0)
     told = stages._untold(more, of, asked)
     assert [n for n, yes in zip(more.c.model.base.names, told, strict=True) if yes] == (["u10"] if held else [])
 
@@ -549,14 +550,14 @@ def test_what_the_beginning_of_a_log_may_cost(
     log may: three tenths of what is four times as much. What can't be integrated may set out."""
     stage = calm(straight)
     quarter = len(stage.prepared.logs[0]) // 4
-    monkeypatch.setattr(stages, "SHORTEST", quarter / 100)
+    monkeypatch.setattr(onsets, "SHORTEST", quarter / 100)
     asked = iterated(stage, monkeypatch, lambda samples: cost, found)
-    onset = stages._onset(stage, disturbed, np.inf)
+    onset = onsets._onset(stage, disturbed, np.inf)
     assert onset is not None
     # Exact dynamics were asked first where they are far off, and both what they do after a few passes.
     assert (onset.samples, asked[0], asked[-1]) == ((quarter,), quarter, quarter)
     assert (len(asked) == 1) == (disturbed > 0)
-    assert stages._sets_out(stage.prepared, replace(onset, without=np.inf), disturbed) == expected
+    assert onsets._sets_out(stage.prepared, replace(onset, without=np.inf), disturbed) == expected
 
 
 @pytest.mark.parametrize(("cost", "before", "passes"), [(9.0, 9.9, 1), (9.0, 10.1, 2), (2.0, 1.0, 2)])
@@ -567,15 +568,15 @@ def test_what_a_few_passes_show_to_do_nothing_goes_no_further(
     that is given all passes."""
     stage = calm(straight)
     quarter = len(stage.prepared.logs[0]) // 4
-    monkeypatch.setattr(stages, "SHORTEST", quarter / 100)
+    monkeypatch.setattr(onsets, "SHORTEST", quarter / 100)
     told = [before]
     asked = iterated(stage, monkeypatch, lambda samples: told[-1], False)
-    onset = stages._onset(stage, 1.0, np.inf)
+    onset = onsets._onset(stage, 1.0, np.inf)
     assert onset is not None
     assert onset.without == pytest.approx(before * quarter)
     asked.clear()
     told.append(cost)
-    assert stages._sets_out(stage.prepared, onset, 1.0) == (cost < 2.2)
+    assert onsets._sets_out(stage.prepared, onset, 1.0) == (cost < 2.2)
     assert asked == [quarter] * passes
 
 
@@ -585,11 +586,11 @@ def test_a_beginning_tells_where_the_model_as_it_is_stays_far_off(
     """The shortest such one: what stays off it too is no cause. A quarter, where none is up to a half."""
     stage = calm(straight)
     n = len(stage.prepared.logs[0])
-    monkeypatch.setattr(stages, "SHORTEST", n / 400)
+    monkeypatch.setattr(onsets, "SHORTEST", n / 400)
     for late, share in ((0.0, 0.25), (0.3, 0.33), (0.45, 0.5), (0.9, 0.25)):
         with monkeypatch.context() as patch:
             iterated(stage, patch, lambda samples, late=late: 20.0 if samples > late * n else 5.0, False)
-            onset = stages._onset(stage, 0.0, np.inf)
+            onset = onsets._onset(stage, 0.0, np.inf)
         assert onset is not None
         assert onset.samples == (int(share * n),)
 
@@ -610,7 +611,7 @@ def iterated(
             return fit
         raise newton.NotConverged("no fit", fit, 50.0)
 
-    monkeypatch.setattr(stages, "_iterated", fit_of)
+    monkeypatch.setattr(onsets, "iterated", fit_of)
     return asked
 
 
