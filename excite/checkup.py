@@ -21,7 +21,7 @@ from model.prediction import Model, build
 
 MACHINE = "machine.toml"
 NEXT = "next"  # folder of the drive that separates what is tied
-PARTS = 0.8  # of the time that diagnosing takes; the rest measures gains
+PARTS = 0.8  # of the time that diagnosing takes; the rest measures gains and draws
 
 Advance = Callable[[int, int, float | None], None]
 
@@ -72,7 +72,7 @@ def write(
         "notes": [*notes, *_followed(found)],
         "versions": asked.versions(),
     }
-    save(portrait.signals_figure(account, summary["signals"], title), place / "signals.png")
+    save(portrait.signals_figure(summary["signals"], bool(found.stages), title), place / "signals.png")
     return summary, separate.rivals(found)
 
 

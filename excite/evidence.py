@@ -259,7 +259,8 @@ class Signatures:
         return form
 
     def _along(self, at: slice) -> tuple[np.ndarray, np.ndarray]:
-        """What signatures do to the scaled state behind each of K samples (K, n, C), and to readings (K, m, C)."""
+        """What signatures do to the scaled state behind each of K samples (K, n, C), and to readings (K, m, C), none
+        of those that had no bounds so far."""
         c, K = self.way.chart, at.stop - at.start
         to = slice(at.start, at.stop + 1)  # to the end of the last interval
         held = tuple(x[to] for x in self.samples)
@@ -294,7 +295,7 @@ def _slopes(c: Chart, p: Point, u: np.ndarray, X: np.ndarray) -> np.ndarray:
 
 
 def _acting(c: Chart, force: np.ndarray) -> np.ndarray:
-    """Of forces (K, n_q, C) those of actuators, then those on rows without one, as `_slopes` has them."""
+    """Of forces (K, n_q, C) those on rows with an actuator, then those on rows without, in the order of `_slopes`."""
     rows = [*c.model.actuated, *(c.pushed[k] for k in _free(c))]
     return force[:, rows].astype(np.float32)
 

@@ -15,7 +15,7 @@ from excite import gain, misfit, separate
 from excite.choosing import Advance
 from excite.diagnose import Diagnosis, Finding
 from excite.gain import Gain, Withheld
-from excite.misfit import Course
+from excite.misfit import Size
 from excite.sidebyside import Together, in_turn
 from excite.stages import as_measured
 from model.machine import EffectEntry, Machine, shipped
@@ -31,15 +31,15 @@ class Account:
     """What is to be told of a diagnosis.
 
     whole, single: gains of all findings and of each, on stretches that were withheld; None where no model could be
-    fitted to what these leave. before, after: the courses of the logs. located: where the misfit sits. run: what would
-    separate causes that are tied.
+    fitted to what these leave. before, after: how large each signal's innovations are without and with what was found.
+    located: where the misfit sits. run: what would separate causes that are tied.
     """
 
     diagnosis: Diagnosis
     whole: Gain | None
     single: tuple[Gain | None, ...]
-    before: tuple[Course, ...]
-    after: tuple[Course, ...]
+    before: Mapping[str, Size]
+    after: Mapping[str, Size]
     located: tuple[str, ...]
     run: str | None
 
@@ -51,7 +51,7 @@ def account(
     beside: Sequence[Callable[[], None]] = (),
 ) -> Account:
     """Measures gains and locates the misfit. Each finding's gain is that of the model with it over the model with those
-    found before it. beside: what else is to be done of the diagnosis, while there are processes for it."""
+    found before it. beside: further calls, carried out side by side with the measuring."""
     tell = advance or (lambda share, what: None)
     stages = [d.before, *d.stages]
     calls: list[Callable[[], Withheld | None]] = [*beside, *(partial(gain.withheld, s) for s in stages)]
@@ -63,8 +63,8 @@ def account(
     held = done[len(beside) :]
     single = tuple(gain.gain(a, b) for a, b in pairwise(held))
     whole = gain.gain(held[0], held[-1])
-    before = misfit.courses(d.before)
-    after = misfit.courses(d.after) if d.stages else before
+    before = misfit.mean_sizes(misfit.courses(d.before))
+    after = misfit.mean_sizes(misfit.courses(d.after)) if d.stages else before
     located = d.located
     if d.verdict == "unexplained":  # which signals, and how much more than noise there is in them, is in these lines
         measured = as_measured(d.after)
@@ -123,16 +123,15 @@ def _interval(g: Gain | None) -> list[float] | None:
 
 def signals(a: Account) -> dict[str, dict[str, Any]]:
     """Per signal: error on withheld stretches before and after [unit]; what of the innovations is systematic [%]."""
-    before, after = misfit.mean_sizes(a.before), misfit.mean_sizes(a.after)
     rows: dict[str, dict[str, Any]] = {}
-    for name in before:
+    for name in a.before:
         was, now, unit = a.whole.signals[name] if a.whole and name in a.whole.signals else (np.nan, np.nan, "")
         rows[name] = {
             "unit": unit,
             "rms_before": was,
             "rms_after": now,
-            "systematic_before_percent": before[name].systematic_percent,
-            "systematic_after_percent": after[name].systematic_percent,
+            "systematic_before_percent": a.before[name].systematic_percent,
+            "systematic_after_percent": a.after[name].systematic_percent,
         }
     return rows
 

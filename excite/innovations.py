@@ -107,14 +107,14 @@ class White:
     through: np.ndarray
 
 
-def stretches(linear: Linear) -> Iterator[tuple[slice, slice]]:
+def _stretches(linear: Linear) -> Iterator[tuple[slice, slice]]:
     """The log in stretches of some STRETCH samples: which parts each is, and which samples. What is computed along one
     stays near the processor; what is computed along a whole log at once waits for memory."""
     ends = np.cumsum([len(stages) for stages in linear.stages])
     first = begin = 0
     while first < len(ends):
         last = max(first + 1, int(np.searchsorted(ends, begin + STRETCH, "right")))
-        if last == len(ends) - 1:  # the one without transition
+        if last == len(ends) - 1:  # only the last sample is left, behind which there is no transition
             last += 1
         yield slice(first, last), slice(begin, int(ends[last - 1]))
         first, begin = last, int(ends[last - 1])
@@ -127,7 +127,7 @@ def whitened(linear: Linear, flawed: tuple[int, ...]) -> White:
     told = np.concatenate([1 + np.array(flawed, int), np.arange(own - linear.direct.shape[2] + len(flawed), own)])
     E, reach = np.empty((N, m, own), np.float32), np.empty((N, m, n), np.float32)
     begin, through = linear.solved.parts[0].whole.b[0], list[np.ndarray]()
-    for parts, samples in stretches(linear):
+    for parts, samples in _stretches(linear):
         stages = linear.stages[parts]
         K = samples.stop - samples.start
         reading, push = np.zeros((K, m, own + n)), np.zeros((K, n, own + n))
@@ -139,23 +139,23 @@ def whitened(linear: Linear, flawed: tuple[int, ...]) -> White:
         both = _filtered(linear, parts, samples.start, x, push, reading)
         E[samples], reach[samples] = both[:, :, :own], both[:, :, own:]
         through.append(x[:, :, own:])
-        begin = _begun(linear, parts, E[samples], reach[samples], through[-1], x[:, :, :own], begin)
+        begin = _joined(linear, parts, E[samples], reach[samples], through[-1], x[:, :, :own], begin)
     return White(E, reach, np.concatenate(through))
 
 
 def whitened_signatures(
     linear: Linear, white: White, along: Callable[[slice], tuple[np.ndarray, np.ndarray]]
 ) -> Iterator[tuple[slice, np.ndarray]]:
-    """Likewise of signatures, stretch by stretch: which samples these are, and (K, m, C). along: of K samples what
-    signatures do to the scaled state behind each, push (K, n, C), nothing behind the last of the log, and to readings
-    (K, m, C)."""
+    """Likewise of signatures, stretch by stretch: of which K samples, and the white innovations (K, m, C). along: of K
+    samples what signatures do to the scaled state behind each, push (K, n, C), nothing behind the last of the log, and
+    to readings (K, m, C)."""
     begin: np.ndarray | None = None
-    for parts, samples in stretches(linear):
+    for parts, samples in _stretches(linear):
         push, reading = along(samples)
         x = np.zeros((parts.stop - parts.start, *push.shape[1:]))
         E = _filtered(linear, parts, samples.start, x, push, reading)
         begin = np.zeros(push.shape[1:]) if begin is None else begin
-        begin = _begun(linear, parts, E, white.reach[samples], white.through[parts], x, begin)
+        begin = _joined(linear, parts, E, white.reach[samples], white.through[parts], x, begin)
         yield samples, E
 
 
@@ -177,7 +177,7 @@ def _filtered(
     return E
 
 
-def _begun(
+def _joined(
     linear: Linear,
     parts: slice,
     E: np.ndarray,

@@ -7,7 +7,7 @@ missing; the innovations say in which signal and when, and how much of each sign
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,14 +75,15 @@ class Size:
         return 100 * (1 - 1 / worst) if worst > EXCESS else 0.0
 
 
-def loosened(stages: Sequence[Stage]) -> Iterator[Stage]:
-    """The same models with disturbing forces of some size; as they are where those find no fit."""
-    least = smoothing.DISTURBED[0]
-
-    def loose(s: Stage | None) -> Stage | None:
-        return s if s is None or (s.fit.disturbed >= least and s.prepared.coarse == 1) else loose(s.loose)
-
-    return (loose(s) or next(refits([(s.machine, s, least)], in_turn)) or s for s in stages)
+def loosened(stage: Stage) -> Stage:
+    """The same model with disturbing forces of some size; as it is where those find no fit."""
+    least, known = smoothing.DISTURBED[0], stage
+    while known.fit.disturbed < least or known.prepared.coarse > 1:
+        if known.loose is None:
+            (found,) = refits([(stage.machine, stage, least)], in_turn)
+            return found or stage
+        known = known.loose
+    return known
 
 
 def courses(stage: Stage) -> tuple[Course, ...]:

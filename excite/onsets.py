@@ -1,7 +1,7 @@
-"""Fits begun anew: machines with other effects fitted to logs from the beginning.
+"""Fits begun anew: machines with other effects fitted to logs from first guesses.
 
-Most come to nothing. A beginning of the logs tells so in a fraction of the time, and only those that set out on it are
-fitted to the whole.
+Most come to nothing. The first part of each log tells so in a fraction of the time, and only those that set out on it
+are fitted to the whole.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from excite.stages import (
     from_first,
     iterated,
     noisy,
+    prepared_for,
     resume,
-    resumed,
     staged,
     with_forces,
 )
@@ -63,7 +63,7 @@ def begun(
     worth: float = np.inf,
     enough: Callable[[int, Stage], bool] = lambda k, stage: False,
 ) -> Iterator[Stage | None]:
-    """Machines with other effects, each fitted to the logs of a stage from the beginning, with so large disturbing
+    """Machines with other effects, each fitted to the logs of a stage from first guesses, with so large disturbing
     forces or smaller ones, side by side; None where no fit is found. With forces none either where so large ones don't
     bring it near, or its beginning tells that they won't. By exact dynamics none where it costs more than it is worth,
     or its beginning tells that it will, or is FAR off already; where they leave much, with small disturbing forces
@@ -184,7 +184,7 @@ def _plain(machine: Machine, prepared: Prepared, worth: float) -> Fits | None:
     fit = from_first(prepared, 0.0, FAR * prepared.readings, worth)
     if fit is None or fit.cost > worth:
         return None
-    stage = Stage(machine, prepared, fit)
+    stage = staged(machine, prepared, fit)
     if stage.near:
         return fit, None
     try:
@@ -196,4 +196,4 @@ def _plain(machine: Machine, prepared: Prepared, worth: float) -> Fits | None:
 
 def _anew(machine: Machine, of: Stage) -> Prepared:
     """The logs of a stage made ready for a machine with other effects, with sensors as noisy as they are."""
-    return noisy(resumed(machine, of), 1.0)
+    return noisy(prepared_for(machine, of), 1.0)

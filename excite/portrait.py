@@ -15,21 +15,23 @@ from matplotlib.figure import Figure
 from excite import misfit
 from excite.diagnose import Diagnosis
 from excite.figures import COLOURS, plain, save
-from excite.findings import Account
 from excite.misfit import Course
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 SHOWN, WIDE = 3, 4  # torques and forces in a figure, panels side by side
-# In inches: a panel, what its labels take left, below, right and above, the line over the panels of one torque, title
-# and legend. Given, as to measure all labels takes as long as to draw them.
-PANEL, INSET, HEAD, EDGE = (2.9, 1.75), (0.52, 0.4, 0.08, 0.07), 0.3, 0.35
+# Sizes in inches are given, as to measure all labels takes as long as to draw them.
+PANEL = 2.9, 1.8  # with its labels
+INSET = 0.52, 0.4, 0.08, 0.14  # of a panel, that labels take: left, below, right, above
+HEAD = 0.28  # over the panels of one torque or force
+EDGE = 0.35  # for the title, and for the legend
+PLAIN = -3, 4  # powers of ten of the numbers beside an axis that are written as they are
 CLEAR = 4.0  # strength from which a quantity is pointed out
 HIGHEST = 30.0  # mean square of innovations at which the colours end
 
 
 def drawings(place: Path, d: Diagnosis, title: str) -> list[Callable[[], None]]:
-    """Calls that draw into the folder of a diagnosis, for each log, misfit.png and when.png: each has no need of the
-    other, nor of what was gained."""
+    """Calls that draw misfit.png and when.png of each log into the folder of a diagnosis: they need neither one another
+    nor what was gained."""
     return [partial(_drawn, place, d, title, kind) for kind in ("misfit", "when")]
 
 
@@ -38,13 +40,13 @@ def _drawn(place: Path, d: Diagnosis, title: str, kind: str) -> None:
     before, after = d.before, d.after
     if kind == "misfit" and before.exact != after.exact:
         # Forces that the one needs must be shown for the other too.
-        before, after = misfit.loosened((before, after))
-    was = misfit.courses(before)
-    now = misfit.courses(after) if d.stages else [None] * len(was)
+        before, after = misfit.loosened(before), misfit.loosened(after)
+    without = misfit.courses(before)
+    beside = misfit.courses(after) if d.stages else [None] * len(without)
     figure = misfit_figure if kind == "misfit" else when_figure
-    for k, (without, beside) in enumerate(zip(was, now, strict=True)):
-        name = f"{kind}-{k + 1}.png" if len(was) > 1 else f"{kind}.png"
-        save(figure(without, beside, f"{title}: {Path(without.source).name}"), place / name)
+    for k, (old, new) in enumerate(zip(without, beside, strict=True)):
+        name = f"{kind}-{k + 1}.png" if len(without) > 1 else f"{kind}.png"
+        save(figure(old, new, f"{title}: {Path(old.source).name}"), place / name)
 
 
 def misfit_figure(before: Course, after: Course | None, title: str) -> Figure:
@@ -77,14 +79,14 @@ def misfit_figure(before: Course, after: Course | None, title: str) -> Figure:
                 for spine in ax.spines.values():
                     spine.set_linewidth(2.2)
             ax.tick_params(which="both", labelsize=7)
-    names = figure.add_axes((0, 0, 0.001, 0.001))
-    names.axis("off")
-    names.plot([], [], color=BEFORE, label="without what was found" if after is not None else "missing (mean)")
+    key = figure.add_axes((0, 0, 0.001, 0.001))
+    key.axis("off")
+    key.plot([], [], color=BEFORE, label="without what was found" if after is not None else "missing (mean)")
     if after is not None:
-        names.plot([], [], color=AFTER, linestyle="--", label="with it")
+        key.plot([], [], color=AFTER, linestyle="--", label="with it")
     if any(np.isfinite(before.missing[row][2]) for row in rows):
-        names.fill_between([], [], [], color="0.8", label="what noise alone leaves")
-    figure.legend(*names.get_legend_handles_labels(), loc="lower center", ncols=3, fontsize=9, frameon=False)
+        key.fill_between([], [], [], color="0.8", label="what noise alone leaves")
+    figure.legend(*key.get_legend_handles_labels(), loc="lower center", ncols=3, fontsize=9, frameon=False)
     return figure
 
 
@@ -101,6 +103,9 @@ def _against(ax: Axes, before: Course, after: Course | None, row: str, column: s
         if at is not None:
             centre, mean, _ = misfit.binned(at, after.missing[row][0], 0.0)
             ax.plot(centre, mean, color=AFTER, linewidth=1.4, linestyle="--")
+    ax.ticklabel_format(scilimits=PLAIN, useOffset=False)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.get_offset_text().set_fontsize(7)
     ax.set_xlabel(f"{column.replace('_', ' ')} [{before.quantities[column][0]}]", fontsize=8, labelpad=1)
     ax.grid(alpha=0.3)
 
@@ -170,10 +175,10 @@ def _edges(x: np.ndarray) -> np.ndarray:
     return np.arange(17) / 16 * (max(high - low, 1e-9)) + low
 
 
-def signals_figure(a: Account, signals: Mapping[str, Mapping[str, Any]], title: str) -> Figure:
-    """Signal by signal: how much of the error is systematic, and errors on withheld stretches, before and after."""
+def signals_figure(signals: Mapping[str, Mapping[str, Any]], found: bool, title: str) -> Figure:
+    """Signal by signal: how much of the error is systematic, and errors on withheld stretches, before and, if anything
+    was found, after."""
     names = list(signals)
-    found = bool(a.diagnosis.stages)
     figure = Figure(figsize=(11, 0.5 * len(names) + 1.9), layout="constrained")
     figure.suptitle(plain(title), fontsize=11)
     left, right = figure.subplots(1, 2, sharey=True)

@@ -170,7 +170,7 @@ Fits = tuple[Fit, Fit | None]  # of a stage and of the one with larger disturbin
 
 def staged(machine: Machine, prepared: Prepared, fit: Fit, loose: Fit | None = None) -> Stage:
     """A stage from fits: its own, and that with larger disturbing forces that it came from, if it did."""
-    came_from = None if loose is None else Stage(machine, prepared, loose)
+    came_from = None if loose is None else staged(machine, prepared, loose)
     return Stage(machine, prepared, fit, prepared.coarse == 1, came_from)
 
 
@@ -225,7 +225,7 @@ def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float], toget
         fit = next((fit for fit in islice(ways, len(forces)) if fit is not None), None)
         if fit is None:
             return Stage(machine, prepared, next(ways), settled=False)
-    stage = Stage(machine, prepared, fit)
+    stage = staged(machine, prepared, fit)
     return exact_if_near(staged(machine, prepared, *_lessened(stage, together))) if stage.near else stage
 
 
@@ -266,7 +266,7 @@ def sharpened(found: Sequence[Stage], disturbed: float, together: Together) -> I
     prepared = [noisy(x.prepared, 1.0) for x in found]
     calls = [partial(_resumable, p, x, disturbed, FAR * p.readings) for p, x in zip(prepared, found, strict=True)]
     every = zip(prepared, found, ahead(calls, together), strict=True)
-    return (None if fit is None else Stage(x.machine, p, fit) for p, x, fit in every)
+    return (None if fit is None else staged(x.machine, p, fit) for p, x, fit in every)
 
 
 def from_first(
@@ -293,7 +293,7 @@ def with_forces(machine: Machine, prepared: Prepared, disturbed: float, worth: f
     fit = _worthy(prepared, disturbed, worth)
     if fit is None:
         return None
-    stage = Stage(machine, prepared, fit)
+    stage = staged(machine, prepared, fit)
     return _lessened(stage) if stage.near else (fit, None)
 
 
@@ -331,7 +331,7 @@ def _with_less(stage: Stage, together: Together) -> Stage | None:
 def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
     """The model of a machine with other effects fitted to the logs of a stage, from its fit, with so large disturbing
     forces. Raises NotConverged."""
-    prepared = resumed(machine, of)
+    prepared = prepared_for(machine, of)
     return staged(machine, prepared, resume(prepared, of, disturbed))
 
 
@@ -346,7 +346,7 @@ def refits(
 ) -> Iterator[Stage | None]:
     """Several refitted, side by side; None where no fit is found or it is given up, as it still costs more than `most`
     after a few passes. held: of each a parameter that stays at the machine file's value, if any are."""
-    prepared = [resumed(machine, of) for machine, of, _ in wishes]
+    prepared = [prepared_for(machine, of) for machine, of, _ in wishes]
     if held:
         prepared = [_holding(p, name) for p, name in zip(prepared, held, strict=True)]
     calls = [
@@ -359,7 +359,7 @@ def refits(
 def refitted_and_freed(machine: Machine, of: Stage, together: Together) -> tuple[Stage | None, Stage]:
     """The model of a machine with other effects fitted from the fit of a stage, None where no fit is found, and beside
     it the stage itself without its disturbing forces, if it has any and is near, as it will be asked for."""
-    prepared, frees = resumed(machine, of), of.near and not of.exact
+    prepared, frees = prepared_for(machine, of), of.near and not of.exact
     calls = [partial(_resumable, prepared, of, of.fit.disturbed), *([partial(_exact, of)] if frees else [])]
     fit, *bare = together(calls)
     other = None if fit is None else staged(machine, prepared, fit)
@@ -493,7 +493,7 @@ def _prepared(machine: Machine, logs: Sequence[Log], filter: Filter) -> Prepared
     return Prepared(c, tuple(logs), records, starts, hidden.unmoved(c.model, logs, filter, slow=False))
 
 
-def resumed(machine: Machine, of: Stage) -> Prepared:
+def prepared_for(machine: Machine, of: Stage) -> Prepared:
     """The logs of a stage made ready for a machine with other effects."""
     before = of.prepared
     if machine is of.machine:

@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
 import pytest
 from conftest import Excite, calm, designed, gentle, logged, slope
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from excite import (
     amounts,
@@ -465,12 +466,46 @@ def test_an_amount_is_as_unsure_as_shapes_that_a_log_hardly_tells(straight: Mode
 
 def test_a_figure_says_that_nothing_could_be_withheld() -> None:
     """In place of an axis without bars."""
-    account: Any = SimpleNamespace(diagnosis=SimpleNamespace(stages=()))
     for rms, shown in ((1e-3, True), (np.nan, False), (None, False)):
         row = {"unit": "rad", "rms_before": rms, "rms_after": rms, "systematic_before_percent": 40.0}
-        right = portrait.signals_figure(account, {"theta1": row}, "a roller").axes[1]
+        right = portrait.signals_figure({"theta1": row}, False, "a roller").axes[1]
         assert right.axison == shown
         assert any("no fit to the rest" in text.get_text() for text in right.texts) != shown
+
+
+def test_every_log_is_drawn(straight: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forces that only the one model needs are shown for the other too."""
+    logs = [log.check(sensors.measure(straight, gentle(straight, 6.0), seed=k), straight.machine) for k in (3, 4)]
+    without = stages.fitted(straight.machine, logs, straight.machine.filter)
+    beside = replace(without, fit=replace(without.fit, disturbed=1.0))
+    loosened = list[stages.Stage]()
+    monkeypatch.setattr(misfit, "loosened", lambda stage: (loosened.append(stage), beside)[1])
+    for after, asked in ((without, []), (beside, [without, beside])):
+        loosened.clear()
+        d: Any = SimpleNamespace(before=without, after=after, stages=(after,))
+        for draw in portrait.drawings(tmp_path, d, "a roller"):
+            draw()
+        assert all(a is b for a, b in zip(loosened, asked, strict=True))
+        drawn = {p.name for p in tmp_path.iterdir()}
+        assert drawn == {f"{kind}-{k}.png" for kind in ("misfit", "when") for k in (1, 2)}
+
+
+@pytest.mark.parametrize("size", [3e-8, 4e-4, 1.0, 3e5])
+def test_panels_keep_apart_whatever_their_numbers(size: float) -> None:
+    rng, t = np.random.default_rng(0), np.arange(6001) / 100
+    quantities = {n: ("m/s", {"torque u1": size * rng.standard_normal(len(t))}) for n in "abcde"}
+    missing = {"torque u1": (size * rng.standard_normal(len(t)), "N m", size)}
+    course = misfit.Course("log.csv", t, missing, quantities, (), cast(Any, None))
+    figure = portrait.misfit_figure(course, course, "a roller")
+    FigureCanvasAgg(figure).draw()
+    *axes, _ = figure.axes
+    taken = [ax.get_tightbbox().padded(-1) for ax in axes] + [text.get_window_extent() for text in figure.texts]
+    taken += [legend.get_window_extent() for legend in figure.legends]
+    assert len(axes) == 6
+    for k, box in enumerate(taken):
+        assert figure.bbox.fully_containsx(box.x0)
+        assert figure.bbox.fully_containsx(box.x1)
+        assert not any(box.overlaps(other) for other in taken[:k])
 
 
 def test_the_usual_range_of_a_shape(va12: Model) -> None:
@@ -870,7 +905,9 @@ def test_what_is_followed_with_coarse_sensors_only_is_named(
     assert abs(d.findings[0].amount - 0.01) < 2 * d.findings[0].amount_std < 0.001
     assert (d.before.prepared.coarse, d.before.settled) == (followed, False)
     assert (d.after.prepared.coarse, d.after.settled, d.after.exact) == (1, True, True)
-    told = findings.account(d)
+    beside = list[int]()
+    told = findings.account(d, beside=[lambda: beside.append(1)])
+    assert beside == [1]
     assert told.whole is not None
     assert told.whole.interval[0] > 50
     assert told.located == ()
@@ -879,8 +916,8 @@ def test_what_is_followed_with_coarse_sensors_only_is_named(
     said, _ = checkup.write(tmp_path, "va12_straight", straight, [sloping], "machine", lambda *a: None)
     assert any(f"fitted to sensors taken for {followed:g} times as noisy" in note for note in said["notes"])
     # Innovations are held against the sensors' true noise, not that of coarse ones.
-    assert max(size.slow for size in misfit.mean_sizes(told.before).values()) > 20
-    assert max(size.slow for size in misfit.mean_sizes(told.after).values()) < 3
+    assert max(size.slow for size in told.before.values()) > 20
+    assert max(size.slow for size in told.after.values()) < 3
 
 
 def test_a_value_that_is_nothing_can_be_written() -> None:

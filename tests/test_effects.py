@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any, cast
 
 import numpy as np
 import pytest
-from conftest import designed
+from conftest import designed, gentle
 
-from excite import choosing, evidence, log, sensors, stages
+from excite import choosing, evidence, innovations, log, sensors, stages
 from excite.collocation import transcribe
 from excite.diagnose import opposite
 from excite.identify import identify
@@ -772,6 +773,52 @@ def test_noise_of_torques_is_no_gain_and_no_delay() -> None:
     every = evidence.candidates(VA12, [s.name for s in plain.prepared.c.sensors], 60.0)
     scores = evidence.scan(plain.ways, plain.fit, every)
     assert max(s.gain for s in scores if s.candidate.name == "channel_delay@articulation") < 12
+
+
+@pytest.mark.parametrize("samples", [350, 1001, 1201, 2001, 2137])
+def test_stretch_by_stretch_tells_what_the_whole_log_does(
+    samples: int, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever is left over at its end."""
+    way, known = _along(straight, samples)
+    found = evidence.Signatures(way, known).products()
+    monkeypatch.setattr(innovations, "STRETCH", 10**9)
+    once, _ = _along(straight, samples)
+    for name in ("E", "reach", "through"):
+        np.testing.assert_allclose(getattr(way.white, name), getattr(once.white, name), rtol=1e-5, atol=1e-5)
+    off = found - evidence.Signatures(once, known).products()
+    size = np.sqrt(np.diag(found))
+    assert (np.abs(off) <= 1e-4 * np.outer(size, size)).all()
+
+
+@pytest.mark.parametrize("far", [1e30, np.inf, np.nan])
+def test_what_has_no_bounds_tells_nothing_and_spoils_nothing(far: float, straight: Model) -> None:
+    """From wherever on it has none."""
+    way, known = _along(straight, 2137)
+    whole = evidence.Signatures(way, known).products()
+    made = evidence.Signatures(way, known)
+    bounded = made.reading
+
+    def reading(*held: np.ndarray) -> list[np.ndarray]:
+        told = bounded(*held)[0].copy()
+        told[held[4][:, 0] > 15.0, :, 1] = far
+        return [told]
+
+    made.reading = cast(Any, reading)
+    form, own = made.products(), way.white.E.shape[2]
+    assert not form[own + 1].any()
+    assert not form[:, own + 1].any()
+    rest = np.delete(np.arange(len(form)), own + 1)
+    np.testing.assert_array_equal(form[np.ix_(rest, rest)], whole[np.ix_(rest, rest)])
+
+
+def _along(model: Model, samples: int) -> tuple[evidence.Way, list[evidence.Candidate]]:
+    """A fitted log without anything hidden, and some candidates."""
+    one = log.check(sensors.measure(model, gentle(model, (samples - 1) / 100), seed=3), model.machine)
+    stage = stages.fitted(model.machine, [one], model.machine.filter)
+    names = "ground_slope", "torque_gain", "measuring_wheel_radius"
+    every = evidence.candidates(model.machine, [s.name for s in stage.prepared.c.sensors], samples / 100)
+    return stage.ways[0], evidence.renumbered([x for x in every if x.placed.effect.name in names])
 
 
 @pytest.mark.parametrize("duration", [2.0, 5.0, 7.0, 10.0, 12.0, 15.0, 60.0])

@@ -499,7 +499,7 @@ def test_a_fit_goes_on_without_what_was_not_seen(
     unseen[names.index("u10")] = True
     of = replace(stage, settled=settled, fit=replace(stage.fit, unseen=unseen, disturbed=forces))
     of = replace(of, prepared=stages.noisy(of.prepared, coarse))
-    more = stages.noisy(stages.resumed(placing.extended(straight.machine, slope(straight)), stage), 1.0)
+    more = stages.noisy(stages.prepared_for(placing.extended(straight.machine, slope(straight)), stage), 1.0)
     told = stages._untold(more, of, asked)
     assert [n for n, yes in zip(more.c.model.base.names, told, strict=True) if yes] == (["u10"] if held else [])
 
