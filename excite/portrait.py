@@ -24,7 +24,7 @@ PANEL = 2.9, 1.8  # with its labels
 INSET = 0.52, 0.4, 0.08, 0.14  # of a panel, that labels take: left, below, right, above
 HEAD = 0.28  # over the panels of one torque or force
 EDGE = 0.35  # for the title, and for the legend
-PLAIN = -3, 4  # powers of ten of the numbers beside an axis that are written as they are
+PLAIN = -3, 5  # powers of ten of the numbers beside an axis that are written as they are
 CLEAR = 4.0  # strength from which a quantity is pointed out
 HIGHEST = 30.0  # mean square of innovations at which the colours end
 
@@ -103,6 +103,7 @@ def _against(ax: Axes, before: Course, after: Course | None, row: str, column: s
         if at is not None:
             centre, mean, _ = misfit.binned(at, after.missing[row][0], 0.0)
             ax.plot(centre, mean, color=AFTER, linewidth=1.4, linestyle="--")
+    ax.locator_params("x", nbins=6, steps=(1, 2, 5, 10))
     ax.ticklabel_format(scilimits=PLAIN, useOffset=False)
     for axis in (ax.xaxis, ax.yaxis):
         axis.get_offset_text().set_fontsize(7)
