@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 
 from excite import chain
+from excite.linearise import BATCH
 
 SLOW = 25  # readings whose mean counts as slow
-STRETCH = 1000  # samples that are computed along at once
 
 
 @dataclass(frozen=True)
@@ -108,14 +108,11 @@ class White:
 
 
 def _stretches(linear: Linear) -> Iterator[tuple[slice, slice]]:
-    """The log in stretches of some STRETCH samples: which parts each is, and which samples. What is computed along one
-    stays near the processor; what is computed along a whole log at once waits for memory."""
+    """The log in stretches of some BATCH samples: which parts each is, and which samples."""
     ends = np.cumsum([len(stages) for stages in linear.stages])
     first = begin = 0
     while first < len(ends):
-        last = max(first + 1, int(np.searchsorted(ends, begin + STRETCH, "right")))
-        if last == len(ends) - 1:  # only the last sample is left, behind which there is no transition
-            last += 1
+        last = max(first + 1, int(np.searchsorted(ends, begin + BATCH, "right")))
         yield slice(first, last), slice(begin, int(ends[last - 1]))
         first, begin = last, int(ends[last - 1])
 
@@ -149,12 +146,11 @@ def whitened_signatures(
     """Likewise of signatures, stretch by stretch: of which K samples, and the white innovations (K, m, C). along: of K
     samples what signatures do to the scaled state behind each, push (K, n, C), nothing behind the last of the log, and
     to readings (K, m, C)."""
-    begin: np.ndarray | None = None
+    begin = np.zeros((linear.H.shape[2], 1))
     for parts, samples in _stretches(linear):
         push, reading = along(samples)
         x = np.zeros((parts.stop - parts.start, *push.shape[1:]))
         E = _filtered(linear, parts, samples.start, x, push, reading)
-        begin = np.zeros(push.shape[1:]) if begin is None else begin
         begin = _joined(linear, parts, E, white.reach[samples], white.through[parts], x, begin)
         yield samples, E
 

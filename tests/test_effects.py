@@ -782,7 +782,7 @@ def test_stretch_by_stretch_tells_what_the_whole_log_does(
     """Whatever is left over at its end."""
     way, known = _along(straight, samples)
     found = evidence.Signatures(way, known).products()
-    monkeypatch.setattr(innovations, "STRETCH", 10**9)
+    monkeypatch.setattr(innovations, "BATCH", 10**9)
     once, _ = _along(straight, samples)
     for name in ("E", "reach", "through"):
         np.testing.assert_allclose(getattr(way.white, name), getattr(once.white, name), rtol=1e-5, atol=1e-5)
