@@ -41,6 +41,7 @@ ENOUGH = 0.2  # a step, in standard deviations, at which a fit is found whose de
 TURNED, SHARE, SLOW = 0.7, 1.15, 0.3
 STRONG = 1.3  # misfit over what noise makes of it from which a fit isn't near the logs, and first-order gains are rough
 FREE = 0.05  # of a parameter's size, in the last step: it is hardly known
+END = 0.1  # standard deviations above zero, below which what makes sense there only is at its end
 ALONG = 0.9  # cosine between two steps that go the same way
 LARGEST_STEP = 0.5  # of a parameter in one pass, relative to its size
 # Where a step was cut short and the next pass asks for the rest of it, but for a share AGAIN of what was gone, the way
@@ -269,6 +270,9 @@ def iterate(
                 # Left free they would go anywhere, and take the mass matrix and the slips with them.
                 known = prior(model, unseen, X)
                 covariance, move, left, cost = newton_step(c, records, linear, points, X, known, damping)
+        ended = _ended(c, X, unseen, covariance, move[0])
+        if ended.any():
+            _, move, left, cost = newton_step(c, records, linear, points, X, known, damping, ended)
         damping *= DAMPING[1]
         before, step = step, left
         latest = X, covariance, unseen, known, points, cost
@@ -370,6 +374,15 @@ def _unseen(
     return found
 
 
+def _ended(c: Chart, X: np.ndarray, unseen: np.ndarray, covariance: np.ndarray, move: np.ndarray) -> np.ndarray:
+    """Parameters (n_base,) that make sense above zero only, are hardly above it, and would go below in this step: the
+    logs like them best at their end, where the others have a place of their own (active set)."""
+    model = c.model
+    value, sigma = X / model.scale, np.sqrt(np.diag(covariance))[: len(X)]
+    below = (value < END * sigma) & (value + move[: len(X)] < 0)
+    return np.asarray(model.positive & ~unseen & below)
+
+
 def _idle(steps: Sequence[float], costs: Sequence[float]) -> bool:
     """Whether steps have ceased to shrink: swing about an answer as good as found, or far from any while costs have
     ceased to fall."""
@@ -417,11 +430,12 @@ def newton_step(
     X: np.ndarray,
     prior: np.ndarray,
     damping: float,
+    still: np.ndarray | None = None,
 ) -> tuple[np.ndarray, list[np.ndarray], float, float]:
     """Covariance of all parameters and offsets (scaled), the step of those of each log, the largest of a parameter in
     standard deviations as it would be undamped, of one that isn't held where there is one, and the cost behind that
     step. Damping (Levenberg): what a log shows badly moves in small steps while the rest is still wrong. prior
-    (n_base,): information about nominal."""
+    (n_base,): information about nominal. still (n_base,): parameters that stay where they are."""
     n, found_at = len(X), places(c, records)
     size = n + sum(len(r.origin) for r in records)
     information, slope = np.zeros((size, size)), np.zeros(size)
@@ -429,6 +443,10 @@ def newton_step(
     off = (X - c.model.nominal) / c.model.scale
     slope[:n] = prior * off
     cost = float(prior @ off**2)
+    free = prior < HELD**-2
+    if still is not None:
+        information[range(n), range(n)] += still * HELD**-2
+        free &= ~still
     for found, r, p, place in zip(linear, records, points, found_at, strict=True):
         information[np.ix_(place, place)] += found.Z[1:, 1:]
         slope[place] += found.Z[1:, 0]
@@ -441,7 +459,6 @@ def newton_step(
     if not (np.diag(covariance) > 0).all():
         raise NotConverged("joint smoothing lost its numbers: check the log with `excite log check`")
     sigma = np.sqrt(np.diag(covariance))[:n]
-    free = prior < HELD**-2
     left = float(np.abs((covariance @ slope)[:n] / sigma)[free if free.any() else slice(None)].max())
     cost -= float(slope @ covariance @ slope)
     information[range(n), range(n)] += damping

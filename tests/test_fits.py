@@ -382,6 +382,19 @@ def test_what_is_held_is_where_it_is_held_a_pass_later(straight: Model, monkeypa
         assert failed.value.nearly is None or not told
 
 
+def test_what_makes_sense_above_zero_only_ends_there(straight: Model) -> None:
+    """A log that would like an amount best below zero has it at zero, all others where they are without it."""
+    stage = calm(straight)
+    effect = placing.parse("torque_deadband@front_roll=20", straight.machine, 10.0)
+    machine = placing.extended(straight.machine, effect)
+    p, without = stages.prepared_for(machine, stage), stage.fit
+    fit = stages.iterated(p, p.starts, p.c.model.nominal, 0.0, patient=True)
+    (amount,) = (k for k, name in enumerate(p.c.model.base.names) if name not in straight.base.names)
+    assert 0 < fit.X[amount] < newton.END * fit.std[amount]
+    assert abs(fit.cost - without.cost) < 0.2
+    assert (np.abs(np.delete(fit.X, amount) - without.X) < 0.1 * without.std).all()
+
+
 def test_a_step_that_was_cut_short_goes_further_when_it_is_told_again(
     straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
