@@ -71,6 +71,7 @@ MAIN = 0.3
 SHARE = 0.7  # of the excess misfit beside coarse sensors, from which a fit with sharp ones is worth disturbing forces
 FORCED = 0.02  # of what is gained with disturbing forces, by which a rival is a tie: they take up part of a difference
 NEAR = 0.3  # of what the best name leaves unexplained, by which a rival may be worse and still is a tie
+NONE = 0.1  # deviations above zero, below which an amount that makes sense there only is none
 TINY = 1e-12  # what a machine file can't hold is nothing
 Advance = Callable[[float, str], None]  # told the share that is done and what is done next
 _Try = tuple[evidence.Score, Stage]
@@ -385,7 +386,7 @@ def _followed(
         enough = partial(_settles, [s.candidate.name for s, _ in begin])
         found = begun([m for _, m in begin], stage, disturbed, together, worth, enough)
         follow = [(s, x) for (s, _), x in zip(begin, found, strict=True) if x is not None and x.follows]
-        follow = [(s, x) for s, x in follow if _felt(s.candidate.name, x)]
+        follow = [(s, x) for s, x in follow if _is_any(s.candidate.name, x)]
         if not follow:
             continue
         tries = _one_each([x for x in follow if x[1].near] or follow)
@@ -406,7 +407,7 @@ def _followed(
 
 def _settles(names: Sequence[str], k: int, stage: Stage) -> bool:
     """Whether one of several effects, begun anew, is a cause: beside it only what brings the model as near is any."""
-    return stage.near and stage.exact and _felt(names[k], stage)
+    return stage.near and stage.exact and _is_any(names[k], stage)
 
 
 def _least(stage: Stage, chosen: Sequence[Choice], candidate: evidence.Candidate, hidden: float = HIDDEN) -> float:
@@ -459,9 +460,11 @@ def _tries(
         most = min(ceiling, stage.fit.cost - BEHIND * gained if tries else np.inf)
         for k, (score, found) in enumerate(zip(batch, refits(wishes, together, most), strict=True)):
             tell(min(at + k + 1, len(likely) - 1))
-            if found is not None and _felt(score.candidate.name, found):
+            if found is None or _vanished(score.candidate.name, found):
+                continue
+            if _felt(score.candidate.name, found):
                 tries.append((score, found))
-            elif found is not None:
+            else:
                 refused.add(score.candidate.name)
         others = likely[at + len(batch) :]
         if stage.exact and _lost(likely, tries, refused) and likely[0].candidate.name not in _names(others):
@@ -495,6 +498,17 @@ def _felt(name: str, stage: Stage) -> bool:
         return True
     told = [shakes(x.values[sensor.name], fitted.shaking(x.t), rate) for x in stage.prepared.logs]
     return any(told) or all(x is None for x in told)
+
+
+def _vanished(name: str, stage: Stage) -> bool:
+    """Whether a fit led an effect that makes sense above zero only to zero: that was no way to what it promised."""
+    effect, fit, k = stage.placed(name).effect, stage.fit, stage.model.base.names.index(name)
+    return effect.positive and not effect.inverse and not fit.unseen[k] and bool(fit.X[k] < NONE * fit.std[k])
+
+
+def _is_any(name: str, stage: Stage) -> bool:
+    """Whether an effect in a fit is one at all."""
+    return not _vanished(name, stage) and _felt(name, stage)
 
 
 def _one_each(tries: Sequence[_Try]) -> list[_Try]:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from excite import chain
 from excite.estimate import NoEstimate
@@ -41,7 +42,7 @@ ENOUGH = 0.2  # a step, in standard deviations, at which a fit is found whose de
 TURNED, SHARE, SLOW = 0.7, 1.15, 0.3
 STRONG = 1.3  # misfit over what noise makes of it from which a fit isn't near the logs, and first-order gains are rough
 FREE = 0.05  # of a parameter's size, in the last step: it is hardly known
-END = 0.1  # standard deviations above zero, below which what makes sense there only is at its end
+DOWN = 0.8  # of a parameter that makes sense above zero only, by which it goes down in one pass at most
 ALONG = 0.9  # cosine between two steps that go the same way
 LARGEST_STEP = 0.5  # of a parameter in one pass, relative to its size
 # Where a step was cut short and the next pass asks for the rest of it, but for a share AGAIN of what was gone, the way
@@ -270,9 +271,6 @@ def iterate(
                 # Left free they would go anywhere, and take the mass matrix and the slips with them.
                 known = prior(model, unseen, X)
                 covariance, move, left, cost = newton_step(c, records, linear, points, X, known, damping)
-        ended = _ended(c, X, unseen, covariance, move[0])
-        if ended.any():
-            _, move, left, cost = newton_step(c, records, linear, points, X, known, damping, ended)
         damping *= DAMPING[1]
         before, step = step, left
         latest = X, covariance, unseen, known, points, cost
@@ -314,9 +312,7 @@ def iterate(
         for m in move:
             # What is held from now on goes back to its value at once, and the others along as far as they may.
             own = np.clip(share * m[: len(X)], -limit, limit)
-            # Amounts that make sense above zero only stay there.
-            low = np.where(model.positive, -0.8 * X / model.scale, -np.inf)
-            m[: len(X)] = np.where(unseen, m[: len(X)], np.maximum(own, low))
+            m[: len(X)] = np.where(unseen, m[: len(X)], np.maximum(own, _lowest(model, X)))
         gone = move[0][: len(X)]
         rest = np.where(np.abs(share * wanted) > limit, wanted - gone, 0.0)
         there = (
@@ -374,15 +370,6 @@ def _unseen(
     return found
 
 
-def _ended(c: Chart, X: np.ndarray, unseen: np.ndarray, covariance: np.ndarray, move: np.ndarray) -> np.ndarray:
-    """Parameters (n_base,) that make sense above zero only, are hardly above it, and would go below in this step: the
-    logs like them best at their end, where the others have a place of their own (active set)."""
-    model = c.model
-    value, sigma = X / model.scale, np.sqrt(np.diag(covariance))[: len(X)]
-    below = (value < END * sigma) & (value + move[: len(X)] < 0)
-    return np.asarray(model.positive & ~unseen & below)
-
-
 def _idle(steps: Sequence[float], costs: Sequence[float]) -> bool:
     """Whether steps have ceased to shrink: swing about an answer as good as found, or far from any while costs have
     ceased to fall."""
@@ -430,12 +417,12 @@ def newton_step(
     X: np.ndarray,
     prior: np.ndarray,
     damping: float,
-    still: np.ndarray | None = None,
 ) -> tuple[np.ndarray, list[np.ndarray], float, float]:
     """Covariance of all parameters and offsets (scaled), the step of those of each log, the largest of a parameter in
     standard deviations as it would be undamped, of one that isn't held where there is one, and the cost behind that
-    step. Damping (Levenberg): what a log shows badly moves in small steps while the rest is still wrong. prior
-    (n_base,): information about nominal. still (n_base,): parameters that stay where they are."""
+    step. Damping (Levenberg): what a log shows badly moves in small steps while the rest is still wrong. Parameters
+    that make sense above zero only stay there, and the others go where they are best beside them; the covariance knows
+    no such ends. prior (n_base,): information about nominal."""
     n, found_at = len(X), places(c, records)
     size = n + sum(len(r.origin) for r in records)
     information, slope = np.zeros((size, size)), np.zeros(size)
@@ -443,10 +430,6 @@ def newton_step(
     off = (X - c.model.nominal) / c.model.scale
     slope[:n] = prior * off
     cost = float(prior @ off**2)
-    free = prior < HELD**-2
-    if still is not None:
-        information[range(n), range(n)] += still * HELD**-2
-        free &= ~still
     for found, r, p, place in zip(linear, records, points, found_at, strict=True):
         information[np.ix_(place, place)] += found.Z[1:, 1:]
         slope[place] += found.Z[1:, 0]
@@ -458,12 +441,36 @@ def newton_step(
     covariance = np.linalg.inv(information)
     if not (np.diag(covariance) > 0).all():
         raise NotConverged("joint smoothing lost its numbers: check the log with `excite log check`")
-    sigma = np.sqrt(np.diag(covariance))[:n]
-    left = float(np.abs((covariance @ slope)[:n] / sigma)[free if free.any() else slice(None)].max())
-    cost -= float(slope @ covariance @ slope)
+    sigma, free = np.sqrt(np.diag(covariance))[:n], prior < HELD**-2
+    lowest = np.full(size, -np.inf)
+    lowest[:n] = np.where(free, _lowest(c.model, X), -np.inf)
+    undamped = _above(lowest, -covariance @ slope, information, slope)
+    left = float(np.abs(undamped[:n] / sigma)[free if free.any() else slice(None)].max())
+    cost += float(2 * slope @ undamped + undamped @ information @ undamped)
     information[range(n), range(n)] += damping
-    step = -np.linalg.solve(information, slope)
+    step = _above(lowest, -np.linalg.solve(information, slope), information, slope)
     return covariance, [step[place] for place in found_at], left, cost
+
+
+def _lowest(model: Model, X: np.ndarray) -> np.ndarray:
+    """Steps (n_base,), scaled, below which no parameter goes in one pass: what makes sense above zero only stays
+    there."""
+    return np.where(model.positive, -DOWN * X / model.scale, -np.inf)
+
+
+def _above(lowest: np.ndarray, free: np.ndarray, information: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """The step (n,) to the lowest place that a cost of such information (n, n) and slope (n,) has where no step is
+    below its lowest: the free one, where it is so everywhere. That cut short, where information has no root."""
+    if (free >= lowest).all():
+        return free
+    size = np.sqrt(np.diag(information))
+    try:
+        root = np.linalg.cholesky(information / np.outer(size, size))
+    except np.linalg.LinAlgError:
+        return np.maximum(free, lowest)
+    target = -scipy.linalg.solve_triangular(root, slope / size, lower=True)
+    found = scipy.optimize.lsq_linear(root.T, target, (lowest * size, np.inf), method="bvls", tol=1e-12)
+    return np.asarray(found.x / size)
 
 
 def places(c: Chart, records: Sequence[Record]) -> list[np.ndarray]:

@@ -758,6 +758,7 @@ def test_where_no_way_to_the_likeliest_cause_is_found_no_others_are_tried(
 
     monkeypatch.setattr(choosing, "refits", refits)
     monkeypatch.setattr(choosing, "_felt", lambda name, of: True)
+    monkeypatch.setattr(choosing, "_vanished", lambda name, of: False)
     choosing._tries(stage, likely, in_turn, lambda k: None)
     assert len(wished) == asked
 
