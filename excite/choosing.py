@@ -71,7 +71,7 @@ MAIN = 0.3
 SHARE = 0.7  # of the excess misfit beside coarse sensors, from which a fit with sharp ones is worth disturbing forces
 FORCED = 0.02  # of what is gained with disturbing forces, by which a rival is a tie: they take up part of a difference
 NEAR = 0.3  # of what the best name leaves unexplained, by which a rival may be worse and still is a tie
-NONE = 0.1  # deviations above zero, below which an amount that makes sense there only is none
+NONE = 0.3  # deviations above zero, below which a fit ends where the logs would like an amount best below zero
 TINY = 1e-12  # what a machine file can't hold is nothing
 Advance = Callable[[float, str], None]  # told the share that is done and what is done next
 _Try = tuple[evidence.Score, Stage]
@@ -172,7 +172,9 @@ def entry_of(stage: Stage, name: str) -> EffectEntry:
     """An effect with amount and shapes as a stage's fit has them."""
     placed = stage.placed(name)
     values = _values(stage, placed)
-    return identified(placed.effect.name, placed.where, values.pop("A"), values)
+    amount = values.pop("A")
+    amount = max(amount, 2 * TINY) if placed.effect.positive else amount  # zero is none that a machine may have
+    return identified(placed.effect.name, placed.where, amount, values)
 
 
 def _values(stage: Stage, placed: Placed) -> dict[str, float]:
@@ -328,6 +330,7 @@ def sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None
     for disturbed in (0.0, smoothing.DISTURBED[0]) if gain >= SHARE * (gain + best.excess) else (0.0,):
         sharp = zip(alike, sharpened([x for _, x in alike], disturbed, together), strict=True)
         found = [(score, x) for (score, _), x in sharp if x is not None and x.follows]
+        found = [(score, x) for score, x in found if not _vanished(score.candidate.name, x)]
         follow = follow or found
         if near := _one_each([x for x in found if x[1].near]):
             follow = near
@@ -447,7 +450,8 @@ def _tries(
 ) -> tuple[list[_Try], set[str]]:
     """The candidates whose fits were found, as the model without them was fitted: the likeliest two first, the others
     as long as they don't stay far behind what these gain. Those that promise far less than the best come last, and only
-    where they may still come near what was gained. And the names that were fitted and are none: they are not felt.
+    where they may still come near what was gained. No fit was found of what it led to zero. And the names that were
+    fitted and are none: they are not felt.
     ceiling: cost that no fit may stay above."""
     tries, refused = list[_Try](), set[str]()
     near = max(PAIR, sum(OVER * s.gain >= likely[0].gain for s in likely))
@@ -538,5 +542,6 @@ def _without_forces(tries: Sequence[_Try], together: Together) -> tuple[list[_Tr
     good = [x for x in tries if x[1].exact or x[1].near]
     without = freed([s for _, s in good if not s.exact], together)
     found = [(x, x[1] if x[1].exact else next(without)) for x in good]
+    found = [(x, None if s is None or _vanished(x[0].candidate.name, s) else s) for x, s in found]
     exact = [(score, stage) for (score, _), stage in found if stage is not None]
     return sorted(exact, key=lambda x: x[1].fit.cost), [x for x, stage in found if stage is None]

@@ -15,7 +15,7 @@ import numpy as np
 
 from excite.innovations import Linear
 from excite.linearise import Chart
-from excite.newton import Fit, NotConverged, in_si, linearised, moved, newton_step, places
+from excite.newton import DOWN, Fit, NotConverged, in_si, linearised, moved, newton_step, places
 from excite.record import Point, Record, readings
 
 PHASES = 64  # places between two edges at which an encoder's count may begin, to average over
@@ -37,7 +37,7 @@ def sure(
     above (2, n_base) [SI]; and what to say of them."""
     linear = linearised(c, records, fit.points, starts, fit.X, fit.disturbed)
     fit = fit if linear is None else replace(fit, linear=tuple(linear))  # the last step was one from elsewhere
-    covariance, _, _, cost = newton_step(c, records, fit.linear, fit.points, fit.X, fit.prior, 0.0)
+    covariance, _, _, cost = newton_step(c, records, fit.linear, fit.points, fit.X, fit.prior, 0.0, bounded=False)
     n = len(fit.X)
     added = np.zeros_like(covariance)
     for r, p, found, place in zip(records, fit.points, fit.linear, places(c, records), strict=True):
@@ -145,6 +145,8 @@ def followed(
     widths = []
     for far in (-FOLLOWED, FOLLOWED):
         X = fit.X + far * step[:n] * c.model.scale
+        # What may as well be nothing has no part in the combination.
+        X = np.where(c.model.positive & (way[:n] == 0), np.maximum(X, (1 - DOWN) * fit.X), X)
         if not (X[c.model.positive] > 0).all():
             return 1.0, 1.0
         points = [
@@ -155,7 +157,7 @@ def followed(
         if linear is None:
             return 1.0, 1.0
         try:
-            there, steps, _, cost = newton_step(c, records, linear, points, X, fit.prior, 0.0)
+            there, steps, _, cost = newton_step(c, records, linear, points, X, fit.prior, 0.0, bounded=False)
         except (NotConverged, np.linalg.LinAlgError):
             return 1.0, 1.0
         if not np.isfinite(cost):

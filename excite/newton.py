@@ -312,6 +312,7 @@ def iterate(
         for m in move:
             # What is held from now on goes back to its value at once, and the others along as far as they may.
             own = np.clip(share * m[: len(X)], -limit, limit)
+            # A lengthened step, or a rounded one, may go below the lowest that it was computed for.
             m[: len(X)] = np.where(unseen, m[: len(X)], np.maximum(own, _lowest(model, X)))
         gone = move[0][: len(X)]
         rest = np.where(np.abs(share * wanted) > limit, wanted - gone, 0.0)
@@ -417,12 +418,13 @@ def newton_step(
     X: np.ndarray,
     prior: np.ndarray,
     damping: float,
+    bounded: bool = True,
 ) -> tuple[np.ndarray, list[np.ndarray], float, float]:
     """Covariance of all parameters and offsets (scaled), the step of those of each log, the largest of a parameter in
     standard deviations as it would be undamped, of one that isn't held where there is one, and the cost behind that
-    step. Damping (Levenberg): what a log shows badly moves in small steps while the rest is still wrong. Parameters
-    that make sense above zero only stay there, and the others go where they are best beside them; the covariance knows
-    no such ends. prior (n_base,): information about nominal."""
+    step. Damping (Levenberg): what a log shows badly moves in small steps while the rest is still wrong. Where it is
+    `bounded`, parameters that make sense above zero only go down by DOWN at most, and the others where they are best
+    beside them; the covariance knows no such ends. prior (n_base,): information about nominal."""
     n, found_at = len(X), places(c, records)
     size = n + sum(len(r.origin) for r in records)
     information, slope = np.zeros((size, size)), np.zeros(size)
@@ -441,11 +443,12 @@ def newton_step(
     covariance = np.linalg.inv(information)
     if not (np.diag(covariance) > 0).all():
         raise NotConverged("joint smoothing lost its numbers: check the log with `excite log check`")
-    sigma, free = np.sqrt(np.diag(covariance))[:n], prior < HELD**-2
+    sigma, told = np.sqrt(np.diag(covariance))[:n], prior < HELD**-2
     lowest = np.full(size, -np.inf)
-    lowest[:n] = np.where(free, _lowest(c.model, X), -np.inf)
+    if bounded:
+        lowest[:n] = np.where(told, _lowest(c.model, X), -np.inf)
     undamped = _above(lowest, -covariance @ slope, information, slope)
-    left = float(np.abs(undamped[:n] / sigma)[free if free.any() else slice(None)].max())
+    left = float(np.abs(undamped[:n] / sigma)[told if told.any() else slice(None)].max())
     cost += float(2 * slope @ undamped + undamped @ information @ undamped)
     information[range(n), range(n)] += damping
     step = _above(lowest, -np.linalg.solve(information, slope), information, slope)
@@ -460,8 +463,8 @@ def _lowest(model: Model, X: np.ndarray) -> np.ndarray:
 
 def _above(lowest: np.ndarray, free: np.ndarray, information: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """The step (n,) to the lowest place that a cost of such information (n, n) and slope (n,) has where no step is
-    below its lowest: the free one, where it is so everywhere. That cut short, where information has no root."""
-    if (free >= lowest).all():
+    below its lowest: the free one, where that is nowhere below. That clipped, where information has no root."""
+    if (free >= lowest).all() or not np.isfinite(free).all():
         return free
     size = np.sqrt(np.diag(information))
     try:

@@ -763,6 +763,34 @@ def test_where_no_way_to_the_likeliest_cause_is_found_no_others_are_tried(
     assert len(wished) == asked
 
 
+def test_what_a_fit_leads_to_zero_is_no_way_to_a_cause(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither tried nor refused: as if the fit hadn't been found."""
+    stage = calm(straight)
+    likely = [s for s in choosing.scored(stage, in_turn) if s.values["A"] != 0][:1]
+    (name,) = (s.candidate.name for s in likely)
+    monkeypatch.setattr(choosing, "refits", lambda wishes, *given: [stage])
+    monkeypatch.setattr(choosing, "_felt", lambda name, of: True)
+    for zero in (True, False):
+        monkeypatch.setattr(choosing, "_vanished", lambda name, of, zero=zero: zero)
+        tries, refused = choosing._tries(stage, likely, in_turn, lambda k: None)
+        assert [s.candidate.name for s, _ in tries] == ([] if zero else [name])
+        assert not refused
+        assert choosing._lost(likely, tries, refused) == zero
+        exact, unknown = choosing._without_forces([(likely[0], stage)], in_turn)
+        assert (len(exact), len(unknown)) == ((0, 1) if zero else (1, 0))
+        assert choosing._is_any(name, stage) != zero
+
+
+def test_an_amount_at_zero_can_be_written(straight: Model) -> None:
+    """As a machine may have it: zero of what makes sense above it only is refused."""
+    machine = placing.extended(straight.machine, placing.parse("torque_deadband@front_roll=20", straight.machine, 10.0))
+    stage = calm(prediction.build(machine))
+    k = stage.model.base.names.index("torque_deadband@front_roll")
+    X = np.where(np.arange(len(stage.fit.X)) == k, 1e-15, stage.fit.X)
+    entry = choosing.entry_of(replace(stage, fit=replace(stage.fit, X=X)), "torque_deadband@front_roll")
+    assert placing.extended(straight.machine, entry).effect
+
+
 def test_stretches_are_withheld_from_fits_that_are_near_enough(
     straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:

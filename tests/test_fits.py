@@ -428,6 +428,10 @@ def test_steps_within_bounds_are_the_best_there_are(alike: float) -> None:
                 best, least = step, cost
         found = newton._above(lowest, -np.linalg.solve(information, slope), information, slope)
         np.testing.assert_allclose(found, best, atol=1e-9)
+    unknown = np.full(3, np.nan)
+    np.testing.assert_array_equal(newton._above(lowest, unknown, information, unknown), unknown)
+    without_root = np.eye(3) + 2 * (np.eye(3, k=1) + np.eye(3, k=-1))
+    np.testing.assert_array_equal(newton._above(lowest, np.full(3, -1.0), without_root, slope), [-0.1, -0.2, -1.0])
 
 
 def test_a_step_that_was_cut_short_goes_further_when_it_is_told_again(
