@@ -15,7 +15,7 @@ import numpy as np
 
 from excite.innovations import Linear
 from excite.linearise import Chart
-from excite.newton import DOWN, Fit, NotConverged, in_si, linearised, moved, newton_step, places
+from excite.newton import Fit, NotConverged, in_si, linearised, moved, newton_step, places
 from excite.record import Point, Record, readings
 
 PHASES = 64  # places between two edges at which an encoder's count may begin, to average over
@@ -27,6 +27,7 @@ FLAT = (
     "the likelihood of {} is nearly flat to one side, so the intervals of these are as wide as it was followed, not as"
     " wide as they should be: a drive that shows them better tells more"
 )
+HARDLY = 0.1  # deviations above zero
 MOST = 0.5  # of the largest part in a combination of parameters, from which one is told as part of it
 
 
@@ -37,15 +38,20 @@ def sure(
     above (2, n_base) [SI]; and what to say of them."""
     linear = linearised(c, records, fit.points, starts, fit.X, fit.disturbed)
     fit = fit if linear is None else replace(fit, linear=tuple(linear))  # the last step was one from elsewhere
-    covariance, _, _, cost = newton_step(c, records, fit.linear, fit.points, fit.X, fit.prior, 0.0, bounded=False)
     n = len(fit.X)
+    free = np.zeros(n, bool)
+    covariance, (step, *_), _, cost = newton_step(c, records, fit.linear, fit.points, fit.X, fit.prior, 0.0, free)
+    ended = at_end(c, fit, covariance, step)
+    beside = covariance
+    if ended.any():
+        beside, _, _, cost = newton_step(c, records, fit.linear, fit.points, fit.X, fit.prior, 0.0, ended)
     added = np.zeros_like(covariance)
     for r, p, found, place in zip(records, fit.points, fit.linear, places(c, records), strict=True):
         own, white = counted(c, r, p, fit.X, found)
         added[np.ix_(place, place)] += own - white
     true = covariance + covariance @ added @ covariance
-    way = widest(c, fit, covariance)
-    below, above = followed(c, records, starts, replace(fit, cost=cost), covariance, way)
+    way = widest(c, fit, beside)
+    below, above = followed(c, records, starts, replace(fit, cost=cost), beside, way, ended)
     along, true = in_deviations(true, way)[:n] * c.model.scale, in_si(c, true)
     more = np.array([below**2, above**2]) - 1
     sides = np.diag(true) + np.where(along > 0, more[:, None], more[::-1, None]) * along**2
@@ -103,6 +109,14 @@ def _slopes(found: Linear, flawed: tuple[int, ...], sensors: np.ndarray) -> np.n
     return by
 
 
+def at_end(c: Chart, fit: Fit, covariance: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Parameters (n_base,) that make sense above zero only and which the logs would like best below: a step leads there
+    from hardly above. The likelihood beside them is that with these where they are."""
+    n, value = len(fit.X), fit.X / c.model.scale
+    hardly = value < HARDLY * np.sqrt(np.diag(covariance)[:n])
+    return np.asarray(c.model.positive & ~fit.unseen & hardly & (value + step[:n] < 0))
+
+
 def widest(c: Chart, fit: Fit, covariance: np.ndarray) -> np.ndarray:
     """The combination of parameters (n_p + offsets,) whose relative deviation is largest, zero where that is small."""
     n = len(fit.X)
@@ -131,12 +145,13 @@ def followed(
     fit: Fit,
     covariance: np.ndarray,
     way: np.ndarray,
+    ended: np.ndarray,
 ) -> tuple[float, float]:
     """How many times as wide as at the answer the likelihood of a combination of parameters is below and above it, all
     else as likely as it can be (profile likelihood; Venzon and Moolgavkar, Applied Statistics 37 (1988) 87).
 
-    What one linearisation at either side says, which the next ones change by a few hundredths. 1 and 1 where there is
-    nothing to follow or the motion can't be followed.
+    What one linearisation at either side says, which the next ones change by a few hundredths. ended (n_base,):
+    parameters that stay where they are. 1 and 1 where there is nothing to follow or the motion can't be followed.
     """
     if not way.any():
         return 1.0, 1.0
@@ -145,8 +160,6 @@ def followed(
     widths = []
     for far in (-FOLLOWED, FOLLOWED):
         X = fit.X + far * step[:n] * c.model.scale
-        # What may as well be nothing has no part in the combination.
-        X = np.where(c.model.positive & (way[:n] == 0), np.maximum(X, (1 - DOWN) * fit.X), X)
         if not (X[c.model.positive] > 0).all():
             return 1.0, 1.0
         points = [
@@ -157,7 +170,7 @@ def followed(
         if linear is None:
             return 1.0, 1.0
         try:
-            there, steps, _, cost = newton_step(c, records, linear, points, X, fit.prior, 0.0, bounded=False)
+            there, steps, _, cost = newton_step(c, records, linear, points, X, fit.prior, 0.0, ended)
         except (NotConverged, np.linalg.LinAlgError):
             return 1.0, 1.0
         if not np.isfinite(cost):

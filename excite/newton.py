@@ -418,13 +418,14 @@ def newton_step(
     X: np.ndarray,
     prior: np.ndarray,
     damping: float,
-    bounded: bool = True,
+    still: np.ndarray | None = None,
 ) -> tuple[np.ndarray, list[np.ndarray], float, float]:
     """Covariance of all parameters and offsets (scaled), the step of those of each log, the largest of a parameter in
     standard deviations as it would be undamped, of one that isn't held where there is one, and the cost behind that
-    step. Damping (Levenberg): what a log shows badly moves in small steps while the rest is still wrong. Where it is
-    `bounded`, parameters that make sense above zero only go down by DOWN at most, and the others where they are best
-    beside them; the covariance knows no such ends. prior (n_base,): information about nominal."""
+    step. Damping (Levenberg): what a log shows badly moves in small steps while the rest is still wrong. Parameters
+    that make sense above zero only go down by DOWN at most, and the others where they are best beside them; the
+    covariance knows no such ends. prior (n_base,): information about nominal. still (n_base,): parameters that stay
+    where they are, also as far as the covariance knows; the others go anywhere then."""
     n, found_at = len(X), places(c, records)
     size = n + sum(len(r.origin) for r in records)
     information, slope = np.zeros((size, size)), np.zeros(size)
@@ -432,6 +433,8 @@ def newton_step(
     off = (X - c.model.nominal) / c.model.scale
     slope[:n] = prior * off
     cost = float(prior @ off**2)
+    if still is not None:
+        information[range(n), range(n)] += still * HELD**-2
     for found, r, p, place in zip(linear, records, points, found_at, strict=True):
         information[np.ix_(place, place)] += found.Z[1:, 1:]
         slope[place] += found.Z[1:, 0]
@@ -445,7 +448,7 @@ def newton_step(
         raise NotConverged("joint smoothing lost its numbers: check the log with `excite log check`")
     sigma, told = np.sqrt(np.diag(covariance))[:n], prior < HELD**-2
     lowest = np.full(size, -np.inf)
-    if bounded:
+    if still is None:
         lowest[:n] = np.where(told, _lowest(c.model, X), -np.inf)
     undamped = _above(lowest, -covariance @ slope, information, slope)
     left = float(np.abs(undamped[:n] / sigma)[told if told.any() else slice(None)].max())

@@ -20,7 +20,7 @@ from excite.linearise import Batch, Chart, advance, chart, differentiate
 from excite.log import Log, check
 from excite.record import Record, beating, common_sensors, first_point, record
 from excite.simulate import Motion, simulate
-from model import machine, prediction
+from model import machine, placing, prediction
 from model.prediction import Model
 
 
@@ -429,7 +429,7 @@ def test_the_likelihood_is_followed_where_a_drive_shows_little(va12: Model) -> N
     covariance, *_ = newton.newton_step(c, records, fit.linear, fit.points, fit.X, prior, 0.0)
     k = va12.base.names.index("Ky4")
     way = (np.arange(len(covariance)) == k).astype(float)
-    widths = deviations.followed(c, records, starts, fit, covariance, way)
+    widths = deviations.followed(c, records, starts, fit, covariance, way, free)
     for far, width in zip((-2.0, 2.0), widths, strict=True):
         X = fit.X + far * deviations.in_deviations(covariance, way)[:n] * va12.scale
         there = replace(va12, nominal=np.where(way[:n] > 0, X, va12.nominal))
@@ -442,6 +442,23 @@ def test_the_likelihood_is_followed_where_a_drive_shows_little(va12: Model) -> N
     low, high = np.abs(estimate.interval95 - estimate.value)
     assert (high[k] - low[k]) * (widths[1] - widths[0]) > 0
     assert low[k] / high[k] == pytest.approx(widths[0] / widths[1], rel=0.2)
+
+
+def test_the_likelihood_is_followed_beside_an_amount_at_its_end(va12: Model) -> None:
+    """As it is without the effect: what the logs would like best below zero has no say there."""
+    log = measured(va12, simulate(va12, design("R60")), va12.nominal, seed=8)
+    effect = placing.parse("torque_deadband@front_roll=20", va12.machine, 60.0)
+    told = []
+    for model in (va12, prediction.build(placing.extended(va12.machine, effect))):
+        c = chart(model, common_sensors(model, [log]))
+        records = [record(c, log, unbiased=True)]
+        starts = [first_point(c, records[0], log, model.machine.filter)]
+        fit = newton.iterate(c, records, starts, model.nominal, starts, 0.0, np.zeros(len(model.scale), bool))
+        _, sides, _ = deviations.sure(c, records, starts, fit)
+        told.append(sides[:, model.base.names.index("Ky4")])
+        added = [k for k, name in enumerate(model.base.names) if name not in va12.base.names]
+        assert (fit.X[added] < deviations.HARDLY * fit.std[added]).all()
+    np.testing.assert_allclose(told[1], told[0], rtol=0.02)
 
 
 def test_what_counting_does_to_an_estimate_is_foreseen(straight: Model) -> None:
