@@ -22,6 +22,7 @@ from excite.onsets import begun
 from excite.sidebyside import Together
 from excite.stages import (
     FAR,
+    FOLLOWED,
     SMALL,
     Stage,
     exact_if_near,
@@ -99,12 +100,13 @@ class Choice:
 
 
 def wald(name: str, stage: Stage) -> float:
-    """By how many deviations an effect's amount, or a shape that is none by default, is from none in a fit, squared
-    (Wald's statistic); 0 of one that was held, as nothing shows it."""
+    """By how many deviations an effect's amount and the shapes that are none by default are from none together in a
+    fit, squared (Wald's statistic): one may stand for the other. 0 of what was held, as nothing shows it."""
     shapes, names, fit = stage.placed(name).effect.shapes, stage.model.base.names, stage.fit
     told = [name, *(f"{name}.{s}" for s, shape in shapes.items() if shape.signed and not shape.circular)]
-    at = [names.index(n) for n in told if n in names]
-    return max(0.0 if fit.unseen[k] else float((fit.X[k] / fit.std[k]) ** 2) for k in at)
+    at = [k for k in (names.index(n) for n in told if n in names) if not fit.unseen[k]]
+    away = fit.X[at] / fit.std[at]
+    return float(away @ np.linalg.solve(fit.covariance[np.ix_(at, at)] / np.outer(fit.std[at], fit.std[at]), away))
 
 
 def freedom(name: str, stage: Stage) -> int:
@@ -336,20 +338,55 @@ def sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None
             follow = near
             break
     if not follow:
-        return None
+        both = _both(stage, tries[0], len(scores), together)
+        return (stage, both) if both else None
     follow = _one_each(follow)
     score, best = follow[0]
-    sure = wald(score.candidate.name, best)  # of the same kind as a gain, and smaller where that is large
+    sure = _sure_beside(score.candidate.name, best, gain, stage, plain)
     if sure < LEVEL * best.spread:
         return None
-    # Far from no effect Wald's statistic says too much, and further effects are measured by it. Coarse sensors say too
-    # little: without it the misfit is what a fit has, or as large for sharp ones, as far as a fit is waited for.
-    coarse = stage.prepared.coarse
-    without = (
-        min(coarse**2 * gain, FAR * best.noise - best.fit.cost) if plain is None else plain.fit.cost - best.fit.cost
-    )
-    sure = min(sure, max(coarse * gain, without))
     return stage, [_chosen(follow, sure, len(scores), together)]
+
+
+def _sure_beside(name: str, best: Stage, gain: float, coarse: Stage, plain: Stage | None) -> float:
+    """What an effect gains with sharp sensors, of which coarse ones say gain: Wald's statistic is of the same kind, and
+    smaller where that is large. Far from no effect it says too much, and further effects are measured by it. Coarse
+    sensors say too little: without the effect the misfit is what a plain fit has, or as large for sharp ones, as far as
+    a fit is waited for."""
+    times = coarse.prepared.coarse
+    without = min(times**2 * gain, FAR * best.noise - best.fit.cost)
+    without = without if plain is None else plain.fit.cost - best.fit.cost
+    return min(wald(name, best), max(times * gain, without))
+
+
+def _both(stage: Stage, first: _Try, tried: int, together: Together) -> list[Choice]:
+    """Two effects with which the model comes near coarse sensors, as it does with none, and exact dynamics near sharp
+    ones; the first is the best alone and takes a good part of what is left without. None where there aren't two."""
+    score, beside = first
+    if stage.fit.cost - beside.fit.cost < MAIN * stage.excess:
+        return []
+    scores = scored(beside, together)
+    likely = _likely(beside, scores, (), together)
+    tries, _ = _tries(beside, likely, together, lambda k: None, FOLLOWED * beside.noise) if likely else ([], set())
+    tries = [x for x in tries if x[1].fit.cost <= FOLLOWED * x[1].noise]
+    every = zip(tries, sharpened([x for _, x in tries], 0.0, together), strict=True)
+    found = [(s, coarse, x) for (s, coarse), x in every if x is not None and x.near]
+    found = [x for x in found if not any(_vanished(e.candidate.name, x[2]) for e in (score, x[0]))]
+    if not found:
+        return []
+    _, coarse, best = min(found, key=lambda x: x[2].fit.cost)
+    follow = _one_each([(s, x) for s, _, x in found])
+    second = follow[0][0]
+    sure = (
+        _sure_beside(score.candidate.name, best, stage.fit.cost - beside.fit.cost, stage, None),
+        _sure_beside(second.candidate.name, best, beside.fit.cost - coarse.fit.cost, stage, None),
+    )
+    if min(sure) < LEVEL * best.spread:
+        return []
+    return [
+        Choice(score.candidate.name, beside, sure[0], best.spread, tried, (), score.left),
+        _chosen(follow, sure[1], len(scores), together),
+    ]
 
 
 def unfollowed(stage: Stage, together: Together) -> tuple[Stage, list[Choice], frozenset[str]]:
