@@ -1,8 +1,9 @@
 """One effect chosen for a model: candidates are scored, the likeliest fitted, and those that the logs like about as
 well kept as rivals of the best.
 
-Where no model follows the logs, the first is chosen with coarse sensors (`sharp`) or from the logs' beginning
-(`unfollowed`); where nothing explains them, from their beginning too, however little it promises (`unlikely`).
+Where no model follows the logs, the first, or two of which neither does alone, are chosen with coarse sensors
+(`sharp`), or the first from the logs' beginning (`unfollowed`); where nothing explains them, from their beginning too,
+however little it promises (`unlikely`).
 """
 
 from __future__ import annotations
@@ -313,7 +314,8 @@ def _chosen(tries: Sequence[_Try], gain: float, tried: int, together: Together) 
 def sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None:
     """Where the model follows the logs with coarse sensors only: the effect with which it follows them with sensors as
     they are, and the stage without. Coarse sensors leave of a misfit what shows its cause, and are followed by what is
-    nearly right. No effect where the model does without after all, None where nothing comes near."""
+    nearly right. Two effects where none does by itself. No effect where the model does without after all, None where
+    nothing comes near."""
     begun_without = sharpened([stage], 0.0, together)
     scores, least = scored(stage, together), LEAST[1] * stage.excess
     plain = next(begun_without)

@@ -4,9 +4,9 @@ A log is smoothed with the machine's model. Where the innovations hold more than
 scored (`evidence`), the best are fitted with amount and shapes as parameters, and the one that the log likes best is
 added to the model; then again, until nothing is left or nothing in the catalogue helps. Names that the log likes as
 well are given together. What no name explains, or only four together, is said to be unexplained. Where the model
-without effects can be fitted to much coarser sensors only, the first effect is found with these and the fit sharpened
-with it; where not even that, effects are scored along the file's parameters and fitted from the logs' beginning; so are
-those that promise less where nothing explains the logs.
+without effects can be fitted to much coarser sensors only, the first effect, or two that only together do, are found
+with these and the fit sharpened with them; where not even that, effects are scored along the file's parameters and
+fitted from the logs' beginning; so are those that promise less where nothing explains the logs.
 """
 
 from __future__ import annotations

@@ -202,6 +202,15 @@ def test_a_slope_is_named_with_its_amount_and_gain() -> None:
     named(Hidden("ground_slope", "machine", 0.004))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [94, 99])
+def test_two_causes_of_which_neither_alone_leads_to_the_log_are_named(number: int) -> None:
+    """A measuring wheel's eccentric encoder with play in the joint; a stop's spring, whose stiffness at first touch and
+    hardening stand for each other, with soil that lags."""
+    seen = blind(case("pair", "", number))
+    assert score(seen.case, ask(seen.log)).outcome in ("right", "tied")
+
+
 PLAIN = {  # of each cause the first minute of driving in which it is ten times as large as what is just visible
     "stribeck_friction": 1,
     "load_dependent_friction": 0,

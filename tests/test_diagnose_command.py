@@ -995,6 +995,24 @@ def test_an_amount_that_nothing_shows_is_not_sure(straight: Model) -> None:
     assert [x.name for x in diagnose.needed(clean, chosen)] == names[1:]
 
 
+def test_an_amount_and_its_shapes_are_sure_together(straight: Model) -> None:
+    """Where each may stand for the other, neither is sure by itself."""
+    name = "encoder_eccentricity@front_roll"
+    entry = placing.parse(f"{name}=0.01", straight.machine, 12.0)
+    stage = calm(prediction.build(placing.extended(straight.machine, entry), shapes=True))
+    fit, names = stage.fit, stage.model.base.names
+    at = [names.index(n) for n in (name, f"{name}.cos2", f"{name}.sin2")]
+    X, covariance = fit.X.copy(), np.diag(fit.std**2)
+    unit = np.array([[1.0, -0.95, 0.0], [-0.95, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    X[at], covariance[np.ix_(at, at)] = (
+        np.array([2.0, 2.0, 1.0]) * fit.std[at],
+        unit * np.outer(fit.std[at], fit.std[at]),
+    )
+    for unseen, expected in (([], 8 / 0.05 + 1), (at[1:], 4.0), (at, 0.0)):
+        told = replace(fit, X=X, covariance=covariance, unseen=np.isin(np.arange(len(X)), unseen))
+        assert choosing.wald(name, replace(stage, fit=told)) == pytest.approx(expected)
+
+
 @pytest.mark.parametrize("percent", [-0.5, 0.5])
 def test_what_foretells_nothing_is_no_name(percent: float, straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """An effect whose amount is hardly known must pay on stretches hidden from the fit, however good that is."""
