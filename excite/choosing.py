@@ -356,8 +356,9 @@ def _sure_beside(name: str, best: Stage, gain: float, coarse: Stage, plain: Stag
     sensors say too little: without the effect the misfit is what a plain fit has, or as large for sharp ones, as far as
     a fit is waited for."""
     times = coarse.prepared.coarse
-    without = min(times**2 * gain, FAR * best.noise - best.fit.cost)
-    without = without if plain is None else plain.fit.cost - best.fit.cost
+    without = (
+        min(times**2 * gain, FAR * best.noise - best.fit.cost) if plain is None else plain.fit.cost - best.fit.cost
+    )
     return min(wald(name, best), max(times * gain, without))
 
 
@@ -367,18 +368,18 @@ def _both(stage: Stage, first: _Try, tried: int, together: Together) -> list[Cho
     score, beside = first
     if stage.fit.cost - beside.fit.cost < MAIN * stage.excess:
         return []
-    scores = scored(beside, together)
+    scores, most = scored(beside, together), FOLLOWED * beside.noise
     likely = _likely(beside, scores, (), together)
-    tries, _ = _tries(beside, likely, together, lambda k: None, FOLLOWED * beside.noise) if likely else ([], set())
-    tries = [x for x in tries if x[1].fit.cost <= FOLLOWED * x[1].noise]
+    if not likely:
+        return []
+    tries, _ = _tries(beside, likely, together, lambda k: None, most)
+    tries = [x for x in tries if x[1].fit.cost <= most]
     every = zip(tries, sharpened([x for _, x in tries], 0.0, together), strict=True)
     found = [(s, coarse, x) for (s, coarse), x in every if x is not None and x.near]
     found = [x for x in found if not any(_vanished(e.candidate.name, x[2]) for e in (score, x[0]))]
     if not found:
         return []
-    _, coarse, best = min(found, key=lambda x: x[2].fit.cost)
-    follow = _one_each([(s, x) for s, _, x in found])
-    second = follow[0][0]
+    second, coarse, best = min(found, key=lambda x: x[2].fit.cost)
     sure = (
         _sure_beside(score.candidate.name, best, stage.fit.cost - beside.fit.cost, stage, None),
         _sure_beside(second.candidate.name, best, beside.fit.cost - coarse.fit.cost, stage, None),
@@ -387,7 +388,7 @@ def _both(stage: Stage, first: _Try, tried: int, together: Together) -> list[Cho
         return []
     return [
         Choice(score.candidate.name, beside, sure[0], best.spread, tried, (), score.left),
-        _chosen(follow, sure[1], len(scores), together),
+        _chosen(_one_each([(s, x) for s, _, x in found]), sure[1], len(scores), together),
     ]
 
 
@@ -489,9 +490,8 @@ def _tries(
 ) -> tuple[list[_Try], set[str]]:
     """The candidates whose fits were found, as the model without them was fitted: the likeliest two first, the others
     as long as they don't stay far behind what these gain. Those that promise far less than the best come last, and only
-    where they may still come near what was gained. No fit was found of what it led to zero. And the names that were
-    fitted and are none: they are not felt.
-    ceiling: cost that no fit may stay above."""
+    where they may still come near what was gained. What a fit led to zero wasn't found. And the names that were fitted
+    and are none: they are not felt. ceiling: cost that no fit may stay above."""
     tries, refused = list[_Try](), set[str]()
     near = max(PAIR, sum(OVER * s.gain >= likely[0].gain for s in likely))
     for at, batch in ((0, likely[:PAIR]), (PAIR, likely[PAIR:near]), (near, likely[near:])):

@@ -308,12 +308,12 @@ def iterate(
         straight = (rest != 0) & (np.abs(wanted - rest) < AGAIN * np.abs(gone))
         reach = np.where(straight, FURTHER * reach, 1.0)
         limit = reach * LARGEST_STEP * np.maximum(np.abs(X) / model.scale, 1.0)
-        share = 1.0 if away else whole
+        share, lowest = 1.0 if away else whole, _lowest(model, X)
         for m in move:
             # What is held from now on goes back to its value at once, and the others along as far as they may.
             own = np.clip(share * m[: len(X)], -limit, limit)
             # A lengthened step, or a rounded one, may go below the lowest that it was computed for.
-            m[: len(X)] = np.where(unseen, m[: len(X)], np.maximum(own, _lowest(model, X)))
+            m[: len(X)] = np.where(unseen, m[: len(X)], np.maximum(own, lowest))
         gone = move[0][: len(X)]
         rest = np.where(np.abs(share * wanted) > limit, wanted - gone, 0.0)
         there = (
