@@ -21,6 +21,7 @@ EDGE = 0.2  # [s] over which what acts between two instants begins and ends
 
 MOMENTS = 120  # at which a load is looked for that slides
 PRESSED = 0.1  # [rad] beyond a stop, at which its hardening is stated
+TOUCH = 0.003  # [rad] over which a stop begins to be pressed
 BEHIND = 2.0  # [m] from the joint, where a load is put on or taken off
 
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
@@ -88,8 +89,8 @@ def _played(s: Scene, k: int, p: Values) -> ca.SX:
 
 def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
     q = s.q[k] - p["centre"]
-    high, low = _softplus(q - p["stop"], 0.01), _softplus(-q - p["stop"], 0.01)
-    return -p["A"] * (high - low) * (1 + p["hardening"] * (high + low) / PRESSED)
+    high, low = _softplus(q - p["stop"], TOUCH), _softplus(-q - p["stop"], TOUCH)
+    return -p["A"] * (high - low) * (1 + p["hardening"] * ((high + low) / PRESSED) ** 2)
 
 
 def _one_sided(site: Site) -> list[dict[str, float]]:
@@ -606,7 +607,7 @@ _declare(
         {
             "stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), sizes.stop),
             "centre": Shape("rad", 0.0, (0.0,), meaning="the angle in the middle between the stops"),
-            "hardening": Shape("-", 0.0, (0.0,), meaning="x beyond the stop gives A x (1 + hardening x / 0.1 rad)"),
+            "hardening": Shape("-", 0.0, (0.0,), meaning="x beyond the stop gives A x (1 + hardening (x / 0.1 rad)^2)"),
         },
         torque=_stopped,
         beside=_one_sided,
