@@ -203,6 +203,16 @@ def test_a_slope_is_named_with_its_amount_and_gain() -> None:
 
 
 @pytest.mark.slow
+def test_a_slope_that_promises_little_beside_what_it_explains_is_named() -> None:
+    """Forces of the smallest kind come near this log without it, from parameters so far off that six other causes
+    promise more."""
+    seen = blind(case("cause", "ground_slope", 40))
+    judged = score(seen.case, ask(seen.log))
+    assert judged.outcome == "right"
+    assert judged.amount_in
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [94, 99])
 def test_two_causes_of_which_neither_alone_leads_to_the_log_are_named(number: int) -> None:
     """A measuring wheel's eccentric encoder with play in the joint; a stop's spring, whose stiffness at first touch and

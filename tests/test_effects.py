@@ -668,9 +668,10 @@ def test_points_between_the_grids_are_tried_for_every_way_of_counting(straight: 
         assert tried[-1] > 35
 
 
-@pytest.mark.parametrize(("hardening", "torque"), [(0.0, 1e3), (0.2, 1.2e3)])
-def test_stops_may_be_out_of_the_middle_and_harden(hardening: float, torque: float) -> None:
-    """A stop that only one side reaches pushes back there alone, and more so the further it is pressed."""
+@pytest.mark.parametrize(("hardening", "pressed", "further"), [(0.0, 1e3, 2e3), (0.2, 1.2e3, 3.6e3)])
+def test_stops_may_be_out_of_the_middle_and_harden(hardening: float, pressed: float, further: float) -> None:
+    """A stop that only one side reaches pushes back there alone, from where it is reached on, and the more so the
+    further it is pressed."""
     entry = shaped("articulation_stop_spring=10000", {"stop": 0.4, "centre": -0.2, "hardening": hardening})
     plain, sprung = build(VA12), build(placing.extended(VA12, entry))
     still = np.zeros(len(plain.coordinates))
@@ -682,7 +683,9 @@ def test_stops_may_be_out_of_the_middle_and_harden(hardening: float, torque: flo
         own = sprung.balance(q, still, still, sprung.expand @ sprung.nominal, u, []).full()
         return float((own - plain.balance(q, still, still, plain.expand @ plain.nominal).full())[4, 0])
 
-    assert more(0.3) == pytest.approx(torque, rel=0.01)
+    assert more(0.3) == pytest.approx(pressed, rel=0.01)
+    assert more(0.4) == pytest.approx(further, rel=0.01)
+    assert abs(more(0.19)) < 5
     assert abs(more(-0.3)) < 5
 
 
