@@ -607,7 +607,13 @@ _declare(
         {
             "stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), sizes.stop),
             "centre": Shape("rad", 0.0, (0.0,), meaning="the angle in the middle between the stops"),
-            "hardening": Shape("-", 0.0, (0.0,), meaning="x beyond the stop gives A x (1 + hardening (x / 0.1 rad)^2)"),
+            "hardening": Shape(
+                "-",
+                0.0,
+                (0.0,),
+                meaning="x beyond the stop gives A x (1 + hardening (x / 0.1 rad)^2); of one that hardens by another"
+                " law A is not the stiffness at first touch",
+            ),
         },
         torque=_stopped,
         beside=_one_sided,
