@@ -90,7 +90,7 @@ def _played(s: Scene, k: int, p: Values) -> ca.SX:
 def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
     q = s.q[k] - p["centre"]
     high, low = _softplus(q - p["stop"], TOUCH), _softplus(-q - p["stop"], TOUCH)
-    return -p["A"] * (high - low) * (1 + p["hardening"] * ((high + low) / PRESSED) ** 2)
+    return -p["A"] * (high - low) * (1 + p["hardening"] * ((high + low) / PRESSED) ** p["power"])
 
 
 def _one_sided(site: Site) -> list[dict[str, float]]:
@@ -98,7 +98,7 @@ def _one_sided(site: Site) -> list[dict[str, float]]:
     limit = sizes.stop(site)
     stops = [x * limit for x in (0.15, 0.35, 0.55, 0.75)]
     sides = [{"stop": (limit + x) / 2, "centre": side * (x - limit) / 2} for x in stops for side in (1.0, -1.0)]
-    return [{**x, "hardening": 0.0} for x in sides]
+    return [{**x, "hardening": 0.0, "power": 2.0} for x in sides]
 
 
 def _rubbing(site: Site) -> list[dict[str, float]]:
@@ -608,12 +608,9 @@ _declare(
             "stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), sizes.stop),
             "centre": Shape("rad", 0.0, (0.0,), meaning="the angle in the middle between the stops"),
             "hardening": Shape(
-                "-",
-                0.0,
-                (0.0,),
-                meaning="x beyond the stop gives A x (1 + hardening (x / 0.1 rad)^2); of one that hardens by another"
-                " law A is not the stiffness at first touch",
+                "-", 0.0, (0.0,), meaning="x beyond the stop gives A x (1 + hardening (x / 0.1 rad)^power)"
             ),
+            "power": Shape("-", 2.0, (2.0,)),
         },
         torque=_stopped,
         beside=_one_sided,

@@ -668,11 +668,18 @@ def test_points_between_the_grids_are_tried_for_every_way_of_counting(straight: 
         assert tried[-1] > 35
 
 
-@pytest.mark.parametrize(("hardening", "pressed", "further"), [(0.0, 1e3, 2e3), (0.2, 1.2e3, 3.6e3)])
-def test_stops_may_be_out_of_the_middle_and_harden(hardening: float, pressed: float, further: float) -> None:
+@pytest.mark.parametrize(
+    ("hardening", "power", "pressed", "further"),
+    [(0.0, 2.0, 1e3, 2e3), (0.2, 2.0, 1.2e3, 3.6e3), (0.2, 1.0, 1.2e3, 2.8e3)],
+)
+def test_stops_may_be_out_of_the_middle_and_harden(
+    hardening: float, power: float, pressed: float, further: float
+) -> None:
     """A stop that only one side reaches pushes back there alone, from where it is reached on, and the more so the
     further it is pressed."""
-    entry = shaped("articulation_stop_spring=10000", {"stop": 0.4, "centre": -0.2, "hardening": hardening})
+    entry = shaped(
+        "articulation_stop_spring=10000", {"stop": 0.4, "centre": -0.2, "hardening": hardening, "power": power}
+    )
     plain, sprung = build(VA12), build(placing.extended(VA12, entry))
     still = np.zeros(len(plain.coordinates))
 
