@@ -362,6 +362,20 @@ def test_a_drive_that_hardly_shows_the_machine_still_shows_a_cause(seed: int, st
 
 
 @pytest.mark.slow
+def test_a_stop_tells_by_which_law_its_rubber_hardens(va12: Model) -> None:
+    """What it is at first touch is seen nowhere alone: by the wrong law it would come out twice as stiff."""
+    shapes = {"stop": 0.25, "hardening": 1.0, "power": 1.0}
+    hidden = choosing.identified("articulation_stop_spring", "articulation", 10000.0, shapes)
+    truth = prediction.build(placing.extended(va12.machine, hidden))
+    table = sensors.measure(truth, designed("R60_accuracy", truth), kit="full", seed=5)
+    (found,) = diagnose.diagnose(va12, [log.check(table, va12.machine)], va12.machine.filter).findings
+    assert found.name == hidden.label
+    assert abs(found.amount - 10000) < 3 * found.amount_std < 6000
+    for name, value in shapes.items():
+        assert abs(found.shapes[name][0] - value) < 4 * found.shapes[name][1], name
+
+
+@pytest.mark.slow
 def test_the_order_in_which_several_are_found_does_not_count(straight: Model, straight_motion: Motion) -> None:
     """Two at once; found the other way round they stay, and a wrong name that came before or between them goes. Side by
     side or in turn, the numbers are the same."""
