@@ -124,7 +124,7 @@ def diagnose(
         before, chosen, tried = choosing.unfollowed(before, together)
     chosen, left = extended(before, chosen, together, tell)
     chosen, odd, nearest = weighed(before, chosen, left)
-    if not chosen and (before.prepared.coarse > 1 or not (before.exact and before.near)):
+    if not (chosen or (before.exact and before.near)):  # a fit with coarse sensors has forces, too
         tell(0.85, "fitting less likely effects from the beginning")
         old = before if before.prepared.coarse == 1 else forced(before, together)
         before, anew = choosing.unlikely(first, old, tried if old is first else (), together)

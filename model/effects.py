@@ -602,7 +602,7 @@ _declare(
         "N m/rad",
         "a spring beyond some angle, to both sides of a middle that may be off; rubber hardens as it is pressed",
         "a torque that grows with the angle beyond a limit",
-        "rubber stops of articulated frames; hardening as Duffing's spring",
+        "rubber stops of articulated frames; hardening with power 2 as Duffing's spring",
         sizes.torque,
         {
             "stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), sizes.stop),
