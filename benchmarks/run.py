@@ -36,10 +36,13 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 import numpy as np
 from joblib.externals.loky import get_reusable_executor
 
-from excite import asked, brief, cell, diagnose, identify, log, plan, profiles, sensors, study
-from excite.simulate import Motion, simulate
-from model import machine, prediction
-from model.prediction import Model
+from excite.diagnosis import diagnosis
+from excite.identification import methods
+from excite.logs import log, profile
+from excite.model import Model, prediction
+from excite.model.machine import machine
+from excite.simulation import Motion, sensors, simulate
+from excite.workflows import design_request, requests, study_plan, study_runner, study_runs
 
 HERE = Path(__file__).parent
 HISTORY = HERE / "history.jsonl"
@@ -77,7 +80,7 @@ def reference() -> None:
 
 @lru_cache
 def straight() -> Model:
-    return prediction.build(machine.load("va12_straight"))
+    return prediction.build(machine.load_machine("va12_straight"))
 
 
 @lru_cache
@@ -90,7 +93,7 @@ def drive(seconds: float) -> Motion:
 
 @lru_cache
 def measured(seconds: float) -> log.Log:
-    return log.check(sensors.measure(straight(), drive(seconds), seed=1), straight().machine)
+    return log.from_table(sensors.measure(straight(), drive(seconds), seed=1), straight().machine)
 
 
 def started(*words: str) -> None:
@@ -105,26 +108,26 @@ def worker() -> None:
 def simulated() -> None:
     """A short command that computes: 2.5 s of driving, a log of 250 rows."""
     with tempfile.TemporaryDirectory() as folder:
-        profiles.of(straight(), drive(2.5)).to_csv(f"{folder}/drive.csv", index=False)
+        profile.profile_of(straight(), drive(2.5)).to_csv(f"{folder}/drive.csv", index=False)
         started("simulate", "va12_straight", f"{folder}/drive.csv", "--out", f"{folder}/log.csv")
 
 
 def designed() -> None:
-    _, problem = asked.problem(straight().machine, None, 8.0)
-    brief.answer(straight(), problem, brief.Brief("cond", starts=1))
+    _, problem = requests.choose_problem(straight().machine, None, 8.0)
+    design_request.answer(straight(), problem, design_request.Brief("cond", starts=1))
     get_reusable_executor().shutdown(wait=True)  # CPU time of a process counts when it has ended
 
 
 def diagnosed() -> None:
-    diagnose.diagnose(straight(), [measured(20.0)], straight().machine.filter)
+    diagnosis.diagnose(straight(), [measured(20.0)], straight().machine.filter)
 
 
 def studied(runs: int, jobs: int = 1) -> None:
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        profiles.of(straight(), drive(2.5)).to_csv(place / "drive.csv", index=False)
+        profile.profile_of(straight(), drive(2.5)).to_csv(place / "drive.csv", index=False)
         (place / "study.toml").write_text(STUDY.format(runs=runs))
-        study.carry(plan.read(place / "study.toml"), place / "out", jobs=jobs)
+        study_runner.run_study(study_plan.read_study(place / "study.toml"), place / "out", jobs=jobs)
 
 
 def bare(runs: int) -> None:
@@ -139,11 +142,11 @@ PARTS: dict[str, Callable[[], object]] = {
     "start-up: machines": lambda: started("machines", "--json"),
     "start-up: a worker": worker,
     "start-up: simulate": simulated,
-    "model of va12": lambda: prediction.build(machine.load("va12")),
+    "model of va12": lambda: prediction.build(machine.load_machine("va12")),
     "simulation, 40 s": lambda: simulate(straight(), drive(40.0).u),
     "sensors, 40 s": lambda: sensors.measure(straight(), drive(40.0), seed=1),
-    "identification ols, 40 s": lambda: identify.identify(straight(), [measured(40.0)], "ols"),
-    "identification joint, 40 s": lambda: identify.identify(straight(), [measured(40.0)], "joint"),
+    "identification ols, 40 s": lambda: methods.identify(straight(), [measured(40.0)], "ols"),
+    "identification joint, 40 s": lambda: methods.identify(straight(), [measured(40.0)], "joint"),
     "diagnosis, 20 s": diagnosed,
     "design, 8 s, one start": designed,
     "study of 200 runs": lambda: studied(200),
@@ -239,7 +242,7 @@ def one(runs: int, jobs: int, alone: float) -> None:
     bare(1)
     with tempfile.TemporaryDirectory() as folder:
         place, workers, looked, size = Path(folder), 0.0, 0.0, "-"
-        profiles.of(straight(), drive(2.5)).to_csv(place / "drive.csv", index=False)
+        profile.profile_of(straight(), drive(2.5)).to_csv(place / "drive.csv", index=False)
         (place / "study.toml").write_text(STUDY.format(runs=runs))
 
         def look(*_: object) -> None:
@@ -250,7 +253,7 @@ def one(runs: int, jobs: int, alone: float) -> None:
 
         begin, spent = time.perf_counter(), cpu()
         if jobs:
-            study.carry(plan.read(place / "study.toml"), place / "out", jobs=jobs, progress=look)
+            study_runner.run_study(study_plan.read_study(place / "study.toml"), place / "out", jobs=jobs, progress=look)
             size = f"{(place / 'out' / 'runs.parquet').stat().st_size / 1e3:.0f}"
         else:
             bare(runs)
@@ -285,7 +288,12 @@ def main() -> None:
     rows = measure(asked.only)
     worse = compared(rows, asked.check)
     if not asked.dry and asked.only is None:
-        about = {"commit": commit(), "python": platform.python_version(), "program": cell.program(), "parts": rows}
+        about = {
+            "commit": commit(),
+            "python": platform.python_version(),
+            "program": study_runs.program(),
+            "parts": rows,
+        }
         with HISTORY.open("a", encoding="utf-8") as file:
             file.write(json.dumps(about) + "\n")
     sys.exit(1 if worse else 0)

@@ -1,19 +1,17 @@
-"""What one does with a machine: design a drive, simulate it, identify from its log, verify, report."""
+"""Excitation trajectories for dynamic machines: design, simulation, identification, diagnosis.
 
-from __future__ import annotations
+    import excite
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+    drive = excite.design("va12_straight")                  # a test drive that excites every parameter
+    log = excite.simulate("va12_straight", drive, seed=1)   # what the sensors would write, as a DataFrame
+    estimate = excite.identify("va12_straight", log)        # parameters with 95 % intervals
 
-if TYPE_CHECKING:
-    from model.prediction import Model
+`load` and `read_log` give the records that these work on, `verify` and `compare` judge drives, `diagnose` finds what
+the model gets wrong. Everything else is in the packages: `excite.model`, `simulation`, `logs`, `smoothing`,
+`identification`, `trajectories`, `diagnosis`, `reports`, `operator`, `workflows`, `cli`, each importing from those
+before it only.
+"""
 
+import lazy_loader
 
-def load(name: str | Path) -> Model:
-    """The equations of a machine: a shipped name (`excite machines` lists them) or a machine file (.toml).
-
-    Raises MachineError: one line with file, key, what is wrong, what is allowed.
-    """
-    from model import machine, prediction  # here, so that `excite --help` needs no CasADi
-
-    return prediction.build(machine.load(name))
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

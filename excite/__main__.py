@@ -14,9 +14,12 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import typer  # noqa: E402
 
 from excite import interrupt  # noqa: E402
-from excite.asked import UsageError  # noqa: E402
-from excite.commands import app  # noqa: E402
-from excite.terminal import INTERRUPTED, fail  # noqa: E402
+from excite.cli import (  # noqa: E402
+    INTERRUPTED,
+    app,
+    fail,
+)
+from excite.errors import UsageError  # noqa: E402
 
 
 def main() -> None:
@@ -53,17 +56,19 @@ def _terminate(*_: object) -> None:
 
 def _exit_code(err: Exception) -> int | None:
     """What an error means for the person who must act; None for a defect of ours, which shows its traceback."""
-    from excite.drive import DriveError
-    from excite.engine import EngineError
-    from excite.estimate import NoEstimate
-    from excite.folder import FolderError
-    from excite.limit import InfeasibleError
-    from excite.log import LogError
-    from excite.serve import ServeError
-    from excite.simulate import SimulationError
-    from excite.store import StoreError
-    from excite.stored import StoredError
-    from model.machine import MachineError
+    from excite.errors import (
+        DriveError,
+        EngineError,
+        FolderError,
+        InfeasibleError,
+        LogError,
+        MachineError,
+        NoEstimate,
+        ServeError,
+        SimulationError,
+        StoredError,
+        StoreError,
+    )
 
     if isinstance(err, UsageError | MachineError | LogError | FolderError | StoredError | DriveError):
         return 2

@@ -1,1 +1,5 @@
-"""What a machine is: its file, its rigid bodies, its contact with the soil, and what its equations predict."""
+"""."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

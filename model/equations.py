@@ -12,10 +12,10 @@ from functools import cached_property
 
 import casadi as ca
 
-from model import contact as law
-from model import lane, placing, sizes, tree
-from model.effect import Placed, Rolling, Scene, Soil, Values
-from model.machine import Body, Machine, MachineError
+from excite.errors import MachineError
+from excite.model import effects, mechanics
+from excite.model.effects import Placed, Rolling, Scene, Soil, Values
+from excite.model.machine import Body, Machine
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Sample:
     at: dict[str, ca.SX]
     rate: dict[str, ca.SX]
     by_name: dict[str, ca.SX]
-    frames: dict[int, tree.Frame]
+    frames: dict[int, mechanics.Frame]
     gravity: ca.SX
     heading: ca.SX
 
@@ -47,7 +47,7 @@ class Sample:
     def by_inertia(self) -> ca.SX:
         """How generalised forces follow from the inertial parameters of all bodies (n_q, 10 bodies), linearly."""
         every = {b.index: ca.SX.sym(f"inertia{b.index}", 10) for b in self.machine.body}
-        rows = tree.generalised_forces(self.machine, self.at, self.frames, every)
+        rows = mechanics.generalised_forces(self.machine, self.at, self.frames, every)
         return ca.jacobian(ca.vertcat(*[rows[c] for c in self.names]), ca.vertcat(*every.values()))
 
 
@@ -101,7 +101,7 @@ def sample_of(machine: Machine, standard: tuple[str, ...]) -> Sample:
     rate = full | dict(zip(names, ca.vertsplit(nu), strict=True))
     accel = full | dict(zip(names, ca.vertsplit(a), strict=True))
     heading = at[machine.body[0].coordinates[2]] if machine.planar else ca.SX(0)
-    gravity = tree.rot_z(-heading) @ ca.DM(machine.gravity)
+    gravity = mechanics.rot_z(-heading) @ ca.DM(machine.gravity)
     return Sample(
         machine,
         q,
@@ -113,7 +113,7 @@ def sample_of(machine: Machine, standard: tuple[str, ...]) -> Sample:
         at,
         rate,
         dict(zip(standard, ca.vertsplit(p), strict=True)),
-        tree.motion(machine, at, rate, accel, gravity),
+        mechanics.motion(machine, at, rate, accel, gravity),
         gravity,
         heading,
     )
@@ -162,9 +162,9 @@ def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Plac
 def _check_axis(machine: Machine, body: Body) -> None:
     """The law takes rolling along x of the carrier for a turn about its y; else the soil would push wrongly."""
     assert not isinstance(body.antecedent, str)
-    own, _ = tree.place(body, {c: ca.SX(0) for c in body.coordinates})
+    own, _ = mechanics.place(body, {c: ca.SX(0) for c in body.coordinates})
     axis = ca.DM(own[:, 2]).full()[:, 0]
-    upright = tree.poses(machine, {})[body.antecedent][0][2, 2]
+    upright = mechanics.poses(machine, {})[body.antecedent][0][2, 2]
     if abs(axis[1] - 1) > 1e-9 or abs(upright - 1) > 1e-9:
         raise MachineError(
             f"{machine.name}: body {body.name}: contact: must turn about y of an upright chassis, so that rolling"
@@ -176,7 +176,7 @@ def _check_axis(machine: Machine, body: Body) -> None:
 def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Placed]) -> Signatures:
     """What each of these effects alone adds to a machine with standard parameters of these names."""
     s = sample_of(machine, standard)
-    inertia = {b.index: tree.inertial_vector(b, s.by_name) for b in machine.body}
+    inertia = {b.index: mechanics.inertial_vector(b, s.by_name) for b in machine.body}
     time = ca.SX.sym("t")
     exact = ca.SX.sym("exact", sum(x.kind != "torque" for x in machine.sensors("full")))
     force, reading, rates = [], [], list[ca.SX]()
@@ -218,7 +218,7 @@ def _mapped(machine: Machine, placed: Sequence[Placed]) -> tuple[str, ...]:
     """What a map of the ground tells, by name, if any of these effects look at it."""
     if not any(e.mapped for e in placed):
         return ()
-    return tuple(f"over{b.index}.{n + 1}" for b in machine.contacts for n in range(lane.MOST))
+    return tuple(f"over{b.index}.{n + 1}" for b in machine.contacts for n in range(effects.MOST))
 
 
 def _acting(s: Sample, placed: Sequence[Placed]) -> tuple[tuple[str, ...], tuple[str, ...], ca.SX, list[Acting]]:
@@ -260,7 +260,7 @@ def _scene(s: Sample, time: ca.SX) -> Scene:
         {b.index: _friction(s, b) for b in rubbing},
         {b.index: s.by_name[f"Fs{b.index}"] for b in rubbing},
         {b.index: float(b.friction.smoothing) for b in rubbing if b.friction is not None},
-        {b.index: sizes.full_torque(s.machine, b) for b in s.machine.actuated},
+        {b.index: effects.full_torque(s.machine, b) for b in s.machine.actuated},
         {b.index: _rolling(s, b)[0] for b in s.machine.contacts},
         {b.index: s.frames[b.index].velocity[0] for b in s.machine.body},
         time,
@@ -271,9 +271,9 @@ def _seeing(s: Sample, scene: Scene, e: Placed, z: dict[str, ca.SX], counts: Seq
     """An effect that remembers z, and sees what a map of the ground tells where it looks at one."""
     values = {key: ca.SX(x) for key, x in e.values.items()}
     values |= {key: s.by_name[name] for name, (key, _) in e.parameters.items() if name in s.by_name}
-    over = {b.index: ca.SX.zeros(lane.MOST) for b in s.machine.contacts}
+    over = {b.index: ca.SX.zeros(effects.MOST) for b in s.machine.contacts}
     if e.mapped:
-        over = {k: ca.vertcat(*counts[lane.MOST * i : lane.MOST * (i + 1)]) for i, k in enumerate(over)}
+        over = {k: ca.vertcat(*counts[effects.MOST * i : effects.MOST * (i + 1)]) for i, k in enumerate(over)}
     return Acting(e, replace(scene, z=dict.fromkeys(e.memories, ca.SX(0)) | z, over=over), values)
 
 
@@ -291,8 +291,8 @@ def _friction(s: Sample, body: Body) -> ca.SX:
 def _balance(s: Sample, acting: Sequence[Acting]) -> tuple[ca.SX, dict[str, ca.SX]]:
     """The generalised forces (n_q,) that the motors must deliver, as their sensors feel them flaws aside; the slips."""
     machine = s.machine
-    inertia = {b.index: tree.inertial_vector(b, s.by_name) for b in machine.body}
-    rows = tree.generalised_forces(machine, s.at, s.frames, inertia)
+    inertia = {b.index: mechanics.inertial_vector(b, s.by_name) for b in machine.body}
+    rows = mechanics.generalised_forces(machine, s.at, s.frames, inertia)
     force = ca.vertcat(*[rows[c] for c in s.names])
     for body in machine.body:
         if body.friction is not None and body.coordinates[0] in s.names:
@@ -322,16 +322,16 @@ def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
             lever = _rolling(s, body)[1]
             force += lever[:2, :].T @ ca.vertcat(*effect.push(e.scene, k, e.values))
     if effect.gravity is not None:
-        pull = tree.rot_z(-s.heading) @ ca.vertcat(*effect.gravity(e.scene, e.values), 0)
+        pull = mechanics.rot_z(-s.heading) @ ca.vertcat(*effect.gravity(e.scene, e.values), 0)
         still = {c: ca.SX(0) for c in s.at}
-        frames = tree.motion(machine, s.at, still, still, pull)
-        rows = tree.generalised_forces(machine, s.at, frames, dict(inertia))
+        frames = mechanics.motion(machine, s.at, still, still, pull)
+        rows = mechanics.generalised_forces(machine, s.at, frames, dict(inertia))
         force -= ca.vertcat(*[rows[c] for c in s.names])
     if effect.inertia is not None:
         told = effect.inertia(e.scene, e.values)
-        moved = placing.shifted(machine, told)
+        moved = effects.shifted(machine, told)
         none = {n: ca.SX(0) for n in s.by_name}
-        change = ca.vertcat(*[tree.inertial_vector(b, {**none, **moved}) for b in machine.body])
+        change = ca.vertcat(*[mechanics.inertial_vector(b, {**none, **moved}) for b in machine.body])
         force -= s.by_inertia @ change
         if effect.recoil is not None:
             force += e.values[effect.recoil] * _recoil(s, e, told)
@@ -341,7 +341,7 @@ def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
 def _recoil(s: Sample, e: Acting, change: Mapping[str, ca.SX]) -> ca.SX:
     """Generalised force (n_q,) on a body along whose x axis a load slides: the first moment MX and the inertia ZZ of it
     change with time. -MX'' along, the Coriolis force -2 omega MX' across, the moment -omega ZZ' about the origin."""
-    body = placing.shifting(s.machine)
+    body = effects.shifting(s.machine)
     assert body is not None
     frame = s.frames[body]
     lever = ca.jacobian(ca.vertcat(frame.velocity[:2], frame.omega[2]), s.nu)
@@ -355,7 +355,7 @@ def _rolling(s: Sample, body: Body) -> tuple[Rolling, ca.SX]:
     assert body.contact is not None
     assert not isinstance(body.antecedent, str)
     carrier, own = s.frames[body.antecedent], s.frames[body.index]
-    R, _ = tree.place(body, {c: ca.SX(0) for c in body.coordinates})
+    R, _ = mechanics.place(body, {c: ca.SX(0) for c in body.coordinates})
     turn = carrier.rotation.T @ own.rotation
     centre = turn @ own.velocity
     spin = (R[:, 2].T @ turn) @ own.omega
@@ -370,7 +370,7 @@ def _soil(s: Sample, body: Body, rolling: Rolling) -> Soil:
     saturation = None
     if contact.law == "exponential":
         assert contact.saturation_slip is not None
-        saturation = law.Saturation(ca.SX(float(contact.saturation_slip)))
+        saturation = mechanics.Saturation(ca.SX(float(contact.saturation_slip)))
     Kx, Ky = s.by_name[f"Kx{body.index}"], s.by_name[f"Ky{body.index}"]
     return Soil(rolling.slip, rolling.yaw, Kx, Ky, saturation)
 
@@ -436,7 +436,7 @@ def _readings(s: Sample, acting: Sequence[Acting]) -> tuple[ca.SX, tuple[str, ..
 def axles(s: Sample) -> ca.Function:
     """q -> (4, n_contacts): where the middle of each contact is on the ground, x, y, and the way from its right end to
     its left one [m]."""
-    machine, R = s.machine, tree.rot_z(s.heading)
+    machine, R = s.machine, mechanics.rot_z(s.heading)
     root = ca.vertcat(*[s.at[c] for c in machine.body[0].coordinates[:2]], 0) if machine.planar else ca.SX(3, 1)
     found = []
     for body in machine.contacts:
@@ -454,7 +454,7 @@ def kinematics(s: Sample, slips: Mapping[str, ca.SX]) -> ca.Function:
     if machine.planar:
         x, y, _ = machine.body[0].coordinates
         turned = dict(
-            zip((x, y), ca.vertsplit((tree.rot_z(s.heading) @ ca.vertcat(rate[x], rate[y], 0))[:2]), strict=True)
+            zip((x, y), ca.vertsplit((mechanics.rot_z(s.heading) @ ca.vertcat(rate[x], rate[y], 0))[:2]), strict=True)
         )
         dq = ca.vertcat(*[turned.get(c, rate[c]) for c in machine.coordinates])
     wheels = []
@@ -464,7 +464,7 @@ def kinematics(s: Sample, slips: Mapping[str, ca.SX]) -> ca.Function:
             assert sensor.radius is not None
             assert sensor.lateral is not None
             wheels.append((f.velocity[0] - float(sensor.lateral) * f.omega[2]) / float(sensor.radius))
-    R = tree.rot_z(s.heading)
+    R = mechanics.rot_z(s.heading)
     root = ca.vertcat(*[at[c] for c in machine.body[0].coordinates[:2]], 0) if machine.planar else ca.SX(3, 1)
     places = ca.horzcat(*[root + R @ frames[b.index].position for b in machine.body])
     speeds = ca.horzcat(*[frames[b.index].velocity for b in machine.body])

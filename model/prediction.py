@@ -15,11 +15,12 @@ from functools import cached_property, lru_cache
 import casadi as ca
 import numpy as np
 
-from model import lane, placing, tree
-from model.columns import independent
-from model.effect import Placed, Site
-from model.equations import Equations, axles, equations, kinematics
-from model.machine import Machine, MachineError
+from excite.errors import MachineError
+from excite.model import mechanics
+from excite.model.effects import Ground, Placed, Site, placed as placing_placed
+from excite.model.equations import Equations, axles, equations, kinematics
+from excite.model.machine import Machine
+from excite.model.mechanics import independent
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ def standard_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
     joints: dict[str, tuple[float, str]] = {}
     for body in machine.body:
         k = body.index
-        inertia = {n: (v, _inertial_unit(n)) for n, v in tree.standard_inertia(body).items()}
+        inertia = {n: (v, _inertial_unit(n)) for n, v in mechanics.standard_inertia(body).items()}
         if body.inertia is not None and body.inertia.axisymmetric:
             joints |= inertia
         else:
@@ -153,7 +154,7 @@ class Model:
         """A map of ground on which no contact has been yet: what it tells (n_contacts MOST,) when the machine has come
         to coordinates (n_q,), called for one sample of a motion after the other."""
         contacts = [b.contact for b in self.machine.contacts if b.contact is not None]
-        ground = lane.Ground([float(c.width) for c in contacts])
+        ground = Ground([float(c.width) for c in contacts])
         q, axles = np.zeros(len(self.coordinates)), np.zeros((len(contacts), 4))
         told = self.axles.buffer()
         told[0].set_arg(0, q.data)
@@ -303,7 +304,7 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
     """
     table = standard_parameters(machine)
     _check_names(machine, tuple(table))
-    placed = tuple(placing.placed(machine, entry) for entry in machine.effect)
+    placed = tuple(placing_placed(machine, entry) for entry in machine.effect)
     twice = sorted({e.name for e in placed if [f.name for f in placed].count(e.name) > 1})
     if twice:
         raise MachineError(f"{machine.name}: effect: given twice at one place: {', '.join(twice)}")

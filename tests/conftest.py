@@ -19,11 +19,12 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from excite import log, profiles, sensors, stages
-from excite.simulate import Motion, simulate
-from model import machine, placing, prediction
-from model.machine import EffectEntry
-from model.prediction import Model
+from excite.diagnosis import fits
+from excite.logs import log, profile
+from excite.model import Model, prediction
+from excite.model.effects import placing
+from excite.model.machine import EffectEntry, machine
+from excite.simulation import Motion, sensors, simulate
 
 settings.register_profile("calm", deadline=None)  # other work on the machine is no fault of the code
 settings.load_profile("calm")
@@ -45,7 +46,7 @@ def drive(model: Model, duration: float, seed: int, amplitude: dict[str, float])
 
 def designed(name: str, model: Model) -> Motion:
     """A committed design, its torques on a machine."""
-    torque, q0, nu0 = profiles.read(RESULTS / name / "design" / "profile.csv", model)
+    torque, q0, nu0 = profile.read_profile(RESULTS / name / "design" / "profile.csv", model)
     return simulate(model, torque, q0=q0, nu0=nu0)
 
 
@@ -76,10 +77,10 @@ def gentle(model: Model, seconds: float) -> Motion:
     return simulate(model, np.column_stack([1500 * np.sin(1.7 * t) * slow, 1200 * np.sin(2.6 * t) * slow]))
 
 
-def calm(model: Model) -> stages.Stage:
+def calm(model: Model) -> fits.Stage:
     """The model fitted to a log of that without anything hidden."""
-    one = log.check(sensors.measure(model, gentle(model, 12.0), seed=3), model.machine)
-    return stages.fitted(model.machine, [one], model.machine.filter)
+    one = log.from_table(sensors.measure(model, gentle(model, 12.0), seed=3), model.machine)
+    return fits.fitted(model.machine, [one], model.machine.filter)
 
 
 def slope(straight: Model) -> EffectEntry:
@@ -89,17 +90,17 @@ def slope(straight: Model) -> EffectEntry:
 
 @pytest.fixture(scope="session")
 def va12() -> Model:
-    return prediction.build(machine.load("va12"))
+    return prediction.build(machine.load_machine("va12"))
 
 
 @pytest.fixture(scope="session")
 def straight() -> Model:
-    return prediction.build(machine.load("va12_straight"))
+    return prediction.build(machine.load_machine("va12_straight"))
 
 
 @pytest.fixture(scope="session")
 def emps() -> Model:
-    return prediction.build(machine.load("emps"))
+    return prediction.build(machine.load_machine("emps"))
 
 
 @pytest.fixture(scope="session")

@@ -18,9 +18,10 @@ import pytest
 import typer
 from conftest import Excite
 
-from excite import folder, handbook, reference
-from excite.commands import app
-from model import effects, machine, units
+from excite import output
+from excite.cli import app, reference, reference_html
+from excite.model.effects import catalogue
+from excite.model.machine import units
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
@@ -74,7 +75,7 @@ def test_a_study_can_be_rebuilt_where_it_is(monkeypatch: pytest.MonkeyPatch) -> 
     places = re.findall(r"--out (results/[^ `]+)", (ROOT / "results" / "README.md").read_text(encoding="utf-8"))
     assert len(places) > 8
     for place in places:
-        folder.claim(Path(place))
+        output.claim(Path(place))
         assert (ROOT / place / "summary.json").is_file() or (ROOT / place / "design" / "summary.json").is_file()
 
 
@@ -98,18 +99,15 @@ def test_readme_lines_of_python_run(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     (text,) = [text for language, text in blocks(ROOT / "README.md") if language == "python"]
     assert len([line for line in text.splitlines() if line and not line.startswith(("from", "import"))]) <= 5
     monkeypatch.chdir(tmp_path)
-    asked = machine.load("va12").problems["R60"]
-    names: dict[str, Any] = {
-        "half": asked.model_copy(update={"duration_s": asked.duration_s.model_copy(update={"value": 30.0})})
-    }
-    text = text.replace('model.machine.problems["R60"]', "half").replace("starts=2", "starts=1")
+    names: dict[str, Any] = {}
+    text = text.replace("starts=2", "starts=1, duration=30")
     exec(compile(text, "README.md", "exec"), names)
     assert len(names["estimate"].names) == 22
 
 
 def test_every_effect_is_in_its_page() -> None:
     page = reference.effects_page()
-    for name, effect in effects.CATALOGUE.items():
+    for name, effect in catalogue.CATALOGUE.items():
         section = page.split(f"## {name}\n")[1].split("\n## ")[0]
         assert " ".join(effect.source.split())[1:40] in " ".join(section.split())
         for shape in effect.shapes:
@@ -120,11 +118,11 @@ def test_every_effect_is_in_its_page() -> None:
 def test_reference_pages_hold_what_the_code_has(excite: Excite, tmp_path: Path) -> None:
     code, stdout, _ = excite("docs", "--out", tmp_path / "d", "--json")
     assert code == 0
-    assert json.loads(stdout)["pages"] == [handbook.NAME, *reference.PAGES]
-    read = {name: (tmp_path / "d" / name).read_text() for name in reference.PAGES}
-    assert (tmp_path / "d" / handbook.NAME).read_text() == handbook.page(read)
-    assert "def load(name: str | Path) -> Model" in read["python.md"]
-    assert "### identify.identify" in read["python.md"]
+    assert json.loads(stdout)["pages"] == [reference_html.NAME, "commands.md", *reference.PAGES]
+    read = {name: (tmp_path / "d" / name).read_text() for name in ("commands.md", *reference.PAGES)}
+    assert (tmp_path / "d" / reference_html.NAME).read_text() == reference_html.page(read)
+    assert "### excite.load" in read["python.md"]
+    assert "### excite.identification.identify" in read["python.md"]
     assert not re.search(r"0x[0-9a-f]{6}", "".join(read.values()))  # the same code gives the same bytes
     for unit in units.UNITS:
         assert f"| {unit} |" in read["machine-file.md"]
@@ -137,13 +135,16 @@ def test_reference_pages_hold_what_the_code_has(excite: Excite, tmp_path: Path) 
 
 
 def test_every_place_of_an_effect_is_explained() -> None:
-    assert {p for e in effects.CATALOGUE.values() for p in e.places} == set(reference.PLACES)
+    assert {p for e in catalogue.CATALOGUE.values() for p in e.places} == set(reference.PLACES)
 
 
 def test_the_handbook_is_whole() -> None:
     """Every heading of every page, links that lead somewhere, and nothing left as it was written."""
-    pages = {name: page() for name, page in reference.PAGES.items() if name != "python.md"}
-    text = handbook.page(pages | {"python.md": "# Python\n\n## m\n\n```python\ndef f(x: a < b)\n```\n\n*x* | y <i>\n"})
+    pages = {"commands.md": reference.commands_page(app)}
+    pages |= {name: page() for name, page in reference.PAGES.items() if name != "python.md"}
+    text = reference_html.page(
+        pages | {"python.md": "# Python\n\n## m\n\n```python\ndef f(x: a < b)\n```\n\n*x* | y <i>\n"}
+    )
     anchors = re.findall(r'<h[123] id="([^"]+)"', text)
     assert len(set(anchors)) == len(anchors) == 2 + sum(len(re.findall("^#+ ", p, re.M)) for p in pages.values())
     assert set(re.findall(r'href="#([^"]+)"', text)) <= set(anchors)

@@ -19,32 +19,19 @@ import casadi as ca
 import numpy as np
 import pandas as pd
 import pytest
-from test_tree import TOLERANCE, Case, relative
+from model.test_tree import TOLERANCE, Case, relative
 
-from excite import (
-    compare,
-    design,
-    diagnose,
-    hidden,
-    identify,
-    limit,
-    log,
-    logcheck,
-    manoeuvre,
-    misfit,
-    sensors,
-    separate,
-    sheet,
-    topview,
-)
-from excite.diagnose import Diagnosis
-from excite.limit import InfeasibleError
-from excite.simulate import Motion, simulate
-from model import effects, placing, sizes
-from model.effect import Site
-from model.file import Quantity
-from model.machine import Machine, Problem, load, shipped
-from model.prediction import Model, build, standard_parameters
+from excite.diagnosis import Diagnosis, diagnosis as diagnose, residuals, separating_run
+from excite.errors import InfeasibleError
+from excite.identification import identifiability, methods
+from excite.logs import inspection, log
+from excite.model import Model, build, standard_parameters
+from excite.model.effects import Site, catalogue, placing, sizes
+from excite.model.machine import Machine, Problem, Quantity, load_machine, shipped_machines
+from excite.operator import sheet
+from excite.reports import top_view
+from excite.simulation import Motion, sensors, simulate
+from excite.trajectories import baselines, excitation, limits, multistart
 
 ROOT = Path(__file__).parents[1]
 NEVER = ("MZ", "XX", "XY", "XZ", "YY", "YZ")  # of a chassis: what motion on the plane can't show
@@ -139,7 +126,7 @@ CASES = {
 
 @lru_cache
 def model_of(name: str) -> Model:
-    return build(load(name))
+    return build(load_machine(name))
 
 
 @pytest.fixture(params=CASES)
@@ -186,7 +173,7 @@ def test_rank_of_the_standard_regressor_is_the_number_of_base_parameters(model: 
 
 
 # ------------------------------------------------------------------------------------------------- rigid bodies
-MACHINES = [load(name) for name in shipped()]
+MACHINES = [load_machine(name) for name in shipped_machines()]
 # Held on a line, a machine has no bias to compare.
 FREE = [m.name for m in MACHINES if m.planar and not set(m.body[0].coordinates) & set(m.locked)]
 
@@ -220,7 +207,7 @@ def test_dynamics_are_pinocchios(name: str) -> None:
 
 def test_an_axle_is_a_roll_as_wide_as_sqrt_3_times_its_track() -> None:
     """What the loaders' files say: two wheels that turn together, and the roll that stands for them, push alike."""
-    one = load("pendulum_loader")
+    one = load_machine("pendulum_loader")
     track, spin = 1.35, 1.7
     body = one.find(1)
     assert body.contact is not None
@@ -260,10 +247,10 @@ def _of_soil(model: Model, index: int, q: np.ndarray, nu: np.ndarray) -> np.ndar
 # --------------------------------------------------------------------------------- design, simulation, estimate
 def test_a_log_gives_the_true_parameters_back(name: str, model: Model) -> None:
     """A random drive of twelve seconds with every sensor's flaws: no parameter four of its own deviations off."""
-    drive = manoeuvre.scaled(manoeuvre.multisine(model, short(model.machine, 12.0), 1, top=0.4), CASES[name].share)
+    drive = excitation.scaled(excitation.multisine(model, short(model.machine, 12.0), 1, top=0.4), CASES[name].share)
     motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
     table = sensors.measure(model, motion, kit="full", seed=1)
-    estimate = identify.identify(model, [log.check(table, model.machine)], identify.recommended(model))
+    estimate = methods.identify(model, [log.from_table(table, model.machine)], methods.recommended(model))
     assert estimate.unidentifiable == {}
     z = (estimate.value - model.nominal) / estimate.std
     assert np.abs(z).max() < 4, dict(zip(model.base.names, z.round(1), strict=True))
@@ -274,16 +261,16 @@ def test_a_log_gives_the_true_parameters_back(name: str, model: Model) -> None:
 
 def test_a_drum_that_nothing_drives_is_found_as_well() -> None:
     """The single-drum roller pulled along by its wheels: the drum's row says that no torque acts on it."""
-    pulled = load("single_drum")
+    pulled = load_machine("single_drum")
     body = tuple(b.model_copy(update={"actuated": False}) if b.name == "drum" else b for b in pulled.body)
     sensor = tuple(s for s in pulled.sensor if s.name != "u_drum")
     model = build(pulled.model_copy(update={"body": body, "sensor": sensor}))
     assert model.inputs == ("u1", "u2", "u3")
     assert "u50" in model.base.invisible
-    drive = manoeuvre.scaled(manoeuvre.multisine(model, short(model.machine, 12.0), 1, top=0.4), 0.5)
+    drive = excitation.scaled(excitation.multisine(model, short(model.machine, 12.0), 1, top=0.4), 0.5)
     motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
-    measured = log.check(sensors.measure(model, motion, seed=1), model.machine)
-    estimate = identify.identify(model, [measured], "joint")
+    measured = log.from_table(sensors.measure(model, motion, seed=1), model.machine)
+    estimate = methods.identify(model, [measured], "joint")
     z = (estimate.value - model.nominal) / estimate.std
     assert np.nanmax(np.abs(z)) < 4
     drum = [k for k, n in enumerate(model.base.names) if n in ("ZZ5", "Fs5", "Kx5", "Ky5")]
@@ -295,8 +282,8 @@ def test_design_ends_with_a_drive_or_with_the_limit_that_it_misses(model: Model)
     problem = short(model.machine, 6.0)
     excess, said = 0.0, "no drive found"
     try:
-        found = design.design(model, problem, starts=1, seed=1, budget_s=0.1)
-        excess = max(limit.check(model, problem, found.motion).values())
+        found = multistart.design(model, problem, starts=1, seed=1, budget_s=0.1)
+        excess = max(limits.check_limits(model, problem, found.motion).values())
     except InfeasibleError as missed:
         said = str(missed)
     assert excess <= 1e-3
@@ -306,7 +293,7 @@ def test_design_ends_with_a_drive_or_with_the_limit_that_it_misses(model: Model)
 # ------------------------------------------------------------------------- what once knew that it is a compactor
 def turned(model: Model) -> float:
     """How far the hand-made drive turns the machine, the range of its heading [rad]."""
-    drive = compare.hand_made(model, short(model.machine, 20.0), 0, 0.0)
+    drive = baselines.hand_made(model, short(model.machine, 20.0), 0, 0.0)
     motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
     return float(np.ptp(motion.q[:, model.coordinates.index("theta0")]))
 
@@ -320,14 +307,14 @@ def test_a_hand_made_drive_turns_whatever_it_steers_with(name: str) -> None:
 
 def test_sides_of_a_skid_steered_robot_may_turn_against_each_other() -> None:
     """On the spot the sides do; two wheels of one side that do are wired wrongly."""
-    robot = load("skid_robot")
+    robot = load_machine("skid_robot")
     t = np.arange(500) / 100
     way = np.sin(2 * t) + 0.3 * np.sin(5 * t)
     signs = {"front_left": -1, "rear_left": -1, "front_right": 1, "rear_right": 1}
 
     def wired() -> list[str]:
         table = pd.DataFrame({"t_s": t} | {f"{n}_rad": sign * way for n, sign in signs.items()})
-        return [r for r in logcheck.inspect(table, robot).faults if "against each other" in r]
+        return [r for r in inspection.inspect(table, robot).faults if "against each other" in r]
 
     assert wired() == []
     signs["rear_left"] = 1
@@ -366,7 +353,7 @@ def test_no_code_and_no_message_speaks_of_one_kind_of_machine(path: Path) -> Non
     steering = re.compile(r"(?i)\barticulations?\b")
     found = []
     for line, text in said(path):
-        for name in effects.CATALOGUE:
+        for name in catalogue.CATALOGUE:
             text = text.replace(name, "")
         words = FOREIGN.findall(KINDS.sub("", text))
         if path.parent.name == "excite" and text != '"articulation"':
@@ -394,7 +381,7 @@ def test_torques_that_effects_take_are_of_the_machines_own_size(name: str) -> No
         full, nu = sizes.full_torque(plain.machine, body), np.zeros(len(still))
         u, nu[row] = full * np.eye(len(plain.inputs))[k], 1.0
         for cause, share in (("torque_deadband", 1.0), ("relief_valve", 0.4 * full), ("load_dependent_friction", full)):
-            effect = effects.CATALOGUE[cause]
+            effect = catalogue.CATALOGUE[cause]
             if body.where not in placing.places(plain.machine, effect):
                 continue
             amount = effect.amount(Site(plain.machine, body, 10.0))
@@ -409,8 +396,8 @@ def test_torques_that_effects_take_are_of_the_machines_own_size(name: str) -> No
 def test_what_is_advised_has_the_machines_names(own: str) -> None:
     """A robot and a loader have no rolls: neither in what a log hides, nor in what separates causes, nor in the cab."""
     model = model_of(own)
-    texts = [c.text for c in hidden.changes(model, np.zeros(len(model.coordinates), bool))]
-    texts += [separate._said(run, model.machine) for run in separate.RUNS]
+    texts = [c.text for c in identifiability.changes(model, np.zeros(len(model.coordinates), bool))]
+    texts += [separating_run._said(run, model.machine) for run in separating_run.RUNS]
     texts += sheet.set_up(model.machine)
     contacts = [b.where.replace("_", " ") for b in model.machine.contacts]
     assert any(f"drive {contacts[0]}" in text and contacts[-1] in text for text in texts)
@@ -419,9 +406,9 @@ def test_what_is_advised_has_the_machines_names(own: str) -> None:
 
 def test_what_a_straight_log_of_a_skid_steered_robot_hides_is_seen_by_turning() -> None:
     model = model_of("skid_robot")
-    texts = [c.text for c in hidden.changes(model, np.zeros(len(model.coordinates), bool))]
+    texts = [c.text for c in identifiability.changes(model, np.zeros(len(model.coordinates), bool))]
     assert "turn (drive its sides at different speeds)" in texts
-    assert not any("sides" in c.text for c in hidden.changes(model_of("tandem"), np.zeros(7, bool)))
+    assert not any("sides" in c.text for c in identifiability.changes(model_of("tandem"), np.zeros(7, bool)))
 
 
 @pytest.fixture(scope="module")
@@ -429,11 +416,11 @@ def biased() -> tuple[Motion, Diagnosis]:
     """The robot on its designed drive, with a gyro that reads too much; and what the log shows."""
     model = model_of("skid_robot")
     drawn = json.loads((ROOT / "results" / "machines" / "skid_robot" / "drive.json").read_text())
-    torque = manoeuvre.Manoeuvre(np.array(drawn["times_s"]), np.array(drawn["torque"])).sample(100.0)[:801]
+    torque = excitation.Manoeuvre(np.array(drawn["times_s"]), np.array(drawn["torque"])).sample(100.0)[:801]
     effect = placing.parse("yaw_rate_bias=0.01", model.machine, 8.0)
     wrong = build(placing.extended(model.machine, effect))
     motion = simulate(wrong, torque)
-    measured = log.check(sensors.measure(wrong, motion, seed=3), model.machine)
+    measured = log.from_table(sensors.measure(wrong, motion, seed=3), model.machine)
     return motion, diagnose.diagnose(model, [measured], model.machine.filter)
 
 
@@ -443,7 +430,7 @@ def test_a_diagnosis_names_what_a_robot_has(biased: tuple[Motion, Diagnosis]) ->
     assert (found.verdict, [f.name for f in found.findings]) == ("named", ["yaw_rate_bias@yaw_rate"])
     (bias,) = found.findings
     assert abs(bias.amount - 0.01) < 4 * bias.amount_std
-    (course,) = misfit.courses(found.after)
+    (course,) = residuals.courses(found.after)
     machine = model_of("skid_robot").machine
     (Vx, _, yaw, *spins), slips = motion.nu.T, course.quantities["slip"][1]
     for body, spin in zip(machine.contacts, spins, strict=True):
@@ -465,11 +452,11 @@ def test_a_diagnosis_names_what_a_roll_has_that_nothing_drives(cause: str) -> No
     """On the three-wheel roller's designed drive, by the right name, place and amount."""
     model = model_of("three_wheel")
     drawn = json.loads((ROOT / "results" / "machines" / "three_wheel" / "drive.json").read_text())
-    torque = manoeuvre.Manoeuvre(np.array(drawn["times_s"]), np.array(drawn["torque"])).sample(100.0)
+    torque = excitation.Manoeuvre(np.array(drawn["times_s"]), np.array(drawn["torque"])).sample(100.0)
     wrong = build(placing.extended(model.machine, placing.parse(cause, model.machine, 20.0)))
     motion = simulate(wrong, torque, q0=np.array(drawn["start"]))
     found = diagnose.diagnose(
-        model, [log.check(sensors.measure(wrong, motion, seed=1), model.machine)], model.machine.filter
+        model, [log.from_table(sensors.measure(wrong, motion, seed=1), model.machine)], model.machine.filter
     )
     name, _, amount = cause.partition("=")
     assert (found.verdict, [f.name for f in found.findings]) == ("named", [name])
@@ -493,13 +480,13 @@ def test_the_run_that_separates_has_the_machines_names(
     tied = (placing.parse(f"{rival}=1", machine, 8.0),)
     found = replace(biased[1].findings[0], effect=effect, where=where, rivals=tied)
     diagnosis = replace(biased[1], findings=(found,))
-    assert separate.run(diagnosis) == said
-    pairs = separate.rivals(diagnosis)
+    assert separating_run.run(diagnosis) == said
+    pairs = separating_run.rivals(diagnosis)
     assert [(p.machine, p.between) for p in pairs] == ([] if said is None else [(machine, (found.entry, tied[0]))])
 
 
 def test_footprints_stand_where_the_wheels_do() -> None:
     """The robot turned by a quarter and moved: its front left wheel is now ahead on the left of where it stood."""
-    shapes = topview.footprints(load("skid_robot"), {"x0": 5.0, "y0": 1.0, "theta0": np.pi / 2})
+    shapes = top_view.footprints(load_machine("skid_robot"), {"x0": 5.0, "y0": 1.0, "theta0": np.pi / 2})
     assert shapes[0].mean(axis=0) == pytest.approx([5 - 0.29153, 1 + 0.249])
-    assert np.ptp(shapes[0], axis=0) == pytest.approx([topview.NARROW * 0.16459, 2 * 0.16459])
+    assert np.ptp(shapes[0], axis=0) == pytest.approx([top_view.NARROW * 0.16459, 2 * 0.16459])

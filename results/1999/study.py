@@ -23,20 +23,14 @@ import numpy as np
 import scipy.linalg
 from matplotlib.figure import Figure
 
-from excite import log, sensors
-from excite.design import design
-from excite.driver import follow
-from excite.figures import COLOURS, save
-from excite.manoeuvre import Manoeuvre
-from excite.objective import percent
-from excite.processing import decimate, samples
-from excite.simulate import Motion, simulate
+from excite.identification import summarise_runs as verified, verify
+from excite.logs import decimate, log, samples
+from excite.model import Model, build
+from excite.model.machine import Filter, Machine, machine as machines
+from excite.reports import COLOURS, save
+from excite.simulation import Motion, follow, sensors, simulate
 from excite.smoothing import cramer_rao
-from excite.verify import summary as verified
-from excite.verify import verify
-from model import machine as machines
-from model.machine import Filter, Machine
-from model.prediction import Model, build
+from excite.trajectories import Manoeuvre, design, percent
 
 HERE = Path(__file__).parent
 FORK = "multiprocessing"  # workers keep the models that this file has built
@@ -101,7 +95,7 @@ class Fit:
 
 @lru_cache(maxsize=1)
 def reference() -> Model:
-    return build(machines.load("va12_straight"))
+    return build(machines.load_machine("va12_straight"))
 
 
 @lru_cache(maxsize=64)
@@ -170,7 +164,7 @@ def measured(plant: Plant, moved: Motion, seed: int) -> log.Log:
     table = sensors.measure(true_model(plant), moved, kit="paper", seed=seed, noise=bool(np.isfinite(plant.counts)))
     for column in ("u1_Nm", "u4_Nm"):
         table[column] = table[column] / plant.scale
-    return log.check(table, reference().machine)
+    return log.from_table(table, reference().machine)
 
 
 # ------------------------------------------------------------------------------------------------ least squares, 1999

@@ -19,14 +19,14 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 import numpy as np
 from matplotlib.figure import Figure
 
-from excite import folder, objective, profiles
-from excite.bound import Bound, bound
-from excite.figures import COLOURS, save
-from excite.limit import placed
-from excite.manoeuvre import Manoeuvre
-from excite.simulate import Motion, simulate
-from model import machine, prediction
-from model.prediction import Model
+from excite import output
+from excite.logs import profile
+from excite.model import Model, prediction
+from excite.model.machine import machine
+from excite.reports import COLOURS, save
+from excite.simulation import Motion, simulate
+from excite.trajectories import Manoeuvre, objective, placed
+from excite.trajectories.bound import Bound, bound
 
 HERE = Path(__file__).parent
 DESIGNS = HERE.parent / "R60" / "design", HERE.parent / "R60_accuracy" / "design"
@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--degree", type=int, default=2, help="of the polynomials")
     parser.add_argument("--polished", type=int, default=12, help="states that are made worse locally in a round")
     options = parser.parse_args()
-    model = prediction.build(machine.load("va12"))
+    model = prediction.build(machine.load_machine("va12"))
     motions = drives(model)
     path: list[Bound] = []
     begin = time.monotonic()
@@ -77,10 +77,10 @@ def main() -> None:
     certificate = found.certificate
     assert certificate is not None
     told = {k: getattr(certificate, k) for k in ("U", "V", "m", "a", "b")}
-    with folder.writing_file(HERE / "certificate.json") as place:
+    with output.writing_file(HERE / "certificate.json") as place:
         place.write_text(json.dumps(told, default=lambda x: np.asarray(x).tolist()) + "\n", encoding="utf-8")
-    with folder.writing_file(HERE / "summary.json") as place:
-        place.write_text(folder.dump(summary), encoding="utf-8")
+    with output.writing_file(HERE / "summary.json") as place:
+        place.write_text(output.dump(summary), encoding="utf-8")
 
 
 def drives(model: Model) -> list[Motion]:
@@ -91,7 +91,7 @@ def drives(model: Model) -> list[Motion]:
     start = placed(model, model.machine.problems["R60"], simulate(model, torque))
     found = [simulate(model, torque, q0=start)]
     for place in DESIGNS:
-        torque, q0, nu0 = profiles.read(place / "profile.csv", model)
+        torque, q0, nu0 = profile.read_profile(place / "profile.csv", model)
         found.append(simulate(model, torque, q0=q0, nu0=nu0))
     return found
 

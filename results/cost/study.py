@@ -25,11 +25,13 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 import numpy as np
 from matplotlib.figure import Figure
 
-from excite import aim as aims
-from excite import folder
-from excite.continuation import PLAN, depart, repair, search
-from excite.figures import COLOURS, STYLES, save
-from model import machine, prediction
+from excite import output
+from excite.model import prediction
+from excite.model.machine import machine
+from excite.reports import COLOURS, save
+from excite.reports.figures import STYLES
+from excite.trajectories import composite_objective as aims
+from excite.trajectories.continuation import PLAN, depart, repair, search
 
 HERE = Path(__file__).parent
 # Functions whose time is told apart: (file, name) to what they do. None of them calls another.
@@ -65,13 +67,13 @@ def main() -> None:
     (HERE / "table.md").write_text(table(rows))
     save(figure(rows), HERE / "cost.png")
     summary = {"load_average": os.getloadavg()[0], "cores": os.cpu_count(), "cases": rows}
-    with folder.writing_file(HERE / "summary.json") as place:
-        place.write_text(folder.dump(summary), encoding="utf-8")
+    with output.writing_file(HERE / "summary.json") as place:
+        place.write_text(output.dump(summary), encoding="utf-8")
 
 
 def case(name: str, seconds: float, knot: float) -> dict[str, object]:
     """One start of a design: wall and processor time [s], peak memory [MB], where the time went."""
-    model = prediction.build(machine.load(name))
+    model = prediction.build(machine.load_machine(name))
     before = model.machine.problems[model.machine.problem or ""]
     problem = before.model_copy(
         update={

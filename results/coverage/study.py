@@ -26,17 +26,18 @@ import numpy as np
 import pandas as pd
 import scipy.signal
 
-from excite import drive, log, sensors
-from excite.driver import Driver
-from excite.estimate import NoEstimate
-from excite.identify import identify
-from excite.objective import percent, relative
-from excite.scenario import varied
-from excite.simulate import Motion, simulate
-from excite.smoothing import DOUBT, DRAWN, cramer_rao
-from model import machine as machines
-from model.machine import Machine
-from model.prediction import Model, build
+from excite.errors import NoEstimate
+from excite.identification import identify
+from excite.identification.joint import DOUBT, DRAWN
+from excite.logs import log
+from excite.model import Model, build
+from excite.model.machine import Machine, machine as machines
+from excite.operator import ground
+from excite.simulation import Driver, Motion, sensors, simulate
+from excite.simulation.scenarios import varied
+from excite.smoothing import cramer_rao
+from excite.trajectories import percent
+from excite.trajectories.objective import relative
 
 HERE = Path(__file__).parent
 RUNS = HERE / "runs.jsonl"
@@ -51,7 +52,7 @@ MEAN, LEAST = (93.0, 97.0), 88.0  # coverage asked for, mean and least of the pa
 class Set:
     """Runs of one kind: the drive, the sensors, how far off the start is, what nature adds."""
 
-    drive: str
+    ground: str
     kit: str
     runs: int
     start: str = "off"
@@ -80,7 +81,7 @@ SETS = (
 
 @lru_cache(maxsize=1)
 def nominal() -> Model:
-    return build(machines.load("va12"))
+    return build(machines.load_machine("va12"))
 
 
 @lru_cache(maxsize=8)
@@ -106,9 +107,9 @@ def designed(name: str) -> np.ndarray:
 
 
 @lru_cache(maxsize=1)
-def trace() -> drive.Trace:
+def trace() -> ground.Trace:
     """The phases that a person is given: R60_accuracy in pieces of two seconds and more."""
-    return drive.phases(nominal(), simulate(nominal(), designed("R60_accuracy")))
+    return ground.phases(nominal(), simulate(nominal(), designed("R60_accuracy")))
 
 
 def moved(name: str, nature: str, seed: int) -> Motion:
@@ -116,7 +117,7 @@ def moved(name: str, nature: str, seed: int) -> Motion:
     model = natural(nature)
     if name != "human":
         return simulate(model, designed(name))
-    by_hand = drive.driven(model, trace(), Driver(), seed)
+    by_hand = ground.driven(model, trace(), Driver(), seed)
     low = scipy.signal.butter(2, HYDRAULICS / (float(model.machine.sampling_hz) / 2))
     return simulate(model, scipy.signal.filtfilt(*low, by_hand.u, axis=0))
 
@@ -126,7 +127,7 @@ def run(s: Set, seed: int) -> dict[str, object]:
     rng = np.random.default_rng([seed, 1999])
     start = build(varied(nominal().machine, FAR if s.start == "far" else OFF, rng, corner=s.start == "far"))
     table = sensors.measure(natural(s.nature), moved(s.drive, s.nature, seed), kit=s.kit, seed=seed)
-    measured = log.check(table, start.machine)
+    measured = log.from_table(table, start.machine)
     row: dict[str, object] = {"set": s.name, "seed": seed}
     began = time.process_time()
     try:

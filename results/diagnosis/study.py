@@ -35,20 +35,22 @@ import joblib
 import numpy as np
 import pandas as pd
 import scipy.stats
-from blind import Case, ask, blind, case, score
-from causes import CAUSES
 from matplotlib.figure import Figure
-from surprises import SURPRISES
-from visibility import VISIBLE, visibility
+from support.blind import Case, ask, blind, case, score
+from support.causes import CAUSES
+from support.surprises import SURPRISES
+from support.visibility import VISIBLE, visibility
 
-from excite.folder import writing_file
+from excite.output import writing_file
 
 Row = dict[str, Any]
 FRESH = {"nothing": 3030, "cause": 41, "surprise": 20, "pair": 106}  # numbers below were looked at when mending
 GOOD = ("right", "tied")  # a tie that holds the cause sends nobody to repair the wrong thing
-LOADED = """import sys, excite.findings, excite.examine
-print(*(m.__file__ for n, m in sys.modules.items() if n.partition(".")[0] in ("excite", "model")), sep="\\n")"""
-ROLLER = [ROOT / "tests" / n for n in ("plant.py", "causes.py", "surprises.py", "blind.py", "visibility.py")]
+LOADED = """import sys, excite.diagnosis.findings, excite.logs.repair
+print(*(m.__file__ for n, m in sys.modules.items() if n.partition(".")[0] == "excite" and m.__file__), sep="\\n")"""
+ROLLER = [
+    ROOT / "tests" / "support" / n for n in ("plant.py", "causes.py", "surprises.py", "blind.py", "visibility.py")
+]
 
 
 def _digits(files: Sequence[Path]) -> str:

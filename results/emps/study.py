@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from excite import log
-from excite.estimate import NoEstimate
-from excite.identify import METHODS, identify
-from excite.processing import derivative, lowpass
-from excite.simulate import Motion, respond
-from model import machine
-from model.prediction import Model, build
+from excite.errors import NoEstimate
+from excite.identification import METHODS, identify
+from excite.logs import derivative, log, lowpass
+from excite.model import Model, build
+from excite.model.machine import machine
+from excite.simulation import Motion, respond
 
 HERE = Path(__file__).parent
 DATA = HERE.parents[1] / ".." / "shared" / "data" / "emps" / "DATA_EMPS.mat"
@@ -172,8 +171,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path, nargs="?", default=DATA)
     path = parser.parse_args().data
-    model = build(machine.load("emps"))
-    one = log.read(path, model.machine)
+    model = build(machine.load_machine("emps"))
+    one = log.read_log(path, model.machine)
     raw = {k: np.ravel(v) for k, v in scipy.io.loadmat(path).items() if not k.startswith("_")}
     found: dict[str, dict[str, object]] = {}
     for method in METHODS:

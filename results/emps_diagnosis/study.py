@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from excite import log
-from excite.processing import filtered_regression
-from model import machine, placing
-from model.prediction import build
+from excite.logs import filtered_regression, log
+from excite.model import build
+from excite.model.effects import placing
+from excite.model.machine import machine
 
 HERE = Path(__file__).parent
 DATA = HERE.parents[2] / "shared" / "data" / "emps" / "DATA_EMPS.mat"
@@ -30,12 +30,12 @@ SECOND, DRAWS = 100, 2000  # rows of a second; intervals from so many draws
 
 
 def main(path: Path) -> None:
-    plain = machine.load("emps")
+    plain = machine.load_machine("emps")
     found = {}
     errors = {}
     for name, texts in MODELS.items():
         model = build(placing.extended(plain, *(placing.parse(t, plain, 25.0) for t in texts)))
-        W, Y = filtered_regression(model, log.read(path, plain), plain.filter)
+        W, Y = filtered_regression(model, log.read_log(path, plain), plain.filter)
         W, Y = W[0], Y[0]
         X = np.linalg.lstsq(W, Y, rcond=None)[0]
         half = len(Y) // 2

@@ -9,13 +9,16 @@ and identified with the old file and with the new one. Of a tie the new file has
 
 from __future__ import annotations
 
-# ruff: noqa: E402  (threads are set before numpy loads)
 import argparse
 import json
 import os
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+# ruff: noqa: E402  (threads are set before numpy loads)
+from excite import smoothing
+from excite.errors import InfeasibleError
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
@@ -24,30 +27,18 @@ import joblib
 import numpy as np
 from matplotlib.figure import Figure
 
-from excite import (
-    aim,
-    design,
-    diagnose,
-    examine,
-    folder,
-    identify,
-    limit,
-    log,
-    objective,
-    profiles,
-    sensors,
-    smoothing,
-    verify,
-)
-from excite.estimate import NoEstimate
-from excite.figures import COLOURS, save
-from excite.log import Log
-from excite.sidebyside import forked
-from excite.simulate import Motion, SimulationError, simulate
-from excite.wording import rounded
-from model import machine, placing, prediction
-from model.machine import Machine
-from model.prediction import Model
+from excite import output
+from excite.diagnosis import diagnosis, forked
+from excite.errors import NoEstimate, SimulationError
+from excite.identification import methods, monte_carlo
+from excite.logs import Log, log, profile, repair
+from excite.model import Model, prediction
+from excite.model.effects import placing
+from excite.model.machine import Machine, machine
+from excite.reports import COLOURS, save
+from excite.simulation import Motion, sensors, simulate
+from excite.text import rounded
+from excite.trajectories import composite_objective, limits, multistart, objective
 
 HERE = Path(__file__).parent
 DRIVE = HERE.parent / "R60_accuracy" / "design" / "profile.csv"
@@ -77,22 +68,22 @@ def main() -> None:
     for hidden in HIDDEN:
         path = options.kept / f"{hidden}-{options.runs}.json"
         if not path.is_file():
-            with folder.writing_file(path) as place:
-                place.write_text(folder.dump(one(hidden, options.runs, options.jobs)), encoding="utf-8")
+            with output.writing_file(path) as place:
+                place.write_text(output.dump(one(hidden, options.runs, options.jobs)), encoding="utf-8")
         rows.append(json.loads(path.read_text(encoding="utf-8")))
         print(f"{hidden}: done", flush=True)
     save(figure(rows), HERE / "figure.png")
-    with folder.writing_file(HERE / "summary.json") as place:
-        place.write_text(folder.dump({"runs": options.runs, "rows": rows}), encoding="utf-8")
-    with folder.writing_file(HERE / "README.md") as place:
+    with output.writing_file(HERE / "summary.json") as place:
+        place.write_text(output.dump({"runs": options.runs, "rows": rows}), encoding="utf-8")
+    with output.writing_file(HERE / "README.md") as place:
         place.write_text(readme(rows, options.runs), encoding="utf-8")
 
 
 def one(hidden: str, runs: int, jobs: int) -> dict[str, Any]:
     """One effect: what the diagnosis of one log makes of it, and what old and new file tell on old and new drive."""
-    old = machine.load("va12")
+    old = machine.load_machine("va12")
     true = prediction.build(placing.extended(old, placing.parse(hidden, old, 60.0)))
-    torque, start, _ = profiles.read(DRIVE, true)
+    torque, start, _ = profile.read_profile(DRIVE, true)
     motions = {"old": simulate(true, torque, q0=start)}
     found = diagnosed(old, measured(prediction.build(old), true, motions["old"], 1000))
     row: dict[str, Any] = {"hidden": hidden, "verdict": found.verdict, "found": [], "ways": {}}
@@ -105,12 +96,12 @@ def one(hidden: str, runs: int, jobs: int) -> dict[str, Any]:
         problem = old.problems["R60"]
         planned = prediction.build(files["new"].machine, flaws=False)
         try:
-            made = design.design(planned, problem, aim.aim(planned, "accuracy"), starts=2, seed=0)
+            made = multistart.design(planned, problem, composite_objective.aim(planned, "accuracy"), starts=2, seed=0)
             row["cond_phi"] = made.cond_phi
             motions["new"] = simulate(true, made.manoeuvre.sample(float(old.sampling_hz)), q0=made.motion.q[0])
-        except (limit.InfeasibleError, SimulationError) as failed:
+        except (InfeasibleError, SimulationError) as failed:
             row["failed"] = str(failed)
-        row["violation"] = {n: between(limit.check(true, problem, m)) for n, m in motions.items()}
+        row["violation"] = {n: between(limits.check_limits(true, problem, m)) for n, m in motions.items()}
     for way, (file, driven) in WAYS.items():
         if file in files and driven in motions:
             row["ways"][way] = told(files[file], true, motions[driven], runs, jobs)
@@ -119,18 +110,18 @@ def one(hidden: str, runs: int, jobs: int) -> dict[str, Any]:
 
 def between(excess: dict[str, float]) -> dict[str, float]:
     """Excesses of the limits on the motion itself, not of the lane and of rest at its ends."""
-    return {n: x for n, x in excess.items() if not limit.free(n)}
+    return {n: x for n, x in excess.items() if not limits.free(n)}
 
 
-def diagnosed(old: Machine, one: Log) -> diagnose.Diagnosis:
+def diagnosed(old: Machine, one: Log) -> diagnosis.Diagnosis:
     model = prediction.build(old)
-    return diagnose.diagnose(model, [examine.examine(model, one).log], old.filter, together=forked)
+    return diagnosis.diagnose(model, [repair.examine(model, one).log], old.filter, together=forked)
 
 
 def measured(known: Model, true: Model, motion: Motion, seed: int) -> Log:
     """What the sensors write of a true machine's motion, read as a file says."""
     table = sensors.measure(true, motion, kit="full", seed=seed)
-    return log.check(table, known.machine, identify.needed_sensors(known, "joint"))
+    return log.from_table(table, known.machine, methods.needed_sensors(known, "joint"))
 
 
 def told(known: Model, true: Model, motion: Motion, runs: int, jobs: int) -> dict[str, Any]:
@@ -147,9 +138,9 @@ def told(known: Model, true: Model, motion: Motion, runs: int, jobs: int) -> dic
     value, std, interval = (np.array([a[k] for a in answers])[..., at] for k in range(3))
     units = tuple(true.base.units[k] for k in there)
     truth, scale = true.nominal[there], true.scale[there]
-    of = verify.Verification("joint", "full", names, units, truth, scale, value, std, interval, {})
+    of = monte_carlo.Verification("joint", "full", names, units, truth, scale, value, std, interval, {})
     bound = objective.percent(true, smoothing.cramer_rao(true, motion))[there]
-    for (name, row), least in zip(verify.summary(of).items(), bound, strict=True):
+    for (name, row), least in zip(monte_carlo.summarise_runs(of).items(), bound, strict=True):
         told = {key: row[key] for key in ("bias_percent", "rms_percent", "coverage95")}
         found["parameters"][name] = {**told, "attainable_percent": float(least)}
     return found
@@ -158,7 +149,7 @@ def told(known: Model, true: Model, motion: Motion, runs: int, jobs: int) -> dic
 def estimated(known: Machine, true: Machine, motion: Motion, seed: int) -> tuple[np.ndarray, ...] | None:
     model = prediction.build(known)
     try:
-        estimate = identify.identify(model, [measured(model, prediction.build(true), motion, seed)], "joint")
+        estimate = methods.identify(model, [measured(model, prediction.build(true), motion, seed)], "joint")
     except NoEstimate:
         return None
     return estimate.value, estimate.std, estimate.interval95

@@ -18,16 +18,15 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 import numpy as np
 from matplotlib.figure import Figure
 
-from excite import aim as aims
-from excite import folder, objective, profiles
-from excite.continuation import verdict
-from excite.design import design
-from excite.figures import COLOURS, save
-from excite.limit import InfeasibleError
-from excite.manoeuvre import Manoeuvre, knots
-from model import machine, prediction
-from model.machine import Problem
-from model.prediction import Model
+from excite import output
+from excite.errors import InfeasibleError
+from excite.logs import profile
+from excite.model import Model, prediction
+from excite.model.machine import Problem, machine
+from excite.reports import COLOURS, save
+from excite.trajectories import Manoeuvre, composite_objective as aims, design, objective
+from excite.trajectories.continuation import verdict
+from excite.trajectories.excitation import knots
 
 HERE = Path(__file__).parent
 ENDS = {"cond": HERE.parent / "R60" / "design", "accuracy": HERE.parent / "R60_accuracy" / "design"}
@@ -38,7 +37,7 @@ def main() -> None:
     parser.add_argument("--sigma-max", type=float, nargs="*", default=[1.0, 1.5, 2.0, 3.0, 5.0], help="per cent")
     options = parser.parse_args()
     (HERE / "drives").mkdir(exist_ok=True)
-    model = prediction.build(machine.load("va12"))
+    model = prediction.build(machine.load_machine("va12"))
     problem = model.machine.problems["R60"]
     ends = {name: stored(model, problem, place) for name, place in ENDS.items()}
     points = [point(model, problem, name, None, drive, 0.0) for name, drive in ends.items()]
@@ -54,7 +53,7 @@ def main() -> None:
                 continue
             wall = time.monotonic() - begin
             rows = np.column_stack([found.manoeuvre.times, found.manoeuvre.torque])
-            with folder.writing_file(path) as place:
+            with output.writing_file(path) as place:
                 np.savetxt(place, rows, "%.12g", ",", header="t_s,u1_Nm,u2_Nm,u4_Nm", comments="")
         rows = np.loadtxt(path, delimiter=",", skiprows=1)
         before = Manoeuvre(rows[:, 0], rows[:, 1:])
@@ -63,13 +62,13 @@ def main() -> None:
     points.sort(key=lambda p: float(p["worst_percent"]))
     summary = {"machine": "va12", "problem": "R60", "designs": points}
     save(figure(points), HERE / "front.png")
-    with folder.writing_file(HERE / "summary.json") as place:
-        place.write_text(folder.dump(summary), encoding="utf-8")
+    with output.writing_file(HERE / "summary.json") as place:
+        place.write_text(output.dump(summary), encoding="utf-8")
 
 
 def stored(model: Model, problem: Problem, place: Path) -> Manoeuvre:
     """The knots of a design folder."""
-    torque, _, _ = profiles.read(place / "profile.csv", model)
+    torque, _, _ = profile.read_profile(place / "profile.csv", model)
     times = knots(problem)
     return Manoeuvre(times, torque[np.rint(times * float(model.machine.sampling_hz)).astype(int)])
 

@@ -27,17 +27,16 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from scipy.stats import binom
 
-from excite import compare, design, folder, identify, manoeuvre, objective, smoothing
-from excite.figures import COLOURS, save
-from excite.machinecheck import grouping
-from excite.manoeuvre import Manoeuvre
-from excite.simulate import Motion, simulate
-from excite.topview import outline
-from excite.verify import summary, verify
-from excite.wording import rounded
-from model import machine, prediction
-from model.machine import Problem
-from model.prediction import Model
+from excite import output, smoothing
+from excite.identification import methods, summarise_runs, verify
+from excite.model import Model, prediction
+from excite.model.machine import Problem, machine
+from excite.reports import COLOURS, save
+from excite.reports.top_view import outline
+from excite.simulation import Motion, simulate
+from excite.text import rounded
+from excite.trajectories import Manoeuvre, baselines, excitation, multistart, objective
+from excite.workflows.machine_check import grouping
 
 HERE = Path(__file__).parent
 SECONDS, BUDGET = 20.0, 240.0  # of every drive, and for its design [s]; quiet cores need less than 60
@@ -66,7 +65,7 @@ STUDIES = {
 def main(names: list[str], as_is: bool) -> None:
     for name in names:
         (HERE / name).mkdir(exist_ok=True)
-        model = prediction.build(machine.load(name))
+        model = prediction.build(machine.load_machine(name))
         problem = short(model)
         drive = kept(HERE / name / "drive.json", lambda m=model, p=problem: designed(m, p))
         drawn = Manoeuvre(np.array(drive["times_s"]), np.array(drive["torque"]))
@@ -96,8 +95,8 @@ def read(path: Path) -> Any:
 
 
 def write(path: Path, made: Any) -> None:
-    with folder.writing_file(path) as place:
-        place.write_text(folder.dump(made), encoding="utf-8")
+    with output.writing_file(path) as place:
+        place.write_text(output.dump(made), encoding="utf-8")
 
 
 def short(model: Model) -> Problem:
@@ -114,7 +113,7 @@ def driven(model: Model, drive: Manoeuvre, start: np.ndarray) -> Motion:
 
 def designed(model: Model, problem: Problem) -> dict[str, Any]:
     """The drive of lowest cond(Phi), as `excite design NAME --duration 20 --starts 1 --budget 240` finds it."""
-    found = design.design(model, problem, starts=1, seed=0, budget_s=BUDGET)
+    found = multistart.design(model, problem, starts=1, seed=0, budget_s=BUDGET)
     return {
         "times_s": found.manoeuvre.times,
         "torque": found.manoeuvre.torque,
@@ -142,19 +141,19 @@ def quiet(model: Model) -> Model:
 
 
 def verified(model: Model, motion: Motion, runs: int) -> dict[str, Any]:
-    method = identify.recommended(model)
+    method = methods.recommended(model)
     found = verify(model, motion, method, "full", runs, seed=0, jobs=1)
     return {
         "method": method,
         "failures": found.failures,
-        "parameters": summary(found),
+        "parameters": summarise_runs(found),
         "error_percent": dict(zip(found.names, found.error_percent.T, strict=True)),
     }
 
 
 def multisine(model: Model, problem: Problem, seed: int) -> dict[str, Any]:
     """A random multisine brought inside the limits as `excite compare` does it."""
-    found = compare.within(model, problem, manoeuvre.multisine(model, problem, seed))
+    found = baselines.within(model, problem, excitation.multisine(model, problem, seed))
     error = sigma(model, driven(model, found.manoeuvre, found.start))
     return {
         "cond_phi": objective.reported("cond", found.score),

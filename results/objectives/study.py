@@ -22,17 +22,16 @@ import numpy as np
 import scipy.stats
 from matplotlib.figure import Figure
 
-from excite import aim as aims
-from excite import compare, folder, objective, profiles
-from excite.design import design
-from excite.figures import COLOURS, save
-from excite.manoeuvre import Manoeuvre, knots
-from excite.simulate import Motion, simulate
+from excite import output
+from excite.identification import verify
+from excite.logs import profile
+from excite.model import Model, prediction
+from excite.model.machine import Problem, machine
+from excite.reports import COLOURS, save
+from excite.simulation import Motion, simulate
 from excite.smoothing import cramer_rao
-from excite.verify import verify
-from model import machine, prediction
-from model.machine import Problem
-from model.prediction import Model
+from excite.trajectories import Manoeuvre, baselines, composite_objective as aims, design, objective
+from excite.trajectories.excitation import knots
 
 HERE = Path(__file__).parent
 RANDOM = {"multisine": 5, "slow multisine": 3, "random steps": 3, "chirp": 2, "hand-made": 1}
@@ -49,7 +48,7 @@ def main() -> None:
     options = parser.parse_args()
     for name in ("drives", "runs"):
         (HERE / name).mkdir(exist_ok=True)
-    model = prediction.build(machine.load("va12"))
+    model = prediction.build(machine.load_machine("va12"))
     problem = model.machine.problems["R60"]
     rows: list[dict[str, Any]] = []
     for name, make in list(drives(model, problem).items())[: options.few]:
@@ -70,8 +69,8 @@ def main() -> None:
     }
     summary = {"machine": "va12", "problem": "R60", "runs": options.runs, "rank_correlation": ranks, "drives": rows}
     save(figure(other, worst, ranks), HERE / "objectives.png")
-    with folder.writing_file(HERE / "summary.json") as place:
-        place.write_text(folder.dump(summary), encoding="utf-8")
+    with output.writing_file(HERE / "summary.json") as place:
+        place.write_text(output.dump(summary), encoding="utf-8")
 
 
 # ------------------------------------------------------------------------------------------------ criteria
@@ -136,11 +135,11 @@ def drives(model: Model, problem: Problem) -> dict[str, Make]:
 
 
 def usual(model: Model, problem: Problem, kind: str, seed: int) -> Manoeuvre:
-    return compare.within(model, problem, compare.USUAL[kind].make(model, problem, seed, 0.0)).manoeuvre
+    return baselines.within(model, problem, baselines.USUAL[kind].make(model, problem, seed, 0.0)).manoeuvre
 
 
 def stored(model: Model, problem: Problem, place: Path) -> Manoeuvre:
-    torque, _, _ = profiles.read(place / "profile.csv", model)
+    torque, _, _ = profile.read_profile(place / "profile.csv", model)
     times = knots(problem)
     return Manoeuvre(times, torque[np.rint(times * float(model.machine.sampling_hz)).astype(int)])
 
@@ -154,7 +153,7 @@ def driven(model: Model, problem: Problem, name: str, make: Make) -> Motion:
     path = HERE / "drives" / f"{name.replace(' ', '-')}.csv"
     if not path.is_file():
         m = make()
-        with folder.writing_file(path) as place:
+        with output.writing_file(path) as place:
             rows = np.column_stack([m.times, m.torque])
             np.savetxt(place, rows, "%.12g", ",", header="t_s,u1_Nm,u2_Nm,u4_Nm", comments="")
     rows = np.loadtxt(path, delimiter=",", skiprows=1)
@@ -166,7 +165,7 @@ def errors(model: Model, motion: Motion, name: str, runs: int, jobs: int) -> lis
     path = HERE / "runs" / f"{name.replace(' ', '-')}-{runs}.json"
     if not path.is_file():
         v = verify(model, motion, "joint", "full", runs, seed=1, jobs=jobs)
-        with folder.writing_file(path) as place:
+        with output.writing_file(path) as place:
             place.write_text(json.dumps(np.sqrt(np.nanmean(v.error_percent**2, axis=0)).tolist()))
     return [float(x) for x in json.loads(path.read_text())]
 

@@ -22,19 +22,17 @@ import joblib
 import numpy as np
 from matplotlib.figure import Figure
 
-from excite import aim as aims
-from excite import folder, identify, log, objective, scenario, sensors, sequential
-from excite.design import design
-from excite.driver import follow
-from excite.estimate import NoEstimate
-from excite.figures import COLOURS, save
-from excite.limit import check, free
-from excite.manoeuvre import Manoeuvre
-from excite.simulate import Motion, SimulationError, simulate
+from excite import output
+from excite.errors import NoEstimate, SimulationError
+from excite.identification import methods, prior
+from excite.logs import log
+from excite.model import Model, prediction
+from excite.model.machine import Problem, machine
+from excite.reports import COLOURS, save
+from excite.simulation import Motion, follow, scenarios, sensors, simulate
 from excite.smoothing import cramer_rao
-from model import machine, prediction
-from model.machine import Problem
-from model.prediction import Model
+from excite.trajectories import Manoeuvre, check_limits, composite_objective as aims, design, objective
+from excite.trajectories.limits import free
 
 HERE = Path(__file__).parent
 SECONDS = 30.0  # of each of two drives
@@ -76,9 +74,9 @@ def main() -> None:
         "rows": rows,
     }
     save(figure(rows), HERE / "figure.png")
-    with folder.writing_file(HERE / "summary.json") as place:
-        place.write_text(folder.dump(summary), encoding="utf-8")
-    with folder.writing_file(HERE / "README.md") as place:
+    with output.writing_file(HERE / "summary.json") as place:
+        place.write_text(output.dump(summary), encoding="utf-8")
+    with output.writing_file(HERE / "README.md") as place:
         place.write_text(readme(summary["table"], rows), encoding="utf-8")
 
 
@@ -88,7 +86,7 @@ def short(model: Model) -> Problem:
 
 
 def roller() -> Model:
-    return prediction.build(machine.load("va12"))
+    return prediction.build(machine.load_machine("va12"))
 
 
 def designed(objective: str, runs: Path) -> dict[str, Manoeuvre]:
@@ -97,10 +95,10 @@ def designed(objective: str, runs: Path) -> dict[str, Manoeuvre]:
     for kind in ("nominal", "robust"):
         path = runs / f"{kind}-{objective}.json"
         if not path.is_file():
-            others = scenario.scenarios(model, SCENARIOS, SPREAD) if kind == "robust" else ()
+            others = scenarios.perturbed_machines(model, SCENARIOS, SPREAD) if kind == "robust" else ()
             warm = [found["nominal"]] if kind == "robust" else []
             d = design(model, short(model), aims.aim(model, objective, machines=others), starts=2, seed=0, warm=warm)
-            with folder.writing_file(path) as place:
+            with output.writing_file(path) as place:
                 place.write_text(json.dumps({"t": d.manoeuvre.times.tolist(), "u": d.manoeuvre.torque.tolist()}))
             print(f"{kind}: cond(Phi) {d.cond_phi:.1f}", flush=True)
         stored = json.loads(path.read_text())
@@ -116,7 +114,7 @@ def one(
     if path.is_file():
         return dict(json.loads(path.read_text()))
     nominal = roller()
-    true = prediction.build(scenario.varied(nominal.machine, SPREAD, np.random.default_rng([number, 7])))
+    true = prediction.build(scenarios.varied(nominal.machine, SPREAD, np.random.default_rng([number, 7])))
     row: dict[str, object] = {"machine": number}
     first: Motion | None = None
     for kind in KINDS[: 3 if third else 2]:
@@ -135,8 +133,8 @@ def one(
         row[kind] = told(true, motions)
         if identified:
             row[kind] |= {"error_percent": errors(nominal, true, motions, number)}  # type: ignore[operator]
-    with folder.writing_file(path) as place:
-        place.write_text(folder.dump(row), encoding="utf-8")
+    with output.writing_file(path) as place:
+        place.write_text(output.dump(row), encoding="utf-8")
     return row
 
 
@@ -150,7 +148,7 @@ def second(
     nominal: Model, true: Model, first: Motion, start: Manoeuvre, objective: str, number: int
 ) -> tuple[Model, Manoeuvre]:
     """The machine as the first log tells it, and the drive for what that leaves."""
-    known = sequential.known(nominal, [measured(nominal, true, first, 1000 + number)])
+    known = prior.known_before(nominal, [measured(nominal, true, first, 1000 + number)])
     aim = aims.aim(known.model, objective, prior=known.information)
     turned = Manoeuvre(start.times, start.torque * [1, -1, 1])
     found = design(known.model, short(nominal), aim, starts=0, warm=[start, turned])
@@ -159,7 +157,7 @@ def second(
 
 def measured(nominal: Model, true: Model, motion: Motion, seed: int) -> log.Log:
     table = sensors.measure(true, motion, seed=seed)
-    return log.check(table, nominal.machine, identify.needed_sensors(nominal, "joint"))
+    return log.from_table(table, nominal.machine, methods.needed_sensors(nominal, "joint"))
 
 
 def told(true: Model, motions: Sequence[Motion]) -> dict[str, object]:
@@ -168,7 +166,7 @@ def told(true: Model, motions: Sequence[Motion]) -> dict[str, object]:
     by = np.outer(true.scale, true.scale)
     information = sum(np.linalg.inv(cramer_rao(true, m) / by) for m in motions)
     spread = objective.percent(true, np.linalg.inv(information) * by)
-    broken = [(v, n) for m in motions for n, v in check(true, short(true), m).items() if not free(n)]
+    broken = [(v, n) for m in motions for n, v in check_limits(true, short(true), m).items() if not free(n)]
     return {
         "limit": max(broken)[1],
         "excess": max(broken)[0],
@@ -180,7 +178,7 @@ def told(true: Model, motions: Sequence[Motion]) -> dict[str, object]:
 def errors(nominal: Model, true: Model, motions: Sequence[Motion], number: int) -> list[float]:
     """Errors [%] of what both logs together give."""
     logs = [measured(nominal, true, m, 1000 * (i + 1) + number) for i, m in enumerate(motions)]
-    found = identify.identify(nominal, logs, "joint")
+    found = methods.identify(nominal, logs, "joint")
     return (100 * (found.value - true.nominal) / np.abs(true.nominal)).tolist()
 
 

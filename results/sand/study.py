@@ -22,12 +22,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.optimize import least_squares
 
-from excite.figures import COLOURS, STYLES, save
-from model import contact
-from model.effect import DURATION, Rolling, Scene, Site, Soil
-from model.effects import CATALOGUE
-from model.file import Quantity
-from model.machine import Contact, load
+from excite.model.effects import CATALOGUE, DURATION, Rolling, Scene, Site, Soil
+from excite.model.machine import Contact, Quantity, load_machine
+from excite.model.mechanics import contact
+from excite.reports import COLOURS, save
+from excite.reports.figures import STYLES
 
 HERE = Path(__file__).parent
 DATA = HERE.parents[2] / "shared" / "data" / "cmu_single_wheel" / "smooth_wheel.csv"
@@ -47,7 +46,7 @@ WHEEL = Contact(
     Ky=quantity(-1.0),
     v_eps=quantity(1e-6),
 )
-ROLLER = load("va12")
+ROLLER = load_machine("va12")
 USUAL = Site(ROLLER, ROLLER.contacts[0], DURATION)  # shapes of effects are as in any other machine
 
 

@@ -1,0 +1,11 @@
+from .interface import (
+    __version__ as __version__,
+    compare as compare,
+    design as design,
+    diagnose as diagnose,
+    identify as identify,
+    load as load,
+    read_log as read_log,
+    simulate as simulate,
+    verify as verify,
+)

@@ -1,0 +1,368 @@
+"""Reference pages made from the code: effects, machine file and units, what there is to choose from, study file,
+commands, Python interface."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+import re
+import types
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import typer
+from pydantic import AfterValidator
+
+import excite
+from excite import identification, simulation, trajectories, workflows
+from excite.cli import reference_html
+from excite.model import effects
+from excite.model.effects import DURATION, Effect, Shape, Site, one
+from excite.model.machine import UNITS, Machine, Record, load_machine, shipped_machines
+
+SETS = 8  # shapes that go together, from which not all are told
+PLAIN = (str, int, float, tuple, type(None))  # defaults that read as they are
+ADDRESS = re.compile(r"<(?:function |bound method |built-in function )?_?(\S+?)(?: object)? at 0x[0-9a-f]+>")
+WORDS: Mapping[type, str] = {str: "text", int: "whole number", float: "number", bool: "true or false"}
+FORMULA = re.compile(r"\S*[_=()]")  # no sentence begins with a capital letter here
+PLACES = {
+    "joints": "each joint with friction",
+    "drives": "each driven joint",
+    "contacts": "each contact with the ground",
+    "driven_contacts": "each driven contact",
+    "drive": "all driven contacts together; where it is the ground that changes, all contacts",
+    "articulation": "each driven joint without a contact",
+    "wheels": "each measuring wheel",
+    "yaw_rate": "the gyro",
+    "lateral_speed": "the lateral speed sensor",
+    "machine": "the machine as a whole",
+}
+
+
+def write(place: Path, app: typer.Typer) -> list[str]:
+    """Write every page into a folder, and all of them as one `index.html`; return their names. app: the commands."""
+    texts = {"commands.md": commands_page(app), **{name: page() for name, page in PAGES.items()}}
+    texts = {name: ADDRESS.sub(r"\1", text) for name, text in texts.items()}  # addresses in memory say nothing
+    for name, text in texts.items():
+        (place / name).write_text(text, encoding="utf-8")
+    (place / reference_html.NAME).write_text(reference_html.page(texts), encoding="utf-8")
+    return [reference_html.NAME, *texts]
+
+
+def _table(heads: str, rows: Iterable[Sequence[object]]) -> list[str]:
+    """A table's lines; heads: with bars in between."""
+    lines = [f"| {heads} |", "|" + "---|" * (heads.count("|") + 1)]
+    return [*lines, *("| " + " | ".join(_cell(str(cell)) for cell in row) + " |" for row in rows), ""]
+
+
+def _page(*lines: str) -> str:
+    return "\n".join(lines).rstrip() + "\n"
+
+
+# ------------------------------------------------------------------------------------------------ effects
+
+
+def effects_page() -> str:
+    """The catalogue of effects: what each does, where it may sit, its amount and shapes, its trace in a log, source."""
+    catalogue, va12 = effects.CATALOGUE.values(), load_machine("va12")
+    lines = [
+        "# Effects",
+        "",
+        "What a real machine may do beyond the model. `excite simulate MACHINE PROFILE --effect NAME[@WHERE]=AMOUNT`",
+        "puts one into a log, `excite diagnose` looks for all of them, a machine file may hold one for good",
+        "(`[[effect]]`). In the formulas A is the amount, in SI units, w a joint's speed, u its torque.",
+        "",
+        *_table("where | what it stands for", PLACES.items()),
+        *_table(
+            "effect | where | unit | what it does",
+            ((f"[{e.name}](#{e.name})", ", ".join(e.places), e.unit, e.meaning) for e in catalogue),
+        ),
+    ]
+    for e in catalogue:
+        sites = effects.places(va12, e)
+        typical = [f"`{e.name}@{where}={_typical(va12, e, bodies):.3g}`" for where, (bodies, _) in sites.items()]
+        lines += [f"## {e.name}", "", f"{_sentence(e.meaning)} {_amount(e)}", ""]
+        lines += [f"Seen in a log: {e.signature.strip('.')}.", "", f"Source: {e.source.strip('.')}.", ""]
+        if typical:
+            lines += [f"On va12, at a typical size: {', '.join(typical)}", ""]
+        if e.shapes:
+            bodies, _ = next(iter(sites.values()), ((1,), None))
+            beside = e.beside(Site.of(va12, bodies))
+            lines += _table(
+                "shape | unit | default | looked for at | meaning",
+                (_shape(n, s) for n, s in e.shapes.items()),
+            )
+            lines += [f"Looked for as well, on va12 in a log of {DURATION:g} s: {_sets(beside)}.", ""] if beside else []
+    return _page(*lines)
+
+
+def _typical(machine: Machine, e: Effect, bodies: tuple[int, ...]) -> float:
+    return e.amount(Site.of(machine, bodies))
+
+
+def _amount(e: Effect) -> str:
+    unit = "without unit" if e.unit == "-" else f"in {e.unit}"
+    sign = ", positive" if e.positive else "; the smaller, the larger the effect" if e.inverse else ""
+    return f"Amount {unit}{sign}."
+
+
+def _shape(name: str, shape: Shape) -> tuple[str, str, str, str, str]:
+    of = "" if shape.size is one else " of the site's size"
+    tried = ", ".join(f"{x:.3g}" for x in shape.grid) + of
+    form = f"where {shape.form[0]} is {shape.form[1]:g}" if shape.form else ""
+    ends = "from {:g} to {:g}".format(*shape.within) + of if shape.within else ""
+    return name, shape.unit, f"{shape.default:.3g}{of}", tried, "; ".join(filter(None, (shape.meaning, ends, form)))
+
+
+def _sets(beside: Sequence[Mapping[str, float]]) -> str:
+    """Shapes that go together; of many the first and the last."""
+    told = ["`" + ",".join(f"{name}={x:.3g}" for name, x in shapes.items()) + "`" for shapes in beside]
+    return "; ".join(told) if len(told) <= SETS else f"{told[0]}; {told[1]}; and so on to {told[-1]}"
+
+
+# ------------------------------------------------------------------------------------------------ files
+
+
+def machine_page() -> str:
+    """The machine file: every record with its keys, and the units that columns may be in."""
+    return _page(
+        "# Machine file",
+        "",
+        'TOML; a file may say `extends = "va12"` and give only what differs: `[sensor.u1]` changes a sensor,',
+        "`[body.front_roll.limit]` limits of a body. `excite machine new NAME` writes one with comments to start from.",
+        "",
+        *_keys(Machine),
+        "## Units",
+        "",
+        "What columns of logs may be in.",
+        "",
+        *_table("unit | quantity | SI value of one", ((u, quantity, f"{x:.9g}") for u, (quantity, x) in UNITS.items())),
+    )
+
+
+def study_page() -> str:
+    """The study file: every record with its keys."""
+    return _page("# Study file", "", _doc(inspect.getmodule(workflows.Study)), "", *_keys(workflows.Study))
+
+
+def _keys(root: type[Record]) -> Iterator[str]:
+    """Every key of a record and of those inside it, a table for each."""
+    for record in _records(root, set()):
+        yield from (f"## {record.__name__}", "", _doc(record), "")
+        yield from _table("key | what | default", ((n, _type(f), _default(f)) for n, f in record.model_fields.items()))
+
+
+def _records(record: type[Record], seen: set[type[Record]]) -> Iterator[type[Record]]:
+    """A record and those inside it, each once."""
+    if record in seen:
+        return
+    seen.add(record)
+    yield record
+    for field in record.model_fields.values():
+        for inner in _inside(field.annotation):
+            yield from _records(inner, seen)
+
+
+def _inside(annotation: Any) -> list[type[Record]]:
+    if isinstance(annotation, type) and issubclass(annotation, Record):
+        return [annotation]
+    return [r for a in get_args(annotation) for r in _inside(a)]
+
+
+def _type(field: Any) -> str:
+    """What a key holds, in words."""
+    return _worded(field.annotation) + _checked(field.metadata)
+
+
+def _worded(annotation: Any) -> str:
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _worded(inner[0]) + _checked(annotation.__metadata__)
+    if origin is Literal:
+        return ", ".join(f'"{x}"' for x in inner)
+    if origin in (Union, types.UnionType):
+        return " or ".join(_worded(a) for a in inner if a is not type(None))
+    if origin is tuple:
+        return f"list: {_worded(inner[0])}" if inner[-1] is Ellipsis else f"{len(inner)} x {_worded(inner[0])}"
+    if origin is dict:
+        return f"table, for each name: {_worded(inner[1])}"
+    if isinstance(annotation, type) and issubclass(annotation, Record):
+        return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
+    return WORDS.get(annotation, str(annotation))
+
+
+def _checked(metadata: Iterable[Any]) -> str:
+    """What a value must be, by the names of its checks."""
+    names = [m.func.__name__.strip("_").replace("_", " ") for m in metadata if isinstance(m, AfterValidator)]
+    return "".join(f", {name}" for name in names if name in ("positive", "not negative", "negative"))
+
+
+def _default(field: Any) -> str:
+    if field.is_required():
+        return "needed"
+    value = field.get_default(call_default_factory=True)
+    if isinstance(value, Record):
+        return "0" if getattr(value, "value", None) == 0 else "its own defaults"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "-" if value in (None, "", (), {}) else f"`{list(value) if isinstance(value, tuple) else value}`"
+
+
+# ------------------------------------------------------------------------------------------------ choices
+
+
+def choices_page() -> str:
+    """What commands and studies may ask for by name: objectives, limits, methods, kits, usual drives."""
+    every, yes = [load_machine(name) for name in shipped_machines()], {True: "yes", False: "no"}
+    return _page(
+        "# What there is to choose from",
+        "",
+        "## Objectives",
+        "",
+        "What a drive is best for, by the information that it gives: `--objective`. Lower is better.",
+        "",
+        *_table(
+            "objective | what it is | of | equations count by their noise",
+            ((n, _what(o.function), o.of, yes[o.weighted]) for n, o in trajectories.OBJECTIVES.items()),
+        ),
+        "## Limits",
+        "",
+        "What every drive keeps. The `limits` of a study are factors on what the machine file states.",
+        "",
+        *_table(
+            "limit | what it bounds | stated in the machine file as",
+            (
+                *(
+                    (n, _what(k.bounds), ", ".join(f"`{s}`" for s in k.stated) or "-")
+                    for n, k in trajectories.KINDS.items()
+                ),
+                *((n, _what(whole), "-") for n, whole in trajectories.WHOLE.items()),
+            ),
+        ),
+        "## Methods",
+        "",
+        "How parameters are found: `--method`; by default `joint` where slips are measured, `ols` where none are.",
+        "",
+        *_table(
+            "method | what it does | effects that it estimates | needs the lateral speed",
+            ((n, _what(m.find), m.effects, yes[not m.simulates]) for n, m in identification.METHODS.items()),
+        ),
+        "## Kits",
+        "",
+        "Which sensors there are: `--kit`.",
+        "",
+        *_table(
+            "machine | kit | columns",
+            ((m.name, kit, ", ".join(s.column for s in m.sensors(kit))) for m in every for kit in simulation.KITS),
+        ),
+        "## Usual drives",
+        "",
+        "What `excite compare` sets a design against: all of them, or those given by `--against`.",
+        "",
+        *_table(
+            "drive | what it is | drawn at random",
+            ((n, _what(u.make), yes[u.random]) for n, u in trajectories.USUAL.items()),
+        ),
+    )
+
+
+def _what(function: Callable[..., object]) -> str:
+    """The first paragraph of what a function says of itself."""
+    return _doc(function).partition("\n\n")[0]
+
+
+# ------------------------------------------------------------------------------------------------ commands, Python
+
+
+def commands_page(app: typer.Typer) -> str:
+    """Every command with its arguments and options, as `--help` says them."""
+    lines = ["# Commands", "", "`excite COMMAND --help` says the same.", ""]
+    for name, command in _commands(typer.main.get_command(app), "excite"):
+        lines += [f"## {name}", "", command.help or "", "", *_table("option | default | what", _options(command))]
+    return _page(*lines)
+
+
+def _options(command: Any) -> Iterator[tuple[str, str, str]]:
+    for p in command.params:
+        named = p.param_type_name == "option"
+        label = ", ".join(f"`{o}`" for o in p.opts) if named else f"`{p.metavar or p.name.upper()}`"
+        none = p.default is None or p.default is False or callable(p.default)
+        yield (
+            label,
+            "needed" if p.required else "" if none else str(p.default),
+            workflows.helped(p.name, getattr(p, "help", None)),
+        )
+
+
+def _commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
+    if not hasattr(command, "commands"):
+        yield name, command
+        return
+    for key, inner in command.commands.items():
+        yield from _commands(inner, f"{name} {key}")
+
+
+def python_page() -> str:
+    """Every public function and class, by package, with its docstring."""
+    lines = ["# Python interface", ""]
+    for package in _packages(excite):
+        lines += [f"## {package.__name__}", "", _doc(package), ""]
+        for name in sorted(package.__all__):
+            thing = getattr(package, name)
+            if inspect.isfunction(thing) or inspect.isclass(thing):
+                where = f"{package.__name__}.{name}"
+                lines += [f"### {where}", "", "```python", _signature(name, thing), "```", "", _doc(thing), ""]
+    return _page(*lines)
+
+
+def _packages(package: ModuleType) -> Iterator[ModuleType]:
+    """A package and those inside it but for the command line's, which has a page of its own."""
+    yield package
+    for found in sorted(pkgutil.iter_modules(package.__path__), key=lambda m: m.name):
+        if found.ispkg and found.name != "cli":
+            yield from _packages(importlib.import_module(f"{package.__name__}.{found.name}"))
+
+
+def _signature(name: str, thing: Any) -> str:
+    if inspect.isclass(thing):
+        own = vars(thing)
+        bases = ", ".join(b.__name__ for b in thing.__bases__ if b is not object)
+        head = f"class {name}({bases})" if bases else f"class {name}"
+        fields = [
+            f"    {key}: {kind}" + (f" = {own[key]!r}" if isinstance(own.get(key, ...), PLAIN) else "")
+            for key, kind in inspect.get_annotations(thing).items()
+            if key[0] != "_"
+        ]
+        return "\n".join([head, *fields])
+    try:
+        text = str(inspect.signature(thing))
+    except (TypeError, ValueError):
+        return name
+    return f"def {name}{text}".replace("'", "")
+
+
+def _doc(thing: Any) -> str:
+    own = thing.__doc__ if not inspect.isclass(thing) else thing.__dict__.get("__doc__")
+    return inspect.cleandoc(own) if own else ""
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def _sentence(text: str) -> str:
+    text = text.strip()
+    first = text if FORMULA.match(text) else text[:1].upper() + text[1:]
+    return first + ("" if text.endswith(".") else ".")
+
+
+PAGES: dict[str, Callable[[], str]] = {
+    "machine-file.md": machine_page,
+    "study-file.md": study_page,
+    "choices.md": choices_page,
+    "effects.md": effects_page,
+    "python.md": python_page,
+}

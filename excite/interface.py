@@ -1,0 +1,196 @@
+"""The functions that most people need, behind `import excite`.
+
+Each takes what is at hand: a machine as its name, its file or a model; a problem by name; a log as a path, a pandas
+DataFrame in the machine's columns, or a `Log`; a drive as a profile, a design folder, a `Design` or a `Motion`.
+Defaults are those of the command of the same name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from excite import identification, logs as readers, model as models, simulation, trajectories, workflows
+from excite.diagnosis import Account
+from excite.identification import Estimate, Verification
+from excite.logs import Log
+from excite.model import Model
+from excite.model.machine import load_machine
+from excite.simulation import Motion
+from excite.trajectories import Comparison, Design
+from excite.workflows import Brief
+
+__version__ = version("excite")
+
+Machine = str | Path | Model
+Source = str | Path | pd.DataFrame | Log
+Drive = str | Path | np.ndarray | Design | Motion
+
+
+def load(machine: Machine) -> Model:
+    """Load a machine and build its equations.
+
+    machine: a shipped name (`excite machines` lists them) or a machine file (.toml); a model is returned as it is.
+    Raises MachineError: file, key, what is wrong, what is allowed.
+    """
+    return machine if isinstance(machine, Model) else models.build(load_machine(machine))
+
+
+def read_log(machine: Machine, source: Source) -> Log:
+    """Read and check a log of a machine.
+
+    source: a file (.csv, .txt, .parquet, .mat, .mf4) or a DataFrame in the machine's columns.
+    Raises LogError: what is wrong, where (row, column), what to do.
+    """
+    model = load(machine)
+    if isinstance(source, Log):
+        return source
+    if isinstance(source, pd.DataFrame):
+        return readers.from_table(source, model.machine)
+    return readers.read_log(source, model.machine)
+
+
+def design(
+    machine: Machine,
+    problem: str | None = None,
+    objective: str = "cond",
+    *,
+    duration: float | None = None,
+    sigma_max: float | None = None,
+    robust: bool = False,
+    starts: int = 2,
+    seed: int = 0,
+    budget: float | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+) -> Design:
+    """Design a test drive that makes the parameters of a machine identifiable.
+
+    problem: a design problem of the machine file, its default one if not given. objective: a name of
+    `excite.trajectories.OBJECTIVES`. duration [s]: another length of the drive. sigma_max [%]: bound on the worst
+    attainable standard deviation. robust: for machines up to 20 % off the nominal one. starts: starting guesses.
+    budget [s]: stop improving after so long. progress(done, total, best score) is called as the search goes on.
+    Raises InfeasibleError with the limit that can't be met, UsageError for an unknown name.
+    """
+    model = workflows.build_model(str(machine), flaws=False) if not isinstance(machine, Model) else machine
+    _, chosen = workflows.choose_problem(model.machine, problem, duration)
+    workflows.require_objective(objective, model.machine)
+    workflows.require_positive("sigma_max", sigma_max, "%")
+    workflows.require_positive("budget", budget, "s")
+    brief = Brief(objective, sigma_max, robust, (), starts, seed, budget)
+    return workflows.answer(model, chosen, brief, progress).design
+
+
+def simulate(
+    machine: Machine,
+    drive: Drive,
+    *,
+    seed: int = 0,
+    noise: bool = True,
+    kit: str = "full",
+    effects: Sequence[str] = (),
+) -> pd.DataFrame:
+    """Drive a machine in simulation and return the log that its sensors would write.
+
+    drive: a profile (.csv), a design folder, a design, a motion, or torques (N, n_u) [N m] from rest. noise: False for
+    exact signals. kit: a name of `excite.simulation.KITS`. effects: NAME[@WHERE]=MAGNITUDE each, what else the machine
+    does. Raises LogError for a profile, MachineError for an effect, SimulationError for a motion that can't be had.
+    """
+    model = load(machine)
+    workflows.require_known("kit", kit, simulation.KITS)
+    torque, q0, nu0 = _torques(model, drive)
+    true = workflows.with_effects(model, effects, len(torque))
+    motion = simulation.simulate(true, torque, q0=q0, nu0=nu0)
+    return simulation.measure(true, motion, kit=kit, seed=seed, noise=noise)
+
+
+def identify(machine: Machine, logs: Source | Sequence[Source], method: str | None = None) -> Estimate:
+    """Estimate the parameters of a machine, with uncertainty, from one log or several.
+
+    method: a name of `excite.identification.METHODS`, the one recommended for the machine if not given.
+    Raises LogError for a log that can't be used, NoEstimate where it gives no answer, UsageError for an unknown method.
+    """
+    model = load(machine)
+    name = workflows.choose_method(method, model)
+    read, notes = _read(model, logs, identification.needed_sensors(model, name))
+    estimate = workflows.identify_from(model, read, name).estimate
+    return replace(estimate, notes=(*notes, *estimate.notes))
+
+
+def diagnose(machine: Machine, logs: Source | Sequence[Source]) -> Account:
+    """Find what the model of a machine gets wrong along logs: named causes, their magnitudes, what each gains.
+
+    Raises LogError for a log that can't be used, NoEstimate where nothing can be fitted.
+    """
+    model = load(machine)
+    read, _ = _read(model, logs, identification.needed_sensors(model, "joint"))
+    return workflows.diagnose_from(model, read)
+
+
+def verify(
+    machine: Machine,
+    drive: Drive,
+    *,
+    runs: int = 50,
+    method: str | None = None,
+    kit: str = "full",
+    seed: int = 0,
+) -> Verification:
+    """Simulate a drive with sensor flaws and identify from it, many times.
+
+    drive: as in `simulate`. runs: simulated test days. The verification gives each parameter's bias, dispersion,
+    predicted standard deviation and how often its 95 % interval holds. Raises UsageError for an unknown method or kit.
+    """
+    model = load(machine)
+    workflows.require_known("kit", kit, simulation.KITS)
+    name = workflows.choose_method(method, model, kit)
+    motion = drive if isinstance(drive, Motion) else _motion(model, drive)
+    return identification.verify(model, motion, name, kit, runs, seed)
+
+
+def compare(
+    machine: Machine,
+    problem: str | None = None,
+    *,
+    against: Sequence[str] = (),
+    samples: int = 20,
+    seed: int = 0,
+    budget: float | None = None,
+) -> Comparison:
+    """Compare the designed drive with the usual ones on the same problem, limits and time.
+
+    against: names of `excite.trajectories.USUAL`, all of them if not given. samples: drives of every random kind.
+    Raises UsageError for an unknown name, MachineError for sensors of unknown noise.
+    """
+    model = workflows.build_model(str(machine), flaws=False) if not isinstance(machine, Model) else machine
+    _, chosen = workflows.choose_problem(model.machine, problem, None)
+    workflows.graded(model)
+    for usual in against:
+        workflows.require_known("against", usual, tuple(trajectories.USUAL))
+    return trajectories.compare(model, chosen, samples, seed, budget, None, against)
+
+
+def _read(model: Model, logs: Source | Sequence[Source], needs: Sequence[str]) -> tuple[list[Log], list[str]]:
+    several = [logs] if isinstance(logs, str | Path | pd.DataFrame | Log) else list(logs)
+    return readers.read_stretches(several, model.machine, needs)
+
+
+def _torques(model: Model, drive: Drive) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Torques (N, n_u) [N m] of a drive and the state that it starts from."""
+    if isinstance(drive, np.ndarray):
+        return drive, None, None
+    if isinstance(drive, Design):
+        drive = drive.motion
+    if isinstance(drive, Motion):
+        return drive.u, drive.q[0], drive.nu[0]
+    path = Path(drive)
+    return readers.read_profile(path / "profile.csv" if path.is_dir() else path, model)
+
+
+def _motion(model: Model, drive: Drive) -> Motion:
+    torque, q0, nu0 = _torques(model, drive)
+    return simulation.simulate(model, torque, q0=q0, nu0=nu0)

@@ -1,0 +1,23 @@
+from .filtered import (
+    BLOCK as BLOCK,
+    Samples as Samples,
+    decimate as decimate,
+    derivative as derivative,
+    filtered_regression as filtered_regression,
+    implicit as implicit,
+    kept_samples as kept_samples,
+    lowpass as lowpass,
+    passes as passes,
+    regression as regression,
+    remember as remember,
+    samples as samples,
+    unmeasured as unmeasured,
+    white_noise as white_noise,
+)
+from .gaps import read_stretches as read_stretches
+from .inspection import guess_machine as guess_machine, inspect as inspect
+from .log import Log as Log, from_table as from_table, read_log as read_log, table_of as table_of
+from .plausibility import doubts_in_errors as doubts_in_errors
+from .profile import profile_of as profile_of, read_profile as read_profile, torque_column as torque_column
+from .repair import NEEDED as NEEDED, examine as examine, moves as moves
+from .tables import read_table as read_table

@@ -1,0 +1,265 @@
+"""Logs: reading, checking, naming what is wrong in one line."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from excite.errors import LogError as LogError
+from excite.logs import tables
+from excite.logs.tables import MDF_TIME, UNCLEAR
+from excite.model.machine import UNITS, Machine, Sensor, arms, load_machine, shipped_machines
+
+SHORTEST = 100  # samples: below this no filter and no estimate makes sense
+OFF_RATE = 0.02  # by which the usual rate of sampling may differ from the machine file's
+GAP = 1.5  # samples from one row to the next that leave something out
+
+
+@dataclass(frozen=True)
+class Log:
+    """Checked measurements: t (N,) [s] evenly spaced, values (N,) by sensor name [SI]."""
+
+    source: str
+    t: np.ndarray
+    values: dict[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+def read_log(path: str | Path, machine: Machine, needs: Sequence[str] = ()) -> Log:
+    """A log (a file that `tables` reads) as the machine file names its columns, checked.
+
+    `needs`: names of sensors that must be there. Raises LogError: a missing column, a NaN, time that goes back, a
+    gap, a wrong rate, another machine's log, an empty file.
+    """
+    return from_table(table_of(path, machine), machine, needs, str(path))
+
+
+def table_of(path: str | Path, machine: Machine) -> pd.DataFrame:
+    """The columns of a log as they are; MDF files give the machine's time column its name. Raises LogError."""
+    table = tables.read_table(path)
+    if MDF_TIME in table.columns and machine.time_column not in table.columns:
+        one = UNITS[machine.time_unit][1]
+        table.insert(0, machine.time_column, table[MDF_TIME] / one)
+    return table
+
+
+def from_table(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> Log:
+    """A table of columns as a Log. Raises LogError."""
+    wanted = machine.sensors("full")
+    known = [s for s in wanted if set(s.columns) <= set(table.columns)]
+    if machine.time_column not in table.columns:
+        raise LogError(
+            f"{source}: no column {machine.time_column} (time), {columns_of(table)}{looks_like(table, machine)}"
+        )
+    missing = [s for s in wanted if s.name in needs and s not in known]
+    if missing:
+        names = ", ".join(f"{c} ({what_of(s, machine)})" for s in missing for c in s.columns if c not in table.columns)
+        raise LogError(f"{source}: no column {names}, {columns_of(table)}{looks_like(table, machine)}")
+    t = times(table, machine, source)
+    if line := too_short(len(t), machine):
+        raise LogError(f"{source}: {line}")
+    rate = float(machine.sampling_hz)
+    values = {s.name: values_of(s, machine, table, source) for s in known}
+    check_time(t, rate, machine.time_column, source)
+    for s in known:
+        check_values(s, values[s.name], rate, machine, source)
+    for s in machine.sensor:
+        if s.kind == "angle" and s not in wanted and s.column in table.columns:
+            moved = values_of(s, machine, table, source)
+            if np.ptp(moved) > 0.05:
+                raise LogError(
+                    f"{source}: column {s.column}: moves by {np.ptp(moved):.2g} {machine.si(s)}, {machine.name} holds"
+                    " it still; is this a log of another machine?"
+                )
+    return Log(source, np.arange(len(t)) / rate, values)
+
+
+def times(table: pd.DataFrame, machine: Machine, source: str) -> np.ndarray:
+    """The time column (N,) [s]: numbers in the machine file's unit, or dates from the first on. Raises LogError."""
+    raw = table[machine.time_column]
+    if len(raw) and raw.dtype.kind in "OTU" and pd.to_numeric(raw, errors="coerce").isna().all():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # a format that pandas has to guess
+            raw = pd.to_datetime(raw, errors="coerce", utc=True)
+    if raw.dtype.kind == "M":
+        since = (raw - raw.iloc[0]).dt.total_seconds()
+        return numbers(pd.DataFrame({machine.time_column: since}), machine.time_column, source)
+    return UNITS[machine.time_unit][1] * numbers(table, machine.time_column, source)
+
+
+def values_of(sensor: Sensor, machine: Machine, table: pd.DataFrame, source: str) -> np.ndarray:
+    """A sensor's readings (N,) [SI] from its columns: units, torques of pressures. Raises LogError."""
+    number = numbers(table, sensor.column, source)
+    if sensor.return_column is None:
+        return sensor.gain * number
+    back = numbers(table, sensor.return_column, source)
+    if not sensor.cylinders:
+        return sensor.gain * (number - back)
+    push, pull = arms(sensor.displacement, sensor.cylinders, _joint_angle(sensor, machine, table, source))
+    return sensor.gain * (push * number + pull * back)
+
+
+def _joint_angle(sensor: Sensor, machine: Machine, table: pd.DataFrame, source: str) -> np.ndarray:
+    """The angle (N,) [rad] of the joint that cylinders turn; zero where their lever is the same at every angle."""
+    still = machine.find(sensor.body).coordinates[0] in machine.locked
+    if still or all(c.lever is not None for c in sensor.cylinders):
+        return np.zeros(len(table))
+    angle = next(s for s in machine.sensor if s.kind == "angle" and s.body == sensor.body)
+    if angle.column not in table.columns:
+        raise LogError(
+            f"{source}: no column {angle.column} ({what_of(angle, machine)}), on which the lever of the cylinders of"
+            f" {sensor.column} depends"
+        )
+    return values_of(angle, machine, table, source)
+
+
+def numbers(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
+    raw = table[column]
+    if unclear := table.attrs.get(UNCLEAR, {}).get(column):
+        raise LogError(f"{source}: {unclear}")
+    if raw.dtype.kind == "c":
+        raise LogError(f"{source}: column {column}: complex numbers, a measurement is real")
+    values = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float)
+    bad = ~np.isfinite(values)
+    if bad.any():
+        k = int(np.argmax(bad))
+        cell = raw.iloc[k]
+        what = "is empty or not a number (NaN)" if pd.isna(cell) else f"is {str(cell)[:30]!r}, not a finite number"
+        count = int(bad.sum())
+        more = f"; {count} such cells in this column" if count > 1 else ""
+        raise LogError(f"{source}: row {k + 1}, column {column}: {what}{more}; cut the log there or repair the value")
+    return values
+
+
+def too_short(rows: int, machine: Machine) -> str:
+    """What is said of a log of so few rows that nothing can be made of it, "" otherwise."""
+    least = max(SHORTEST, sum(machine.filter.drop) + 12 * machine.filter.decimation)
+    return f"only {rows} rows, at least {least} are needed: is the file complete?" if rows < least else ""
+
+
+def gap_rows(t: np.ndarray, machine: Machine) -> list[int]:
+    """First rows (from 0) after each gap in times (N,) [s]; none where these are not what they should be in other
+    ways."""
+    dt = np.diff(t) * float(machine.sampling_hz)
+    if not len(dt) or (dt <= 0).any() or abs(float(np.median(dt)) - 1) > OFF_RATE:
+        return []
+    return [int(k) + 1 for k in np.flatnonzero(dt > GAP)]
+
+
+def check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
+    dt = np.diff(t)
+    if (dt <= 0).any():
+        k = int(np.argmax(dt <= 0))
+        what = "goes back" if dt[k] < 0 else "stands still"
+        raise LogError(
+            f"{source}: row {k + 2}, column {column}: time {what} ({t[k]:g} s, then {t[k + 1]:g} s);"
+            " sort or cut the log"
+        )
+    typical = float(np.median(dt))
+    if abs(typical * rate - 1) > OFF_RATE:
+        raise LogError(
+            f"{source}: column {column}: sampled at {1 / typical:.4g} Hz, the machine file says {rate:g} Hz;"
+            " resample the log or correct sampling_hz"
+        )
+    jump = np.abs(dt * rate - 1) > GAP - 1
+    if jump.any():
+        k = int(np.argmax(jump))
+        raise LogError(
+            f"{source}: row {k + 2}, column {column}: a gap of {dt[k]:.4g} s (from {t[k]:g} s to {t[k + 1]:g} s) where"
+            f" {1 / rate:g} s is expected; give the stretches before and after as two logs"
+        )
+    drift = (t[-1] - t[0]) * rate / (len(t) - 1)
+    if abs(drift - 1) > 0.01:
+        raise LogError(f"{source}: column {column}: the clock is {100 * (drift - 1):+.1f} % off {rate:g} Hz on average")
+
+
+def check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Machine, source: str) -> None:
+    """Units and wrapping: what no such machine can do is a wrong log, not a measurement."""
+    if len(values) < 2:
+        return  # nothing moves in one row
+    body = machine.find(sensor.body)
+    if sensor.is_rate:
+        fastest, usual = _fastest(sensor, machine), float(np.percentile(np.abs(values), 99))
+        if fastest is not None and usual > 3 * fastest:
+            raise LogError(
+                f"{source}: column {sensor.column}: turns at {usual:.3g} rad/s, the machine allows {fastest:.3g} rad/s;"
+                f" is the unit {sensor.unit} right?"
+            )
+        return
+    if sensor.kind == "wheel" or (sensor.kind == "angle" and body.joint == "revolute"):
+        step = np.abs(np.diff(values))
+        k = int(np.argmax(step))
+        if step[k] > 2.0:
+            raise LogError(
+                f"{source}: row {k + 2}, column {sensor.column}: the angle jumps by {step[k]:.3g} rad in one sample;"
+                " unwrap it (encoder angles are counted on) or cut the log there"
+            )
+        fastest = _fastest(sensor, machine)
+        if fastest is not None and step[k] * rate > 5 * fastest and np.percentile(step, 99) * rate > 3 * fastest:
+            raise LogError(
+                f"{source}: column {sensor.column}: turns at {np.percentile(step, 99) * rate:.3g} rad/s, the machine"
+                f" allows {fastest:.3g} rad/s; is the column in degrees?"
+            )
+        limit = body.limit.position
+        if sensor.kind == "angle" and limit is not None and np.abs(values).max() > 3 * float(limit):
+            raise LogError(
+                f"{source}: column {sensor.column}: up to {np.abs(values).max():.3g} rad, the machine allows"
+                f" {float(limit):g} rad; is the column in degrees?"
+            )
+    if sensor.kind == "torque" and body.limit.torque is not None:
+        top, most = float(np.abs(values).max()), float(body.limit.torque)
+        if top > 10 * most:
+            raise LogError(
+                f"{source}: column {sensor.column}: up to {top:.3g}, more than ten times the drive's limit {most:g};"
+                " is the unit right?"
+            )
+
+
+def _fastest(sensor: Sensor, machine: Machine) -> float | None:
+    """The rate [rad/s] that a joint's limits allow, None where they don't say."""
+    limit, contact = machine.find(sensor.body).limit, machine.find(sensor.body).contact
+    if sensor.kind != "angle":
+        return None
+    if limit.rim_speed is not None and contact is not None:
+        return float(limit.rim_speed) / float(contact.radius)
+    return None if limit.rate is None else float(limit.rate)
+
+
+def what_of(sensor: Sensor, machine: Machine) -> str:
+    where = sensor.place or machine.find(sensor.body).where
+    kind = {"angle": "angle", "wheel": "angle", "torque": "torque"}.get(sensor.kind, sensor.kind.replace("_", " "))
+    kind = "rate" if sensor.is_rate else kind
+    return f"{kind} of {where.replace('_', ' ')}"
+
+
+def columns_of(table: pd.DataFrame) -> str:
+    """What a file holds instead of a column that it lacks."""
+    names = [str(c) for c in table.columns]
+    shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+    return f"the file has {shown}"
+
+
+def looks_like(table: pd.DataFrame, machine: Machine) -> str:
+    """A shipped machine whose log this looks like."""
+    if {s.column for s in machine.sensors("paper")} <= {str(c) for c in table.columns}:
+        return "; without it --method joint works"
+    for name in shipped_machines():
+        if name == machine.name:
+            continue
+        other = load_machine(name)
+        columns = {other.time_column, *(s.column for s in other.sensors("paper"))}
+        if columns <= {str(c) for c in table.columns}:
+            return f"; this looks like a log of {name}"
+    if machine.name not in shipped_machines():
+        return f"; is this a log of {machine.name}? The machine file names each sensor's column"
+    return (
+        f"; is this a log of {machine.name}? The machine file names each sensor's column: `excite machine new NAME"
+        f" --like {machine.name}` writes one with columns and units to change"
+    )

@@ -1,0 +1,330 @@
+"""What may be wrong with a log though every value is possible: a sign turned around, a torque a thousand times off, a
+speed for an angle, other counts than the machine file's.
+
+The drive of a joint that steers does more work with the joint's motion than against it, since friction takes some. A
+contact may well brake while another one pulls; but whatever the others do, more torque makes the machine faster. All
+contacts turn about as fast, and angles that are counted move in whole counts.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from excite.errors import NoEstimate
+from excite.model import mechanics
+from excite.model.machine import Body, Machine, Sensor, shipped_machines
+
+SPAN = 0.5  # s: half of what accelerations and torques are taken over, so that counts and noise don't matter
+LEAST = 10  # independent spans that a sign is judged by
+CLEAR = 2.5  # standard deviations
+AGAINST = 0.3  # correlation, or share of the acceleration that the machine file's masses promise, below zero
+OPPOSED = -0.5  # correlation of two speeds that says that one is counted the other way round
+ALIKE = 0.1  # of the largest singular value: torques that differ by less can't be told apart
+FRICTION = 2.0  # times that of the joints: in a bend contacts rub on the ground as well
+SAME = 1e-6  # of the largest singular value: no direction of its own
+RATES = ("rpm", "rad/s")
+CLEARER = 0.8  # times what is left of the torques otherwise: beyond doubt a speed
+FAST, SLOWLY = 0.95, 0.7  # correlation with another one's speed, of a speed and of what is none
+SEVERAL = 50  # steps that counts are judged by
+STILL = 1e-6  # of a count: no step
+OFF, MOSTLY = 0.1, 0.9  # of a count, and share of the steps, by which steps are whole ones
+ONE = 0.03  # by which the smallest step may differ from one count, as numbers in a file are rounded
+SHARE = 0.1  # of the highest speed: below, dry friction fades
+SLOW = 0.1  # rad/s: below, friction fades in an average over a span
+MOVED = 0.05  # rad or m: a joint that moves less says nothing of its drive
+SMALL, LARGE, REFUSED = 0.01, 3.0, 10.0  # times the drive's limit; more than the last `log.check` refuses
+THOUSAND = {"N m": "kN m", "Nm": "kNm", "N": "kN", "Pa": "kPa", "kPa": "MPa"}
+
+
+def doubts(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """A line for everything that is doubtful about readings (N,) by sensor name [SI], evenly sampled."""
+    found = {(s.kind, s.body): s for s in machine.sensors("full") if s.name in values}
+    driven = [b for b in machine.actuated if ("angle", b.index) in found and ("torque", b.index) in found]
+    angles = {b.index: found["angle", b.index] for b in driven}
+    torques = {b.index: found["torque", b.index] for b in driven}
+    rate = float(machine.sampling_hz)
+    position = {i: np.cumsum(values[s.name]) / rate if s.is_rate else values[s.name] for i, s in angles.items()}
+    moved = [b for b in driven if np.ptp(position[b.index]) > MOVED]
+    counted = [s for s in machine.sensors("full") if s.name in values and s.resolution is not None]
+    counts = {s.name: line for s in counted if (line := _counts(s, machine, values[s.name]))}
+    scales = (_scale(torques[b.index], b, machine, values[torques[b.index].name]) for b in moved)
+    dead = _dead(machine, values)
+    if lines := [line for line in scales if line]:
+        # With a torque that is too small the others seem to move the machine alone.
+        return (*dead, *counts.values(), *lines)
+    speeds = _speeds(machine, values, rate)
+    lines = [
+        f"column {s.column}: goes as the speed of {other.column} does, not as its angle: is it a speed? then"
+        f" {as_speed(RATES, machine)}"
+        for s, other in speeds
+    ]
+    for s, _ in speeds:
+        counts.pop(s.name, None)
+    half = max(1, round(SPAN * rate))
+    for b in moved:
+        if len(position[b.index]) < 2 * half * LEAST or (speeds and b.contact):
+            continue
+        motion = _motion(position[b.index], half, rate)
+        means = {c.index: _mean(values[torques[c.index].name], half) for c in driven}
+        turned = _pulls(machine, b, driven, motion, means, half) if b.contact else _works(motion, means[b.index], half)
+        if turned:
+            torque, angle = " - ".join(torques[b.index].columns), angles[b.index].column
+            what = (
+                f"the more torque {torque} tells, the less the machine speeds up as {angle} counts"
+                if b.contact
+                else f"the torque {torque} does more work against {angle}'s motion than with it"
+            )
+            lines.append(
+                f"{what}: is the sign of one of them turned around? (right if something else moves this joint: a slope,"
+                " a tow, another drive)"
+            )
+    return (*dead, *counts.values(), *lines, *_backward(machine, values))
+
+
+def against(machine: Machine, values: Mapping[str, np.ndarray]) -> list[str]:
+    """A line for every two contacts that turn against each other: the sensor of one of them counts the wrong way."""
+    contacts = _contacts(machine, values)
+    sides = _sides(machine, contacts)
+    found = []
+    for one, other in itertools.pairwise(sorted(contacts, key=lambda s: sides[s.name])):
+        if sides[one.name] == sides[other.name] and _opposed(one, other, values):
+            first, second = (machine.find(s.body).where.replace("_", " ") for s in (one, other))
+            found.append(
+                f"columns {one.column}, {other.column}: {first} and {second} turn against each other; give one a"
+                " negative factor"
+            )
+    return found
+
+
+def _backward(machine: Machine, values: Mapping[str, np.ndarray]) -> list[str]:
+    """A line for every measuring wheel that turns against all contacts beside it."""
+    wheels = [s for s in machine.sensors("full") if s.name in values and s.kind == "wheel"]
+    contacts = _contacts(machine, values)
+    sides = _sides(machine, [*contacts, *wheels])
+    found = []
+    for wheel in wheels:
+        beside = [s for s in contacts if sides[s.name] == sides[wheel.name]]
+        if beside and all(_opposed(wheel, s, values) for s in beside):
+            found.append(
+                f"column {wheel.column}: turns against {', '.join(s.column for s in beside)}: is its sign right?"
+            )
+    return found
+
+
+def _contacts(machine: Machine, values: Mapping[str, np.ndarray]) -> list[Sensor]:
+    """The sensors of contacts' angles."""
+    known = [s for s in machine.sensors("full") if s.name in values and s.kind == "angle"]
+    return [s for s in known if machine.find(s.body).contact is not None]
+
+
+def _sides(machine: Machine, sensors: Sequence[Sensor]) -> dict[str, float]:
+    """Left or right, of sensors on a machine with no joint to steer with, which turns its sides against each other."""
+    if any(b.contact is None for b in machine.actuated):
+        return {s.name: 0.0 for s in sensors}
+    places = mechanics.poses(machine, {})
+    across = {s.name: float(s.lateral) if s.lateral is not None else places[s.body][1][1] for s in sensors}
+    return {name: float(np.sign(round(y, 6))) for name, y in across.items()}
+
+
+def _opposed(one: Sensor, other: Sensor, values: Mapping[str, np.ndarray]) -> bool:
+    """Whether two contacts or measuring wheels turn against each other."""
+    a, b = (values[s.name][::10] if s.is_rate else np.diff(values[s.name][::10]) for s in (one, other))
+    a, b = a[: len(b)], b[: len(a)]
+    return len(a) > 10 and np.ptp(a) > 0 and np.ptp(b) > 0 and bool(np.corrcoef(a, b)[0, 1] < OPPOSED)
+
+
+def unchanging(sensor: Sensor, values: np.ndarray) -> str:
+    """What is said of a channel that always reads the same, "" of any other."""
+    name = " - ".join(sensor.columns)
+    return f"column {name}: never changes ({values[0]:g}): is the sensor connected?" if np.ptp(values) == 0 else ""
+
+
+def _dead(machine: Machine, values: Mapping[str, np.ndarray]) -> list[str]:
+    """Channels of torques, contacts and measuring wheels that never change while something turns."""
+    there = [s for s in machine.sensors("full") if s.name in values]
+    rolling = [*_contacts(machine, values), *(s for s in there if s.kind == "wheel")]
+    if not any(np.ptp(values[s.name]) > MOVED for s in rolling):
+        return []
+    found = (unchanging(s, values[s.name]) for s in there if s.kind == "torque" or s in rolling)
+    return [line for line in found if line]
+
+
+def _speeds(machine: Machine, values: Mapping[str, np.ndarray], rate: float) -> list[tuple[Sensor, Sensor]]:
+    """Angles of contacts and measuring wheels that are rather speeds, each with another one that tells so: all go over
+    the same ground, and about as fast."""
+    half = max(1, round(SPAN * rate))
+    angles = [
+        s
+        for s in machine.sensors("full")
+        if s.kind == "wheel" or (s.kind == "angle" and machine.find(s.body).contact is not None)
+    ]
+    angles = [s for s in angles if s.name in values and not s.is_rate and len(values[s.name]) >= 2 * half * LEAST]
+    own = {s.name: _mean(values[s.name], half) for s in angles}
+    turning = {s.name: _motion(values[s.name], half, rate)[0] for s in angles}
+    found = []
+    for s in angles:
+        others = [r for r in angles if r is not s and _alike(own[s.name], turning[r.name]) > FAST]
+        if others and _alike(turning[s.name], turning[others[0].name]) < SLOWLY:
+            found.append((s, others[0]))
+    return found
+
+
+def _alike(x: np.ndarray, y: np.ndarray) -> float:
+    """Correlation, of either sign."""
+    return abs(float(np.corrcoef(x, y)[0, 1])) if min(np.ptp(x), np.ptp(y)) > 0 else 0.0
+
+
+def is_speed(values: np.ndarray, torques: Sequence[np.ndarray], rate: float) -> bool:
+    """Whether readings (N,) of an angle, in any unit, are rather its speed: what they do goes with the torques (N,), by
+    inertia and friction, better if they are taken for one."""
+    half = max(1, round(SPAN * rate))
+    moving = [u for u in torques if np.ptp(u) > 0]
+    if not moving or len(values) < 2 * half * LEAST:
+        return False
+    u = np.column_stack([_mean(u, half) for u in moving])
+    first, second = _motion(values, half, rate)
+    return _unexplained(u, _mean(values, half), first) < CLEARER * _unexplained(u, first, second)
+
+
+def as_speed(units: Sequence[str], machine: Machine) -> str:
+    """What to write for a column that holds a speed in one of these units."""
+    line = " or ".join(f'unit = "{unit}"' for unit in units)
+    return f"write {line} for it in {own_file(machine)}, with its noise [rad/s] instead of counts_per_turn"
+
+
+def _unexplained(torques: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) -> float:
+    """What a speed (N,) and its change leave of the combination of torques (N, k) that goes best with them, as a share:
+    one less the largest canonical correlation squared."""
+    dry = np.tanh(speed / (SHARE * np.abs(speed).max() or 1.0))
+    both = _directions(torques).T @ _directions(np.column_stack([speed, acceleration, dry]))
+    return max(1 - float(np.linalg.norm(both, 2)) ** 2, 1e-300)
+
+
+def _directions(A: np.ndarray) -> np.ndarray:
+    """Orthonormal columns that span the columns of A (N, k) but for their means."""
+    A = A - A.mean(axis=0)
+    U, sizes, _ = np.linalg.svd(A / np.maximum(A.std(axis=0), 1e-300), full_matrices=False)
+    found: np.ndarray = U[:, sizes > SAME * sizes[0]]
+    return found
+
+
+@contextmanager
+def doubts_in_errors(lines: Sequence[str]) -> Iterator[None]:
+    """Where no estimate is found, the message says what is doubtful about the logs as well."""
+    try:
+        yield
+    except NoEstimate as err:
+        if lines:
+            err.args = ("; ".join((str(err), *lines)),)
+        raise
+
+
+def own_file(machine: Machine) -> str:
+    """The machine file that a line can be written in, as a message calls it."""
+    if machine.name not in shipped_machines():
+        return "the machine file"
+    return f"a machine file (`excite machine new NAME --like {machine.name}` makes one)"
+
+
+def _motion(x: np.ndarray, half: int, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Speed and acceleration (N - 2 half,) of a position (N,), averages over a span."""
+    step = half / rate
+    first, middle, last = x[: -2 * half], x[half:-half], x[2 * half :]
+    return (last - first) / (2 * step), (last - 2 * middle + first) / step**2
+
+
+def _mean(x: np.ndarray, half: int) -> np.ndarray:
+    """The average (N - 2 half,) of a signal (N,) that goes with an acceleration: weighted by a triangle."""
+    weights = np.concatenate([np.arange(1, half), np.arange(half, 0, -1)]) / half**2
+    return np.convolve(x, weights, "same")[half:-half]
+
+
+def _works(motion: tuple[np.ndarray, np.ndarray], torque: np.ndarray, half: int) -> bool:
+    """Whether a torque, but for its offset, goes clearly against the speed."""
+    speed, _ = motion
+    if np.ptp(torque) == 0 or np.ptp(speed) == 0:
+        return False
+    r = float(np.corrcoef(torque, speed)[0, 1])
+    return r < -AGAINST and r * np.sqrt(len(speed) / (2 * half)) < -CLEAR
+
+
+def _pulls(
+    machine: Machine,
+    body: Body,
+    driven: Sequence[Body],
+    motion: tuple[np.ndarray, np.ndarray],
+    means: Mapping[int, np.ndarray],
+    half: int,
+) -> bool:
+    """Whether a contact turns slower for more torque, by least squares over the torques of all contacts and friction.
+
+    As a share of what the machine's mass at the rims makes of a force. Torques that go together all along share the
+    effect equally: of one half of them turned around that half is found.
+    """
+    speed, acceleration = motion
+    rolling = [(b, float(b.contact.radius)) for b in driven if b.contact is not None]
+    columns = [means[b.index] / radius for b, radius in rolling]
+    rubbed = [(b.friction, radius) for b, radius in rolling if b.friction is not None]
+    columns.append(FRICTION * sum(float(f.Fs) / radius for f, radius in rubbed) * np.tanh(speed / SLOW))
+    columns.append(FRICTION * sum(float(f.Fv) / radius for f, radius in rubbed) * speed)
+    A = np.column_stack(columns)
+    A -= A.mean(axis=0)
+    k = next(k for k, (b, _) in enumerate(rolling) if b.index == body.index)
+    y = rolling[k][1] * (acceleration - acceleration.mean())
+    inverse = np.linalg.pinv(A, rcond=ALIKE)
+    x = inverse @ y
+    left = y - A @ x
+    deviation = float(np.sqrt(left @ left / len(y) * (inverse[k] @ inverse[k]) * 2 * half))
+    mass = sum(float(b.inertia.mass) for b in machine.body if b.inertia is not None)
+    mass += sum(
+        float(b.inertia.ZZ) / float(b.contact.radius) ** 2
+        for b in machine.contacts
+        if b.inertia is not None and b.contact is not None
+    )
+    return float(x[k]) * mass < -AGAINST and float(x[k]) < -CLEAR * deviation
+
+
+def _counts(sensor: Sensor, machine: Machine, values: np.ndarray) -> str:
+    """An angle that moves in other steps than those of its counts, "" where it doesn't."""
+    assert sensor.resolution is not None
+    steps = np.abs(np.diff(values)) / sensor.resolution
+    steps = steps[steps > STILL]
+    if len(steps) < SEVERAL:
+        return ""
+    off = OFF + float(np.finfo(np.float32).eps * np.abs(values).max() / sensor.resolution)
+    least, turn = float(np.quantile(steps, 0.01)), float(sensor.counts_per_turn or 0)
+    if _whole(steps / least, off * min(1, 1 / least)) and abs(least - 1) > ONE:
+        return (
+            f"column {sensor.column}: moves in steps of {least:.3g} counts of {turn:g} per turn: is it filtered or"
+            f" rounded, or is it counts_per_turn = {round(turn / least)}? then write that for it in {own_file(machine)}"
+        )
+    if _whole(steps, off):
+        return ""
+    return (
+        f"column {sensor.column}: does not move in whole counts of {turn:g} per turn: is it exact, filtered, rounded or"
+        " resampled? deviations are stated for counts as they come"
+    )
+
+
+def _whole(steps: np.ndarray, off: float) -> bool:
+    return bool(np.mean(np.abs(steps - np.round(steps)) < off) > MOSTLY)
+
+
+def _scale(sensor: Sensor, body: Body, machine: Machine, torque: np.ndarray) -> str:
+    """A torque far below or above what its drive can do, "" where it isn't."""
+    if body.limit.torque is None:
+        return ""
+    top, most, name = float(np.abs(torque).max()), float(body.limit.torque), " - ".join(sensor.columns)
+    said = f"column {name}: the largest torque is {top:.3g} {machine.si(sensor)}, the drive's limit {most:g}"
+    if 0 < top < SMALL * most:
+        larger = THOUSAND.get(sensor.unit) if sensor.factor is None else None
+        if larger is None:
+            return f"{said}: is its {'unit' if sensor.factor is None else 'factor'} in the machine file right?"
+        return f'{said}: is it in {larger}? then write unit = "{larger}" for it in {own_file(machine)}'
+    if LARGE * most < top <= REFUSED * most:
+        return f"{said}: is its {'unit' if sensor.factor is None else 'factor'} right?"
+    return ""

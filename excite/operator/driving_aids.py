@@ -1,0 +1,271 @@
+"""What goes into the cab: from a designed motion to the driver's sheet, the driver's page and their numbers."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from excite import trajectories
+from excite.errors import DriveError, SimulationError
+from excite.model import Model
+from excite.model.machine import Problem
+from excite.operator import ground, page, sheet
+from excite.operator.ground import Score, Trace
+from excite.operator.server import Tail, run
+from excite.operator.sheet import Sheet
+from excite.simulation import Motion
+from excite.trajectories import Stored
+
+PEOPLE = 3  # drives by different people, in simulation
+PAGE = "driver.html"
+PACES = (4.0, 3.0, 2.5)  # s per phase that are tried where nobody says how many phases
+ENOUGH = 1.2
+NEAR = 0.8  # of a steered joint's stop
+SLOWER = (0.95, 0.9, 0.8)  # of a trace's speeds, where people exceed limits on it
+Progress = Callable[[int, int, float | None], None]
+
+PLAYED, TRACED, PHASED = "torques played back", "a person on the design's own trace", "a person on these phases"
+
+
+def prepare(
+    design: Stored, most: int | None = None, shortest: float = 2.0, seed: int = 0, progress: Progress | None = None
+) -> Sheet:
+    """Everything that the sheet and the page show of a design: phases, paths, room, warnings, what a person keeps.
+
+    Raises DriveError and SimulationError as `drive.phases` and `drive.driven`.
+    """
+    model, motion, problem = design.model, design.motion, design.problem
+    if problem is None:
+        raise DriveError(f"{model.machine.name}: has no problem {design.summary.get('problem')}, design again")
+    made = design.summary.get("driver") if most is None else None  # by `--driver`: of phases already
+    if made is not None:
+        choices = [ground.from_table(model, made["phases"])]
+        free = made["played_back"]
+        played = Score(free["cond_phi"], free["worst_percent"], free["worst_parameter"], free["median_percent"])
+    else:
+        counts = [most] if most is not None else [round(motion.t[-1] / pace) for pace in PACES]
+        choices = [ground.phases(model, motion, shortest, max(2, n)) for n in counts]
+        choices = [c for k, c in enumerate(choices) if len(c) not in [len(b) for b in choices[:k]]]
+        played = ground.score(model, motion)
+    done, total = 0, (1 if made is not None else 2) * PEOPLE + len(choices)
+
+    def person(way: Trace, who: int) -> Motion:
+        nonlocal done
+        driven = ground.driven(model, way, None, seed + who, motion.q[0])
+        done += 1
+        if progress is not None:
+            progress(done, total, None)
+        return driven
+
+    def people(way: Trace) -> tuple[Motion, ...]:
+        return tuple(person(way, k) for k in range(PEOPLE))
+
+    trace = choices[0]
+    if len(choices) > 1:  # the fewest phases that keep about what the best keep
+        lost = [_loss(ground.score(model, person(c, 0))) for c in choices]
+        trace = next(c for c, x in zip(choices, lost, strict=True) if x <= ENOUGH * min(lost))
+
+    scores: list[tuple[str, Score]] = [(PLAYED, played)]
+    if made is None:
+        try:
+            own = ground.as_designed(model, motion)
+            scores.append((TRACED, ground.middle([ground.score(model, m) for m in people(own)])))
+        except SimulationError:  # a trace that no one can follow need not stop the phases
+            done = PEOPLE
+    motions = ground.placed(model, problem, people(trace))
+    scores.append((PHASED, ground.middle([ground.score(model, m) for m in motions])))
+    room = ground.room(model, motions)
+    lane = (float(problem.lane_m[0]), float(problem.lane_m[1]))
+    over = _exceeded(model, problem, motions)
+    said = verdict(
+        scores[0][1],
+        scores[-1][1],
+        str(design.summary.get("objective")),
+        by_hand=design.summary.get("driver") is not None,
+        fewer=most is not None,
+        over=over,
+        slower=_slower(model, problem, trace, motion.q[0], seed) if over else None,
+    )
+    return Sheet(
+        design.title,
+        model,
+        trace,
+        motions,
+        room,
+        lane,
+        tuple(_warnings(model, trace, motions, room)),
+        tuple(scores),
+        said,
+    )
+
+
+def _loss(score: Score) -> float:
+    """How poor a score is: worst and median error alike."""
+    return score.worst_percent * score.median_percent
+
+
+def verdict(
+    played: Score,
+    person: Score,
+    objective: str = "accuracy",
+    *,
+    by_hand: bool = False,
+    fewer: bool = False,
+    over: Mapping[str, float] | None = None,
+    slower: float | None = None,
+) -> str:
+    """What a person keeps of a design, in a sentence, and what still helps where that is too little.
+
+    by_hand: the design was made with `--driver`; fewer: on phases of its own (`--phases`). over: limits that people
+    exceed, in their range; slower: the share of the speeds that keeps them.
+    """
+    worst, median = person.worst_percent / played.worst_percent, person.median_percent / played.median_percent
+    ratio = max(worst, median)
+    again = _again(trajectories.conditions(objective), by_hand, fewer)
+    if ratio <= 1.1:
+        said = "nothing that counts is lost"
+    elif ratio <= ground.LOST:
+        said = "good enough to drive"
+    else:
+        said = f"too much is lost; {again}, or play back the torques"
+    text = f"A person on these phases {_attained(median, worst)}: {said}."
+    if not over:
+        return text
+    named = ", ".join(f"{n.replace('_', ' ')} by {100 * v:.0f} %" for n, v in over.items())
+    keep = "design again with --driver"
+    if by_hand:
+        keep = again if fewer else "design again with them so much tighter in the machine file"
+    below = "" if slower is None else f", or stay {100 * (1 - slower):.0f} % below all speeds, which keeps them"
+    return (
+        f"{text} But a person exceeds limits, {named} of {'its' if len(over) == 1 else 'their'} range: {keep}{below}."
+    )
+
+
+def _attained(median: float, worst: float) -> str:
+    """Errors as multiples of those with torques played back, in words."""
+    exact = "torques played back exactly"
+    factors = {name: f"{x:.2g}" for name, x in (("median", median), ("worst", worst))}
+    more = [f"{x} times the {name} error" for name, x in factors.items() if x != "1"]
+    same = [name for name, x in factors.items() if x == "1"]
+    if not more:
+        return f"is as good as {exact}"
+    return f"attains {' and '.join(more)} of {exact}" + "".join(f" and is as good in the {n} parameter" for n in same)
+
+
+def _again(conditions: bool, by_hand: bool, fewer: bool) -> str:
+    """What to ask for instead: nothing that was asked for already."""
+    if not by_hand:
+        return "design again with " + ("--objective accuracy --driver" if conditions else "--driver, or a longer drive")
+    if fewer:
+        return "leave out --phases, the design has phases for people already"
+    first = "--objective accuracy, " if conditions else ""
+    return f"design again with {first}a longer --duration, more --starts or, where there was one, a larger --budget"
+
+
+def _exceeded(model: Model, problem: Problem, motions: tuple[Motion, ...]) -> dict[str, float]:
+    """The limits that any of the drives exceeds, with the largest excess in their range."""
+    over: dict[str, float] = {}
+    for m in motions:
+        for name, value in ground.broken(model, problem, m).items():
+            over[name] = max(over.get(name, 0.0), value)
+    return over
+
+
+def _slower(model: Model, problem: Problem, trace: Trace, start: np.ndarray, seed: int) -> float | None:
+    """The largest share of the speeds at which people keep every limit, in simulation; None where none helps."""
+    for share in SLOWER:
+        slow = replace(trace, speed=share * trace.speed)
+        with contextlib.suppress(SimulationError):
+            motions = tuple(ground.driven(model, slow, None, seed + k, start) for k in range(PEOPLE))
+            if not _exceeded(model, problem, ground.placed(model, problem, motions)):
+                return share
+    return None
+
+
+def _warnings(model: Model, trace: Trace, motions: tuple[Motion, ...], room: ground.Room) -> list[str]:
+    free = (np.ceil(room.length + 2 * sheet.AHEAD), np.ceil(room.width + 2 * sheet.AHEAD))
+    lines = [
+        f"Keep everybody off {free[0]:.0f} m x {free[1]:.0f} m: the machine touches {room.length:.1f} m x"
+        f" {room.width:.1f} m of ground, {sheet.AHEAD:g} m are left all around for overhangs and for stopping. Stop at"
+        " once if anybody comes near.",
+        "Engine speed and drive settings the same all along, whatever else shakes or moves off; ground level and firm.",
+    ]
+    turns = len(ground.reversals(trace))
+    if turns:
+        times = "once" if turns == 1 else f"{turns} times"
+        lines.append(f"The machine changes direction {times}: somebody must see the ground behind it.")
+    ends = np.array([ground.edges(model, m)[0].mean(axis=0)[-1] for m in motions])
+    spread = float(np.hypot(*(ends.max(axis=0) - ends.min(axis=0))))
+    *others, last = ("speed", *(lever.name for lever in trace.levers))
+    followed = f"{', '.join(others)} and {last}" if others else "the speed"
+    lines.append(
+        f"People drift: between {len(motions)} simulated drives the ends lie {spread:.1f} m apart. Follow"
+        f" {followed}, not the place; don't correct the place before the end."
+    )
+    if len(trace.levers) > 1:
+        lines.append(
+            "Left, of every joint, is what turns the machine to the left when it goes forward: joints to one side turn"
+            " it tightly, to different sides they move it sideways."
+        )
+    for lever, angle in zip(trace.levers, trace.angle.T, strict=True):
+        stop = lever.body.limit.position
+        if stop is not None and (top := float(np.abs(angle).max()) / float(stop)) > NEAR:
+            lines.append(f"The {lever.name} goes to {100 * top:.0f} % of its stop: hands and feet away from the joint.")
+    return lines
+
+
+def summary(made: Sheet) -> dict[str, Any]:
+    """The numbers of a sheet: phases, room, scores by way of driving, warnings."""
+    trace = made.trace
+    return {
+        "duration_s": trace.duration,
+        "start": ground.start_words(made.model, made.motions[0], trace),
+        "phases": ground.trace_table(trace),
+        "direction_changes_s": ground.reversals(trace),
+        "room_m": [made.room.length, made.room.width],
+        "tolerance": {
+            "speed_m_s": ground.BAND_SPEED,
+            "angle_rad": float(ground.BAND_ANGLE),
+            "time_s": ground.BAND_S,
+        },
+        "scores": {
+            name: {
+                "cond_phi": s.cond_phi,
+                "worst_percent": s.worst_percent,
+                "worst": s.worst,
+                "median_percent": s.median_percent,
+            }
+            for name, s in made.scores
+        },
+        "verdict": made.verdict,
+        "warnings": list(made.warnings),
+    }
+
+
+def write(made: Sheet, place: Path) -> dict[str, Any]:
+    """sheet.pdf, driver.html and phases.csv into a folder; returns the numbers."""
+    sheet.save(made, place / "sheet.pdf")
+    said = summary(made)
+    text = page.driver_page(made.model, made.trace, made.title, said["start"])
+    (place / PAGE).write_text(text, encoding="utf-8")
+    t = made.trace.times
+    angles = {lever.column: angle for lever, angle in zip(made.trace.levers, made.trace.angle.T, strict=True)}
+    knots = pd.DataFrame({"t_s": t, "v_m_s": made.trace.speed, **angles})
+    knots.to_csv(place / "phases.csv", index=False)
+    return said
+
+
+def serve(out: Path, made: Sheet, host: str, port: int, live: Path | None, ready: Callable[[str], None]) -> None:
+    """The page of a written folder with live values, until Ctrl-C; `ready` gets its addresses. Raises ServeError."""
+    text = (out / PAGE).read_text(encoding="utf-8")
+    levers = made.trace.levers
+    tail = Tail(live, made.model.machine, levers) if live is not None else None
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(run(text, [lever.column for lever in levers], host, port, tail, ready))

@@ -1,0 +1,222 @@
+"""Figures of a diagnosis: what the model misses against all that the machine does, before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from excite import diagnosis
+from excite.diagnosis import Course, Diagnosis
+from excite.reports.figures import COLOURS, plain, save
+
+BEFORE, AFTER = COLOURS[1], COLOURS[0]
+SHOWN, WIDE = 3, 4  # torques and forces in a figure, panels side by side
+# Sizes in inches are given, as to measure all labels takes as long as to draw them.
+PANEL = 2.9, 1.8  # with its labels
+INSET = 0.52, 0.4, 0.08, 0.14  # of a panel, that labels take: left, below, right, above
+HEAD = 0.28  # over the panels of one torque or force
+EDGE = 0.35  # for the title, and for the legend
+PLAIN = -3, 5  # powers of ten of the numbers beside an axis that are written as they are
+CLEAR = 4.0  # strength from which a quantity is pointed out
+HIGHEST = 30.0  # mean square of innovations at which the colours end
+
+
+def drawings(place: Path, d: Diagnosis, title: str) -> list[Callable[[], None]]:
+    """Calls that draw misfit.png and when.png of each log into the folder of a diagnosis: they need neither one another
+    nor what was gained."""
+    return [partial(_drawn, place, d, title, kind) for kind in ("misfit", "when")]
+
+
+def _drawn(place: Path, d: Diagnosis, title: str, kind: str) -> None:
+    """One of the two figures of every log."""
+    before, after = d.before, d.after
+    if kind == "misfit" and before.exact != after.exact:
+        # Forces that the one needs must be shown for the other too.
+        before, after = diagnosis.loosened(before), diagnosis.loosened(after)
+    without = diagnosis.courses(before)
+    beside = diagnosis.courses(after) if d.stages else [None] * len(without)
+    figure = misfit_figure if kind == "misfit" else when_figure
+    for k, (old, new) in enumerate(zip(without, beside, strict=True)):
+        name = f"{kind}-{k + 1}.png" if len(without) > 1 else f"{kind}.png"
+        save(figure(old, new, f"{title}: {Path(old.source).name}"), place / name)
+
+
+def misfit_figure(before: Course, after: Course | None, title: str) -> Figure:
+    """What is missing most, at most SHOWN torques and forces, against everything that the machine does, and its
+    spectrum. A thick frame: against this it shows most clearly."""
+    evidence = {row: {q: diagnosis.strength(before, row, q) for q in before.quantities} for row in before.missing}
+    rows = sorted(evidence, key=lambda row: -max(evidence[row].values()))[:SHOWN]
+    panels = max(sum(row in v for _, v in before.quantities.values()) for row in rows) + 1
+    block = HEAD + -(-panels // WIDE) * PANEL[1]
+    width, height = WIDE * PANEL[0], len(rows) * block + 2 * EDGE
+    figure = Figure(figsize=(width, height))
+    figure.suptitle(plain(title), fontsize=11, y=1 - EDGE / 2 / height, va="center")
+    left, below, right, above = INSET
+    share = (PANEL[0] - left - right) / width, (PANEL[1] - below - above) / height
+    for k, row in enumerate(rows):
+        top = height - EDGE - k * block - HEAD
+        words = f"missing {row} [{before.missing[row][1]}]"
+        figure.text(0.01, (top + HEAD / 2) / height, words, fontsize=9.5, va="center")
+        own = [q for q, (_, values) in before.quantities.items() if row in values]
+        clearest = max(own, key=lambda q: evidence[row][q])
+        for n, name in enumerate([*own, None]):
+            down, across = divmod(n, WIDE)
+            x, y = across * PANEL[0] + left, top - (down + 1) * PANEL[1] + below
+            ax = figure.add_axes((x / width, y / height, *share))
+            if name is None:
+                _spectrum(ax, before, after, row)
+            else:
+                _against(ax, before, after, row, name)
+            if name == clearest and evidence[row][name] > CLEAR:
+                for spine in ax.spines.values():
+                    spine.set_linewidth(2.2)
+            ax.tick_params(which="both", labelsize=7)
+    key = figure.add_axes((0, 0, 0.001, 0.001))
+    key.axis("off")
+    key.plot([], [], color=BEFORE, label="without what was found" if after is not None else "missing (mean)")
+    if after is not None:
+        key.plot([], [], color=AFTER, linestyle="--", label="with it")
+    if any(np.isfinite(before.missing[row][2]) for row in rows):
+        key.fill_between([], [], [], color="0.8", label="what noise alone leaves")
+    figure.legend(*key.get_legend_handles_labels(), loc="lower center", ncols=3, fontsize=9, frameon=False)
+    return figure
+
+
+def _against(ax: Axes, before: Course, after: Course | None, row: str, column: str) -> None:
+    y, _, sigma = before.missing[row]
+    x = before.quantities[column][1][row]
+    centre, mean, band = diagnosis.binned(x, y, sigma if np.isfinite(sigma) else 0.0)
+    if np.isfinite(sigma):
+        ax.fill_between(centre, -band, band, color="0.8", linewidth=0)
+    ax.axhline(0, color="black", linewidth=0.6)
+    ax.plot(centre, mean, color=BEFORE, linewidth=1.4, marker="." if len(centre) < 8 else None)
+    if after is not None and row in after.missing:
+        at = after.quantities[column][1].get(row)
+        if at is not None:
+            centre, mean, _ = diagnosis.binned(at, after.missing[row][0], 0.0)
+            ax.plot(centre, mean, color=AFTER, linewidth=1.4, linestyle="--")
+    ax.locator_params("x", nbins=6, steps=(1, 2, 5, 10))
+    ax.ticklabel_format(scilimits=PLAIN, useOffset=False)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.get_offset_text().set_fontsize(7)
+    ax.set_xlabel(f"{column.replace('_', ' ')} [{before.quantities[column][0]}]", fontsize=8, labelpad=1)
+    ax.grid(alpha=0.3)
+
+
+def _spectrum(ax: Axes, before: Course, after: Course | None, row: str) -> None:
+    f, size = diagnosis.spectrum(before, before.missing[row][0])
+    ax.loglog(f, size, color=BEFORE, linewidth=1.0)
+    if after is not None and row in after.missing:
+        f, size = diagnosis.spectrum(after, after.missing[row][0])
+        ax.loglog(f, size, color=AFTER, linewidth=1.0, linestyle="--")
+    ax.set_xlabel(f"frequency [Hz], up: {before.missing[row][1]}/√Hz", fontsize=8, labelpad=1)
+    ax.grid(alpha=0.3)
+
+
+def when_figure(before: Course, after: Course | None, title: str) -> Figure:
+    """When and in which signal: innovations over time, 1 is noise; and where in speed and steering or torque."""
+    shown = [(before, "without what was found" if after is not None else "")]
+    if after is not None:
+        shown.append((after, "with it"))
+    m = len(before.sensors)
+    figure = Figure(figsize=(12, (0.34 * m + 1.7) * len(shown) + 0.6), layout="constrained")
+    figure.suptitle(plain(title), fontsize=11)
+    axes = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(2.2, 1), sharex="col")
+    norm = LogNorm(1 / 3, HIGHEST)
+    picture = None
+    for k, (course, words) in enumerate(shown):
+        t, size = diagnosis.over_time(course)
+        ax = axes[k, 0]
+        step = diagnosis.BLOCK_S / 2
+        picture = ax.pcolormesh(
+            np.append(t - step, t[-1] + step), np.arange(m + 1), size, norm=norm, cmap="inferno_r", rasterized=True
+        )
+        ax.set_yticks(np.arange(m) + 0.5, course.sensors, fontsize=9)
+        ax.invert_yaxis()
+        ax.set_title(f"when, in which signal {f'({words})' if words else ''}", fontsize=9, loc="left")
+        _map(axes[k, 1], course, norm)
+    axes[-1, 0].set_xlabel("time [s]")
+    assert picture is not None
+    bar = figure.colorbar(picture, ax=axes[:, 1], ticks=[0.5, 1, 2, 5, 10, 20])
+    bar.ax.set_yticklabels(["0.5", "1: noise", "2", "5", "10", "20"])
+    bar.set_label("mean square error of one step ahead,\nin units of noise", fontsize=9)
+    return figure
+
+
+def _map(ax: Axes, course: Course, norm: LogNorm) -> None:
+    """Where in the state space: speed across, steering angle (or torque where nothing steers) up."""
+    names = list(course.quantities)
+    up = next((n for n in names if n.endswith(" angle")), None)
+    up = up or next(n for n in names if n in ("torque", "force"))
+    (x_unit, xs), (y_unit, ys) = course.quantities["speed"], course.quantities[up]
+    x, y = next(iter(xs.values())), next(iter(ys.values()))
+    z = course.innovations**2
+    told = np.isfinite(z)
+    bins = [_edges(x), _edges(y)]
+    total = np.histogram2d(x, y, bins, weights=np.where(told, z, 0.0).sum(axis=1))[0]
+    count = np.histogram2d(x, y, bins, weights=told.sum(axis=1).astype(float))[0]
+    mean = np.where(count >= diagnosis.FEWEST, total / np.maximum(count, 1), np.nan)
+    ax.pcolormesh(*bins, mean.T, norm=norm, cmap="inferno_r", rasterized=True)
+    ax.set_title("where, over all signals", fontsize=9, loc="left")
+    ax.set_xlabel(f"speed [{x_unit}]")
+    ax.set_ylabel(f"{up.replace('_', ' ')} [{y_unit}]", fontsize=9)
+
+
+def _edges(x: np.ndarray) -> np.ndarray:
+    """Edges of bins that hold all but the outermost values."""
+    low, high = (float(v) for v in np.quantile(x, (0.002, 0.998)))
+    return np.arange(17) / 16 * (max(high - low, 1e-9)) + low
+
+
+def signals_figure(signals: Mapping[str, Mapping[str, Any]], found: bool, title: str) -> Figure:
+    """Signal by signal: how much of the error is systematic, and errors on withheld stretches, before and, if anything
+    was found, after."""
+    names = list(signals)
+    figure = Figure(figsize=(11, 0.5 * len(names) + 1.9), layout="constrained")
+    figure.suptitle(plain(title), fontsize=11)
+    left, right = figure.subplots(1, 2, sharey=True)
+    places = np.arange(len(names))[::-1].astype(float)
+    kinds = (("before", BEFORE, 0.2, ""), ("after", AFTER, -0.2, "//")) if found else (("before", BEFORE, 0.0, ""),)
+    for kind, colour, shift, hatch in kinds:
+        words = {"before": "without what was found" if found else "the model", "after": "with it"}[kind]
+        share = [signals[n][f"systematic_{kind}_percent"] for n in names]
+        height = 0.36 if found else 0.6
+        left.barh(places + shift, share, height=height, color=colour, hatch=hatch, edgecolor="white", label=words)
+        rms = np.array([signals[n][f"rms_{kind}"] or np.nan for n in names], float)
+        base = np.array([signals[n]["rms_before"] or np.nan for n in names], float)
+        ratio = 100 * rms / base
+        right.barh(places + shift, ratio, height=height, color=colour, hatch=hatch, edgecolor="white")
+        for y, value, n in zip(places + shift, rms, names, strict=True):
+            if np.isfinite(value):
+                right.annotate(
+                    f"{value:.3g} {signals[n]['unit']}",
+                    (0, y),
+                    xytext=(4, 0),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize=8,
+                    bbox={"boxstyle": "square,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8},
+                )
+    left.set_yticks(places, names)
+    left.set_xlim(0, 100)
+    left.set_xlabel("systematic share of the error one step ahead [%]")
+    right.set_xlabel("error on withheld stretches [% of that without]")
+    if not any(np.isfinite(row["rms_before"] or np.nan) for row in signals.values()):
+        right.set_axis_off()
+        none = (
+            "no error on withheld stretches:\nno fit to the rest of the log was found,\nor it is too short to hide any"
+        )
+        right.text(0.5, 0.5, none, transform=right.transAxes, ha="center", va="center", fontsize=9)
+    for ax in (left, right):
+        ax.grid(axis="x", alpha=0.3)
+        ax.set_axisbelow(True)
+    if found:
+        figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=9, frameon=False)
+    return figure

@@ -1,0 +1,290 @@
+"""Figures that answer at a glance: labelled, with units, readable in black and white."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from excite import trajectories
+from excite.identification import Comparison, Verification
+from excite.model import Model
+from excite.model.machine import Problem
+from excite.simulation import Motion
+from excite.trajectories import OURS, Row
+
+# Okabe-Ito, told apart by the colour-blind; line styles tell them apart in black and white.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
+EVEN = 5.0  # errors [%] up to which their axis is linear
+DECADES = 3  # on a logarithmic axis, up to which there are ticks between the powers of ten
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes a figure at print resolution, without the clock in it: the same data give the same bytes."""
+    figure.savefig(path, dpi=160, metadata={"Software": None} if path.suffix == ".png" else None)
+
+
+def plain(text: str) -> str:
+    """Text as it is written: a dollar sign in a machine's title or a file's name begins no formula."""
+    return text.replace("$", r"\$")
+
+
+def _style(k: int) -> dict[str, Any]:
+    """Colour and dashes of the k-th of several lines."""
+    return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
+
+
+def _lines(ax: Axes, t: np.ndarray, curves: Mapping[str, np.ndarray], label: str, legend: bool = True) -> None:
+    for k, (name, values) in enumerate(curves.items()):
+        ax.plot(t, values, **_style(k), linewidth=1.2, label=name)
+    ax.set_ylabel(label)
+    ax.grid(alpha=0.3)
+    if legend:
+        ax.legend(
+            loc="lower right",
+            bbox_to_anchor=(1, 0.98),
+            fontsize=8,
+            ncols=max(1, len(curves)),
+            frameon=False,
+            borderpad=0,
+        )
+
+
+def _bound(ax: Axes, value: float) -> None:
+    for y in (-value, value):
+        ax.axhline(y, color="black", linewidth=0.8, linestyle=(0, (2, 3)))
+
+
+def design_figure(model: Model, problem: Problem, motion: Motion, title: str) -> Figure:
+    """A drive: torques, speeds, joint angles and slips over time, the path, and how much of each limit is used."""
+    machine, t = model.machine, motion.t
+    moving = [b for b in machine.actuated if b.limit.position is not None]
+    slips = model.kinematics(motion.q.T, motion.nu.T)[1].full()
+    panels = 2 + bool(moving) + bool(len(slips))
+    figure = Figure(figsize=(11.5, 2.3 * max(panels, 3) + 0.6), layout="constrained")
+    halves = figure.subfigures(1, 2, width_ratios=(1.7, 1))
+    assert isinstance(halves, np.ndarray)
+    left, right = halves
+    axes = left.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
+    figure.suptitle(plain(title))
+
+    # torques in per cent of their limit where the joints differ in size, so that one panel shows all
+    named = {
+        f"{name} {b.where.replace('_', ' ')}": k
+        for k, (name, b) in enumerate(zip(model.inputs, machine.actuated, strict=True))
+    }
+    tops = [float(b.limit.torque or np.abs(motion.u[:, k]).max() or 1.0) for k, b in enumerate(machine.actuated)]
+    unit = "N m" if all(b.joint == "revolute" for b in machine.actuated) else "N"
+    curves = {f"{n} ({tops[k]:g} {unit})": 100 * motion.u[:, k] / tops[k] for n, k in named.items()}
+    _lines(axes[0], t, curves, "torque [% of limit]")
+    _bound(axes[0], 100)
+    axes[0].set_ylim(-115, 115)
+
+    speeds: dict[str, np.ndarray] = {}
+    if machine.planar:
+        speeds["forward speed"] = motion.nu[:, 0]
+    for b in machine.contacts:
+        assert b.contact is not None
+        rim = float(b.contact.radius) * motion.nu[:, model.coordinates.index(b.coordinates[0])]
+        speeds[f"rim of {b.name.replace('_', ' ')}"] = rim
+    if not speeds:
+        speeds = {c: motion.nu[:, k] for k, c in enumerate(model.coordinates)}
+    _lines(axes[1], t, speeds, "speed [m/s]" if machine.planar else "speed [m/s or rad/s]")
+    rims = [float(b.limit.rim_speed) for b in machine.contacts if b.limit.rim_speed is not None]
+    if rims:
+        _bound(axes[1], max(rims))
+    row = 2
+    if moving:
+        angles = {b.where.replace("_", " "): motion.q[:, model.coordinates.index(b.coordinates[0])] for b in moving}
+        _lines(axes[row], t, angles, "angle [rad]")
+        _bound(axes[row], max(float(b.limit.position) for b in moving if b.limit.position is not None))
+        row += 1
+    if len(slips):
+        _lines(axes[row], t, dict(zip(model.slips, slips, strict=True)), "slip [-]")
+        allowed = [float(b.contact.slip_limit) for b in machine.contacts if b.contact and b.contact.slip_limit]
+        if allowed:
+            _bound(axes[row], max(allowed))
+    axes[-1].set_xlabel("time [s]")
+
+    use = limit_use(model, problem, motion)
+    lane = machine.planar and f"y{machine.body[0].index}" in model.coordinates
+    if lane:
+        path, bars = right.subplots(2, 1, height_ratios=(1, 1.5))
+        _path(path, model, problem, motion)
+    else:
+        bars = right.subplots(1, 1)
+    names = list(use)[::-1]
+    bars.barh(names, [100 * use[n] for n in names], color=COLOURS[0], height=0.6)
+    bars.axvline(100, color="black", linewidth=0.8, linestyle=(0, (2, 3)))
+    bars.set_xlim(0, 115)
+    bars.set_xlabel("most used [% of the limit]")
+    bars.tick_params(axis="y", labelsize=8)
+    return figure
+
+
+def _path(ax: Axes, model: Model, problem: Problem, motion: Motion) -> None:
+    places = model.kinematics(motion.q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), len(model.machine.body))
+    for k, i in enumerate(problem.lane_points):
+        body = model.machine.find(i)
+        x, y, _ = places[:, :, model.machine.body.index(body)]
+        ax.plot(x, y, **_style(k), linewidth=1.2, label=body.name.replace("_", " "))
+        ax.plot(x[0], y[0], "o", color=_style(k)["color"], markersize=5)
+    length, width = problem.lane_m
+    ax.plot(
+        *np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]).T * [[length / 2], [width / 2]], "k:", linewidth=0.8
+    )
+    ax.set_aspect("equal")
+    ax.set_xlabel("x on the lane [m]")
+    ax.set_ylabel("y [m]")
+    ax.legend(loc="lower right", bbox_to_anchor=(1, 1.0), ncols=2, fontsize=8, frameon=False, borderaxespad=0.2)
+    ax.grid(alpha=0.3)
+
+
+def sigma_figure(sigma: Mapping[str, float], title: str) -> Figure:
+    """What accuracy a drive makes attainable: the Cramer-Rao bound of every parameter, one standard deviation [%]."""
+    n = len(sigma)
+    figure = Figure(figsize=(7.5, 1.2 + 0.27 * n), layout="constrained")
+    ax = figure.subplots()
+    figure.suptitle(plain(title), fontsize=11)
+    names = list(sigma)[::-1]
+    values = np.array([sigma[s] for s in names])
+    low, high = 10.0 ** np.floor(np.log10(values.min())), 10.0 ** np.ceil(np.log10(values.max()) + 1e-9)
+    ax.hlines(names, low, values, color="0.75", linewidth=5)
+    ax.plot(values, names, "o", color=COLOURS[0])
+    for y, value in enumerate(values):
+        ax.annotate(f"{value:.2g}", (value, y), xytext=(7, 0), textcoords="offset points", va="center", fontsize=8)
+    ax.set_xscale("log")
+    ax.set_xlim(low, 1.3 * high)
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.xaxis.set_minor_formatter("")
+    ax.set_xlabel("attainable standard deviation [% of the nominal value]")
+    ax.grid(axis="x", alpha=0.3)
+    return figure
+
+
+def limit_use(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
+    """How much of each limit the motion uses at most: 1 is the limit itself."""
+    du = np.gradient(motion.u, motion.t, axis=0)
+    use: dict[str, float] = {}
+    for bound in trajectories.machine_limits(model, problem):
+        values = bound.expression(motion.q.T, motion.nu.T, motion.u.T, du.T).full()
+        if np.isfinite(bound.low):
+            use[bound.name] = float(np.abs(values - bound.centre).max() / (bound.range / 2))
+        else:
+            use[bound.name] = float(values.max() / bound.high)
+    return use
+
+
+def verify_figure(v: Verification, title: str) -> Figure:
+    """Every run's error of every parameter against the predicted spread, and the coverage of 95 % intervals."""
+    n = len(v.names)
+    figure = Figure(figsize=(10, 1.6 + 0.34 * n), layout="constrained")
+    errors, cover = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
+    figure.suptitle(plain(title))
+    places = np.arange(n)[::-1]
+    e = v.error_percent
+    # An error is within its interval where the truth is: as far below the value as the interval reaches down.
+    ends = 100 * np.nanmean((v.value[:, None] - v.interval) / v.reference, axis=0)
+    for k, y in enumerate(places):
+        errors.plot(ends[:, k], [y, y], color="0.75", linewidth=9, solid_capstyle="butt", zorder=1)
+        errors.plot(e[:, k], y + np.linspace(-0.25, 0.25, len(e)), ".", color=COLOURS[0], markersize=3, zorder=2)
+        errors.plot(np.nanmean(e[:, k]), y, "D", color=COLOURS[1], markeredgecolor="black", markersize=6, zorder=3)
+    errors.axvline(0, color="black", linewidth=0.8)
+    _error_axis(errors, float(max(np.nanmax(np.abs(x), initial=0.0) for x in (e, ends))))
+    errors.set_yticks(places, v.names)
+    errors.grid(axis="x", alpha=0.3)
+    errors.plot([], [], color="0.75", linewidth=9, label="95 % interval as predicted")
+    errors.plot([], [], ".", color=COLOURS[0], label="one run")
+    errors.plot([], [], "D", color=COLOURS[1], markeredgecolor="black", label="mean of the runs")
+    errors.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize=8, frameon=False)
+    cover.barh(places, 100 * np.nanmean(v.covered, axis=0), color=COLOURS[2], height=0.6)
+    cover.axvline(95, color="black", linewidth=0.8, linestyle="--")
+    cover.set_xlim(0, 100)
+    cover.set_xlabel("truth within the\n95 % interval [% of runs]")
+    return figure
+
+
+def _error_axis(ax: Axes, reach: float) -> None:
+    """Errors [%] up to `reach`: evenly where they are alike, otherwise by decades, with ticks that show it."""
+    label, top = "error [% of the true value]", reach or 1.0
+    if reach >= EVEN:
+        heads = (1, 2, 5) if reach < 10**DECADES else (1,)
+        ticks = [float(f"{head}e{k}") for k in range(int(np.log10(reach)) + 2) for head in heads]
+        top = next(tick for tick in ticks if tick >= reach)
+        ticks = [tick for tick in ticks if tick <= top]
+        ax.set_xscale("symlog", linthresh=1.0, linscale=0.6)
+        ax.set_xticks([-tick for tick in ticks[::-1]] + [0.0, *ticks])
+        ax.tick_params(axis="x", labelsize=7)
+        label += ", logarithmic beyond 1 %"
+    ax.set_xlim(-1.1 * top, 1.1 * top)
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.set_xlabel(label)
+
+
+def comparison_figure(model: Model, c: Comparison, title: str) -> Figure:
+    """Measured beside predicted, signal by signal, with the residual below each."""
+    n = len(c.names)
+    figure = Figure(figsize=(10, 0.8 + 3.0 * n), layout="constrained")
+    figure.suptitle(plain(title), fontsize=11)
+    axes = figure.subplots(2 * n, 1, sharex=True, squeeze=False, height_ratios=(2, 1) * n)[:, 0]
+    places = {name: b.where.replace("_", " ") for name, b in zip(model.inputs, model.machine.actuated, strict=True)}
+    for k, (name, unit) in enumerate(zip(c.names, c.units, strict=True)):
+        label = f"{name} {places.get(name, '')}".strip()
+        _lines(axes[2 * k], c.t, {"measured": c.measured[k], "predicted": c.predicted[k]}, f"{label} [{unit}]")
+        _lines(axes[2 * k + 1], c.t, {"residual": c.residual[k]}, f"residual [{unit}]", legend=False)
+    axes[-1].set_xlabel("time [s]")
+    return figure
+
+
+def compare_figure(rows: Sequence[Row], title: str) -> Figure:
+    """Drives side by side, the lowest cond(Phi) on top: cond(Phi), and the attainable accuracy of the worst parameter.
+
+    Hatched: a drive that breaks a limit, which its label names.
+    """
+    rows = sorted(rows, key=lambda r: r.cond_phi, reverse=True)
+    figure = Figure(figsize=(10.5, 1.5 + 0.36 * len(rows)), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    figure.suptitle(plain(title), fontsize=11)
+    values = ([r.cond_phi for r in rows], [r.worst_std_percent for r in rows])
+    places = np.arange(len(rows))
+    for ax, x, label in zip(
+        axes, values, ("cond(Phi)", "worst parameter: attainable standard deviation [%]"), strict=True
+    ):
+        for y, (r, value) in enumerate(zip(rows, x, strict=True)):
+            ours, hatch = r.name == OURS, "" if r.breaks is None else "///"
+            ax.barh(y, value, height=0.65, color=COLOURS[1 if ours else 0], edgecolor="black", hatch=hatch)
+            ax.annotate(f"{value:.3g}", (value, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8)
+        ax.set_xscale("log")
+        ax.set_xlim(min(x) / 2, max(x) * 2)
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.xaxis.set_minor_formatter("")
+        ax.set_xlabel(label)
+        ax.grid(axis="x", alpha=0.3)
+        ax.set_axisbelow(True)
+    names = [r.name if r.breaks is None else f"{r.name}\n(breaks {r.breaks})" for r in rows]
+    axes[0].set_yticks(places, names, fontsize=9)
+    for label, r in zip(axes[0].get_yticklabels(), rows, strict=True):  # in black and white colour tells nothing
+        label.set_fontweight("bold" if r.name == OURS else "normal")
+    return figure
+
+
+def log_figure(signals: Mapping[str, tuple[np.ndarray, np.ndarray, str]], gaps: Sequence[float], title: str) -> Figure:
+    """What a log holds, channel by channel over time [SI]: name -> (t (N,) [s], values (N,), unit); gaps [s] dashed."""
+    count = max(len(signals), 1)
+    figure = Figure(figsize=(10, 0.8 + 1.15 * count), layout="constrained")
+    figure.suptitle(plain(title), fontsize=11)
+    axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+    for ax, (name, (t, values, unit)) in zip(axes, signals.items(), strict=False):
+        ax.plot(t, values, color=COLOURS[0], linewidth=1)
+        for gap in gaps:
+            ax.axvline(gap, color=COLOURS[1], linewidth=1, linestyle="--")
+        ax.set_ylabel(f"{name}\n[{unit}]", fontsize=8)
+        ax.tick_params(labelsize=8)
+        ax.grid(alpha=0.3)
+    axes[-1].set_xlabel("time [s]" + ("; dashed: gaps" if gaps else ""))
+    return figure

@@ -1,0 +1,153 @@
+"""A machine from above: bodies, joints, what stands on the ground, centres of mass, measuring wheels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from excite.model import mechanics
+from excite.model.machine import Body, Machine
+from excite.reports.figures import COLOURS, plain
+
+NARROW = 0.25  # drawn width of a contact that is a point, in its radius
+FRAME, GHOST = "0.55", "0.6"
+
+
+def top_view_figure(machine: Machine) -> Figure:
+    """The machine in its rest position; in grey, with every steered joint at its stop. Raises ValueError without a
+    root that moves on the plane."""
+    if not machine.planar:
+        raise ValueError(f"{machine.name}: does not move on the plane, so there is nothing to see from above")
+    fig = Figure(figsize=(9, 6), layout="constrained")
+    ax = fig.subplots()
+    fig.suptitle(plain(machine.title), fontsize=11)
+    outline(ax, machine)
+    return fig
+
+
+def outline(ax: Axes, machine: Machine) -> None:
+    """Draws it: forward is to the right, left is up [m]. Dots are centres of mass, green outlines measuring wheels."""
+    at_stop = {b.coordinates[0]: float(b.limit.position) for b in steered(machine) if b.limit.position is not None}
+    if at_stop:
+        _contacts(ax, machine, at_stop, ghost=True)
+    poses = mechanics.poses(machine, {})
+    for b in machine.body:
+        x, y = poses[b.index][1][:2]
+        if not isinstance(b.antecedent, str):
+            x0, y0 = poses[b.antecedent][1][:2]
+            ax.plot([x0, x], [y0, y], color=FRAME, linewidth=3, solid_capstyle="round", zorder=2)
+    _contacts(ax, machine, {}, ghost=False)
+    _joints(ax, machine, poses)
+    _masses(ax, machine, poses)
+    for s in machine.sensor:
+        if s.kind == "wheel":
+            assert s.radius is not None
+            assert s.lateral is not None
+            shape = _footprint(*poses[s.body], float(s.radius), 0.2 * float(s.radius), float(s.lateral))
+            ax.add_patch(Polygon(shape, closed=True, facecolor="none", edgecolor=COLOURS[2], zorder=4))
+    ax.set_aspect("equal")
+    ax.margins(0.1)
+    ax.autoscale_view()
+    ax.set_xlabel("x, forward [m]")
+    ax.set_ylabel("y, left [m]")
+    ax.grid(alpha=0.3)
+
+
+def steered(machine: Machine) -> list[Body]:
+    """Driven joints that turn about the vertical."""
+    poses = mechanics.poses(machine, {})
+    driven = [b for b in machine.actuated if b.contact is None and b.joint == "revolute"]
+    return [b for b in driven if abs(poses[b.index][0][2, 2]) > 0.9]
+
+
+def footprints(machine: Machine, q: Mapping[str, float]) -> list[np.ndarray]:
+    """(4, 2) corners [m] of every contact as it stands on the ground at coordinates q, those of the root too.
+
+    As long as it is high; a contact that is a point is drawn NARROW.
+    """
+    poses = mechanics.poses(machine, q)
+    x, y, heading = (q.get(c, 0.0) for c in machine.body[0].coordinates)
+    c, s = np.cos(heading), np.sin(heading)
+    shapes = []
+    for b in machine.contacts:
+        assert b.contact is not None
+        assert not isinstance(b.antecedent, str)
+        radius = float(b.contact.radius)
+        own = _footprint(
+            poses[b.antecedent][0], poses[b.index][1], radius, float(b.contact.width) or NARROW * radius, 0.0
+        )
+        shapes.append(own @ np.array([[c, s], [-s, c]]) + [x, y])
+    return shapes
+
+
+def _contacts(ax: Axes, machine: Machine, q: Mapping[str, float], ghost: bool) -> None:
+    """Contacts as rectangles, as long as they are high, their names beside them."""
+    poses, still = mechanics.poses(machine, q), footprints(machine, {})
+    for b, shape, before in zip(machine.contacts, footprints(machine, q), still, strict=True):
+        place = poses[b.index][1]
+        if ghost and np.allclose(shape, before):
+            continue
+        if ghost:
+            ax.add_patch(Polygon(shape, closed=True, facecolor="none", edgecolor=GHOST, linestyle="--", zorder=4))
+            continue
+        driven = b.actuated
+        ax.add_patch(
+            Polygon(shape, closed=True, facecolor="white" if driven else "0.9", edgecolor="black", alpha=0.9, zorder=3)
+        )
+        left = place[1] > -1e-6
+        ax.annotate(
+            b.where.replace("_", " ") + ("" if driven else " (not driven)"),
+            (place[0], shape[:, 1].max() if left else shape[:, 1].min()),
+            xytext=(0, 2 if left else -2),
+            textcoords="offset points",
+            ha="center",
+            va="bottom" if left else "top",
+            fontsize=7.5,
+        )
+
+
+def _footprint(turned: np.ndarray, place: np.ndarray, radius: float, width: float, lateral: float) -> np.ndarray:
+    """(4, 2) corners of a wheel [m] that stands at `place` in a frame `turned`, to its left by `lateral`."""
+    corners = np.array([[x * radius, lateral + y * width / 2, 0] for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))])
+    return np.asarray((corners @ turned.T + place)[:, :2])
+
+
+def _joints(ax: Axes, machine: Machine, poses: Mapping[int, tuple[np.ndarray, np.ndarray]]) -> None:
+    taken: list[np.ndarray] = []
+    for b in machine.body:
+        if b.contact is not None or b.joint in ("planar", "fixed"):
+            continue
+        place = poses[b.index][1][:2]
+        held = b.coordinates[0] in machine.locked
+        ax.plot(*place, "s" if held else "o", markersize=8, color="white", markeredgecolor=COLOURS[1], zorder=6)
+        words = b.where.replace("_", " ") + (" (held)" if held else "" if b.actuated else " (free)")
+        row = sum(np.allclose(place, other, atol=0.05) for other in taken)
+        taken.append(place)
+        ax.annotate(
+            words,
+            (float(place[0]), float(place[1])),
+            xytext=(0, -10 - 9 * row),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            fontsize=7.5,
+            color=COLOURS[1],
+            zorder=7,
+        )
+
+
+def _masses(ax: Axes, machine: Machine, poses: Mapping[int, tuple[np.ndarray, np.ndarray]]) -> None:
+    """Centres of mass; the size of the mark goes with the mass."""
+    bodies = [b for b in machine.body if b.inertia is not None]
+    most = max(float(b.inertia.mass) for b in bodies if b.inertia is not None) if bodies else 1.0
+    for b in bodies:
+        assert b.inertia is not None
+        turned, place = poses[b.index]
+        x, y, _ = place + turned @ np.array(b.inertia.com.value)
+        size = 4 + 8 * float(np.sqrt(float(b.inertia.mass) / most))
+        ax.plot(x, y, "o", markersize=size, color=COLOURS[0], alpha=0.35, zorder=5)
+        ax.plot(x, y, "+", markersize=size, color=COLOURS[0], zorder=5)

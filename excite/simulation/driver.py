@@ -1,0 +1,228 @@
+"""A person at the levers: follows speed and steered angles that can be seen coming, slowly and not quite.
+
+People do not play back torques. They set a speed lever and what steers; the hydrostatic drive makes the torques that
+bring the driven contacts to that speed and the steered joints to that rate, within the machine's limits.
+
+What is assumed of the person: the trace is seen ahead, as on the road (MacAdam, "Application of an optimal preview
+control for simulation of closed-loop automobile driving", IEEE Trans. SMC 11(6), 1981; Sheridan, 1966), so the hand
+moves early by about its own delay and only what the machine is late is left. What was not foreseen is corrected from
+what is seen, a reaction time late, against what the person expects of the machine: its usual lag is no error. The hand
+is slow (second order, McRuer and Jex, 1967) and all that it does goes through it, its slow errors too, so that nothing
+in the torques is faster than hand, drive and machine. With the lever in neutral there are no errors. Who steers several
+joints looks at each of them and at the speed less often: deviations are corrected more slowly by that share, and the
+variance of the slow errors grows by it (Levison, Elkind and Ward, "Studies of multivariable manual control systems: a
+model for task interference", NASA CR-1746, 1971). Not assumed: fatigue, learning within a drive, coupling of speed and
+steering, the place on the lane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+import scipy
+
+from excite.model import Model
+from excite.model.machine import Body
+from excite.simulation.integrator import Motion, respond
+
+DRIVER = 2  # stream of random numbers, apart from the sensors'
+RESPONSE = 0.3  # s, in which a hydrostatic drive brings what it moves to speed
+WALK = 1.0  # m/s
+HOLD = 5.0  # 1/s, with which the oil in the steering cylinders brings a joint back that the soil pushed away
+WANDER = 2.0  # s, twice: time constants of the slow errors
+WATCHED = 2  # speed and one angle: what the driver's numbers are of
+NEUTRAL = 0.2  # m/s: below it the lever nears its detent, and errors and corrections fade with it
+
+
+@dataclass(frozen=True)
+class Driver:
+    """delay [s] of reaction, bandwidth [Hz] of hand and lever, slow errors of speed [m/s] and angle [rad].
+
+    `attention` [1/s]: how fast a deviation seen is corrected. `preview` [s]: how early the hand moves for what comes;
+    0.6 makes up for reaction and hand. `hydraulics` [Hz]: no torque follows the drive's control loop faster. The values
+    are of a practised operator; delays of 0.2-0.4 s and bandwidths below 1 Hz are usual in manual tracking (McRuer and
+    Jex, 1967), swash plates of pumps settle in 0.05-0.2 s.
+    """
+
+    delay_s: float = 0.3
+    bandwidth_hz: float = 0.8
+    speed_error_m_s: float = 0.03
+    angle_error_rad: float = 0.01
+    attention: float = 0.8
+    preview_s: float = 0.6
+    hydraulics_hz: float = 3.0
+
+
+STEADY = Driver(speed_error_m_s=0.0, angle_error_rad=0.0)  # a person without slow errors: the middle of all people
+
+
+def follow(
+    model: Model,
+    speed: np.ndarray,
+    angles: np.ndarray,
+    driver: Driver | None = None,
+    X: np.ndarray | None = None,
+    seed: int = 0,
+    q0: np.ndarray | None = None,
+) -> Motion:
+    """The motion (N samples) of a machine whose driver follows speed (N,) [m/s] and joint angles (N, n) [rad].
+
+    `angles` belong to the driven joints without a contact, in the order of the machine file. X (n_base,): the true
+    machine. Torque and torque-rate limits hold. Raises SimulationError, and ValueError for shapes that don't fit.
+    """
+    driver = driver or Driver()
+    machine, rate = model.machine, float(model.machine.sampling_hz)
+    rolling = [k for k, b in enumerate(machine.actuated) if b.contact is not None]
+    joints = [k for k, b in enumerate(machine.actuated) if b.contact is None]
+    n = len(speed)
+    if angles.shape != (n, len(joints)):
+        raise ValueError(f"angles: needs shape ({n}, {len(joints)}), got {angles.shape}")
+    rng = np.random.default_rng([seed, DRIVER])
+    foreseen = _ahead(np.asarray(speed, float), driver, rate)
+    detent = np.minimum(np.abs(foreseen) / NEUTRAL, 1.0)
+    share = min(WATCHED / (1 + len(joints)), 1.0)
+    attention, blur = driver.attention * share, share**-0.5
+    pushed = foreseen + blur * driver.speed_error_m_s * detent * _wander(n, rate, rng)
+    aimed = [_ahead(np.asarray(a, float), driver, rate) for a in angles.T]
+    wandered = [a + blur * driver.angle_error_rad * _wander(n, rate, rng) for a in aimed]
+    turned = [np.gradient(a) * rate for a in wandered]
+    # lists: the loop below works sample by sample, where they are faster than arrays
+    expected = [_expected(x, driver, rate).tolist() for x in (foreseen, *aimed)]
+    commands = [x.tolist() for x in (pushed, *turned)]
+    hands = [_Hand(driver.bandwidth_hz, rate) for _ in commands]
+    late = round(driver.delay_s * rate)
+
+    n_q = len(model.coordinates)
+    rows = list(model.actuated)
+    limits = [b.limit for b in machine.actuated]
+    radius = [float(b.contact.radius) if b.contact is not None else 1.0 for b in machine.actuated]
+    most = [float(x.rim_speed) if x.rim_speed is not None else np.inf for x in limits]
+    swing = [float(x.rate) if x.rate is not None else np.inf for x in limits]
+    fastest = [(most[k] / radius[k] if k in rolling else swing[k]) for k in range(len(rows))]
+    gain = gains(model).tolist()
+    top = np.array([float(x.torque) if x.torque is not None else np.inf for x in limits])
+    climb = np.array([float(x.torque_rate) if x.torque_rate is not None else np.inf for x in limits]) / rate
+    settled = 1 - np.exp(-2 * np.pi * driver.hydraulics_hz / rate)
+    seen: list[list[float]] = []
+    watched = [rows[j] for j in joints]
+    last = np.zeros(len(rows))
+    start = np.zeros(n_q) if q0 is None else np.asarray(q0, float)
+    trim = 0.0
+    held = [float(start[r]) for r in watched]
+
+    def torque(k: int, state: np.ndarray) -> np.ndarray:
+        nonlocal trim
+        seen.append([state[n_q], *(state[r] for r in watched)])
+        then = max(k - late, 0)
+        off = [e[then] - s for e, s in zip(expected, seen[then], strict=True)]
+        trim += attention * off[0] * float(detent[k]) / rate
+        lever = hands[0].moved(commands[0][k] + trim * float(detent[k]))
+        target = np.empty(len(rows))
+        for j in rolling:
+            asked = min(max(lever / radius[j], -fastest[j]), fastest[j])
+            target[j] = gain[j] * (asked - state[n_q + rows[j]])
+        for i, j in enumerate(joints, 1):
+            turn = hands[i].moved(commands[i][k] + attention * off[i])
+            turn = min(max(turn, -fastest[j]), fastest[j])
+            relief = top[j] / (gain[j] * HOLD)  # a relief valve opens before the oil is pressed further
+            away = held[i - 1] + turn / rate - state[rows[j]]
+            held[i - 1] = min(max(away, -relief), relief) + state[rows[j]]
+            target[j] = gain[j] * (turn - state[n_q + rows[j]] + HOLD * (held[i - 1] - state[rows[j]]))
+        wish = last + settled * (np.minimum(np.maximum(target, -top), top) - last)
+        if k > 0:
+            last[:] += np.minimum(np.maximum(wish - last, -climb), climb)
+        return last.copy()
+
+    return respond(model, n, torque, X, q0)
+
+
+class _Hand:
+    """Second-order low-pass (Butterworth), a sample at a time, at rest at first."""
+
+    def __init__(self, bandwidth: float, rate: float) -> None:
+        b, a = _hand(bandwidth, rate)
+        self._b, self._a, self._z = b.tolist(), a.tolist(), (0.0, 0.0)
+
+    def moved(self, x: float) -> float:
+        y = self._b[0] * x + self._z[0]
+        self._z = (self._b[1] * x - self._a[1] * y + self._z[1], self._b[2] * x - self._a[2] * y)
+        return y
+
+
+def _hand(bandwidth: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    b, a = scipy.signal.butter(2, bandwidth / (rate / 2))
+    return np.asarray(b), np.asarray(a)
+
+
+def _ahead(wanted: np.ndarray, driver: Driver, rate: float) -> np.ndarray:
+    """What the hand aims at, sample by sample: the trace, `preview` early and a reaction late, held at its ends."""
+    at = np.arange(len(wanted)) + round((driver.preview_s - driver.delay_s) * rate)
+    return np.asarray(wanted[np.clip(at, 0, len(wanted) - 1)])
+
+
+def _expected(aimed: np.ndarray, driver: Driver, rate: float) -> np.ndarray:
+    """What the person expects of the machine: what the hand aims at, as late as hand and drive always are."""
+    keep = np.exp(-1 / (RESPONSE * rate))
+    slow = scipy.signal.lfilter(*_hand(driver.bandwidth_hz, rate), aimed - aimed[0])
+    return np.asarray(scipy.signal.lfilter([1 - keep], [1, -keep], slow) + aimed[0])
+
+
+def _wander(n: int, rate: float, rng: np.random.Generator) -> np.ndarray:
+    """Slow errors (n,) of deviation 1, that fade in the first and the last two seconds."""
+    keep = np.exp(-1 / (WANDER * rate))
+    shape = [1, -2 * keep, keep**2]
+    size = np.sqrt((1 + keep**2) / (1 - keep**2) ** 3)  # deviation of what the filter makes of white noise
+    before = round(5 * WANDER * rate)  # so that the errors are stationary from the first sample on
+    noise = scipy.signal.lfilter([1 / size], shape, rng.standard_normal(before + n))[before:]
+    fade = np.clip(np.minimum(np.arange(n), np.arange(n)[::-1]) / rate / 2, 0, 1)
+    return np.asarray(noise * fade)
+
+
+def gains(model: Model) -> np.ndarray:
+    """(n_u,) torque per speed error [N m s/rad] of each drive: its reflected inertia to speed in RESPONSE.
+
+    Of a joint no less than what resists its turning at a WALK: oil that flows in has to go somewhere.
+    """
+    q, nu, _ = model.symbols()
+    dry = [f"Fs{b.index}" for b in model.machine.body]  # is the same at any speed
+    mass, force = model.equations(q, nu, ca.DM(np.where(np.isin(model.base.names, dry), 0.0, model.nominal)))
+    at = ca.Function("at", [q, nu], [mass, ca.jacobian(force, nu)])
+    names, still = model.coordinates, np.zeros(len(model.coordinates))
+    rolling = still.copy()
+    rolling[0] = WALK
+    for b in model.machine.contacts:
+        assert b.contact is not None
+        rolling[names.index(b.coordinates[0])] = WALK / float(b.contact.radius)
+    M, D = at(still, still)[0].full(), at(still, rolling)[1].full()
+    aside = [names.index(c) for c in model.machine.body[0].coordinates[1:] if c in names]  # the chassis gives way
+    D -= D[:, aside] @ np.linalg.solve(D[np.ix_(aside, aside)], D[aside])
+    driven = sum(b.contact is not None for b in model.machine.actuated)
+    gain = np.zeros(len(model.inputs))
+    for j, (row, body) in enumerate(zip(model.actuated, model.machine.actuated, strict=True)):
+        if body.contact is None:
+            gain[j] = max(M[row, row] / RESPONSE, D[row, row])
+        else:
+            gain[j] = (M[0, 0] * float(body.contact.radius) ** 2 / driven + M[row, row]) / RESPONSE
+    return gain
+
+
+def turns_left(model: Model, body: Body) -> int:
+    """The sign of a joint's angle that, alone, turns the machine left when rolling forward.
+
+    From pure rolling: the lateral speeds of all contacts vanish, which is linear in the chassis' speeds.
+    """
+    names = model.coordinates
+    q = np.zeros(len(names))
+    q[names.index(body.coordinates[0])] = 0.1
+    rows = [k for k, s in enumerate(model.slips) if s.startswith("gy")]
+
+    def lateral(k: int) -> np.ndarray:
+        nu = np.zeros(len(names))
+        nu[k] = 1e-3
+        return np.asarray(model.kinematics(q, nu)[1].full())[rows, 0]
+
+    forward, sideways, yaw = (lateral(k) for k in range(3))
+    turn = np.linalg.lstsq(np.column_stack([sideways, yaw]), -forward, rcond=None)[0][1]
+    return 1 if turn > 0 else -1

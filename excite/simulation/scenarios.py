@@ -1,0 +1,91 @@
+"""Machines that the designer may have in front of him: the nominal one with every value off by some per cent.
+
+Who designs a drive does not know the parameters yet. A scenario is a machine whose bodies, friction and contacts differ
+from the machine file's, each value on its own, so that it stays physically possible: masses, centres of mass and
+inertias of bodies are changed, not base parameters.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from excite.model import Model
+from excite.model.machine import Body, Machine, Quantity
+from excite.simulation.driver import gains
+from excite.simulation.integrator import Motion, respond
+
+SCENARIO = 3  # stream of random numbers
+HOLD = 5.0  # 1/s: how fast a steered joint that is off comes back
+FIRM = 5.0  # times the gain of the driver model's hydrostatic drive: a steady hand
+
+
+def perturbed_machines(model: Model, count: int, spread: float = 0.2, seed: int = 0) -> tuple[Model, ...]:
+    """The nominal machine and count - 1 others at random corners of the box of +-`spread` around it.
+
+    Raises ValueError for a count below 2 or a spread that is not between 0 and 0.9.
+    """
+    if count < 2:
+        raise ValueError(f"a robust design needs at least 2 machines (got {count})")
+    rng = np.random.default_rng([seed, SCENARIO])
+    machines = [varied(model.machine, spread, rng, corner=True) for _ in range(count - 1)]
+    return model, *(model.of(m) for m in machines)
+
+
+def varied(machine: Machine, spread: float, rng: np.random.Generator, corner: bool = False) -> Machine:
+    """The machine with values of bodies, friction and contacts multiplied by 1 +- spread: uniform, or one end of it."""
+    if not 0 < spread <= 0.9:
+        raise ValueError(f"spread: must be above 0 and at most 0.9 (got {spread:g})")
+
+    def factor() -> float:
+        x = float(rng.uniform(-1, 1))
+        return 1 + spread * (float(np.sign(x)) if corner else x)
+
+    def changed(q: Quantity) -> Quantity:
+        return q.model_copy(update={"value": float(q) * factor()})
+
+    def body(b: Body) -> Body:
+        update: dict[str, object] = {}
+        if b.inertia is not None:
+            parts: dict[str, object] = {}
+            for name in ("mass", "XX", "YY", "ZZ"):
+                value = getattr(b.inertia, name, None)
+                if isinstance(value, Quantity) and float(value) != 0:
+                    parts[name] = changed(value)
+            if b.inertia.com is not None and any(b.inertia.com.value):
+                moved = tuple(x * factor() if x else 0.0 for x in b.inertia.com.value)
+                parts["com"] = b.inertia.com.model_copy(update={"value": moved})
+            update["inertia"] = b.inertia.model_copy(update=parts)
+        if b.friction is not None:
+            update["friction"] = b.friction.model_copy(
+                update={n: changed(getattr(b.friction, n)) for n in ("Fv", "Fs", "u0")}
+            )
+        if b.contact is not None:
+            update["contact"] = b.contact.model_copy(update={n: changed(getattr(b.contact, n)) for n in ("Kx", "Ky")})
+        return b.model_copy(update=update)
+
+    return machine.model_copy(update={"body": tuple(body(b) for b in machine.body)})
+
+
+def followed(machine: Model, nominal: Model, motion: Motion) -> Motion:
+    """What another machine does when someone makes it follow the speeds and steering of the nominal one's motion.
+
+    The nominal torques, corrected by what the driven joints are off, within torque and torque-rate limits: an attentive
+    driver without delay. Raises SimulationError.
+    """
+    rate, rows = float(nominal.machine.sampling_hz), list(nominal.actuated)
+    n_q = len(nominal.coordinates)
+    limited = [b.limit for b in nominal.machine.actuated]
+    top = np.array([float(x.torque) if x.torque is not None else np.inf for x in limited])
+    climb = np.array([float(x.torque_rate) if x.torque_rate is not None else np.inf for x in limited])
+    held = np.array([0.0 if b.contact is not None else HOLD for b in nominal.machine.actuated])
+    gain = FIRM * gains(nominal)
+    last = np.zeros(len(rows))
+
+    def torque(k: int, state: np.ndarray) -> np.ndarray:
+        at = max(k - 1, 0)  # the state is that of the sample before
+        off = motion.nu[at, rows] - state[n_q:][rows] + held * (motion.q[at, rows] - state[rows])
+        wish = np.clip(motion.u[k] + gain * off, -top, top)
+        last[:] += np.clip(wish - last, -climb / rate, climb / rate)
+        return last.copy()
+
+    return respond(machine, len(motion.t), torque, None, motion.q[0], motion.nu[0])

@@ -1,0 +1,70 @@
+"""A design folder read back: what `excite design` wrote, as a model and a motion again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from excite import logs, output
+from excite.errors import StoredError
+from excite.model import Model, build
+from excite.model.machine import Machine, Problem
+from excite.simulation import Motion, simulate
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A design: its summary, model and problem, and the motion that its torques make."""
+
+    summary: dict[str, Any]
+    model: Model
+    problem: Problem | None
+    motion: Motion
+
+    @property
+    def title(self) -> str:
+        return f"{self.model.machine.title}: {self.summary.get('problem')}"
+
+
+def read_design_summary(design_dir: Path) -> dict[str, Any]:
+    """The summary of a design folder. Raises StoredError."""
+    path = design_dir / output.SUMMARY
+    if not path.is_file():
+        raise StoredError(
+            f"{design_dir}: not a design (no {output.SUMMARY} in it), make one with `excite design MACHINE`"
+        )
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise StoredError(f"{path}: damaged or not readable, design again") from None
+    whole = isinstance(found, dict) and isinstance(found.get("machine"), str) and "duration_s" in found
+    if not whole or not (design_dir / "profile.csv").is_file():
+        raise StoredError(f"{design_dir}: not a design, make one with `excite design MACHINE`")
+    return dict(found)
+
+
+def read_design(design_dir: Path) -> Stored:
+    """A design folder, its profile driven afresh. Raises StoredError, LogError, SimulationError."""
+    before = read_design_summary(design_dir)
+    path = design_dir / "machine.json"
+    try:
+        model = build(Machine.model_validate_json(path.read_bytes()))
+    except (OSError, ValueError):
+        raise StoredError(f"{path}: missing or damaged, design again") from None
+    nominal = dict(zip(model.base.names, model.nominal.tolist(), strict=True))
+    try:
+        # Designed for what logs told of the machine, if it was; what sits in a sensor alone is no part of a design.
+        nominal |= {n: float(x) for n, x in before.get("nominal", {}).items()}
+        seconds = float(before["duration_s"])
+    except (AttributeError, TypeError, ValueError):
+        raise StoredError(f"{design_dir / output.SUMMARY}: damaged, design again") from None
+    model = replace(model, nominal=np.array([nominal[n] for n in model.base.names]))
+    torque, q0, nu0 = logs.read_profile(design_dir / "profile.csv", model)
+    if len(torque) != round(seconds * float(model.machine.sampling_hz)) + 1:
+        raise StoredError(f"{design_dir / 'profile.csv'}: {len(torque)} rows do not make {seconds:g} s, design again")
+    problem = model.machine.problems.get(str(before.get("problem")))
+    return Stored(before, model, problem, simulate(model, torque, q0=q0, nu0=nu0))

@@ -1,0 +1,30 @@
+from .design_request import Brief as Brief, answer as answer, graded as graded
+from .design_workflow import compare as compare, design as design
+from .diagnose_workflow import (
+    diagnose_from as diagnose_from,
+    diagnose_logs as diagnose_logs,
+    separating_drive as separating_drive,
+)
+from .identify_workflow import identify as identify, identify_from as identify_from
+from .machine_check import (
+    MACHINE_COLUMNS as MACHINE_COLUMNS,
+    check_machine as check_machine,
+    machine_answer as machine_answer,
+    machine_rows as machine_rows,
+)
+from .requests import (
+    build_model as build_model,
+    choices as choices,
+    choose_method as choose_method,
+    choose_problem as choose_problem,
+    helped as helped,
+    require_known as require_known,
+    require_objective as require_objective,
+    require_positive as require_positive,
+    stem as stem,
+    versions as versions,
+)
+from .simulate_workflow import doubtful_effects as doubtful_effects, with_effects as with_effects
+from .study_plan import Study as Study, read_study as read_study
+from .study_runner import run_study as run_study
+from .verify_workflow import verify as verify

@@ -1,0 +1,122 @@
+"""`excite design` and `excite compare`: a folder with the drive, its figures, a report and summary.json."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from excite import reports, trajectories
+from excite.errors import MachineError
+from excite.logs import profile_of, torque_column
+from excite.model import Model, meanings
+from excite.model.machine import Problem
+from excite.workflows import design_request as briefs, requests
+from excite.workflows.design_request import Brief
+from excite.workflows.progress import Bar, silent
+
+
+def design(
+    place: Path, machine: str, problem: str | None, duration: float | None, brief: Brief, bar: Bar = silent
+) -> dict[str, Any]:
+    """A drive for a machine as a brief asks for it."""
+    model = requests.build_model(machine, flaws=False)
+    name, chosen = requests.choose_problem(model.machine, problem, duration)
+    if brief.between:
+        model = briefs.rivals(model, brief.between, float(chosen.duration_s))
+    requests.require_objective(brief.objective, model.machine)
+    requests.require_positive("--budget", brief.budget_s, "s")
+    requests.require_positive("--sigma-max", brief.sigma_max, "%")
+    return designed(place, model, name, chosen, brief, bar)
+
+
+def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief, bar: Bar = silent) -> dict[str, Any]:
+    """The same for a model and a problem of this name that are there already."""
+    begin = time.perf_counter()
+    with bar("designing") as advance:
+        try:
+            found = briefs.answer(model, chosen, brief, advance)
+        except np.linalg.LinAlgError:
+            raise MachineError(
+                f"{model.machine.name}: {briefs.unmoved(name)}; is an effect outside of what the drive can reach?"
+            ) from None
+    wall = time.perf_counter() - begin
+    profile_of(found.model, found.design.motion).to_csv(place / "profile.csv", index=False)
+    (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    summary: dict[str, Any] = {
+        "machine": model.machine.name,
+        "problem": name,
+        "duration_s": float(chosen.duration_s),
+        **briefs.summary(brief, found),
+        "meanings": meanings(found.model),
+        "wall_s": wall,
+        "versions": requests.versions(),
+    }
+    title = f"{model.machine.title}: {name}, cond(Phi) = {found.design.cond_phi:.2f}"
+    reports.save(reports.design_figure(found.model, chosen, found.design.motion, title), place / "design.png")
+    reports.save(reports.sigma_figure(summary["sigma_percent"], title), place / "sigma.png")
+    reports.write_report(place, "design", summary)
+    return summary
+
+
+def compare(
+    place: Path,
+    machine: str,
+    problem: str | None,
+    samples: int,
+    against: Sequence[str],
+    seed: int,
+    budget: float | None,
+    bar: Bar = silent,
+) -> dict[str, Any]:
+    model = requests.build_model(machine, flaws=False)
+    name, chosen = requests.choose_problem(model.machine, problem, None)
+    briefs.graded(model)
+    requests.require_positive("--budget", budget, "s")
+    for usual in against:
+        requests.require_known("--against", usual, tuple(trajectories.USUAL))
+    with bar("comparing") as advance:
+        result = trajectories.compare(model, chosen, samples, seed, budget, advance, against)
+    columns = ["t_s", *(torque_column(model, u) for u in model.inputs)]
+    (place / "drives").mkdir()
+    designs = []
+    for row in result.rows:
+        knots = f"drives/{row.name.replace(',', '').replace(' ', '-')}.csv"
+        table = pd.DataFrame([[t, *u] for t, u in zip(row.manoeuvre.times, row.manoeuvre.torque, strict=True)])
+        table.to_csv(place / knots, index=False, header=columns, float_format="%.12g")
+        designs.append(
+            {
+                "name": row.name,
+                "cond_phi": row.cond_phi,
+                "cond_w": row.cond_w,
+                "worst_std_percent": row.worst_std_percent,
+                "median_std_percent": row.median_std_percent,
+                "max_violation": row.max_violation,
+                "breaks": row.breaks,
+                "kept": row.kept,
+                "samples": row.samples,
+                "wall_s": row.wall_s,
+                "equal_score_s": row.equal_s,
+                "knots": knots,
+                "start": dict(zip(model.coordinates, row.start, strict=True)),
+            }
+        )
+    summary = {
+        "machine": model.machine.name,
+        "problem": name,
+        "objective": "cond",
+        "samples": samples,
+        "seed": seed,
+        "budget_s": budget,
+        "designs": designs,
+        "ratio_equal_time": result.ratio_equal_time,
+        "versions": requests.versions(),
+    }
+    title = f"{model.machine.title}: {name}, the designed drive and the usual ones"
+    reports.save(reports.compare_figure(result.rows, title), place / "compare.png")
+    reports.write_report(place, "compare", summary)
+    return summary

@@ -1,0 +1,497 @@
+"""What is wrong or doubtful in a machine file.
+
+One plain function per kind of complaint, in the tables FAULTS (the machine can't be as the file says, or nothing can be
+done with it) and DOUBTS (it can, but hardly is); each takes a model and yields lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from pydantic import ValidationError
+
+from excite import identification, output, reports, smoothing, trajectories
+from excite.errors import MachineError, SimulationError
+from excite.model import Model, build, effects, meanings, mechanics, standard_parameters
+from excite.model.effects import GRAVITY
+from excite.model.machine import Machine, Problem, Quantity, complaints as files_complaints, load_machine
+from excite.reports import Picture, Table
+from excite.simulation import simulate
+from excite.text import rounded
+from excite.workflows.requests import LONGEST
+
+PICTURE = "machine.png"
+LINEAR = 0.15  # slip up to which the linear law holds, where a contact gives no limit
+CRAWL = 0.05  # m/s2: a machine that can't be accelerated so much hardly moves
+LOADS = (0.3, 50.0)  # stiffness of a contact over the load on it
+WHEELS = (0.02, 2.0)  # radius of a measuring wheel [m]
+ASIDE = 10.0  # m: a measuring wheel runs nearer than that
+LARGEST, WIDEST = 5.0, 20.0  # radius and width of a contact [m]
+STEERING = 3.5  # rad/s: a joint that turns a chassis by 200 degrees in a second is none
+FASTEST = 10e3  # Hz: beyond it no random drive is tried, which would take minutes
+TRIED, HARDLY = (0, 1), 50.0  # random drives; what is uncertain by so much [%] after the best of them
+TRIAL = Problem(
+    source="definition",
+    duration_s=Quantity(value=20.0, source="definition"),
+    knot_s=Quantity(value=0.2, source="definition"),
+    lane_m=(1e3, 1e3),
+    lane_points=(),
+)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A machine file: what is wrong, what is doubtful, what else must be known, a line each; its model if it has one.
+
+    sigma_percent: after the best of some random drives, one standard deviation by parameter (Cramer-Rao, all sensors);
+    empty where none could be driven, or none was tried.
+    """
+
+    faults: tuple[str, ...]
+    doubts: tuple[str, ...]
+    remarks: tuple[str, ...]
+    model: Model | None
+    sigma_percent: dict[str, float]
+
+
+def check(path: Path) -> Checked:
+    """Everything that can be said of a machine file without a log. Raises MachineError where there is none to read."""
+    faults = complaints(path)
+    if faults:
+        return Checked(tuple(faults), (), (), None, {})
+    try:
+        model = build(load_machine(path))
+    except MachineError as err:
+        return Checked((str(err),), (), (), None, {})
+    faults = [line for rule in FAULTS for line in rule(model)]
+    doubts = [line for rule in DOUBTS for line in rule(model)]
+    sigma = {} if faults or float(model.machine.sampling_hz) > FASTEST else _trial(model)
+    doubts += [
+        f"{name}: random drives leave it uncertain by {value:.0f} %: hardly any drive shows it apart from the others"
+        for name, value in sigma.items()
+        if value > HARDLY
+    ]
+    return Checked(tuple(faults), tuple(doubts), tuple(unseen(model)), model, sigma)
+
+
+def complaints(path: Path) -> list[str]:
+    """All that keeps a file from being a machine, a line each. Raises MachineError where there's none to read."""
+    try:
+        load_machine(path)
+    except MachineError as err:
+        if not isinstance(err.__context__, ValidationError):
+            raise
+        return files_complaints(path, err.__context__, Machine)
+    return []
+
+
+# ------------------------------------------------------------------------------------------------ wrong
+
+
+def _mass(model: Model) -> Iterator[str]:
+    q, nu, _ = model.symbols()
+    mass = ca.Function("mass", [q], [model.equations(q, nu, ca.DM(model.nominal))[0]])
+    rng = np.random.default_rng(0)
+    worst = np.inf
+    for at in rng.uniform(-1, 1, (20, len(model.coordinates))):
+        M = mass(at).full()
+        none = [c for c, m in zip(model.coordinates, np.diag(M), strict=True) if not m > 0]
+        if none:
+            yield f"{', '.join(none)}: neither mass nor inertia moves with it, its acceleration has no bound"
+            return
+        size = np.sqrt(np.diag(M))
+        worst = min(worst, float(np.linalg.eigvalsh(M / np.outer(size, size)).min()))
+    if worst <= 1e-9:
+        yield "the mass matrix is not positive definite: no real bodies have these masses, inertias and places"
+
+
+def _tensor(model: Model) -> Iterator[str]:
+    for b in model.machine.body:
+        i = b.inertia
+        if i is None or i.axisymmetric:
+            continue
+        if any(float(x) for x in (i.XY, i.XZ, i.YZ)) or all(float(x) for x in (i.XX, i.YY, i.ZZ)):
+            J = np.array([[i.XX, i.XY, i.XZ], [i.XY, i.YY, i.YZ], [i.XZ, i.YZ, i.ZZ]], float)
+            small, middle, large = np.linalg.eigvalsh(J)
+            if small < -1e-9 * large:
+                yield f"{b.name}: inertia: has a negative principal moment, {small:.4g} kg m2"
+            elif small + middle < large * (1 - 1e-9):
+                yield (
+                    f"{b.name}: inertia: principal moments {small:.4g}, {middle:.4g}, {large:.4g} kg m2: no body"
+                    " has one larger than the other two together"
+                )
+
+
+def _stuck(model: Model) -> Iterator[str]:
+    for b in model.machine.actuated:
+        assert b.friction is not None
+        top, rest = b.limit.torque, float(b.friction.Fs)
+        if top is not None and float(top) <= rest:
+            yield f"{b.name}: limit.torque: {float(top):g} is not above its own friction Fs {rest:g}: it never moves"
+
+
+def _lane(model: Model) -> Iterator[str]:
+    poses = mechanics.poses(model.machine, {})
+    for name, problem in model.machine.problems.items():
+        places = [poses[i][1][:2] for i in problem.lane_points]
+        apart = max((float(np.linalg.norm(a - b)) for a in places for b in places), default=0.0)
+        room = float(np.hypot(*problem.lane_m))
+        if apart >= room:
+            yield f"problems.{name}.lane_m: lane_points {apart:.3g} m apart don't fit its diagonal, {room:.3g} m"
+        for b in model.machine.actuated:
+            if b.limit.torque_rate is None or b.friction is None:
+                continue
+            reached = float(b.limit.torque_rate) * float(problem.duration_s) / 2
+            if reached <= float(b.friction.Fs):
+                yield (
+                    f"{b.name}: limit.torque_rate: in {float(problem.duration_s):g} s (problem {name}) the torque"
+                    f" comes to {reached:.3g} and back, which is not above its friction Fs {float(b.friction.Fs):g}"
+                )
+
+
+def _sensors(model: Model) -> Iterator[str]:
+    try:
+        identification.measurable(model)
+    except MachineError as err:
+        yield str(err).removeprefix(f"{model.machine.name}: ")
+
+
+FAULTS: tuple[Callable[[Model], Iterator[str]], ...] = (_mass, _tensor, _stuck, _lane, _sensors)
+
+
+# ------------------------------------------------------------------------------------------------ doubtful
+
+
+def _traction(model: Model) -> Iterator[str]:
+    machine = model.machine
+    if not machine.contacts:
+        return
+    mass = sum(float(b.inertia.mass) for b in machine.body if b.inertia is not None)
+    push = 0.0
+    for b in machine.contacts:
+        assert b.contact is not None
+        slip = float(b.contact.slip_limit) if b.contact.slip_limit is not None else LINEAR
+        push += abs(float(b.contact.Kx)) * slip * b.actuated
+        load = mass * GRAVITY / len(machine.contacts)
+        for key in ("Kx", "Ky"):
+            stiff = abs(float(getattr(b.contact, key)))
+            if not LOADS[0] * load < stiff < LOADS[1] * load:
+                yield f"{b.name}: contact.{key}: {stiff:.3g} N per slip, {stiff / load:.2g} times its load"
+    if push < CRAWL * mass:
+        yield f"contacts: with all slip that is allowed they push {push:.3g} N, {push / mass:.2g} m/s2 for {mass:g} kg"
+
+
+def _speed(model: Model) -> Iterator[str]:
+    for b in model.machine.contacts:
+        if b.contact is None or b.limit.rim_speed is None:
+            continue
+        R, top = float(b.contact.radius), float(b.limit.rim_speed)
+        if float(b.contact.v_eps) > 0.2 * top:
+            yield f"{b.name}: contact.v_eps: {float(b.contact.v_eps):g} m/s is no small part of its rim_speed, {top:g}"
+        if b.friction is None or b.limit.torque is None or not b.actuated:
+            continue
+        spare = float(b.limit.torque) - float(b.friction.Fs)
+        reached = R * spare / float(b.friction.Fv) if float(b.friction.Fv) else np.inf
+        if reached < top:
+            yield (
+                f"{b.name}: limit.rim_speed: {top:g} m/s is never reached, friction alone holds it at {reached:.3g} m/s"
+                " with full torque"
+            )
+
+
+def _bounds(model: Model) -> Iterator[str]:
+    for b in model.machine.actuated:
+        missing = [key for key in ("torque", "torque_rate") if getattr(b.limit, key) is None]
+        if b.contact is not None:
+            missing += ["rim_speed"] * (b.limit.rim_speed is None)
+        elif b.limit.position is None:
+            missing.append("position")
+        if missing:
+            yield f"{b.name}: limit: {', '.join(missing)} not given: a designed drive knows no such bound"
+        if b.limit.position is not None and b.joint == "revolute" and float(b.limit.position) > np.pi:
+            yield f"{b.name}: limit.position: {float(b.limit.position):g} rad is beyond half a turn: degrees?"
+    for b in model.machine.contacts:
+        if b.contact is not None and b.contact.slip_limit is None and b.contact.law == "linear":
+            yield f"{b.name}: contact.slip_limit: not given: a drive may slip beyond where the linear law holds"
+
+
+def _bodies(model: Model) -> Iterator[str]:
+    """Centres of mass and radii of gyration against the size of the machine; spin inertia against a flat disc's."""
+    poses = mechanics.poses(model.machine, {})
+    places = np.array([P for _, P in poses.values()])
+    reach = float(np.ptp(places, axis=0).max()) + 2 * max(
+        (float(b.contact.radius) for b in model.machine.contacts if b.contact is not None), default=0.0
+    )
+    if not reach > 0:
+        return
+    for b in model.machine.body:
+        i = b.inertia
+        if i is None:
+            continue
+        away, around = float(np.linalg.norm(i.com.value)), float(np.sqrt(float(i.ZZ) / float(i.mass)))
+        if away > reach:
+            yield f"{b.name}: inertia.com: {away:.3g} m from its frame, the machine is {reach:.3g} m long"
+        if around > reach:
+            yield f"{b.name}: inertia.ZZ: {float(i.ZZ):g} kg m2: a radius of gyration of {around:.3g} on {reach:.3g} m"
+        if i.axisymmetric and float(i.XX) and float(i.ZZ) > 2 * float(i.XX) * (1 + 1e-9):
+            yield (
+                f"{b.name}: inertia.ZZ: {float(i.ZZ):g} kg m2 is more than a flat disc has beside XX {float(i.XX):g}:"
+                " right only with a motor behind its gear in it"
+            )
+
+
+def _sizes(model: Model) -> Iterator[str]:
+    """Lengths as no machine has them."""
+    for s in model.machine.sensors("full"):
+        if s.radius is not None and not WHEELS[0] <= float(s.radius) <= WHEELS[1]:
+            low, high = WHEELS
+            yield f"sensor {s.name}: radius: {float(s.radius):g} m, usual are {low:g} to {high:g}: in mm?"
+        if s.lateral is not None and abs(float(s.lateral)) > ASIDE:
+            yield f"sensor {s.name}: lateral: {float(s.lateral):g} m, usual are {ASIDE:g} at most: in mm?"
+    for b in model.machine.contacts:
+        assert b.contact is not None
+        for key, most in (("radius", LARGEST), ("width", WIDEST)):
+            size = float(getattr(b.contact, key))
+            if size > most:
+                yield f"{b.name}: contact.{key}: {size:g} m, usual are {most:g} at most: in mm?"
+
+
+def _slips(model: Model) -> Iterator[str]:
+    for b in model.machine.contacts:
+        if b.contact is not None and b.contact.slip_limit is not None and float(b.contact.slip_limit) > 1:
+            yield (
+                f"{b.name}: contact.slip_limit: {float(b.contact.slip_limit):g}, the linear law holds to about"
+                f" {LINEAR:g}: in per cent?"
+            )
+
+
+def _times(model: Model) -> Iterator[str]:
+    """Rates and durations as no machine has them, and a filter whose decimation takes more than its cut-off."""
+    for b in reports.steered(model.machine):
+        if b.limit.rate is not None and float(b.limit.rate) > STEERING:
+            yield (
+                f"{b.name}: limit.rate: {float(b.limit.rate):g} rad/s, steered joints turn by less than"
+                f" {STEERING:g}: in deg/s?"
+            )
+    for name, problem in model.machine.problems.items():
+        if float(problem.duration_s) > LONGEST:
+            yield (
+                f"problems.{name}.duration_s: {float(problem.duration_s):g} s, usual are {LONGEST:g} at most: in ms?"
+            )
+    f, rate = model.machine.filter, float(model.machine.sampling_hz)
+    if rate > FASTEST:
+        yield (
+            f"sampling_hz: {rate:g} Hz, usual are {FASTEST:g} at most: samples in a second? (no random drive is"
+            " tried at such a rate)"
+        )
+    left = rate / f.decimation / 2
+    if left < float(f.cutoff_hz) and f.source != "published":  # who published one has tried it: EMPS cuts lower so
+        yield (
+            f"filter.decimation: one row in {f.decimation} at {rate:g} Hz shows motion up to {left:g} Hz, below"
+            f" filter.cutoff_hz {float(f.cutoff_hz):g}: at most {int(rate / 2 / float(f.cutoff_hz))} keeps all of it"
+        )
+
+
+def _effects(model: Model) -> Iterator[str]:
+    for e in model.effects:
+        said = effects.doubtful(model.machine, e)
+        if said is not None:
+            yield f"effect {said}"
+
+
+def _turning(model: Model) -> Iterator[str]:
+    """Chassis that turn about the vertical as if their mass were in one point."""
+    poses = mechanics.poses(model.machine, {})
+    for b in model.machine.body:
+        i = b.inertia
+        if i is None or i.axisymmetric or b.joint not in ("planar", "revolute") or float(i.ZZ):
+            continue
+        upright = abs(poses[b.index][0][2, 2]) > 0.9
+        if upright and b.coordinates[-1] in model.coordinates:
+            yield (
+                f"{b.name}: inertia.ZZ: 0 kg m2 with {float(i.mass):g} kg, a body that turns has one: about mass times"
+                " (length squared + width squared) / 12"
+            )
+
+
+def _noise(model: Model) -> Iterator[str]:
+    for s in model.machine.sensors("full"):
+        if not s.graded:
+            yield f"sensor {s.name}: neither noise nor counts_per_turn: what accuracy is attainable can't be said"
+
+
+def _scales(model: Model) -> Iterator[str]:
+    """Scales that reach no base parameter, and base parameters so near zero that their relative error means nothing."""
+    base, groups = model.base, {s: n for n in model.base.names for s in model.base.grouping(n)}
+    for name in model.machine.scale:
+        if name not in base.names and groups.get(name) not in (None, name):
+            yield f"scale.{name}: does nothing, the base parameter is called {groups[name]}"
+    mass = sum(float(b.inertia.mass) for b in model.machine.body if b.inertia is not None)
+    for k, name in enumerate(base.names):
+        first = base.units[k] == "kg m"
+        if first and name not in model.machine.scale and abs(model.nominal[k]) < 5e-3 * mass:
+            yield (
+                f"{name}: {model.nominal[k]:.3g} kg m, a centre of mass {1e3 * abs(model.nominal[k]) / mass:.2g} mm"
+                f" off: errors relative to it mean little, give it a scale ([scale] {name} = ...)"
+            )
+
+
+DOUBTS: tuple[Callable[[Model], Iterator[str]], ...] = (
+    *(_traction, _speed, _bounds, _bodies, _sizes, _slips, _effects, _times, _turning, _noise, _scales),
+)
+
+
+# ------------------------------------------------------------------------------------------------ unseen
+
+
+def unseen(model: Model) -> Iterator[str]:
+    """Standard parameters other than zero that no drive reveals, and why; bodies that are only seen within others."""
+    machine = model.machine
+    table = dict(zip(model.base.standard, _standard(model), strict=True))
+    left = [n for n in model.base.invisible if table[n]]
+    for b in machine.body:
+        held = [c for c in b.coordinates if c in machine.locked]
+        if held and b.joint == "planar":
+            yield f"{', '.join(held)}: held at zero, the machine keeps to a line"
+        elif held:
+            own = [n for n in left if n in (f"Fv{b.index}", f"Fs{b.index}", f"u{b.index}0")]
+            left = [n for n in left if n not in own]
+            yield f"{b.where}: {held[0]} is held at zero, no drive reveals what belongs to it alone" + (
+                f": {', '.join(own)}" if own else ""
+            )
+    if left:
+        yield f"no motion {'on the plane ' if machine.planar else ''}reveals {', '.join(left)}"
+
+
+def _standard(model: Model) -> list[float]:
+    values = {n: v for n, (v, _) in standard_parameters(model.machine).items()}
+    return [values.get(n, 0.0) for n in model.base.standard]
+
+
+def _trial(model: Model) -> dict[str, float]:
+    """One standard deviation [%] of every parameter after the best of some random drives; {} where there is none.
+
+    Of the nominal value or the scale, whichever is larger: per cent of what is nearly zero mean little.
+    """
+    best: dict[str, float] = {}
+    size = np.maximum(np.abs(model.nominal), model.scale)
+    for seed in TRIED:
+        wish = trajectories.multisine(model, TRIAL, seed, top=0.4)
+        for share in 0.75 ** np.arange(14):
+            try:
+                motion = simulate(model, trajectories.scaled(wish, share).sample(float(model.machine.sampling_hz)))
+            except SimulationError:
+                continue
+            if trajectories.kept_between(trajectories.check_limits(model, TRIAL, motion)):
+                break
+        else:
+            continue
+        try:
+            sigma = 100 * np.sqrt(np.diag(smoothing.cramer_rao(model, motion))) / size
+        except (ValueError, np.linalg.LinAlgError):
+            return {}
+        for name, value in zip(model.base.names, sigma, strict=True):
+            best[name] = min(best.get(name, np.inf), float(value))
+    return best
+
+
+# ------------------------------------------------------------------------------------------------ the commands' work
+
+
+def check_machine(place: Path, path: Path, versions: dict[str, str]) -> dict[str, Any]:
+    """What there is to say of a machine file, with its picture and report in a folder. Raises MachineError."""
+    found = check(path)
+    model = found.model
+    summary: dict[str, Any] = {
+        "file": str(path),
+        "machine": model.machine.name if model else None,
+        "usable": not found.faults,
+        "faults": list(found.faults),
+        "doubts": list(found.doubts),
+        "remarks": list(found.remarks),
+        "coordinates": list(model.coordinates) if model else [],
+        "inputs": list(model.inputs) if model else [],
+        "parameters": _parameters(model, found.sigma_percent) if model else {},
+        "invisible": list(model.base.invisible) if model else [],
+        "versions": versions,
+    }
+    if model is not None and model.machine.planar:
+        reports.save(reports.top_view_figure(model.machine), place / PICTURE)
+    (place / "report.html").write_text(_page(summary, place), encoding="utf-8")
+    output.keep(place, summary)
+    return summary
+
+
+def _parameters(model: Model, sigma: dict[str, float]) -> dict[str, dict[str, Any]]:
+    what = meanings(model)
+    return {
+        name: {
+            "what": what[name],
+            "unit": unit,
+            "value": float(value),
+            "stands_for": model.base.grouping(name),
+            "random_drive_percent": sigma.get(name),
+        }
+        for name, unit, value in zip(model.base.names, model.base.units, model.nominal, strict=True)
+    }
+
+
+def machine_answer(summary: dict[str, Any]) -> str:
+    """A check in a sentence."""
+    name, faults, doubts = summary["machine"] or summary["file"], summary["faults"], summary["doubts"]
+    if faults:
+        return f"{_count(len(faults), 'thing')} wrong with {name}."
+    said = f"{name} can be used: {len(summary['parameters'])} parameters can be told"
+    return f"{said}, {_count(len(doubts), 'thing')} doubtful." if doubts else f"{said}, nothing is doubtful."
+
+
+def _count(n: int, what: str) -> str:
+    return f"1 {what} is" if n == 1 else f"{n} {what}s are"
+
+
+def grouping(parts: dict[str, float]) -> str:
+    """What a base parameter stands for, as a sum: "MX0 + 1.45 M3"."""
+    said = ""
+    for name, c in parts.items():
+        said += ("-" if not said else " - ") if c < 0 else " + " if said else ""
+        said += name if abs(abs(c) - 1) < 1e-9 else f"{abs(c):.4g} {name}"
+    return said
+
+
+def machine_rows(summary: dict[str, Any]) -> list[tuple[str, ...]]:
+    """The table of parameters: name, what it is, what it stands for, value, unit, what random drives leave [%]."""
+    return [
+        (
+            *(n, r["what"], grouping(r["stands_for"]), rounded(r["value"]), r["unit"]),
+            rounded(r["random_drive_percent"], 2),
+        )
+        for n, r in summary["parameters"].items()
+    ]
+
+
+MACHINE_COLUMNS = ("parameter", "what it is", "stands for", "value", "unit", "random drives: std %")
+
+
+def _page(summary: dict[str, Any], place: Path) -> str:
+    caption = (
+        "The machine from above: dots its centres of mass, green its measuring wheels, dashed with every steered joint"
+        " at its stop."
+    )
+    pictures = [Picture(place / PICTURE, caption)] if (place / PICTURE).is_file() else []
+    remarks = [
+        *(f"Wrong: {x}" for x in summary["faults"]),
+        *(f"Doubtful: {x}" for x in summary["doubts"]),
+        *(x[:1].upper() + x[1:] for x in summary["remarks"]),
+    ]
+    tables = (
+        [Table("What a drive can tell of it.", MACHINE_COLUMNS, tuple(machine_rows(summary)))]
+        if summary["parameters"]
+        else []
+    )
+    title = f"The machine file {summary['file']}"
+    return reports.report_page(title, machine_answer(summary), pictures, tables, reports.how(summary), remarks)

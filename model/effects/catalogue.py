@@ -1,0 +1,669 @@
+"""The catalogue of effects: what real machines do beyond the model, each declared once.
+
+An effect says where it may sit, what its amount and shapes mean [unit], and what it does to one sample: to the torque
+that a joint gets, to the soil under a contact, to gravity, inertia, a sensor's reading or a torque channel. Simulation,
+regressor, smoothing, diagnosis, the documentation and the tests are made from that declaration; adding an effect is
+adding one entry to `CATALOGUE`. Amounts and names are those of the project's contract; where it leaves a shape open (a
+decay speed, a phase), the shape has a default for simulation and a grid on which diagnosis looks for it.
+"""
+
+from __future__ import annotations
+
+from math import pi
+
+import casadi as ca
+
+from excite.model.effects import friction, ground_map, sizes, soil
+from excite.model.effects.effect import Channel, Effect, Memory, Scene, Shape, Site, Values
+
+SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
+EDGE = 0.2  # [s] over which what acts between two instants begins and ends
+
+MOMENTS = 120  # at which a load is looked for that slides
+PRESSED = 0.1  # [rad] beyond a stop, at which its hardening is stated
+TOUCH = 0.003  # [rad] over which a stop begins to be pressed
+BEHIND = 2.0  # [m] from the joint, where a load is put on or taken off
+
+PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
+BEND = Shape("-", 0.0, (0.0,), meaning="0: exponential law; 1: hyperbola; the force's limit is (2 + bend) A K")
+TWICE = Shape("rad", 0.0, (0.0,), lambda site: 0.001)
+
+
+def _forms(meaning: str, only: tuple[float, ...] = (0.0, 1.0), grid: tuple[float, ...] = (0.0,)) -> Shape:
+    """A shape that chooses in which of several ways an effect acts."""
+    return Shape("-", 0.0, grid, whole=True, only=only, meaning=meaning)
+
+
+# ------------------------------------------------------------------------------------------------ the hooks
+
+
+def _softplus(x: ca.SX, width: float | ca.SX) -> ca.SX:
+    """max(x, 0), rounded over `width`."""
+    return (x + ca.sqrt(x**2 + width**2)) / 2
+
+
+def _eccentric(s: Scene, angle: ca.SX, k: int, p: Values) -> ca.SX:
+    def error(at: ca.SX | float) -> ca.SX:
+        return p["A"] * ca.sin(at + p["phase"]) + p["cos2"] * ca.cos(2 * at) + p["sin2"] * ca.sin(2 * at)
+
+    return error(angle) - error(0.0)
+
+
+def _deadband(s: Scene, k: int, p: Values) -> ca.SX:
+    u, A, width = s.u[k], p["A"], SMOOTH_TORQUE * s.full[k]
+    return _softplus(u - A, width) - _softplus(-u - A, width) - u + 0 * A
+
+
+def _coupling(s: Scene, k: int, p: Values) -> ca.SX:
+    felt = [(1 - p["hose"]) * s.u[j] + p["hose"] * s.z[f"late{j}"] for j in s.others(k)]
+    return p["A"] * sum(felt, ca.SX(0))
+
+
+def _behind(s: Scene, k: int, p: Values) -> ca.SX:
+    """How a hose follows a contact's torque."""
+    return (s.u[k] - s.z[f"late{k}"]) / p["lag"]
+
+
+def _slid(s: Scene, p: Values) -> dict[str, ca.SX]:
+    """What a load on the last chassis changes of its inertia when it slides, is put on or taken off within so long."""
+    there = p["A"] * (1 + ca.tanh((s.time - p["instant"]) / ca.sqrt(p["takes"] ** 2 + 0.05**2))) / 2
+    return {"M": p["mass"] * there, "MX": there, "ZZ": p["arm"] * there}
+
+
+def _between(t: ca.SX, begin: ca.SX, end: ca.SX) -> ca.SX:
+    return (ca.tanh((t - begin) / EDGE) - ca.tanh((t - end) / EDGE)) / 2
+
+
+def _window(t: ca.SX, p: Values) -> ca.SX:
+    return _between(t, p["begin"], p["begin"] + p["length"])
+
+
+def _played(s: Scene, k: int, p: Values) -> ca.SX:
+    """How fast an actuator moves in its play, -1 to 1: to the side that it is pushed to by more than its own friction
+    has; pushed by less it creeps towards u / breakaway, the more slowly the more friction there is. A friction that
+    holds it there would be sharper than any fit finds a way to."""
+    width = SMOOTH_TORQUE * s.full[k]
+    ahead, back = _softplus(s.u[k] - p["breakaway"], width), _softplus(-s.u[k] - p["breakaway"], width)
+    return (ahead * (1 - s.z["play"]) - back * (1 + s.z["play"])) / p["damping"]
+
+
+def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
+    q = s.q[k] - p["centre"]
+    high, low = _softplus(q - p["stop"], TOUCH), _softplus(-q - p["stop"], TOUCH)
+    return -p["A"] * (high - low) * (1 + p["hardening"] * ((high + low) / PRESSED) ** p["power"])
+
+
+def _one_sided(site: Site) -> list[dict[str, float]]:
+    """Stops so far from the middle that only one of them is reached."""
+    limit = sizes.stop(site)
+    stops = [x * limit for x in (0.15, 0.35, 0.55, 0.75)]
+    sides = [{"stop": (limit + x) / 2, "centre": side * (x - limit) / 2} for x in stops for side in (1.0, -1.0)]
+    return [{**x, "hardening": 0.0, "power": 2.0} for x in sides]
+
+
+def _rubbing(site: Site) -> list[dict[str, float]]:
+    """Plays that an actuator crosses against its own friction."""
+    full = sizes.torque(site)
+    held = [(damping, breakaway) for damping in (0.0001, 0.0005) for breakaway in (0.003, 0.01, 0.03)]
+    return [{"turn": 0.02 * full, "rubs": 1.0, "damping": d * full, "breakaway": b * full} for d, b in held]
+
+
+def _clipped(s: Scene, k: int, p: Values) -> ca.SX:
+    """A relief valve: what is above its torque is lost, to the share A."""
+    width = 2.5 * SMOOTH_TORQUE * s.full[k]
+    over = _softplus(s.u[k] - p["valve"], width) - _softplus(-s.u[k] - p["valve"], width)
+    return -p["A"] * over
+
+
+def _sliding(site: Site) -> list[dict[str, float]]:
+    """A load that slides within a second, at every second, in long logs at MOMENTS: its recoil is short. And one that
+    is put on or taken off behind the joint, at every sixth of these."""
+    step = max(1.0, site.duration / MOMENTS)
+    times = [k * step for k in range(1, round(site.duration / step))]
+    slid = [{"instant": t, "takes": 0.5, "arm": 0.0, "mass": 0.0, "recoil": 1.0} for t in times]
+    off = [{"instant": t, "takes": 0.5, "arm": -BEHIND, "mass": -1 / BEHIND, "recoil": 0.0} for t in times[5::6]]
+    return slid + off
+
+
+CATALOGUE: dict[str, Effect] = {}
+
+
+def _declare(*effects: Effect) -> None:
+    for e in effects:
+        if e.name in CATALOGUE:
+            raise ValueError(f"{e.name}: two effects have this name")
+        CATALOGUE[e.name] = e
+
+
+_declare(
+    # ---------------------------------------------------------------- friction
+    Effect(
+        "stribeck_friction",
+        ("joints",),
+        "N m",
+        "friction above Fs near standstill, fading with speed: A sgn(w) exp(-abs(w/decay)^power); or Fs and it by"
+        " bristles that bend",
+        "torque missing just after every start and reversal",
+        "Stribeck 1902; Armstrong-Helouvry, Dupont, Canudas de Wit, Automatica 30 (1994), eq. (4); bristles: Canudas de"
+        " Wit, Olsson, Astrom, Lischinsky, IEEE TAC 40 (1995), (1) to (4)",
+        sizes.coulomb(0.5),
+        {
+            "decay": Shape("rad/s", 15.0, (4.0, 12.0, 36.0), sizes.smooth),
+            "power": Shape("-", 2.0, (1.0, 2.0), whole=True),
+            "bristles": _forms(
+                "0: friction turns with the speed; 1: all of it as bristles bend (LuGre without damping)"
+            ),
+            "presliding": Shape(
+                "rad",
+                0.2,
+                (0.2,),
+                sizes.smooth,
+                meaning="the angle within which bristles bend",
+                form=("bristles", 1.0),
+            ),
+        },
+        beside=friction.bristly,
+        torque=friction.stribeck,
+        memory={"bent": Memory(friction.bending, 1.0, form=("bristles", 1.0))},
+    ),
+    Effect(
+        "friction_transition",
+        ("joints",),
+        "-",
+        "Coulomb friction turns over the rate w_s exp(-A) in place of w_s: the larger A, the more suddenly",
+        "torque missing just at starts and reversals, within the rate over which friction turns",
+        "Andersson, Soderberg, Bjorklund, Tribology International 40 (2007), smoothed Coulomb friction",
+        sizes.constant(0.5),
+        {
+            "slow": Shape(
+                "-", 0.0, (0.0,), meaning="0: as tanh does; 1: as slowly as the arc tangent; in between or beyond"
+            )
+        },
+        grid=(1.0, 3.0, -1.0, -3.0),
+        beside=lambda site: [{"A": 0.05, "slow": 0.5}, {"A": 0.05, "slow": -0.5}],
+        torque=friction.turned,
+    ),
+    Effect(
+        "load_dependent_friction",
+        ("drives",),
+        "-",
+        "friction grows by A times the delivered torque's size",
+        "friction larger where the torque is large, at the same speed",
+        "Dohring et al. 1993; Linderoth et al. 2013, load-dependent Coulomb friction",
+        sizes.constant(0.05),
+        torque=lambda s, k, p: -p["A"] * ca.sqrt(s.u[k] ** 2 + (SMOOTH_TORQUE * s.full[k]) ** 2) * s.sign(k),
+    ),
+    Effect(
+        "asymmetric_coulomb",
+        ("joints",),
+        "N m",
+        "Coulomb friction Fs + A forward, Fs - A backward",
+        "an offset of the torque while the joint moves that is gone at rest",
+        "Armstrong-Helouvry 1991, ch. 4",
+        sizes.coulomb(0.3),
+        torque=lambda s, k, p: -p["A"] * s.sign(k) ** 2,
+    ),
+    Effect(
+        "asymmetric_viscous",
+        ("joints",),
+        "N m s",
+        "friction grows by A abs(w): viscous friction Fv + A forward, Fv - A backward",
+        "an error even in speed and proportional to it",
+        "Janot, Gautier, Brunot 2019 (EMPS: direction-dependent friction)",
+        sizes.viscous(0.3),
+        torque=lambda s, k, p: -p["A"] * s.w[k] * s.sign(k),
+    ),
+    Effect(
+        "quadratic_drag",
+        ("joints",),
+        "N m s2",
+        "friction grows by A w abs(w)",
+        "an error odd in speed, growing with its square",
+        "turbulent losses of hydraulic motors, Merritt, Hydraulic Control Systems, 1967",
+        sizes.viscous(0.5, 1.0),
+        torque=lambda s, k, p: -p["A"] * s.w[k] * ca.sqrt(s.w[k] ** 2 + s.smooth[k] ** 2),
+    ),
+    Effect(
+        "friction_warm_up",
+        ("joints",),
+        "-",
+        "Fv and Fs larger by the factor 1 + A at the start, fading with time: A exp(-t/fade)",
+        "friction that falls over minutes as oil warms",
+        "Bittencourt, Axelsson, J. Dyn. Sys. 136 (2014): friction and temperature",
+        sizes.constant(0.5),
+        {"fade": Shape("s", 30.0, (8.0, 25.0, 80.0))},
+        torque=lambda s, k, p: -p["A"] * ca.exp(-s.time / p["fade"]) * s.friction[k],
+        timed=True,
+    ),
+    Effect(
+        "brake_drag",
+        ("driven_contacts",),
+        "N m",
+        "between two instants a brake drags: dry friction larger by A",
+        "friction that begins or ends at an instant",
+        "Limpert, Brake Design and Safety, 3rd ed., SAE, 2011: residual brake torque",
+        sizes.coulomb(2.0),
+        {
+            "begin": Shape("s", 0.1, (0.0, 0.25, 0.5, 0.75), sizes.duration),
+            "end": Shape("s", 0.5, (0.25, 0.5, 0.75, 1.0), sizes.duration),
+        },
+        positive=True,
+        torque=lambda s, k, p: -p["A"] * s.sign(k) * ca.fmax(0, _between(s.time, p["begin"], p["end"])),
+        timed=True,
+    ),
+    # ---------------------------------------------------------------- drives and torque channels
+    Effect(
+        "actuator_lag",
+        ("drives",),
+        "s",
+        "the delivered torque follows the measured one with a first-order lag of time constant A",
+        "torque errors proportional to the torque's rate of change",
+        "Merritt, Hydraulic Control Systems, 1967, ch. 4",
+        sizes.constant(0.05),
+        grid=(0.3, 1.0, 4.0),
+        positive=True,
+        torque=lambda s, k, p: s.z["u"] - s.u[k],
+        memory={"u": Memory(lambda s, k, p: (s.u[k] - s.z["u"]) / p["A"], 1000.0)},
+    ),
+    Effect(
+        "channel_delay",
+        ("drives",),
+        "s",
+        "the torque channel is late by A: u_measured(t) = u(t - A) + u0",
+        "torque errors proportional to the torque's rate of change, with the sign of a torque that comes early",
+        "Ljung, System Identification, 2nd ed., 10.3",
+        sizes.constant(0.03),
+        positive=True,
+        channel=lambda t, p: Channel(delay=p["A"]),
+    ),
+    Effect(
+        "torque_gain",
+        ("drives",),
+        "-",
+        "u_measured = (1 + A) u + u0",
+        "one joint's parameters scaled against the rest of the machine",
+        "Gautier, Briot, J. Dyn. Sys. 136 (2014): global identification of drive gains",
+        sizes.constant(0.05),
+        channel=lambda t, p: Channel(gain=1 + p["A"]),
+    ),
+    Effect(
+        "torque_offset_drift",
+        ("drives",),
+        "N m/s",
+        "the torque sensor's offset drifts by A a second over the first minute: A t (1 + slowing (1 - t / 60 s))",
+        "a torque error that grows with time, steadily or ever slower",
+        "strain-gauge and pressure sensors' zero drift, Doebelin, Measurement Systems, ch. 5",
+        sizes.of(sizes.torque, 2e-4),
+        {"slowing": Shape("-", 0.0, (0.0,), meaning="0: steady; over two minutes the mean rate is (1 - slowing) A")},
+        channel=lambda t, p: Channel(offset=p["A"] * t * (1 + p["slowing"] * (1 - t / 60))),
+        timed=True,
+    ),
+    Effect(
+        "torque_deadband",
+        ("driven_contacts",),
+        "N m",
+        "delivered sgn(u) max(abs(u) - A, 0), u measured",
+        "a loss of torque with the sign of the torque, also at standstill",
+        "overlap of proportional valves, Merritt, Hydraulic Control Systems, 1967, ch. 5",
+        sizes.of(sizes.torque, 0.02),
+        grid=(1.0, 4.0),
+        positive=True,
+        torque=_deadband,
+    ),
+    Effect(
+        "pump_coupling",
+        ("drive",),
+        "-",
+        "each driven contact's delivered torque grows by A times what the others' sensors read, at once or after a lag",
+        "one driven contact answers to another's torque",
+        "two motors on one hydraulic pump",
+        sizes.constant(0.05),
+        {
+            "hose": _forms("0: the other's torque acts at once; 1: through a hose, with a first-order lag"),
+            "lag": Shape("s", 0.1, (0.1,), meaning="time constant of the hose", form=("hose", 1.0)),
+        },
+        beside=lambda site: [{"hose": 1.0, "lag": x} for x in (0.03, 0.1, 0.3)],
+        torque=_coupling,
+        memory={"late": Memory(_behind, 1000.0, each=True, form=("hose", 1.0))},
+    ),
+    Effect(
+        "relief_valve",
+        ("drives",),
+        "-",
+        "of the torque beyond a valve's opening the share A is not delivered",
+        "torque missing at the largest torques alone",
+        "pressure relief valves, Merritt, Hydraulic Control Systems, 1967, ch. 5",
+        sizes.constant(0.5),
+        {"valve": Shape("N m", 0.6, (0.3, 0.5, 0.7, 0.85), sizes.torque)},
+        torque=_clipped,
+    ),
+    # ---------------------------------------------------------------- once or several times per turn
+    Effect(
+        "roll_unbalance",
+        ("contacts",),
+        "N m",
+        "a torque once per turn of the contact: A sin(theta + phase)",
+        "a torque error periodic in the contact's angle",
+        "eccentric mass or bearing of a roll or wheel",
+        sizes.of(sizes.torque, 0.02),
+        {"phase": PHASE},
+        torque=lambda s, k, p: p["A"] * ca.sin(s.q[k] + p["phase"]),
+    ),
+    Effect(
+        "roll_out_of_round",
+        ("contacts",),
+        "m",
+        "the ground is A sin(theta + phase) further from the axle than the radius; a load goes up and down with it",
+        "slip and torque errors once per turn, a quarter of a turn apart",
+        "rolling and statics of a disc that turns about a point beside its middle",
+        sizes.constant(0.003),
+        {
+            "phase": PHASE,
+            "load": Shape(
+                "N", 0.5, (0.5,), sizes.weighing(1.0), meaning="the weight that the axle carries", within=(0.1, 1.0)
+            ),
+        },
+        further=lambda s, k, p: p["A"] * ca.sin(s.q[k] + p["phase"]),
+        torque=lambda s, k, p: -p["A"] * p["load"] * ca.cos(s.q[k] + p["phase"]),
+    ),
+    Effect(
+        "encoder_eccentricity",
+        ("contacts", "wheels"),
+        "rad",
+        "the encoder reads A sin(theta + phase) too much, and cos2 cos(2 theta) + sin2 sin(2 theta)",
+        "an angle error periodic in the angle itself",
+        "eccentric encoder discs, Dunster; error once per turn",
+        sizes.constant(0.005),
+        {"phase": PHASE, "cos2": TWICE, "sin2": TWICE},
+        reading=_eccentric,
+        angular=True,
+    ),
+    Effect(
+        "torque_ripple",
+        ("driven_contacts",),
+        "N m",
+        "the delivered torque ripples several times per turn: A sin(order theta + phase)",
+        "a torque error periodic in the contact's angle, several times per turn",
+        "piston motors, Ivantysyn, Hydrostatic Pumps and Motors, 2001",
+        sizes.of(sizes.torque, 0.02),
+        {
+            "order": Shape("1/turn", 5.0, tuple(float(n) for n in range(2, 21)), whole=True),
+            "phase": PHASE,
+        },
+        torque=lambda s, k, p: p["A"] * ca.sin(p["order"] * s.q[k] + p["phase"]),
+    ),
+    # ---------------------------------------------------------------- soil
+    Effect(
+        "shear_saturation",
+        ("contacts",),
+        "-",
+        "law (18) instead of the linear one; A = K / xi_s, the slip at which j = K at the rear of the patch",
+        "contact forces fall behind the linear law at large slips",
+        "paper (18), (20); Janosi, Hanamoto 1961",
+        sizes.constant(0.3),
+        grid=(0.5, 1.0, 3.0),
+        positive=True,
+        inverse=True,
+        shapes={
+            "across": _forms(
+                "0: every strip of the width saturates by its own slip; 1: all of it as its middle; 2: the"
+                " same, but for the moment T_z",
+                (0.0, 1.0, 2.0),
+                grid=(0.0, 1.0, 2.0),
+            ),
+            "bend": BEND,
+        },
+        soil=soil.saturated,
+    ),
+    Effect(
+        "lateral_saturation",
+        ("contacts",),
+        "-",
+        "law (18) for the lateral force alone",
+        "lateral forces fall behind the linear law at large lateral slips",
+        "paper (18); Wong, Theory of Ground Vehicles, ch. 2",
+        sizes.constant(0.3),
+        grid=(0.5, 1.0, 3.0),
+        positive=True,
+        inverse=True,
+        shapes={"bend": BEND},
+        soil=soil.saturated_aside,
+    ),
+    Effect(
+        "drive_brake_asymmetry",
+        ("contacts",),
+        "-",
+        "Kx larger by the factor 1 + A when braking (abs(V_x) > abs(R_c w))",
+        "slip of another size when braking than when driving at the same force",
+        "Wong, Theory of Ground Vehicles, ch. 2; driven and towed wheels on sand",
+        sizes.constant(0.3),
+        soil=soil.braking,
+    ),
+    Effect(
+        "compaction_per_pass",
+        ("drive",),
+        "-",
+        "Kx, Ky grow with the passes towards the factor 1 + A: A (1 - exp(-n / pass)), n the way, or passes",
+        "less slip at the same force, the longer the drive on the same lane",
+        "soil compaction by passes, Forssblad, Vibratory Soil and Rock Fill Compaction, 1981",
+        sizes.constant(0.3),
+        {
+            "pass": Shape("m", 15.0, (5.0, 15.0, 50.0)),
+            "counted": _forms(
+                f"0: n is the way; 1: passes are counted by reversals; 2: place by place, on a map of the ground, for"
+                f" every contact; a pass is worth {ground_map.PASS:g} m of way, and each log begins on new ground",
+                (0.0, 1.0, 2.0),
+            ),
+        },
+        soil=soil.compacted,
+        memory=ground_map.MEMORY,
+        ground=("counted", 2.0),
+        beside=lambda site: [{"pass": x, "counted": form} for form in (1.0, 2.0) for x in (5.0, 15.0, 50.0)],
+        positive=True,
+    ),
+    Effect(
+        "slip_relaxation",
+        ("contacts",),
+        "m",
+        "contact forces build up over the distance A",
+        "contact forces late against slip, by a distance",
+        "relaxation length, Pacejka, Tire and Vehicle Dynamics, ch. 5",
+        sizes.constant(0.05),
+        {"moment": Shape("-", 1.0, (0.0, 1.0))},
+        grid=(0.2, 1.0, 4.0),
+        positive=True,
+        soil=soil.relaxed,
+        memory={
+            "gx": soil.relaxation(lambda r: r.slip.gx, "gx"),
+            "gy": soil.relaxation(lambda r: r.slip.gy, "gy"),
+            "turn": soil.relaxation(lambda r: r.yaw / r.slip.vn, "turn"),
+        },
+    ),
+    Effect(
+        "vibration_on",
+        ("contacts",),
+        "-",
+        "for a while Kx and Ky are smaller by the factor 1 - A, the contact vibrates",
+        "more slip at the same force between two instants",
+        "Forssblad, Vibratory Soil and Rock Fill Compaction, 1981",
+        sizes.constant(0.3),
+        {
+            "begin": Shape("s", 0.4, (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), sizes.duration),
+            "length": Shape("s", 0.25, (0.125, 0.25, 0.5), sizes.duration),
+            "shake": Shape("N m", 0.02, (0.0,), sizes.torque, whole=True),
+            "frequency": Shape("Hz", 27.0, (27.0,), whole=True),
+        },
+        positive=True,
+        soil=lambda s, k, p, plain: soil.scaled(plain, 1 - p["A"] * _window(s.time, p)),
+        channel=lambda t, p: Channel(offset=p["shake"] * _window(t, p) * ca.sin(2 * pi * p["frequency"] * t)),
+        shaking=_window,
+        timed=True,
+    ),
+    # ---------------------------------------------------------------- forces
+    Effect(
+        "rolling_resistance",
+        ("contacts",),
+        "N",
+        "a force against the motion at the contact's centre: A (1 + rise V_x^2) tanh(V_x / soft)",
+        "a force that turns with the direction of travel",
+        "Bekker, Introduction to Terrain-Vehicle Systems, 1969",
+        sizes.weighing(0.002),
+        {"rise": Shape("s2/m2", 0.0, (0.0,)), "soft": Shape("m/s", 1.0, (1.0,), sizes.constant(soil.SMOOTH_SPEED))},
+        resisting=True,
+        push=soil.resistance,
+    ),
+    Effect(
+        "ground_slope",
+        ("machine",),
+        "rad",
+        "gravity along a fixed direction of the ground; `direction` points downhill, from x0 on, or from the"
+        " first heading where no x0 is",
+        "a force that keeps its direction on the ground while the machine turns and reverses",
+        "statics of an inclined plane",
+        sizes.constant(0.005),
+        {"direction": PHASE},
+        gravity=lambda s, p: (
+            sizes.GRAVITY * p["A"] * ca.cos(p["direction"]),
+            sizes.GRAVITY * p["A"] * ca.sin(p["direction"]),
+        ),
+    ),
+    Effect(
+        "payload_shift",
+        ("machine",),
+        "kg m",
+        "at one instant the first moment of the last chassis along its axis changes by A",
+        "inertial and yaw forces that change at an instant",
+        "a water tank or a load that moves",
+        sizes.load_moment,
+        {
+            "instant": Shape("s", 0.5, (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875), sizes.duration),
+            "takes": Shape("s", 0.2, (0.2,)),
+            "arm": Shape("m", 0.0, (0.0,), meaning="the yaw inertia about the joint changes by A times this"),
+            "mass": Shape("1/m", 0.0, (0.0,), meaning="the mass changes by A times this"),
+            "recoil": _forms("1: a load slides and pushes back; 0: it is put on or taken away"),
+        },
+        inertia=_slid,
+        recoil="recoil",
+        beside=_sliding,
+        timed=True,
+    ),
+    # ---------------------------------------------------------------- articulation
+    Effect(
+        "articulation_backlash",
+        ("articulation",),
+        "rad",
+        "play A between the actuator, with its encoder, and the joint",
+        "the angle jumps where the torque changes its sign, or after it has",
+        "Nordin, Gutman, Automatica 38 (2002)",
+        sizes.constant(0.005),
+        {
+            "turn": Shape("N m", 0.02, (0.01, 0.05), sizes.torque, form=("rubs", 0.0)),
+            "rubs": _forms("0: the play is crossed at once; 1: against the actuator's own friction, over time"),
+            "damping": Shape(
+                "N m s",
+                0.0002,
+                (0.0002,),
+                sizes.torque,
+                meaning="over the torque beyond breakaway: the time constant with which the actuator crosses its play",
+                form=("rubs", 1.0),
+            ),
+            "breakaway": Shape(
+                "N m",
+                0.01,
+                (0.01,),
+                sizes.torque,
+                meaning="torque that the actuator's own friction takes: below it, it creeps to that share of its play",
+                form=("rubs", 1.0),
+            ),
+        },
+        beside=_rubbing,
+        positive=True,
+        reading=lambda s, exact, k, p: (
+            p["A"] / 2 * ((1 - p["rubs"]) * ca.tanh(s.u[k] / p["turn"]) + p["rubs"] * s.z["play"])
+        ),
+        memory={"play": Memory(_played, 1.0, form=("rubs", 1.0))},
+        angular=True,
+    ),
+    Effect(
+        "articulation_compliance",
+        ("articulation",),
+        "rad/(N m)",
+        "a spring between the actuator, with its encoder, and the joint: it winds up by A times the torque",
+        "the angle leads by an amount proportional to the torque",
+        "Spong 1987, flexible joints",
+        sizes.one_over_torque,
+        positive=True,
+        reading=lambda s, exact, k, p: p["A"] * s.u[k],
+        angular=True,
+    ),
+    Effect(
+        "articulation_stop_spring",
+        ("articulation",),
+        "N m/rad",
+        "a spring beyond some angle, to both sides of a middle that may be off; rubber hardens as it is pressed",
+        "a torque that grows with the angle beyond a limit",
+        "rubber stops of articulated frames; hardening with power 2 as Duffing's spring",
+        sizes.torque,
+        {
+            "stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), sizes.stop),
+            "centre": Shape("rad", 0.0, (0.0,), meaning="the angle in the middle between the stops"),
+            "hardening": Shape(
+                "-", 0.0, (0.0,), meaning="x beyond the stop gives A x (1 + hardening (x / 0.1 rad)^power)"
+            ),
+            "power": Shape("-", 2.0, (2.0,)),
+        },
+        torque=_stopped,
+        beside=_one_sided,
+    ),
+    # ---------------------------------------------------------------- sensors
+    Effect(
+        "measuring_wheel_radius",
+        ("wheels",),
+        "-",
+        "the true radius is R (1 + A)",
+        "slip where there is none, proportional to speed, and the same forward and backward",
+        "Borenstein, Feng, IEEE Trans. Robotics and Automation 12 (1996): odometry",
+        sizes.constant(0.002),
+        reading=lambda s, exact, k, p: exact / (1 + p["A"]) - exact,
+    ),
+    Effect(
+        "yaw_rate_bias",
+        ("yaw_rate",),
+        "rad/s",
+        "the gyro reads A too much",
+        "a constant difference between gyro and measuring wheels",
+        "IEEE Std 952, gyro bias",
+        sizes.constant(0.001),
+        reading=lambda s, exact, k, p: p["A"] + 0 * exact,
+    ),
+    Effect(
+        "yaw_rate_gain",
+        ("yaw_rate",),
+        "-",
+        "the gyro reads 1 + A times the rate",
+        "a difference between gyro and measuring wheels proportional to the rate",
+        "IEEE Std 952, scale factor",
+        sizes.constant(0.02),
+        reading=lambda s, exact, k, p: p["A"] * exact,
+    ),
+    Effect(
+        "lateral_speed_bias",
+        ("lateral_speed",),
+        "m/s",
+        "the lateral speed sensor reads A too much",
+        "a lateral speed that stays at rest",
+        "optical speed sensors' zero",
+        sizes.constant(0.005),
+        reading=lambda s, exact, k, p: p["A"] + 0 * exact,
+    ),
+    Effect(
+        "lateral_speed_misalignment",
+        ("lateral_speed",),
+        "rad",
+        "the lateral speed sensor is turned by A and reads a share of the forward speed",
+        "a lateral speed proportional to the forward speed",
+        "mounting angle of optical speed sensors",
+        sizes.constant(0.01),
+        reading=lambda s, exact, k, p: p["A"] * s.ahead[k],
+    ),
+)

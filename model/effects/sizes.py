@@ -1,0 +1,83 @@
+"""How large things typically are at a site: what amounts and shapes of effects are shares of.
+
+Most are functions of the site; `constant` and `of` make one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from excite.model.effects.effect import Site
+from excite.model.machine import Body, Machine
+
+GRAVITY = 9.81
+
+
+def constant(value: float) -> Callable[[Site], float]:
+    return lambda site: value
+
+
+def of(size: Callable[[Site], float], share: float) -> Callable[[Site], float]:
+    return lambda site: share * size(site)
+
+
+def duration(site: Site) -> float:
+    return site.duration
+
+
+def smooth(site: Site) -> float:
+    return float(site.body.friction.smoothing) if site.body.friction is not None else 1.0
+
+
+def stop(site: Site) -> float:
+    return float(site.body.limit.position) if site.body.limit.position is not None else 0.6
+
+
+def full_torque(machine: Machine, body: Body) -> float:
+    """What counts as a large torque [N m] at a joint: its limit, the machine's largest, or what friction suggests."""
+    if body.limit.torque is not None:
+        return float(body.limit.torque)
+    stated = [float(b.limit.torque) for b in machine.body if b.limit.torque is not None]
+    rubbing = [30 * float(b.friction.Fs) for b in machine.body if b.friction is not None]
+    return max(stated or rubbing, default=0.0) or 1.0
+
+
+def torque(site: Site) -> float:
+    return full_torque(site.machine, site.body)
+
+
+def one_over_torque(site: Site) -> float:
+    return 0.002 / torque(site) * 3
+
+
+def coulomb(share: float) -> Callable[[Site], float]:
+    return lambda site: share * max(float(site.body.friction.Fs), 1e-6) if site.body.friction is not None else share
+
+
+def viscous(share: float, power: float = 0.0) -> Callable[[Site], float]:
+    """A share of Fv over a rate of 1 m/s at the rim, or half the rate limit, to a power."""
+
+    def size(site: Site) -> float:
+        body = site.body
+        assert body.friction is not None
+        rate = 1.0
+        if body.contact is not None:
+            rate = 1.0 / float(body.contact.radius)
+        elif body.limit.rate is not None:
+            rate = float(body.limit.rate) / 2
+        return share * max(float(body.friction.Fv), 1e-6) / rate**power
+
+    return size
+
+
+def _mass(machine: Machine) -> float:
+    return sum(float(b.inertia.mass) for b in machine.body if b.inertia is not None)
+
+
+def weighing(share: float) -> Callable[[Site], float]:
+    """A share of the machine's weight [N]."""
+    return lambda site: share * GRAVITY * _mass(site.machine)
+
+
+def load_moment(site: Site) -> float:
+    return 0.05 * _mass(site.machine)

@@ -1,0 +1,559 @@
+"""The machine file (TOML) as frozen, checked records.
+
+A machine is a tree of bodies given by its modified Denavit-Hartenberg table (Khalil and Kleinfinger, 1986), with
+inertias, joint friction, contacts with the ground, sensors, limits and the design problems that it is used for.
+Every number carries where it comes from. All values are SI.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator, model_validator
+
+from excite.errors import MachineError
+from excite.model.machine import extends, hydraulics, units
+from excite.model.machine.records import (
+    Flag,
+    Negative,
+    NotNegative,
+    Number,
+    Point,
+    Positive,
+    Quantity,
+    Record,
+    Source,
+    Vector3,
+    one_line,
+)
+
+MACHINES = Path(__file__).parents[1] / "machines"
+Index = Annotated[int, Field(strict=True, ge=0, le=99)]
+
+
+def _zero() -> Quantity:
+    return Quantity(value=0.0, source="definition")
+
+
+class Inertia(Record):
+    """Mass [kg], centre of mass [m] in the body's frame and inertia [kg m2] about the centre of mass.
+
+    `axisymmetric`: a roll or wheel, balanced about its joint axis z with its centre of mass at the frame's origin;
+    its standard parameters are then M, XX (= YY) and ZZ only.
+    """
+
+    mass: Positive
+    com: Point = Point(value=(0.0, 0.0, 0.0), source="definition")
+    XX: NotNegative = Field(default_factory=_zero)
+    XY: Quantity = Field(default_factory=_zero)
+    XZ: Quantity = Field(default_factory=_zero)
+    YY: NotNegative = Field(default_factory=_zero)
+    YZ: Quantity = Field(default_factory=_zero)
+    ZZ: NotNegative = Field(default_factory=_zero)
+    axisymmetric: Flag = False
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Inertia:
+        if self.axisymmetric:
+            if any(self.com.value):
+                raise ValueError("com: of an axisymmetric body is at its frame's origin, leave it out")
+            for key in ("XY", "XZ", "YZ"):
+                if getattr(self, key).value:
+                    raise ValueError(f"{key}: of an axisymmetric body is 0, leave it out")
+            if self.YY.value not in (0.0, self.XX.value):
+                raise ValueError("YY: of an axisymmetric body equals XX, leave it out")
+        return self
+
+
+class Friction(Record):
+    """Joint friction U = ... + Fv q' + Fs tanh(q'/smoothing), and the torque sensor's offset u0 (28).
+
+    Units of a revolute joint [N m s], [N m], [N m], smoothing [rad/s]; of a prismatic one [N s/m], [N], [N], [m/s].
+    """
+
+    Fv: NotNegative
+    Fs: NotNegative
+    u0: Quantity
+    smoothing: Positive
+
+
+class Contact(Record):
+    """A roll or wheel on the soil (11, 17, 24, 25). Frame: the chassis that carries it, at its own centre.
+
+    `law = "exponential"` is (18) integrated over the patch; it needs `saturation_slip` = K / xi_s, the slip at which
+    the shear displacement reaches K at the rear of the patch.
+    """
+
+    radius: Positive
+    width: NotNegative
+    Kx: Negative
+    Ky: Negative
+    v_eps: Positive
+    law: Literal["linear", "exponential"] = "linear"
+    saturation_slip: Positive | None = None
+    slip_limit: Positive | None = None
+
+    @model_validator(mode="after")
+    def _law(self) -> Contact:
+        if self.law == "exponential" and self.saturation_slip is None:
+            raise ValueError('saturation_slip: law "exponential" needs it (K / xi_s)')
+        return self
+
+
+class JointLimit(Record):
+    """What the drive of a joint allows. `rim_speed` is |radius x rate| of a contact [m/s]."""
+
+    torque: Positive | None = None
+    torque_rate: Positive | None = None
+    position: Positive | None = None
+    rate: Positive | None = None
+    rim_speed: Positive | None = None
+
+
+def _antecedent(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
+    try:
+        return handler(value)
+    except ValidationError:
+        raise ValueError(f'must be "ground" or the index of a body above (got {value!r})') from None
+
+
+class Body(Record):
+    """One row of the modified Denavit-Hartenberg table, and what hangs on it.
+
+    Transform from the antecedent: Rot(z, gamma) Trans(z, b) Rot(x, alpha) Trans(x, d) Rot(z, theta) Trans(z, r);
+    the joint's coordinate replaces theta (revolute) or r (prismatic).
+    """
+
+    index: Index
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+    antecedent: Annotated[Index | Literal["ground"], WrapValidator(_antecedent)]
+    joint: Literal["planar", "revolute", "prismatic", "fixed"]
+    actuated: Flag = False
+    place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
+    gamma: Quantity = Field(default_factory=_zero)
+    b: Quantity = Field(default_factory=_zero)
+    alpha: Quantity = Field(default_factory=_zero)
+    d: Quantity = Field(default_factory=_zero)
+    theta: Quantity = Field(default_factory=_zero)
+    r: Quantity = Field(default_factory=_zero)
+    inertia: Inertia | None = None
+    friction: Friction | None = None
+    contact: Contact | None = None
+    limit: JointLimit = JointLimit()
+
+    @property
+    def where(self) -> str:
+        """The name of the joint or contact, as effects and reports call it."""
+        return self.place or self.name
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        i = self.index
+        return {
+            "planar": (f"x{i}", f"y{i}", f"theta{i}"),
+            "revolute": (f"theta{i}",),
+            "prismatic": (f"q{i}",),
+            "fixed": (),
+        }[self.joint]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Body:
+        replaced = {"planar": ("gamma", "b", "alpha", "d", "theta", "r"), "revolute": ("theta",), "prismatic": ("r",)}
+        for key in replaced.get(self.joint, ()):
+            if getattr(self, key).value:
+                raise ValueError(f"{key}: a {self.joint} joint's coordinate takes its place, leave it out")
+        if self.joint in ("fixed", "planar") and (self.actuated or self.friction):
+            key = "actuated" if self.actuated else "friction"
+            raise ValueError(f"{key}: a {self.joint} joint can't be actuated or have friction")
+        if self.actuated and self.friction is None:
+            raise ValueError("friction: an actuated joint needs a [body.friction] table (Fv, Fs, u0, smoothing)")
+        if self.joint == "planar" and self.antecedent != "ground":
+            raise ValueError(f'antecedent: a planar joint must stand on "ground" (got {self.antecedent})')
+        if self.contact and self.joint != "revolute":
+            raise ValueError(f"contact: belongs to a roll or wheel, a revolute joint (got {self.joint})")
+        return self
+
+
+class Sensor(Record):
+    """One column of a log, in `unit` (see `units`). SI value = `gain` x (number in the column).
+
+    A `factor` that is given is the SI value of one, whatever `unit` says; it is needed where the unit has none, V say.
+    A torque may come as the pressures on both sides of a hydraulic motor, in `column` and `return_column`, with the
+    `displacement` [m3 per turn of the joint, gear included]: u = displacement / (2 pi) (p - p_return); or as those on
+    both sides of `cylinders` (see `hydraulics`). `factor` is then the pressure of one [Pa], 4e6 for 0-10 V over
+    0-400 bar. An angle may come as a rate (rpm, deg/s): it then stays one, with the `noise` of a rate [rad/s].
+
+    kind `angle`: encoder of a joint; `wheel`: measuring wheel of `radius` [m] at `lateral` [m] (+ left) on the axis
+    through the body's origin (32); `torque`: delivered torque or force + u0; `yaw_rate`, `lateral_speed`: of the
+    body, in its own frame; `x`, `y`: position of its origin on the ground. All but angles and torques sit on the first
+    chassis. Every sensor is in kit `full`.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+    kind: Literal["angle", "wheel", "torque", "yaw_rate", "lateral_speed", "x", "y"]
+    body: Index
+    column: Annotated[str, Field(min_length=1)]
+    unit: str
+    factor: Quantity | None = None
+    return_column: Annotated[str | None, Field(min_length=1)] = None
+    displacement: Positive | None = None
+    cylinders: tuple[hydraulics.Cylinder, ...] = ()
+    kits: tuple[Literal["paper", "full"], ...] = ("paper", "full")
+    place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
+    counts_per_turn: Positive | None = None
+    noise: NotNegative | None = None
+    lateral: Quantity | None = None
+    radius: Positive | None = None
+
+    @property
+    def resolution(self) -> float | None:
+        """One count [SI unit of the column], None for an analogue sensor."""
+        return None if self.counts_per_turn is None else 2 * math.pi / self.counts_per_turn.value
+
+    @property
+    def graded(self) -> bool:
+        """Whether it is said how well it measures, by noise or by counts."""
+        return self.noise is not None or self.counts_per_turn is not None
+
+    @property
+    def gain(self) -> float:
+        """SI value of one in the column; of a motor's pressures the torque [N m], of cylinders' the pressure [Pa]."""
+        one = float(self.factor) if self.factor is not None else units.UNITS[self.unit][1]
+        return one if self.displacement is None else one * float(self.displacement) / (2 * math.pi)
+
+    @property
+    def is_rate(self) -> bool:
+        """Whether the column holds the rate of the angle that the sensor stands for."""
+        known = units.UNITS.get(self.unit, ("", 1.0))[0]
+        return self.kind in ("angle", "wheel") and known in units.RATES
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of a log that it is in."""
+        return (self.column,) if self.return_column is None else (self.column, self.return_column)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Sensor:
+        pressed = self.displacement is not None or bool(self.cylinders)
+        if pressed != (self.return_column is not None):
+            key = "return_column" if pressed else "displacement"
+            raise ValueError(f"{key}: two pressures need column, return_column and displacement (or cylinders)")
+        if self.displacement is not None and self.cylinders:
+            raise ValueError("cylinders: a joint is turned by a motor of some displacement or by cylinders, not both")
+        if pressed and self.kind != "torque":
+            key = "cylinders" if self.cylinders else "displacement"
+            raise ValueError(f"{key}: makes a torque of pressures, not kind {self.kind}")
+        measured = ("pressure",) if pressed else units.MEASURES[self.kind]
+        if self.factor is None and units.UNITS.get(self.unit, ("",))[0] not in measured:
+            raise ValueError(
+                f"unit: {self.unit!r} is no {' or '.join(measured)}, allowed for kind {self.kind}:"
+                f" {units.allowed(measured)}, or any with its factor (the SI value of one)"
+            )
+        if self.is_rate and self.counts_per_turn is not None:
+            raise ValueError("counts_per_turn: is for a column that counts, not for a rate")
+        if self.kind == "wheel" and (self.radius is None or self.lateral is None):
+            raise ValueError(f"{'lateral' if self.radius else 'radius'}: a measuring wheel needs radius and lateral")
+        if self.kind != "wheel" and (self.radius is not None or self.lateral is not None):
+            raise ValueError(f"{'radius' if self.radius else 'lateral'}: is for kind wheel only")
+        if self.factor is not None and self.factor.value == 0:
+            raise ValueError("factor: must not be 0")
+        if self.noise is not None and self.noise.value == 0 and self.counts_per_turn is None:
+            raise ValueError("noise: must be > 0 (got 0); leave it out where nobody knows it")
+        if "full" not in self.kits:
+            raise ValueError(f'kits: "full" has every sensor, add it (got {", ".join(self.kits) or "none"})')
+        return self
+
+
+class Filter(Record):
+    """Default processing of a log before least squares: zero-phase Butterworth of positions, then `drop` samples at
+    the start and at the end are left out, and one row in `decimation` is kept. `source` is that of the whole numbers.
+    """
+
+    source: Source
+    cutoff_hz: Positive
+    order: Annotated[int, Field(strict=True, ge=1, le=8)] = 4
+    decimation: Annotated[int, Field(strict=True, ge=1, le=1000)] = 10
+    drop: tuple[Annotated[int, Field(strict=True, ge=0)], Annotated[int, Field(strict=True, ge=0)]] = (0, 0)
+
+
+class Problem(Record):
+    """A design problem: how long, where, how fine. `source` is that of the lane.
+
+    lane_m: length and width of the lane area, centred on 0, 0; lane_polygon_m: corners of a convex area in which the
+    `lane_points` stay as well. reversals: of the direction of travel, at most.
+    """
+
+    source: Source
+    duration_s: Positive
+    knot_s: Positive
+    lane_m: tuple[Number, Number]
+    lane_points: tuple[Index, ...]
+    lane_polygon_m: tuple[tuple[Number, Number], ...] = ()
+    reversals: Annotated[int, Field(strict=True, ge=0)] | None = None
+    rest: Flag = True
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Problem:
+        if min(self.lane_m) <= 0:
+            raise ValueError(f"lane_m: must be > 0, length and width (got {min(self.lane_m):g})")
+        if self.lane_polygon_m and not _convex(self.lane_polygon_m):
+            raise ValueError("lane_polygon_m: must be three corners or more, in order, of a convex area")
+        if self.knot_s.value * 4 > self.duration_s.value:
+            least = 4 * self.knot_s.value
+            raise ValueError(f"duration_s: must be at least 4 knots long, {least:g} s (got {self.duration_s.value:g})")
+        return self
+
+
+class EffectEntry(Record):
+    """An effect that the machine has beyond the plain model: its name in the catalogue, place, amount and shapes."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+    where: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
+    amount: Quantity
+    std: NotNegative | None = None
+    shape: dict[str, Quantity] = Field({})
+
+    @property
+    def label(self) -> str:
+        """As people give it: effect@place."""
+        return f"{self.name}@{self.where}"
+
+
+def _convex(corners: Sequence[tuple[float, float]]) -> bool:
+    """Whether corners, in order, go once around a convex area, turning the same way at every one."""
+    n = len(corners)
+    turn, turns = 0.0, []
+    for k in range(n):
+        (ax, ay), (bx, by), (cx, cy) = (corners[(k + i) % n] for i in range(3))
+        cross = (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
+        turns.append(cross)
+        turn += math.atan2(cross, (bx - ax) * (cx - bx) + (by - ay) * (cy - by))
+    one_way = all(t > 0 for t in turns) or all(t < 0 for t in turns)
+    return n >= 3 and one_way and abs(abs(turn) - 2 * math.pi) < 1e-6
+
+
+class Machine(Record):
+    """A machine as its file describes it. Frozen; `locked` coordinates are held at zero."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")]
+    title: str
+    reference: str = ""
+    sampling_hz: Positive
+    time_column: str = "t_s"
+    time_unit: Literal["s", "ms", "us", "min"] = "s"
+    gravity: Vector3 = (0.0, 0.0, -9.81)
+    power_limit: Positive | None = None
+    locked: tuple[str, ...] = ()
+    body: Annotated[tuple[Body, ...], Field(min_length=1)]
+    sensor: tuple[Sensor, ...]
+    filter: Filter
+    problem: str | None = None
+    problems: dict[str, Problem] = Field({})
+    parameter_names: dict[str, str] = Field({})
+    scale: dict[str, Positive] = Field({})
+    effect: tuple[EffectEntry, ...] = ()
+
+    def find(self, index: int) -> Body:
+        """The body with this index. Raises KeyError."""
+        for body in self.body:
+            if body.index == index:
+                return body
+        raise KeyError(index)
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Names of the free coordinates, in the order of the table."""
+        return tuple(c for b in self.body for c in b.coordinates if c not in self.locked)
+
+    @property
+    def planar(self) -> bool:
+        """Whether the root moves on the plane (velocities are then written in the chassis' own axes)."""
+        return self.body[0].joint == "planar"
+
+    @property
+    def actuated(self) -> tuple[Body, ...]:
+        """Actuated bodies whose coordinate is free."""
+        return tuple(b for b in self.body if b.actuated and b.coordinates[0] not in self.locked)
+
+    @property
+    def contacts(self) -> tuple[Body, ...]:
+        return tuple(b for b in self.body if b.contact)
+
+    def sensors(self, kit: str) -> tuple[Sensor, ...]:
+        """The sensors of a kit that measure something which is free to move."""
+        return tuple(s for s in self.sensor if kit in s.kits and self._visible(s))
+
+    def si(self, sensor: Sensor) -> str:
+        """The SI unit of a sensor's values, whatever its column is in."""
+        straight = self.find(sensor.body).joint == "prismatic"
+        if sensor.kind in ("angle", "wheel"):
+            return ("m" if straight and sensor.kind == "angle" else "rad") + ("/s" if sensor.is_rate else "")
+        torque = "N" if straight else "N m"
+        return {"torque": torque, "yaw_rate": "rad/s", "lateral_speed": "m/s", "x": "m", "y": "m"}[sensor.kind]
+
+    def _visible(self, sensor: Sensor) -> bool:
+        free = set(self.coordinates)
+        body = self.find(sensor.body)
+        if sensor.kind in ("angle", "torque"):
+            return body.coordinates[0] in free
+        if sensor.kind == "yaw_rate":
+            return f"theta{self.body[0].index}" in free
+        if sensor.kind in ("lateral_speed", "y"):
+            return f"y{self.body[0].index}" in free
+        return True
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Machine:
+        self._check_tree()
+        self._check_locked()
+        self._check_sensors()
+        if self.problem is not None and self.problem not in self.problems:
+            allowed = ", ".join(self.problems) or "none is declared"
+            raise ValueError(f"problem: no problem {self.problem}, allowed: {allowed}")
+        indices = [b.index for b in self.body]
+        for name, problem in self.problems.items():
+            for i in problem.lane_points:
+                if i not in indices:
+                    raise ValueError(f"problems.{name}.lane_points: no body {i}, allowed: {sorted(indices)}")
+        if self.filter.cutoff_hz.value >= self.sampling_hz.value / 2:
+            raise ValueError(
+                f"filter.cutoff_hz: must be below half the sampling rate, {self.sampling_hz.value / 2:g} Hz"
+                f" (got {self.filter.cutoff_hz.value:g})"
+            )
+        return self
+
+    def _check_tree(self) -> None:
+        seen: set[int] = set()
+        names: set[str] = set()
+        for k, body in enumerate(self.body):
+            if body.index in seen:
+                raise ValueError(f"body[{k}].index: {body.index} is given twice, every body needs its own")
+            if k == 0 and body.antecedent != "ground":
+                raise ValueError(f'body[0].antecedent: the first body must stand on "ground" (got {body.antecedent})')
+            if k > 0 and body.antecedent not in seen:
+                known = ", ".join(map(str, sorted(seen)))
+                raise ValueError(f"body[{k}].antecedent: {body.antecedent} is not a body above it, allowed: {known}")
+            if names & {body.name, body.where}:
+                raise ValueError(f"body[{k}].name: {body.where} is given twice, every body and place needs its own")
+            if body.contact and (body.antecedent == "ground" or not self.planar):
+                raise ValueError(f"body[{k}].contact: needs a chassis on a planar root to carry it")
+            seen.add(body.index)
+            names |= {body.name, body.where}
+
+    def _check_locked(self) -> None:
+        every = [c for b in self.body for c in b.coordinates]
+        for c in self.locked:
+            if c not in every:
+                raise ValueError(f"locked: no coordinate {c}, allowed: {', '.join(every)}")
+        if self.planar:
+            x, y, heading = self.body[0].coordinates
+            if {x, y} & set(self.locked) and heading not in self.locked:
+                raise ValueError(f"locked: {x} and {y} can only be held where {heading} is held too")
+        for body in self.contacts:
+            if body.coordinates[0] in self.locked:
+                raise ValueError(f"locked: {body.coordinates[0]} has a contact that must turn, take that out first")
+        if not self.coordinates:
+            raise ValueError("locked: nothing is left to move")
+        if not self.actuated:
+            raise ValueError("body: no joint is actuated, so nothing can drive the machine")
+
+    def _check_sensors(self) -> None:
+        known = {b.index: b for b in self.body}
+        jointed = [i for i, b in known.items() if b.joint in ("revolute", "prismatic")]
+        driven = [i for i, b in known.items() if b.actuated]
+        names: set[str] = set()
+        columns: set[str] = {self.time_column}
+        measured: set[tuple[str, int]] = set()
+        for k, sensor in enumerate(self.sensor):
+            if sensor.body not in known:
+                raise ValueError(f"sensor[{k}].body: no body {sensor.body}, allowed: {sorted(known)}")
+            if sensor.kind == "angle" and sensor.body not in jointed:
+                raise ValueError(f"sensor[{k}].body: body {sensor.body} has no joint to measure, allowed: {jointed}")
+            if sensor.kind == "torque" and sensor.body not in driven:
+                raise ValueError(f"sensor[{k}].body: joint {sensor.body} isn't actuated, allowed: {driven}")
+            if sensor.kind not in ("angle", "torque") and not self.planar:
+                raise ValueError(f"sensor[{k}].kind: {sensor.kind} needs a planar root, allowed here: angle, torque")
+            if sensor.kind not in ("angle", "torque") and sensor.body != self.body[0].index:
+                raise ValueError(
+                    f"sensor[{k}].body: {sensor.kind} is measured on the first chassis alone, body {self.body[0].index}"
+                    f" (got {sensor.body}); leave the sensor out, or begin the table with that chassis"
+                )
+            if sensor.name in names:
+                raise ValueError(f"sensor[{k}].name: {sensor.name} is used twice")
+            for column in sensor.columns:
+                if column in columns:
+                    raise ValueError(f"sensor[{k}].column: {column} is used twice")
+                columns.add(column)
+            if sensor.cylinders:
+                self._check_cylinders(f"sensor[{k}].cylinders", sensor)
+            twin = (sensor.kind, sensor.body)
+            if sensor.kind in ("angle", "torque") and twin in measured:
+                raise ValueError(
+                    f"sensor[{k}].kind: joint {sensor.body} has two sensors of kind {sensor.kind}, keep one"
+                )
+            measured.add(twin)
+            names.add(sensor.name)
+
+    def _check_cylinders(self, key: str, sensor: Sensor) -> None:
+        """Whether every pressure turns the joint the same way all along its range, at an angle that is measured."""
+        body = self.find(sensor.body)
+        if body.joint != "revolute":
+            raise ValueError(f"{key}: turn a revolute joint, joint {body.index} is {body.joint}")
+        pinned = any(c.anchor is not None for c in sensor.cylinders)
+        angles = [s for s in self.sensor if s.kind == "angle" and s.body == sensor.body and not s.is_rate]
+        if pinned and not angles and body.coordinates[0] not in self.locked:
+            raise ValueError(f"{key}: the lever depends on the angle of joint {body.index}, which no sensor measures")
+        top = float(body.limit.position) if body.limit.position is not None else 0.5
+        for arm in hydraulics.arms(sensor.displacement, sensor.cylinders, np.linspace(-top, top, 41)):
+            if not (arm > 0).all() and not (arm < 0).all():
+                raise ValueError(f"{key}: a pressure has no lever at some angle within {top:g} rad, check the pins")
+
+
+def shipped_machines() -> tuple[str, ...]:
+    """Names of the machines that come with the package."""
+    return extends.names_in(MACHINES)
+
+
+def load_machine(name: str | Path) -> Machine:
+    """The machine of a shipped name, or of a path to a TOML file.
+
+    A file may say `extends = "va12"` and give only what differs: tables merge, values and lists replace; a table
+    [body.NAME] or [sensor.NAME] changes the one of that name.
+    Raises MachineError: one line with file, key, what is wrong, what is allowed.
+    """
+    path = _find(str(name))
+    try:
+        raw = extends.read(path, MACHINES)
+    except ValueError as err:
+        raise MachineError(str(err)) from None
+    try:
+        return Machine.model_validate(raw)
+    except ValidationError as err:
+        raise MachineError(one_line(path, err, Machine)) from None
+
+
+def own_files(name: str | Path) -> list[Path]:
+    """The files of a machine of one's own, those that it extends included; none of a shipped name. Raises
+    MachineError."""
+    try:
+        whole = [] if str(name) in shipped_machines() else extends.chain(_find(str(name)), MACHINES)
+    except ValueError as err:
+        raise MachineError(str(err)) from None
+    return [p for k, (p, _) in enumerate(whole) if k == 0 or p.parent != MACHINES]
+
+
+def _find(name: str) -> Path:
+    if name in shipped_machines():
+        return MACHINES / f"{name}.toml"
+    path = Path(name)
+    if path.suffix != ".toml":
+        raise MachineError(
+            f"{name}: no such machine, allowed: {', '.join(shipped_machines())}, or a path to a .toml file"
+        )
+    if not path.is_file():
+        raise MachineError(f"{name}: no such file")
+    return path

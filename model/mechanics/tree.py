@@ -1,0 +1,196 @@
+"""Rigid bodies: modified Denavit-Hartenberg tree -> velocities, equations of motion.
+
+Recursive Newton-Euler in the form of Khalil and Dombre ("Modeling, Identification and Control of Robots", ch. 9):
+every force is linear in the standard inertial parameters (m, first moments, inertia about the frame's origin), so
+the same expression serves simulation, design and regressor.
+
+A planar root is written in its own axes: its velocities are (V_x, V_y, theta'), its accelerations their time
+derivatives, and its three rows are the forces along its axes and the moment about its origin. The pose on the plane
+then appears only through the direction of gravity.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from excite.model.machine import Body, Machine
+
+INERTIAL = ("M", "MX", "MY", "MZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
+Z = ca.DM([0, 0, 1])
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A body's motion, all vectors (3,) in the body's own axes: rates [rad/s], [m/s], accelerations minus gravity.
+
+    `rotation` (3, 3) and `position` (3,) lead from the body to the root's axes at the root's origin.
+    """
+
+    rotation: ca.SX
+    position: ca.SX
+    omega: ca.SX
+    velocity: ca.SX
+    domega: ca.SX
+    acceleration: ca.SX
+
+
+def _exact(value: float) -> float:
+    """cos(pi/2) as 0: keeps the symbolic graph free of 6e-17 terms."""
+    return round(value) if abs(value - round(value)) < 1e-15 else value
+
+
+def _rot_x(angle: float) -> ca.SX:
+    c, s = _exact(math.cos(angle)), _exact(math.sin(angle))
+    return ca.sparsify(ca.SX([[1, 0, 0], [0, c, -s], [0, s, c]]))
+
+
+def rot_z(angle: ca.SX | float) -> ca.SX:
+    """Rotation (3, 3) about z by an angle [rad]."""
+    number = isinstance(angle, float)
+    c = ca.SX(_exact(math.cos(angle))) if number else ca.cos(angle)
+    s = ca.SX(_exact(math.sin(angle))) if number else ca.sin(angle)
+    R = ca.SX.eye(3)
+    R[0, 0], R[0, 1], R[1, 0], R[1, 1] = c, -s, s, c
+    return ca.sparsify(R)
+
+
+def place(body: Body, q: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
+    """Rotation (3, 3) and position (3,) [m] of the body's frame in its antecedent's."""
+    c = body.coordinates[0] if body.coordinates else ""
+    theta = q[c] if body.joint == "revolute" else float(body.theta)
+    r = q[c] if body.joint == "prismatic" else float(body.r)
+    Rz, Rx, Rt = rot_z(float(body.gamma)), _rot_x(float(body.alpha)), rot_z(theta)
+    along = ca.vertcat(float(body.d), 0, 0) + Rx @ (Z * r)
+    return Rz @ Rx @ Rt, Rz @ along + Z * float(body.b)
+
+
+def motion(
+    machine: Machine, q: dict[str, ca.SX], dq: dict[str, ca.SX], ddq: dict[str, ca.SX], gravity: ca.SX
+) -> dict[int, Frame]:
+    """Forward recursion: the motion of every body.
+
+    q, dq, ddq by coordinate name [rad, m and per s, s2]; those of a planar root are velocities and accelerations in
+    its own axes. gravity (3,) [m/s2] in the root's axes.
+    """
+    frames: dict[int, Frame] = {}
+    for body in machine.body:
+        R, P = place(body, q)
+        zero = ca.SX(3, 1)
+        if body.antecedent == "ground":
+            above = Frame(ca.SX.eye(3), zero, zero, zero, zero, -gravity)
+        else:
+            above = frames[body.antecedent]
+        if body.joint == "planar":
+            x, y, t = body.coordinates
+            spin = dq[t]
+            frames[body.index] = Frame(
+                ca.SX.eye(3),
+                zero,
+                Z * spin,
+                ca.vertcat(dq[x], dq[y], 0),
+                Z * ddq[t],
+                ca.vertcat(ddq[x] - spin * dq[y], ddq[y] + spin * dq[x], 0) - gravity,
+            )
+            continue
+        omega, domega = R.T @ above.omega, R.T @ above.domega
+        velocity = R.T @ (above.velocity + ca.cross(above.omega, P))
+        lever = ca.cross(above.domega, P) + ca.cross(above.omega, ca.cross(above.omega, P))
+        acceleration = R.T @ (above.acceleration + lever)
+        if body.joint == "revolute":
+            c = body.coordinates[0]
+            domega = domega + Z * ddq[c] + ca.cross(omega, Z * dq[c])
+            omega = omega + Z * dq[c]
+        elif body.joint == "prismatic":
+            c = body.coordinates[0]
+            velocity = velocity + Z * dq[c]
+            acceleration = acceleration + Z * ddq[c] + 2 * ca.cross(omega, Z * dq[c])
+        frames[body.index] = Frame(
+            above.rotation @ R, above.position + above.rotation @ P, omega, velocity, domega, acceleration
+        )
+    return frames
+
+
+def generalised_forces(
+    machine: Machine, q: dict[str, ca.SX], frames: dict[int, Frame], inertial: dict[int, ca.SX]
+) -> dict[str, ca.SX]:
+    """Backward recursion: the generalised force [N or N m] of every coordinate, from (10,) parameters per body.
+
+    Parameters in the order of INERTIAL, about the body's own frame.
+    """
+    force: dict[int, ca.SX] = {}
+    moment: dict[int, ca.SX] = {}
+    for body in machine.body:
+        f = frames[body.index]
+        m, mx, my, mz, xx, xy, xz, yy, yz, zz = ca.vertsplit(inertial[body.index])
+        ms = ca.vertcat(mx, my, mz)
+        J = ca.vertcat(ca.horzcat(xx, xy, xz), ca.horzcat(xy, yy, yz), ca.horzcat(xz, yz, zz))
+        force[body.index] = m * f.acceleration + ca.cross(f.domega, ms) + ca.cross(f.omega, ca.cross(f.omega, ms))
+        moment[body.index] = J @ f.domega + ca.cross(f.omega, J @ f.omega) + ca.cross(ms, f.acceleration)
+    rows: dict[str, ca.SX] = {}
+    for body in reversed(machine.body):
+        F, N = force[body.index], moment[body.index]
+        if body.joint == "planar":
+            x, y, t = body.coordinates
+            rows[x], rows[y], rows[t] = F[0], F[1], N[2]
+            continue
+        if body.joint == "revolute":
+            rows[body.coordinates[0]] = N[2]
+        elif body.joint == "prismatic":
+            rows[body.coordinates[0]] = F[2]
+        if body.antecedent != "ground":
+            R, P = place(body, q)
+            force[body.antecedent] += R @ F
+            moment[body.antecedent] += R @ N + ca.cross(P, R @ F)
+    return rows
+
+
+def poses(machine: Machine, q: Mapping[str, float]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Rotation (3, 3) and position (3,) [m] of every body in the root's axes, by index.
+
+    q: coordinates by name [rad, m], zero where not given; those of a planar root change nothing.
+    """
+    every = [c for b in machine.body for c in b.coordinates]
+    still = dict.fromkeys(every, ca.SX(0))
+    frames = motion(machine, still | {c: ca.SX(x) for c, x in q.items()}, still, still, ca.SX(3, 1))
+    return {k: (ca.DM(f.rotation).full(), ca.DM(f.position).full()[:, 0]) for k, f in frames.items()}
+
+
+def standard_inertia(body: Body) -> dict[str, float]:
+    """Standard parameters of a body that are free to differ, by name, from its mass, centre of mass and inertia.
+
+    First moments and inertia are about the body's frame (parallel axes); an axisymmetric body has M, XX (= YY), ZZ.
+    """
+    if body.inertia is None:
+        return {}
+    i, k = body.inertia, body.index
+    m = float(i.mass)
+    if i.axisymmetric:
+        return {f"M{k}": m, f"XX{k}": float(i.XX), f"ZZ{k}": float(i.ZZ)}
+    x, y, z = i.com.value
+    return {
+        f"M{k}": m,
+        f"MX{k}": m * x,
+        f"MY{k}": m * y,
+        f"MZ{k}": m * z,
+        f"XX{k}": float(i.XX) + m * (y * y + z * z),
+        f"XY{k}": float(i.XY) - m * x * y,
+        f"XZ{k}": float(i.XZ) - m * x * z,
+        f"YY{k}": float(i.YY) + m * (x * x + z * z),
+        f"YZ{k}": float(i.YZ) - m * y * z,
+        f"ZZ{k}": float(i.ZZ) + m * (x * x + y * y),
+    }
+
+
+def inertial_vector(body: Body, p: dict[str, ca.SX]) -> ca.SX:
+    """The body's ten parameters in the order of INERTIAL; those that it doesn't have are zero."""
+    if body.inertia is None:
+        return ca.SX.zeros(10)
+    k = body.index
+    if body.inertia.axisymmetric:
+        p = {**p, f"YY{k}": p[f"XX{k}"]}
+    return ca.vertcat(*[p.get(f"{name}{k}", ca.SX.zeros(1)) for name in INERTIAL])

@@ -1,0 +1,50 @@
+"""What a model's parameters are, in words that need no table of symbols."""
+
+from __future__ import annotations
+
+from excite.model.machine import Body
+from excite.model.prediction import Model
+
+MOMENTS = {"MX": "first moment x", "MY": "first moment y", "MZ": "first moment z"}
+INERTIA = {"XX": "about x", "YY": "about y", "ZZ": "about the axis", "XY": "xy", "XZ": "xz", "YZ": "yz"}
+ACTING = {
+    "Fv": "viscous friction",
+    "Fs": "dry friction",
+    "Kx": "lengthwise force per slip",
+    "Ky": "sideways force per slip",
+}
+
+
+def meanings(model: Model) -> dict[str, str]:
+    """Every base parameter's name -> what it is and of which body: "viscous friction, JOINT". One that stands for
+    several is called regrouped; its sum is `model.base.grouping`."""
+    words = {name: text for body in model.machine.body for name, text in _of(body).items()}
+    masses = {f"M{b.index}" for b in model.machine.body if b.inertia is not None}
+    found: dict[str, str] = {}
+    for name, k in zip(model.base.names, model.base.independent, strict=True):
+        parts = model.base.grouping(name)
+        own = words.get(model.base.standard[k]) or _of_effect(name)
+        if len(masses) > 1 and parts == dict.fromkeys(masses, 1.0):
+            own = "mass, whole machine"
+        elif len(parts) > 1:
+            own = f"regrouped {own}"
+        found[name] = own
+    return found
+
+
+def _of(body: Body) -> dict[str, str]:
+    """A body's standard parameters: its inertia by the body's name, what acts on it by the joint's or contact's."""
+    k, own, place = body.index, body.name.replace("_", " "), body.where.replace("_", " ")
+    table = {f"M{k}": f"mass, {own}"}
+    table |= {f"{letters}{k}": f"{what}, {own}" for letters, what in MOMENTS.items()}
+    turned = INERTIA | ({"ZZ": "about the vertical"} if body.joint == "planar" else {})
+    table |= {f"{letters}{k}": f"inertia {about}, {own}" for letters, about in turned.items()}
+    table |= {f"{letters}{k}": f"{what}, {place}" for letters, what in ACTING.items()}
+    return table | {f"u{k}0": f"{'force' if body.joint == 'prismatic' else 'torque'} offset, {place}"}
+
+
+def _of_effect(name: str) -> str:
+    """An effect's amount or shape, NAME@WHERE[.SHAPE]."""
+    effect, _, place = name.replace("_", " ").partition("@")
+    place, _, shape = place.partition(".")
+    return f"{shape} of {effect}, {place}" if shape else f"{effect}, {place}"

@@ -1,0 +1,859 @@
+"""How fits to logs are found, gone on with and given up."""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import pickle
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import calm, gentle, slope
+
+from excite import smoothing
+from excite.diagnosis import fits as stages, forked, screening, selection
+from excite.diagnosis.parallel import in_turn
+from excite.logs import log
+from excite.model import Model, prediction
+from excite.model.effects import placing
+from excite.simulation import Motion, sensors, simulate
+from excite.smoothing import gauss_newton
+
+
+def test_what_a_process_found_can_be_sent_back(straight: Model, straight_motion: Motion) -> None:
+    """An answer that can't be sent would be computed again in silence."""
+
+    def sent(calls: Sequence[Callable[[], Any]]) -> Generator[Any, None, None]:
+        return (pickle.loads(pickle.dumps(call())) for call in calls)
+
+    one = log.from_table(sensors.measure(straight, straight_motion, seed=3), straight.machine)
+    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    sloped = placing.extended(straight.machine, placing.parse("ground_slope=0.001", straight.machine, 10.0))
+    for disturbed in (0.0, 1.0):
+        (found,) = screening.begun([sloped], stage, disturbed, sent)
+        assert found is not None
+        assert found.fit.disturbed < max(disturbed, 0.01)
+        assert (found.loose is None) == found.exact
+    (found,) = stages.refits([(sloped, stage, 0.0)], sent)
+    assert found is not None
+
+
+def test_coarse_sensors_are_no_measure_of_how_near_sharp_ones_come(
+    straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fit that goes on from one with coarse sensors, and comes near the logs, is gone on with; from one with sensors
+    as they are it must come nearer by far than that."""
+    stage = calm(straight)
+    calls = list[float]()
+
+    def nearly(*given: Any) -> gauss_newton.Fit:
+        calls.append(given[3])
+        if len(calls) == 1:
+            raise gauss_newton.NotConverged("no fit", replace(stage.fit, cost=1.1 * stage.noise), 5.0)
+        return stage.fit
+
+    monkeypatch.setattr(stages, "_nearly", nearly)
+    coarse = replace(stage, prepared=stages.noisy(stage.prepared, 10.0))
+    coarse = replace(coarse, fit=replace(stage.fit, cost=coarse.noise))
+    assert coarse.near
+    assert stages.resume(stage.prepared, coarse, 0.0).cost == stage.fit.cost
+    assert calls == [0.0, 0.0]
+    calls.clear()
+    with pytest.raises(gauss_newton.NotConverged):
+        stages.resume(stage.prepared, stage, 0.0)
+
+
+def test_ways_that_are_not_needed_are_given_up(straight: Model) -> None:
+    """Of the ways to a fit the first one is enough for a clean log, whatever has been begun beside it."""
+    one = log.from_table(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
+    carried: list[int] = []
+
+    def counted(calls: Sequence[Callable[[], Any]]) -> Generator[Any, None, None]:
+        for k, call in enumerate(calls):
+            carried.append(k)
+            yield call()
+
+    others = multiprocessing.active_children()
+    there = stages.fitted(straight.machine, [one], straight.machine.filter, forked)
+    assert set(multiprocessing.active_children()) <= set(others)
+    here = stages.fitted(straight.machine, [one], straight.machine.filter, counted)
+    assert carried == [0]
+    np.testing.assert_array_equal(there.fit.X, here.fit.X)
+
+
+def test_a_fit_whose_steps_cease_to_shrink_ends(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Near an answer as one that is as good as found, far from any without; whoever is patient goes on for longer."""
+    stage = calm(straight)
+    p, true = stage.prepared, gauss_newton.newton_step
+    steps: list[float] = []
+
+    def scripted(*args: Any) -> Any:
+        covariance, move, _, cost = true(*args)
+        return covariance, move, steps.pop(0), cost
+
+    monkeypatch.setattr(gauss_newton, "newton_step", scripted)
+    for end, spent, found in ((0.3, 7, True), (30.0, 8, False)):
+        for patient, passes in ((True, 14), (False, spent)):
+            steps[:] = [500.0, 90.0, 80.0, 40.0, *[end] * 10]
+            with pytest.raises(gauss_newton.NotConverged) as failed:
+                gauss_newton.iterate(
+                    p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.0, p.held, passes=14, patient=patient
+                )
+            hopeless = gauss_newton.HOPELESS[0] + 1 if patient and not found else passes
+            assert 14 - len(steps) == hopeless
+            assert (failed.value.nearly is not None) == found
+
+
+def test_a_fit_is_found_where_its_steps_are_small_enough(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With disturbing forces, whose deviations are no promise, sooner than without, unless that is asked for."""
+    stage = calm(straight)
+    p, true = stage.prepared, gauss_newton.newton_step
+    steps: list[float] = []
+
+    def scripted(*args: Any) -> Any:
+        covariance, move, _, cost = true(*args)
+        return covariance, move, steps.pop(0), cost
+
+    monkeypatch.setattr(gauss_newton, "newton_step", scripted)
+    for disturbed, enough, spent in (
+        (0.0, None, 5),
+        (0.1, None, 4),
+        (0.0, gauss_newton.ENOUGH, 4),
+        (0.1, gauss_newton.NEARLY, 3),
+    ):
+        steps[:] = [5.0, 1.5, 0.5, 0.15, 1e-4, 1e-4]
+        gauss_newton.iterate(
+            p.c, p.records, stage.fit.points, stage.fit.X, p.starts, disturbed, p.held, passes=6, enough=enough
+        )
+        assert 6 - len(steps) == spent
+
+
+@pytest.mark.parametrize(("falling", "misfit", "found"), [(5.0, 1.1, True), (0.0, 1.1, False), (5.0, 2.0, False)])
+def test_a_fit_that_goes_downhill_goes_on(
+    falling: float, misfit: float, found: bool, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A parameter that must become many times as large takes many passes, whose steps grow first: near the logs, as
+    long as costs fall, that is no swing about an answer."""
+    stage = calm(straight)
+    p, true = stage.prepared, gauss_newton.newton_step
+    steps, costs = list[float](), list[float]()
+
+    def scripted(*args: Any) -> Any:
+        covariance, move, *_ = true(*args)
+        ahead = [np.full_like(m, 1e-6) for m in move]
+        costs.append(misfit * stage.noise - falling * len(costs))
+        return covariance, ahead, steps.pop(0), costs[-1]
+
+    monkeypatch.setattr(gauss_newton, "newton_step", scripted)
+    steps[:] = [500.0, 90.0, 3.0, 0.9, 1.0, 1.4, 1.8, 2.1, 1.9, 1.2, 0.3, 0.1, 0.01, 1e-4]
+    given = p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.0, p.held
+    if found:
+        told = steps.copy()
+        fit = gauss_newton.iterate(*given, passes=14, patient=False)
+        assert fit.cost == costs[-1]
+        assert len(costs) >= 13
+        # Where passes run out on the way, what was passed is not as good as found.
+        steps[:], costs[:] = told, []
+        with pytest.raises(gauss_newton.NotConverged) as failed:
+            gauss_newton.iterate(*given, passes=8, patient=False)
+        assert (failed.value.step, failed.value.nearly) == (2.1, None)
+    else:
+        with pytest.raises(gauss_newton.NotConverged) as failed:
+            gauss_newton.iterate(*given, passes=14, patient=False)
+        assert failed.value.step == 0.9
+        assert len(costs) < 9
+
+
+@pytest.mark.parametrize(
+    ("misfit", "patient", "spent"), [(1.1, False, 4), (2.0, False, 3), (2.0, True, 4)], ids=["near", "far", "patient"]
+)
+def test_far_from_the_logs_forces_need_no_more_than_nearly(
+    misfit: float, patient: bool, spent: int, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Near them costs are compared that hardly differ."""
+    stage = calm(straight)
+    p, true = stage.prepared, gauss_newton.newton_step
+    steps: list[float] = [5.0, 1.5, 0.5, 0.15, 1e-4]
+
+    def scripted(*args: Any) -> Any:
+        covariance, move, *_ = true(*args)
+        return covariance, move, steps.pop(0), misfit * stage.noise
+
+    monkeypatch.setattr(gauss_newton, "newton_step", scripted)
+    given = p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.1, p.held
+    gauss_newton.iterate(*given, passes=5, patient=patient)
+    assert 5 - len(steps) == spent
+
+
+def test_small_forces_are_fitted_as_closely_as_none(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What they leave out is compared with small gains; of large ones nobody asks so much."""
+    stage, asked = calm(straight), dict[float, float]()
+
+    def noted(*given: Any) -> gauss_newton.Fit:
+        asked[given[5]] = given[9]
+        return stage.fit
+
+    monkeypatch.setattr(smoothing, "iterate", noted)
+    for disturbed in (0.0, stages.SMALL, 1.0):
+        stages.refitted(straight.machine, stage, disturbed)
+    assert asked == {0.0: gauss_newton.ENOUGH, stages.SMALL: gauss_newton.ENOUGH, 1.0: gauss_newton.NEARLY}
+
+
+def test_smaller_forces_side_by_side_are_the_smallest_that_do(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is done at once, the first of them counts with which there is a fit."""
+    stage, asked = calm(straight), list[float]()
+    loose = replace(stage, fit=replace(stage.fit, disturbed=1.0))
+
+    def at_once(calls: Sequence[Callable[[], Any]]) -> Generator[Any, None, None]:
+        return (x for x in [call() for call in calls])
+
+    def resumable(prepared: Any, of: stages.Stage, disturbed: float, most: float = np.inf) -> gauss_newton.Fit | None:
+        asked.append(disturbed)
+        return None if disturbed < least else replace(stage.fit, disturbed=disturbed)
+
+    monkeypatch.setattr(stages, "_resumable", resumable)
+    wanted = [x for x in stages.LESS if x >= stages.SMALL]
+    for k, least in enumerate(wanted):
+        for together, tried in ((in_turn, wanted[: k + 1]), (at_once, wanted)):
+            asked.clear()
+            less = stages._with_less(loose, together)
+            assert less is not None
+            assert (less.fit.disturbed, asked) == (least, tried)
+    least = np.inf
+    assert stages._with_less(loose, at_once) is None
+
+
+def test_a_stage_is_freed_once(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it was freed beside another fit, that is what it is without its forces."""
+    stage, asked = calm(straight), list[float]()
+    true = stages.resume
+
+    def resume(prepared: Any, of: stages.Stage, disturbed: float, *given: Any) -> gauss_newton.Fit:
+        asked.append(disturbed)
+        return true(prepared, of, disturbed, *given)
+
+    loose = stages.refitted(straight.machine, stage, 1.0)
+    monkeypatch.setattr(stages, "resume", resume)
+    (plain,) = stages.freed([loose], in_turn)
+    assert plain is not None
+    sloped = placing.extended(straight.machine, slope(straight))
+    asked.clear()
+    other, known = stages.refitted_and_freed(sloped, loose, in_turn)
+    assert asked == [1.0, 0.0]
+    assert other is not None
+    assert [e.name for e in other.model.effects] == ["ground_slope@machine"]
+    (again,) = stages.freed([known], in_turn)
+    assert asked == [1.0, 0.0]
+    assert again is not None
+    assert (again.bare, again.fit.cost) == ((), plain.fit.cost)
+    np.testing.assert_array_equal(again.fit.X, plain.fit.X)
+    # Nor is it asked twice for what can't be had; with other forces it is another fit.
+    monkeypatch.setattr(stages, "FAR", 1e-3)
+    _, known = stages.refitted_and_freed(sloped, loose, in_turn)
+    asked.clear()
+    assert list(stages.freed([known], in_turn)) == [None]
+    assert asked == []
+    less = stages._with_less(known, in_turn)
+    assert less is not None
+    assert less.bare == ()
+    # Nothing is freed that has no forces.
+    asked.clear()
+    _, same = stages.refitted_and_freed(sloped, stage, in_turn)
+    assert (asked, same) == ([0.0], stage)
+
+
+def test_a_fit_that_is_not_worth_more_passes_is_given_up(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As soon as its cost doesn't fall in two passes, from the fourth on; not while it falls, nor where it costs no
+    more."""
+    stage = calm(straight)
+    p, true = stage.prepared, gauss_newton.newton_step
+    seen: list[Any] = []
+
+    def scripted(c: Any, records: Any, linear: Any, *asked: Any) -> Any:
+        covariance, move, *_ = true(c, records, linear, *asked)
+        if not any(linear is x for x in seen):  # one pass is computed twice
+            seen.append(linear)
+        return covariance, move, 50.0, costs[min(len(seen), len(costs)) - 1]
+
+    monkeypatch.setattr(gauss_newton, "newton_step", scripted)
+    monkeypatch.setattr(gauss_newton, "LOST", (8, np.inf, 1.0))
+    for costs, spent in (
+        ([900.0, 900.0], 4),
+        ([900.0, 800.0, 700.0, 600.0, 550.0, 549.0, 548.0], 7),
+        ([900.0, 400.0, 300.0, 450.0], 8),
+        ([900.0, 400.0, 300.0, 600.0], 4),
+    ):
+        seen.clear()
+        with pytest.raises(gauss_newton.NotConverged) as failed:
+            gauss_newton.iterate(
+                p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.0, p.held, passes=8, worth=500.0
+            )
+        assert len(seen) == spent
+        assert failed.value.fit is not None
+        assert failed.value.fit.cost == costs[-1]
+
+
+@pytest.mark.parametrize(
+    ("steps", "spent"),
+    [
+        ([400.0, 300.0, 200.0, 100.0, 190.0], 5),  # hardly less than two passes before
+        ([400.0, 300.0, 200.0, 100.0, 170.0, 91.0], 6),
+        ([400.0, 300.0, 200.0, 100.0, 170.0, 80.0, 29.0, 29.0], 8),  # large no more
+        ([400.0, 300.0, 200.0, 100.0, 170.0, 80.0, 140.0, 70.0], 8),
+    ],
+)
+def test_steps_that_stay_large_end_a_fit(
+    steps: list[float], spent: int, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = calm(straight)
+    p, true = stage.prepared, gauss_newton.newton_step
+    seen: list[Any] = []
+
+    def scripted(c: Any, records: Any, linear: Any, *asked: Any) -> Any:
+        covariance, move, *_ = true(c, records, linear, *asked)
+        if not any(linear is x for x in seen):
+            seen.append(linear)
+        return covariance, move, steps[min(len(seen), len(steps)) - 1], 500.0
+
+    monkeypatch.setattr(gauss_newton, "newton_step", scripted)
+    monkeypatch.setattr(gauss_newton, "HOPELESS", (8, 10.0))
+    with pytest.raises(gauss_newton.NotConverged):
+        gauss_newton.iterate(p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.0, p.held, passes=8)
+    assert len(seen) == spent
+
+
+def test_what_takes_too_little_of_a_beginning_is_not_fitted_to_the_whole(
+    straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exact dynamics follow the log without its cause and leave much: of what begins anew only what takes a good part
+    of that from the first quarter, beside what the model without it comes to there, is fitted to all of it."""
+    stuck = prediction.build(
+        placing.extended(straight.machine, placing.parse("torque_deadband@rear_roll=150", straight.machine, 40.0))
+    )
+    one = log.from_table(sensors.measure(stuck, simulate(stuck, gentle(straight, 40.0).u), seed=3), straight.machine)
+    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    assert stage.exact
+    assert stage.excess > 1000
+    lengths, _ = fits(monkeypatch)
+    monkeypatch.setattr(screening, "SHORTEST", 5.0)
+    worth, whole = stage.fit.cost - 0.3 * stage.excess, len(one)
+    for effect, found in (("torque_deadband@rear_roll=100", True), ("torque_offset_drift@front_roll=0.1", False)):
+        lengths.clear()
+        machine = placing.extended(straight.machine, placing.parse(effect, straight.machine, 40.0))
+        (made,) = screening.begun([machine], stage, 0.0, in_turn, worth)
+        assert (made is not None) == found
+        assert lengths[:2] == [whole // 4] * 2  # without it, and with it
+        assert (max(lengths) == whole) == found
+
+
+def test_what_is_held_is_where_it_is_held_a_pass_later(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However far it went until the log was known not to show it, and however much it makes sense above zero only; how
+    far it is from there is no step, but nothing is found, not even nearly, before it is there."""
+    stage = calm(straight)
+    p, true, scale = stage.prepared, gauss_newton.newton_step, stage.model.scale
+    nominal = stage.model.nominal
+    sure = stage.fit.std / np.maximum(np.abs(stage.fit.X), scale)
+    worst = int(np.argmax(np.where(p.held, 0.0, sure)))
+    seen: list[tuple[float, float]] = []
+    steps: list[float] = []
+
+    def blind(c: Any, records: Any, linear: Any, points: Any, X: np.ndarray, prior: np.ndarray, damping: float) -> Any:
+        covariance, move, step, cost = true(c, records, linear, points, X, prior, damping)
+        if prior[worst] < gauss_newton.HELD**-2:
+            covariance[worst, worst] = 1e6
+        seen.append((X[worst], step))
+        return covariance, move, steps.pop(0) if steps else step, cost
+
+    monkeypatch.setattr(gauss_newton, "newton_step", blind)
+    monkeypatch.setattr(gauss_newton, "LARGEST_STEP", 0.01)
+    monkeypatch.setitem(vars(p.c.model), "positive", np.arange(len(scale)) == worst)
+    X = stage.fit.X + 30 * scale * (np.arange(len(scale)) == worst)
+    for told, disturbed in (([], 0.0), ([50.0, 50.0, 50.0, 50.0, 0.005], 0.0), ([50.0, 50.0, 50.0, 50.0, 0.1], 0.1)):
+        seen.clear()
+        steps[:] = [*told, *[50.0 for _ in told]]
+        with pytest.raises(gauss_newton.NotConverged) as failed:  # the others only creep
+            gauss_newton.iterate(p.c, p.records, stage.fit.points, X, p.starts, disturbed, p.held, 0.0, passes=7)
+        assert abs(seen[gauss_newton.SETTLED][0] - nominal[worst]) > 20 * scale[worst]
+        # The pass in which it is held is computed twice.
+        assert seen[gauss_newton.SETTLED + 2][0] == pytest.approx(nominal[worst], abs=gauss_newton.AWAY * scale[worst])
+        assert max(step for _, step in seen[gauss_newton.SETTLED + 1 :]) < 1e4
+        assert failed.value.fit is not None
+        assert failed.value.fit.unseen[worst]
+        assert failed.value.nearly is None or not told
+
+
+@pytest.mark.parametrize("effect", ["torque_deadband@front_roll=20", "torque_deadband@front_roll=0.001"])
+def test_what_makes_sense_above_zero_only_ends_there(straight: Model, effect: str) -> None:
+    """A log that would like an amount best below zero has it near zero, all others where they are without it."""
+    stage = calm(straight)
+    machine = placing.extended(straight.machine, placing.parse(effect, straight.machine, 10.0))
+    p, without = stages.prepared_for(machine, stage), stage.fit
+    fit = stages.iterated(p, p.starts, p.c.model.nominal, 0.0, patient=True)
+    (amount,) = (k for k, name in enumerate(p.c.model.base.names) if name not in straight.base.names)
+    assert 0 < fit.X[amount] < gauss_newton.CONVERGED * fit.std[amount]
+    assert abs(fit.cost - without.cost) < 0.05
+    assert (np.abs(np.delete(fit.X, amount) - without.X) < 0.05 * without.std).all()
+    assert selection._vanished("torque_deadband@front_roll", stages.staged(machine, p, fit))
+
+
+def test_an_amount_that_began_near_zero_leaves_it(straight: Model) -> None:
+    """Where the log wants it: what is at its end is asked anew in every pass."""
+    effect = placing.parse("torque_deadband@front_roll=60", straight.machine, 10.0)
+    hidden = prediction.build(placing.extended(straight.machine, effect))
+    one = log.from_table(sensors.measure(hidden, gentle(hidden, 12.0), seed=3), straight.machine)
+    effect = placing.parse("torque_deadband@front_roll=0.001", straight.machine, 10.0)
+    stage = stages.fitted(placing.extended(straight.machine, effect), [one], straight.machine.filter)
+    fit, amount = stage.fit, hidden.base.names.index("torque_deadband@front_roll")
+    assert abs(fit.X[amount] - 60) < 3 * fit.std[amount] < 30
+    assert not selection._vanished("torque_deadband@front_roll", stage)
+
+
+@pytest.mark.parametrize("alike", [-0.9, 0.9])
+def test_steps_within_bounds_are_the_best_there_are(alike: float) -> None:
+    """Of two parameters that would both go below, one may go up beside the other; and one that would go up may go below
+    beside another: against all four ways of holding them."""
+    information = np.array([[1.0, alike, 0.1], [alike, 1.0, 0.0], [0.1, 0.0, 2.0]])
+    lowest = np.array([-0.1, -0.2, -np.inf])
+    for wanted in ((-10.0, -5.0, 1.0), (-1.0, 0.5, 3.0), (2.0, -3.0, 0.0)):
+        slope = -information @ wanted
+        best, least = np.array(wanted), np.inf
+        for held in itertools.product((False, True), (False, True), (False,)):
+            free = ~np.array(held)
+            step = np.where(free, 0.0, lowest)
+            rest = slope + information[:, ~free] @ step[~free]
+            step[free] = -np.linalg.solve(information[np.ix_(free, free)], rest[free])
+            cost = 2 * slope @ step + step @ information @ step
+            if (step >= lowest - 1e-12).all() and cost < least:
+                best, least = step, cost
+        found = gauss_newton._above(lowest, -np.linalg.solve(information, slope), information, slope)
+        np.testing.assert_allclose(found, best, atol=1e-9)
+    unknown = np.full(3, np.nan)
+    np.testing.assert_array_equal(gauss_newton._above(lowest, unknown, information, unknown), unknown)
+    without_root = np.eye(3) + 2 * (np.eye(3, k=1) + np.eye(3, k=-1))
+    np.testing.assert_array_equal(
+        gauss_newton._above(lowest, np.full(3, -1.0), without_root, slope), [-0.1, -0.2, -1.0]
+    )
+
+
+def test_a_step_that_was_cut_short_goes_further_when_it_is_told_again(
+    straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fit is found from a torque offset forty times its scale off, which without that is given up on the way."""
+    stage = calm(straight)
+    p, k = stage.prepared, stage.model.base.names.index("u10")
+    start = stage.fit.X - 40 * stage.model.scale * (np.arange(len(stage.fit.X)) == k)
+    asked = p.c, p.records, stage.fit.points, start, p.starts, 0.0, p.held, 0.0
+    monkeypatch.setattr(gauss_newton, "LARGEST_STEP", 0.1)
+    found = gauss_newton.iterate(*asked)
+    assert (np.abs(found.X - stage.fit.X) < stage.fit.std).all()
+    monkeypatch.setattr(gauss_newton, "FURTHER", 1.0)
+    with pytest.raises(gauss_newton.NotConverged):
+        gauss_newton.iterate(*asked)
+
+
+def test_the_whole_log_is_fitted_where_its_beginning_can_be(
+    sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cause that leaves a quarter of a log far off leaves all of it so. A log that is hardly longer is fitted at
+    once, and so is one that is followed without any cause: then none is waited for that costs more than it is worth."""
+    one = log.read_log(sloping, straight.machine)
+    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    lengths, forces = fits(monkeypatch)
+    right = placing.extended(straight.machine, slope(straight))
+    wrong = placing.extended(straight.machine, placing.parse("brake_drag@rear_roll=50", straight.machine, 40.0))
+    (good,) = screening.begun([right], stage, 0.0, in_turn)
+    assert good is not None
+    cost, whole = good.fit.cost, len(one)
+    for onset, worth, first, follows in (
+        (5.0, np.inf, whole // 4, True),
+        (15.0, np.inf, 1500, True),
+        (30.0, np.inf, whole, True),
+        (5.0, cost + 1, whole, True),
+        (5.0, cost - 1, whole, False),
+    ):
+        monkeypatch.setattr(screening, "SHORTEST", onset)
+        for machines, found in ((right, follows), (wrong, False)):
+            lengths.clear()
+            (made,) = screening.begun([machines], stage, 0.0, in_turn, worth)
+            assert (made is not None and made.near) == found
+            assert lengths[0] == first
+            assert (max(lengths) == whole) == (found or first == whole)
+    # What forces don't bring near isn't either, nor is the whole log fitted where they don't bring its beginning near.
+    for onset, first in ((5.0, whole // 4), (30.0, whole)):
+        monkeypatch.setattr(screening, "SHORTEST", onset)
+        for machines, found in ((right, True), (wrong, False)):
+            lengths.clear()
+            forces.clear()
+            (made,) = screening.begun([machines], stage, 1.0, in_turn)
+            assert (made is not None) == found
+            assert lengths[0] == first
+            assert (max(lengths) == whole) == (found or first == whole)
+            assert forces[0] == 1.0
+
+
+def test_beside_a_cause_only_that_is_fitted_whose_beginning_tells_that_it_comes_as_near(
+    sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What stays off is of no use any more; a rival that comes near as well is still found. Where what came near is no
+    cause all others are fitted."""
+    one = log.read_log(sloping, straight.machine)
+    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    lengths, _ = fits(monkeypatch)
+    monkeypatch.setattr(screening, "SHORTEST", 5.0)
+    monkeypatch.setattr(screening, "FAR", np.inf)
+    right = placing.extended(straight.machine, slope(straight))
+    wrong = placing.extended(straight.machine, placing.parse("torque_gain@front_roll=0.1", straight.machine, 40.0))
+    for machines, near, enough, tried in (
+        ([wrong], [False], True, True),
+        ([right, wrong], [True, False], True, False),
+        ([right, wrong], [True, False], False, True),
+        ([wrong, right], [False, True], True, True),
+        ([right, wrong, right], [True, False, True], True, False),
+    ):
+        lengths.clear()
+        found: list[bool] = []
+        whole = [0]
+        for made in screening.begun(machines, stage, 0.0, in_turn, np.inf, lambda k, x, so=enough: so and x.near):
+            found.append(made is not None and made.near)
+            whole.append(lengths.count(len(one)))
+        assert found == near
+        at = machines.index(wrong)
+        assert (whole[at + 1] > whole[at]) == tried
+    running = {x.pid for x in multiprocessing.active_children()}  # of other tests
+    ways = screening.begun([right, wrong, right], stage, 0.0, forked, np.inf, lambda k, x: x.near)
+    assert [x is not None for x in ways] == [True, False, True]
+    assert {x.pid for x in multiprocessing.active_children()} <= running
+    for felt in (True, False):
+        monkeypatch.setattr(selection, "_is_any", lambda name, x, felt=felt: felt and name == "b")
+        (made,) = screening.begun([right], stage, 0.0, in_turn)
+        assert made is not None
+        assert selection._settles(["a", "b"], 1, made) == felt
+        assert not selection._settles(["a", "b"], 0, made)
+        assert not selection._settles(["a", "b"], 1, replace(made, fit=replace(made.fit, disturbed=0.1)))
+
+
+@pytest.mark.parametrize(
+    ("forces", "asked", "coarse", "settled", "held"),
+    [
+        (0.0, 0.0, 1.0, True, True),
+        (0.1, 0.1, 1.0, True, True),
+        (0.1, 1.0, 1.0, True, True),
+        (1.0, 0.1, 1.0, True, False),  # smaller forces may show it
+        (0.1, 0.0, 1.0, True, False),
+        (1.0, 1.0, 10.0, True, False),  # and so may finer sensors
+        (0.0, 0.0, 1.0, False, False),
+    ],
+)
+def test_a_fit_goes_on_without_what_was_not_seen(
+    forces: float, asked: float, coarse: float, settled: bool, held: bool, straight: Model
+) -> None:
+    stage = calm(straight)
+    names, unseen = stage.model.base.names, stage.fit.unseen.copy()
+    unseen[names.index("u10")] = True
+    of = replace(stage, settled=settled, fit=replace(stage.fit, unseen=unseen, disturbed=forces))
+    of = replace(of, prepared=stages.noisy(of.prepared, coarse))
+    more = stages.noisy(stages.prepared_for(placing.extended(straight.machine, slope(straight)), stage), 1.0)
+    told = stages._untold(more, of, asked)
+    assert [n for n, yes in zip(more.c.model.base.names, told, strict=True) if yes] == (["u10"] if held else [])
+
+
+def test_what_was_not_seen_is_judged_again(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the log shows after all is let go: before a fit is found, however soon that is. What it doesn't show never
+    leaves the file's value."""
+    stage = calm(straight)
+    p, names = stage.prepared, stage.model.base.names
+    k = names.index("u10")
+    assert not stage.fit.unseen[k]
+    untold = np.arange(len(names)) == k
+    start = np.where(untold, stage.model.nominal, stage.fit.X)
+    true, passes = gauss_newton.linearise_fit, list[float]()
+
+    def noted(c: Any, r: Any, point: Any, first: Any, X: np.ndarray, *asked: Any) -> Any:
+        passes.append(float(X[k]))
+        return true(c, r, point, first, X, *asked)
+
+    monkeypatch.setattr(gauss_newton, "linearise_fit", noted)
+    asked = p.c, p.records, stage.fit.points, start, p.starts, 0.0, p.held, gauss_newton.RESUMED
+    found = gauss_newton.iterate(*asked, untold=untold)
+    assert not found.unseen[k]
+    assert abs(found.X[k] - stage.fit.X[k]) < 0.1 * stage.fit.std[k]
+    passes.clear()
+    monkeypatch.setattr(
+        gauss_newton, "UNSEEN", 0.5 * float(stage.fit.std[k] / max(abs(start[k]), stage.model.scale[k]))
+    )
+    held = gauss_newton.iterate(*asked, untold=untold)
+    assert held.unseen[k]
+    assert passes == pytest.approx([stage.model.nominal[k]] * len(passes), abs=gauss_newton.AWAY * stage.model.scale[k])
+
+
+@pytest.mark.parametrize(
+    ("disturbed", "cost", "found", "expected"),
+    [
+        (0.0, 9.9, False, True),
+        (0.0, 10.1, False, False),
+        (0.0, 10.1, True, True),
+        (1.0, 2.19, False, True),
+        (1.0, 2.21, False, False),
+        (1.0, 2.21, True, False),
+        (1.0, None, False, True),
+    ],
+)
+def test_what_the_beginning_of_a_log_may_cost(
+    disturbed: float, cost: float | None, found: bool, expected: bool, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By exact dynamics ten times its noise, unless a fit is found; with forces no more beside its noise than the whole
+    log may: three tenths of what is four times as much. What can't be integrated may set out."""
+    stage = calm(straight)
+    quarter = len(stage.prepared.logs[0]) // 4
+    monkeypatch.setattr(screening, "SHORTEST", quarter / 100)
+    asked = iterated(stage, monkeypatch, lambda samples: cost, found)
+    onset = screening._onset(stage, disturbed, np.inf)
+    assert onset is not None
+    # Exact dynamics were asked first where they are far off, and both what they do after a few passes.
+    assert (onset.samples, asked[0], asked[-1]) == ((quarter,), quarter, quarter)
+    assert (len(asked) == 1) == (disturbed > 0)
+    assert screening._sets_out(stage.prepared, replace(onset, without=np.inf), disturbed) == expected
+
+
+@pytest.mark.parametrize(("cost", "before", "passes"), [(9.0, 9.9, 1), (9.0, 10.1, 2), (2.0, 1.0, 2)])
+def test_what_a_few_passes_show_to_do_nothing_goes_no_further(
+    cost: float, before: float, passes: int, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That is, nine tenths and more of what the model leaves without it, and more than there may be; what is less than
+    that is given all passes."""
+    stage = calm(straight)
+    quarter = len(stage.prepared.logs[0]) // 4
+    monkeypatch.setattr(screening, "SHORTEST", quarter / 100)
+    told = [before]
+    asked = iterated(stage, monkeypatch, lambda samples: told[-1], False)
+    onset = screening._onset(stage, 1.0, np.inf)
+    assert onset is not None
+    assert onset.without == pytest.approx(before * quarter)
+    asked.clear()
+    told.append(cost)
+    assert screening._sets_out(stage.prepared, onset, 1.0) == (cost < 2.2)
+    assert asked == [quarter] * passes
+
+
+def test_a_beginning_tells_where_the_model_as_it_is_stays_far_off(
+    straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The shortest such one: what stays off it too is no cause. A quarter, where none is up to a half."""
+    stage = calm(straight)
+    n = len(stage.prepared.logs[0])
+    monkeypatch.setattr(screening, "SHORTEST", n / 400)
+    for late, share in ((0.0, 0.25), (0.3, 0.33), (0.45, 0.5), (0.9, 0.25)):
+        with monkeypatch.context() as patch:
+            iterated(stage, patch, lambda samples, late=late: 20.0 if samples > late * n else 5.0, False)
+            onset = screening._onset(stage, 0.0, np.inf)
+        assert onset is not None
+        assert onset.samples == (int(share * n),)
+
+
+def iterated(
+    stage: stages.Stage, monkeypatch: pytest.MonkeyPatch, cost: Callable[[int], float | None], found: bool
+) -> list[int]:
+    """In place of fits: what each costs, times its noise, by how many samples it has, and whether it is found. How many
+    samples were asked for, one after the other."""
+    asked = list[int]()
+    monkeypatch.setattr(stages.Prepared, "readings", property(lambda p: float(len(p.records[0].used))))
+
+    def fit_of(prepared: stages.Prepared, *given: Any, **more: Any) -> gauss_newton.Fit:
+        asked.append(len(prepared.records[0].used))
+        told = cost(asked[-1])
+        fit = None if told is None else replace(stage.fit, cost=told * prepared.readings)
+        if found and fit is not None:
+            return fit
+        raise gauss_newton.NotConverged("no fit", fit, 50.0)
+
+    monkeypatch.setattr(screening, "iterated", fit_of)
+    return asked
+
+
+def test_smaller_forces_are_tried_where_the_model_is_near(
+    sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They leave more. Where large ones leave it far off, the file's parameters show where to look."""
+    one = log.read_log(sloping, straight.machine)
+    far = stages.fitted(straight.machine, [one], straight.machine.filter)
+    assert (far.prepared.coarse, far.settled) == (10.0, False)
+    far = replace(far, loose=None)
+    for name in ("_lessened", "freed"):
+        true = getattr(stages, name)
+        monkeypatch.setattr(stages, name, lambda *asked, name=name, true=true: (tried.append(name), true(*asked))[1])
+    # So far off every fit is near, then none, then none is worth anything.
+    for strong, most, expected, settled in (
+        (1e3, 1e3, ["_lessened", "freed"], True),
+        (0.1, 1e3, [], True),
+        (0.1, 0.5, [], False),
+    ):
+        tried = list[str]()
+        monkeypatch.setattr(smoothing, "STRONG", strong)
+        monkeypatch.setattr(stages, "FAR", most)
+        told = stages.forced(far, in_turn)
+        assert (tried, told.settled) == (expected, settled)
+    np.testing.assert_allclose(told.fit.X, straight.nominal, rtol=1e-3)
+
+
+def test_what_begins_anew_beside_exact_dynamics_must_take_a_good_part_of_the_misfit(
+    straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where none could be fitted, or forces had to help, anything that lets the model follow the log will do."""
+    stage, asked = calm(straight), list[float]()
+
+    def begin(machines: Any, of: Any, disturbed: float, together: Any, worth: float, enough: Any) -> list[None]:
+        asked.append(worth)
+        return [None for _ in machines]
+
+    monkeypatch.setattr("excite.diagnosis.selection.begun", begin)
+    far = replace(stage, fit=replace(stage.fit, cost=2 * stage.noise))
+    for of in (far, replace(far, settled=False), replace(far, fit=replace(far.fit, disturbed=0.1))):
+        assert selection.unlikely(of, of, (), in_turn) == (of, [])
+    assert asked == [pytest.approx(2 * stage.noise - 0.3 * 0.98 * stage.noise), np.inf, np.inf]
+
+
+def test_a_fit_that_fails_stands_where_it_was_as_good_as_found(
+    straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise where it was last. Steps that swing between what costs alike end a fit under disturbing forces as well:
+    none by exact dynamics, none whose costs rise or still fall."""
+    stage = calm(straight)
+    p, true = stage.prepared, gauss_newton.newton_step
+    seen: list[np.ndarray] = []
+    far = [500.0, 90.0, 80.0]
+
+    def failed(sizes: list[float], costs: list[float], disturbed: float) -> gauss_newton.NotConverged:
+        steps = iter(zip(sizes, costs, strict=True))
+        seen.clear()
+
+        def scripted(*args: Any) -> Any:
+            covariance, move, *_ = true(*args)
+            seen.append(args[4])
+            return covariance, move, *next(steps)
+
+        monkeypatch.setattr(gauss_newton, "newton_step", scripted)
+        points, X = stage.fit.points, stage.fit.X * 1.01
+        with pytest.raises(gauss_newton.NotConverged) as raised:
+            gauss_newton.iterate(p.c, p.records, points, X, p.starts, disturbed, p.held, passes=10, patient=False)
+        return raised.value
+
+    end = failed([*far, 4.0, 0.6, 0.8, 5.0, 4.0, 6.0, 20.0], [1000.0] * 10, 0.0)
+    assert end.nearly is not None
+    assert (end.step, end.nearly.X.tolist()) == (0.6, seen[4].tolist())
+    for costs, disturbed, swung in (
+        ([1000.0, 1010.0] * 5, 0.1, True),
+        ([1000.0, 1010.0] * 5, 0.0, False),
+        ([1000.0 * 2**k for k in range(10)], 0.1, False),
+        ([1000.0 / 1.2**k for k in range(10)], 0.1, False),
+    ):
+        end = failed([*far, *[5.0] * 7], costs, disturbed)
+        assert (end.nearly, end.step) == (None, 5.0)
+        assert end.fit is not None
+        assert end.fit.X.tolist() == seen[-1].tolist()
+        assert (end.swinging is end.fit) == swung
+
+
+def test_a_fit_that_came_near_the_log_is_gone_on_with(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By exact dynamics: with disturbing forces every fit comes near, unless they are none larger than those with which
+    a stage didn't. Far from the log it is given up, behind what was found already as well, and where a stage was near
+    before."""
+    stage = calm(straight)
+    true, steps, times = gauss_newton.newton_step, list[float](), [1.0]
+
+    def scripted(*args: Any) -> Any:
+        covariance, move, _, cost = true(*args)
+        return covariance, move, steps.pop(0), times[0] * cost
+
+    monkeypatch.setattr(gauss_newton, "newton_step", scripted)
+    lost = [500.0, 90.0, 80.0, 40.0, *[30.0] * 4]
+    off = replace(stage, fit=replace(stage.fit, cost=2 * stage.noise))
+    loose = replace(off, fit=replace(off.fit, disturbed=0.1))
+    for of, disturbed, far, most, found in (
+        (off, 0.0, 1.0, np.inf, True),
+        (off, 0.0, 2.0, np.inf, False),
+        (off, 0.1, 1.0, np.inf, False),
+        (loose, 0.1, 1.0, np.inf, True),
+        (loose, 0.1, 2.0, np.inf, False),
+        (loose, 0.1, 1.0, stage.fit.cost / 2, False),
+        (loose, 0.2, 1.0, np.inf, False),
+        (replace(loose, fit=replace(loose.fit, cost=stage.noise)), 0.1, 1.0, np.inf, False),
+        (off, 0.0, 1.0, stage.fit.cost / 2, False),
+        (stage, 0.0, 1.0, np.inf, False),
+    ):
+        steps[:], times[0] = [*lost, 1.0, 0.01, 1e-4, 1e-6], far
+        (tried,) = stages.refits([(stage.machine, of, disturbed)], in_turn, most)
+        assert (tried is not None) == found
+        if tried is None:
+            assert len(steps) >= 4
+        else:
+            assert tried.fit.cost == pytest.approx(stage.fit.cost, abs=20 if disturbed else 1)
+
+
+def test_who_gains_too_little_with_coarse_sensors_is_given_up(
+    straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the first candidate on; the right one isn't."""
+    stage = stages.fitted(straight.machine, [log.read_log(sloping, straight.machine)], straight.machine.filter)
+    true, bars = selection.refits, list[float]()
+
+    def noted(wishes: Any, together: Any, most: float) -> Any:
+        bars.append(most)
+        return true(wishes, together, most)
+
+    monkeypatch.setattr(selection, "refits", noted)
+    found = selection.sharp(stage, in_turn)
+    assert found is not None
+    assert [x.name for x in found[1]] == ["ground_slope@machine"]
+    assert bars[0] == stage.fit.cost - selection.BEHIND * selection.LEAST[1] * stage.excess
+    assert stage.prepared.coarse > 1
+
+
+def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where forces leave much a candidate is fitted as long as it comes to half of what it must gain, and where those
+    that were fitted first gained that, the others as long as they come to half of what these did."""
+    iterate = gauss_newton.iterate
+    bars: list[tuple[str, float]] = []
+
+    def noted(c: Any, *args: Any, **more: Any) -> gauss_newton.Fit:
+        if len(args) > 9 and c.model.effects:
+            bars.append((c.model.effects[0].name, args[9]))
+        return iterate(c, *args, **more)
+
+    monkeypatch.setattr(smoothing, "iterate", noted)
+    stage = stages.fitted(straight.machine, [log.read_log(sloping, straight.machine)], straight.machine.filter)
+    likely = selection.scored(stage, in_turn)
+    for pair, over in ((2, selection.OVER), (1, 1e3)):
+        monkeypatch.setattr(selection, "PAIR", pair)
+        monkeypatch.setattr(selection, "OVER", over)
+        bars.clear()
+        choice = selection.choose(stage, likely, (), in_turn, lambda share, what: None, 0.0)
+        assert choice is not None
+        assert choice.name == "ground_slope@machine"
+        assert not stage.exact
+        assert not stage.near
+        first = stage.fit.cost - selection.BEHIND * selection.MAIN * stage.excess
+        assert bars[0] == (choice.name, first)
+        bar = next(bar for name, bar in bars if name != choice.name)
+        assert bar == pytest.approx(first if pair > 1 else stage.fit.cost - selection.BEHIND * choice.gain)
+    texts = ("ground_slope=0.009", "roll_unbalance@rear_roll=500")
+    machines = [placing.extended(straight.machine, placing.parse(t, straight.machine, 40.0)) for t in texts]
+    for most, found in ((np.inf, [True, True]), (bar, [True, False])):
+        tried = stages.refits([(m, stage, stage.fit.disturbed) for m in machines], in_turn, most)
+        assert [x is not None for x in tried] == found
+
+
+def fits(monkeypatch: pytest.MonkeyPatch) -> tuple[list[int], list[float]]:
+    """Of every fit from now on: how many samples of the first log it is made to, and with which disturbing forces."""
+    iterate, lengths, forces = gauss_newton.iterate, list[int](), list[float]()
+
+    def noted(c: Any, records: Any, *asked: Any) -> gauss_newton.Fit:
+        lengths.append(len(records[0].used))
+        forces.append(asked[3])
+        return iterate(c, records, *asked)
+
+    monkeypatch.setattr(smoothing, "iterate", noted)
+    return lengths, forces

@@ -1,0 +1,200 @@
+"""Reports: the answer first and right, figures that carry units and survive a black-and-white printer, one file."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Excite
+from matplotlib.figure import Figure
+
+from excite.logs import profile as profiles
+from excite.model import Model
+from excite.reports import Picture, Table, figures, html, pages
+from excite.simulation import Motion
+
+RESULTS = Path(__file__).parents[2] / "results"
+VERSIONS = {"excite": "1", "numpy": "2"}
+
+
+@pytest.fixture
+def picture(tmp_path: Path) -> Path:
+    figure = Figure(figsize=(6, 3))
+    figure.subplots().plot([0, 1], [0, 1])
+    figures.save(figure, tmp_path / "design.png")
+    return tmp_path / "design.png"
+
+
+def test_answer_comes_first_then_figure_table_and_how(picture: Path) -> None:
+    text = html.report_page(
+        "Title",
+        "The answer is 42.",
+        [Picture(picture, "A line [m] over time [s].")],
+        [Table("Numbers.", ("name", "value"), (("a", "1"), ("b", "2")), marked=(1,))],
+        {"command": "excite design va12", "seed": "3"},
+        ["A remark."],
+    )
+    order = [
+        "The answer is 42.",
+        "A remark.",
+        "Figure 1. A line [m]",
+        "Table 1. Numbers.",
+        "<td>1</td>",
+        "excite design",
+    ]
+    places = [text.rindex(words) for words in order]
+    assert places == sorted(places)
+    assert re.findall(r'(?:src|href)="(?!data:)[^"]*"', text) == []
+    assert text.count('class="mark"') == 1
+    with pytest.raises(ValueError, match="row 0 has 1 cells, not 2"):
+        Table("t", ("a", "b"), (("1",),))
+
+
+def test_names_from_files_cannot_break_the_page() -> None:
+    text = html.report_page("<b>", "x < y & z", how={"logs": "<script>alert(1)</script>.csv"})
+    assert "<script" not in text
+    assert "x &lt; y &amp; z" in text
+
+
+def test_verify_answers_with_error_against_the_truth() -> None:
+    """Error of a parameter: bias and spread together; 5 = |(3, 4)|."""
+
+    def row(bias: float, spread: float, cover: float) -> dict[str, Any]:
+        percent = {"bias_percent": bias, "std_percent": spread, "predicted_std_percent": 1.0}
+        percent["rms_percent"] = float(np.hypot(bias, spread))
+        return {"unit": "kg", "true": 10.0, "mean": 10.1, "coverage95": cover, **percent}
+
+    rows = {"a": row(3, 4, 0.8), "b": row(0, 1, 1.0), "c": row(0.0, 2.0, 0.9)}
+    summary = {
+        "machine": "m",
+        "runs": 7,
+        "parameters": rows,
+        "biased": ["a"],
+        "failed": 0,
+        "versions": VERSIONS,
+    }
+    _, answer, remarks, (table,) = pages.KINDS["verify"](summary)
+    assert "7 simulated" in answer
+    assert "within 2 % of the truth" in answer
+    assert "worst a, 5 %" in answer
+    assert "held it in 90 % of cases" in answer
+    assert remarks == ["Biased, the intervals do not hold: a."]
+    assert table.marked == (0,)
+
+
+def test_design_answers_with_what_can_be_known() -> None:
+    summary = json.loads((RESULTS / "R60_accuracy" / "design" / "summary.json").read_text())
+    _, answer, _, tables = pages.KINDS["design"](summary)
+    assert "every parameter to 0.87 %" in answer
+    assert "every limit is kept" in answer
+    assert tables[0].rows[0][0] == "u20"
+    _, answer, _, tables = pages.KINDS["design"](summary | {"max_violation": 0.02, "violations": {"power": 0.02}})
+    assert "limits are exceeded by 2.00 %" in answer
+    assert tables[1].rows == (("power", "2.000"),)
+
+
+def test_compare_says_which_way() -> None:
+    summary = json.loads((RESULTS / "compare_R60" / "summary.json").read_text())
+    _, answer, _, (table,) = pages.KINDS["compare"](summary | {"ratio_equal_time": 6.8})
+    assert "6.8 times lower" in answer
+    assert table.rows[table.marked[0]][0] == "designed"
+    assert "3 times higher" in pages.KINDS["compare"](summary | {"ratio_equal_time": 1 / 3})[1]
+    assert "No usual drive" in pages.KINDS["compare"](summary | {"ratio_equal_time": None})[1]
+
+
+def test_identify_reports_what_was_found(
+    excite: Excite, straight: Model, straight_motion: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    profile, out = tmp_path / "profile.csv", tmp_path / "o"
+    profiles.profile_of(straight, straight_motion).to_csv(profile, index=False)
+    excite("simulate", "va12_straight", profile, "--noise", "off", "--out", tmp_path / "log.csv")
+    code, _, _ = excite("identify", "va12_straight", tmp_path / "log.csv", "--method", "ols", "--out", out)
+    assert code == 0
+    text = (out / "report.html").read_text()
+    summary = json.loads((out / "summary.json").read_text())
+    assert f"<code>excite identify va12_straight {tmp_path / 'log.csv'} --method ols --out {out}</code>" in text
+    for name, row in summary["parameters"].items():
+        cells = (name, summary["meanings"][name], re.escape(row["unit"]), f"{row['value']:.6g}")
+        assert re.search("".join(f"<td[^>]*>{cell}</td>" for cell in cells), text)
+    assert summary["meanings"]["u10"] == "torque offset, front roll"
+    assert text.count("data:image/png;base64,") == 1
+    assert f"for {tmp_path / 'log.csv'}. Each torque is predicted from the motion that the log shows" in text
+    code, _, _ = excite("identify", "va12_straight", tmp_path / "log.csv", "--method", "ols", "--out", out)
+    assert code == 0  # a folder with a report in it is ours and may be replaced
+
+
+def test_what_a_method_errs_by_comes_first(excite: Excite, tmp_path: Path) -> None:
+    """Least squares on the drive of lowest condition number: small deviations, a mass of a fifteenth."""
+    profile = Path(__file__).parents[2] / "results" / "S40" / "design" / "profile.csv"
+    excite("simulate", "va12_straight", profile, "--seed", 3, "--out", tmp_path / "log.csv")
+    for method, words in (
+        ("ols", "of them wrong by more than it says: on simulated logs"),
+        ("joint", "are found to"),
+    ):
+        out = tmp_path / method
+        code, _, _ = excite("identify", "va12_straight", tmp_path / "log.csv", "--method", method, "--out", out)
+        assert code == 0
+        assert words in " ".join((out / "report.html").read_text().split())
+    summary = json.loads((tmp_path / "ols" / "summary.json").read_text())
+    assert summary["parameters"]["M"]["bias"] == pytest.approx(-10_300, rel=0.05)
+    assert any("far from the machine file's values" in note for note in summary["notes"])
+
+
+def _figures(model: Model, motion: Motion) -> list[Figure]:
+    problem = model.machine.problems[str(model.machine.problem)]
+    sigma = dict(zip(model.base.names, np.linspace(0.1, 5, len(model.base.names)), strict=True))
+    return [figures.design_figure(model, problem, motion, "t"), figures.sigma_figure(sigma, "t")]
+
+
+def test_figures_have_units_and_line_styles_of_their_own(va12: Model, va12_motion: Motion) -> None:
+    """In black and white only the style tells curves apart; an axis without a unit tells nothing."""
+    checked = 0
+    for figure in _figures(va12, va12_motion):
+        for ax in figure.axes:
+            curves = [line for line in ax.lines if not str(line.get_label()).startswith("_")]
+            styles = [line._dash_pattern for line in curves]  # type: ignore[attr-defined]
+            if len(curves) > 1:
+                assert len({str(s) for s in styles}) == len(styles)
+                checked += 1
+            assert re.search(r"\[.+\]", ax.get_xlabel() + ax.get_ylabel()), ax.get_title()
+    assert checked >= 4
+
+
+def test_colours_differ_for_the_colour_blind() -> None:
+    """Seen through protanopia and deuteranopia (Vienot, Brettel and Mollon, 1999) the first four still differ."""
+    to_lms = np.array([[17.8824, 43.5161, 4.11935], [3.45565, 27.1554, 3.86714], [0.0299566, 0.184309, 1.46709]])
+    blind = {
+        "protan": np.array([[0, 2.02344, -2.52581], [0, 1, 0], [0, 0, 1]]),
+        "deutan": np.array([[1, 0, 0], [0.494207, 0, 1.24827], [0, 0, 1]]),
+    }
+    rgb = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in figures.COLOURS[:4]]) / 255.0
+    for matrix in blind.values():
+        seen = rgb**2.2 @ to_lms.T @ matrix.T @ np.linalg.inv(to_lms).T
+        seen = np.clip(seen, 0, 1) ** (1 / 2.2)
+        gaps = [np.linalg.norm(a - b) for k, a in enumerate(seen) for b in seen[k + 1 :]]
+        assert min(gaps) > 0.12
+
+
+def test_report_in_a_browser_fits_screen_and_paper(browser: Any, tmp_path: Path) -> None:
+    source = RESULTS / "R60_accuracy" / "verify"
+    summary = json.loads((source / "summary.json").read_text())
+    (tmp_path / "verify.png").write_bytes((source / "verify.png").read_bytes())
+    pages.write(tmp_path, "verify", summary)
+    for size in ((1000, 800), (390, 844)):
+        tab = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        said: list[str] = []
+        tab.on("console", lambda message, said=said: said.append(message.text))
+        tab.on("request", lambda r, said=said: said.append(r.url) if not r.url.startswith(("file:", "data:")) else None)
+        tab.goto((tmp_path / "report.html").as_uri())
+        assert tab.evaluate("document.documentElement.scrollWidth") <= size[0]
+        assert tab.evaluate("Array.from(document.images).every(i => i.complete && i.naturalWidth > 500)")
+        top = tab.locator(".answer").bounding_box()
+        assert top["y"] < 120
+        paper = tab.pdf(prefer_css_page_size=True)
+        assert 1 <= len(re.findall(rb"/Type\s*/Page\b", paper)) <= 3
+        assert said == []
+        tab.close()

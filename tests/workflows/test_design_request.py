@@ -1,0 +1,113 @@
+"""What is asked of a design on the command line, and what is said of the answer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Excite, designed
+
+from excite.errors import StoredError
+from excite.logs import profile as profiles
+from excite.model import Model, build
+from excite.model.machine import load_machine
+from excite.simulation import Motion, sensors
+from excite.smoothing import cramer_rao
+from excite.trajectories import saved_design
+from excite.workflows import Brief
+from excite.workflows.design_request import POOR, advice
+
+
+def test_advice_names_what_to_do() -> None:
+    assert advice(Brief(), "Kx1", POOR) is None
+    text = advice(Brief(), "Kx1", 3 * POOR)
+    assert text is not None
+    assert "cond(Phi) says nothing of accuracy here: Kx1 can't be found better than 15 %" in text
+    assert "170 %" in str(advice(Brief(), "Kx1", 171.0))
+    assert "--objective accuracy" in text
+    assert "--sigma-max" in text
+    for brief in (Brief("accuracy"), Brief("cond", sigma_max=20.0)):
+        said = advice(brief, "Kx1", 3 * POOR)
+        assert said is not None
+        assert "cond(Phi) says nothing" not in said
+
+
+def test_a_design_says_score_and_accuracy(excite: Excite, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    code, shown, err = excite(
+        "design", "va12_straight", "--duration", 12, "--starts", 1, "--seed", 3, "--out", out, "--json"
+    )
+    assert code == 0, err
+    summary = json.loads(shown)
+    found = saved_design.read_design(out)
+    spread = 100 * np.sqrt(np.diag(cramer_rao(found.model, found.motion))) / np.abs(found.model.nominal)
+    assert list(summary["sigma_percent"].values()) == pytest.approx(spread.tolist(), rel=1e-6)
+    assert summary["worst_percent"] == pytest.approx(spread.max(), rel=1e-6)
+    assert summary["median_percent"] == pytest.approx(np.median(spread), rel=1e-6)
+    assert summary["hides_poor_accuracy"] == (spread.max() > POOR)
+    assert (summary["advice"] is not None) == (spread.max() > POOR)
+
+
+def test_after_a_log_the_next_drive_is_for_the_estimated_machine(
+    excite: Excite, straight: Model, straight_motion: Motion, tmp_path: Path
+) -> None:
+    path, out = tmp_path / "log.csv", tmp_path / "d"
+    sensors.measure(straight, straight_motion, seed=5).to_csv(path, index=False)
+    code, shown, err = excite(
+        "design", "va12_straight", "--after", path, "--duration", 12, "--starts", 1, "--out", out, "--json"
+    )
+    assert code == 0, err
+    summary = json.loads(shown)
+    assert summary["after"] == [str(path)]
+    found = saved_design.read_design(out)
+    assert list(summary["nominal"].values()) == pytest.approx(found.model.nominal.tolist())
+    assert not np.array_equal(found.model.nominal, straight.nominal)
+    profile, _, _ = profiles.read_profile(out / "profile.csv", found.model)
+    assert np.abs(found.motion.nu[-1]).max() < 0.04  # at rest for the machine that the log told of
+    assert len(profile) == 1201
+    # both drives together: never worse than the one that was there
+    before = 100 * np.sqrt(np.diag(cramer_rao(straight, straight_motion))) / np.abs(straight.nominal)
+    assert summary["worst_percent"] < 1.1 * before.max()
+    code, _, err = excite("verify", out, "--runs", 1)
+    assert code == 2
+    assert "without --after" in err
+
+
+def test_what_sits_in_a_sensor_is_no_part_of_a_design_that_is_read_back(excite: Excite, tmp_path: Path) -> None:
+    """A machine file with a wheel of another radius, a design after a log: its summary tells the radius nothing."""
+    own, path, out = tmp_path / "own.toml", tmp_path / "log.csv", tmp_path / "d"
+    own.write_text(
+        'extends = "va12_straight"\n[[effect]]\nname = "measuring_wheel_radius"\nwhere = "measuring_wheel_left"\n'
+        'amount = { value = 0.001, source = "identified" }\n'
+    )
+    model = build(load_machine(own))
+    sensors.measure(model, designed("S40", model), seed=5).to_csv(path, index=False)
+    code, _, err = excite("design", own, "--after", path, "--duration", 12, "--starts", 1, "--out", out)
+    assert code == 0, err
+    assert "measuring_wheel_radius@measuring_wheel_left" in saved_design.read_design(out).model.base.names
+    text = json.loads((out / "summary.json").read_text())
+    (out / "summary.json").write_text(json.dumps(text | {"duration_s": None}))
+    with pytest.raises(StoredError, match="damaged, design again"):
+        saved_design.read_design(out)
+
+
+def test_sensors_of_unknown_noise_are_named(excite: Excite, tmp_path: Path) -> None:
+    path = tmp_path / "bench.toml"
+    number = 'source = "assumed"'
+    problem = (
+        f'extends = "emps"\n[problems.P]\n{number}\nduration_s = {{ value = 10, {number} }}\n'
+        f"knot_s = {{ value = 0.1, {number} }}\nlane_m = [1, 1]\nlane_points = []\n"
+    )
+    path.write_text(problem, encoding="utf-8")
+    code, _, err = excite("design", path, "--problem", "P", "--out", tmp_path / "d")
+    assert code == 2
+    assert "sensor q1: give noise or counts_per_turn" in err
+    assert not (tmp_path / "d").exists()
+
+
+def test_an_accuracy_must_be_positive(excite: Excite) -> None:
+    code, _, err = excite("design", "va12_straight", "--sigma-max", 0)
+    assert code == 2
+    assert "--sigma-max: must be > 0 %" in err

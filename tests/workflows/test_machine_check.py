@@ -1,0 +1,307 @@
+"""A machine file to start from, what is wrong or doubtful in one, and the machine from above."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+from conftest import Excite
+
+from excite.cli import machine_template
+from excite.errors import MachineError
+from excite.logs import log
+from excite.model import Model, build
+from excite.model.machine import Machine, load_machine, shipped_machines
+from excite.model.mechanics import tree
+from excite.reports import top_view
+from excite.simulation import Motion, sensors
+from excite.workflows import machine_check
+
+FRESH = machine_template.fresh("mine", Path("mine.toml"))
+
+
+def spoilt(tmp_path: Path, *changes: tuple[str, Any]) -> Path:
+    """The file to start from with some keys changed: "body.1.limit.torque.value" and what is written there."""
+    raw = tomllib.loads(FRESH)
+    for key, value in changes:
+        *way, last = key.split(".")
+        at: Any = raw
+        for step in way:
+            at = at[int(step)] if isinstance(at, list) else at[step]
+        if value is None:
+            del at[int(last) if isinstance(at, list) else last]
+        else:
+            at[int(last) if isinstance(at, list) else last] = value
+    path = tmp_path / "mine.toml"
+    path.write_text(tomli_w.dumps(raw), encoding="utf-8")
+    return path
+
+
+def assumed(value: float) -> dict[str, Any]:
+    return {"value": value, "source": "assumed"}
+
+
+# ---------------------------------------------------------------------------------------------------- to start from
+def test_the_file_to_start_from_is_beyond_doubt(tmp_path: Path) -> None:
+    found = machine_check.check(spoilt(tmp_path))
+    assert (found.faults, found.doubts) == ((), ())
+    assert found.model is not None
+    assert set(found.sigma_percent) == set(found.model.base.names)
+    assert 0 < max(found.sigma_percent.values()) < machine_check.HARDLY
+
+
+@pytest.mark.parametrize("name", ["", "2wd", "my machine", "va12", "../x", "röller"])
+def test_a_name_that_cannot_be_one_is_refused(name: str) -> None:
+    with pytest.raises(MachineError):
+        machine_template.fresh(name, Path("x.toml"))
+
+
+# ------------------------------------------------------------------------------------------------- wrong, doubtful
+WRONG = {
+    "negative inertia": ([("body.0.inertia.ZZ.value", -5)], "must be >= 0 (got -5)"),
+    "no spin inertia": (
+        [("body.1.inertia.ZZ.value", 0), ("scale.ZZ1", assumed(80))],
+        "theta1: neither mass nor inertia",
+    ),
+    "no such body": (
+        [("body.0.inertia.XX", assumed(100)), ("body.0.inertia.YY", assumed(100))],
+        "front_frame: inertia: principal moments 100, 100, 1800",
+    ),
+    "negative moment": (
+        [("body.0.inertia.XY", assumed(3000))],
+        "front_frame: inertia: has a negative principal moment",
+    ),
+    "weaker than friction": ([("body.1.limit.torque.value", 90)], "front_axle: limit.torque: 90 is not above"),
+    "too slow to move": ([("body.2.limit.torque_rate.value", 10)], "rear_frame: limit.torque_rate: in 30 s"),
+    "lane too small": ([("problems.T30.lane_m", [1.0, 1.0])], "problems.T30.lane_m: lane_points 2.4 m apart"),
+    "no torque measured": ([("sensor.5", None)], "sensor: none of kind torque on joint 1 (front_axle)"),
+    "rolls the wrong way": ([("body.1.alpha.value", "pi/2")], "front_axle: contact: must turn about y"),
+    "two wheels in one place": ([("sensor.4.lateral.value", 1.1)], "two measuring wheels apart"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_is_said(case: str, tmp_path: Path) -> None:
+    changes, says = WRONG[case]
+    found = machine_check.check(spoilt(tmp_path, *changes))
+    assert [line for line in found.faults if says in line], found.faults
+    assert found.sigma_percent == {}
+
+
+DOUBTFUL = {
+    "no traction": (
+        [("body.1.contact.Kx.value", -260), ("body.3.contact.Kx.value", -310)],
+        "contacts: with all slip that is allowed they push 85.5 N",
+    ),
+    "stiff as rock": ([("body.1.contact.Ky.value", -5e7)], "front_axle: contact.Ky: 5e+07 N per slip"),
+    "a speed never reached": (
+        [("body.1.friction.Fv.value", 2000)],
+        "front_axle: limit.rim_speed: 2 m/s is never reached",
+    ),
+    "degrees": ([("body.2.limit.position.value", 35)], "rear_frame: limit.position: 35 rad is beyond half a turn"),
+    "no limit": ([("body.2.limit.torque", None)], "rear_frame: limit: torque not given"),
+    "millimetres": ([("body.0.inertia.com.value", [200.0, 0.0, 0.0])], "front_frame: inertia.com: 200 m"),
+    "more than a disc": ([("body.1.inertia.ZZ.value", 900)], "more than a flat disc"),
+    "a scale in vain": ([("scale.MX0", assumed(5))], "scale.MX0: does nothing, the base parameter is called MX0R"),
+    "nearly zero": ([("body.0.inertia.com.value", [0.2, 0.001, 0.0]), ("scale.MY0", None)], "MY0: 2 kg m"),
+    "a measuring wheel in millimetres": (
+        [("sensor.3.radius.value", 330)],
+        "sensor wheel_left: radius: 330 m, usual are 0.02 to 2: in mm",
+    ),
+    "a measuring wheel like a pea": ([("sensor.3.radius.value", 0.01)], "sensor wheel_left: radius: 0.01 m, usual"),
+    "a measuring wheel far away": (
+        [("sensor.4.lateral.value", -1100)],
+        "sensor wheel_right: lateral: -1100 m, usual are 10 at most: in mm?",
+    ),
+    "a roll in millimetres": (
+        [("body.1.contact.radius.value", 550), ("body.1.limit.rim_speed.value", 2000)],
+        "front_axle: contact.radius: 550 m, usual are 5 at most: in mm?",
+    ),
+    "a width in millimetres": ([("body.3.contact.width.value", 2400)], "rear_axle: contact.width: 2400 m, usual"),
+    "slip in per cent": (
+        [("body.1.contact.slip_limit.value", 15)],
+        "front_axle: contact.slip_limit: 15, the linear law holds to about 0.15: in per cent?",
+    ),
+    "a rate in degrees": (
+        [("body.2.limit.rate.value", 20)],
+        "rear_frame: limit.rate: 20 rad/s, steered joints turn by less than 3.5: in deg/s?",
+    ),
+    "a drive in milliseconds": (
+        [("problems.T30.duration_s.value", 30000)],
+        "problems.T30.duration_s: 30000 s, usual are 3600 at most: in ms?",
+    ),
+    "samples in kilohertz": ([("sampling_hz.value", 1e5)], "sampling_hz: 100000 Hz, usual are 10000 at most"),
+    "a decimation that undoes the filter": (
+        [("filter.decimation", 50)],
+        "filter.decimation: one row in 50 at 100 Hz shows motion up to 1 Hz, below filter.cutoff_hz 3: at most 16",
+    ),
+    "a root that turns without inertia": ([("body.0.inertia.ZZ", None)], "front_frame: inertia.ZZ: 0 kg m2 with 2000"),
+    "a frame that turns without inertia": (
+        [("body.2.inertia.ZZ", None), ("scale.ZZ2", assumed(2000))],
+        "rear_frame: inertia.ZZ: 0 kg m2 with 2600 kg, a body that turns has one",
+    ),
+    "a slope in per cent": (
+        [("effect", [{"name": "ground_slope", "amount": assumed(3.0)}])],
+        "effect ground_slope@machine: 3 rad, usual are about 0.005: in another unit?",
+    ),
+    "no noise": ([("sensor.5.noise", None)], "sensor u_front: neither noise nor counts_per_turn"),
+}
+
+
+@pytest.mark.parametrize("case", DOUBTFUL)
+def test_what_is_doubtful_is_said(case: str, tmp_path: Path) -> None:
+    changes, says = DOUBTFUL[case]
+    model = build(load_machine(spoilt(tmp_path, *changes)))
+    lines = [line for rule in machine_check.DOUBTS for line in rule(model)]
+    assert [line for line in lines if says in line], lines
+    assert [line for rule in machine_check.FAULTS for line in rule(model)] == []
+
+
+def test_a_parameter_that_no_drive_shows_well_is_doubtful(tmp_path: Path) -> None:
+    """Friction of a hundredth of a newton metre beside noise of 30."""
+    found = machine_check.check(spoilt(tmp_path, ("body.1.friction.Fs.value", 0.01)))
+    assert [line for line in found.doubts if line.startswith("Fs1: random drives leave it uncertain")] == list(
+        found.doubts
+    )
+
+
+def test_everything_wrong_is_said_at_once(tmp_path: Path) -> None:
+    """Not only the first complaint, as the other commands do."""
+    path = spoilt(tmp_path, ("body.0.inertia.mass.value", -1), ("body.2.limit.torque.value", -3), ("colour", "red"))
+    found = machine_check.complaints(path)
+    assert len(found) == 3
+    for says in ("body[0].inertia.mass: must be > 0", "body[2].limit.torque: must be > 0", "colour: no such key"):
+        assert sum(says in line for line in found) == 1
+
+
+@pytest.mark.parametrize("name", shipped_machines())
+def test_nothing_is_wrong_with_what_ships(name: str) -> None:
+    model = build(load_machine(name))
+    assert [line for rule in machine_check.FAULTS for line in rule(model)] == []
+
+
+@pytest.mark.parametrize("name", shipped_machines())
+def test_nothing_is_doubtful_in_what_ships(name: str) -> None:
+    """But for the rig, whose published description has neither noise nor every limit."""
+    model = build(load_machine(name))
+    lines = [line for rule in machine_check.DOUBTS for line in rule(model)]
+    assert len(lines) == 3 * (name == "emps"), lines
+    assert all("not given" in line or "neither noise nor counts" in line for line in lines)
+
+
+def test_no_drive_is_tried_at_a_rate_that_no_logger_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slip of the keyboard must not take minutes."""
+    monkeypatch.setattr(machine_check, "_trial", lambda model: pytest.fail("drives are tried"))
+    found = machine_check.check(spoilt(tmp_path, ("sampling_hz.value", 1e6)))
+    assert found.faults == ()
+    assert [line for line in found.doubts if "no random drive is tried at such a rate" in line]
+
+
+def test_a_pendulum_on_the_plane_is_said_to_be_unseen() -> None:
+    lines = list(machine_check.unseen(build(load_machine("pendulum_loader"))))
+    assert lines[0] == ("pendulum: theta3 is held at zero, no drive reveals what belongs to it alone: Fv3, Fs3")
+    assert "XX4" in lines[1]
+    assert "YY4" in lines[1]
+
+
+# ----------------------------------------------------------------------------------------------------- from above
+def test_a_machine_held_on_a_line_is_said_to_be() -> None:
+    lines = list(machine_check.unseen(build(load_machine("va12_straight"))))
+    assert lines[0] == "y0, theta0: held at zero, the machine keeps to a line"
+
+
+def test_poses_are_where_the_table_puts_the_bodies() -> None:
+    """The tandem's yokes turned by hand; the robot's wheels at the corners of its wheelbase and track."""
+    poses = tree.poses(load_machine("tandem"), {"theta1": 0.3, "theta3": -0.2})
+    assert poses[2][1] == pytest.approx([1.7, 0, 0])
+    assert poses[1][0] @ [1, 0, 0] == pytest.approx([np.cos(0.3), np.sin(0.3), 0])
+    assert poses[3][0] @ [1, 0, 0] == pytest.approx([np.cos(0.2), -np.sin(0.2), 0])
+    robot = tree.poses(load_machine("skid_robot"), {})
+    assert robot[3][1] == pytest.approx([-0.249, 0.29153, 0])
+    assert robot[3][0][:, 2] == pytest.approx([0, 1, 0])
+
+
+def test_the_drawing_has_every_wheel_where_it_stands() -> None:
+    ax = top_view.top_view_figure(load_machine("single_drum")).axes[0]
+    boxes = {tuple(np.round(p.get_xy()[:4].mean(axis=0), 3)) for p in ax.patches}  # type: ignore[attr-defined]
+    assert {(0.0, 0.8), (0.0, -0.8), (2.95, 0.0), (0.0, 1.3), (0.0, -1.3)} <= boxes
+    words = {t.get_text() for t in ax.texts}
+    assert words == {"left wheel", "right wheel", "drum", "articulation"}
+    held = {t.get_text() for t in top_view.top_view_figure(load_machine("pendulum_loader")).axes[0].texts}
+    assert {"pendulum (held)", "articulation"} <= held
+
+
+def test_only_vertical_driven_joints_are_steered() -> None:
+    def names(machine: Machine) -> list[str]:
+        return [b.where for b in top_view.steered(machine)]
+
+    assert names(load_machine("tandem")) == ["front_steering", "rear_steering"]
+    assert names(load_machine("pendulum_loader")) == ["articulation"]
+    assert names(load_machine("skid_robot")) == []
+
+
+# ---------------------------------------------------------------------------------------------------- the commands
+def test_new_then_check(tmp_path: Path, excite: Excite) -> None:
+    path, out = tmp_path / "my_loader.toml", tmp_path / "out"
+    code, stdout, stderr = excite("machine", "new", "my_loader", "--out", path)
+    assert (code, stderr) == (0, "")
+    assert str(path) in stdout
+    assert load_machine(path).name == "my_loader"
+    code, stdout, _ = excite("machine", "check", path, "--out", out, "--json")
+    summary = json.loads(stdout)
+    assert code == 0
+    assert summary["usable"] is True
+    assert summary["parameters"]["MX0R"]["what"] == "regrouped first moment x, front frame"
+    assert summary["parameters"]["MX0R"]["stands_for"] == {"MX0": 1, "M2": -1.2, "M3": -1.2}
+    assert {p.name for p in out.iterdir()} == {"machine.png", "report.html", "summary.json"}
+    code, _, stderr = excite("machine", "new", "my_loader", "--out", path)
+    assert code == 2
+    assert "is there already" in stderr
+
+
+def test_a_faulty_file_ends_with_1_and_a_missing_one_with_2(tmp_path: Path, excite: Excite) -> None:
+    path = spoilt(tmp_path, ("body.1.limit.torque.value", 90))
+    code, stdout, _ = excite("machine", "check", path, "--out", tmp_path / "out")
+    assert code == 1
+    assert "wrong: front_axle: limit.torque: 90 is not above" in " ".join(stdout.split())
+    code, _, stderr = excite("machine", "check", tmp_path / "nowhere.toml", "--out", tmp_path / "no")
+    assert code == 2
+    assert "no such file" in stderr
+
+
+def test_a_logger_of_its_own(excite: Excite, straight: Model, straight_motion: Motion, tmp_path: Path) -> None:
+    """A shipped machine with other columns and units: the file is written, the columns are changed, the log is read."""
+    path = tmp_path / "own.toml"
+    code, _, err = excite("machine", "new", "own", "--like", "va12_straight", "--out", path)
+    assert code == 0, err
+    assert load_machine(path).sensors("full") == straight.machine.sensors("full")
+    table = sensors.measure(straight, straight_motion, seed=1)
+    odd = table.rename(columns={"t_s": "Time [ms]", "theta1_rad": "Front roll [deg]"})
+    odd["Time [ms]"] *= 1000
+    odd["Front roll [deg]"] = np.rad2deg(odd["Front roll [deg]"])
+    odd.to_csv(tmp_path / "odd.csv", index=False, sep=";", decimal=",")
+    code, shown, _ = excite("log", "check", tmp_path / "odd.csv", "--machine", "va12_straight", "--out", tmp_path / "a")
+    assert code == 1
+    assert "Front roll [deg]" in shown  # brackets are no markup
+    code, _, err = excite("identify", "va12_straight", tmp_path / "odd.csv", "--out", tmp_path / "b")
+    assert (code, "excite machine new NAME --like va12_straight" in err) == (2, True)
+    text = (
+        path.read_text(encoding="utf-8").replace('"t_s"', '"Time [ms]"').replace('time_unit = "s"', 'time_unit = "ms"')
+    )
+    path.write_text(text.replace('"theta1_rad"\nunit = "rad"', '"Front roll [deg]"\nunit = "deg"'), encoding="utf-8")
+    read = log.read_log(tmp_path / "odd.csv", load_machine(path))
+    assert read.values["theta1"] == pytest.approx(table["theta1_rad"].to_numpy(), abs=1e-9)
+    assert 'For a speed instead of an angle (unit = "rpm")' in text
+    assert "delete counts_per_turn and give its noise [rad/s]" in text
+    speed = text.replace(
+        '"theta1_rad"\nunit = "rad"\ncounts_per_turn = { value = 8192.0', '"rpm"\nunit = "rpm"\nnoise = { value = 0.01'
+    )
+    path.write_text(speed, encoding="utf-8")
+    assert load_machine(path).sensor[0].is_rate
+    code, _, err = excite("machine", "new", "other", "--like", "va13", "--out", tmp_path / "other.toml")
+    assert (code, "--like: va13 is unknown, allowed: double_loader" in err) == (2, True)
