@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
 import pty
@@ -213,3 +214,18 @@ def test_piped_output_has_no_control_characters(excite: Excite, tmp_path: Path) 
     code, stdout, stderr = excite("machines")
     assert code == 0
     assert "\x1b" not in stdout + stderr
+
+
+def test_theory_names_things_that_exist() -> None:
+    """Every dotted name and every file in docs/theory.md."""
+    text = (ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
+    names = re.findall(r"`(excite(?:\.\w+)+)`", text)
+    assert len(names) > 8
+    for name in names:
+        module, _, last = name.rpartition(".")
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError:
+            assert hasattr(importlib.import_module(module), last), name
+    for path in re.findall(r"`((?:tests|model|results)/[\w./]+)`", text):
+        assert (ROOT / path).exists(), path

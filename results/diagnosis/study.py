@@ -256,8 +256,7 @@ def told(s: dict[str, Any], planned: int, options: Sequence[str]) -> str:
 `{command}`
 makes this page, of program {programs} (`version` in study.py); [summary.json](summary.json) has every rate,
 [cases.csv](cases.csv) every case.{part} Nobody had looked at any of them while the diagnosis was written: their numbers
-begin where those end that it was mended by, which `--seen` runs instead, so that every round has others. What came of
-them and of the other rounds is in [docs/derivations.md](../../docs/derivations.md).
+begin where those end that it was mended by, which `--seen` runs instead, so that every round has others.
 
 A second roller (`tests/plant.py`) shares no code with the program: Lagrange's equations in ground coordinates by
 automatic differentiation, half-millisecond Runge-Kutta steps, a person with delay, slow hand and hydraulics at the
