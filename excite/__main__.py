@@ -25,12 +25,12 @@ from excite.errors import UsageError  # noqa: E402
 def main() -> None:
     """Runs a command: exit 0 done, 1 could not be done, 2 bad input or usage; one clear line on stderr."""
     signal.signal(signal.SIGTERM, _terminate)
-    with interrupt.heard() as said:
+    with interrupt.watch_interrupts() as said:
         try:
             try:
                 result = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
             finally:
-                interrupt.deaf()
+                interrupt.ignore_interrupts()
         except typer.TyperException as err:
             fail(" ".join(err.format_message().split()), 2)
         except (KeyboardInterrupt, typer.Abort):
@@ -57,24 +57,24 @@ def _terminate(*_: object) -> None:
 def _exit_code(err: Exception) -> int | None:
     """What an error means for the person who must act; None for a defect of ours, which shows its traceback."""
     from excite.errors import (
-        DriveError,
-        EngineError,
+        DesignFolderError,
         FolderError,
         InfeasibleError,
         LogError,
         MachineError,
-        NoEstimate,
+        NoEstimateError,
+        RowStoreError,
         ServeError,
         SimulationError,
-        StoredError,
-        StoreError,
+        UndrivableError,
+        WorkerError,
     )
 
-    if isinstance(err, UsageError | MachineError | LogError | FolderError | StoredError | DriveError):
+    if isinstance(err, UsageError | MachineError | LogError | FolderError | DesignFolderError | UndrivableError):
         return 2
     if isinstance(err, OSError) and err.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
         return 1
-    if isinstance(err, NoEstimate | InfeasibleError | SimulationError | ServeError | EngineError | StoreError):
+    if isinstance(err, NoEstimateError | InfeasibleError | SimulationError | ServeError | WorkerError | RowStoreError):
         return 1
     return None
 

@@ -43,23 +43,23 @@ class FolderError(InputError):
     """An output folder that can't be written."""
 
 
-class StoredError(InputError):
+class DesignFolderError(InputError):
     """A folder that holds no design, or a damaged one."""
 
 
-class DriveError(InputError):
+class UndrivableError(InputError):
     """A design that no person can be asked to follow."""
 
 
-class NoEstimate(FailedError):
+class NoEstimateError(FailedError):
     """A method found no estimate, or none that it stands by."""
 
 
-class NotIdentifiable(NoEstimate):
+class NotIdentifiableError(NoEstimateError):
     """The log says nothing of any parameter, or has fewer rows than parameters."""
 
 
-class NotConsistent(NoEstimate):
+class NotConsistentError(NoEstimateError):
     """No physically possible machine was found near an estimate."""
 
 
@@ -67,7 +67,7 @@ class SimulationError(FailedError):
     """A motion could not be integrated; the message says when and from which state."""
 
 
-class UnsettledError(FailedError):
+class CollocationError(FailedError):
     """The collocation equations of an interval have no solution that Newton's method finds."""
 
 
@@ -89,9 +89,9 @@ class ServeError(FailedError):
     """The driver's page can't be served."""
 
 
-class EngineError(FailedError):
+class WorkerError(FailedError):
     """The workers of a study can't be had any more."""
 
 
-class StoreError(FailedError):
+class RowStoreError(FailedError):
     """Rows of a study can't be kept now (a full disk, say); what was kept before is safe."""

@@ -20,7 +20,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class Heard:
+class InterruptFlag:
     """Whether somebody asked to stop."""
 
     def __init__(self) -> None:
@@ -28,9 +28,9 @@ class Heard:
 
 
 @contextmanager
-def heard() -> Iterator[Heard]:
+def watch_interrupts() -> Iterator[InterruptFlag]:
     """Notes Ctrl-C and a polite kill within, and leaves them to the handlers that were there (main thread only)."""
-    said = Heard()
+    said = InterruptFlag()
     if threading.current_thread() is not threading.main_thread():
         yield said
         return
@@ -50,15 +50,15 @@ def heard() -> Iterator[Heard]:
                 signal.signal(number, handler)
 
 
-def deaf() -> None:
+def ignore_interrupts() -> None:
     """From here on Ctrl-C is ignored: the program is at its end, and waits for its processes alone."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def whole(call: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+def call_interruptible(call: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
     """What a call returns, where nobody asked to stop meanwhile. Raises KeyboardInterrupt where somebody did."""
-    with heard() as said:
+    with watch_interrupts() as said:
         result = call(*args, **kwargs)
     if said.stop:
         raise KeyboardInterrupt

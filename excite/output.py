@@ -19,19 +19,27 @@ import numpy as np
 from excite.errors import FolderError
 
 SUMMARY = "summary.json"
-ASKED = ("objective", "duration_s", "method", "runs", "samples", "starts", "seed")  # what tells a result from another
-OURS = re.compile(
+REQUEST_KEYS = (
+    "objective",
+    "duration_s",
+    "method",
+    "runs",
+    "samples",
+    "starts",
+    "seed",
+)  # what tells a result from another
+OWN_NAMES = re.compile(
     r"summary\.json|machine\.(json|toml)|(profile|phases)\.csv|README\.md|[a-z0-9-]+\.(png|pdf|html|md)|design|verify|next"
     r"|drives|runs\.parquet|study\.json|machines"
 )
 
 
-def keep(place: Path, summary: Any) -> None:
+def write_summary(place: Path, summary: Any) -> None:
     """Writes a folder's summary."""
-    (place / SUMMARY).write_text(dump(summary), encoding="utf-8")
+    (place / SUMMARY).write_text(to_json(summary), encoding="utf-8")
 
 
-def claim(out: Path, inputs: Iterable[Path] = ()) -> None:
+def check_out_folder(out: Path, inputs: Iterable[Path] = ()) -> None:
     """Checks before the work that `out` can be written at its end. Raises FolderError.
 
     An empty folder may be replaced, and one of ours that holds nothing but our own files and none of the `inputs`;
@@ -46,16 +54,16 @@ def claim(out: Path, inputs: Iterable[Path] = ()) -> None:
         if place == path.resolve() or place in path.resolve().parents:
             raise FolderError(f"{out}: holds {path}, which is read, choose another --out")
     if out.is_dir():
-        foreign = [p.name for p in out.iterdir() if not OURS.fullmatch(p.name)]
+        foreign = [p.name for p in out.iterdir() if not OWN_NAMES.fullmatch(p.name)]
         if foreign or (any(out.iterdir()) and not (out / SUMMARY).is_file()):
             what = foreign[0] if foreign else "something else"
             raise FolderError(f"{out}: exists and holds {what}, choose another --out")
         if not os.access(out, os.W_OK):
             raise FolderError(f"{out}: can't be replaced, it may not be written to")
-    _writable(out)
+    _check_writable(out)
 
 
-def former_result(out: Path) -> str | None:
+def describe_result(out: Path) -> str | None:
     """When what is in a folder of ours was made and, as far as its summary says, how; None where nothing is there."""
     path = out / SUMMARY
     if not path.is_file():
@@ -67,20 +75,20 @@ def former_result(out: Path) -> str | None:
         return made
     if isinstance(found, dict) and isinstance(found.get("design"), dict):  # of `excite run`
         found = found["design"]
-    known = [(key, found.get(key)) for key in ASKED] if isinstance(found, dict) else []
+    known = [(key, found.get(key)) for key in REQUEST_KEYS] if isinstance(found, dict) else []
     told = [
-        f"{key.removesuffix('_s')} {_short(value)}{' s' * key.endswith('_s')}"
+        f"{key.removesuffix('_s')} {_short_text(value)}{' s' * key.endswith('_s')}"
         for key, value in known
         if value is not None
     ]
     return f"{made} ({', '.join(told)})" if told else made
 
 
-def _short(value: Any) -> str:
+def _short_text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _writable(out: Path) -> None:
+def _check_writable(out: Path) -> None:
     parent = out.absolute().parent
     while not parent.exists():
         parent = parent.parent
@@ -89,12 +97,12 @@ def _writable(out: Path) -> None:
 
 
 @contextmanager
-def writing(out: Path) -> Iterator[Path]:
+def new_folder(out: Path) -> Iterator[Path]:
     """A folder to fill that becomes `out` when the block ends well, and vanishes otherwise.
 
     A killed run leaves only a hidden folder beside it. Raises FolderError.
     """
-    claim(out)
+    check_out_folder(out)
     made = _make_parents(out)
     partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
     try:
@@ -112,18 +120,18 @@ def writing(out: Path) -> Iterator[Path]:
         _remove_empty(made)
 
 
-def sweep(out: Path) -> None:
+def remove_partial_folders(out: Path) -> None:
     """Removes what killed runs left beside `out`; for a caller that knows no other one at work on it."""
     for left in out.absolute().parent.glob(f".{glob.escape(out.name)}.*.partial"):
         shutil.rmtree(left, ignore_errors=True)
 
 
 @contextmanager
-def writing_file(out: Path) -> Iterator[Path]:
+def new_file(out: Path) -> Iterator[Path]:
     """A file to write that becomes `out` when the block ends well. Raises FolderError."""
     if out.is_dir():
         raise FolderError(f"{out}: is a folder, --out needs a file name")
-    _writable(out)
+    _check_writable(out)
     made = _make_parents(out)
     handle, name = tempfile.mkstemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent)
     os.close(handle)
@@ -151,18 +159,18 @@ def _remove_empty(made: list[Path]) -> None:
         path.rmdir()
 
 
-def dump(summary: Mapping[str, Any]) -> str:
+def to_json(summary: Mapping[str, Any]) -> str:
     """Strict JSON: a number that is not finite is null, never NaN."""
-    return json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n"
+    return json.dumps(_plain_value(summary), indent=2, allow_nan=False) + "\n"
 
 
-def _plain(value: Any) -> Any:
+def _plain_value(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): _plain_value(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [_plain_value(v) for v in value]
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return _plain_value(value.tolist())
     if isinstance(value, np.integer):
         return int(value)
     if isinstance(value, float | np.floating):

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-LINES = 8  # of what is left of a misfit, that are told at once
+MAX_LINES = 8  # of what is left of a misfit, that are told at once
 
 
-def some(lines: Sequence[str]) -> list[str]:
+def first_lines(lines: Sequence[str]) -> list[str]:
     """The first of many lines, and where the rest is."""
-    if len(lines) <= LINES + 1:
+    if len(lines) <= MAX_LINES + 1:
         return list(lines)
-    return [*lines[:LINES], f"and {len(lines) - LINES} more, in summary.json under `located`"]
+    return [*lines[:MAX_LINES], f"and {len(lines) - MAX_LINES} more, in summary.json under `located`"]
 
 
-def rounded(value: object, digits: int = 4) -> str:
+def format_number(value: object, digits: int = 4) -> str:
     """A number to so many digits, a dash where there is none; 170, not 1.7e+02, where it is below a million."""
     if value is None or (isinstance(value, float) and value != value):
         return "-"
@@ -24,11 +24,11 @@ def rounded(value: object, digits: int = 4) -> str:
     return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
 
 
-def percent(value: float, digits: int = 2) -> str:
+def format_percent(value: float, digits: int = 2) -> str:
     """A number of per cent as it stands in a sentence."""
-    return f"{rounded(float(value), digits)} %"
+    return f"{format_number(float(value), digits)} %"
 
 
-def likely(p: float) -> str:
+def format_p_value(p: float) -> str:
     """A p-value, as small as it may be told."""
-    return "< 1e-12" if p < 1e-12 else rounded(p, 2)
+    return "< 1e-12" if p < 1e-12 else format_number(p, 2)

@@ -1,9 +1,9 @@
-from .equations import Signatures as Signatures, signatures as signatures
-from .parameter_names import meanings as meanings
+from .equations import SignatureFunctions as SignatureFunctions, signatures as signatures
+from .parameter_names import parameter_descriptions as parameter_descriptions
 from .prediction import (
     Model as Model,
     build as build,
-    built as built,
-    signs as signs,
+    build_cached as build_cached,
+    required_signs as required_signs,
     standard_parameters as standard_parameters,
 )

@@ -14,12 +14,12 @@ import casadi as ca
 
 from excite.errors import MachineError
 from excite.model import effects, mechanics
-from excite.model.effects import Placed, Rolling, Scene, Soil, Values
+from excite.model.effects import ContactMotion, PlacedEffect, SampleView, Soil, Values
 from excite.model.machine import Body, Machine
 
 
 @dataclass(frozen=True)
-class Sample:
+class SymbolicSample:
     """The symbols of one sample, and the machine's motion in it."""
 
     machine: Machine
@@ -52,11 +52,11 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Acting:
+class ActiveEffect:
     """An effect in a sample: what it sees, and its amount and shapes."""
 
-    placed: Placed
-    scene: Scene
+    placed: PlacedEffect
+    scene: SampleView
     values: Values
 
 
@@ -64,7 +64,7 @@ class Acting:
 class Equations:
     """A machine's functions of one sample, with standard parameters p in place of base parameters."""
 
-    sample: Sample
+    sample: SymbolicSample
     inputs: tuple[str, ...]
     slips: Mapping[str, ca.SX]
     predict: ca.Function
@@ -80,7 +80,7 @@ class Equations:
 
 
 @dataclass(frozen=True)
-class Signatures:
+class SignatureFunctions:
     """What C effects add, each alone, at samples (q, nu, a, u, t, z, exact readings, p): generalised forces (n_q, C)
     and readings (n_readable, C); and the rates (q, nu, u, t, z, p) -> dz of all that they remember. mapped: how many of
     z, the last ones, a map of the ground tells."""
@@ -91,7 +91,7 @@ class Signatures:
     mapped: int
 
 
-def sample_of(machine: Machine, standard: tuple[str, ...]) -> Sample:
+def symbolic_sample(machine: Machine, standard: tuple[str, ...]) -> SymbolicSample:
     names = machine.coordinates
     n = len(names)
     q, nu, a = ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
@@ -102,7 +102,7 @@ def sample_of(machine: Machine, standard: tuple[str, ...]) -> Sample:
     accel = full | dict(zip(names, ca.vertsplit(a), strict=True))
     heading = at[machine.body[0].coordinates[2]] if machine.planar else ca.SX(0)
     gravity = mechanics.rot_z(-heading) @ ca.DM(machine.gravity)
-    return Sample(
+    return SymbolicSample(
         machine,
         q,
         nu,
@@ -113,18 +113,18 @@ def sample_of(machine: Machine, standard: tuple[str, ...]) -> Sample:
         at,
         rate,
         dict(zip(standard, ca.vertsplit(p), strict=True)),
-        mechanics.motion(machine, at, rate, accel, gravity),
+        mechanics.body_motions(machine, at, rate, accel, gravity),
         gravity,
         heading,
     )
 
 
-def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Placed]) -> Equations:
+def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[PlacedEffect]) -> Equations:
     """The functions of a machine with effects. Raises MachineError for a contact that can't turn as the law has it."""
     for body in machine.contacts:
         _check_axis(machine, body)
-    s = sample_of(machine, standard)
-    memory, mapped, z, acting = _acting(s, placed)
+    s = symbolic_sample(machine, standard)
+    memory, mapped, z, acting = _active_effects(s, placed)
     balance, slips = _balance(s, acting)
     time = ca.SX.sym("t")
     gain, offset, delay = _channels(s, acting, time)
@@ -136,7 +136,7 @@ def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Plac
         predict[row] = ca.substitute(gain[k], time, now) * predict[row] + ca.substitute(offset[k], time, now)
     rates = [ca.SX(1)] if "time" in memory else []
     for e in acting:
-        rates += _rates(e)
+        rates += _memory_rates(e)
     rates += [ca.SX(0)] * len(mapped)
     beside = [s.u, z] if placed else []
     labels = ["q", "nu", "a", "p", "u", "z"][: 4 + len(beside)]
@@ -162,9 +162,9 @@ def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Plac
 def _check_axis(machine: Machine, body: Body) -> None:
     """The law takes rolling along x of the carrier for a turn about its y; else the soil would push wrongly."""
     assert not isinstance(body.antecedent, str)
-    own, _ = mechanics.place(body, {c: ca.SX(0) for c in body.coordinates})
+    own, _ = mechanics.joint_transform(body, {c: ca.SX(0) for c in body.coordinates})
     axis = ca.DM(own[:, 2]).full()[:, 0]
-    upright = mechanics.poses(machine, {})[body.antecedent][0][2, 2]
+    upright = mechanics.body_poses(machine, {})[body.antecedent][0][2, 2]
     if abs(axis[1] - 1) > 1e-9 or abs(upright - 1) > 1e-9:
         raise MachineError(
             f"{machine.name}: body {body.name}: contact: must turn about y of an upright chassis, so that rolling"
@@ -173,26 +173,26 @@ def _check_axis(machine: Machine, body: Body) -> None:
         )
 
 
-def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Placed]) -> Signatures:
+def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[PlacedEffect]) -> SignatureFunctions:
     """What each of these effects alone adds to a machine with standard parameters of these names."""
-    s = sample_of(machine, standard)
+    s = symbolic_sample(machine, standard)
     inertia = {b.index: mechanics.inertial_vector(b, s.by_name) for b in machine.body}
     time = ca.SX.sym("t")
     exact = ca.SX.sym("exact", sum(x.kind != "torque" for x in machine.sensors("full")))
     force, reading, rates = [], [], list[ca.SX]()
     states: list[ca.SX] = []
-    scene = _scene(s, time)
-    counts = [ca.SX.sym(name) for name in _mapped(machine, placed)]
-    rollings = {b.index: _rolling(s, b) for b in machine.contacts}
+    scene = _common_view(s, time)
+    counts = [ca.SX.sym(name) for name in _map_names(machine, placed)]
+    rollings = {b.index: _contact_motion(s, b) for b in machine.contacts}
     for e in placed:
         z = {m: ca.SX.sym(m) for m in e.memory}
-        (own,) = _rolled([_seeing(s, scene, e, z, counts)])
-        added = _added(s, own, inertia)
+        (own,) = _with_shared_contacts([_active_effect(s, scene, e, z, counts)])
+        added = _effect_force(s, own, inertia)
         if e.effect.further is not None or e.effect.soil is not None:
             for k in e.bodies:
                 body, rolling, (plain, lever) = machine.find(k), own.scene.rolling[k], rollings[k]
-                added += _pushed(body, _changed(s, [own], body, rolling), lever, rolling)
-                added -= _pushed(body, _soil(s, body, plain), lever, plain)
+                added += _contact_force(body, _changed_soil(s, [own], body, rolling), lever, rolling)
+                added -= _contact_force(body, _plain_soil(s, body, plain), lever, plain)
         force.append(added)
         read = ca.SX.zeros(exact.numel())
         if e.effect.reading is not None:
@@ -201,10 +201,10 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Pla
             read[at] = e.effect.reading(own.scene, exact[at], sensors[at].body, own.values)
         reading.append(read)
         states += z.values()
-        rates += _rates(own)
+        rates += _memory_rates(own)
     held = ca.vertcat(*states, *counts, ca.SX(0, 1))
     arguments = [s.q, s.nu, s.a, s.u, time, held, exact, s.p]
-    return Signatures(
+    return SignatureFunctions(
         ca.Function("force", arguments, [ca.horzcat(*force)]),
         ca.Function("reading", arguments, [ca.horzcat(*reading)]),
         ca.Function(
@@ -214,29 +214,31 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Pla
     )
 
 
-def _mapped(machine: Machine, placed: Sequence[Placed]) -> tuple[str, ...]:
+def _map_names(machine: Machine, placed: Sequence[PlacedEffect]) -> tuple[str, ...]:
     """What a map of the ground tells, by name, if any of these effects look at it."""
     if not any(e.mapped for e in placed):
         return ()
-    return tuple(f"over{b.index}.{n + 1}" for b in machine.contacts for n in range(effects.MOST))
+    return tuple(f"over{b.index}.{n + 1}" for b in machine.contacts for n in range(effects.MAX_PASSES))
 
 
-def _acting(s: Sample, placed: Sequence[Placed]) -> tuple[tuple[str, ...], tuple[str, ...], ca.SX, list[Acting]]:
+def _active_effects(
+    s: SymbolicSample, placed: Sequence[PlacedEffect]
+) -> tuple[tuple[str, ...], tuple[str, ...], ca.SX, list[ActiveEffect]]:
     """What effects remember, that which a map of the ground tells last; the latter; symbols z of all of it; and the
     effects with what they see of a sample."""
-    mapped = _mapped(s.machine, placed)
+    mapped = _map_names(s.machine, placed)
     memory = ["time"] if any(e.effect.timed for e in placed) else []
     memory += [f"{e.name}.{m}" for e in placed for m in e.memory]
     memory += mapped
     z = ca.SX.sym("z", len(memory))
     known = dict(zip(memory, ca.vertsplit(z), strict=True))
-    scene = _scene(s, known.get("time", ca.SX(0)))
+    scene = _common_view(s, known.get("time", ca.SX(0)))
     counts = [known[name] for name in mapped]
-    acting = [_seeing(s, scene, e, {m: known[f"{e.name}.{m}"] for m in e.memory}, counts) for e in placed]
-    return tuple(memory), mapped, z, _rolled(acting)
+    acting = [_active_effect(s, scene, e, {m: known[f"{e.name}.{m}"] for m in e.memory}, counts) for e in placed]
+    return tuple(memory), mapped, z, _with_shared_contacts(acting)
 
 
-def _rolled(acting: list[Acting]) -> list[Acting]:
+def _with_shared_contacts(acting: list[ActiveEffect]) -> list[ActiveEffect]:
     """Effects that see the contacts as some of them make these."""
     further: dict[int, ca.SX] = {}
     for e in acting:
@@ -249,46 +251,50 @@ def _rolled(acting: list[Acting]) -> list[Acting]:
     return [replace(e, scene=replace(e.scene, rolling=rolling)) for e in acting]
 
 
-def _scene(s: Sample, time: ca.SX) -> Scene:
+def _common_view(s: SymbolicSample, time: ca.SX) -> SampleView:
     """A sample as every effect sees it."""
     turning = [b for b in s.machine.body if b.coordinates and b.joint != "planar"]
     rubbing = [b for b in turning if b.friction is not None]
-    return Scene(
+    return SampleView(
         {b.index: s.at[b.coordinates[0]] for b in turning},
         {b.index: s.rate[b.coordinates[0]] for b in turning},
         dict(zip([b.index for b in s.machine.actuated], ca.vertsplit(s.u), strict=True)),
-        {b.index: _friction(s, b) for b in rubbing},
+        {b.index: _friction_torque(s, b) for b in rubbing},
         {b.index: s.by_name[f"Fs{b.index}"] for b in rubbing},
         {b.index: float(b.friction.smoothing) for b in rubbing if b.friction is not None},
-        {b.index: effects.full_torque(s.machine, b) for b in s.machine.actuated},
-        {b.index: _rolling(s, b)[0] for b in s.machine.contacts},
+        {b.index: effects.large_torque(s.machine, b) for b in s.machine.actuated},
+        {b.index: _contact_motion(s, b)[0] for b in s.machine.contacts},
         {b.index: s.frames[b.index].velocity[0] for b in s.machine.body},
         time,
     )
 
 
-def _seeing(s: Sample, scene: Scene, e: Placed, z: dict[str, ca.SX], counts: Sequence[ca.SX]) -> Acting:
+def _active_effect(
+    s: SymbolicSample, scene: SampleView, e: PlacedEffect, z: dict[str, ca.SX], counts: Sequence[ca.SX]
+) -> ActiveEffect:
     """An effect that remembers z, and sees what a map of the ground tells where it looks at one."""
     values = {key: ca.SX(x) for key, x in e.values.items()}
     values |= {key: s.by_name[name] for name, (key, _) in e.parameters.items() if name in s.by_name}
-    over = {b.index: ca.SX.zeros(effects.MOST) for b in s.machine.contacts}
+    over = {b.index: ca.SX.zeros(effects.MAX_PASSES) for b in s.machine.contacts}
     if e.mapped:
-        over = {k: ca.vertcat(*counts[effects.MOST * i : effects.MOST * (i + 1)]) for i, k in enumerate(over)}
-    return Acting(e, replace(scene, z=dict.fromkeys(e.memories, ca.SX(0)) | z, over=over), values)
+        over = {
+            k: ca.vertcat(*counts[effects.MAX_PASSES * i : effects.MAX_PASSES * (i + 1)]) for i, k in enumerate(over)
+        }
+    return ActiveEffect(e, replace(scene, z=dict.fromkeys(e.memories, ca.SX(0)) | z, over=over), values)
 
 
-def _rates(e: Acting) -> list[ca.SX]:
+def _memory_rates(e: ActiveEffect) -> list[ca.SX]:
     """How fast all that an effect remembers changes."""
     return [own.rate(e.scene, k, e.values) for k, own in e.placed.memory.values()]
 
 
-def _friction(s: Sample, body: Body) -> ca.SX:
+def _friction_torque(s: SymbolicSample, body: Body) -> ca.SX:
     assert body.friction is not None
     w, k = s.rate[body.coordinates[0]], body.index
     return s.by_name[f"Fv{k}"] * w + s.by_name[f"Fs{k}"] * ca.tanh(w / float(body.friction.smoothing))
 
 
-def _balance(s: Sample, acting: Sequence[Acting]) -> tuple[ca.SX, dict[str, ca.SX]]:
+def _balance(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, dict[str, ca.SX]]:
     """The generalised forces (n_q,) that the motors must deliver, as their sensors feel them flaws aside; the slips."""
     machine = s.machine
     inertia = {b.index: mechanics.inertial_vector(b, s.by_name) for b in machine.body}
@@ -296,21 +302,21 @@ def _balance(s: Sample, acting: Sequence[Acting]) -> tuple[ca.SX, dict[str, ca.S
     force = ca.vertcat(*[rows[c] for c in s.names])
     for body in machine.body:
         if body.friction is not None and body.coordinates[0] in s.names:
-            force[s.row(body)] += _friction(s, body)
+            force[s.row(body)] += _friction_torque(s, body)
     for e in acting:
-        force -= _added(s, e, inertia)
+        force -= _effect_force(s, e, inertia)
     slips: dict[str, ca.SX] = {}
     for body in machine.contacts:
-        plain, lever = _rolling(s, body)
+        plain, lever = _contact_motion(s, body)
         rolling = acting[0].scene.rolling[body.index] if acting else plain
         slips |= {f"gx{body.index}": plain.slip.gx, f"gy{body.index}": plain.slip.gy}
-        force -= _pushed(body, _changed(s, acting, body, rolling), lever, rolling)
+        force -= _contact_force(body, _changed_soil(s, acting, body, rolling), lever, rolling)
     if machine.planar and machine.body[0].coordinates[1] in machine.locked:
         slips = {g: x for g, x in slips.items() if not g.startswith("gy")}
     return force, slips
 
 
-def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
+def _effect_force(s: SymbolicSample, e: ActiveEffect, inertia: Mapping[int, ca.SX]) -> ca.SX:
     """Generalised force (n_q,) of an effect that isn't the soil's: torques, forces at contacts, gravity, inertia."""
     effect, machine = e.placed.effect, s.machine
     force = ca.SX.zeros(len(s.names))
@@ -319,29 +325,29 @@ def _added(s: Sample, e: Acting, inertia: Mapping[int, ca.SX]) -> ca.SX:
         if effect.torque is not None:
             force[s.row(body)] += effect.torque(e.scene, k, e.values)
         if effect.push is not None:
-            lever = _rolling(s, body)[1]
+            lever = _contact_motion(s, body)[1]
             force += lever[:2, :].T @ ca.vertcat(*effect.push(e.scene, k, e.values))
     if effect.gravity is not None:
         pull = mechanics.rot_z(-s.heading) @ ca.vertcat(*effect.gravity(e.scene, e.values), 0)
         still = {c: ca.SX(0) for c in s.at}
-        frames = mechanics.motion(machine, s.at, still, still, pull)
+        frames = mechanics.body_motions(machine, s.at, still, still, pull)
         rows = mechanics.generalised_forces(machine, s.at, frames, dict(inertia))
         force -= ca.vertcat(*[rows[c] for c in s.names])
     if effect.inertia is not None:
         told = effect.inertia(e.scene, e.values)
-        moved = effects.shifted(machine, told)
+        moved = effects.payload_change(machine, told)
         none = {n: ca.SX(0) for n in s.by_name}
         change = ca.vertcat(*[mechanics.inertial_vector(b, {**none, **moved}) for b in machine.body])
         force -= s.by_inertia @ change
         if effect.recoil is not None:
-            force += e.values[effect.recoil] * _recoil(s, e, told)
+            force += e.values[effect.recoil] * _recoil_force(s, e, told)
     return force
 
 
-def _recoil(s: Sample, e: Acting, change: Mapping[str, ca.SX]) -> ca.SX:
+def _recoil_force(s: SymbolicSample, e: ActiveEffect, change: Mapping[str, ca.SX]) -> ca.SX:
     """Generalised force (n_q,) on a body along whose x axis a load slides: the first moment MX and the inertia ZZ of it
     change with time. -MX'' along, the Coriolis force -2 omega MX' across, the moment -omega ZZ' about the origin."""
-    body = effects.shifting(s.machine)
+    body = effects.payload_body(s.machine)
     assert body is not None
     frame = s.frames[body]
     lever = ca.jacobian(ca.vertcat(frame.velocity[:2], frame.omega[2]), s.nu)
@@ -350,21 +356,21 @@ def _recoil(s: Sample, e: Acting, change: Mapping[str, ca.SX]) -> ca.SX:
     return lever.T @ ca.vertcat(-ca.jacobian(MX, e.scene.time), -2 * yaw * MX, -yaw * ZZ)
 
 
-def _rolling(s: Sample, body: Body) -> tuple[Rolling, ca.SX]:
+def _contact_motion(s: SymbolicSample, body: Body) -> tuple[ContactMotion, ca.SX]:
     """How a contact moves, and how (Vx, Vy, spin, yaw) follow from the velocities (4, n_q)."""
     assert body.contact is not None
     assert not isinstance(body.antecedent, str)
     carrier, own = s.frames[body.antecedent], s.frames[body.index]
-    R, _ = mechanics.place(body, {c: ca.SX(0) for c in body.coordinates})
+    R, _ = mechanics.joint_transform(body, {c: ca.SX(0) for c in body.coordinates})
     turn = carrier.rotation.T @ own.rotation
     centre = turn @ own.velocity
     spin = (R[:, 2].T @ turn) @ own.omega
     yaw = carrier.omega[2]
     lever = ca.jacobian(ca.vertcat(centre[0], centre[1], spin, yaw), s.nu)
-    return Rolling(body.contact, centre[0], centre[1], spin, yaw), lever
+    return ContactMotion(body.contact, centre[0], centre[1], spin, yaw), lever
 
 
-def _soil(s: Sample, body: Body, rolling: Rolling) -> Soil:
+def _plain_soil(s: SymbolicSample, body: Body, rolling: ContactMotion) -> Soil:
     """The soil under a contact as the machine file has it."""
     contact = rolling.contact
     saturation = None
@@ -375,23 +381,23 @@ def _soil(s: Sample, body: Body, rolling: Rolling) -> Soil:
     return Soil(rolling.slip, rolling.yaw, Kx, Ky, saturation)
 
 
-def _changed(s: Sample, acting: Sequence[Acting], body: Body, rolling: Rolling) -> Soil:
+def _changed_soil(s: SymbolicSample, acting: Sequence[ActiveEffect], body: Body, rolling: ContactMotion) -> Soil:
     """The soil under a contact as effects make it, one after the other."""
-    soil = _soil(s, body, rolling)
+    soil = _plain_soil(s, body, rolling)
     for e in acting:
         if e.placed.effect.soil is not None and body.index in e.placed.bodies:
             soil = e.placed.effect.soil(e.scene, body.index, e.values, soil)
     return soil
 
 
-def _pushed(body: Body, soil: Soil, lever: ca.SX, rolling: Rolling) -> ca.SX:
+def _contact_force(body: Body, soil: Soil, lever: ca.SX, rolling: ContactMotion) -> ca.SX:
     """Generalised force (n_q,) of a contact (11), by virtual power."""
     assert body.contact is not None
     w = soil.wrench(body.contact)
     return lever.T @ ca.vertcat(w.Sx, w.Sy, -(float(body.contact.radius) + rolling.further) * w.Sx, -w.Tz)
 
 
-def _channels(s: Sample, acting: Sequence[Acting], time: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+def _channels(s: SymbolicSample, acting: Sequence[ActiveEffect], time: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Gain, offset and delay (n_u,) of the torque sensors."""
     gain, offset, delay = [], [], []
     for body in s.machine.actuated:
@@ -406,7 +412,7 @@ def _channels(s: Sample, acting: Sequence[Acting], time: ca.SX) -> tuple[ca.SX, 
     return ca.vertcat(*gain), ca.vertcat(*offset), ca.vertcat(*delay)
 
 
-def _readings(s: Sample, acting: Sequence[Acting]) -> tuple[ca.SX, tuple[str, ...]]:
+def _readings(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, tuple[str, ...]]:
     """What sensors read, those of torque aside, and their names."""
     machine, root = s.machine, s.machine.body[0]
     wheels = [x.name for x in machine.sensor if x.kind == "wheel"]
@@ -433,7 +439,7 @@ def _readings(s: Sample, acting: Sequence[Acting]) -> tuple[ca.SX, tuple[str, ..
     return ca.vertcat(*readings.values(), ca.SX(0, 1)), tuple(readings)
 
 
-def axles(s: Sample) -> ca.Function:
+def contact_lines(s: SymbolicSample) -> ca.Function:
     """q -> (4, n_contacts): where the middle of each contact is on the ground, x, y, and the way from its right end to
     its left one [m]."""
     machine, R = s.machine, mechanics.rot_z(s.heading)
@@ -447,7 +453,7 @@ def axles(s: Sample) -> ca.Function:
     return ca.Function("axles", [s.q], [ca.densify(ca.horzcat(*found, ca.SX(4, 0)))], ["q"], ["axles"])
 
 
-def kinematics(s: Sample, slips: Mapping[str, ca.SX]) -> ca.Function:
+def kinematics(s: SymbolicSample, slips: Mapping[str, ca.SX]) -> ca.Function:
     """(q, nu) -> dq, slips, wheel rates, lateral and longitudinal speed of each body's origin, its ground position."""
     machine, at, rate, frames, nu = s.machine, s.at, s.rate, s.frames, s.nu
     dq = nu

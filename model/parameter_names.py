@@ -15,15 +15,15 @@ ACTING = {
 }
 
 
-def meanings(model: Model) -> dict[str, str]:
+def parameter_descriptions(model: Model) -> dict[str, str]:
     """Every base parameter's name -> what it is and of which body: "viscous friction, JOINT". One that stands for
     several is called regrouped; its sum is `model.base.grouping`."""
-    words = {name: text for body in model.machine.body for name, text in _of(body).items()}
+    words = {name: text for body in model.machine.body for name, text in _body_descriptions(body).items()}
     masses = {f"M{b.index}" for b in model.machine.body if b.inertia is not None}
     found: dict[str, str] = {}
     for name, k in zip(model.base.names, model.base.independent, strict=True):
         parts = model.base.grouping(name)
-        own = words.get(model.base.standard[k]) or _of_effect(name)
+        own = words.get(model.base.standard[k]) or _effect_description(name)
         if len(masses) > 1 and parts == dict.fromkeys(masses, 1.0):
             own = "mass, whole machine"
         elif len(parts) > 1:
@@ -32,7 +32,7 @@ def meanings(model: Model) -> dict[str, str]:
     return found
 
 
-def _of(body: Body) -> dict[str, str]:
+def _body_descriptions(body: Body) -> dict[str, str]:
     """A body's standard parameters: its inertia by the body's name, what acts on it by the joint's or contact's."""
     k, own, place = body.index, body.name.replace("_", " "), body.where.replace("_", " ")
     table = {f"M{k}": f"mass, {own}"}
@@ -43,7 +43,7 @@ def _of(body: Body) -> dict[str, str]:
     return table | {f"u{k}0": f"{'force' if body.joint == 'prismatic' else 'torque'} offset, {place}"}
 
 
-def _of_effect(name: str) -> str:
+def _effect_description(name: str) -> str:
     """An effect's amount or shape, NAME@WHERE[.SHAPE]."""
     effect, _, place = name.replace("_", " ").partition("@")
     place, _, shape = place.partition(".")

@@ -17,10 +17,10 @@ import numpy as np
 
 from excite.errors import MachineError
 from excite.model import mechanics
-from excite.model.effects import Ground, Placed, Site, placed as placing_placed
-from excite.model.equations import Equations, axles, equations, kinematics
+from excite.model.effects import GroundMap, PlacedEffect, Site, place_effect
+from excite.model.equations import Equations, contact_lines, equations, kinematics
 from excite.model.machine import Machine
-from excite.model.mechanics import independent
+from excite.model.mechanics import independent_columns
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def standard_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
     return chassis | joints
 
 
-def signs(machine: Machine) -> dict[str, float]:
+def required_signs(machine: Machine) -> dict[str, float]:
     """The sign that standard parameters must have, of those that have one by themselves: joints only brake and the soil
     only resists."""
     found: dict[str, float] = {}
@@ -129,7 +129,7 @@ class Model:
     memory: tuple[str, ...]
     mapped: tuple[str, ...]
     axles: ca.Function
-    effects: tuple[Placed, ...]
+    effects: tuple[PlacedEffect, ...]
     flaws: bool
     shapes: bool
 
@@ -154,7 +154,7 @@ class Model:
         """A map of ground on which no contact has been yet: what it tells (n_contacts MOST,) when the machine has come
         to coordinates (n_q,), called for one sample of a motion after the other."""
         contacts = [b.contact for b in self.machine.contacts if b.contact is not None]
-        ground = Ground([float(c.width) for c in contacts])
+        ground = GroundMap([float(c.width) for c in contacts])
         q, axles = np.zeros(len(self.coordinates)), np.zeros((len(contacts), 4))
         told = self.axles.buffer()
         told[0].set_arg(0, q.data)
@@ -304,7 +304,7 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
     """
     table = standard_parameters(machine)
     _check_names(machine, tuple(table))
-    placed = tuple(placing_placed(machine, entry) for entry in machine.effect)
+    placed = tuple(place_effect(machine, entry) for entry in machine.effect)
     twice = sorted({e.name for e in placed if [f.name for f in placed].count(e.name) > 1})
     if twice:
         raise MachineError(f"{machine.name}: effect: given twice at one place: {', '.join(twice)}")
@@ -322,11 +322,11 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
                 f"{machine.name}: scale.{s}: the nominal value is 0, give a scale > 0 in the machine file"
             )
     if placed:
-        amounts = _amounts(machine, placed, shapes)
+        amounts = _effect_parameters(machine, placed, shapes)
         if not flaws:
-            shown = _shown(equations(machine, (*table, *amounts), placed))
+            shown = _visible_parameters(equations(machine, (*table, *amounts), placed))
             amounts = {name: amount for name, amount in amounts.items() if name in shown}
-        base = _beside_base(base, amounts)
+        base = _append_parameters(base, amounts)
         nominal = np.concatenate([nominal, [v for v, _, _ in amounts.values()]])
         scale = np.concatenate([scale, [size for _, _, size in amounts.values()]])
         found = equations(machine, base.standard, placed)
@@ -343,13 +343,13 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
         kinematics(found.sample, found.slips),
         found.nonlinear,
         found.balance,
-        _of_base(found.flow, base),
-        _of_base(_rated(machine, found), base),
-        _of_base(found.channels, base),
+        _as_base_function(found.flow, base),
+        _as_base_function(_with_rate_readings(machine, found), base),
+        _as_base_function(found.channels, base),
         found.readable,
         found.memory,
         found.mapped,
-        axles(found.sample),
+        contact_lines(found.sample),
         placed,
         flaws,
         shapes,
@@ -357,18 +357,20 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
 
 
 @lru_cache(maxsize=8)
-def built(machine: str) -> Model:
+def build_cached(machine: str) -> Model:
     """The model of a machine as JSON, built once in a process: CasADi functions are cheaper to build than to send."""
     return build(Machine.model_validate_json(machine))
 
 
-def _shown(found: Equations) -> set[str]:
+def _visible_parameters(found: Equations) -> set[str]:
     """Standard parameters that the prediction depends on."""
     columns = found.standard_regressor.sparsity_out(0).get_triplet()[1]
     return {list(found.sample.by_name)[k] for k in set(columns)}
 
 
-def _amounts(machine: Machine, placed: Sequence[Placed], shapes: bool) -> dict[str, tuple[float, str, float]]:
+def _effect_parameters(
+    machine: Machine, placed: Sequence[PlacedEffect], shapes: bool
+) -> dict[str, tuple[float, str, float]]:
     """Value, unit and typical size of every shape and amount that is a parameter, by name: amounts last."""
     found: dict[str, tuple[float, str, float]] = {}
     for e in placed:
@@ -386,7 +388,7 @@ def _amounts(machine: Machine, placed: Sequence[Placed], shapes: bool) -> dict[s
     return found | amounts
 
 
-def _beside_base(base: BaseParameters, amounts: Mapping[str, tuple[float, str, float]]) -> BaseParameters:
+def _append_parameters(base: BaseParameters, amounts: Mapping[str, tuple[float, str, float]]) -> BaseParameters:
     """Base parameters with amounts behind them, each standing for itself."""
     n, k, m = len(base.names), len(base.standard), len(amounts)
     matrix = np.zeros((n + m, k + m))
@@ -401,7 +403,7 @@ def _beside_base(base: BaseParameters, amounts: Mapping[str, tuple[float, str, f
     )
 
 
-def _rated(machine: Machine, found: Equations) -> ca.Function:
+def _with_rate_readings(machine: Machine, found: Equations) -> ca.Function:
     """What sensors read; of those of a rate, how their angle and what is wrong with it change along the motion."""
     rates = {s.name for s in machine.sensor if s.is_rate}
     if not rates & set(found.readable):
@@ -415,7 +417,7 @@ def _rated(machine: Machine, found: Equations) -> ca.Function:
     return ca.Function("read", [q, nu, wheels, u, z, p], [reading])
 
 
-def _of_base(function: ca.Function, base: BaseParameters) -> ca.Function:
+def _as_base_function(function: ca.Function, base: BaseParameters) -> ca.Function:
     """A function whose last argument is standard parameters, of base parameters instead."""
     arguments = function.sx_in()[:-1]
     X = ca.SX.sym("X", len(base.names))
@@ -453,7 +455,7 @@ def base_parameters(machine: Machine, W: ca.Function, p: np.ndarray, units: dict
     A = flat.transpose(1, 0, 2).reshape(-1, len(standard))
     size = np.linalg.norm(A, axis=0)
     visible = np.flatnonzero(size > 1e-12 * size.max())
-    kept, left = (visible[k] for k in independent(A[:, visible] / size[visible], 1e-9))
+    kept, left = (visible[k] for k in independent_columns(A[:, visible] / size[visible], 1e-9))
     matrix = np.zeros((len(standard), len(standard)))
     matrix[kept, kept] = 1.0
     for j in left:

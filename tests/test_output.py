@@ -15,7 +15,7 @@ from excite.errors import FolderError
 
 def test_a_folder_appears_whole(tmp_path: Path) -> None:
     out = tmp_path / "a" / "b"
-    with output.writing(out) as place:
+    with output.new_folder(out) as place:
         (place / "x").write_text("1")
         assert not out.exists()
     assert [p.name for p in out.iterdir()] == ["x"]
@@ -23,19 +23,19 @@ def test_a_folder_appears_whole(tmp_path: Path) -> None:
 
 
 def test_what_fails_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError), output.writing(tmp_path / "a" / "b") as place:
+    with pytest.raises(FileNotFoundError), output.new_folder(tmp_path / "a" / "b") as place:
         (place / "no" / "x").write_text("1")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_fails_keeps_the_old_one(tmp_path: Path) -> None:
     out = tmp_path / "o"
-    with output.writing(out) as place:
+    with output.new_folder(out) as place:
         (place / output.SUMMARY).write_text("old")
-    with pytest.raises(ZeroDivisionError), output.writing(out):
+    with pytest.raises(ZeroDivisionError), output.new_folder(out):
         _ = 1 / 0
     assert (out / output.SUMMARY).read_text() == "old"
-    with output.writing(out) as place:
+    with output.new_folder(out) as place:
         (place / output.SUMMARY).write_text("new")
     assert (out / output.SUMMARY).read_text() == "new"
     assert [p.name for p in tmp_path.iterdir()] == ["o"]
@@ -43,10 +43,10 @@ def test_what_fails_keeps_the_old_one(tmp_path: Path) -> None:
 
 def test_a_file_appears_whole(tmp_path: Path) -> None:
     out = tmp_path / "a" / "log.csv"
-    with pytest.raises(ZeroDivisionError), output.writing_file(out):
+    with pytest.raises(ZeroDivisionError), output.new_file(out):
         _ = 1 / 0
     assert list(tmp_path.iterdir()) == []
-    with output.writing_file(out) as path:
+    with output.new_file(out) as path:
         path.write_text("1")
     assert out.read_text() == "1"
     assert [p.name for p in out.parent.iterdir()] == ["log.csv"]
@@ -56,7 +56,7 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path: Pat
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(FolderError):
-            output.claim(out)
+            output.check_out_folder(out)
 
 
 @pytest.mark.parametrize(
@@ -71,13 +71,13 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path: Pat
     ],
 )
 def test_a_former_result_is_told(tmp_path: Path, summary: object, told: str) -> None:
-    assert output.former_result(tmp_path) is None
+    assert output.describe_result(tmp_path) is None
     (tmp_path / output.SUMMARY).write_text("{" if summary is None else json.dumps(summary))
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d" + told, output.former_result(tmp_path) or "")
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d" + told, output.describe_result(tmp_path) or "")
 
 
 def test_json_is_strict() -> None:
-    text = output.dump({"a": np.float64("nan"), "b": np.array([1, np.inf]), "c": {1: np.int64(3)}, "d": "x"})
+    text = output.to_json({"a": np.float64("nan"), "b": np.array([1, np.inf]), "c": {1: np.int64(3)}, "d": "x"})
     assert json.loads(text, parse_constant=lambda name: pytest.fail(name)) == {
         "a": None,
         "b": [1.0, None],
@@ -92,15 +92,15 @@ def test_a_folder_with_anything_else_in_it_is_left_alone(tmp_path: Path, foreign
     (tmp_path / "o" / output.SUMMARY).write_text("{}")
     (tmp_path / "o" / foreign).write_text("precious")
     with pytest.raises(FolderError, match=foreign):
-        output.claim(tmp_path / "o")
+        output.check_out_folder(tmp_path / "o")
 
 
 def test_what_is_read_is_not_written_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with output.writing(tmp_path / "o") as place:
+    with output.new_folder(tmp_path / "o") as place:
         (place / output.SUMMARY).write_text("{}")
     for given in (tmp_path / "o", tmp_path / "o" / "log.csv"):
         with pytest.raises(FolderError, match="which is read"):
-            output.claim(tmp_path / "o", [given])
+            output.check_out_folder(tmp_path / "o", [given])
     monkeypatch.chdir(tmp_path / "o")
     with pytest.raises(FolderError, match="the folder that you are in"):
-        output.claim(Path())
+        output.check_out_folder(Path())

@@ -381,7 +381,7 @@ def test_the_catalogues_sliding_load_moves_the_machine_as_this_one_does(va12: Mo
         told = {n: Quantity(value=float(x), source="assumed") for n, x in shapes.items()}
         amount = Quantity(value=mass * way, source="assumed")
         entry = EffectEntry(name="payload_shift", where="machine", amount=amount, shape=told)
-        model = build(placing.extended(va12.machine, entry))
+        model = build(placing.with_effects(va12.machine, entry))
         X = np.array([base.get(n, x) for n, x in zip(model.base.names, model.nominal, strict=True)])
         return simulate(model, torque, X).q
 

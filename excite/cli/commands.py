@@ -66,12 +66,12 @@ def _result(
     will replace; the summary is told at the end. Given are a place to write to and the summary, still empty."""
     from excite import output
 
-    output.claim(out, inputs)
-    before = output.former_result(out)
+    output.check_out_folder(out, inputs)
+    before = output.describe_result(out)
     if before is not None and not json:
         terminal.say(f"{out}/ will be replaced, what is there is of {before}; --out keeps both")
     summary: dict[str, Any] = {}
-    with output.writing(out) as place:
+    with output.new_folder(out) as place:
         yield place, summary
     terminal.finish(summary, out, json, show)
 
@@ -233,7 +233,7 @@ def run(
         checked.mkdir()
         second = workflows.verify(checked, designed, runs, method, kit, seed, out / "design", terminal.bar)
         summary |= {"design": first, "verify": second}
-        output.keep(place, summary)
+        output.write_summary(place, summary)
 
 
 @app.command()
@@ -283,7 +283,7 @@ def drive(
             made = operator.prepare(trajectories.read_design(design_dir), phases, shortest, seed, advance)
         summary |= {"machine": name, "design": str(design_dir), "seed": seed, **operator.write(made, place)}
         summary["versions"] = workflows.versions()
-        output.keep(place, summary)
+        output.write_summary(place, summary)
     if serve:
         operator.serve(out, made, host, port, live, lambda address: typer.echo(f"{address} (Ctrl-C ends)", err=True))
 
@@ -322,7 +322,7 @@ def simulate(
     torque, q0, nu0 = read_profile(profile, model)
     nominal, model = model, workflows.with_effects(model, effect or (), len(torque))
     doubts = [f"--effect {line}" for line in workflows.doubtful_effects(nominal, model)]
-    with output.writing_file(out) as path:
+    with output.new_file(out) as path:
         motion = drive(model, torque, q0=q0, nu0=nu0)
         table = simulation.measure(model, motion, kit=kit, seed=seed, noise=noise == "on")
         writers[out.suffix.lower()](table, path)
@@ -501,7 +501,7 @@ def docs(out: OutOption = None, json: JsonOption = False) -> None:
     out = out or Path("results/docs-excite")
     with _result(out, json, lambda s: terminal.say(", ".join(s["pages"]))) as (place, summary):
         summary |= {"pages": reference.write(place, app), "versions": workflows.versions()}
-        output.keep(place, summary)
+        output.write_summary(place, summary)
 
 
 @app.command()

@@ -24,7 +24,7 @@ def start(name: str, file: Path, like: str | None = None) -> None:
     text = fresh(name, file) if like is None else renamed(name, file, machine.load_machine(like))
     if file.exists():
         raise MachineError(f"{file}: is there already, give another --out")
-    with output.writing_file(file) as place:
+    with output.new_file(file) as place:
         place.write_text(text, encoding="utf-8")
 
 

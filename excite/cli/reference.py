@@ -20,8 +20,8 @@ import excite
 from excite import identification, simulation, trajectories, workflows
 from excite.cli import reference_html
 from excite.model import effects
-from excite.model.effects import DURATION, Effect, Shape, Site, one
-from excite.model.machine import UNITS, Machine, Record, load_machine, shipped_machines
+from excite.model.effects import DEFAULT_DURATION, Effect, Shape, Site, unit_size
+from excite.model.machine import UNITS, FileRecord, Machine, load_machine, shipped_machines
 
 SETS = 8  # shapes that go together, from which not all are told
 PLAIN = (str, int, float, tuple, type(None))  # defaults that read as they are
@@ -82,7 +82,7 @@ def effects_page() -> str:
         ),
     ]
     for e in catalogue:
-        sites = effects.places(va12, e)
+        sites = effects.allowed_places(va12, e)
         typical = [f"`{e.name}@{where}={_typical(va12, e, bodies):.3g}`" for where, (bodies, _) in sites.items()]
         lines += [f"## {e.name}", "", f"{_sentence(e.meaning)} {_amount(e)}", ""]
         lines += [f"Seen in a log: {e.signature.strip('.')}.", "", f"Source: {e.source.strip('.')}.", ""]
@@ -95,7 +95,11 @@ def effects_page() -> str:
                 "shape | unit | default | looked for at | meaning",
                 (_shape(n, s) for n, s in e.shapes.items()),
             )
-            lines += [f"Looked for as well, on va12 in a log of {DURATION:g} s: {_sets(beside)}.", ""] if beside else []
+            lines += (
+                [f"Looked for as well, on va12 in a log of {DEFAULT_DURATION:g} s: {_sets(beside)}.", ""]
+                if beside
+                else []
+            )
     return _page(*lines)
 
 
@@ -110,7 +114,7 @@ def _amount(e: Effect) -> str:
 
 
 def _shape(name: str, shape: Shape) -> tuple[str, str, str, str, str]:
-    of = "" if shape.size is one else " of the site's size"
+    of = "" if shape.size is unit_size else " of the site's size"
     tried = ", ".join(f"{x:.3g}" for x in shape.grid) + of
     form = f"where {shape.form[0]} is {shape.form[1]:g}" if shape.form else ""
     ends = "from {:g} to {:g}".format(*shape.within) + of if shape.within else ""
@@ -148,14 +152,14 @@ def study_page() -> str:
     return _page("# Study file", "", _doc(inspect.getmodule(workflows.Study)), "", *_keys(workflows.Study))
 
 
-def _keys(root: type[Record]) -> Iterator[str]:
+def _keys(root: type[FileRecord]) -> Iterator[str]:
     """Every key of a record and of those inside it, a table for each."""
     for record in _records(root, set()):
         yield from (f"## {record.__name__}", "", _doc(record), "")
         yield from _table("key | what | default", ((n, _type(f), _default(f)) for n, f in record.model_fields.items()))
 
 
-def _records(record: type[Record], seen: set[type[Record]]) -> Iterator[type[Record]]:
+def _records(record: type[FileRecord], seen: set[type[FileRecord]]) -> Iterator[type[FileRecord]]:
     """A record and those inside it, each once."""
     if record in seen:
         return
@@ -166,8 +170,8 @@ def _records(record: type[Record], seen: set[type[Record]]) -> Iterator[type[Rec
             yield from _records(inner, seen)
 
 
-def _inside(annotation: Any) -> list[type[Record]]:
-    if isinstance(annotation, type) and issubclass(annotation, Record):
+def _inside(annotation: Any) -> list[type[FileRecord]]:
+    if isinstance(annotation, type) and issubclass(annotation, FileRecord):
         return [annotation]
     return [r for a in get_args(annotation) for r in _inside(a)]
 
@@ -189,7 +193,7 @@ def _worded(annotation: Any) -> str:
         return f"list: {_worded(inner[0])}" if inner[-1] is Ellipsis else f"{len(inner)} x {_worded(inner[0])}"
     if origin is dict:
         return f"table, for each name: {_worded(inner[1])}"
-    if isinstance(annotation, type) and issubclass(annotation, Record):
+    if isinstance(annotation, type) and issubclass(annotation, FileRecord):
         return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
     return WORDS.get(annotation, str(annotation))
 
@@ -204,7 +208,7 @@ def _default(field: Any) -> str:
     if field.is_required():
         return "needed"
     value = field.get_default(call_default_factory=True)
-    if isinstance(value, Record):
+    if isinstance(value, FileRecord):
         return "0" if getattr(value, "value", None) == 0 else "its own defaults"
     if isinstance(value, bool):
         return str(value).lower()

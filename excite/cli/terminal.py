@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from excite import reports, workflows
-from excite.text import likely, percent, rounded, some
+from excite.text import first_lines, format_number, format_p_value, format_percent
 
 SHOWN = 40  # cells of a study in the terminal
 PAUSE = 30.0  # s between lines of progress
@@ -33,7 +33,7 @@ def show_json(summary: dict[str, Any]) -> None:
     """The summary as JSON on stdout and nothing else."""
     from excite import output
 
-    sys.stdout.write(output.dump(summary))
+    sys.stdout.write(output.to_json(summary))
 
 
 def finish(summary: dict[str, Any], out: Path, json: bool, show: Callable[[dict[str, Any]], None]) -> None:
@@ -80,7 +80,7 @@ def design_table(summary: dict[str, Any]) -> None:
         say("cut short: this is the best drive so far, more time may find a better one")
     say(
         f"attainable accuracy (Cramer-Rao, one standard deviation): worst {summary['worst_parameter']}"
-        f" {percent(summary['worst_percent'])}, median {percent(summary['median_percent'])}"
+        f" {format_percent(summary['worst_percent'])}, median {format_percent(summary['median_percent'])}"
     )
     if "driver" in summary:
         by_hand = summary["driver"]
@@ -90,10 +90,10 @@ def design_table(summary: dict[str, Any]) -> None:
         say(
             f"in people's hands, {len(by_hand['phases'])} phases: {titled(summary['objective'], hand['score'])}"
             f" (torques played back {free['score']:.4g}), worst {hand['worst_parameter']}"
-            f" {percent(hand['worst_percent'])} ({percent(free['worst_percent'])}), median"
-            f" {percent(hand['median_percent'])} ({percent(free['median_percent'])})"
+            f" {format_percent(hand['worst_percent'])} ({format_percent(free['worst_percent'])}), median"
+            f" {format_percent(hand['median_percent'])} ({format_percent(free['median_percent'])})"
         )
-        broken = ", ".join(f"{name} by {percent(100 * over)}" for name, over in by_hand["limits_broken"].items())
+        broken = ", ".join(f"{name} by {format_percent(100 * over)}" for name, over in by_hand["limits_broken"].items())
         say(f"people exceed {broken} of the range" if broken else "people keep all limits")
     if summary["advice"] is not None:
         say(summary["advice"])
@@ -106,12 +106,12 @@ def verify_table(summary: dict[str, Any]) -> None:
         rows.add_row(
             name,
             row["unit"],
-            rounded(row["true"], 6),
-            rounded(row["mean"], 6),
-            rounded(row["bias_percent"], 3),
-            rounded(row["std_percent"], 3),
-            rounded(row["predicted_std_percent"], 3),
-            rounded(100 * row["coverage95"], 3),
+            format_number(row["true"], 6),
+            format_number(row["mean"], 6),
+            format_number(row["bias_percent"], 3),
+            format_number(row["std_percent"], 3),
+            format_number(row["predicted_std_percent"], 3),
+            format_number(100 * row["coverage95"], 3),
         )
     say(f"{summary['runs']} simulated runs, method {summary['method']}, kit {summary['kit']}")
     say(rows)
@@ -129,9 +129,9 @@ def compare_table(summary: dict[str, Any]) -> None:
     for row in summary["designs"]:
         rows.add_row(
             row["name"],
-            *(rounded(row[k], 4) for k in ("cond_phi", "cond_w", "worst_std_percent", "median_std_percent")),
+            *(format_number(row[k], 4) for k in ("cond_phi", "cond_w", "worst_std_percent", "median_std_percent")),
             f"{row['kept']}/{row['samples']}",
-            "-" if row["breaks"] is None else f"{row['breaks']} by {percent(100 * row['max_violation'])}",
+            "-" if row["breaks"] is None else f"{row['breaks']} by {format_percent(100 * row['max_violation'])}",
             f"{row['wall_s']:.1f}",
             f"not in {row['wall_s']:.0f}" if row["equal_score_s"] is None else f"{row['equal_score_s']:.0f}",
         )
@@ -148,7 +148,7 @@ def identify_table(summary: dict[str, Any]) -> None:
     """An estimate, a parameter a line, with what there is to remark."""
     rows = table("parameter", "unit", *(heading for heading, *_ in reports.ESTIMATE))
     for name, row in summary["parameters"].items():
-        rows.add_row(name, row["unit"], *(rounded(row[k], digits) for _, k, digits in reports.ESTIMATE))
+        rows.add_row(name, row["unit"], *(format_number(row[k], digits) for _, k, digits in reports.ESTIMATE))
     say(rows)
     say(
         f"method {summary['method']}: relative error {summary['relative_error_percent']:.2f} %,"
@@ -168,7 +168,12 @@ def log_table(summary: dict[str, Any]) -> None:
     rows = table("column", "what it is", "unit", "lowest", "highest", "bad cells")
     for c in summary["columns"]:
         rows.add_row(
-            c["name"], c["what"] or "-", c["unit"] or "-", rounded(c["low"], 5), rounded(c["high"], 5), str(c["bad"])
+            c["name"],
+            c["what"] or "-",
+            c["unit"] or "-",
+            format_number(c["low"], 5),
+            format_number(c["high"], 5),
+            str(c["bad"]),
         )
     say(rows)
     for fault in summary["faults"]:
@@ -191,12 +196,12 @@ def diagnose_table(summary: dict[str, Any]) -> None:
             rows.add_row(
                 f["effect"],
                 f["where"],
-                rounded(f["amount"], 5),
-                rounded(f["amount_std"], 2),
+                format_number(f["amount"], 5),
+                format_number(f["amount_std"], 2),
                 f["unit"],
-                likely(f["p_value"]),
-                rounded(f["gain_percent"], 3),
-                "-" if low is None else f"{rounded(low, 3)} to {rounded(high, 3)}",
+                format_p_value(f["p_value"]),
+                format_number(f["gain_percent"], 3),
+                "-" if low is None else f"{format_number(low, 3)} to {format_number(high, 3)}",
                 ", ".join(f["tied_with"]) or "-",
             )
         say(rows)
@@ -205,11 +210,11 @@ def diagnose_table(summary: dict[str, Any]) -> None:
         rows.add_row(
             name,
             row["unit"],
-            *(rounded(row[f"rms_{k}"], 3) for k in ("before", "after")),
-            *(rounded(row[f"systematic_{k}_percent"], 2) for k in ("before", "after")),
+            *(format_number(row[f"rms_{k}"], 3) for k in ("before", "after")),
+            *(format_number(row[f"systematic_{k}_percent"], 2) for k in ("before", "after")),
         )
     say(rows)
-    for line in some(summary["located"]):
+    for line in first_lines(summary["located"]):
         say(line)
     if summary["separating_run"]:
         say(f"to tell them apart, drive: {summary['separating_run']}")
@@ -266,9 +271,9 @@ def study_table(summary: dict[str, Any]) -> None:
             str(row["done"]),
             str(row["failed"] + row["defect"]),
             row.get("worst_parameter", "-"),
-            rounded(row.get("worst_rms_percent"), 3),
-            rounded(row.get("median_rms_percent"), 3),
-            rounded(100 * row["coverage95"] if row.get("coverage95") is not None else None, 3),
+            format_number(row.get("worst_rms_percent"), 3),
+            format_number(row.get("median_rms_percent"), 3),
+            format_number(100 * row["coverage95"] if row.get("coverage95") is not None else None, 3),
             ", ".join(f"{k} {v}" for k, v in row.get("verdicts", {}).items()) or "-",
         )
     say(rows)

@@ -247,7 +247,7 @@ def _one_by_one(before: Stage, chosen: Sequence[Choice], whole: Stage) -> list[C
     made = [before]
     try:
         for x in chosen:
-            machine = effects.extended(made[-1].machine, selection.entry_of(whole, x.name))
+            machine = effects.with_effects(made[-1].machine, selection.entry_of(whole, x.name))
             made.append(refitted(machine, made[-1], before.fit.disturbed))
         made[-1] = made[-1] if whole.fit.disturbed == before.fit.disturbed else whole
     except NotConverged:
@@ -326,7 +326,7 @@ def _others(choice: Choice, found: Container[str]) -> tuple[EffectEntry, ...]:
 
 def _without(name: str, stage: Stage) -> Stage:
     """A stage's model without one of its effects, fitted. Raises NotConverged."""
-    machine = effects.without(stage.machine, name)
+    machine = effects.without_effect(stage.machine, name)
     try:
         return refitted(machine, stage, stage.fit.disturbed)
     except NotConverged:

@@ -20,8 +20,8 @@ from excite import identification, smoothing
 from excite.diagnosis import score_test
 from excite.diagnosis.parallel import Together, ahead, in_turn
 from excite.logs import Log
-from excite.model import Model, build, signs
-from excite.model.effects import Placed
+from excite.model import Model, build, required_signs
+from excite.model.effects import PlacedEffect
 from excite.model.machine import Filter, Machine
 from excite.smoothing import (
     Chart,
@@ -94,7 +94,7 @@ class Stage:
     def model(self) -> Model:
         return self.prepared.c.model
 
-    def placed(self, name: str) -> Placed:
+    def placed(self, name: str) -> PlacedEffect:
         """An effect that the model has."""
         return next(e for e in self.model.effects if e.name == name)
 
@@ -154,7 +154,7 @@ class Stage:
         """Parameters that surely have a sign that no machine has, friction that drives or soil that pulls, a line each.
         What makes them so is no cause, however much it explains."""
         fit, base = self.fit, self.model.base
-        of = signs(self.machine) | {e.name: 1.0 for e in self.model.effects if e.effect.resisting}
+        of = required_signs(self.machine) | {e.name: 1.0 for e in self.model.effects if e.effect.resisting}
         sure = np.maximum(SURELY * self.doubt * fit.std, WRONG * self.model.scale)
         found: list[str] = []
         for k, (name, unit) in enumerate(zip(base.names, base.units, strict=True)):

@@ -14,14 +14,14 @@ from excite.diagnosis import selection
 from excite.diagnosis.fits import Stage, refits
 from excite.diagnosis.parallel import Together
 from excite.model import effects
-from excite.model.effects import Placed, Site
+from excite.model.effects import PlacedEffect, Site
 from excite.model.machine import Machine, Quantity
 
 HARDLY = 0.5  # deviation of a shape, as a share of that without any log, from which logs hardly tell it
 APART = 2.0  # deviations by which another shape may be worse that logs like about as well
 
 
-def unsure(placed: Placed, after: Stage, together: Together) -> float:
+def unsure(placed: PlacedEffect, after: Stage, together: Together) -> float:
     """How unsure an effect's amount is for shapes that the logs hardly tell: by how much it is another one with such a
     shape at either end of its usual range, or halfway there, where the logs like that about as well. The deviation of
     a fit holds for shapes nearby only."""
@@ -38,7 +38,7 @@ def unsure(placed: Placed, after: Stage, together: Together) -> float:
             for x in ((fit.X[k] + end) / 2, end) if end != fit.X[k] else ():
                 value = Quantity(value=float(x), source="assumed")
                 other = entry.model_copy(update={"shape": {**entry.shape, s: value}})
-                machine = effects.extended(effects.without(after.machine, placed.name), other)
+                machine = effects.with_effects(effects.without_effect(after.machine, placed.name), other)
                 wishes.append((machine, after, fit.disturbed))
                 held.append(name)
     most = fit.cost + APART**2 * after.spread
@@ -48,7 +48,7 @@ def unsure(placed: Placed, after: Stage, together: Together) -> float:
     return max((abs(float(a - fit.X[names.index(placed.name)])) / APART for a in every), default=0.0)
 
 
-def _usual(placed: Placed, name: str, machine: Machine) -> tuple[float, ...]:
+def _usual(placed: PlacedEffect, name: str, machine: Machine) -> tuple[float, ...]:
     """The ends of the range that a shape is usually in: of all that is tried in this form, and of what there is. None
     of an instant, which a log tells or not."""
     shape, site = placed.effect.shapes[name], Site.of(machine, placed.bodies)

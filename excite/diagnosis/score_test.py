@@ -20,10 +20,10 @@ import numpy as np
 from excite import smoothing
 from excite.diagnosis.parallel import Together, in_turn
 from excite.logs import implicit, passes
-from excite.model import Signatures as MadeSignatures, effects, signatures
-from excite.model.effects import CATALOGUE, Effect, Placed, Site
+from excite.model import SignatureFunctions as MadeSignatures, effects, signatures
+from excite.model.effects import CATALOGUE, Effect, PlacedEffect, Site
 from excite.model.machine import Machine
-from excite.simulation import torque_behind
+from excite.simulation import delivered_torque
 from excite.smoothing import (
     BATCH,
     Batch,
@@ -48,7 +48,7 @@ ABSORBED = 1e-5  # share of a signature that is left, below which it is but sing
 class Candidate:
     """An effect at a place with shapes of the grid; `columns`: one, or the sine and the cosine of a phase."""
 
-    placed: Placed
+    placed: PlacedEffect
     columns: tuple[int, ...]
 
     @property
@@ -86,12 +86,12 @@ def candidates(machine: Machine, sensors: Sequence[str], duration: float) -> lis
     found: list[Candidate] = []
     columns = 0
     for effect in CATALOGUE.values():
-        for where, (bodies, sensor) in effects.places(machine, effect).items():
+        for where, (bodies, sensor) in effects.allowed_places(machine, effect).items():
             if effect.reading is not None and sensor not in sensors:
                 continue
             site = Site.of(machine, bodies, duration)
             for values, width in _grid(effect, site):
-                placed = Placed(effect, where, bodies, sensor, values)
+                placed = PlacedEffect(effect, where, bodies, sensor, values)
                 found.append(Candidate(placed, tuple(range(columns, columns + width))))
                 columns += width
     return found
@@ -130,13 +130,13 @@ def finer(scores: Sequence[Score], machine: Machine, duration: float, reach: flo
         site = Site.of(machine, placed.bodies, duration)
         for values in _about(placed, site, reach):
             width = len(score.candidate.columns)
-            own = Placed(placed.effect, placed.where, placed.bodies, placed.sensor, values)
+            own = PlacedEffect(placed.effect, placed.where, placed.bodies, placed.sensor, values)
             found.append(Candidate(own, tuple(range(columns, columns + width))))
             columns += width
     return found
 
 
-def _about(placed: Placed, site: Site, reach: float) -> list[dict[str, float]]:
+def _about(placed: PlacedEffect, site: Site, reach: float) -> list[dict[str, float]]:
     """Values near those of a candidate: shapes up to two thirds of the way to the next points that are tried. What is
     tried beside the grid is a grid of its own, or points on a line of shapes that go together."""
     effect, own = placed.effect, placed.values
@@ -232,13 +232,13 @@ class Signatures:
     def __init__(self, way: Way, found: Sequence[Candidate]) -> None:
         c, model = way.chart, way.chart.model
         self.way, self.columns = way, sum(len(x.columns) for x in found)
-        every: list[Placed] = []
+        every: list[PlacedEffect] = []
         for x in found:
             circular = [n for n, s in x.placed.effect.shapes.items() if s.circular]
             for turn in range(len(x.columns)):
                 shift = dict.fromkeys(circular, turn * np.pi / 2)
                 values = {**x.placed.values, **shift}
-                every.append(Placed(x.placed.effect, x.placed.where, x.placed.bodies, x.placed.sensor, values))
+                every.append(PlacedEffect(x.placed.effect, x.placed.where, x.placed.bodies, x.placed.sensor, values))
         standard = tuple(n for n in model.base.standard if "@" not in n)
         made = signatures(model.machine, standard, every)
         self.force, self.reading = Batch(made.force, (7,)), Batch(made.reading, (7,))
@@ -307,7 +307,7 @@ def _acting(c: Chart, force: np.ndarray) -> np.ndarray:
     return force[:, rows].astype(np.float32)
 
 
-def _misread(c: Chart, e: Placed, u: np.ndarray, t: np.ndarray) -> np.ndarray:
+def _misread(c: Chart, e: PlacedEffect, u: np.ndarray, t: np.ndarray) -> np.ndarray:
     """How much more torque would be delivered (N, n_u) where a channel reads as the effect has it.
 
     From smoothed torques u: measured ones would answer to their own noise.
@@ -316,7 +316,7 @@ def _misread(c: Chart, e: Placed, u: np.ndarray, t: np.ndarray) -> np.ndarray:
     more = np.zeros_like(u)
     for k, body in enumerate(c.model.machine.actuated):
         if body.index in e.bodies:
-            more[:, k] = torque_behind(t, u[:, k], gain, offset, delay) - u[:, k]
+            more[:, k] = delivered_torque(t, u[:, k], gain, offset, delay) - u[:, k]
     return more
 
 

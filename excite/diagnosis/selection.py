@@ -34,7 +34,7 @@ from excite.diagnosis.residual_tests import shakes
 from excite.diagnosis.screening import begun
 from excite.logs import Log
 from excite.model import effects
-from excite.model.effects import Effect, Placed
+from excite.model.effects import Effect, PlacedEffect
 from excite.model.machine import EffectEntry, Quantity
 from excite.smoothing import NotConverged
 
@@ -180,7 +180,7 @@ def entry_of(stage: Stage, name: str) -> EffectEntry:
     return identified(placed.effect.name, placed.where, amount, values)
 
 
-def _values(stage: Stage, placed: Placed) -> dict[str, float]:
+def _values(stage: Stage, placed: PlacedEffect) -> dict[str, float]:
     """Amount and shapes of an effect as a stage's fit has them."""
     fitted = dict(zip(stage.model.base.names, stage.fit.X, strict=True))
     return {key: float(fitted.get(p, placed.values[key])) for p, (key, _) in placed.parameters.items()}
@@ -420,7 +420,7 @@ def _followed(
 ) -> tuple[Stage, list[Choice]] | None:
     """The effect with which a model can follow the logs from the beginning, with the first forces that do. Where exact
     dynamics were fitted without any, one that takes less than MAIN of what they leave isn't waited for."""
-    machines = [effects.extended(stage.machine, _entry(s)) for s in likely]
+    machines = [effects.with_effects(stage.machine, _entry(s)) for s in likely]
     worth = stage.fit.cost - MAIN * stage.excess if stage.settled and stage.exact else np.inf
     for disturbed in forces if likely else ():
         few = disturbed > identification.DISTURBED[0]
@@ -498,7 +498,7 @@ def _tries(
         gained = max((stage.fit.cost - found.fit.cost for _, found in tries), default=0.0)
         if not batch or (at >= near and gained > OVER * batch[0].gain):
             continue
-        wishes = [(effects.extended(stage.machine, _entry(s)), stage, stage.fit.disturbed) for s in batch]
+        wishes = [(effects.with_effects(stage.machine, _entry(s)), stage, stage.fit.disturbed) for s in batch]
         tell(at)
         most = min(ceiling, stage.fit.cost - BEHIND * gained if tries else np.inf)
         for k, (score, found) in enumerate(zip(batch, refits(wishes, together, most), strict=True)):
@@ -531,7 +531,7 @@ def _felt(name: str, stage: Stage) -> bool:
     if that shakes it; also where none of them can tell."""
     placed = stage.placed(name)
     fitted = replace(placed, values={**placed.values, **_values(stage, placed)})
-    if not effects.possible(stage.machine, fitted):
+    if not effects.shapes_possible(stage.machine, fitted):
         return False
     if fitted.effect.shaking is None:
         return True

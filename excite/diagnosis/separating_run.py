@@ -17,8 +17,8 @@ from excite.diagnosis.diagnosis import Diagnosis
 from excite.diagnosis.fits import Stage
 from excite.diagnosis.score_test import remembered
 from excite.logs import passes
-from excite.model import Signatures, effects, signatures
-from excite.model.effects import Placed, Site
+from excite.model import SignatureFunctions, effects, signatures
+from excite.model.effects import PlacedEffect, Site
 from excite.model.machine import EffectEntry, Machine
 from excite.smoothing import smoothed
 
@@ -84,7 +84,7 @@ def rivals(d: Diagnosis) -> list[Rivals]:
         tied = [_placed(d.after, name) for name in (f.name, *f.tied_with)]
         pairs = [(0, k) for k in range(1, len(tied))]
         apart = set(pairs) - _same(_Asked(d.after, tied)(_stirred(_motion(d.after))), pairs)
-        machine = effects.extended(d.before.machine, *(x.entry for x in d.findings if x is not f))
+        machine = effects.with_effects(d.before.machine, *(x.entry for x in d.findings if x is not f))
         found += [Rivals(machine, (f.entry, f.rivals[k - 1])) for _, k in sorted(apart)]
     return found
 
@@ -134,18 +134,18 @@ def _words(where: str) -> str:
     return where.replace("_", " ")
 
 
-def _placed(stage: Stage, name: str) -> Placed:
+def _placed(stage: Stage, name: str) -> PlacedEffect:
     """A tied effect with the amount and shapes that it was found with, or the catalogue's."""
     known = next((e for e in stage.model.effects if e.name == name), None)
     if known is not None:
         return known
     name, _, where = name.partition("@")
     effect = effects.CATALOGUE[name]
-    bodies, sensor = effects.places(stage.machine, effect)[where]
+    bodies, sensor = effects.allowed_places(stage.machine, effect)[where]
     log = stage.prepared.logs[0]
     site = Site.of(stage.machine, bodies, float(log.t[-1] - log.t[0]))
     shapes = {n: s.default * s.size(site) for n, s in effect.shapes.items()}
-    return Placed(effect, where, bodies, sensor, {"A": effect.amount(site), **shapes})
+    return PlacedEffect(effect, where, bodies, sensor, {"A": effect.amount(site), **shapes})
 
 
 def _motion(stage: Stage) -> Motion:
@@ -166,11 +166,11 @@ def _motion(stage: Stage) -> Motion:
 class _Asked:
     """What effects add along a motion: (C, K), forces and readings each in units of their size."""
 
-    def __init__(self, stage: Stage, placed: Sequence[Placed]) -> None:
+    def __init__(self, stage: Stage, placed: Sequence[PlacedEffect]) -> None:
         model = stage.model
         standard = tuple(n for n in model.base.standard if "@" not in n)
         self.model, self.machine, self.placed = model, stage.machine, placed
-        self.made: Signatures = signatures(stage.machine, standard, placed)
+        self.made: SignatureFunctions = signatures(stage.machine, standard, placed)
         self.p = (model.expand @ stage.fit.X)[: len(standard)]
         self.rows = {b.index: k for b, k in zip(stage.machine.actuated, model.actuated, strict=True)}
         self.readings = self.made.reading.size1_out(0)
@@ -190,7 +190,7 @@ class _Asked:
                 force[:, :, k] += self._misread(e, m)
         return np.concatenate([force, reading]).transpose(2, 0, 1).reshape(C, -1)
 
-    def _misread(self, e: Placed, m: Motion) -> np.ndarray:
+    def _misread(self, e: PlacedEffect, m: Motion) -> np.ndarray:
         """What a torque channel reads beside the torque (n_q, N)."""
         gain, offset, delay = e.channel(m.t)
         added = np.zeros((m.q.shape[1], len(m.t)))
@@ -226,7 +226,7 @@ def _same(signature: np.ndarray, pairs: Sequence[tuple[int, int]]) -> set[tuple[
     return {(i, j) for i, j in pairs if abs(unit[i] @ unit[j]) > 1 - SAME}
 
 
-def _by_place(machine: Machine, a: Placed, b: Placed) -> str | None:
+def _by_place(machine: Machine, a: PlacedEffect, b: PlacedEffect) -> str | None:
     """What separates two causes that answer alike because they differ in place alone, or not even in that."""
     if a.where != b.where and machine.planar:
         pulling = {x.index for x in machine.actuated if x.contact is not None}

@@ -8,14 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from excite.errors import NotIdentifiable, SimulationError
+from excite.errors import NotIdentifiableError, SimulationError
 from excite.identification.estimate import Estimate, noted
 from excite.identification.noise_propagation import reread
 from excite.logs import Log, Samples, lowpass, samples, white_noise
 from excite.model import Model
 from excite.model.machine import Filter
-from excite.simulation import Motion, respond, signals
-from excite.text import percent, rounded
+from excite.simulation import Motion, exact_readings, respond
+from excite.text import format_number, format_percent
 
 RUNS = 8
 HOLD = 1.0  # time constant with which the simulated joints are held to the log's speeds [s]
@@ -43,7 +43,7 @@ def with_bias(
     estimate that is far off it is far too small: better parameters, of a consistent method, make a better place. A
     note says so where the machine can't be simulated.
     """
-    from excite.errors import NotConsistent
+    from excite.errors import NotConsistentError
     from excite.identification.consistency import consistent
 
     try:
@@ -52,7 +52,7 @@ def with_bias(
         if not _is_machine(model, X):
             X = consistent(model, replace(estimate, value=X, covariance=_known(model, estimate))).value
         motions = [replay(model, log, X, filter) for log in logs]
-    except (SimulationError, NotConsistent) as err:
+    except (SimulationError, NotConsistentError) as err:
         return noted(estimate, f"{estimate.method}: bias unknown, the identified machine can't be simulated ({err})")
     rng = np.random.default_rng(seed)
     errors = []
@@ -60,7 +60,7 @@ def with_bias(
         again = [measured_again(model, log, motion, X, rng) for log, motion in zip(logs, motions, strict=True)]
         try:
             errors.append(method(model, again, filter).value - X)
-        except NotIdentifiable:
+        except NotIdentifiableError:
             continue
     if len(errors) < 2:
         return noted(estimate, f"{estimate.method}: bias unknown, it fails on simulated logs of the identified machine")
@@ -77,8 +77,8 @@ def _remark(model: Model, estimate: Estimate, bias: np.ndarray, std: np.ndarray,
         return f"{estimate.method}: no bias found on {runs} simulated logs of the identified machine"
     order = [k for k in np.argsort(-np.abs(bias) / size) if matters[k]]
     listed = ", ".join(
-        f"{estimate.names[k]} {'+' if bias[k] > 0 else ''}{percent(100 * bias[k] / size[k])}"
-        f" (+-{rounded(float(100 * std[k] / size[k]), 1)})"
+        f"{estimate.names[k]} {'+' if bias[k] > 0 else ''}{format_percent(100 * bias[k] / size[k])}"
+        f" (+-{format_number(float(100 * std[k] / size[k]), 1)})"
         for k in order
     )
     return (
@@ -128,7 +128,7 @@ def _inertia(model: Model, s: Samples, X: np.ndarray, rows: Sequence[int]) -> np
 
 def measured_again(model: Model, log: Log, motion: Motion, X: np.ndarray, rng: np.random.Generator) -> Log:
     """The log that the log's own sensors would write of a motion."""
-    exact = signals(model, motion, X)
+    exact = exact_readings(model, motion, X)
     values = {
         s.name: reread(s, exact[s.name], white_noise(log.values[s.name]), rng)
         for s in model.machine.sensors("full")

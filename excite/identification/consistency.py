@@ -15,10 +15,10 @@ from dataclasses import replace
 import cvxpy as cp
 import numpy as np
 
-from excite.errors import NotConsistent
+from excite.errors import NotConsistentError
 from excite.identification.estimate import Estimate, noted
 from excite.identification.linear_methods import Block, residual, size
-from excite.model import Model, signs, standard_parameters
+from excite.model import Model, required_signs, standard_parameters
 from excite.model.mechanics import INERTIAL
 
 MARGIN = 1e-6  # of a parameter's scale, kept from the edge: a mass matrix must be invertible
@@ -45,9 +45,9 @@ def consistent(model: Model, estimate: Estimate) -> Estimate:
     try:
         problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
     except cp.error.SolverError as err:
-        raise NotConsistent(f"no possible machine found near the estimate: {err}") from None
+        raise NotConsistentError(f"no possible machine found near the estimate: {err}") from None
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or X.value is None:
-        raise NotConsistent(f"no possible machine found near the estimate: the solver says {problem.status}")
+        raise NotConsistentError(f"no possible machine found near the estimate: the solver says {problem.status}")
     value = np.full(len(estimate.value), np.nan)
     value[kept] = np.asarray(X.value)[kept]
     moved = (value[kept] - estimate.value[kept]) / estimate.std[kept]
@@ -85,7 +85,7 @@ def is_possible(model: Model, X: np.ndarray) -> bool:
 def _possible(model: Model, p: dict[str, cp.Expression], margin: float) -> list[cp.Constraint]:
     """What every real machine obeys, in standard parameters by name, `margin` of their nominal size inside."""
     nominal = {name: abs(value) for name, (value, _) in standard_parameters(model.machine).items()}
-    found = [sign * p[name] >= margin * nominal[name] for name, sign in signs(model.machine).items()]
+    found = [sign * p[name] >= margin * nominal[name] for name, sign in required_signs(model.machine).items()]
     for body in model.machine.body:
         k = body.index
         if body.inertia is not None:

@@ -13,7 +13,7 @@ from excite.identification.least_squares import exchanged
 from excite.logs import BLOCK, Log, Samples, samples, unmeasured
 from excite.model import Model
 from excite.model.machine import Filter
-from excite.model.mechanics import independent
+from excite.model.mechanics import independent_columns
 
 SAMPLES = 400  # of the logs, that stand for them
 STILL = 0.01  # of a coordinate's speed at other times [rad/s, m/s]
@@ -119,7 +119,7 @@ def _exactly(R: np.ndarray) -> np.ndarray:
     """T (n, n) with R T = R to within NOTHING, by which a column of R that others make up is made of them."""
     size = np.linalg.norm(R, axis=0)
     nothing = NOTHING * size.max()
-    kept = np.array(exchanged(R, *independent(R, nothing)), int)  # also where there is none
+    kept = np.array(exchanged(R, *independent_columns(R, nothing)), int)  # also where there is none
     made = np.setdiff1d(np.flatnonzero(size > nothing), kept)
     T = np.zeros((R.shape[1], R.shape[1]))
     T[kept, kept] = 1.0

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
-from excite.errors import NotIdentifiable, SimulationError
+from excite.errors import NotIdentifiableError, SimulationError
 from excite.identification.estimate import Estimate
 from excite.identification.identifiability import at_rest
 from excite.identification.linear_methods import (
@@ -80,7 +80,7 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
                 model, blocks, first, "iv", x, covariance, effective(solved(own, model.scale), covariance), ()
             )
     worst = kept[int(np.argmax(ratio))]
-    raise NotIdentifiable(
+    raise NotIdentifiableError(
         f"iv: no estimate reproduces itself after {PASSES} passes, {model.base.names[worst]} still moves by"
         f" {abs(step[worst]):.3g}: start from better values in the machine file, or drive more lively"
     )
@@ -103,7 +103,7 @@ def _observed(
                 break
             step = step / 2
             x = x - step
-    raise NotIdentifiable(
+    raise NotIdentifiableError(
         "iv: the machine that it leads to can't be simulated; start from better values in the machine file"
     )
 
@@ -135,7 +135,7 @@ def _square(
     y = np.concatenate([residual(b, given).reshape(-1) for b in blocks])
     size = np.linalg.norm(tall, axis=0)
     if not (size > 0).all():
-        raise NotIdentifiable("iv: along the simulated motion nothing depends on one of the parameters")
+        raise NotIdentifiableError("iv: along the simulated motion nothing depends on one of the parameters")
     Q, R = np.linalg.qr(tall / size)
     A = Q.T @ W
     found = x.copy()

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from excite.errors import NotIdentifiable
+from excite.errors import NotIdentifiableError
 from excite.identification import identifiability
 from excite.identification.estimate import UNMOVED, Estimate, held_note
 from excite.logs import Log, decimate, derivative
@@ -178,7 +178,7 @@ def _estimate(
     model = c.model
     weak = fit.unseen | (fit.std > UNSEEN * np.maximum(np.abs(fit.X), model.scale))
     if weak.all():
-        raise NotIdentifiable(UNMOVED)
+        raise NotIdentifiableError(UNMOVED)
     if fit.unseen.any():
         held = [n for n, yes in zip(model.base.names, fit.unseen, strict=True) if yes]
         notes = (*notes, held_note(held))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from excite.model.mechanics import independent
+from excite.model.mechanics import independent_columns
 
 DEPENDENT = 1e-10  # a column this close to a combination of the others carries nothing [relative]
 BLOCK = 20_000  # rows of a tall matrix that are reduced at once
@@ -121,7 +121,7 @@ def solve(t: Triangle, tolerance: float = DEPENDENT, scale: np.ndarray | None = 
     A, y = t.R[:, :n], t.R[:, n]
     size = np.linalg.norm(A, axis=0)
     scaled = A / np.where(size > 0, size, 1.0)
-    kept, left = independent(scaled, tolerance)
+    kept, left = independent_columns(scaled, tolerance)
     if scale is not None:
         kept = exchanged(A * scale, kept, left)
     dependent: dict[int, int | None] = {

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
-from excite.errors import NotIdentifiable
+from excite.errors import NotIdentifiableError
 from excite.identification.estimate import UNMOVED, Estimate, held_note, noted
 from excite.identification.identifiability import at_rest
 from excite.identification.least_squares import Solution, Triangle, lag_one, merge, reduce, scores_covariance, solve
@@ -89,7 +89,7 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     relative = scipy.linalg.solve_triangular(R, half.T, trans="T")
     mu, v = np.linalg.eigh((relative + relative.T) / 2)
     if not mu[-1] > 0:
-        raise NotIdentifiable("tls: no signal of this log has noise or counts, so nothing says what noise is like")
+        raise NotIdentifiableError("tls: no signal of this log has noise or counts, so nothing says what noise is like")
     direction = scipy.linalg.solve_triangular(R, v[:, -1])
     x = np.zeros(len(model.base.names))
     x[kept] = -direction[:-1] / direction[-1]
@@ -142,15 +142,15 @@ def solved(blocks: Sequence[Block], scale: np.ndarray | None = None) -> Solution
     n_base = blocks[0][0].shape[2]
     for W, Y in blocks:
         if not (np.isfinite(W).all() and np.isfinite(Y).all()):
-            raise NotIdentifiable("the filtered log is not finite: is a value in it far out of range?")
+            raise NotIdentifiableError("the filtered log is not finite: is a value in it far out of range?")
     rows = sum(Y.size for _, Y in blocks)
     if not any((Y != 0).any() for _, Y in blocks):
-        raise NotIdentifiable("every torque is zero all along: are their sensors connected?")
+        raise NotIdentifiableError("every torque is zero all along: are their sensors connected?")
     if rows <= n_base:
-        raise NotIdentifiable(f"{rows} filtered rows for {n_base} parameters: the log is too short")
+        raise NotIdentifiableError(f"{rows} filtered rows for {n_base} parameters: the log is too short")
     solution = solve(triangle(blocks), scale=scale)
     if not solution.kept:
-        raise NotIdentifiable(UNMOVED)
+        raise NotIdentifiableError(UNMOVED)
     return solution
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from excite.errors import MachineError, NoEstimate, NotIdentifiable
+from excite.errors import MachineError, NoEstimateError, NotIdentifiableError
 from excite.identification import bias
 from excite.identification.bias import Find
 from excite.identification.estimate import Estimate, noted
@@ -54,13 +54,13 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     examined = [examine(model, log) for log in logs]
     mended, filter = [e.log for e in examined], filter or model.machine.filter
     if not any(v.any() for log in mended for v in log.values.values()):
-        raise NotIdentifiable(f"{mended[0].source}: every signal is zero: is the log empty of measurements?")
+        raise NotIdentifiableError(f"{mended[0].source}: every signal is zero: is the log empty of measurements?")
     doubtful = [line for e in examined for line in e.doubts]
     with doubts_in_errors(doubtful):
         try:
             estimate = explained(model, mended, METHODS[method].find(model, mended, filter), filter)
         except np.linalg.LinAlgError:
-            raise NotIdentifiable(
+            raise NotIdentifiableError(
                 f"{mended[0].source}: the equations of {method} are singular along this log: check the sign and unit of"
                 " every column, and that the machine moves"
             ) from None
@@ -120,7 +120,7 @@ def with_bias(
     around: np.ndarray | None = None
     if METHODS[estimate.method].biased:
         for find in (METHODS["joint"].find, iv):
-            with suppress(NoEstimate):
+            with suppress(NoEstimateError):
                 around = find(model, logs, filter).value
                 break
     return bias.with_bias(model, logs, estimate, METHODS[estimate.method].find, filter, around, runs)

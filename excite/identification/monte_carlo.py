@@ -9,9 +9,9 @@ import numpy as np
 from joblib import Parallel, delayed
 
 from excite import logs, simulation
-from excite.errors import NoEstimate
+from excite.errors import NoEstimateError
 from excite.identification import methods
-from excite.model import Model, built
+from excite.model import Model, build_cached
 from excite.simulation import Motion
 
 Progress = Callable[[int, int], None]
@@ -112,12 +112,12 @@ Found = tuple[np.ndarray, np.ndarray, np.ndarray]
 def _run(
     k: int, true: str, known: str, motion: Motion, method: str, kit: str, seed: int
 ) -> tuple[int, Found | None, str]:
-    model, assumed = built(true), built(known)
+    model, assumed = build_cached(true), build_cached(known)
     table = simulation.measure(model, motion, kit=kit, seed=seed)
     measured = logs.from_table(table, assumed.machine, methods.needed_sensors(assumed, method))
     try:
         estimate = methods.identify(assumed, [measured], method)
-    except NoEstimate as err:
+    except NoEstimateError as err:
         return k, None, str(err)
     return k, (estimate.value, estimate.std, estimate.interval95), ""
 

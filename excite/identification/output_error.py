@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from excite.errors import NotIdentifiable, SimulationError
+from excite.errors import NotIdentifiableError, SimulationError
 from excite.identification.estimate import Estimate
 from excite.identification.least_squares import Triangle, merge, solve
 from excite.identification.linear_methods import assembled, regressions, solved
@@ -72,7 +72,9 @@ def oe(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     x, level = model.nominal.copy(), sensor_noise
     runs = _simulated(c, pieces, x)
     if runs is None:
-        raise NotIdentifiable("oe: the machine file's values give no motion along this log; check masses and inertias")
+        raise NotIdentifiableError(
+            "oe: the machine file's values give no motion along this log; check masses and inertias"
+        )
     nearest = np.inf, x, runs
     for _ in range(PASSES):
         step, starts, covariance = _step(runs, level, torque_noise, sensor_noise, kept)
@@ -85,7 +87,7 @@ def oe(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
                 break
             share /= 2
         else:
-            raise NotIdentifiable(
+            raise NotIdentifiableError(
                 "oe: no step makes the fit better, and it is none yet; start from better values in the machine file, or"
                 " use another method"
             )
@@ -97,7 +99,7 @@ def oe(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
             break
     left, x, runs = nearest
     if left > NEARLY:
-        raise NotIdentifiable(
+        raise NotIdentifiableError(
             f"oe: no end after {PASSES} passes (the smallest step is {left:.2g} standard deviations); start from better"
             " values in the machine file, or use another method"
         )

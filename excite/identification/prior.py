@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from excite.errors import NotIdentifiable
+from excite.errors import NotIdentifiableError
 from excite.identification.estimate import Estimate
 from excite.identification.methods import identify
 from excite.logs import Log
-from excite.model import Model, signs
+from excite.model import Model, required_signs
 
 POSES = 181  # at which the mass matrix is looked at
 SHARES = np.linspace(1, 0, 21)
@@ -58,7 +58,7 @@ def from_estimate(model: Model, estimate: Estimate) -> Known:
             scale = np.where(np.array(floor) > 0, floor, np.abs(nominal))
             scale = np.where(scale > 0, scale, model.scale)
             return Known(replace(model, nominal=nominal, scale=scale), information, estimate, float(share))
-    raise NotIdentifiable("the machine file's own values have no positive definite mass matrix")
+    raise NotIdentifiableError("the machine file's own values have no positive definite mass matrix")
 
 
 def _possible(model: Model, X: np.ndarray) -> bool:
@@ -71,6 +71,6 @@ def _possible(model: Model, X: np.ndarray) -> bool:
                 q[model.coordinates.index(c)] = np.linspace(-wide, wide, POSES)
     if not (model.pivots(q, X).full() > 0).all():
         return False
-    of = signs(model.machine)
+    of = required_signs(model.machine)
     sign = np.array([of.get(model.base.standard[k], 0.0) for k in model.base.independent])
     return bool((X * sign >= 0)[model.nominal != 0].all())  # of none an estimate may be a little less

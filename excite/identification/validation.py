@@ -10,7 +10,7 @@ from excite.identification.estimate import Estimate
 from excite.logs import Log, lowpass, samples
 from excite.model import Model
 from excite.model.machine import Filter
-from excite.simulation import Motion, signals, simulate, torques_behind
+from excite.simulation import Motion, delivered_torques, exact_readings, simulate
 
 FAR = 4.0  # times as large or as small as in the machine file
 SURELY = 3.0  # deviations from it
@@ -90,7 +90,7 @@ def replayed(model: Model, log: Log, X: np.ndarray, filter: Filter | None = None
     Raises SimulationError where the parameters are no machine."""
     s = samples(model, log, filter or model.machine.filter)
     channels = [x.full() for x in model.channels(log.t[None], X)]
-    torque = torques_behind(log.t, s.Y[list(model.actuated)].T, channels)
+    torque = delivered_torques(log.t, s.Y[list(model.actuated)].T, channels)
     return simulate(model, torque, X, s.q[:, 0], s.nu[:, 0])
 
 
@@ -106,7 +106,7 @@ def motions(model: Model, log: Log, estimate: Estimate, filter: Filter | None = 
         raise ValueError(f"a simulation needs every parameter, unknown: {', '.join(unknown)}")
     X = estimate.value
     motion = replayed(model, log, X, filter)
-    exact = signals(model, motion, X)
+    exact = exact_readings(model, motion, X)
     chosen = [x for x in model.machine.sensors("full") if x.name in log.values and x.kind not in ("torque", "x", "y")]
     turned = {x.name: x.kind in ("angle", "wheel") and not x.is_rate for x in chosen}
 

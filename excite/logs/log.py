@@ -13,7 +13,7 @@ import pandas as pd
 from excite.errors import LogError as LogError
 from excite.logs import tables
 from excite.logs.tables import MDF_TIME, UNCLEAR
-from excite.model.machine import UNITS, Machine, Sensor, arms, load_machine, shipped_machines
+from excite.model.machine import UNITS, Machine, Sensor, load_machine, shipped_machines, torque_per_pressure
 
 SHORTEST = 100  # samples: below this no filter and no estimate makes sense
 OFF_RATE = 0.02  # by which the usual rate of sampling may differ from the machine file's
@@ -102,7 +102,9 @@ def values_of(sensor: Sensor, machine: Machine, table: pd.DataFrame, source: str
     back = numbers(table, sensor.return_column, source)
     if not sensor.cylinders:
         return sensor.gain * (number - back)
-    push, pull = arms(sensor.displacement, sensor.cylinders, _joint_angle(sensor, machine, table, source))
+    push, pull = torque_per_pressure(
+        sensor.displacement, sensor.cylinders, _joint_angle(sensor, machine, table, source)
+    )
     return sensor.gain * (push * number + pull * back)
 
 

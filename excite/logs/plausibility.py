@@ -14,7 +14,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from excite.errors import NoEstimate
+from excite.errors import NoEstimateError
 from excite.model import mechanics
 from excite.model.machine import Body, Machine, Sensor, shipped_machines
 
@@ -125,7 +125,7 @@ def _sides(machine: Machine, sensors: Sequence[Sensor]) -> dict[str, float]:
     """Left or right, of sensors on a machine with no joint to steer with, which turns its sides against each other."""
     if any(b.contact is None for b in machine.actuated):
         return {s.name: 0.0 for s in sensors}
-    places = mechanics.poses(machine, {})
+    places = mechanics.body_poses(machine, {})
     across = {s.name: float(s.lateral) if s.lateral is not None else places[s.body][1][1] for s in sensors}
     return {name: float(np.sign(round(y, 6))) for name, y in across.items()}
 
@@ -217,7 +217,7 @@ def doubts_in_errors(lines: Sequence[str]) -> Iterator[None]:
     """Where no estimate is found, the message says what is doubtful about the logs as well."""
     try:
         yield
-    except NoEstimate as err:
+    except NoEstimateError as err:
         if lines:
             err.args = ("; ".join((str(err), *lines)),)
         raise

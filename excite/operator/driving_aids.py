@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from excite import trajectories
-from excite.errors import DriveError, SimulationError
+from excite.errors import SimulationError, UndrivableError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.operator import ground, page, sheet
@@ -43,7 +43,7 @@ def prepare(
     """
     model, motion, problem = design.model, design.motion, design.problem
     if problem is None:
-        raise DriveError(f"{model.machine.name}: has no problem {design.summary.get('problem')}, design again")
+        raise UndrivableError(f"{model.machine.name}: has no problem {design.summary.get('problem')}, design again")
     made = design.summary.get("driver") if most is None else None  # by `--driver`: of phases already
     if made is not None:
         choices = [ground.from_table(model, made["phases"])]

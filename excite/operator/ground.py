@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from excite import simulation, smoothing, trajectories
-from excite.errors import DriveError
+from excite.errors import UndrivableError
 from excite.model import Model
 from excite.model.machine import Body, Problem
-from excite.simulation import Motion, turns_left
+from excite.simulation import Motion, left_turn_sign
 
 BROKEN = 0.02  # of its range, by which a limit is broken
 GRID = 0.5  # s between places where a phase may begin
@@ -100,8 +100,8 @@ class Room:
 def levers(model: Model) -> tuple[Lever, ...]:
     """The joints that a person steers, none on a straight lane. Raises DriveError where nobody drives: no wheels."""
     if not model.machine.planar or not model.machine.contacts:
-        raise DriveError(f"{model.machine.name}: touches the ground nowhere, so there is nobody to drive it")
-    return tuple(Lever(b, turns_left(model, b)) for b in model.machine.actuated if b.contact is None)
+        raise UndrivableError(f"{model.machine.name}: touches the ground nowhere, so there is nobody to drive it")
+    return tuple(Lever(b, left_turn_sign(model, b)) for b in model.machine.actuated if b.contact is None)
 
 
 def phases(model: Model, motion: Motion, shortest: float = 2.0, most: int | None = None) -> Trace:
@@ -113,9 +113,9 @@ def phases(model: Model, motion: Motion, shortest: float = 2.0, most: int | None
     duration = float(motion.t[-1])
     most = max(2, round(duration / 3)) if most is None else most
     if most < 2:
-        raise DriveError(f"phases: at least 2 are needed, to go and to stop (got {most})")
+        raise UndrivableError(f"phases: at least 2 are needed, to go and to stop (got {most})")
     if not GRID <= shortest <= duration / 2:
-        raise DriveError(f"shortest phase: must be between {GRID:g} and {duration / 2:g} s (got {shortest:g})")
+        raise UndrivableError(f"shortest phase: must be between {GRID:g} and {duration / 2:g} s (got {shortest:g})")
     own = as_designed(model, motion)
     speed, angle = own.speed, own.angle
     fastest, widest, swing = bounds(model)
@@ -263,9 +263,9 @@ def from_table(model: Model, rows: Sequence[Mapping[str, Any]]) -> Trace:
     except (KeyError, IndexError, TypeError, ValueError) as err:
         other = isinstance(err, KeyError) and err.args[0] in [j.column for j in joints]
         why = f"of another version or machine (no column {err.args[0]})" if other else "damaged"
-        raise DriveError(f"summary.json: the design's phases are {why}, design again") from None
+        raise UndrivableError(f"summary.json: the design's phases are {why}, design again") from None
     if len(times) < 2 or not (np.diff(times) > 0).all():
-        raise DriveError("summary.json: the design's phases are damaged, design again")
+        raise UndrivableError("summary.json: the design's phases are damaged, design again")
     return Trace(times, speed, np.reshape(angle, (len(joints), len(times))).T, joints)
 
 

@@ -21,12 +21,12 @@ import joblib
 import numpy as np
 
 from excite import trajectories
-from excite.errors import DriveError, SimulationError
+from excite.errors import SimulationError, UndrivableError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.operator import ground
 from excite.operator.ground import ANGLE_STEP, GRID, SPEED_STEP, Score, Trace
-from excite.simulation import STEADY, Motion, followed
+from excite.simulation import STEADY_DRIVER, Motion, track_motion
 from excite.trajectories import Aim, Design, Manoeuvre, processes
 
 PEOPLE = 3  # who drive it in the end, in simulation
@@ -126,7 +126,9 @@ def check(model: Model, problem: Problem, shortest: float) -> None:
     ground.levers(model)
     top = float(problem.duration_s) / 4
     if not GRID <= shortest <= top:
-        raise DriveError(f"shortest phase (--phase-min): must be between {GRID:g} and {top:g} s (got {shortest:g})")
+        raise UndrivableError(
+            f"shortest phase (--phase-min): must be between {GRID:g} and {top:g} s (got {shortest:g})"
+        )
 
 
 def as_design(model: Model, problem: Problem, free: Design, made: Phased) -> Design:
@@ -165,7 +167,7 @@ def _judged(task: Task, trace: Trace, begin: Trace, designed: Motion, seed: int,
 
     before = people(begin, [ground.driven(model, begin, None, seed + k) for k in range(PEOPLE)])
     after = people(trace, motions[1:])
-    played = worth(designed, lambda m: followed(m, model, designed)), ground.score(model, designed)
+    played = worth(designed, lambda m: track_motion(m, model, designed)), ground.score(model, designed)
     scores, attained = (played[0], before[0], after[0]), (played[1], before[1], after[1])
     return Phased(trace, motions[0], motions[1:], scores, attained, over, whole)
 
@@ -322,7 +324,7 @@ def _revived(blob: bytes) -> Task:
 
 
 def _driven(task: Task, trace: Trace) -> Motion:
-    return ground.driven(task.model, trace, STEADY, 0)
+    return ground.driven(task.model, trace, STEADY_DRIVER, 0)
 
 
 def _placed(task: Task, motions: Sequence[Motion]) -> list[Motion]:

@@ -17,7 +17,7 @@ from excite.logs import guess_machine, inspect, read_table, table_of
 from excite.model.machine import load_machine
 from excite.reports import figures
 from excite.reports.html import Picture, Table, report_page
-from excite.text import likely, percent, rounded, some
+from excite.text import first_lines, format_number, format_p_value, format_percent
 from excite.trajectories import TOLERANCE
 
 REPORT = "report.html"
@@ -73,7 +73,7 @@ def write(place: Path, kind: str, summary: Summary) -> None:
 def write_report(place: Path, kind: str, summary: Summary) -> None:
     """Report and summary of a command's folder, once its figures are there."""
     write(place, kind, summary)
-    output.keep(place, summary)
+    output.write_summary(place, summary)
 
 
 def how(summary: Summary) -> dict[str, str]:
@@ -84,7 +84,7 @@ def how(summary: Summary) -> dict[str, str]:
         value = summary.get(key)
         if value is not None:
             name, unit = (key[:-2], " s") if key.endswith("_s") else (key, "")
-            rows[{"wall": "computed in"}.get(name, name)] = f"{rounded(value, 4)}{unit}"
+            rows[{"wall": "computed in"}.get(name, name)] = f"{format_number(value, 4)}{unit}"
     if summary.get("logs"):
         rows["logs"] = ", ".join(summary["logs"])
     rows["versions"] = ", ".join(f"{name} {version}" for name, version in summary["versions"].items())
@@ -150,8 +150,8 @@ def _design(s: Summary) -> Said:
     )
     driven = "Followed by a steady person" if s.get("driver") else "Driven as designed"
     answer = (
-        f"{driven}, these {s['duration_s']:g} s can tell every parameter to {percent(sigma[worst])} or better"
-        f" (one standard deviation; worst {worst}, median {percent(np.median(list(sigma.values())))}); {limits}."
+        f"{driven}, these {s['duration_s']:g} s can tell every parameter to {format_percent(sigma[worst])} or better"
+        f" (one standard deviation; worst {worst}, median {format_percent(np.median(list(sigma.values())))}); {limits}."
     )
     remarks = [
         f"Condition number of Phi {s['cond_phi']:.4g}, of W {s['cond_w']:.4g}; best start {s['cond_phi_start']:.4g}."
@@ -161,7 +161,7 @@ def _design(s: Summary) -> Said:
     if s.get("advice"):
         remarks.append(s["advice"])
     ordered = sorted(sigma.items(), key=lambda x: -x[1])
-    rows = tuple((name, *_meant(s, name), rounded(value, 3)) for name, value in ordered)
+    rows = tuple((name, *_meant(s, name), format_number(value, 3)) for name, value in ordered)
     names = ("parameter", *_meaning(s), "%")
     tables = [Table("Attainable standard deviation of each parameter, the worst first.", names, rows)]
     if s.get("driver"):
@@ -193,15 +193,15 @@ def kept(s: Summary) -> str:
     free, hand = d["played_back"], d["by_hand"]
     return (
         f"In people's hands these {len(d['phases'])} phases give {trajectories.titled(s['objective'], hand['score'])},"
-        f" torques played back {free['score']:.4g}; the worst parameter can be told to {percent(hand['worst_percent'])}"
-        f" ({hand['worst_parameter']}) instead of {percent(free['worst_percent'])}, the median one to"
-        f" {percent(hand['median_percent'])} instead of {percent(free['median_percent'])}"
+        f" torques played back {free['score']:.4g}; the worst parameter can be told to {format_percent(hand['worst_percent'])}"
+        f" ({hand['worst_parameter']}) instead of {format_percent(free['worst_percent'])}, the median one to"
+        f" {format_percent(hand['median_percent'])} instead of {format_percent(free['median_percent'])}"
     )
 
 
 def _by_hand(s: Summary) -> tuple[list[str], list[Table]]:
     d = s["driver"]
-    over = ", ".join(f"{name} by {percent(100 * value)}" for name, value in d["limits_broken"].items())
+    over = ", ".join(f"{name} by {format_percent(100 * value)}" for name, value in d["limits_broken"].items())
     remarks = [
         f"{kept(s)}.",
         f"In the hands of {d['people']} simulated people these limits are exceeded: {over} of their range."
@@ -210,7 +210,7 @@ def _by_hand(s: Summary) -> tuple[list[str], list[Table]]:
         "The numbers below are of a steady person; `excite drive` makes the driver's sheet and page of this drive.",
     ]
     keys = ("score", "cond_phi", "worst_percent", "median_percent")
-    rows = tuple((WAYS[w], *(rounded(d[w][k], 4) for k in keys), d[w]["worst_parameter"]) for w in WAYS)
+    rows = tuple((WAYS[w], *(format_number(d[w][k], 4) for k in keys), d[w]["worst_parameter"]) for w in WAYS)
     names = ("driven by", "objective", "cond(Phi)", "worst std %", "median std %", "worst parameter")
     phases = tuple((f"{r['start_s']:g}", f"{r['end_s'] - r['start_s']:g}", r["do"]) for r in d["phases"])
     return remarks, [
@@ -229,8 +229,8 @@ def _verify(s: Summary) -> Said:
     cover = 100 * float(np.mean([rows[n]["coverage95"] for n in errors]))
     median = float(np.median(list(errors.values())))
     answer = (
-        f"In {s['runs']} simulated test days the parameters came out within {percent(median)} of the truth (median;"
-        f" worst {worst}, {percent(errors[worst])}), and the 95 % intervals held it in {cover:.0f} % of cases."
+        f"In {s['runs']} simulated test days the parameters came out within {format_percent(median)} of the truth (median;"
+        f" worst {worst}, {format_percent(errors[worst])}), and the 95 % intervals held it in {cover:.0f} % of cases."
     )
     remarks = [f"Biased, the intervals do not hold: {', '.join(s['biased'])}."] if s["biased"] else []
     if s["failed"]:
@@ -240,10 +240,10 @@ def _verify(s: Summary) -> Said:
             n,
             *_meant(s, n),
             r["unit"],
-            rounded(r["true"], 6),
-            rounded(r["mean"], 6),
-            *(rounded(r[k], 3) for k in ("bias_percent", "std_percent", "predicted_std_percent")),
-            rounded(100 * r["coverage95"], 3),
+            format_number(r["true"], 6),
+            format_number(r["mean"], 6),
+            *(format_number(r[k], 3) for k in ("bias_percent", "std_percent", "predicted_std_percent")),
+            format_number(100 * r["coverage95"], 3),
         )
         for n, r in rows.items()
     )
@@ -271,9 +271,9 @@ def _compare(s: Summary) -> Said:
     rows = tuple(
         (
             d["name"],
-            *(rounded(d[k], 4) for k in ("cond_phi", "cond_w", "worst_std_percent", "median_std_percent")),
+            *(format_number(d[k], 4) for k in ("cond_phi", "cond_w", "worst_std_percent", "median_std_percent")),
             f"{d['kept']}/{d['samples']}",
-            "-" if d["breaks"] is None else f"{d['breaks']} by {percent(100 * d['max_violation'])}",
+            "-" if d["breaks"] is None else f"{d['breaks']} by {format_percent(100 * d['max_violation'])}",
             f"{d['wall_s']:.1f}",
         )
         for d in s["designs"]
@@ -302,15 +302,15 @@ def _identify(s: Summary) -> Said:
     logs = "one log" if len(s["logs"]) == 1 else f"{len(s['logs'])} logs"
     median, rest = float(np.median(list(known.values()))), float(s["relative_error_percent"])
     answer = (
-        f"From {logs}, {count} are found to {percent(median)} (median, one standard deviation; worst {worst},"
-        f" {percent(known[worst])}); the prediction leaves {percent(rest)} of what was measured."
+        f"From {logs}, {count} are found to {format_percent(median)} (median, one standard deviation; worst {worst},"
+        f" {format_percent(known[worst])}); the prediction leaves {format_percent(rest)} of what was measured."
     )
     off = {n: abs(r["bias"] / (r["value"] - r["bias"])) for n, r in rows.items() if n in known and _is_biased(r)}
     if off:
         most = max(off, key=lambda n: off[n])
         answer = (
             f"From {logs}, {s['method']} finds {count}, {len(off)} of them wrong by more than it says: on simulated"
-            f" logs like this by up to {percent(100 * off[most])} ({most}); the prediction leaves {percent(rest)} of"
+            f" logs like this by up to {format_percent(100 * off[most])} ({most}); the prediction leaves {format_percent(rest)} of"
             " what was measured."
         )
     remarks = [f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()] + list(s["notes"])
@@ -323,8 +323,8 @@ def _identify(s: Summary) -> Said:
             n,
             *_meant(s, n),
             r["unit"],
-            *(rounded(r[k], d) for _, k, d in ESTIMATE),
-            *((rounded(r.get("bias"), 3),) if biased else ()),
+            *(format_number(r[k], d) for _, k, d in ESTIMATE),
+            *((format_number(r.get("bias"), 3),) if biased else ()),
         )
         for n, r in rows.items()
     )
@@ -357,7 +357,14 @@ def _log(s: Summary) -> Said:
     else:
         answer = f"{name} is a usable log of {s['machine']}: {span}."
     rows = tuple(
-        (c["name"], c["what"] or "-", c["unit"] or "-", rounded(c["low"], 5), rounded(c["high"], 5), str(c["bad"]))
+        (
+            c["name"],
+            c["what"] or "-",
+            c["unit"] or "-",
+            format_number(c["low"], 5),
+            format_number(c["high"], 5),
+            str(c["bad"]),
+        )
         for c in s["columns"]
     )
     names = ("column", "what it is", "unit", "lowest", "highest", "bad cells")
@@ -375,7 +382,7 @@ def _designed(drive: Mapping[str, Any]) -> str:
     return (
         f"{drive['folder']}/ beside this page is a drive designed to tell {first} from {second} (`profile.csv`; `excite"
         f" drive` makes a sheet of it): from its log the amount of each can be found within"
-        f" {percent(drive['sigma_percent'])} beside the other."
+        f" {format_percent(drive['sigma_percent'])} beside the other."
         + ("" if drive["complete"] else " Its search was stopped early.")
     )
 
@@ -386,7 +393,7 @@ def _diagnose(s: Summary) -> Said:
         remarks.append(f"To tell apart what is tied, drive: {s['separating_run']}.")
     if s["separating_drive"]:
         remarks.append(_designed(s["separating_drive"]))
-    remarks += [f"What is left: {line}." for line in some(s["located"])]
+    remarks += [f"What is left: {line}." for line in first_lines(s["located"])]
     if s["machine_file"]:
         remarks.append(
             f"{s['machine_file']} beside this page is the machine with what was found: `excite design`, `verify`,"
@@ -398,13 +405,13 @@ def _diagnose(s: Summary) -> Said:
         found = tuple(
             (
                 f"{f['effect']}@{f['where']}",
-                rounded(f["amount"], 5),
-                rounded(f["amount_std"], 2),
+                format_number(f["amount"], 5),
+                format_number(f["amount_std"], 2),
                 f["unit"],
-                "; ".join(f"{n} {rounded(x['value'], 4)} {x['unit']}" for n, x in f["shapes"].items()) or "-",
-                likely(f["p_value"]),
-                rounded(f["gain_percent"], 3),
-                "-" if f["gain_ci95"] is None else " to ".join(rounded(x, 3) for x in f["gain_ci95"]),
+                "; ".join(f"{n} {format_number(x['value'], 4)} {x['unit']}" for n, x in f["shapes"].items()) or "-",
+                format_p_value(f["p_value"]),
+                format_number(f["gain_percent"], 3),
+                "-" if f["gain_ci95"] is None else " to ".join(format_number(x, 3) for x in f["gain_ci95"]),
                 ", ".join(f["tied_with"]) or "-",
             )
             for f in s["findings"]
@@ -419,8 +426,8 @@ def _diagnose(s: Summary) -> Said:
         (
             n,
             r["unit"],
-            *(rounded(r[k], 3) for k in ("rms_before", "rms_after")),
-            *(rounded(r[f"systematic_{k}_percent"], 2) for k in ("before", "after")),
+            *(format_number(r[k], 3) for k in ("rms_before", "rms_after")),
+            *(format_number(r[f"systematic_{k}_percent"], 2) for k in ("before", "after")),
         )
         for n, r in s["signals"].items()
     )
@@ -435,8 +442,8 @@ def _diagnose(s: Summary) -> Said:
             (
                 n,
                 r["unit"],
-                *(rounded(r[k], 6) for k in ("before", "after")),
-                *(rounded(r[k], 2) for k in ("std_before", "std_after", "moved")),
+                *(format_number(r[k], 6) for k in ("before", "after")),
+                *(format_number(r[k], 2) for k in ("std_before", "std_after", "moved")),
             )
             for n, r in s["parameters"].items()
         )

@@ -34,7 +34,7 @@ def outline(ax: Axes, machine: Machine) -> None:
     at_stop = {b.coordinates[0]: float(b.limit.position) for b in steered(machine) if b.limit.position is not None}
     if at_stop:
         _contacts(ax, machine, at_stop, ghost=True)
-    poses = mechanics.poses(machine, {})
+    poses = mechanics.body_poses(machine, {})
     for b in machine.body:
         x, y = poses[b.index][1][:2]
         if not isinstance(b.antecedent, str):
@@ -59,7 +59,7 @@ def outline(ax: Axes, machine: Machine) -> None:
 
 def steered(machine: Machine) -> list[Body]:
     """Driven joints that turn about the vertical."""
-    poses = mechanics.poses(machine, {})
+    poses = mechanics.body_poses(machine, {})
     driven = [b for b in machine.actuated if b.contact is None and b.joint == "revolute"]
     return [b for b in driven if abs(poses[b.index][0][2, 2]) > 0.9]
 
@@ -69,7 +69,7 @@ def footprints(machine: Machine, q: Mapping[str, float]) -> list[np.ndarray]:
 
     As long as it is high; a contact that is a point is drawn NARROW.
     """
-    poses = mechanics.poses(machine, q)
+    poses = mechanics.body_poses(machine, q)
     x, y, heading = (q.get(c, 0.0) for c in machine.body[0].coordinates)
     c, s = np.cos(heading), np.sin(heading)
     shapes = []
@@ -86,7 +86,7 @@ def footprints(machine: Machine, q: Mapping[str, float]) -> list[np.ndarray]:
 
 def _contacts(ax: Axes, machine: Machine, q: Mapping[str, float], ghost: bool) -> None:
     """Contacts as rectangles, as long as they are high, their names beside them."""
-    poses, still = mechanics.poses(machine, q), footprints(machine, {})
+    poses, still = mechanics.body_poses(machine, q), footprints(machine, {})
     for b, shape, before in zip(machine.contacts, footprints(machine, q), still, strict=True):
         place = poses[b.index][1]
         if ghost and np.allclose(shape, before):

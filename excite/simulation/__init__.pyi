@@ -1,20 +1,20 @@
-from .driver import STEADY as STEADY, Driver as Driver, follow as follow, turns_left as turns_left
-from .integrator import Motion as Motion, beside as beside, respond as respond, simulate as simulate
+from .driver import STEADY_DRIVER as STEADY_DRIVER, Driver as Driver, follow as follow, left_turn_sign as left_turn_sign
+from .integrator import Motion as Motion, effect_inputs as effect_inputs, respond as respond, simulate as simulate
 from .rosenbrock import (
     A_ROWS as A_ROWS,
     C_ROWS as C_ROWS,
     GAMMA as GAMMA,
-    SLOPES as SLOPES,
-    TIMES as TIMES,
+    STAGE_TIMES as STAGE_TIMES,
+    TIME_DERIVATIVE_WEIGHTS as TIME_DERIVATIVE_WEIGHTS,
     lu as lu,
     lu_solve as lu_solve,
 )
-from .scenarios import followed as followed, perturbed_machines as perturbed_machines
+from .scenarios import perturbed_machines as perturbed_machines, track_motion as track_motion
 from .sensors import (
     KITS as KITS,
+    delivered_torque as delivered_torque,
+    delivered_torques as delivered_torques,
+    exact_readings as exact_readings,
     measure as measure,
-    signals as signals,
-    torque_behind as torque_behind,
-    torques_behind as torques_behind,
-    torques_read as torques_read,
+    measured_torques as measured_torques,
 )

@@ -27,13 +27,13 @@ from excite.model import Model
 from excite.model.machine import Body
 from excite.simulation.integrator import Motion, respond
 
-DRIVER = 2  # stream of random numbers, apart from the sensors'
-RESPONSE = 0.3  # s, in which a hydrostatic drive brings what it moves to speed
-WALK = 1.0  # m/s
-HOLD = 5.0  # 1/s, with which the oil in the steering cylinders brings a joint back that the soil pushed away
-WANDER = 2.0  # s, twice: time constants of the slow errors
-WATCHED = 2  # speed and one angle: what the driver's numbers are of
-NEUTRAL = 0.2  # m/s: below it the lever nears its detent, and errors and corrections fade with it
+DRIVER_STREAM = 2  # stream of random numbers, apart from the sensors'
+RESPONSE_TIME = 0.3  # s, in which a hydrostatic drive brings what it moves to speed
+WALKING_SPEED = 1.0  # m/s
+HOLDING_RATE = 5.0  # 1/s, with which the oil in the steering cylinders brings a joint back that the soil pushed away
+WANDER_TIME = 2.0  # s, twice: time constants of the slow errors
+WATCHED_SIGNALS = 2  # speed and one angle: what the driver's numbers are of
+NEUTRAL_SPEED = 0.2  # m/s: below it the lever nears its detent, and errors and corrections fade with it
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,9 @@ class Driver:
     hydraulics_hz: float = 3.0
 
 
-STEADY = Driver(speed_error_m_s=0.0, angle_error_rad=0.0)  # a person without slow errors: the middle of all people
+STEADY_DRIVER = Driver(
+    speed_error_m_s=0.0, angle_error_rad=0.0
+)  # a person without slow errors: the middle of all people
 
 
 def follow(
@@ -79,17 +81,17 @@ def follow(
     n = len(speed)
     if angles.shape != (n, len(joints)):
         raise ValueError(f"angles: needs shape ({n}, {len(joints)}), got {angles.shape}")
-    rng = np.random.default_rng([seed, DRIVER])
-    foreseen = _ahead(np.asarray(speed, float), driver, rate)
-    detent = np.minimum(np.abs(foreseen) / NEUTRAL, 1.0)
-    share = min(WATCHED / (1 + len(joints)), 1.0)
+    rng = np.random.default_rng([seed, DRIVER_STREAM])
+    foreseen = _previewed(np.asarray(speed, float), driver, rate)
+    detent = np.minimum(np.abs(foreseen) / NEUTRAL_SPEED, 1.0)
+    share = min(WATCHED_SIGNALS / (1 + len(joints)), 1.0)
     attention, blur = driver.attention * share, share**-0.5
-    pushed = foreseen + blur * driver.speed_error_m_s * detent * _wander(n, rate, rng)
-    aimed = [_ahead(np.asarray(a, float), driver, rate) for a in angles.T]
-    wandered = [a + blur * driver.angle_error_rad * _wander(n, rate, rng) for a in aimed]
+    pushed = foreseen + blur * driver.speed_error_m_s * detent * _slow_errors(n, rate, rng)
+    aimed = [_previewed(np.asarray(a, float), driver, rate) for a in angles.T]
+    wandered = [a + blur * driver.angle_error_rad * _slow_errors(n, rate, rng) for a in aimed]
     turned = [np.gradient(a) * rate for a in wandered]
     # lists: the loop below works sample by sample, where they are faster than arrays
-    expected = [_expected(x, driver, rate).tolist() for x in (foreseen, *aimed)]
+    expected = [_expected_response(x, driver, rate).tolist() for x in (foreseen, *aimed)]
     commands = [x.tolist() for x in (pushed, *turned)]
     hands = [_Hand(driver.bandwidth_hz, rate) for _ in commands]
     late = round(driver.delay_s * rate)
@@ -101,7 +103,7 @@ def follow(
     most = [float(x.rim_speed) if x.rim_speed is not None else np.inf for x in limits]
     swing = [float(x.rate) if x.rate is not None else np.inf for x in limits]
     fastest = [(most[k] / radius[k] if k in rolling else swing[k]) for k in range(len(rows))]
-    gain = gains(model).tolist()
+    gain = drive_gains(model).tolist()
     top = np.array([float(x.torque) if x.torque is not None else np.inf for x in limits])
     climb = np.array([float(x.torque_rate) if x.torque_rate is not None else np.inf for x in limits]) / rate
     settled = 1 - np.exp(-2 * np.pi * driver.hydraulics_hz / rate)
@@ -126,10 +128,10 @@ def follow(
         for i, j in enumerate(joints, 1):
             turn = hands[i].moved(commands[i][k] + attention * off[i])
             turn = min(max(turn, -fastest[j]), fastest[j])
-            relief = top[j] / (gain[j] * HOLD)  # a relief valve opens before the oil is pressed further
+            relief = top[j] / (gain[j] * HOLDING_RATE)  # a relief valve opens before the oil is pressed further
             away = held[i - 1] + turn / rate - state[rows[j]]
             held[i - 1] = min(max(away, -relief), relief) + state[rows[j]]
-            target[j] = gain[j] * (turn - state[n_q + rows[j]] + HOLD * (held[i - 1] - state[rows[j]]))
+            target[j] = gain[j] * (turn - state[n_q + rows[j]] + HOLDING_RATE * (held[i - 1] - state[rows[j]]))
         wish = last + settled * (np.minimum(np.maximum(target, -top), top) - last)
         if k > 0:
             last[:] += np.minimum(np.maximum(wish - last, -climb), climb)
@@ -142,7 +144,7 @@ class _Hand:
     """Second-order low-pass (Butterworth), a sample at a time, at rest at first."""
 
     def __init__(self, bandwidth: float, rate: float) -> None:
-        b, a = _hand(bandwidth, rate)
+        b, a = _hand_filter(bandwidth, rate)
         self._b, self._a, self._z = b.tolist(), a.tolist(), (0.0, 0.0)
 
     def moved(self, x: float) -> float:
@@ -151,36 +153,36 @@ class _Hand:
         return y
 
 
-def _hand(bandwidth: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
+def _hand_filter(bandwidth: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
     b, a = scipy.signal.butter(2, bandwidth / (rate / 2))
     return np.asarray(b), np.asarray(a)
 
 
-def _ahead(wanted: np.ndarray, driver: Driver, rate: float) -> np.ndarray:
+def _previewed(wanted: np.ndarray, driver: Driver, rate: float) -> np.ndarray:
     """What the hand aims at, sample by sample: the trace, `preview` early and a reaction late, held at its ends."""
     at = np.arange(len(wanted)) + round((driver.preview_s - driver.delay_s) * rate)
     return np.asarray(wanted[np.clip(at, 0, len(wanted) - 1)])
 
 
-def _expected(aimed: np.ndarray, driver: Driver, rate: float) -> np.ndarray:
+def _expected_response(aimed: np.ndarray, driver: Driver, rate: float) -> np.ndarray:
     """What the person expects of the machine: what the hand aims at, as late as hand and drive always are."""
-    keep = np.exp(-1 / (RESPONSE * rate))
-    slow = scipy.signal.lfilter(*_hand(driver.bandwidth_hz, rate), aimed - aimed[0])
+    keep = np.exp(-1 / (RESPONSE_TIME * rate))
+    slow = scipy.signal.lfilter(*_hand_filter(driver.bandwidth_hz, rate), aimed - aimed[0])
     return np.asarray(scipy.signal.lfilter([1 - keep], [1, -keep], slow) + aimed[0])
 
 
-def _wander(n: int, rate: float, rng: np.random.Generator) -> np.ndarray:
+def _slow_errors(n: int, rate: float, rng: np.random.Generator) -> np.ndarray:
     """Slow errors (n,) of deviation 1, that fade in the first and the last two seconds."""
-    keep = np.exp(-1 / (WANDER * rate))
+    keep = np.exp(-1 / (WANDER_TIME * rate))
     shape = [1, -2 * keep, keep**2]
     size = np.sqrt((1 + keep**2) / (1 - keep**2) ** 3)  # deviation of what the filter makes of white noise
-    before = round(5 * WANDER * rate)  # so that the errors are stationary from the first sample on
+    before = round(5 * WANDER_TIME * rate)  # so that the errors are stationary from the first sample on
     noise = scipy.signal.lfilter([1 / size], shape, rng.standard_normal(before + n))[before:]
     fade = np.clip(np.minimum(np.arange(n), np.arange(n)[::-1]) / rate / 2, 0, 1)
     return np.asarray(noise * fade)
 
 
-def gains(model: Model) -> np.ndarray:
+def drive_gains(model: Model) -> np.ndarray:
     """(n_u,) torque per speed error [N m s/rad] of each drive: its reflected inertia to speed in RESPONSE.
 
     Of a joint no less than what resists its turning at a WALK: oil that flows in has to go somewhere.
@@ -191,10 +193,10 @@ def gains(model: Model) -> np.ndarray:
     at = ca.Function("at", [q, nu], [mass, ca.jacobian(force, nu)])
     names, still = model.coordinates, np.zeros(len(model.coordinates))
     rolling = still.copy()
-    rolling[0] = WALK
+    rolling[0] = WALKING_SPEED
     for b in model.machine.contacts:
         assert b.contact is not None
-        rolling[names.index(b.coordinates[0])] = WALK / float(b.contact.radius)
+        rolling[names.index(b.coordinates[0])] = WALKING_SPEED / float(b.contact.radius)
     M, D = at(still, still)[0].full(), at(still, rolling)[1].full()
     aside = [names.index(c) for c in model.machine.body[0].coordinates[1:] if c in names]  # the chassis gives way
     D -= D[:, aside] @ np.linalg.solve(D[np.ix_(aside, aside)], D[aside])
@@ -202,13 +204,13 @@ def gains(model: Model) -> np.ndarray:
     gain = np.zeros(len(model.inputs))
     for j, (row, body) in enumerate(zip(model.actuated, model.machine.actuated, strict=True)):
         if body.contact is None:
-            gain[j] = max(M[row, row] / RESPONSE, D[row, row])
+            gain[j] = max(M[row, row] / RESPONSE_TIME, D[row, row])
         else:
-            gain[j] = (M[0, 0] * float(body.contact.radius) ** 2 / driven + M[row, row]) / RESPONSE
+            gain[j] = (M[0, 0] * float(body.contact.radius) ** 2 / driven + M[row, row]) / RESPONSE_TIME
     return gain
 
 
-def turns_left(model: Model, body: Body) -> int:
+def left_turn_sign(model: Model, body: Body) -> int:
     """The sign of a joint's angle that, alone, turns the machine left when rolling forward.
 
     From pure rolling: the lateral speeds of all contacts vanish, which is linear in the chassis' speeds.

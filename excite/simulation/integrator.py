@@ -16,11 +16,11 @@ import numpy as np
 
 from excite.errors import SimulationError
 from excite.model import Model
-from excite.simulation.rosenbrock import A_ROWS, C_ROWS, GAMMA, SLOPES, TIMES, lu, lu_solve
+from excite.simulation.rosenbrock import A_ROWS, C_ROWS, GAMMA, STAGE_TIMES, TIME_DERIVATIVE_WEIGHTS, lu, lu_solve
 
 TOLERANCE = 3e-7  # of one step, relative to each state's typical size
-FLOOR = 0.1
-SMALLEST = 1e-7  # share of a sample below which a step is not split further
+MIN_STATE_SCALE = 0.1
+MIN_STEP_SHARE = 1e-7  # share of a sample below which a step is not split further
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Motion:
     memory: np.ndarray
 
 
-def beside(model: Model, motion: Motion) -> tuple[np.ndarray, ...]:
+def effect_inputs(model: Model, motion: Motion) -> tuple[np.ndarray, ...]:
     """What the model's functions of a sample take beside q, nu and a of a motion: nothing, or with effects u and z."""
     return () if model.plain else (motion.u.T, motion.memory.T)
 
@@ -84,13 +84,13 @@ def respond(
     parameters = np.ascontiguousarray(model.nominal if X is None else X, float)
     n_u, n_q = len(model.inputs), len(model.coordinates)
     rate = float(model.machine.sampling_hz)
-    step, n_w = _step(model)
+    step, n_w = _step_function(model)
     state = np.zeros(2 * n_q + n_w + len(model.memory))
     state[:n_q] = 0.0 if q0 is None else q0
     state[n_q : 2 * n_q] = 0.0 if nu0 is None else nu0
     state[2 * n_q + n_w :] = model.fresh
     driven = np.empty((samples, n_u))
-    history = _integrate(step, state, driven, torque, parameters, 1.0 / rate, _looking(model))
+    history = _integrate(step, state, driven, torque, parameters, 1.0 / rate, _map_updater(model))
     finite = np.isfinite(history).all(axis=1)  # an error estimate of many states overlooks one that is no number
     if not finite.all():
         raise SimulationError(
@@ -148,7 +148,7 @@ def _integrate(
             if e <= 1.0:
                 done += share
                 start[:] = end
-            elif share < SMALLEST or not (np.isfinite(e) or share > 1e-3):
+            elif share < MIN_STEP_SHARE or not (np.isfinite(e) or share > 1e-3):
                 raise SimulationError(
                     f"the motion diverges at t = {(k + done) * sample:.3f} s,"
                     f" state {np.array2string(start, precision=3)}:"
@@ -161,7 +161,7 @@ def _integrate(
     return history
 
 
-def _looking(model: Model) -> Callable[[np.ndarray], None]:
+def _map_updater(model: Model) -> Callable[[np.ndarray], None]:
     """Puts into a state what a map of the ground tells there, and the contacts onto the map."""
     if not model.mapped:
         return lambda state: None
@@ -174,7 +174,7 @@ def _looking(model: Model) -> Callable[[np.ndarray], None]:
 
 
 @lru_cache(maxsize=8)
-def _step(model: Model) -> tuple[ca.Function, int]:
+def _step_function(model: Model) -> tuple[ca.Function, int]:
     """One step (state, u, du/dt, h, X) -> state after h, its error over the tolerance.
 
     Rosenbrock for the speeds, what effects remember, and the coordinates that the forces depend on. The others (pose,
@@ -204,7 +204,7 @@ def _step(model: Model) -> tuple[ca.Function, int]:
     none = ca.SX(len(core), 1)
     stages: list[ca.SX] = []
     at = y[core]
-    for time, gain, weights, c in zip(TIMES, SLOPES, A_ROWS, C_ROWS, strict=True):
+    for time, gain, weights, c in zip(STAGE_TIMES, TIME_DERIVATIVE_WEIGHTS, A_ROWS, C_ROWS, strict=True):
         at = y[core] + sum((w * U for w, U in zip(weights, stages, strict=True)), none)
         whole = ca.SX(y)
         whole[core] = at
@@ -213,7 +213,7 @@ def _step(model: Model) -> tuple[ca.Function, int]:
         stages.append(lu_solve(lower, upper, known))
     end = ca.SX(y)
     end[core] = at + stages[-1]
-    error = ca.norm_inf(stages[-1] / (FLOOR + ca.fabs(y[core]))) / TOLERANCE
+    error = ca.norm_inf(stages[-1] / (MIN_STATE_SCALE + ca.fabs(y[core]))) / TOLERANCE
 
     # The heading must be at its end before the position that turns with it: the order of the table does that
     # when taken backwards, since (x, y) come before theta.

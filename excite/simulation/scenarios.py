@@ -11,12 +11,12 @@ import numpy as np
 
 from excite.model import Model
 from excite.model.machine import Body, Machine, Quantity
-from excite.simulation.driver import gains
+from excite.simulation.driver import drive_gains
 from excite.simulation.integrator import Motion, respond
 
-SCENARIO = 3  # stream of random numbers
-HOLD = 5.0  # 1/s: how fast a steered joint that is off comes back
-FIRM = 5.0  # times the gain of the driver model's hydrostatic drive: a steady hand
+SCENARIO_STREAM = 3  # stream of random numbers
+HOLDING_RATE = 5.0  # 1/s: how fast a steered joint that is off comes back
+GAIN_FACTOR = 5.0  # times the gain of the driver model's hydrostatic drive: a steady hand
 
 
 def perturbed_machines(model: Model, count: int, spread: float = 0.2, seed: int = 0) -> tuple[Model, ...]:
@@ -26,12 +26,12 @@ def perturbed_machines(model: Model, count: int, spread: float = 0.2, seed: int 
     """
     if count < 2:
         raise ValueError(f"a robust design needs at least 2 machines (got {count})")
-    rng = np.random.default_rng([seed, SCENARIO])
-    machines = [varied(model.machine, spread, rng, corner=True) for _ in range(count - 1)]
+    rng = np.random.default_rng([seed, SCENARIO_STREAM])
+    machines = [vary_machine(model.machine, spread, rng, corner=True) for _ in range(count - 1)]
     return model, *(model.of(m) for m in machines)
 
 
-def varied(machine: Machine, spread: float, rng: np.random.Generator, corner: bool = False) -> Machine:
+def vary_machine(machine: Machine, spread: float, rng: np.random.Generator, corner: bool = False) -> Machine:
     """The machine with values of bodies, friction and contacts multiplied by 1 +- spread: uniform, or one end of it."""
     if not 0 < spread <= 0.9:
         raise ValueError(f"spread: must be above 0 and at most 0.9 (got {spread:g})")
@@ -66,7 +66,7 @@ def varied(machine: Machine, spread: float, rng: np.random.Generator, corner: bo
     return machine.model_copy(update={"body": tuple(body(b) for b in machine.body)})
 
 
-def followed(machine: Model, nominal: Model, motion: Motion) -> Motion:
+def track_motion(machine: Model, nominal: Model, motion: Motion) -> Motion:
     """What another machine does when someone makes it follow the speeds and steering of the nominal one's motion.
 
     The nominal torques, corrected by what the driven joints are off, within torque and torque-rate limits: an attentive
@@ -77,8 +77,8 @@ def followed(machine: Model, nominal: Model, motion: Motion) -> Motion:
     limited = [b.limit for b in nominal.machine.actuated]
     top = np.array([float(x.torque) if x.torque is not None else np.inf for x in limited])
     climb = np.array([float(x.torque_rate) if x.torque_rate is not None else np.inf for x in limited])
-    held = np.array([0.0 if b.contact is not None else HOLD for b in nominal.machine.actuated])
-    gain = FIRM * gains(nominal)
+    held = np.array([0.0 if b.contact is not None else HOLDING_RATE for b in nominal.machine.actuated])
+    gain = GAIN_FACTOR * drive_gains(nominal)
     last = np.zeros(len(rows))
 
     def torque(k: int, state: np.ndarray) -> np.ndarray:

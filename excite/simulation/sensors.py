@@ -12,8 +12,8 @@ from excite.model.machine import UNITS, Sensor
 from excite.simulation.integrator import Motion
 
 KITS = ("paper", "full")
-IDLE = 15e5  # Pa in a hydraulic line that does not push (boost pressure)
-SENSORS = 1  # stream of random numbers: one seed drives and measures, but not with the same numbers
+BOOST_PRESSURE = 15e5  # Pa in a hydraulic line that does not push (boost pressure)
+SENSOR_STREAM = 1  # stream of random numbers: one seed drives and measures, but not with the same numbers
 
 
 def measure(
@@ -27,38 +27,38 @@ def measure(
     """
     if kit not in KITS:
         raise ValueError(f"kit: {kit} is unknown, allowed: {', '.join(KITS)}")
-    exact = signals(model, motion, X)
-    rng = np.random.default_rng([seed, SENSORS])
+    exact = exact_readings(model, motion, X)
+    rng = np.random.default_rng([seed, SENSOR_STREAM])
     columns = {model.machine.time_column: motion.t / UNITS[model.machine.time_unit][1]}
     for sensor in model.machine.sensors(kit):
-        read = _flawed(sensor, exact[sensor.name], rng) if noise else exact[sensor.name]
-        columns |= _written(sensor, read, _angle(model, motion, sensor))
+        read = _with_sensor_errors(sensor, exact[sensor.name], rng) if noise else exact[sensor.name]
+        columns |= _as_columns(sensor, read, _joint_angle(model, motion, sensor))
     return pd.DataFrame(columns)
 
 
-def _written(sensor: Sensor, read: np.ndarray, angle: np.ndarray) -> dict[str, np.ndarray]:
+def _as_columns(sensor: Sensor, read: np.ndarray, angle: np.ndarray) -> dict[str, np.ndarray]:
     """A reading (N,) [SI] as its columns: in the file's unit, or as the pressures of a motor or of cylinders at a joint
     at `angle` (N,) [rad]: one side pushes, the other is at IDLE."""
     if sensor.return_column is None:
         return {sensor.column: read / sensor.gain}
-    push, pull = machine.arms(sensor.displacement, sensor.cylinders, angle)
-    more = read - (push + pull) * IDLE
+    push, pull = machine.torque_per_pressure(sensor.displacement, sensor.cylinders, angle)
+    more = read - (push + pull) * BOOST_PRESSURE
     forward = more * push > 0
     pascal = sensor.gain if sensor.displacement is None else sensor.gain * 2 * np.pi / float(sensor.displacement)
     return {
-        sensor.column: (IDLE + np.where(forward, more / push, 0)) / pascal,
-        sensor.return_column: (IDLE + np.where(forward, 0, more / pull)) / pascal,
+        sensor.column: (BOOST_PRESSURE + np.where(forward, more / push, 0)) / pascal,
+        sensor.return_column: (BOOST_PRESSURE + np.where(forward, 0, more / pull)) / pascal,
     }
 
 
-def _angle(model: Model, motion: Motion, sensor: Sensor) -> np.ndarray:
+def _joint_angle(model: Model, motion: Motion, sensor: Sensor) -> np.ndarray:
     """(N,) [rad] the angle of a sensor's joint, zero where it is held or there is none."""
     names = model.machine.find(sensor.body).coordinates
     k = model.coordinates.index(names[0]) if names and names[0] in model.coordinates else None
     return np.zeros(len(motion.t)) if k is None else motion.q[:, k]
 
 
-def signals(model: Model, motion: Motion, X: np.ndarray | None = None) -> dict[str, np.ndarray]:
+def exact_readings(model: Model, motion: Motion, X: np.ndarray | None = None) -> dict[str, np.ndarray]:
     """What ideal sensors would read, (N,) each by sensor name [SI]; torques include the offset u0.
 
     Effects that sit in a sensor are in its reading.
@@ -66,33 +66,33 @@ def signals(model: Model, motion: Motion, X: np.ndarray | None = None) -> dict[s
     X = model.nominal if X is None else X
     arrays = (motion.q, motion.nu, motion.wheels, motion.u, motion.memory)
     values = dict(zip(model.readable, model.read(*(x.T for x in arrays), X).full(), strict=True))
-    torques = torques_read(model, motion.t, motion.u, X)
+    torques = measured_torques(model, motion.t, motion.u, X)
     for sensor in model.machine.sensors("full"):
         if sensor.kind == "torque":
             values[sensor.name] = torques[:, model.inputs.index(f"u{sensor.body}")]
     return values
 
 
-def torques_read(model: Model, t: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
+def measured_torques(model: Model, t: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
     """What torque channels read (N, n_u) of delivered torques u (N, n_u) [N m] at times t (N,) [s]."""
     channels = (x.full() for x in model.channels(t[None], X))
     each = zip(u.T, *channels, strict=True)
     return np.column_stack([gain * np.interp(t - delay, t, one) + offset for one, gain, offset, delay in each])
 
 
-def torque_behind(
+def delivered_torque(
     t: np.ndarray, read: np.ndarray, gain: np.ndarray, offset: np.ndarray, delay: np.ndarray
 ) -> np.ndarray:
     """The reverse of one channel: the torque (N,) [N m] behind what is read (N,); gain, offset, delay [s] (N,)."""
     return np.asarray((np.interp(t + delay, t, read) - offset) / gain)
 
 
-def torques_behind(t: np.ndarray, read: np.ndarray, channels: Sequence[np.ndarray]) -> np.ndarray:
+def delivered_torques(t: np.ndarray, read: np.ndarray, channels: Sequence[np.ndarray]) -> np.ndarray:
     """The same of all channels, (N, n_u) of (N, n_u); channels: gain, offset, delay, (n_u, N) each."""
-    return np.column_stack([torque_behind(t, *each) for each in zip(read.T, *channels, strict=True)])
+    return np.column_stack([delivered_torque(t, *each) for each in zip(read.T, *channels, strict=True)])
 
 
-def _flawed(sensor: Sensor, exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _with_sensor_errors(sensor: Sensor, exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     step = sensor.resolution
     if step is not None:
         phase = rng.uniform()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from excite.model import Model
-from excite.simulation import Motion, torques_read
+from excite.simulation import Motion, measured_torques
 from excite.smoothing.gauss_newton import PRIOR, in_si, linearise_fit
 from excite.smoothing.linearisation import chart
 from excite.smoothing.measurements import Noise, Point, Record, expected, origins, torque_sensor
@@ -39,7 +39,7 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
         np.array([s.resolution or float(s.noise or 0) for s in c.sensors]),
     )
     none = np.zeros((len(state), len(c.sensors)))
-    r = Record(torques_read(model, motion.t, motion.u, X), none, none, counts, origins(c, counts), noise)
+    r = Record(measured_torques(model, motion.t, motion.u, X), none, none, counts, origins(c, counts), noise)
     p = Point(state, np.zeros_like(motion.u[1:]), np.zeros(len(r.origin)), over)
     linear = linearise_fit(c, expected(c, r, p, motion.u, X), p, state[0], X, 0.0, exact=True)
     assert linear is not None

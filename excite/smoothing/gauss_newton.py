@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from excite.errors import NoEstimate
+from excite.errors import NoEstimateError
 from excite.model import Model
 from excite.smoothing import parallel_smoother
 from excite.smoothing.innovations import Linear
@@ -59,7 +59,7 @@ PART = 200  # samples at a time: their chain stays in the processor's cache
 SPREAD_SPEED, SPREAD_ANGLE = 0.05, 0.1
 
 
-class NotConverged(NoEstimate):
+class NotConverged(NoEstimateError):
     """Joint smoothing found no estimate; the message says how far it came and what to do, `fit` where it stood, last or
     as good as found, and `step` the step from there, in standard deviations. swung: the last steps led to and fro
     between what costs alike."""

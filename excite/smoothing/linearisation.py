@@ -18,7 +18,16 @@ import scipy.special
 
 from excite.model import Model
 from excite.model.machine import Sensor
-from excite.simulation import A_ROWS, C_ROWS, GAMMA, SLOPES, TIMES, lu, lu_solve, torques_behind
+from excite.simulation import (
+    A_ROWS,
+    C_ROWS,
+    GAMMA,
+    STAGE_TIMES,
+    TIME_DERIVATIVE_WEIGHTS,
+    delivered_torques,
+    lu,
+    lu_solve,
+)
 
 # Of a speed over an interval [rad/s, m/s], and of what an effect remembers in its size: what a sample's torque noise
 # does is far more.
@@ -273,7 +282,7 @@ class Chart:
         t = np.arange(len(torque)) * step
         *channels, by_gain, by_offset, by_delay = self.channels(t[:, None], X)
         gain, offset, delay = (e[:, :, 0] for e in channels)
-        u = torques_behind(t, torque, (gain.T, offset.T, delay.T))
+        u = delivered_torques(t, torque, (gain.T, offset.T, delay.T))
         true = u + errors
         rise = np.gradient(gain * true + offset, step, axis=0)
         slope = (rise[:, :, None] * by_delay - by_offset - true[:, :, None] * by_gain) / gain[:, :, None]
@@ -440,7 +449,7 @@ def _step(
     lower, upper = lu(ca.SX.eye(core) / (GAMMA * h) - Jy)
     dt = ca.vertcat(By @ slope, ca.SX.zeros(n - core, 1))
     stages: list[ca.SX] = []
-    for time, gain, weights, c in zip(TIMES, SLOPES, A_ROWS, C_ROWS, strict=True):
+    for time, gain, weights, c in zip(STAGE_TIMES, TIME_DERIVATIVE_WEIGHTS, A_ROWS, C_ROWS, strict=True):
         at = y + sum((w * U for w, U in zip(weights, stages, strict=True)), ca.SX(n, 1))
         known = rate(at, left + slope * (time * h), X) + gain * h * dt
         known += sum((w * U for w, U in zip(c, stages, strict=True)), ca.SX(n, 1)) / h

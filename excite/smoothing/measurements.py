@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.integrate
 
-from excite.errors import NotIdentifiable
+from excite.errors import NotIdentifiableError
 from excite.logs import Log, passes, remember, samples, white_noise
 from excite.model import Model
 from excite.model.machine import Filter, Sensor
@@ -87,7 +87,7 @@ def common_sensors(model: Model, logs: Sequence[Log]) -> tuple[str, ...]:
     common = set.intersection(*(set(log.values) for log in logs))
     for body in model.machine.actuated:
         if not any(s.kind == "torque" and s.body == body.index and s.name in common for s in model.machine.sensor):
-            raise NotIdentifiable(f"joint smoothing needs the torque of every driven joint, {body.where} has none")
+            raise NotIdentifiableError(f"joint smoothing needs the torque of every driven joint, {body.where} has none")
     return tuple(s.name for s in model.machine.sensors("full") if s.name in common)
 
 

@@ -26,10 +26,10 @@ import numpy as np
 import scipy
 
 from excite import smoothing
-from excite.errors import SimulationError, UnsettledError
+from excite.errors import CollocationError, SimulationError
 from excite.model import Model, mechanics
 from excite.model.machine import Body, Problem
-from excite.simulation import Motion, follow, simulate, turns_left
+from excite.simulation import Motion, follow, left_turn_sign, simulate
 from excite.trajectories import excitation, interior_point, objective
 from excite.trajectories.collocation import settle, transcribe
 from excite.trajectories.composite_objective import aim
@@ -167,7 +167,7 @@ def _leftward(model: Model, joints: Sequence[Body]) -> list[int]:
     other."""
     if len(joints) < 2 or sum(s.startswith("gy") for s in model.slips) < 2:
         return [1] * len(joints)
-    ways = [turns_left(model, b) for b in joints]
+    ways = [left_turn_sign(model, b) for b in joints]
     return [ways[0] * way for way in ways]
 
 
@@ -175,7 +175,7 @@ def _sides(model: Model) -> np.ndarray:
     """(n_u,) torques that turn a machine to the left by driving its sides apart: a quarter of what the drives have."""
     if not model.machine.planar:
         return np.zeros(len(model.inputs))
-    poses = mechanics.poses(model.machine, {})
+    poses = mechanics.body_poses(model.machine, {})
     left = np.array([np.sign(poses[b.index][1][1].round(6)) for b in model.machine.actuated])
     top = [float(b.limit.torque) if b.limit.torque is not None else 0.0 for b in model.machine.actuated]
     return -left * np.array(top) / 4
@@ -397,7 +397,7 @@ def _nearest(
         try:
             point = interior_point.begin(tr, task, start, settle(tr, start, U, Z), U, 1e-3, 0.05)
             point, _ = interior_point.minimise(tr, task, point, levels if friction == 1 else levels[:1])
-        except UnsettledError:
+        except CollocationError:
             if friction == 1:
                 return None
             continue  # a soft machine only shows the way; the sharp one may follow without it

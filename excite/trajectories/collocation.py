@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from excite.errors import UnsettledError
+from excite.errors import CollocationError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion
@@ -154,7 +154,7 @@ def settle(tr: Transcription, start: np.ndarray, U: np.ndarray, guess: np.ndarra
         if size > SETTLED:
             x, size = _follow(tr, left, np.tile(left, tr.nodes), u, over)
         if size > SETTLED:
-            raise UnsettledError(f"no motion follows these torques in interval {k} (residual {size:.1e})")
+            raise CollocationError(f"no motion follows these torques in interval {k} (residual {size:.1e})")
         Z[k] = x.reshape(tr.nodes, tr.n_z)
         left = Z[k, -1]
     return Z

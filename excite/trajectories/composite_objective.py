@@ -19,7 +19,7 @@ import numpy as np
 
 from excite import smoothing
 from excite.model import Model
-from excite.simulation import Motion, beside
+from excite.simulation import Motion, effect_inputs
 from excite.trajectories import objective as objectives
 from excite.trajectories.objective import EXACT, OBJECTIVES, Local, percent, relative
 
@@ -166,7 +166,7 @@ def _hinge(x: float) -> tuple[float, float, float]:
 
 def information(aim: Aim, model: Model, motion: Motion) -> list[np.ndarray]:
     """The matrices (n_base, n_base) of a motion in the scale, every sample counted, one for each of `aim.rows`."""
-    W = model.stacked(motion.q.T, motion.nu.T, motion.a.T, *beside(model, motion))
+    W = model.stacked(motion.q.T, motion.nu.T, motion.a.T, *effect_inputs(model, motion))
     found: list[np.ndarray] = []
     for weights in aim.rows:
         # by QR: squaring W would cost half of the digits

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from excite.errors import SimulationError, UnsettledError
+from excite.errors import CollocationError, SimulationError
 from excite.model import Model
 from excite.model.machine import Machine, Problem
-from excite.simulation import Motion, followed, simulate
+from excite.simulation import Motion, simulate, track_motion
 from excite.trajectories import composite_objective as aims, interior_point, objective as _objective
 from excite.trajectories.collocation import Transcription, settle, transcribe
 from excite.trajectories.composite_objective import SIGMA_MAX, Aim
@@ -353,7 +353,7 @@ def _advance(
 
     try:
         Z = settle(tr, start, U, Z)
-    except UnsettledError:
+    except CollocationError:
         return None
     sharp = [stage.sharp * 2**i for i in range(stage.levels)]
     levels = tuple(
@@ -417,7 +417,7 @@ def verdict(model: Model, problem: Problem, aim: Aim, drive: Manoeuvre) -> tuple
     if not np.array_equal(start, motion.q[0]):
         motion = simulate(model, torque, q0=start)
     violations = check_limits(model, problem, motion)
-    motions = [(model, motion), *((m, followed(m, model, motion)) for m in aim.machines[1:])]
+    motions = [(model, motion), *((m, track_motion(m, model, motion)) for m in aim.machines[1:])]
     for m, other in motions[1:]:  # what people see to themselves, where the machine goes, is left out
         for name, excess in check_limits(m, problem, other).items():
             if not free(name):

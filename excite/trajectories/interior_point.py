@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from excite.errors import UnsettledError
+from excite.errors import CollocationError
 from excite.trajectories import composite_objective as aims
 from excite.trajectories.collocation import FAR, Transcription, settle
 from excite.trajectories.composite_objective import Aim
@@ -396,7 +396,7 @@ def _move(tr: Transcription, point: Point, step: Point, alpha: float, dual: floa
     start, U = point.start + alpha * step.start, point.U + alpha * step.U
     try:
         Z = settle(tr, start, U, point.Z + alpha * step.Z)
-    except UnsettledError:
+    except CollocationError:
         return None
     return Point(
         start,

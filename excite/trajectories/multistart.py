@@ -26,7 +26,7 @@ from excite.errors import InfeasibleError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion, simulate
-from excite.text import percent
+from excite.text import format_percent
 from excite.trajectories import composite_objective as aims, objective as objectives
 from excite.trajectories.composite_objective import SIGMA_MAX, Aim
 from excite.trajectories.continuation import (
@@ -167,8 +167,8 @@ def _infeasible(aim: Aim, best: Candidate, complete: bool) -> InfeasibleError:
     if name == SIGMA_MAX and aim.sigma_max is not None:
         return InfeasibleError(
             f"no drive found that is accurate enough: {name} {aim.sigma_max:g} % is exceeded by"
-            f" {percent(100 * excess)}, the worst parameter comes out at"
-            f" {percent(aim.sigma_max * (1 + excess), 3)} in the best attempt;"
+            f" {format_percent(100 * excess)}, the worst parameter comes out at"
+            f" {format_percent(aim.sigma_max * (1 + excess), 3)} in the best attempt;"
             f" {'allow more, or give a longer duration or more starts' if complete else cut}",
             name,
             excess,

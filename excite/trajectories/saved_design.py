@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from excite import logs, output
-from excite.errors import StoredError
+from excite.errors import DesignFolderError
 from excite.model import Model, build
 from excite.model.machine import Machine, Problem
 from excite.simulation import Motion, simulate
@@ -34,16 +34,16 @@ def read_design_summary(design_dir: Path) -> dict[str, Any]:
     """The summary of a design folder. Raises StoredError."""
     path = design_dir / output.SUMMARY
     if not path.is_file():
-        raise StoredError(
+        raise DesignFolderError(
             f"{design_dir}: not a design (no {output.SUMMARY} in it), make one with `excite design MACHINE`"
         )
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        raise StoredError(f"{path}: damaged or not readable, design again") from None
+        raise DesignFolderError(f"{path}: damaged or not readable, design again") from None
     whole = isinstance(found, dict) and isinstance(found.get("machine"), str) and "duration_s" in found
     if not whole or not (design_dir / "profile.csv").is_file():
-        raise StoredError(f"{design_dir}: not a design, make one with `excite design MACHINE`")
+        raise DesignFolderError(f"{design_dir}: not a design, make one with `excite design MACHINE`")
     return dict(found)
 
 
@@ -54,17 +54,19 @@ def read_design(design_dir: Path) -> Stored:
     try:
         model = build(Machine.model_validate_json(path.read_bytes()))
     except (OSError, ValueError):
-        raise StoredError(f"{path}: missing or damaged, design again") from None
+        raise DesignFolderError(f"{path}: missing or damaged, design again") from None
     nominal = dict(zip(model.base.names, model.nominal.tolist(), strict=True))
     try:
         # Designed for what logs told of the machine, if it was; what sits in a sensor alone is no part of a design.
         nominal |= {n: float(x) for n, x in before.get("nominal", {}).items()}
         seconds = float(before["duration_s"])
     except (AttributeError, TypeError, ValueError):
-        raise StoredError(f"{design_dir / output.SUMMARY}: damaged, design again") from None
+        raise DesignFolderError(f"{design_dir / output.SUMMARY}: damaged, design again") from None
     model = replace(model, nominal=np.array([nominal[n] for n in model.base.names]))
     torque, q0, nu0 = logs.read_profile(design_dir / "profile.csv", model)
     if len(torque) != round(seconds * float(model.machine.sampling_hz)) + 1:
-        raise StoredError(f"{design_dir / 'profile.csv'}: {len(torque)} rows do not make {seconds:g} s, design again")
+        raise DesignFolderError(
+            f"{design_dir / 'profile.csv'}: {len(torque)} rows do not make {seconds:g} s, design again"
+        )
     problem = model.machine.problems.get(str(before.get("problem")))
     return Stored(before, model, problem, simulate(model, torque, q0=q0, nu0=nu0))

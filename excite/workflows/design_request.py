@@ -61,13 +61,13 @@ def rivals(model: Model, between: tuple[str, ...], duration: float) -> Model:
 
     Raises MachineError for an effect that is unknown, that the machine can't have, or that driving doesn't show.
     """
-    return beside(model, [effects.parse(text, model.machine, duration) for text in between])
+    return beside(model, [effects.parse_effect(text, model.machine, duration) for text in between])
 
 
 def beside(model: Model, rivals: Sequence[EffectEntry]) -> Model:
     """The same for effects as a machine file has them. What they can be mistaken for may have any shape, so shapes of
     effects are parameters too, unless they are times of a log. Raises MachineError."""
-    machine = effects.extended(model.machine, *rivals)
+    machine = effects.with_effects(model.machine, *rivals)
     times = any(effects.CATALOGUE[e.name].timed for e in machine.effect)
     both = build(machine, model.flaws, shapes=not times)
     for e in both.effects[-2:]:
@@ -190,7 +190,7 @@ def advice(brief: Brief, worst: str, percent: float) -> str | None:
     if percent <= POOR:
         return None
     blind = trajectories.conditions(brief.objective) and brief.sigma_max is None
-    poor = f"{worst} can't be found better than {wording.percent(percent)}"
+    poor = f"{worst} can't be found better than {wording.format_percent(percent)}"
     if not blind:
         return f"poor accuracy: {poor}; drive longer, or on more room"
     return (

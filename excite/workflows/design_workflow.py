@@ -13,7 +13,7 @@ import pandas as pd
 from excite import reports, trajectories
 from excite.errors import MachineError
 from excite.logs import profile_of, torque_column
-from excite.model import Model, meanings
+from excite.model import Model, parameter_descriptions
 from excite.model.machine import Problem
 from excite.workflows import design_request as briefs, requests
 from excite.workflows.design_request import Brief
@@ -52,7 +52,7 @@ def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief
         "problem": name,
         "duration_s": float(chosen.duration_s),
         **briefs.summary(brief, found),
-        "meanings": meanings(found.model),
+        "meanings": parameter_descriptions(found.model),
         "wall_s": wall,
         "versions": requests.versions(),
     }

@@ -10,7 +10,7 @@ from typing import Any
 
 from excite import diagnosis, identification, reports
 from excite.diagnosis import Account, Diagnosis, Rivals, diagnose, forked
-from excite.errors import InfeasibleError, MachineError, NotIdentifiable, SimulationError
+from excite.errors import InfeasibleError, MachineError, NotIdentifiableError, SimulationError
 from excite.identification import FILTERS
 from excite.logs import Log, doubts_in_errors, examine, moves, read_stretches
 from excite.model import Model, build
@@ -43,7 +43,7 @@ def _ready(model: Model, logs: Sequence[Log], filtering: str) -> Ready:
     doubtful = [line for e in examined for line in e.doubts]
     if not any(moves(model, one) for one in mended):
         sources = ", ".join(one.source for one in mended)
-        raise NotIdentifiable(f"{sources}: nothing moves, which shows no cause; give a log of a drive as well")
+        raise NotIdentifiableError(f"{sources}: nothing moves, which shows no cause; give a log of a drive as well")
     chosen, reason = FILTERS[filtering](model, mended)
     notes = [note for e in examined for note in e.notes] + doubtful + ([reason] if reason else [])
     return Ready(mended, notes, doubtful, chosen)

@@ -18,7 +18,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import joblib
 
-from excite.errors import EngineError
+from excite.errors import WorkerError
 
 AHEAD = 2  # pieces in flight per worker: one at work, one at hand
 TRIES = 3  # deaths of a worker that had a piece alone before the piece is to blame: others kill workers too
@@ -123,7 +123,7 @@ class Cluster:
         try:
             import distributed
         except ImportError:
-            raise EngineError("--cluster needs Dask: pip install 'excite[cluster]'") from None
+            raise WorkerError("--cluster needs Dask: pip install 'excite[cluster]'") from None
         self._levels = {logger: logger.level for logger in map(logging.getLogger, LOGGERS)}
         for logger in self._levels:  # their tracebacks of a lost connection: what it means is said in a line
             logger.setLevel(logging.CRITICAL)
@@ -133,7 +133,7 @@ class Cluster:
             self._client.wait_for_workers(1, timeout=30)
         except (OSError, ValueError, TimeoutError) as err:
             self._loud()
-            raise EngineError(f"--cluster {address}: no scheduler with a worker answers: {err}") from None
+            raise WorkerError(f"--cluster {address}: no scheduler with a worker answers: {err}") from None
         self._executor = self._client.get_executor(pure=False)
 
     @property
@@ -152,7 +152,7 @@ class Cluster:
             yield
         except Exception as err:
             if isinstance(err, OSError) or self._client.status != "running":
-                raise EngineError(GONE) from None
+                raise WorkerError(GONE) from None
             raise
 
     def died(self, err: BaseException) -> bool:
@@ -241,7 +241,7 @@ def spread(
             try:
                 value, seconds = future.result()
             except CancelledError:
-                raise EngineError(GONE) from None
+                raise WorkerError(GONE) from None
             except Exception as err:
                 if not workers.died(err):
                     raise

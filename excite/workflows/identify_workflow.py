@@ -13,7 +13,7 @@ from excite import identification, reports
 from excite.errors import SimulationError
 from excite.identification import FILTERS, Estimate, late_channels
 from excite.logs import Log, examine, read_stretches
-from excite.model import Model, meanings
+from excite.model import Model, parameter_descriptions
 from excite.model.machine import Filter
 from excite.workflows import requests
 from excite.workflows.progress import Bar, silent
@@ -69,7 +69,7 @@ def identify(
         "logs": [one.source for one in read],
         "method": estimate.method,
         "parameters": _parameters(estimate),
-        "meanings": meanings(model),
+        "meanings": parameter_descriptions(model),
         "cond_w": estimate.cond_w,
         "cond_phi": estimate.cond_phi,
         "relative_error_percent": estimate.relative_error_percent,

@@ -17,12 +17,12 @@ from pydantic import ValidationError
 
 from excite import identification, output, reports, smoothing, trajectories
 from excite.errors import MachineError, SimulationError
-from excite.model import Model, build, effects, meanings, mechanics, standard_parameters
+from excite.model import Model, build, effects, mechanics, parameter_descriptions, standard_parameters
 from excite.model.effects import GRAVITY
-from excite.model.machine import Machine, Problem, Quantity, complaints as files_complaints, load_machine
+from excite.model.machine import Machine, Problem, Quantity, error_lines as files_complaints, load_machine
 from excite.reports import Picture, Table
 from excite.simulation import simulate
-from excite.text import rounded
+from excite.text import format_number
 from excite.workflows.requests import LONGEST
 
 PICTURE = "machine.png"
@@ -136,7 +136,7 @@ def _stuck(model: Model) -> Iterator[str]:
 
 
 def _lane(model: Model) -> Iterator[str]:
-    poses = mechanics.poses(model.machine, {})
+    poses = mechanics.body_poses(model.machine, {})
     for name, problem in model.machine.problems.items():
         places = [poses[i][1][:2] for i in problem.lane_points]
         apart = max((float(np.linalg.norm(a - b)) for a in places for b in places), default=0.0)
@@ -222,7 +222,7 @@ def _bounds(model: Model) -> Iterator[str]:
 
 def _bodies(model: Model) -> Iterator[str]:
     """Centres of mass and radii of gyration against the size of the machine; spin inertia against a flat disc's."""
-    poses = mechanics.poses(model.machine, {})
+    poses = mechanics.body_poses(model.machine, {})
     places = np.array([P for _, P in poses.values()])
     reach = float(np.ptp(places, axis=0).max()) + 2 * max(
         (float(b.contact.radius) for b in model.machine.contacts if b.contact is not None), default=0.0
@@ -299,14 +299,14 @@ def _times(model: Model) -> Iterator[str]:
 
 def _effects(model: Model) -> Iterator[str]:
     for e in model.effects:
-        said = effects.doubtful(model.machine, e)
+        said = effects.size_warning(model.machine, e)
         if said is not None:
             yield f"effect {said}"
 
 
 def _turning(model: Model) -> Iterator[str]:
     """Chassis that turn about the vertical as if their mass were in one point."""
-    poses = mechanics.poses(model.machine, {})
+    poses = mechanics.body_poses(model.machine, {})
     for b in model.machine.body:
         i = b.inertia
         if i is None or i.axisymmetric or b.joint not in ("planar", "revolute") or float(i.ZZ):
@@ -423,12 +423,12 @@ def check_machine(place: Path, path: Path, versions: dict[str, str]) -> dict[str
     if model is not None and model.machine.planar:
         reports.save(reports.top_view_figure(model.machine), place / PICTURE)
     (place / "report.html").write_text(_page(summary, place), encoding="utf-8")
-    output.keep(place, summary)
+    output.write_summary(place, summary)
     return summary
 
 
 def _parameters(model: Model, sigma: dict[str, float]) -> dict[str, dict[str, Any]]:
-    what = meanings(model)
+    what = parameter_descriptions(model)
     return {
         name: {
             "what": what[name],
@@ -467,8 +467,8 @@ def machine_rows(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     """The table of parameters: name, what it is, what it stands for, value, unit, what random drives leave [%]."""
     return [
         (
-            *(n, r["what"], grouping(r["stands_for"]), rounded(r["value"]), r["unit"]),
-            rounded(r["random_drive_percent"], 2),
+            *(n, r["what"], grouping(r["stands_for"]), format_number(r["value"]), r["unit"]),
+            format_number(r["random_drive_percent"], 2),
         )
         for n, r in summary["parameters"].items()
     ]

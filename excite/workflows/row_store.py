@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from excite.errors import FolderError, StoreError
+from excite.errors import FolderError, RowStoreError
 
 Row = dict[str, Any]
 
@@ -44,7 +44,7 @@ class Store:
         except sqlite3.IntegrityError as err:
             raise ValueError(f"{self.path}: a run is there already: {err}") from None
         except (sqlite3.OperationalError, sqlite3.DatabaseError) as err:
-            raise StoreError(
+            raise RowStoreError(
                 f"{self.path}: can't be written: {err}; what was kept is safe, mend that and repeat the command"
             ) from None
 
@@ -106,6 +106,6 @@ def _begin(db: sqlite3.Connection, path: Path, fingerprint: str) -> None:
     except sqlite3.OperationalError as err:
         if "locked" in str(err):
             raise FolderError(f"{path}: somebody is at work on this study, wait or choose another --out") from None
-        raise StoreError(f"{path}: can't be written: {err}") from None
+        raise RowStoreError(f"{path}: can't be written: {err}") from None
     except sqlite3.DatabaseError as err:
         raise FolderError(f"{path}: damaged ({err}), delete it to begin afresh") from None

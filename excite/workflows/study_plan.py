@@ -42,8 +42,17 @@ from pydantic_core import PydanticCustomError
 from excite import identification, logs
 from excite.errors import LogError, MachineError, StudyError, UsageError
 from excite.model import build
-from excite.model.effects import DURATION, parse, placed
-from excite.model.machine import Machine, Number, Record, load_machine, one_line, own_files, read_toml, shipped_machines
+from excite.model.effects import DEFAULT_DURATION, parse_effect, place_effect
+from excite.model.machine import (
+    FileRecord,
+    Machine,
+    Number,
+    error_line,
+    load_machine,
+    machine_files,
+    read_toml,
+    shipped_machines,
+)
 from excite.trajectories import KINDS
 from excite.workflows import requests
 
@@ -63,7 +72,7 @@ def _sets(value: Any) -> Any:
     return [_several(v) for v in _several(value)]
 
 
-class Range(Record):
+class Range(FileRecord):
     """Numbers from low to high, drawn evenly, or evenly in their logarithm."""
 
     low: Number
@@ -111,7 +120,7 @@ Limits = Annotated[dict[str, Number], BeforeValidator(_limits)]
 VariedLimits = Annotated[dict[str, Varied], BeforeValidator(_limits)]
 
 
-class Axes(Record):
+class Axes(FileRecord):
     """What varies; an axis that is left out has the one value that the commands take by default.
 
     limits: factors on the machine's own; effects: sets of NAME[@WHERE]=AMOUNT; profile: drives instead of designs.
@@ -259,7 +268,7 @@ def _cell(v: dict[str, Any]) -> Cell:
     return Cell(Drive(v["machine"], *own, v["profile"]), v["kit"], v["method"], tuple(v["effects"]), v["seed"])
 
 
-class Study(Record):
+class Study(FileRecord):
     """A study file. runs: of every cell; steps: what is done with each."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,79}$")]
@@ -367,7 +376,7 @@ def read_study(path: str | Path) -> Plan:
     try:
         study = Study.model_validate(raw)
     except ValidationError as err:
-        raise StudyError(one_line(path, err, Study)) from None
+        raise StudyError(error_line(path, err, Study)) from None
     try:
         return ready(study, path.parent)
     except UsageError as err:
@@ -390,7 +399,7 @@ def ready(study: Study, base: Path | str = Path()) -> Plan:
             if name not in known:
                 place = name if name in shipped_machines() else base / name
                 known[name] = load_machine(place)
-                texts[name] = {p.name: p.read_text(encoding="utf-8-sig") for p in own_files(place)}
+                texts[name] = {p.name: p.read_text(encoding="utf-8-sig") for p in machine_files(place)}
     plan = Plan(study, base, tuple(study.cells()), known, texts)
     seen: set[Any] = set()
     for cell in plan.cells:
@@ -414,8 +423,8 @@ def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:
             requests.require_objective(d.objective, machine)
             requests.choose_problem(plan.designed(d), d.problem, d.duration_s)
     if fresh(d.machine, cell.effects):
-        own = [placed(machine, entry).name for entry in machine.effect]
-        labels = [parse(text, machine, DURATION).label for text in cell.effects]
+        own = [place_effect(machine, entry).name for entry in machine.effect]
+        labels = [parse_effect(text, machine, DEFAULT_DURATION).label for text in cell.effects]
         for k, label in enumerate(labels):
             if label in labels[:k]:
                 raise StudyError(f"effects: {', '.join(cell.effects)}: an effect is given twice, {label}")

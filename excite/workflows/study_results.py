@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 
 from excite import identification, reports
 from excite.identification import Verification
-from excite.model import built
+from excite.model import build_cached
 from excite.reports import COLOURS, Picture, Table, report_page
-from excite.text import percent, rounded
+from excite.text import format_number, format_percent
 from excite.workflows import study_runs as cells
 from excite.workflows.study_plan import Cell, Plan
 from excite.workflows.study_runs import DEFECT, DONE, Row
@@ -171,12 +171,12 @@ def _line(wanted: Plan, number: int, cell: Cell, about: Row, row: Row, seed: int
     names = wanted.parameters[cell.drive.machine]
     for kind in cells.ESTIMATES:
         line |= {f"{kind}.{n}": x for n, x in zip(names, row.get(kind, ()), strict=False)}
-    model = built(wanted.machines[cell.drive.machine].model_dump_json())
+    model = build_cached(wanted.machines[cell.drive.machine].model_dump_json())
     return line | {f"true.{n}": float(x) for n, x in zip(names, model.nominal, strict=True)}
 
 
 def _seen(wanted: Plan, c: int, cell: Cell, track: Any, rows: Sequence[Row]) -> Seen:
-    model = built(wanted.machines[cell.drive.machine].model_dump_json())
+    model = build_cached(wanted.machines[cell.drive.machine].model_dump_json())
     table: dict[str, dict[str, float | str]] = {}
     if any("value" in row for row in rows):
         nothing = [None] * len(model.base.names)
@@ -318,9 +318,9 @@ def page(title: str, said: Mapping[str, Any], picture: Path) -> str:
             str(row["done"]),
             str(row["failed"] + row["defect"]),
             row.get("worst_parameter", "-"),
-            rounded(row.get("worst_rms_percent"), 3),
-            rounded(row.get("median_rms_percent"), 3),
-            rounded(100 * row["coverage95"] if "coverage95" in row else None, 3),
+            format_number(row.get("worst_rms_percent"), 3),
+            format_number(row.get("median_rms_percent"), 3),
+            format_number(100 * row["coverage95"] if "coverage95" in row else None, 3),
             ", ".join(f"{k} {v}" for k, v in row.get("verdicts", {}).items()) or "-",
         )
         for row in said["cells"][:200]
@@ -346,4 +346,4 @@ def page(title: str, said: Mapping[str, Any], picture: Path) -> str:
 
 
 def _erring(row: Mapping[str, Any]) -> str:
-    return f"{row['cell']} ({row['worst_parameter']} {percent(row['worst_rms_percent'])} rms)"
+    return f"{row['cell']} ({row['worst_parameter']} {format_percent(row['worst_rms_percent'])} rms)"

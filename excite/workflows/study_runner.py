@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from excite import logs, output
-from excite.errors import EngineError, FolderError, StoreError, StudyError
-from excite.model import built, effects
+from excite.errors import FolderError, RowStoreError, StudyError, WorkerError
+from excite.model import build_cached, effects
 from excite.model.machine import Machine, shipped_machines
 from excite.workflows import executors, requests, row_store, study_results, study_runs as cells
 from excite.workflows.executors import Pool
@@ -60,20 +60,20 @@ def run_study(
     if before is not None:
         shutil.rmtree(place, ignore_errors=True)
         return before
-    output.claim(out, _inputs(wanted))
+    output.check_out_folder(out, _inputs(wanted))
     try:
         (place / DRIVES).mkdir(parents=True, exist_ok=True)
         with row_store.opened(place / "runs.sqlite", finger) as kept:
-            output.sweep(out)
+            output.remove_partial_folders(out)
             _design(wanted, place / DRIVES, kept, cluster, tell)
             _run(wanted, place / DRIVES, kept, jobs, cluster, tell)
             tell(wanted.total, wanted.total, "writing")
-            with output.writing(out) as partial:
+            with output.new_folder(out) as partial:
                 summary = _write(wanted, place / DRIVES, kept, partial, finger)
     except OSError as err:
         if err.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG):
             raise
-        raise StoreError(
+        raise RowStoreError(
             f"{err.filename or out}: can't be written: {err.strerror}; what was kept is safe, mend that and repeat the"
             " command"
         ) from None
@@ -123,7 +123,7 @@ def _design(wanted: Plan, place: Path, kept: Store, cluster: str | None, tell: P
     for k in missing:
         drive = wanted.drives[k]
         if drive.profile is not None:
-            with output.writing(place / _name(k)) as partial:
+            with output.new_folder(place / _name(k)) as partial:
                 (partial / "profile.csv").write_bytes((wanted.base / drive.profile).read_bytes())
             done += 1
         else:
@@ -135,10 +135,10 @@ def _design(wanted: Plan, place: Path, kept: Store, cluster: str | None, tell: P
         if made.failure is not None:
             kept.fail(order.number, made.failure)
         else:
-            with output.writing(place / _name(order.number)) as partial:
+            with output.new_folder(place / _name(order.number)) as partial:
                 (partial / "profile.csv").write_text(made.profile, encoding="utf-8")
                 (partial / "machine.json").write_text(order.machine + "\n", encoding="utf-8")
-                output.keep(partial, made.summary | {"versions": requests.versions()})
+                output.write_summary(partial, made.summary | {"versions": requests.versions()})
         done += 1
         tell(done, len(wanted.drives), "designing")
 
@@ -172,7 +172,7 @@ class Track:
 
 def _track(wanted: Plan, place: Path, number: int) -> Track:
     drive = wanted.drives[number]
-    model = built(wanted.machines[drive.machine].model_dump_json())
+    model = build_cached(wanted.machines[drive.machine].model_dump_json())
     torque, q0, nu0 = logs.read_profile(place / _name(number) / "profile.csv", model)
     driven = Driven(np.ascontiguousarray(torque, float).tobytes(), torque.shape[1], tuple(q0), tuple(nu0))
     path = place / _name(number) / output.SUMMARY
@@ -224,7 +224,7 @@ def _rows(work: Work, value: tuple[str, list[tuple[int, cells.Row]]] | None, wor
         return [(n, {"status": DEFECT, "reason": "killed the worker that computed it"}) for n, _ in work.runs]
     program, rows = value
     if workers.foreign and program != cells.program():
-        raise EngineError("a worker of the cluster has another version of the program: install the same everywhere")
+        raise WorkerError("a worker of the cluster has another version of the program: install the same everywhere")
     return rows
 
 
@@ -251,8 +251,8 @@ def _work(wanted: Plan, cell: Cell, track: Track) -> Work:
     machine = wanted.machines[cell.drive.machine]
     true: Machine = machine
     if cell.effects:
-        entries = [effects.parse(text, machine, track.duration_s) for text in cell.effects]
-        true = effects.extended(machine, *entries)
+        entries = [effects.parse_effect(text, machine, track.duration_s) for text in cell.effects]
+        true = effects.with_effects(machine, *entries)
     known = machine.model_dump_json()
     return Work(known, true.model_dump_json(), track.driven, wanted.study.steps, cell.kit, wanted.method(cell), ())
 
@@ -294,5 +294,5 @@ def _write(wanted: Plan, drives: Path, kept: Store, partial: Path, finger: str) 
         "versions": requests.versions(),
     }
     study_results.draw(wanted, seen, summary, partial)
-    output.keep(partial, summary)
+    output.write_summary(partial, summary)
     return summary

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from excite import identification, interrupt, simulation
-from excite.errors import InfeasibleError, LogError, MachineError, NoEstimate, SimulationError
+from excite.errors import InfeasibleError, LogError, MachineError, NoEstimateError, SimulationError
 from excite.logs import Log, examine, from_table, profile_of
-from excite.model import Model, build, built
+from excite.model import Model, build, build_cached
 from excite.model.machine import Machine, Problem
 from excite.simulation import Motion, simulate
 from excite.workflows import design_request
@@ -55,7 +55,7 @@ class Work:
 @lru_cache(maxsize=4)
 def _motion(machine: str, driven: Driven) -> Motion:
     torque = np.frombuffer(driven.torque).reshape(-1, driven.inputs)
-    return simulate(built(machine), torque, q0=np.array(driven.q0), nu0=np.array(driven.nu0))
+    return simulate(build_cached(machine), torque, q0=np.array(driven.q0), nu0=np.array(driven.nu0))
 
 
 def carry(work: Work) -> tuple[str, list[tuple[int, Row]]]:
@@ -71,13 +71,13 @@ def run(work: Work, seed: int) -> Row:
     is a defect of the program, which is told as such and doesn't end the study. Raises KeyboardInterrupt for one that
     came meanwhile, in whatever guise.
     """
-    return interrupt.whole(_judged, work, seed)
+    return interrupt.call_interruptible(_judged, work, seed)
 
 
 def _judged(work: Work, seed: int) -> Row:
     try:
         return {"status": DONE} | _run(work, seed)
-    except (NoEstimate, SimulationError, LogError, MachineError) as err:
+    except (NoEstimateError, SimulationError, LogError, MachineError) as err:
         return {"status": FAILED, "reason": _said(err)}
     except Exception as err:
         return {"status": DEFECT, "reason": f"{type(err).__name__}: {_said(err)}"}
@@ -88,11 +88,11 @@ def _said(err: Exception) -> str:
 
 
 def _run(work: Work, seed: int) -> Row:
-    known, steps = built(work.known), set(work.steps)
+    known, steps = build_cached(work.known), set(work.steps)
     row: Row = {}
     if not steps & {"simulate", "identify", "verify", "diagnose"}:
         return row
-    table = simulation.measure(built(work.true), _motion(work.true, work.driven), kit=work.kit, seed=seed)
+    table = simulation.measure(build_cached(work.true), _motion(work.true, work.driven), kit=work.kit, seed=seed)
     row["log_sha256"] = hashlib.sha256(table.to_numpy(float).tobytes()).hexdigest()[:16]
     if steps & {"identify", "verify"}:
         measured = from_table(table, known.machine, identification.needed_sensors(known, work.method))
@@ -155,7 +155,7 @@ class Designed:
 
 def designed(order: Order) -> Designed:
     """A study's drive. Raises KeyboardInterrupt where it was cut short."""
-    return interrupt.whole(_designed, order)
+    return interrupt.call_interruptible(_designed, order)
 
 
 def _designed(order: Order) -> Designed:
@@ -163,7 +163,7 @@ def _designed(order: Order) -> Designed:
     try:
         model = build(Machine.model_validate_json(order.machine), flaws=False)  # no drive shows what sits in a sensor
         answer = design_request.answer(model, order.problem, asked)
-    except (InfeasibleError, SimulationError, NoEstimate, MachineError) as err:
+    except (InfeasibleError, SimulationError, NoEstimateError, MachineError) as err:
         return Designed("", {}, _said(err))
     except np.linalg.LinAlgError:
         return Designed("", {}, design_request.unmoved(order.name))

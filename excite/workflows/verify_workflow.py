@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from excite import identification, reports, simulation, trajectories
-from excite.errors import NotIdentifiable, UsageError
-from excite.model import meanings
+from excite.errors import NotIdentifiableError, UsageError
+from excite.model import parameter_descriptions
 from excite.workflows import requests
 from excite.workflows.progress import Bar, silent
 
@@ -37,7 +37,7 @@ def verify(
             model, motion, method, kit, runs, seed, progress=lambda done, total: advance(done, total, None)
         )
     if len(result.failures) == runs:
-        raise NotIdentifiable(f"all {runs} runs failed, the first one: {result.failures[0]}")
+        raise NotIdentifiableError(f"all {runs} runs failed, the first one: {result.failures[0]}")
     parameters = identification.summarise_runs(result)
     summary = {
         "machine": model.machine.name,
@@ -50,7 +50,7 @@ def verify(
         "failed": len(result.failures),
         "failures": result.failures,
         "parameters": parameters,
-        "meanings": meanings(model),
+        "meanings": parameter_descriptions(model),
         "biased": identification.biased(parameters),
         "versions": requests.versions(),
     }

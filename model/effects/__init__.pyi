@@ -1,26 +1,26 @@
 from .catalogue import CATALOGUE as CATALOGUE
 from .effect import (
-    DURATION as DURATION,
+    DEFAULT_DURATION as DEFAULT_DURATION,
+    ContactMotion as ContactMotion,
     Effect as Effect,
-    Placed as Placed,
-    Rolling as Rolling,
-    Scene as Scene,
+    PlacedEffect as PlacedEffect,
+    SampleView as SampleView,
     Shape as Shape,
     Site as Site,
     Soil as Soil,
     Values as Values,
-    one as one,
+    unit_size as unit_size,
 )
-from .ground_map import MOST as MOST, Ground as Ground
+from .ground_map import MAX_PASSES as MAX_PASSES, GroundMap as GroundMap
 from .placing import (
-    doubtful as doubtful,
-    extended as extended,
-    parse as parse,
-    placed as placed,
-    places as places,
-    possible as possible,
-    shifted as shifted,
-    shifting as shifting,
-    without as without,
+    allowed_places as allowed_places,
+    parse_effect as parse_effect,
+    payload_body as payload_body,
+    payload_change as payload_change,
+    place_effect as place_effect,
+    shapes_possible as shapes_possible,
+    size_warning as size_warning,
+    with_effects as with_effects,
+    without_effect as without_effect,
 )
-from .sizes import GRAVITY as GRAVITY, duration as duration, full_torque as full_torque
+from .sizes import GRAVITY as GRAVITY, duration as duration, large_torque as large_torque

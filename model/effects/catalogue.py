@@ -14,22 +14,22 @@ from math import pi
 import casadi as ca
 
 from excite.model.effects import friction, ground_map, sizes, soil
-from excite.model.effects.effect import Channel, Effect, Memory, Scene, Shape, Site, Values
+from excite.model.effects.effect import Channel, Effect, Memory, SampleView, Shape, Site, Values
 
-SMOOTH_TORQUE = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
-EDGE = 0.2  # [s] over which what acts between two instants begins and ends
+TORQUE_SMOOTHING = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
+EDGE_TIME = 0.2  # [s] over which what acts between two instants begins and ends
 
-MOMENTS = 120  # at which a load is looked for that slides
-PRESSED = 0.1  # [rad] beyond a stop, at which its hardening is stated
-TOUCH = 0.003  # [rad] over which a stop begins to be pressed
-BEHIND = 2.0  # [m] from the joint, where a load is put on or taken off
+MAX_SLIDE_INSTANTS = 120  # at which a load is looked for that slides
+HARDENING_DEPTH = 0.1  # [rad] beyond a stop, at which its hardening is stated
+STOP_SMOOTHING = 0.003  # [rad] over which a stop begins to be pressed
+LOAD_ARM = 2.0  # [m] from the joint, where a load is put on or taken off
 
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
 BEND = Shape("-", 0.0, (0.0,), meaning="0: exponential law; 1: hyperbola; the force's limit is (2 + bend) A K")
-TWICE = Shape("rad", 0.0, (0.0,), lambda site: 0.001)
+SECOND_HARMONIC = Shape("rad", 0.0, (0.0,), lambda site: 0.001)
 
 
-def _forms(meaning: str, only: tuple[float, ...] = (0.0, 1.0), grid: tuple[float, ...] = (0.0,)) -> Shape:
+def _form_choice(meaning: str, only: tuple[float, ...] = (0.0, 1.0), grid: tuple[float, ...] = (0.0,)) -> Shape:
     """A shape that chooses in which of several ways an effect acts."""
     return Shape("-", 0.0, grid, whole=True, only=only, meaning=meaning)
 
@@ -42,86 +42,86 @@ def _softplus(x: ca.SX, width: float | ca.SX) -> ca.SX:
     return (x + ca.sqrt(x**2 + width**2)) / 2
 
 
-def _eccentric(s: Scene, angle: ca.SX, k: int, p: Values) -> ca.SX:
+def _eccentricity_error(s: SampleView, angle: ca.SX, k: int, p: Values) -> ca.SX:
     def error(at: ca.SX | float) -> ca.SX:
         return p["A"] * ca.sin(at + p["phase"]) + p["cos2"] * ca.cos(2 * at) + p["sin2"] * ca.sin(2 * at)
 
     return error(angle) - error(0.0)
 
 
-def _deadband(s: Scene, k: int, p: Values) -> ca.SX:
-    u, A, width = s.u[k], p["A"], SMOOTH_TORQUE * s.full[k]
+def _deadband_loss(s: SampleView, k: int, p: Values) -> ca.SX:
+    u, A, width = s.u[k], p["A"], TORQUE_SMOOTHING * s.full[k]
     return _softplus(u - A, width) - _softplus(-u - A, width) - u + 0 * A
 
 
-def _coupling(s: Scene, k: int, p: Values) -> ca.SX:
+def _coupled_torque(s: SampleView, k: int, p: Values) -> ca.SX:
     felt = [(1 - p["hose"]) * s.u[j] + p["hose"] * s.z[f"late{j}"] for j in s.others(k)]
     return p["A"] * sum(felt, ca.SX(0))
 
 
-def _behind(s: Scene, k: int, p: Values) -> ca.SX:
+def _hose_rate(s: SampleView, k: int, p: Values) -> ca.SX:
     """How a hose follows a contact's torque."""
     return (s.u[k] - s.z[f"late{k}"]) / p["lag"]
 
 
-def _slid(s: Scene, p: Values) -> dict[str, ca.SX]:
+def _payload_change(s: SampleView, p: Values) -> dict[str, ca.SX]:
     """What a load on the last chassis changes of its inertia when it slides, is put on or taken off within so long."""
     there = p["A"] * (1 + ca.tanh((s.time - p["instant"]) / ca.sqrt(p["takes"] ** 2 + 0.05**2))) / 2
     return {"M": p["mass"] * there, "MX": there, "ZZ": p["arm"] * there}
 
 
 def _between(t: ca.SX, begin: ca.SX, end: ca.SX) -> ca.SX:
-    return (ca.tanh((t - begin) / EDGE) - ca.tanh((t - end) / EDGE)) / 2
+    return (ca.tanh((t - begin) / EDGE_TIME) - ca.tanh((t - end) / EDGE_TIME)) / 2
 
 
 def _window(t: ca.SX, p: Values) -> ca.SX:
     return _between(t, p["begin"], p["begin"] + p["length"])
 
 
-def _played(s: Scene, k: int, p: Values) -> ca.SX:
+def _play_rate(s: SampleView, k: int, p: Values) -> ca.SX:
     """How fast an actuator moves in its play, -1 to 1: to the side that it is pushed to by more than its own friction
     has; pushed by less it creeps towards u / breakaway, the more slowly the more friction there is. A friction that
     holds it there would be sharper than any fit finds a way to."""
-    width = SMOOTH_TORQUE * s.full[k]
+    width = TORQUE_SMOOTHING * s.full[k]
     ahead, back = _softplus(s.u[k] - p["breakaway"], width), _softplus(-s.u[k] - p["breakaway"], width)
     return (ahead * (1 - s.z["play"]) - back * (1 + s.z["play"])) / p["damping"]
 
 
-def _stopped(s: Scene, k: int, p: Values) -> ca.SX:
+def _stop_torque(s: SampleView, k: int, p: Values) -> ca.SX:
     q = s.q[k] - p["centre"]
-    high, low = _softplus(q - p["stop"], TOUCH), _softplus(-q - p["stop"], TOUCH)
-    return -p["A"] * (high - low) * (1 + p["hardening"] * ((high + low) / PRESSED) ** p["power"])
+    high, low = _softplus(q - p["stop"], STOP_SMOOTHING), _softplus(-q - p["stop"], STOP_SMOOTHING)
+    return -p["A"] * (high - low) * (1 + p["hardening"] * ((high + low) / HARDENING_DEPTH) ** p["power"])
 
 
-def _one_sided(site: Site) -> list[dict[str, float]]:
+def _one_sided_stops(site: Site) -> list[dict[str, float]]:
     """Stops so far from the middle that only one of them is reached."""
-    limit = sizes.stop(site)
+    limit = sizes.angle_limit(site)
     stops = [x * limit for x in (0.15, 0.35, 0.55, 0.75)]
     sides = [{"stop": (limit + x) / 2, "centre": side * (x - limit) / 2} for x in stops for side in (1.0, -1.0)]
     return [{**x, "hardening": 0.0, "power": 2.0} for x in sides]
 
 
-def _rubbing(site: Site) -> list[dict[str, float]]:
+def _rubbing_plays(site: Site) -> list[dict[str, float]]:
     """Plays that an actuator crosses against its own friction."""
     full = sizes.torque(site)
     held = [(damping, breakaway) for damping in (0.0001, 0.0005) for breakaway in (0.003, 0.01, 0.03)]
     return [{"turn": 0.02 * full, "rubs": 1.0, "damping": d * full, "breakaway": b * full} for d, b in held]
 
 
-def _clipped(s: Scene, k: int, p: Values) -> ca.SX:
+def _relief_loss(s: SampleView, k: int, p: Values) -> ca.SX:
     """A relief valve: what is above its torque is lost, to the share A."""
-    width = 2.5 * SMOOTH_TORQUE * s.full[k]
+    width = 2.5 * TORQUE_SMOOTHING * s.full[k]
     over = _softplus(s.u[k] - p["valve"], width) - _softplus(-s.u[k] - p["valve"], width)
     return -p["A"] * over
 
 
-def _sliding(site: Site) -> list[dict[str, float]]:
+def _payload_trials(site: Site) -> list[dict[str, float]]:
     """A load that slides within a second, at every second, in long logs at MOMENTS: its recoil is short. And one that
     is put on or taken off behind the joint, at every sixth of these."""
-    step = max(1.0, site.duration / MOMENTS)
+    step = max(1.0, site.duration / MAX_SLIDE_INSTANTS)
     times = [k * step for k in range(1, round(site.duration / step))]
     slid = [{"instant": t, "takes": 0.5, "arm": 0.0, "mass": 0.0, "recoil": 1.0} for t in times]
-    off = [{"instant": t, "takes": 0.5, "arm": -BEHIND, "mass": -1 / BEHIND, "recoil": 0.0} for t in times[5::6]]
+    off = [{"instant": t, "takes": 0.5, "arm": -LOAD_ARM, "mass": -1 / LOAD_ARM, "recoil": 0.0} for t in times[5::6]]
     return slid + off
 
 
@@ -148,23 +148,23 @@ _declare(
         " Wit, Olsson, Astrom, Lischinsky, IEEE TAC 40 (1995), (1) to (4)",
         sizes.coulomb(0.5),
         {
-            "decay": Shape("rad/s", 15.0, (4.0, 12.0, 36.0), sizes.smooth),
+            "decay": Shape("rad/s", 15.0, (4.0, 12.0, 36.0), sizes.friction_smoothing),
             "power": Shape("-", 2.0, (1.0, 2.0), whole=True),
-            "bristles": _forms(
+            "bristles": _form_choice(
                 "0: friction turns with the speed; 1: all of it as bristles bend (LuGre without damping)"
             ),
             "presliding": Shape(
                 "rad",
                 0.2,
                 (0.2,),
-                sizes.smooth,
+                sizes.friction_smoothing,
                 meaning="the angle within which bristles bend",
                 form=("bristles", 1.0),
             ),
         },
-        beside=friction.bristly,
+        beside=friction.bristle_trials,
         torque=friction.stribeck,
-        memory={"bent": Memory(friction.bending, 1.0, form=("bristles", 1.0))},
+        memory={"bent": Memory(friction.bristle_rate, 1.0, form=("bristles", 1.0))},
     ),
     Effect(
         "friction_transition",
@@ -181,7 +181,7 @@ _declare(
         },
         grid=(1.0, 3.0, -1.0, -3.0),
         beside=lambda site: [{"A": 0.05, "slow": 0.5}, {"A": 0.05, "slow": -0.5}],
-        torque=friction.turned,
+        torque=friction.transition,
     ),
     Effect(
         "load_dependent_friction",
@@ -191,7 +191,7 @@ _declare(
         "friction larger where the torque is large, at the same speed",
         "Dohring et al. 1993; Linderoth et al. 2013, load-dependent Coulomb friction",
         sizes.constant(0.05),
-        torque=lambda s, k, p: -p["A"] * ca.sqrt(s.u[k] ** 2 + (SMOOTH_TORQUE * s.full[k]) ** 2) * s.sign(k),
+        torque=lambda s, k, p: -p["A"] * ca.sqrt(s.u[k] ** 2 + (TORQUE_SMOOTHING * s.full[k]) ** 2) * s.sign(k),
     ),
     Effect(
         "asymmetric_coulomb",
@@ -293,7 +293,7 @@ _declare(
         "the torque sensor's offset drifts by A a second over the first minute: A t (1 + slowing (1 - t / 60 s))",
         "a torque error that grows with time, steadily or ever slower",
         "strain-gauge and pressure sensors' zero drift, Doebelin, Measurement Systems, ch. 5",
-        sizes.of(sizes.torque, 2e-4),
+        sizes.share_of(sizes.torque, 2e-4),
         {"slowing": Shape("-", 0.0, (0.0,), meaning="0: steady; over two minutes the mean rate is (1 - slowing) A")},
         channel=lambda t, p: Channel(offset=p["A"] * t * (1 + p["slowing"] * (1 - t / 60))),
         timed=True,
@@ -305,10 +305,10 @@ _declare(
         "delivered sgn(u) max(abs(u) - A, 0), u measured",
         "a loss of torque with the sign of the torque, also at standstill",
         "overlap of proportional valves, Merritt, Hydraulic Control Systems, 1967, ch. 5",
-        sizes.of(sizes.torque, 0.02),
+        sizes.share_of(sizes.torque, 0.02),
         grid=(1.0, 4.0),
         positive=True,
-        torque=_deadband,
+        torque=_deadband_loss,
     ),
     Effect(
         "pump_coupling",
@@ -319,12 +319,12 @@ _declare(
         "two motors on one hydraulic pump",
         sizes.constant(0.05),
         {
-            "hose": _forms("0: the other's torque acts at once; 1: through a hose, with a first-order lag"),
+            "hose": _form_choice("0: the other's torque acts at once; 1: through a hose, with a first-order lag"),
             "lag": Shape("s", 0.1, (0.1,), meaning="time constant of the hose", form=("hose", 1.0)),
         },
         beside=lambda site: [{"hose": 1.0, "lag": x} for x in (0.03, 0.1, 0.3)],
-        torque=_coupling,
-        memory={"late": Memory(_behind, 1000.0, each=True, form=("hose", 1.0))},
+        torque=_coupled_torque,
+        memory={"late": Memory(_hose_rate, 1000.0, each=True, form=("hose", 1.0))},
     ),
     Effect(
         "relief_valve",
@@ -335,7 +335,7 @@ _declare(
         "pressure relief valves, Merritt, Hydraulic Control Systems, 1967, ch. 5",
         sizes.constant(0.5),
         {"valve": Shape("N m", 0.6, (0.3, 0.5, 0.7, 0.85), sizes.torque)},
-        torque=_clipped,
+        torque=_relief_loss,
     ),
     # ---------------------------------------------------------------- once or several times per turn
     Effect(
@@ -345,7 +345,7 @@ _declare(
         "a torque once per turn of the contact: A sin(theta + phase)",
         "a torque error periodic in the contact's angle",
         "eccentric mass or bearing of a roll or wheel",
-        sizes.of(sizes.torque, 0.02),
+        sizes.share_of(sizes.torque, 0.02),
         {"phase": PHASE},
         torque=lambda s, k, p: p["A"] * ca.sin(s.q[k] + p["phase"]),
     ),
@@ -360,7 +360,7 @@ _declare(
         {
             "phase": PHASE,
             "load": Shape(
-                "N", 0.5, (0.5,), sizes.weighing(1.0), meaning="the weight that the axle carries", within=(0.1, 1.0)
+                "N", 0.5, (0.5,), sizes.weight(1.0), meaning="the weight that the axle carries", within=(0.1, 1.0)
             ),
         },
         further=lambda s, k, p: p["A"] * ca.sin(s.q[k] + p["phase"]),
@@ -374,8 +374,8 @@ _declare(
         "an angle error periodic in the angle itself",
         "eccentric encoder discs, Dunster; error once per turn",
         sizes.constant(0.005),
-        {"phase": PHASE, "cos2": TWICE, "sin2": TWICE},
-        reading=_eccentric,
+        {"phase": PHASE, "cos2": SECOND_HARMONIC, "sin2": SECOND_HARMONIC},
+        reading=_eccentricity_error,
         angular=True,
     ),
     Effect(
@@ -385,7 +385,7 @@ _declare(
         "the delivered torque ripples several times per turn: A sin(order theta + phase)",
         "a torque error periodic in the contact's angle, several times per turn",
         "piston motors, Ivantysyn, Hydrostatic Pumps and Motors, 2001",
-        sizes.of(sizes.torque, 0.02),
+        sizes.share_of(sizes.torque, 0.02),
         {
             "order": Shape("1/turn", 5.0, tuple(float(n) for n in range(2, 21)), whole=True),
             "phase": PHASE,
@@ -405,7 +405,7 @@ _declare(
         positive=True,
         inverse=True,
         shapes={
-            "across": _forms(
+            "across": _form_choice(
                 "0: every strip of the width saturates by its own slip; 1: all of it as its middle; 2: the"
                 " same, but for the moment T_z",
                 (0.0, 1.0, 2.0),
@@ -427,7 +427,7 @@ _declare(
         positive=True,
         inverse=True,
         shapes={"bend": BEND},
-        soil=soil.saturated_aside,
+        soil=soil.saturated_laterally,
     ),
     Effect(
         "drive_brake_asymmetry",
@@ -449,9 +449,9 @@ _declare(
         sizes.constant(0.3),
         {
             "pass": Shape("m", 15.0, (5.0, 15.0, 50.0)),
-            "counted": _forms(
+            "counted": _form_choice(
                 f"0: n is the way; 1: passes are counted by reversals; 2: place by place, on a map of the ground, for"
-                f" every contact; a pass is worth {ground_map.PASS:g} m of way, and each log begins on new ground",
+                f" every contact; a pass is worth {ground_map.PASS_LENGTH:g} m of way, and each log begins on new ground",
                 (0.0, 1.0, 2.0),
             ),
         },
@@ -507,8 +507,8 @@ _declare(
         "a force against the motion at the contact's centre: A (1 + rise V_x^2) tanh(V_x / soft)",
         "a force that turns with the direction of travel",
         "Bekker, Introduction to Terrain-Vehicle Systems, 1969",
-        sizes.weighing(0.002),
-        {"rise": Shape("s2/m2", 0.0, (0.0,)), "soft": Shape("m/s", 1.0, (1.0,), sizes.constant(soil.SMOOTH_SPEED))},
+        sizes.weight(0.002),
+        {"rise": Shape("s2/m2", 0.0, (0.0,)), "soft": Shape("m/s", 1.0, (1.0,), sizes.constant(soil.SPEED_SMOOTHING))},
         resisting=True,
         push=soil.resistance,
     ),
@@ -540,11 +540,11 @@ _declare(
             "takes": Shape("s", 0.2, (0.2,)),
             "arm": Shape("m", 0.0, (0.0,), meaning="the yaw inertia about the joint changes by A times this"),
             "mass": Shape("1/m", 0.0, (0.0,), meaning="the mass changes by A times this"),
-            "recoil": _forms("1: a load slides and pushes back; 0: it is put on or taken away"),
+            "recoil": _form_choice("1: a load slides and pushes back; 0: it is put on or taken away"),
         },
-        inertia=_slid,
+        inertia=_payload_change,
         recoil="recoil",
-        beside=_sliding,
+        beside=_payload_trials,
         timed=True,
     ),
     # ---------------------------------------------------------------- articulation
@@ -558,7 +558,7 @@ _declare(
         sizes.constant(0.005),
         {
             "turn": Shape("N m", 0.02, (0.01, 0.05), sizes.torque, form=("rubs", 0.0)),
-            "rubs": _forms("0: the play is crossed at once; 1: against the actuator's own friction, over time"),
+            "rubs": _form_choice("0: the play is crossed at once; 1: against the actuator's own friction, over time"),
             "damping": Shape(
                 "N m s",
                 0.0002,
@@ -576,12 +576,12 @@ _declare(
                 form=("rubs", 1.0),
             ),
         },
-        beside=_rubbing,
+        beside=_rubbing_plays,
         positive=True,
         reading=lambda s, exact, k, p: (
             p["A"] / 2 * ((1 - p["rubs"]) * ca.tanh(s.u[k] / p["turn"]) + p["rubs"] * s.z["play"])
         ),
-        memory={"play": Memory(_played, 1.0, form=("rubs", 1.0))},
+        memory={"play": Memory(_play_rate, 1.0, form=("rubs", 1.0))},
         angular=True,
     ),
     Effect(
@@ -591,7 +591,7 @@ _declare(
         "a spring between the actuator, with its encoder, and the joint: it winds up by A times the torque",
         "the angle leads by an amount proportional to the torque",
         "Spong 1987, flexible joints",
-        sizes.one_over_torque,
+        sizes.compliance,
         positive=True,
         reading=lambda s, exact, k, p: p["A"] * s.u[k],
         angular=True,
@@ -605,15 +605,15 @@ _declare(
         "rubber stops of articulated frames; hardening with power 2 as Duffing's spring",
         sizes.torque,
         {
-            "stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), sizes.stop),
+            "stop": Shape("rad", 0.6, (0.15, 0.35, 0.55, 0.75), sizes.angle_limit),
             "centre": Shape("rad", 0.0, (0.0,), meaning="the angle in the middle between the stops"),
             "hardening": Shape(
                 "-", 0.0, (0.0,), meaning="x beyond the stop gives A x (1 + hardening (x / 0.1 rad)^power)"
             ),
             "power": Shape("-", 2.0, (2.0,)),
         },
-        torque=_stopped,
-        beside=_one_sided,
+        torque=_stop_torque,
+        beside=_one_sided_stops,
     ),
     # ---------------------------------------------------------------- sensors
     Effect(

@@ -11,13 +11,13 @@ import numpy as np
 from excite.model import mechanics
 from excite.model.machine import Body, Contact, Machine
 
-DURATION = 60.0  # [s] of a log, where nobody says
+DEFAULT_DURATION = 60.0  # [s] of a log, where nobody says
 Values = Mapping[str, ca.SX]  # the amount "A" and the shapes by name
 Form = tuple[str, float]  # a shape that an effect's way of acting is chosen by, and its value
 
 
 @dataclass(frozen=True)
-class Rolling:
+class ContactMotion:
     """How a contact, a roll or a wheel, moves: its centre's velocity along and across its chassis [m/s], spin and yaw
     rate [rad/s]; further: by how much the ground is further from its axle than its radius [m]."""
 
@@ -31,7 +31,7 @@ class Rolling:
     @property
     def rim(self) -> ca.SX:
         """Speed of the rim at the ground [m/s]."""
-        return mechanics.rim(self.contact, self.spin, self.further)
+        return mechanics.rim_speed(self.contact, self.spin, self.further)
 
     @property
     def slip(self) -> mechanics.Slip:
@@ -55,7 +55,7 @@ class Soil:
 
 
 @dataclass(frozen=True)
-class Scene:
+class SampleView:
     """One sample as an effect sees it.
 
     q, w: angle and rate of a joint [rad, rad/s] by body; u: torque that its sensor feels, flaws aside [N m]; friction:
@@ -73,7 +73,7 @@ class Scene:
     coulomb: Mapping[int, ca.SX]
     smooth: Mapping[int, float]
     full: Mapping[int, float]
-    rolling: Mapping[int, Rolling]
+    rolling: Mapping[int, ContactMotion]
     ahead: Mapping[int, ca.SX]
     time: ca.SX
     z: Mapping[str, ca.SX] = field(default_factory=dict)
@@ -106,16 +106,16 @@ class Site:
     duration: float
 
     @classmethod
-    def of(cls, machine: Machine, bodies: Sequence[int], duration: float = DURATION) -> Site:
+    def of(cls, machine: Machine, bodies: Sequence[int], duration: float = DEFAULT_DURATION) -> Site:
         """Where an effect acts on these bodies."""
         return cls(machine, machine.find(bodies[0]), duration)
 
 
-def one(site: Site) -> float:
+def unit_size(site: Site) -> float:
     return 1.0
 
 
-def nothing(site: Site) -> list[dict[str, float]]:
+def no_trials(site: Site) -> list[dict[str, float]]:
     return []
 
 
@@ -132,7 +132,7 @@ class Shape:
     unit: str
     default: float
     grid: tuple[float, ...]
-    size: Callable[[Site], float] = one
+    size: Callable[[Site], float] = unit_size
     circular: bool = False
     whole: bool = False
     only: tuple[float, ...] = ()
@@ -151,7 +151,7 @@ class Memory:
     each: one for each body that the effect acts on, named by the name and the body's index; form: the shape and its
     value with which alone there is one, or None."""
 
-    rate: Callable[[Scene, int, Values], ca.SX]
+    rate: Callable[[SampleView, int, Values], ca.SX]
     spread: float
     each: bool = False
     form: Form | None = None
@@ -184,18 +184,18 @@ class Effect:
     amount: Callable[[Site], float]
     shapes: Mapping[str, Shape] = field(default_factory=dict)
     grid: tuple[float, ...] = (1.0,)
-    beside: Callable[[Site], list[dict[str, float]]] = nothing
+    beside: Callable[[Site], list[dict[str, float]]] = no_trials
     positive: bool = False
     resisting: bool = False
     inverse: bool = False
-    torque: Callable[[Scene, int, Values], ca.SX] | None = None
-    further: Callable[[Scene, int, Values], ca.SX] | None = None
-    soil: Callable[[Scene, int, Values, Soil], Soil] | None = None
-    push: Callable[[Scene, int, Values], tuple[ca.SX, ca.SX]] | None = None
-    gravity: Callable[[Scene, Values], tuple[ca.SX, ca.SX]] | None = None
-    inertia: Callable[[Scene, Values], dict[str, ca.SX]] | None = None
+    torque: Callable[[SampleView, int, Values], ca.SX] | None = None
+    further: Callable[[SampleView, int, Values], ca.SX] | None = None
+    soil: Callable[[SampleView, int, Values, Soil], Soil] | None = None
+    push: Callable[[SampleView, int, Values], tuple[ca.SX, ca.SX]] | None = None
+    gravity: Callable[[SampleView, Values], tuple[ca.SX, ca.SX]] | None = None
+    inertia: Callable[[SampleView, Values], dict[str, ca.SX]] | None = None
     recoil: str | None = None
-    reading: Callable[[Scene, ca.SX, int, Values], ca.SX] | None = None
+    reading: Callable[[SampleView, ca.SX, int, Values], ca.SX] | None = None
     channel: Callable[[ca.SX, Values], Channel] | None = None
     shaking: Callable[[ca.SX, Values], ca.SX] | None = None
     memory: Mapping[str, Memory] = field(default_factory=dict)
@@ -211,7 +211,7 @@ class Effect:
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedEffect:
     """An effect at a place: `bodies` it acts on, the sensor it sits in, values of amount and shapes."""
 
     effect: Effect

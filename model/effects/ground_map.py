@@ -8,53 +8,53 @@ from math import exp, floor, hypot, inf, isfinite, log
 import casadi as ca
 import numpy as np
 
-from excite.model.effects.effect import Memory, Scene, Values
+from excite.model.effects.effect import Memory, SampleView, Values
 
-PASS = 10.0  # [m] of way that a pass is worth where these are counted
-STANDSTILL = 0.02  # [m/s] over which the way turns
-BACK = 0.1  # [m] of way back, within which a reversal counts
-MOST = 12  # passes that are told apart
-CELL = 0.2  # [m] of the map's cells
-FINE = 1.5  # places looked at across a contact for each cell
-NEXT = 0.03  # [m] of way from which a contact is looked at again
-LEFT = 0.06  # [m] of way from a cell, after which it may be entered again
-PATCH = 0.15  # [m] of way over which what is under a contact becomes another
+PASS_LENGTH = 10.0  # [m] of way that a pass is worth where these are counted
+DIRECTION_SMOOTHING = 0.02  # [m/s] over which the way turns
+REVERSAL_LENGTH = 0.1  # [m] of way back, within which a reversal counts
+MAX_PASSES = 12  # passes that are told apart
+CELL_SIZE = 0.2  # [m] of the map's cells
+POINTS_PER_CELL = 1.5  # places looked at across a contact for each cell
+MIN_STEP = 0.03  # [m] of way from which a contact is looked at again
+LEAVING_LENGTH = 0.06  # [m] of way from a cell, after which it may be entered again
+FOOTPRINT_LENGTH = 0.15  # [m] of way over which what is under a contact becomes another
 
 
-def _way(s: Scene, k: int) -> tuple[ca.SX, ca.SX]:
+def _travel(s: SampleView, k: int) -> tuple[ca.SX, ca.SX]:
     """Speed of a contact's centre, forward or back, nothing at standstill, and which way it goes, 1 or -1."""
     Vx = s.rolling[k].Vx
-    ahead = ca.tanh(Vx / STANDSTILL)
+    ahead = ca.tanh(Vx / DIRECTION_SMOOTHING)
     return Vx * ahead, ahead
 
 
-def _facing(s: Scene, k: int, p: Values) -> ca.SX:
+def _direction_rate(s: SampleView, k: int, p: Values) -> ca.SX:
     """How fast the direction that a contact remembers follows the one that it goes."""
-    way, ahead = _way(s, k)
-    return way * (ahead - s.z["facing"]) / BACK
+    way, ahead = _travel(s, k)
+    return way * (ahead - s.z["facing"]) / REVERSAL_LENGTH
 
 
-def _reversing(s: Scene, k: int, p: Values) -> ca.SX:
+def _reversal_rate(s: SampleView, k: int, p: Values) -> ca.SX:
     """One for each reversal: against the direction that it remembers, which is 0 before any and turns 2 exp(-x) - 1."""
-    way, ahead = _way(s, k)
-    return ca.fmax(-way * ahead * s.z["facing"], 0) / (BACK * (1 - log(2)))
+    way, ahead = _travel(s, k)
+    return ca.fmax(-way * ahead * s.z["facing"], 0) / (REVERSAL_LENGTH * (1 - log(2)))
 
 
 MEMORY = {
-    "distance": Memory(lambda s, k, p: _way(s, k)[0], 1e-6, form=("counted", 0.0)),
-    "facing": Memory(_facing, 1e-6, form=("counted", 1.0)),
-    "reversals": Memory(_reversing, 1e-6, form=("counted", 1.0)),
+    "distance": Memory(lambda s, k, p: _travel(s, k)[0], 1e-6, form=("counted", 0.0)),
+    "facing": Memory(_direction_rate, 1e-6, form=("counted", 1.0)),
+    "reversals": Memory(_reversal_rate, 1e-6, form=("counted", 1.0)),
 }
 
 
-def passed(over: ca.SX, each: ca.SX) -> ca.SX:
+def pass_effect(over: ca.SX, each: ca.SX) -> ca.SX:
     """What passes have made of the soil under a contact, 0 to 1, where each leaves exp(-PASS / each) of what was still
     to come; over (MOST,): as a scene has it."""
-    left = ca.exp(-PASS / each)
-    return (1 - left) * ca.dot(over, ca.vertcat(*[left**n for n in range(MOST)]))
+    left = ca.exp(-PASS_LENGTH / each)
+    return (1 - left) * ca.dot(over, ca.vertcat(*[left**n for n in range(MAX_PASSES)]))
 
 
-class Ground:
+class GroundMap:
     """A map of the ground that counts how often contacts have entered each of its cells: of every contact, the shares
     of its width that were passed over at least 1, 2, ... MOST times before, each time by any of them. A cell counts as
     left once a contact is LEFT away from where it was on it, so that who swings about a border doesn't pass over it.
@@ -64,10 +64,12 @@ class Ground:
     """
 
     def __init__(self, widths: Sequence[float]) -> None:
-        self.places = [np.linspace(-0.5, 0.5, max(2, round(FINE * w / CELL) + 1)).tolist() for w in widths]
+        self.places = [
+            np.linspace(-0.5, 0.5, max(2, round(POINTS_PER_CELL * w / CELL_SIZE) + 1)).tolist() for w in widths
+        ]
         self.entered: dict[tuple[int, int], int] = {}
         self.trail: list[list[tuple[float, float, set[tuple[int, int]]]]] = [[] for _ in widths]
-        self.shares = np.zeros((len(widths), MOST))
+        self.shares = np.zeros((len(widths), MAX_PASSES))
         self.last: list[tuple[float, float] | None] = [None] * len(widths)
 
     def come(self, axles: np.ndarray) -> np.ndarray:
@@ -76,17 +78,17 @@ class Ground:
         for k, (x, y, across, along) in enumerate(axles.tolist()):
             last = self.last[k]
             moved = inf if last is None else hypot(x - last[0], y - last[1])
-            if moved < NEXT or not isfinite(x + y + across + along):  # a fit that goes astray may lead anywhere
+            if moved < MIN_STEP or not isfinite(x + y + across + along):  # a fit that goes astray may lead anywhere
                 continue
             self.last[k] = x, y
-            cells = [(floor((x + p * across) / CELL), floor((y + p * along) / CELL)) for p in self.places[k]]
+            cells = [(floor((x + p * across) / CELL_SIZE), floor((y + p * along) / CELL_SIZE)) for p in self.places[k]]
             now = set(cells)
-            near = [one for one in self.trail[k] if hypot(x - one[0], y - one[1]) < LEFT]
+            near = [one for one in self.trail[k] if hypot(x - one[0], y - one[1]) < LEAVING_LENGTH]
             for cell in now.difference(*(under for _, _, under in near)):
                 self.entered[cell] = self.entered.get(cell, 0) + 1
             self.trail[k] = [*near, (x, y, now)]
-            before = [min(self.entered[cell] - 1, MOST) for cell in cells]  # but for the pass that it is in
-            often = np.bincount(before, minlength=MOST + 1)
+            before = [min(self.entered[cell] - 1, MAX_PASSES) for cell in cells]  # but for the pass that it is in
+            often = np.bincount(before, minlength=MAX_PASSES + 1)
             target = often[:0:-1].cumsum()[::-1] / len(cells)
-            self.shares[k] += (1 - exp(-moved / PATCH)) * (target - self.shares[k])
+            self.shares[k] += (1 - exp(-moved / FOOTPRINT_LENGTH)) * (target - self.shares[k])
         return self.shares.ravel().copy()

@@ -10,14 +10,14 @@ import casadi as ca
 from excite.errors import MachineError
 from excite.model.effects import sizes
 from excite.model.effects.catalogue import CATALOGUE
-from excite.model.effects.effect import DURATION, Effect, Placed, Site
+from excite.model.effects.effect import DEFAULT_DURATION, Effect, PlacedEffect, Site
 from excite.model.machine import Body, EffectEntry, Machine, Quantity, Sensor
 
-HUGE = 50.0  # times what an effect usually is, from which its amount is doubtful
-SMALLEST = 1e-5  # N m: a usual friction below which there is none to compare with
+SUSPICIOUS_RATIO = 50.0  # times what an effect usually is, from which its amount is doubtful
+MIN_TYPICAL_FRICTION = 1e-5  # N m: a usual friction below which there is none to compare with
 
 
-def places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...], str | None]]:
+def allowed_places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...], str | None]]:
     """Where an effect may sit on a machine: name of the place -> bodies, sensor."""
     driven = list(machine.actuated)
     rubbing = [b for b in machine.body if b.friction is not None and b.coordinates[0] in machine.coordinates]
@@ -31,14 +31,14 @@ def places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...],
     found: dict[str, tuple[tuple[int, ...], str | None]] = {}
     for place in effect.places:
         if place in each:
-            found |= {b.where: ((b.index,), _angle(sensors, b)) for b in each[place]}
+            found |= {b.where: ((b.index,), _angle_sensor(sensors, b)) for b in each[place]}
         elif place == "drive" and len(together) > 1:
             found["drive"] = tuple(b.index for b in together), None
         elif place == "wheels":
             found |= {s.place or s.name: ((s.body,), s.name) for s in sensors if s.kind == "wheel"}
         elif place in ("yaw_rate", "lateral_speed"):
             found |= {s.place or place: ((s.body,), s.name) for s in sensors if s.kind == place}
-        elif place == "machine" and machine.planar and (effect.gravity or shifting(machine) is not None):
+        elif place == "machine" and machine.planar and (effect.gravity or payload_body(machine) is not None):
             found["machine"] = (root,), None
     if effect.soil or effect.push:
         found = {w: at for w, at in found.items() if all(machine.find(k).contact for k in at[0])}
@@ -47,31 +47,31 @@ def places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...],
     return found
 
 
-def _angle(sensors: Sequence[Sensor], body: Body) -> str | None:
+def _angle_sensor(sensors: Sequence[Sensor], body: Body) -> str | None:
     return next((s.name for s in sensors if s.kind == "angle" and s.body == body.index), None)
 
 
-def shifting(machine: Machine) -> int | None:
+def payload_body(machine: Machine) -> int | None:
     """The body whose load may move: the last chassis of those that turn, as a moment that never turns shows nowhere."""
     chassis = [b for b in machine.body if b.inertia is not None and not b.inertia.axisymmetric and b.contact is None]
-    turning = [b.index for b in chassis if _turns(machine, b)]
+    turning = [b.index for b in chassis if _turns_freely(machine, b)]
     return turning[-1] if turning else None
 
 
-def _turns(machine: Machine, body: Body) -> bool:
+def _turns_freely(machine: Machine, body: Body) -> bool:
     """Whether a free joint turns a body: its own, or one that carries it."""
     own = {"planar": body.coordinates[2:], "revolute": body.coordinates}.get(body.joint, ())
     if set(own) & set(machine.coordinates):
         return True
-    return not isinstance(body.antecedent, str) and _turns(machine, machine.find(body.antecedent))
+    return not isinstance(body.antecedent, str) and _turns_freely(machine, machine.find(body.antecedent))
 
 
-def shifted(machine: Machine, change: Mapping[str, ca.SX]) -> dict[str, ca.SX]:
+def payload_change(machine: Machine, change: Mapping[str, ca.SX]) -> dict[str, ca.SX]:
     """What an `inertia` hook changes, by standard parameter of the body whose load may move."""
-    return {f"{name}{shifting(machine)}": value for name, value in change.items()}
+    return {f"{name}{payload_body(machine)}": value for name, value in change.items()}
 
 
-def parse(text: str, machine: Machine, duration: float) -> EffectEntry:
+def parse_effect(text: str, machine: Machine, duration: float) -> EffectEntry:
     """`NAME[@WHERE]=AMOUNT` as an entry of a machine file, shapes at their defaults for a log of duration [s].
 
     Raises MachineError.
@@ -85,43 +85,43 @@ def parse(text: str, machine: Machine, duration: float) -> EffectEntry:
     if not name or not name.replace("_", "").isalnum() or (where and not where.replace("_", "").isalnum()):
         raise MachineError(f"effect {text}: must be NAME[@WHERE]=AMOUNT")
     entry = EffectEntry.model_construct(name=name, where=where or None, amount=value, std=None, shape={})
-    found = placed(machine, entry, duration)
+    found = place_effect(machine, entry, duration)
     if found.effect.resisting and float(value) < 0:
         raise MachineError(f"effect {text}: must not be negative, what resists doesn't push")
     shapes = {s: Quantity(value=found.values[s], source="assumed") for s in found.shapes}
     return EffectEntry(name=name, where=found.where, amount=value, shape=shapes)
 
 
-def extended(machine: Machine, *entries: EffectEntry) -> Machine:
+def with_effects(machine: Machine, *entries: EffectEntry) -> Machine:
     """The machine with these effects beside those that it has."""
     return machine.model_copy(update={"effect": (*machine.effect, *entries)})
 
 
-def without(machine: Machine, name: str) -> Machine:
+def without_effect(machine: Machine, name: str) -> Machine:
     """The machine without the effect of this name (effect@place)."""
     rest = tuple(e for e in machine.effect if e.label != name)
     return machine.model_copy(update={"effect": rest})
 
 
-def possible(machine: Machine, effect: Placed) -> bool:
+def shapes_possible(machine: Machine, effect: PlacedEffect) -> bool:
     """Whether an effect's shapes are such as there are at its place."""
     site = Site.of(machine, effect.bodies)
     ranges = {n: [x * s.size(site) for x in s.within] for n, s in effect.shapes.items() if s.within is not None}
     return all(low <= effect.values[n] <= high for n, (low, high) in ranges.items())
 
 
-def doubtful(machine: Machine, effect: Placed) -> str | None:
+def size_warning(machine: Machine, effect: PlacedEffect) -> str | None:
     """What is said of an effect that is far larger than such effects are at its place."""
     usual, amount = effect.effect.amount(Site.of(machine, effect.bodies)), effect.values["A"]
     large, small = (usual, abs(amount)) if effect.effect.inverse else (abs(amount), usual)
     unit = effect.effect.unit
-    if large < HUGE * small or (usual < SMALLEST and unit.startswith("N m")):
+    if large < SUSPICIOUS_RATIO * small or (usual < MIN_TYPICAL_FRICTION and unit.startswith("N m")):
         return None
     much = f"{amount:g} {unit}".removesuffix(" -")
     return f"{effect.name}: {much}, usual are about {usual:.1g}: in another unit?"
 
 
-def placed(machine: Machine, entry: EffectEntry, duration: float = DURATION) -> Placed:
+def place_effect(machine: Machine, entry: EffectEntry, duration: float = DEFAULT_DURATION) -> PlacedEffect:
     """An effect of a machine file, checked. Raises MachineError for an unknown name, place or shape.
 
     duration [s]: of the log, which the defaults of some shapes are shares of.
@@ -133,7 +133,7 @@ def placed(machine: Machine, entry: EffectEntry, duration: float = DURATION) -> 
         like = like or [n for n in CATALOGUE if parts & set(n.split("_"))]
         hint = f", is {' or '.join(like)} meant?" if like else ":"
         raise MachineError(f"{machine.name}: effect {entry.name}: unknown{hint} `excite docs` tells of all")
-    allowed = places(machine, effect)
+    allowed = allowed_places(machine, effect)
     where = entry.where or (next(iter(allowed)) if len(allowed) == 1 else "")
     if where not in allowed:
         options = ", ".join(allowed) or "none on this machine"
@@ -157,7 +157,7 @@ def placed(machine: Machine, entry: EffectEntry, duration: float = DURATION) -> 
             raise MachineError(
                 f"{machine.name}: effect {entry.name}: shape {name} must be one of {options} (got {values[name]:g})"
             )
-    made = Placed(effect, where, bodies, sensor, values)
+    made = PlacedEffect(effect, where, bodies, sensor, values)
     for name, shape in made.shapes.items():
         stated = (
             name in entry.shape and entry.shape[name].source != "identified"

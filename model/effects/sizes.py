@@ -17,7 +17,7 @@ def constant(value: float) -> Callable[[Site], float]:
     return lambda site: value
 
 
-def of(size: Callable[[Site], float], share: float) -> Callable[[Site], float]:
+def share_of(size: Callable[[Site], float], share: float) -> Callable[[Site], float]:
     return lambda site: share * size(site)
 
 
@@ -25,15 +25,15 @@ def duration(site: Site) -> float:
     return site.duration
 
 
-def smooth(site: Site) -> float:
+def friction_smoothing(site: Site) -> float:
     return float(site.body.friction.smoothing) if site.body.friction is not None else 1.0
 
 
-def stop(site: Site) -> float:
+def angle_limit(site: Site) -> float:
     return float(site.body.limit.position) if site.body.limit.position is not None else 0.6
 
 
-def full_torque(machine: Machine, body: Body) -> float:
+def large_torque(machine: Machine, body: Body) -> float:
     """What counts as a large torque [N m] at a joint: its limit, the machine's largest, or what friction suggests."""
     if body.limit.torque is not None:
         return float(body.limit.torque)
@@ -43,10 +43,10 @@ def full_torque(machine: Machine, body: Body) -> float:
 
 
 def torque(site: Site) -> float:
-    return full_torque(site.machine, site.body)
+    return large_torque(site.machine, site.body)
 
 
-def one_over_torque(site: Site) -> float:
+def compliance(site: Site) -> float:
     return 0.002 / torque(site) * 3
 
 
@@ -70,14 +70,14 @@ def viscous(share: float, power: float = 0.0) -> Callable[[Site], float]:
     return size
 
 
-def _mass(machine: Machine) -> float:
+def _machine_mass(machine: Machine) -> float:
     return sum(float(b.inertia.mass) for b in machine.body if b.inertia is not None)
 
 
-def weighing(share: float) -> Callable[[Site], float]:
+def weight(share: float) -> Callable[[Site], float]:
     """A share of the machine's weight [N]."""
-    return lambda site: share * GRAVITY * _mass(site.machine)
+    return lambda site: share * GRAVITY * _machine_mass(site.machine)
 
 
 def load_moment(site: Site) -> float:
-    return 0.05 * _mass(site.machine)
+    return 0.05 * _machine_mass(site.machine)

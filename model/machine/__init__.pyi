@@ -1,4 +1,4 @@
-from .hydraulics import arms as arms
+from .hydraulics import torque_per_pressure as torque_per_pressure
 from .machine import (
     MACHINES as MACHINES,
     Body as Body,
@@ -9,15 +9,15 @@ from .machine import (
     Problem as Problem,
     Sensor as Sensor,
     load_machine as load_machine,
-    own_files as own_files,
+    machine_files as machine_files,
     shipped_machines as shipped_machines,
 )
 from .records import (
+    FileRecord as FileRecord,
     Number as Number,
     Quantity as Quantity,
-    Record as Record,
-    complaints as complaints,
-    one_line as one_line,
+    error_line as error_line,
+    error_lines as error_lines,
     read_toml as read_toml,
 )
 from .units import TURN as TURN, UNITS as UNITS

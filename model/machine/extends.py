@@ -7,11 +7,11 @@ from typing import Any
 
 from excite.model.machine.records import read_toml
 
-DEEPEST = 4  # files that one may extend, one through another
-NAMED = ("body", "sensor")  # lists of what has a name of its own
+MAX_DEPTH = 4  # files that one may extend, one through another
+NAMED_LISTS = ("body", "sensor")  # lists of what has a name of its own
 
 
-def names_in(folder: Path) -> tuple[str, ...]:
+def file_names(folder: Path) -> tuple[str, ...]:
     """Names of the files in a folder that others may extend by name."""
     return tuple(sorted(p.stem for p in folder.glob("*.toml")))
 
@@ -21,8 +21,8 @@ def chain(path: Path, shipped: Path) -> list[tuple[Path, dict[str, Any]]]:
     by its name. Raises ValueError, one line."""
     found = [(path, read_toml(path))]
     while (base := _base(found[-1][0], found[-1][1].get("extends"), shipped)) is not None:
-        if len(found) > DEEPEST:
-            raise ValueError(f"{base}: extends: more than {DEEPEST} files deep, a loop?")
+        if len(found) > MAX_DEPTH:
+            raise ValueError(f"{base}: extends: more than {MAX_DEPTH} files deep, a loop?")
         found.append((base, read_toml(base)))
     return found
 
@@ -31,7 +31,7 @@ def read(path: Path, shipped: Path) -> dict[str, Any]:
     """What is in a TOML file, with what it differs from (see `chain`). Raises ValueError, one line."""
     whole: dict[str, Any] = {}
     for one, raw in reversed(chain(path, shipped)):
-        whole = _over(one, whole, raw, raw.pop("extends", None))
+        whole = _override(one, whole, raw, raw.pop("extends", None))
     return whole
 
 
@@ -41,14 +41,14 @@ def _base(path: Path, parent: object, shipped: Path) -> Path | None:
         return None
     if not isinstance(parent, str):
         raise ValueError(f"{path}: extends: must be a shipped name or a file name")
-    known = names_in(shipped)
+    known = file_names(shipped)
     base = shipped / f"{parent}.toml" if parent in known else path.parent / parent
     if parent not in known and (Path(parent).name != parent or "\x00" in parent or not base.is_file()):
         raise ValueError(f"{path}: extends: no machine {parent}, allowed: {', '.join(known)}, or a file beside it")
     return base
 
 
-def _over(path: Path, whole: dict[str, Any], raw: dict[str, Any], parent: str | None) -> dict[str, Any]:
+def _override(path: Path, whole: dict[str, Any], raw: dict[str, Any], parent: str | None) -> dict[str, Any]:
     """What a file extends, changed by what is in it."""
     own, listed = (x if isinstance(x, list) else [] for x in (raw.get("sensor"), whole.get("sensor")))
     sensors = [x.get("name") for x in listed if isinstance(x, dict)]
@@ -57,13 +57,13 @@ def _over(path: Path, whole: dict[str, Any], raw: dict[str, Any], parent: str | 
             f"{path}: sensor: the list takes the place of that of {parent}, so that every sensor needs all its keys;"
             " [sensor.NAME] changes one, `excite machine new NAME --like` writes all"
         )
-    for key in NAMED:
+    for key in NAMED_LISTS:
         if isinstance(raw.get(key), dict) and isinstance(whole.get(key), list):
-            raw[key] = _changed(path, key, whole[key], raw[key])
+            raw[key] = _change_named(path, key, whole[key], raw[key])
     return _merge(whole, raw)
 
 
-def _changed(path: Path, key: str, known: list[Any], changes: dict[str, Any]) -> list[Any]:
+def _change_named(path: Path, key: str, known: list[Any], changes: dict[str, Any]) -> list[Any]:
     """A list of named tables with some of them changed, each by a table of its name."""
     names = [x.get("name") if isinstance(x, dict) else None for x in known]
     for name, change in changes.items():

@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 from pydantic import model_validator
 
-from excite.model.machine.records import Number, Positive, Quantity, Record, Source
+from excite.model.machine.records import FileRecord, Number, Positive, Quantity, Source
 
 
-class Pin(Record):
+class Pin(FileRecord):
     """A point [m] in the plane, seen from a joint's axis, in the axes that both of its bodies have at angle zero."""
 
     value: tuple[Number, Number]
@@ -19,7 +19,7 @@ class Pin(Record):
     note: str = ""
 
 
-class Cylinder(Record):
+class Cylinder(FileRecord):
     """A hydraulic cylinder that turns a joint: `area` [m2] of the piston, `rod_area` [m2] what the rod leaves of it.
 
     `piston`: the column with the pressure on the piston side, the rod side has the other one. Where it acts: `lever`
@@ -43,7 +43,7 @@ class Cylinder(Record):
         return self
 
 
-def lever(cylinder: Cylinder, angle: np.ndarray) -> np.ndarray:
+def lever_arm(cylinder: Cylinder, angle: np.ndarray) -> np.ndarray:
     """How a cylinder's length grows with the joint's angle (N,) [m/rad]: its lever arm, signed.
 
     Of pins: L = |p(angle) - a|, a on the antecedent, p on the body and turned with it, both seen from the joint's axis,
@@ -58,7 +58,7 @@ def lever(cylinder: Cylinder, angle: np.ndarray) -> np.ndarray:
     return np.asarray((ax * py - ay * px) / np.hypot(px - ax, py - ay))
 
 
-def arms(
+def torque_per_pressure(
     displacement: Quantity | None, cylinders: Sequence[Cylinder], angle: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Torque [N m] of one pascal in `column` and of one in `return_column` at joint angles (N,) [rad].
@@ -71,7 +71,7 @@ def arms(
         return one, -one
     sides = {"column": np.zeros(len(angle)), "return_column": np.zeros(len(angle))}
     for c in cylinders:
-        arm = lever(c, angle)
+        arm = lever_arm(c, angle)
         other = "return_column" if c.piston == "column" else "column"
         sides[c.piston] += float(c.area) * arm
         sides[other] -= float(c.rod_area) * arm

@@ -18,17 +18,17 @@ from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapV
 from excite.errors import MachineError
 from excite.model.machine import extends, hydraulics, units
 from excite.model.machine.records import (
+    BodyPoint,
+    FileRecord,
     Flag,
     Negative,
     NotNegative,
     Number,
-    Point,
     Positive,
     Quantity,
-    Record,
     Source,
     Vector3,
-    one_line,
+    error_line,
 )
 
 MACHINES = Path(__file__).parents[1] / "machines"
@@ -39,7 +39,7 @@ def _zero() -> Quantity:
     return Quantity(value=0.0, source="definition")
 
 
-class Inertia(Record):
+class Inertia(FileRecord):
     """Mass [kg], centre of mass [m] in the body's frame and inertia [kg m2] about the centre of mass.
 
     `axisymmetric`: a roll or wheel, balanced about its joint axis z with its centre of mass at the frame's origin;
@@ -47,7 +47,7 @@ class Inertia(Record):
     """
 
     mass: Positive
-    com: Point = Point(value=(0.0, 0.0, 0.0), source="definition")
+    com: BodyPoint = BodyPoint(value=(0.0, 0.0, 0.0), source="definition")
     XX: NotNegative = Field(default_factory=_zero)
     XY: Quantity = Field(default_factory=_zero)
     XZ: Quantity = Field(default_factory=_zero)
@@ -69,7 +69,7 @@ class Inertia(Record):
         return self
 
 
-class Friction(Record):
+class Friction(FileRecord):
     """Joint friction U = ... + Fv q' + Fs tanh(q'/smoothing), and the torque sensor's offset u0 (28).
 
     Units of a revolute joint [N m s], [N m], [N m], smoothing [rad/s]; of a prismatic one [N s/m], [N], [N], [m/s].
@@ -81,7 +81,7 @@ class Friction(Record):
     smoothing: Positive
 
 
-class Contact(Record):
+class Contact(FileRecord):
     """A roll or wheel on the soil (11, 17, 24, 25). Frame: the chassis that carries it, at its own centre.
 
     `law = "exponential"` is (18) integrated over the patch; it needs `saturation_slip` = K / xi_s, the slip at which
@@ -104,7 +104,7 @@ class Contact(Record):
         return self
 
 
-class JointLimit(Record):
+class JointLimit(FileRecord):
     """What the drive of a joint allows. `rim_speed` is |radius x rate| of a contact [m/s]."""
 
     torque: Positive | None = None
@@ -121,7 +121,7 @@ def _antecedent(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
         raise ValueError(f'must be "ground" or the index of a body above (got {value!r})') from None
 
 
-class Body(Record):
+class Body(FileRecord):
     """One row of the modified Denavit-Hartenberg table, and what hangs on it.
 
     Transform from the antecedent: Rot(z, gamma) Trans(z, b) Rot(x, alpha) Trans(x, d) Rot(z, theta) Trans(z, r);
@@ -178,7 +178,7 @@ class Body(Record):
         return self
 
 
-class Sensor(Record):
+class Sensor(FileRecord):
     """One column of a log, in `unit` (see `units`). SI value = `gain` x (number in the column).
 
     A `factor` that is given is the SI value of one, whatever `unit` says; it is needed where the unit has none, V say.
@@ -247,11 +247,11 @@ class Sensor(Record):
         if pressed and self.kind != "torque":
             key = "cylinders" if self.cylinders else "displacement"
             raise ValueError(f"{key}: makes a torque of pressures, not kind {self.kind}")
-        measured = ("pressure",) if pressed else units.MEASURES[self.kind]
+        measured = ("pressure",) if pressed else units.QUANTITIES_BY_KIND[self.kind]
         if self.factor is None and units.UNITS.get(self.unit, ("",))[0] not in measured:
             raise ValueError(
                 f"unit: {self.unit!r} is no {' or '.join(measured)}, allowed for kind {self.kind}:"
-                f" {units.allowed(measured)}, or any with its factor (the SI value of one)"
+                f" {units.units_of(measured)}, or any with its factor (the SI value of one)"
             )
         if self.is_rate and self.counts_per_turn is not None:
             raise ValueError("counts_per_turn: is for a column that counts, not for a rate")
@@ -268,7 +268,7 @@ class Sensor(Record):
         return self
 
 
-class Filter(Record):
+class Filter(FileRecord):
     """Default processing of a log before least squares: zero-phase Butterworth of positions, then `drop` samples at
     the start and at the end are left out, and one row in `decimation` is kept. `source` is that of the whole numbers.
     """
@@ -280,7 +280,7 @@ class Filter(Record):
     drop: tuple[Annotated[int, Field(strict=True, ge=0)], Annotated[int, Field(strict=True, ge=0)]] = (0, 0)
 
 
-class Problem(Record):
+class Problem(FileRecord):
     """A design problem: how long, where, how fine. `source` is that of the lane.
 
     lane_m: length and width of the lane area, centred on 0, 0; lane_polygon_m: corners of a convex area in which the
@@ -308,7 +308,7 @@ class Problem(Record):
         return self
 
 
-class EffectEntry(Record):
+class EffectEntry(FileRecord):
     """An effect that the machine has beyond the plain model: its name in the catalogue, place, amount and shapes."""
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
@@ -336,7 +336,7 @@ def _convex(corners: Sequence[tuple[float, float]]) -> bool:
     return n >= 3 and one_way and abs(abs(turn) - 2 * math.pi) < 1e-6
 
 
-class Machine(Record):
+class Machine(FileRecord):
     """A machine as its file describes it. Frozen; `locked` coordinates are held at zero."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")]
@@ -508,14 +508,14 @@ class Machine(Record):
         if pinned and not angles and body.coordinates[0] not in self.locked:
             raise ValueError(f"{key}: the lever depends on the angle of joint {body.index}, which no sensor measures")
         top = float(body.limit.position) if body.limit.position is not None else 0.5
-        for arm in hydraulics.arms(sensor.displacement, sensor.cylinders, np.linspace(-top, top, 41)):
+        for arm in hydraulics.torque_per_pressure(sensor.displacement, sensor.cylinders, np.linspace(-top, top, 41)):
             if not (arm > 0).all() and not (arm < 0).all():
                 raise ValueError(f"{key}: a pressure has no lever at some angle within {top:g} rad, check the pins")
 
 
 def shipped_machines() -> tuple[str, ...]:
     """Names of the machines that come with the package."""
-    return extends.names_in(MACHINES)
+    return extends.file_names(MACHINES)
 
 
 def load_machine(name: str | Path) -> Machine:
@@ -533,10 +533,10 @@ def load_machine(name: str | Path) -> Machine:
     try:
         return Machine.model_validate(raw)
     except ValidationError as err:
-        raise MachineError(one_line(path, err, Machine)) from None
+        raise MachineError(error_line(path, err, Machine)) from None
 
 
-def own_files(name: str | Path) -> list[Path]:
+def machine_files(name: str | Path) -> list[Path]:
     """The files of a machine of one's own, those that it extends included; none of a shipped name. Raises
     MachineError."""
     try:

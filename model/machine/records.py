@@ -75,7 +75,7 @@ def _negative(q: Quantity) -> Quantity:
     return q
 
 
-class Record(BaseModel):
+class FileRecord(BaseModel):
     """Frozen, and refuses keys that it doesn't know: a misspelt key must not be silently ignored."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -85,7 +85,7 @@ Number = Annotated[float, BeforeValidator(_number), AfterValidator(_finite)]
 Flag = Annotated[bool, Field(strict=True)]
 
 
-class Quantity(Record):
+class Quantity(FileRecord):
     """A value [SI] and where it comes from."""
 
     value: Number
@@ -102,7 +102,7 @@ Negative = Annotated[Quantity, AfterValidator(_negative)]
 Vector3 = tuple[Number, Number, Number]
 
 
-class Point(Record):
+class BodyPoint(FileRecord):
     """A point [m] in the body's frame."""
 
     value: Vector3
@@ -110,33 +110,33 @@ class Point(Record):
     note: str = ""
 
 
-def one_line(path: Path | str, err: ValidationError, root: type[Record]) -> str:
+def error_line(path: Path | str, err: ValidationError, root: type[FileRecord]) -> str:
     """What is wrong with a file that holds a `root` record: file, key, what is wrong, what is allowed, in a line."""
-    first, *more = complaints(path, err, root)
+    first, *more = error_lines(path, err, root)
     return f"{first} (and {len(more)} more)" if more else first
 
 
-def complaints(path: Path | str, err: ValidationError, root: type[Record]) -> list[str]:
+def error_lines(path: Path | str, err: ValidationError, root: type[FileRecord]) -> list[str]:
     """All that is wrong with a file that holds a `root` record, a line each."""
-    return [_complaint(path, one, root) for one in err.errors(include_url=False)]
+    return [_error_text(path, one, root) for one in err.errors(include_url=False)]
 
 
-def _complaint(path: Path | str, one: ErrorDetails, root: type[Record]) -> str:
+def _error_text(path: Path | str, one: ErrorDetails, root: type[FileRecord]) -> str:
     key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in one["loc"]).lstrip(".")
     kind, message, got = one["type"], one["msg"], one.get("input")
     if kind == "extra_forbidden":
-        message = f"no such key here, allowed: {', '.join(_record(one['loc'][:-1], root).model_fields)}"
+        message = f"no such key here, allowed: {', '.join(_record_at(one['loc'][:-1], root).model_fields)}"
     elif kind == "missing":
         message = "is missing"
     elif kind == "model_type":
-        record = _record(one["loc"], root)
-        number = record in (Quantity, Point)
+        record = _record_at(one["loc"], root)
+        number = record in (Quantity, BodyPoint)
         table = '{ value = ..., source = "..." }' if number else f"with keys {', '.join(record.model_fields)}"
         message = f"must be a table {table} (got {reprlib.repr(got)})"
     elif kind == "value_error":
         message = message.removeprefix("Value error, ")
         inner, _, rest = message.partition(": ")
-        if inner in _record(one["loc"], root).model_fields:
+        if inner in _record_at(one["loc"], root).model_fields:
             key, message = f"{key}.{inner}".lstrip("."), rest
     elif kind == "too_short":
         message = f"must have at least {one['ctx']['min_length']} (got {one['ctx']['actual_length']})"
@@ -148,7 +148,7 @@ def _complaint(path: Path | str, one: ErrorDetails, root: type[Record]) -> str:
     return " ".join(f"{path}: {key + ': ' if key else ''}{message}".split())
 
 
-def _record(where: tuple[int | str, ...], root: type[Record]) -> type[Record]:
+def _record_at(where: tuple[int | str, ...], root: type[FileRecord]) -> type[FileRecord]:
     """The record that the file holds at this key."""
     record = root
     for step in where:
@@ -159,7 +159,7 @@ def _record(where: tuple[int | str, ...], root: type[Record]) -> type[Record]:
     return record
 
 
-def _record_in(annotation: Any) -> type[Record] | None:
-    if isinstance(annotation, type) and issubclass(annotation, Record):
+def _record_in(annotation: Any) -> type[FileRecord] | None:
+    if isinstance(annotation, type) and issubclass(annotation, FileRecord):
         return annotation
     return next((r for a in get_args(annotation) if (r := _record_in(a)) is not None), None)

@@ -51,7 +51,7 @@ UNITS: dict[str, tuple[str, float]] = {
 }
 
 # what a column may hold for a sensor of each kind; an angle's rate is a reading of its own
-MEASURES: dict[str, tuple[str, ...]] = {
+QUANTITIES_BY_KIND: dict[str, tuple[str, ...]] = {
     "angle": ("angle", "length", "angular rate", "speed"),
     "wheel": ("angle", "angular rate"),
     "torque": ("torque", "force"),
@@ -63,6 +63,6 @@ MEASURES: dict[str, tuple[str, ...]] = {
 RATES = ("angular rate", "speed")
 
 
-def allowed(quantities: tuple[str, ...]) -> str:
+def units_of(quantities: tuple[str, ...]) -> str:
     """The units of some quantities, as a message lists them."""
     return ", ".join(unit for unit, (quantity, _) in UNITS.items() if quantity in quantities)

@@ -2,19 +2,19 @@ from .contact import (
     Saturation as Saturation,
     Slip as Slip,
     Wrench as Wrench,
-    rim as rim,
+    rim_speed as rim_speed,
     slip as slip,
     wrench as wrench,
 )
-from .rank import independent as independent
+from .rank import independent_columns as independent_columns
 from .tree import (
     INERTIAL as INERTIAL,
     Frame as Frame,
+    body_motions as body_motions,
+    body_poses as body_poses,
     generalised_forces as generalised_forces,
     inertial_vector as inertial_vector,
-    motion as motion,
-    place as place,
-    poses as poses,
+    joint_transform as joint_transform,
     rot_z as rot_z,
     standard_inertia as standard_inertia,
 )

@@ -45,7 +45,7 @@ class Saturation:
 
     def share(self, gx: ca.SX | float, gy: ca.SX) -> ca.SX:
         """Of the linear law's force, at slips gx, gy."""
-        return mobilised(ca.sqrt(gx**2 + gy**2 + 1e-12) / self.slip, self.bend)
+        return mobilised_share(ca.sqrt(gx**2 + gy**2 + 1e-12) / self.slip, self.bend)
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Slip:
     vn: ca.SX
 
 
-def rim(contact: Contact, spin: ca.SX, further: ca.SX | float = 0.0) -> ca.SX:
+def rim_speed(contact: Contact, spin: ca.SX, further: ca.SX | float = 0.0) -> ca.SX:
     """Speed of the rim at the ground [m/s], of a contact that spins at `spin` [rad/s]; further [m]: by how much the
     ground is further from its axle than its radius."""
     return (float(contact.radius) + further) * spin
@@ -65,7 +65,7 @@ def rim(contact: Contact, spin: ca.SX, further: ca.SX | float = 0.0) -> ca.SX:
 
 def slip(contact: Contact, Vx: ca.SX, Vy: ca.SX, spin: ca.SX, further: ca.SX | float = 0.0) -> Slip:
     """Slips of a contact whose centre moves at Vx, Vy [m/s] in its chassis' axes, its rim as `rim` has it."""
-    at_ground = rim(contact, spin, further)
+    at_ground = rim_speed(contact, spin, further)
     vn = ca.sqrt(at_ground**2 + float(contact.v_eps) ** 2)
     return Slip((Vx - at_ground) / vn, Vy / vn, vn)
 
@@ -90,7 +90,7 @@ def wrench(
     if saturation is None:
         return Wrench(Kx * s.gx, Ky * s.gy, turning)
     Sx, Sy, Tz = ca.SX(0), ca.SX(0), ca.SX(0)
-    for y, dy in _across(contact, s, saturation.strips * yaw_rate):
+    for y, dy in _width_points(contact, s, saturation.strips * yaw_rate):
         gx = s.gx - y * yaw_rate / s.vn
         share = saturation.share(s.gx - saturation.strips * y * yaw_rate / s.vn, s.gy) * dy
         Sx += Kx * gx * share
@@ -99,7 +99,7 @@ def wrench(
     return Wrench(Sx, Sy, (1 - saturation.untouched) * Tz + saturation.untouched * turning)
 
 
-def _across(contact: Contact, s: Slip, yaw_rate: ca.SX) -> Iterator[tuple[ca.SX, ca.SX]]:
+def _width_points(contact: Contact, s: Slip, yaw_rate: ca.SX) -> Iterator[tuple[ca.SX, ca.SX]]:
     """Points y [m] across the contact and their shares of its width (they add up to 1).
 
     |g| has a kink where g_x(y) = 0, when the contact turns on the spot: the points meet there, denser towards it
@@ -114,7 +114,7 @@ def _across(contact: Contact, s: Slip, yaw_rate: ca.SX) -> Iterator[tuple[ca.SX,
             yield edge * (still + h * point**2), ca.fabs(h) * point * weight
 
 
-def mobilised(x: ca.SX, bend: ca.SX | float = 0.0) -> ca.SX:
+def mobilised_share(x: ca.SX, bend: ca.SX | float = 0.0) -> ca.SX:
     """Force of the exponential law over that of its linear limit, for x = |g| xi_s / K: 2 (x - 1 + e^-x) / x^2.
 
     The mean over the patch of (1 - exp(-j/K)), j = |g| xi, against j/K (18). Below x = 0.05 the series

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def independent(A: np.ndarray, nothing: float) -> tuple[list[int], list[int]]:
+def independent_columns(A: np.ndarray, nothing: float) -> tuple[list[int], list[int]]:
     """Columns of A longer than `nothing`: those whose part that no earlier ones make up is so too, and the others."""
     kept: list[int] = []
     left: list[int] = []

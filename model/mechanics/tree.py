@@ -39,27 +39,27 @@ class Frame:
     acceleration: ca.SX
 
 
-def _exact(value: float) -> float:
+def _snap_to_integer(value: float) -> float:
     """cos(pi/2) as 0: keeps the symbolic graph free of 6e-17 terms."""
     return round(value) if abs(value - round(value)) < 1e-15 else value
 
 
 def _rot_x(angle: float) -> ca.SX:
-    c, s = _exact(math.cos(angle)), _exact(math.sin(angle))
+    c, s = _snap_to_integer(math.cos(angle)), _snap_to_integer(math.sin(angle))
     return ca.sparsify(ca.SX([[1, 0, 0], [0, c, -s], [0, s, c]]))
 
 
 def rot_z(angle: ca.SX | float) -> ca.SX:
     """Rotation (3, 3) about z by an angle [rad]."""
     number = isinstance(angle, float)
-    c = ca.SX(_exact(math.cos(angle))) if number else ca.cos(angle)
-    s = ca.SX(_exact(math.sin(angle))) if number else ca.sin(angle)
+    c = ca.SX(_snap_to_integer(math.cos(angle))) if number else ca.cos(angle)
+    s = ca.SX(_snap_to_integer(math.sin(angle))) if number else ca.sin(angle)
     R = ca.SX.eye(3)
     R[0, 0], R[0, 1], R[1, 0], R[1, 1] = c, -s, s, c
     return ca.sparsify(R)
 
 
-def place(body: Body, q: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
+def joint_transform(body: Body, q: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
     """Rotation (3, 3) and position (3,) [m] of the body's frame in its antecedent's."""
     c = body.coordinates[0] if body.coordinates else ""
     theta = q[c] if body.joint == "revolute" else float(body.theta)
@@ -69,7 +69,7 @@ def place(body: Body, q: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
     return Rz @ Rx @ Rt, Rz @ along + Z * float(body.b)
 
 
-def motion(
+def body_motions(
     machine: Machine, q: dict[str, ca.SX], dq: dict[str, ca.SX], ddq: dict[str, ca.SX], gravity: ca.SX
 ) -> dict[int, Frame]:
     """Forward recursion: the motion of every body.
@@ -79,7 +79,7 @@ def motion(
     """
     frames: dict[int, Frame] = {}
     for body in machine.body:
-        R, P = place(body, q)
+        R, P = joint_transform(body, q)
         zero = ca.SX(3, 1)
         if body.antecedent == "ground":
             above = Frame(ca.SX.eye(3), zero, zero, zero, zero, -gravity)
@@ -143,20 +143,20 @@ def generalised_forces(
         elif body.joint == "prismatic":
             rows[body.coordinates[0]] = F[2]
         if body.antecedent != "ground":
-            R, P = place(body, q)
+            R, P = joint_transform(body, q)
             force[body.antecedent] += R @ F
             moment[body.antecedent] += R @ N + ca.cross(P, R @ F)
     return rows
 
 
-def poses(machine: Machine, q: Mapping[str, float]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+def body_poses(machine: Machine, q: Mapping[str, float]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """Rotation (3, 3) and position (3,) [m] of every body in the root's axes, by index.
 
     q: coordinates by name [rad, m], zero where not given; those of a planar root change nothing.
     """
     every = [c for b in machine.body for c in b.coordinates]
     still = dict.fromkeys(every, ca.SX(0))
-    frames = motion(machine, still | {c: ca.SX(x) for c, x in q.items()}, still, still, ca.SX(3, 1))
+    frames = body_motions(machine, still | {c: ca.SX(x) for c, x in q.items()}, still, still, ca.SX(3, 1))
     return {k: (ca.DM(f.rotation).full(), ca.DM(f.position).full()[:, 0]) for k, f in frames.items()}
 
 

@@ -77,10 +77,10 @@ def main() -> None:
     certificate = found.certificate
     assert certificate is not None
     told = {k: getattr(certificate, k) for k in ("U", "V", "m", "a", "b")}
-    with output.writing_file(HERE / "certificate.json") as place:
+    with output.new_file(HERE / "certificate.json") as place:
         place.write_text(json.dumps(told, default=lambda x: np.asarray(x).tolist()) + "\n", encoding="utf-8")
-    with output.writing_file(HERE / "summary.json") as place:
-        place.write_text(output.dump(summary), encoding="utf-8")
+    with output.new_file(HERE / "summary.json") as place:
+        place.write_text(output.to_json(summary), encoding="utf-8")
 
 
 def drives(model: Model) -> list[Motion]:

@@ -67,8 +67,8 @@ def main() -> None:
     (HERE / "table.md").write_text(table(rows))
     save(figure(rows), HERE / "cost.png")
     summary = {"load_average": os.getloadavg()[0], "cores": os.cpu_count(), "cases": rows}
-    with output.writing_file(HERE / "summary.json") as place:
-        place.write_text(output.dump(summary), encoding="utf-8")
+    with output.new_file(HERE / "summary.json") as place:
+        place.write_text(output.to_json(summary), encoding="utf-8")
 
 
 def case(name: str, seconds: float, knot: float) -> dict[str, object]:

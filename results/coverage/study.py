@@ -26,7 +26,7 @@ import numpy as np
 import pandas as pd
 import scipy.signal
 
-from excite.errors import NoEstimate
+from excite.errors import NoEstimateError
 from excite.identification import identify
 from excite.identification.joint import DOUBT, DRAWN
 from excite.logs import log
@@ -34,7 +34,7 @@ from excite.model import Model, build
 from excite.model.machine import Machine, machine as machines
 from excite.operator import ground
 from excite.simulation import Driver, Motion, sensors, simulate
-from excite.simulation.scenarios import varied
+from excite.simulation.scenarios import vary_machine
 from excite.smoothing import cramer_rao
 from excite.trajectories import percent
 from excite.trajectories.objective import relative
@@ -125,14 +125,14 @@ def moved(name: str, nature: str, seed: int) -> Motion:
 def run(s: Set, seed: int) -> dict[str, object]:
     """One simulation and identification: value, std, interval, notes or failure, and seconds of identification."""
     rng = np.random.default_rng([seed, 1999])
-    start = build(varied(nominal().machine, FAR if s.start == "far" else OFF, rng, corner=s.start == "far"))
+    start = build(vary_machine(nominal().machine, FAR if s.start == "far" else OFF, rng, corner=s.start == "far"))
     table = sensors.measure(natural(s.nature), moved(s.drive, s.nature, seed), kit=s.kit, seed=seed)
     measured = log.from_table(table, start.machine)
     row: dict[str, object] = {"set": s.name, "seed": seed}
     began = time.process_time()
     try:
         e = identify(start, [measured], "joint")
-    except NoEstimate as failure:
+    except NoEstimateError as failure:
         return row | {"failure": str(failure), "seconds": time.process_time() - began}
     seconds = time.process_time() - began
     return row | {

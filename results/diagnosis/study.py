@@ -41,7 +41,7 @@ from support.causes import CAUSES
 from support.surprises import SURPRISES
 from support.visibility import VISIBLE, visibility
 
-from excite.output import writing_file
+from excite.output import new_file
 
 Row = dict[str, Any]
 FRESH = {"nothing": 3030, "cause": 41, "surprise": 20, "pair": 106}  # numbers below were looked at when mending
@@ -81,7 +81,7 @@ def cases(wanted: Mapping[str, int], first: Mapping[str, int]) -> list[Case]:
 
 
 def _kept(file: Path, row: Row) -> None:
-    with writing_file(file) as part:
+    with new_file(file) as part:
         part.write_text(json.dumps(row, default=float))
 
 
@@ -92,7 +92,7 @@ def driven(one: Case) -> tuple[pd.DataFrame, float]:
     log, file = kept / f"{one.key}.parquet", kept / f"{one.key}.json"
     if not file.exists():
         drive = blind(one)
-        with writing_file(log) as part:
+        with new_file(log) as part:
             drive.log.to_parquet(part)
         _kept(file, {"visibility": visibility(drive)})  # last: a log without it is driven again
     return pd.read_parquet(log), float(json.loads(file.read_text())["visibility"])

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from excite.errors import NoEstimate
+from excite.errors import NoEstimateError
 from excite.identification import METHODS, identify
 from excite.logs import derivative, log, lowpass
 from excite.model import Model, build
@@ -178,7 +178,7 @@ def main() -> None:
     for method in METHODS:
         try:
             e = identify(model, [one], method)
-        except NoEstimate as failure:
+        except NoEstimateError as failure:
             print(f"{method}: {failure}")
             continue
         found[method] = {

@@ -34,7 +34,7 @@ def main(path: Path) -> None:
     found = {}
     errors = {}
     for name, texts in MODELS.items():
-        model = build(placing.extended(plain, *(placing.parse(t, plain, 25.0) for t in texts)))
+        model = build(placing.with_effects(plain, *(placing.parse_effect(t, plain, 25.0) for t in texts)))
         W, Y = filtered_regression(model, log.read_log(path, plain), plain.filter)
         W, Y = W[0], Y[0]
         X = np.linalg.lstsq(W, Y, rcond=None)[0]

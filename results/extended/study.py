@@ -29,7 +29,7 @@ from matplotlib.figure import Figure
 
 from excite import output
 from excite.diagnosis import diagnosis, forked
-from excite.errors import NoEstimate, SimulationError
+from excite.errors import NoEstimateError, SimulationError
 from excite.identification import methods, monte_carlo
 from excite.logs import Log, log, profile, repair
 from excite.model import Model, prediction
@@ -37,7 +37,7 @@ from excite.model.effects import placing
 from excite.model.machine import Machine, machine
 from excite.reports import COLOURS, save
 from excite.simulation import Motion, sensors, simulate
-from excite.text import rounded
+from excite.text import format_number
 from excite.trajectories import composite_objective, limits, multistart, objective
 
 HERE = Path(__file__).parent
@@ -68,21 +68,21 @@ def main() -> None:
     for hidden in HIDDEN:
         path = options.kept / f"{hidden}-{options.runs}.json"
         if not path.is_file():
-            with output.writing_file(path) as place:
-                place.write_text(output.dump(one(hidden, options.runs, options.jobs)), encoding="utf-8")
+            with output.new_file(path) as place:
+                place.write_text(output.to_json(one(hidden, options.runs, options.jobs)), encoding="utf-8")
         rows.append(json.loads(path.read_text(encoding="utf-8")))
         print(f"{hidden}: done", flush=True)
     save(figure(rows), HERE / "figure.png")
-    with output.writing_file(HERE / "summary.json") as place:
-        place.write_text(output.dump({"runs": options.runs, "rows": rows}), encoding="utf-8")
-    with output.writing_file(HERE / "README.md") as place:
+    with output.new_file(HERE / "summary.json") as place:
+        place.write_text(output.to_json({"runs": options.runs, "rows": rows}), encoding="utf-8")
+    with output.new_file(HERE / "README.md") as place:
         place.write_text(readme(rows, options.runs), encoding="utf-8")
 
 
 def one(hidden: str, runs: int, jobs: int) -> dict[str, Any]:
     """One effect: what the diagnosis of one log makes of it, and what old and new file tell on old and new drive."""
     old = machine.load_machine("va12")
-    true = prediction.build(placing.extended(old, placing.parse(hidden, old, 60.0)))
+    true = prediction.build(placing.with_effects(old, placing.parse_effect(hidden, old, 60.0)))
     torque, start, _ = profile.read_profile(DRIVE, true)
     motions = {"old": simulate(true, torque, q0=start)}
     found = diagnosed(old, measured(prediction.build(old), true, motions["old"], 1000))
@@ -92,7 +92,7 @@ def one(hidden: str, runs: int, jobs: int) -> dict[str, Any]:
         row["found"].append({"name": f.name, **told_with})
     files = {"old": prediction.build(old)}
     if found.findings and found.verdict != "unexplained":
-        files["new"] = prediction.build(placing.extended(old, *(f.entry for f in found.findings)))
+        files["new"] = prediction.build(placing.with_effects(old, *(f.entry for f in found.findings)))
         problem = old.problems["R60"]
         planned = prediction.build(files["new"].machine, flaws=False)
         try:
@@ -150,7 +150,7 @@ def estimated(known: Machine, true: Machine, motion: Motion, seed: int) -> tuple
     model = prediction.build(known)
     try:
         estimate = methods.identify(model, [measured(model, prediction.build(true), motion, seed)], "joint")
-    except NoEstimate:
+    except NoEstimateError:
         return None
     return estimate.value, estimate.std, estimate.interval95
 
@@ -214,7 +214,7 @@ def readme(rows: list[dict[str, Any]], runs: int) -> str:
         said = row["verdict"]
         if row["verdict"] in ("named", "tied"):
             said = ", ".join(
-                f"{' or '.join([f['name'], *f['tied_with']])}: {rounded(f['amount'], 3)} ± {rounded(f['std'], 2)}"
+                f"{' or '.join([f['name'], *f['tied_with']])}: {format_number(f['amount'], 3)} ± {format_number(f['std'], 2)}"
                 + (f" {f['unit']}" if f["unit"] != "-" else "")
                 for f in row["found"]
             )

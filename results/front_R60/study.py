@@ -53,7 +53,7 @@ def main() -> None:
                 continue
             wall = time.monotonic() - begin
             rows = np.column_stack([found.manoeuvre.times, found.manoeuvre.torque])
-            with output.writing_file(path) as place:
+            with output.new_file(path) as place:
                 np.savetxt(place, rows, "%.12g", ",", header="t_s,u1_Nm,u2_Nm,u4_Nm", comments="")
         rows = np.loadtxt(path, delimiter=",", skiprows=1)
         before = Manoeuvre(rows[:, 0], rows[:, 1:])
@@ -62,8 +62,8 @@ def main() -> None:
     points.sort(key=lambda p: float(p["worst_percent"]))
     summary = {"machine": "va12", "problem": "R60", "designs": points}
     save(figure(points), HERE / "front.png")
-    with output.writing_file(HERE / "summary.json") as place:
-        place.write_text(output.dump(summary), encoding="utf-8")
+    with output.new_file(HERE / "summary.json") as place:
+        place.write_text(output.to_json(summary), encoding="utf-8")
 
 
 def stored(model: Model, problem: Problem, place: Path) -> Manoeuvre:

@@ -34,7 +34,7 @@ from excite.model.machine import Problem, machine
 from excite.reports import COLOURS, save
 from excite.reports.top_view import outline
 from excite.simulation import Motion, simulate
-from excite.text import rounded
+from excite.text import format_number
 from excite.trajectories import Manoeuvre, baselines, excitation, multistart, objective
 from excite.workflows.machine_check import grouping
 
@@ -95,8 +95,8 @@ def read(path: Path) -> Any:
 
 
 def write(path: Path, made: Any) -> None:
-    with output.writing_file(path) as place:
-        place.write_text(output.dump(made), encoding="utf-8")
+    with output.new_file(path) as place:
+        place.write_text(output.to_json(made), encoding="utf-8")
 
 
 def short(model: Model) -> Problem:
@@ -285,7 +285,7 @@ def page(
     lines += ["", "| base parameter | stands for | true value | attainable [%] | true error of runs [%] | in 95 % |"]
     lines += ["|---|---|---|---|---|---|"]
     for n, row in rows.items():
-        value = f"{rounded(row['true'])} {row['unit']}"
+        value = f"{format_number(row['true'])} {row['unit']}"
         parts = grouping(base.grouping(n))
         lines.append(
             f"| {n} | {parts} | {value} | {sizes[n]:.2g} | {row['rms_percent']:.2g} | {100 * row['coverage95']:.0f} % |"

@@ -69,8 +69,8 @@ def main() -> None:
     }
     summary = {"machine": "va12", "problem": "R60", "runs": options.runs, "rank_correlation": ranks, "drives": rows}
     save(figure(other, worst, ranks), HERE / "objectives.png")
-    with output.writing_file(HERE / "summary.json") as place:
-        place.write_text(output.dump(summary), encoding="utf-8")
+    with output.new_file(HERE / "summary.json") as place:
+        place.write_text(output.to_json(summary), encoding="utf-8")
 
 
 # ------------------------------------------------------------------------------------------------ criteria
@@ -153,7 +153,7 @@ def driven(model: Model, problem: Problem, name: str, make: Make) -> Motion:
     path = HERE / "drives" / f"{name.replace(' ', '-')}.csv"
     if not path.is_file():
         m = make()
-        with output.writing_file(path) as place:
+        with output.new_file(path) as place:
             rows = np.column_stack([m.times, m.torque])
             np.savetxt(place, rows, "%.12g", ",", header="t_s,u1_Nm,u2_Nm,u4_Nm", comments="")
     rows = np.loadtxt(path, delimiter=",", skiprows=1)
@@ -165,7 +165,7 @@ def errors(model: Model, motion: Motion, name: str, runs: int, jobs: int) -> lis
     path = HERE / "runs" / f"{name.replace(' ', '-')}-{runs}.json"
     if not path.is_file():
         v = verify(model, motion, "joint", "full", runs, seed=1, jobs=jobs)
-        with output.writing_file(path) as place:
+        with output.new_file(path) as place:
             place.write_text(json.dumps(np.sqrt(np.nanmean(v.error_percent**2, axis=0)).tolist()))
     return [float(x) for x in json.loads(path.read_text())]
 

@@ -23,7 +23,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from excite import output
-from excite.errors import NoEstimate, SimulationError
+from excite.errors import NoEstimateError, SimulationError
 from excite.identification import methods, prior
 from excite.logs import log
 from excite.model import Model, prediction
@@ -74,9 +74,9 @@ def main() -> None:
         "rows": rows,
     }
     save(figure(rows), HERE / "figure.png")
-    with output.writing_file(HERE / "summary.json") as place:
-        place.write_text(output.dump(summary), encoding="utf-8")
-    with output.writing_file(HERE / "README.md") as place:
+    with output.new_file(HERE / "summary.json") as place:
+        place.write_text(output.to_json(summary), encoding="utf-8")
+    with output.new_file(HERE / "README.md") as place:
         place.write_text(readme(summary["table"], rows), encoding="utf-8")
 
 
@@ -98,7 +98,7 @@ def designed(objective: str, runs: Path) -> dict[str, Manoeuvre]:
             others = scenarios.perturbed_machines(model, SCENARIOS, SPREAD) if kind == "robust" else ()
             warm = [found["nominal"]] if kind == "robust" else []
             d = design(model, short(model), aims.aim(model, objective, machines=others), starts=2, seed=0, warm=warm)
-            with output.writing_file(path) as place:
+            with output.new_file(path) as place:
                 place.write_text(json.dumps({"t": d.manoeuvre.times.tolist(), "u": d.manoeuvre.torque.tolist()}))
             print(f"{kind}: cond(Phi) {d.cond_phi:.1f}", flush=True)
         stored = json.loads(path.read_text())
@@ -114,7 +114,7 @@ def one(
     if path.is_file():
         return dict(json.loads(path.read_text()))
     nominal = roller()
-    true = prediction.build(scenarios.varied(nominal.machine, SPREAD, np.random.default_rng([number, 7])))
+    true = prediction.build(scenarios.vary_machine(nominal.machine, SPREAD, np.random.default_rng([number, 7])))
     row: dict[str, object] = {"machine": number}
     first: Motion | None = None
     for kind in KINDS[: 3 if third else 2]:
@@ -125,7 +125,7 @@ def one(
                 motions = [first, driven(nominal, true, drive[1], drive[0], 2 * number + 1)]
             else:
                 motions = [driven(nominal, true, designs[kind], nominal, 2 * number + i) for i in range(2)]
-        except (SimulationError, NoEstimate, ValueError) as err:
+        except (SimulationError, NoEstimateError, ValueError) as err:
             row[kind] = {"failed": str(err)}
             continue
         if kind == "nominal":
@@ -133,8 +133,8 @@ def one(
         row[kind] = told(true, motions)
         if identified:
             row[kind] |= {"error_percent": errors(nominal, true, motions, number)}  # type: ignore[operator]
-    with output.writing_file(path) as place:
-        place.write_text(output.dump(row), encoding="utf-8")
+    with output.new_file(path) as place:
+        place.write_text(output.to_json(row), encoding="utf-8")
     return row
 
 

@@ -22,7 +22,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.optimize import least_squares
 
-from excite.model.effects import CATALOGUE, DURATION, Rolling, Scene, Site, Soil
+from excite.model.effects import CATALOGUE, DEFAULT_DURATION, ContactMotion, SampleView, Site, Soil
 from excite.model.machine import Contact, Quantity, load_machine
 from excite.model.mechanics import contact
 from excite.reports import COLOURS, save
@@ -47,20 +47,20 @@ WHEEL = Contact(
     v_eps=quantity(1e-6),
 )
 ROLLER = load_machine("va12")
-USUAL = Site(ROLLER, ROLLER.contacts[0], DURATION)  # shapes of effects are as in any other machine
+USUAL = Site(ROLLER, ROLLER.contacts[0], DEFAULT_DURATION)  # shapes of effects are as in any other machine
 
 
 def force(names: Sequence[str]) -> tuple[ca.Function, list[str], np.ndarray]:
     """(V_x, rim speed, parameters) -> traction [N] under some of the catalogue's effects; names and first values."""
     V, rim = ca.SX.sym("V"), ca.SX.sym("rim")
     labels, first = ["Kx"], [-30.0]
-    rolling = Rolling(WHEEL, V, ca.SX(0), rim / RADIUS, ca.SX(0))
+    rolling = ContactMotion(WHEEL, V, ca.SX(0), rim / RADIUS, ca.SX(0))
     p = ca.SX.sym("p", 1 + len(names))
     # The authors' slip divides by the larger speed: the table goes down to a locked wheel, where the rim's is zero.
     larger = ca.fmax(V, rim)
     soil = Soil(contact.Slip((V - rim) / larger, ca.SX(0), larger), ca.SX(0), p[0], ca.SX(-1))
     none: dict[int, ca.SX] = {}
-    scene = Scene(none, none, none, none, {}, {}, {}, {1: rolling}, none, ca.SX(0))
+    scene = SampleView(none, none, none, none, {}, {}, {}, {1: rolling}, none, ca.SX(0))
     pushed = ca.SX(0)
     for k, name in enumerate(names):
         effect = CATALOGUE[name]

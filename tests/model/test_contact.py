@@ -248,16 +248,16 @@ def test_mobilised_share_is_the_mean_along_the_patch(x: float) -> None:
     """Mean over zeta in 0..1 of (1 - exp(-x zeta)) against that of x zeta, by midpoint sums; no step at x = 0.05."""
     zeta = (np.arange(200_000) + 0.5) / 200_000
     want = np.mean(-np.expm1(-x * zeta)) / (x / 2)
-    assert float(ca.DM(contact.mobilised(ca.SX(x)))) == pytest.approx(want, rel=1e-8)
+    assert float(ca.DM(contact.mobilised_share(ca.SX(x)))) == pytest.approx(want, rel=1e-8)
 
 
 @pytest.mark.parametrize("x", [1e-3, 0.3, 5.0])
 def test_a_hyperbola_has_the_same_slope_and_half_as_much_again_at_its_end(x: float) -> None:
     """A force as x / (a + b x): 1 / (1 + x/3) of the linear law, 3 in the limit, where the exponential one has 2."""
-    bent = float(ca.DM(contact.mobilised(ca.SX(x), 1.0)))
+    bent = float(ca.DM(contact.mobilised_share(ca.SX(x), 1.0)))
     assert bent == pytest.approx(1 / (1 + x / 3), rel=1e-8)
-    assert bent >= float(ca.DM(contact.mobilised(ca.SX(x))))
-    assert 1e9 * float(ca.DM(contact.mobilised(ca.SX(1e9), 1.0))) == pytest.approx(3.0, rel=1e-6)
+    assert bent >= float(ca.DM(contact.mobilised_share(ca.SX(x))))
+    assert 1e9 * float(ca.DM(contact.mobilised_share(ca.SX(1e9), 1.0))) == pytest.approx(3.0, rel=1e-6)
 
 
 def test_a_wheel_without_width_only_slips_at_its_middle() -> None:

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from excite.errors import MachineError
 from excite.model import build, standard_parameters
-from excite.model.machine import MACHINES, Body, Machine, extends, load_machine, own_files, shipped_machines
+from excite.model.machine import MACHINES, Body, Machine, extends, load_machine, machine_files, shipped_machines
 
 VA12 = (MACHINES / "va12.toml").read_text(encoding="utf-8")
 EMPS = (MACHINES / "emps.toml").read_text(encoding="utf-8")
@@ -564,21 +564,21 @@ def test_files_that_extend_each_other_are_refused(tmp_path: Path) -> None:
 
 def test_so_many_files_may_extend_one_another_and_no_more(tmp_path: Path) -> None:
     path = write(tmp_path, 'extends = "va12"\n', "deep1.toml")
-    for k in range(2, extends.DEEPEST + 1):
+    for k in range(2, extends.MAX_DEPTH + 1):
         path = write(tmp_path, f'extends = "deep{k - 1}.toml"\n', f"deep{k}.toml")
     assert load_machine(path) == load_machine("va12")
-    assert len(own_files(path)) == extends.DEEPEST
+    assert len(machine_files(path)) == extends.MAX_DEPTH
     path = write(tmp_path, f'extends = "{path.name}"\n', "deeper.toml")
-    for read in (load_machine, own_files):
+    for read in (load_machine, machine_files):
         assert "extends: more than 4 files deep" in complaint(lambda read=read: read(path), MachineError)
 
 
 def test_own_files_are_those_that_a_machine_is_made_of(tmp_path: Path) -> None:
     other = write(tmp_path, 'extends = "va12"\n', "other.toml")
     path = write(tmp_path, 'extends = "other.toml"\n')
-    assert own_files(path) == [path, other]
-    assert own_files("va12") == []
-    assert own_files(MACHINES / "va12.toml") == [MACHINES / "va12.toml"], "given as a file it is one"
+    assert machine_files(path) == [path, other]
+    assert machine_files("va12") == []
+    assert machine_files(MACHINES / "va12.toml") == [MACHINES / "va12.toml"], "given as a file it is one"
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 import scipy.signal
 
 from excite.model import Model
-from excite.simulation import STEADY, Driver, Motion, follow
+from excite.simulation import STEADY_DRIVER, Driver, Motion, follow
 
 T = np.arange(3001) / 100
 SPEED = np.interp(T, [0, 2, 5, 14, 17, 19, 22, 27, 30], [0, 0, 1.5, 1.5, 0, 0, -1.5, -1.5, 0])
@@ -25,7 +25,7 @@ def lag(motion: Motion) -> tuple[float, float]:
 
 def test_follows_as_late_as_the_machine_is(va12: Model) -> None:
     """What comes is seen: reaction and hand cost nothing, the drive's 0.3 s stay."""
-    motion = follow(va12, SPEED, ANGLE, STEADY)
+    motion = follow(va12, SPEED, ANGLE, STEADY_DRIVER)
     late, misfit = lag(motion)
     assert 0.2 <= late <= 0.45
     assert misfit < 0.05
@@ -36,9 +36,9 @@ def test_follows_as_late_as_the_machine_is(va12: Model) -> None:
 
 
 def test_without_a_view_ahead_reaction_and_hand_come_on_top(va12: Model) -> None:
-    blind = follow(va12, SPEED, ANGLE, replace(STEADY, preview_s=0.0))
-    seeing = follow(va12, SPEED, ANGLE, STEADY)
-    assert lag(blind)[0] - lag(seeing)[0] == pytest.approx(STEADY.preview_s, abs=0.05)
+    blind = follow(va12, SPEED, ANGLE, replace(STEADY_DRIVER, preview_s=0.0))
+    seeing = follow(va12, SPEED, ANGLE, STEADY_DRIVER)
+    assert lag(blind)[0] - lag(seeing)[0] == pytest.approx(STEADY_DRIVER.preview_s, abs=0.05)
 
 
 def test_torques_do_not_chatter(va12: Model) -> None:
@@ -54,7 +54,7 @@ def test_slow_errors_are_as_large_as_said(va12: Model) -> None:
     speed, angle = np.full(6001, 1.0), np.full((6001, 1), 0.2)
     t = np.arange(6001) / 100
     speed *= np.clip(np.minimum(t, 60 - t) / 4, 0, 1)
-    steady = follow(va12, speed, angle, STEADY)
+    steady = follow(va12, speed, angle, STEADY_DRIVER)
     many = [follow(va12, speed, angle, seed=s) for s in range(4)]
     at = slice(1000, 5500)
     off = np.std([m.nu[at, 0] - steady.nu[at, 0] for m in many])
@@ -86,7 +86,7 @@ def test_no_two_drives_are_the_same_but_a_seed_is(va12: Model) -> None:
 def test_another_machine_is_driven_by_what_it_does(va12: Model) -> None:
     """The driver steers by what is seen: a machine a fifth heavier still reaches the speed."""
     heavy = va12.base_values({"M0": 2 * 2600.0})
-    motion = follow(va12, SPEED, ANGLE, STEADY, X=heavy)
+    motion = follow(va12, SPEED, ANGLE, STEADY_DRIVER, X=heavy)
     assert motion.nu[1200:1400, 0].mean() == pytest.approx(1.5, abs=0.1)
 
 
