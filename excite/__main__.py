@@ -1,4 +1,4 @@
-"""The command line: runs a command, and says in one line what its errors mean for the person who must act."""
+"""The `excite` program: run a command, report an error in one line, and end with its exit code."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 
-# One BLAS thread: our matrices are small, and threads turn a 0.3 ms eigenproblem into 100 ms.
+# One BLAS thread: the matrices are small, and threads turn a 0.3 ms eigenproblem into 100 ms.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
@@ -19,11 +19,17 @@ from excite.cli import (  # noqa: E402
     app,
     fail,
 )
-from excite.errors import UsageError  # noqa: E402
+from excite.errors import ExciteError  # noqa: E402
+
+# Errors of the file system that the user can mend: full disk, quota, read-only file system, no permission.
+USERS_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES)
 
 
 def main() -> None:
-    """Runs a command: exit 0 done, 1 could not be done, 2 bad input or usage; one clear line on stderr."""
+    """Run a command; exit 0: done, 1: could not be done, 2: bad input or usage, 130: interrupted.
+
+    An error of the user's is one line on stderr, a defect of the program a traceback.
+    """
     signal.signal(signal.SIGTERM, _terminate)
     with interrupt.watch_interrupts() as said:
         try:
@@ -50,33 +56,15 @@ def main() -> None:
 
 
 def _terminate(*_: object) -> None:
-    """A polite kill ends like Ctrl-C: workers are stopped, nothing half written stays."""
+    """End on SIGTERM as on Ctrl-C: workers are stopped, no folder is left half written."""
     raise KeyboardInterrupt
 
 
 def _exit_code(err: Exception) -> int | None:
-    """What an error means for the person who must act; None for a defect of ours, which shows its traceback."""
-    from excite.errors import (
-        DesignFolderError,
-        FolderError,
-        InfeasibleError,
-        LogError,
-        MachineError,
-        NoEstimateError,
-        RowStoreError,
-        ServeError,
-        SimulationError,
-        UndrivableError,
-        WorkerError,
-    )
-
-    if isinstance(err, UsageError | MachineError | LogError | FolderError | DesignFolderError | UndrivableError):
-        return 2
-    if isinstance(err, OSError) and err.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
-        return 1
-    if isinstance(err, NoEstimateError | InfeasibleError | SimulationError | ServeError | WorkerError | RowStoreError):
-        return 1
-    return None
+    """Return the exit code of an error, None for a defect of the program."""
+    if isinstance(err, ExciteError):
+        return err.exit_code
+    return 1 if isinstance(err, OSError) and err.errno in USERS_DISK else None
 
 
 if __name__ == "__main__":
