@@ -1,7 +1,7 @@
-"""Every error that the program raises for the person who must act, with its exit code.
+"""Every error that the program raises for its user, with its exit code.
 
-A message is one line: where, what is wrong, what to do. Bad input ends with 2, what could not be done with 1;
-whatever is not an `ExciteError` is a defect of the program.
+A message is one line: where, what is wrong, what to do. Exit code 2 means bad input, 1 that the work could not be done.
+Any exception that is not an `ExciteError` is a defect of the program.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ class ExciteError(Exception):
 
 
 class InputError(ExciteError, ValueError):
-    """Something given can't be used."""
+    """Input that can't be used."""
 
     exit_code = 2
 
@@ -24,11 +24,11 @@ class FailedError(ExciteError, RuntimeError):
 
 
 class MachineError(InputError):
-    """A machine file that can't be used: file, key, what is wrong, what is allowed."""
+    """A machine file that can't be used: file, key, problem, what is allowed."""
 
 
 class LogError(InputError):
-    """A log or profile that can't be used: file, row and column, what is wrong, what to do."""
+    """A log or profile that can't be used: file, row and column, problem, what to do."""
 
 
 class UsageError(InputError):
@@ -36,7 +36,7 @@ class UsageError(InputError):
 
 
 class StudyError(UsageError):
-    """A study file that can't be carried out: file, key, what is wrong, what is allowed."""
+    """A study file that can't be carried out: file, key, problem, what is allowed."""
 
 
 class FolderError(InputError):
@@ -48,15 +48,15 @@ class DesignFolderError(InputError):
 
 
 class UndrivableError(InputError):
-    """A design that no person can be asked to follow."""
+    """A design that no person can follow."""
 
 
 class NoEstimateError(FailedError):
-    """A method found no estimate, or none that it stands by."""
+    """A method found no estimate, or none that is reliable."""
 
 
 class NotIdentifiableError(NoEstimateError):
-    """The log says nothing of any parameter, or has fewer rows than parameters."""
+    """No parameter is identifiable from the log, or it has fewer rows than parameters."""
 
 
 class NotConsistentError(NoEstimateError):
@@ -64,17 +64,17 @@ class NotConsistentError(NoEstimateError):
 
 
 class SimulationError(FailedError):
-    """A motion could not be integrated; the message says when and from which state."""
+    """A motion could not be integrated; the message gives time and state."""
 
 
 class CollocationError(FailedError):
-    """The collocation equations of an interval have no solution that Newton's method finds."""
+    """Newton's method found no solution of an interval's collocation equations."""
 
 
 class InfeasibleError(ExciteError, ValueError):
     """No drive keeps every limit.
 
-    limit: name of the one that can't be met. excess: by how much, as a fraction of its range.
+    limit: name of the violated limit; excess: violation as a fraction of its range.
     """
 
     def __init__(self, message: str, limit: str, excess: float) -> None:
@@ -90,8 +90,8 @@ class ServeError(FailedError):
 
 
 class WorkerError(FailedError):
-    """The workers of a study can't be had any more."""
+    """The workers of a study are lost."""
 
 
 class RowStoreError(FailedError):
-    """Rows of a study can't be kept now (a full disk, say); what was kept before is safe."""
+    """Rows of a study can't be stored now (a full disk, for example); rows stored before are safe."""

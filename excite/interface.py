@@ -76,7 +76,7 @@ def design(
     budget [s]: stop improving after so long. progress(done, total, best score) is called as the search goes on.
     Raises InfeasibleError with the limit that can't be met, UsageError for an unknown name.
     """
-    model = workflows.build_model(str(machine), flaws=False) if not isinstance(machine, Model) else machine
+    model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
     _, chosen = workflows.choose_problem(model.machine, problem, duration)
     workflows.require_objective(objective, model.machine)
     workflows.require_positive("sigma_max", sigma_max, "%")
@@ -166,7 +166,7 @@ def compare(
     against: names of `excite.trajectories.USUAL`, all of them if not given. samples: drives of every random kind.
     Raises UsageError for an unknown name, MachineError for sensors of unknown noise.
     """
-    model = workflows.build_model(str(machine), flaws=False) if not isinstance(machine, Model) else machine
+    model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
     _, chosen = workflows.choose_problem(model.machine, problem, None)
     workflows.graded(model)
     for usual in against:

@@ -1,8 +1,8 @@
-"""Ctrl-C that doesn't get lost.
+"""Ctrl-C during calls of CasADi.
 
-CasADi's Python wrapper drops a KeyboardInterrupt that falls into one of its calls: what comes back is a None in the
-place of a matrix, or a NotImplementedError about the number of arguments (seen with 3.7 in about a tenth of 230
-interrupts). Taken at its word that is a defect of the program, or a run of a study that failed.
+CasADi's Python wrapper drops a KeyboardInterrupt that arrives inside one of its calls: the call returns None in place
+of a matrix, or raises NotImplementedError (CasADi 3.7, about a tenth of 230 interrupts). Without a check this looks
+like a defect of the program or a failed run of a study.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ R = TypeVar("R")
 
 
 class InterruptFlag:
-    """Whether somebody asked to stop."""
+    """Set once the user asked to stop."""
 
     def __init__(self) -> None:
         self.stop = False
@@ -29,37 +29,37 @@ class InterruptFlag:
 
 @contextmanager
 def watch_interrupts() -> Iterator[InterruptFlag]:
-    """Notes Ctrl-C and a polite kill within, and leaves them to the handlers that were there (main thread only)."""
-    said = InterruptFlag()
+    """Note SIGINT and SIGTERM in the block, then pass them to the previous handlers (main thread only)."""
+    flag = InterruptFlag()
     if threading.current_thread() is not threading.main_thread():
-        yield said
+        yield flag
         return
     before = {number: handler for number in SIGNALS if callable(handler := signal.getsignal(number))}
 
     def note(number: int, frame: FrameType | None) -> None:
-        said.stop = True
+        flag.stop = True
         before[signal.Signals(number)](number, frame)
 
     for number in before:
         signal.signal(number, note)
     try:
-        yield said
+        yield flag
     finally:
         for number, handler in before.items():
-            if signal.getsignal(number) is note:  # not deaf by now
+            if signal.getsignal(number) is note:  # unless `ignore_interrupts` replaced it
                 signal.signal(number, handler)
 
 
 def ignore_interrupts() -> None:
-    """From here on Ctrl-C is ignored: the program is at its end, and waits for its processes alone."""
+    """Ignore Ctrl-C from here on, while the program only waits for its processes to end."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def call_interruptible(call: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
-    """What a call returns, where nobody asked to stop meanwhile. Raises KeyboardInterrupt where somebody did."""
-    with watch_interrupts() as said:
+    """Return the result of a call. Raises KeyboardInterrupt if the user asked to stop meanwhile."""
+    with watch_interrupts() as flag:
         result = call(*args, **kwargs)
-    if said.stop:
+    if flag.stop:
         raise KeyboardInterrupt
     return result

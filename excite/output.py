@@ -1,4 +1,4 @@
-"""Result folders and files that are whole or not there at all."""
+"""Result folders and files that are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ REQUEST_KEYS = (
     "samples",
     "starts",
     "seed",
-)  # what tells a result from another
+)  # entries of a summary that say how a result was made
+# names of the files that the program writes into a result folder
 OWN_NAMES = re.compile(
     r"summary\.json|machine\.(json|toml)|(profile|phases)\.csv|README\.md|[a-z0-9-]+\.(png|pdf|html|md)|design|verify|next"
     r"|drives|runs\.parquet|study\.json|machines"
@@ -35,36 +36,35 @@ OWN_NAMES = re.compile(
 
 
 def write_summary(place: Path, summary: Any) -> None:
-    """Writes a folder's summary."""
+    """Write a folder's summary."""
     (place / SUMMARY).write_text(to_json(summary), encoding="utf-8")
 
 
 def check_out_folder(out: Path, inputs: Iterable[Path] = ()) -> None:
-    """Checks before the work that `out` can be written at its end. Raises FolderError.
+    """Check before the work that `out` can be written at its end. Raises FolderError.
 
-    An empty folder may be replaced, and one of ours that holds nothing but our own files and none of the `inputs`;
-    anything else is left alone.
+    An empty folder may be replaced, and a result folder with only the program's own files and none of the `inputs`.
     """
     if out.is_file():
         raise FolderError(f"{out}: is a file, --out needs a folder")
     place = out.resolve()
     if place == Path.cwd() or place in Path.cwd().parents:
-        raise FolderError(f"{out}: is the folder that you are in or above it, choose another --out")
+        raise FolderError(f"{out}: is the current folder or one above it, choose another --out")
     for path in inputs:
         if place == path.resolve() or place in path.resolve().parents:
-            raise FolderError(f"{out}: holds {path}, which is read, choose another --out")
+            raise FolderError(f"{out}: contains the input {path}, choose another --out")
     if out.is_dir():
         foreign = [p.name for p in out.iterdir() if not OWN_NAMES.fullmatch(p.name)]
         if foreign or (any(out.iterdir()) and not (out / SUMMARY).is_file()):
             what = foreign[0] if foreign else "something else"
             raise FolderError(f"{out}: exists and holds {what}, choose another --out")
         if not os.access(out, os.W_OK):
-            raise FolderError(f"{out}: can't be replaced, it may not be written to")
+            raise FolderError(f"{out}: can't be replaced, no permission to write")
     _check_writable(out)
 
 
 def describe_result(out: Path) -> str | None:
-    """When what is in a folder of ours was made and, as far as its summary says, how; None where nothing is there."""
+    """Return the date of the result in a folder, and its settings if its summary has them; None for no result."""
     path = out / SUMMARY
     if not path.is_file():
         return None
@@ -73,7 +73,7 @@ def describe_result(out: Path) -> str | None:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return made
-    if isinstance(found, dict) and isinstance(found.get("design"), dict):  # of `excite run`
+    if isinstance(found, dict) and isinstance(found.get("design"), dict):  # written by `excite run`
         found = found["design"]
     known = [(key, found.get(key)) for key in REQUEST_KEYS] if isinstance(found, dict) else []
     told = [
@@ -89,18 +89,19 @@ def _short_text(value: Any) -> str:
 
 
 def _check_writable(out: Path) -> None:
+    """Check that the nearest existing parent folder may be written. Raises FolderError."""
     parent = out.absolute().parent
     while not parent.exists():
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise FolderError(f"{out}: can't be written, {parent} is not a folder that you may write to")
+        raise FolderError(f"{out}: can't be written, {parent} is not a folder with write permission")
 
 
 @contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """A folder to fill that becomes `out` when the block ends well, and vanishes otherwise.
+    """Yield a folder to fill that becomes `out` if the block succeeds, and is removed if it fails.
 
-    A killed run leaves only a hidden folder beside it. Raises FolderError.
+    A killed run leaves only a hidden folder next to `out`. Raises FolderError.
     """
     check_out_folder(out)
     made = _make_parents(out)
@@ -121,14 +122,14 @@ def new_folder(out: Path) -> Iterator[Path]:
 
 
 def remove_partial_folders(out: Path) -> None:
-    """Removes what killed runs left beside `out`; for a caller that knows no other one at work on it."""
+    """Remove the hidden folders of killed runs next to `out`; no other run may be writing it."""
     for left in out.absolute().parent.glob(f".{glob.escape(out.name)}.*.partial"):
         shutil.rmtree(left, ignore_errors=True)
 
 
 @contextmanager
 def new_file(out: Path) -> Iterator[Path]:
-    """A file to write that becomes `out` when the block ends well. Raises FolderError."""
+    """Yield a file to write that becomes `out` if the block succeeds. Raises FolderError."""
     if out.is_dir():
         raise FolderError(f"{out}: is a folder, --out needs a file name")
     _check_writable(out)
@@ -145,14 +146,14 @@ def new_file(out: Path) -> Iterator[Path]:
 
 
 def _make_parents(out: Path) -> list[Path]:
-    """Makes the folders that `out` needs and returns those that were not there, the deepest first."""
+    """Make the parent folders of `out` and return the new ones, deepest first."""
     missing = [p for p in out.absolute().parents if not p.exists()]
     out.parent.mkdir(parents=True, exist_ok=True)
     return missing
 
 
 def _remove_empty(made: list[Path]) -> None:
-    """What failed leaves nothing behind, not even an empty folder."""
+    """Remove new parent folders that stayed empty."""
     for path in made:
         if any(path.iterdir()):
             return
@@ -160,11 +161,12 @@ def _remove_empty(made: list[Path]) -> None:
 
 
 def to_json(summary: Mapping[str, Any]) -> str:
-    """Strict JSON: a number that is not finite is null, never NaN."""
+    """Return a summary as strict JSON, with null for a number that is not finite."""
     return json.dumps(_plain_value(summary), indent=2, allow_nan=False) + "\n"
 
 
 def _plain_value(value: Any) -> Any:
+    """Convert arrays and NumPy numbers to plain ones, and numbers that are not finite to None."""
     if isinstance(value, Mapping):
         return {str(k): _plain_value(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -1,21 +1,21 @@
-"""Numbers and lists as people read them, in sentences and tables."""
+"""Numbers and lists formatted for sentences and tables."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-MAX_LINES = 8  # of what is left of a misfit, that are told at once
+MAX_LINES = 8  # lines printed of a longer list; chosen
 
 
 def first_lines(lines: Sequence[str]) -> list[str]:
-    """The first of many lines, and where the rest is."""
+    """Return the first of many lines, and where to find the rest."""
     if len(lines) <= MAX_LINES + 1:
         return list(lines)
     return [*lines[:MAX_LINES], f"and {len(lines) - MAX_LINES} more, in summary.json under `located`"]
 
 
 def format_number(value: object, digits: int = 4) -> str:
-    """A number to so many digits, a dash where there is none; 170, not 1.7e+02, where it is below a million."""
+    """Format a number to some significant digits, a missing one as a dash; below a million without exponent."""
     if value is None or (isinstance(value, float) and value != value):
         return "-"
     if not isinstance(value, float):
@@ -25,10 +25,10 @@ def format_number(value: object, digits: int = 4) -> str:
 
 
 def format_percent(value: float, digits: int = 2) -> str:
-    """A number of per cent as it stands in a sentence."""
+    """Format a percentage for a sentence."""
     return f"{format_number(float(value), digits)} %"
 
 
 def format_p_value(p: float) -> str:
-    """A p-value, as small as it may be told."""
+    """Format a p-value, "< 1e-12" below that."""
     return "< 1e-12" if p < 1e-12 else format_number(p, 2)

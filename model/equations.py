@@ -1,7 +1,7 @@
-"""The equations of motion of one sample, with standard parameters: rigid bodies, friction, soil and effects together.
+"""The equations of motion of one sample in standard parameters: rigid bodies, friction, soil and effects.
 
-Everything that the machine file says becomes one balance: what the motors must deliver for a motion. Effects add to it
-what their declarations say; what one effect alone adds is its signature, which diagnosis looks for.
+The machine file becomes one balance, the torques that the motors must deliver for a motion. Effects add to it by the
+hooks of their declarations. The contribution of a single effect is its signature, which diagnosis searches for.
 """
 
 from __future__ import annotations
@@ -20,7 +20,12 @@ from excite.model.machine import Body, Machine
 
 @dataclass(frozen=True)
 class SymbolicSample:
-    """The symbols of one sample, and the machine's motion in it."""
+    """Symbols of one sample, and the motion of every body in it.
+
+    q, nu, a, u, p, wheels: coordinates, velocities, accelerations, torques, standard parameters, measuring wheels.
+    at, rate: coordinates and velocities by name, zero for locked ones. by_name: standard parameters.
+    frames: motion of each body; gravity (3,) in the root's axes; heading of the root [rad].
+    """
 
     machine: Machine
     q: ca.SX
@@ -38,14 +43,16 @@ class SymbolicSample:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the free coordinates."""
         return self.machine.coordinates
 
     def row(self, body: Body) -> int:
+        """Return the equation of a body's joint."""
         return self.names.index(body.coordinates[0])
 
     @cached_property
     def by_inertia(self) -> ca.SX:
-        """How generalised forces follow from the inertial parameters of all bodies (n_q, 10 bodies), linearly."""
+        """Jacobian (n_q, 10 n_bodies) of the generalised forces to the inertial parameters of all bodies."""
         every = {b.index: ca.SX.sym(f"inertia{b.index}", 10) for b in self.machine.body}
         rows = mechanics.generalised_forces(self.machine, self.at, self.frames, every)
         return ca.jacobian(ca.vertcat(*[rows[c] for c in self.names]), ca.vertcat(*every.values()))
@@ -53,16 +60,16 @@ class SymbolicSample:
 
 @dataclass(frozen=True)
 class ActiveEffect:
-    """An effect in a sample: what it sees, and its amount and shapes."""
+    """An effect in one sample: the view that its hooks get, and values of magnitude and shapes."""
 
     placed: PlacedEffect
-    scene: SampleView
+    view: SampleView
     values: Values
 
 
 @dataclass(frozen=True)
 class Equations:
-    """A machine's functions of one sample, with standard parameters p in place of base parameters."""
+    """Functions of one sample in standard parameters p; their meaning is that of the `Model` built from them."""
 
     sample: SymbolicSample
     inputs: tuple[str, ...]
@@ -73,25 +80,30 @@ class Equations:
     flow: ca.Function
     read: ca.Function
     channels: ca.Function
-    readable: tuple[str, ...]
+    reading_names: tuple[str, ...]
     memory: tuple[str, ...]
-    mapped: tuple[str, ...]
+    map_inputs: tuple[str, ...]
     nonlinear: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class SignatureFunctions:
-    """What C effects add, each alone, at samples (q, nu, a, u, t, z, exact readings, p): generalised forces (n_q, C)
-    and readings (n_readable, C); and the rates (q, nu, u, t, z, p) -> dz of all that they remember. mapped: how many of
-    z, the last ones, a map of the ground tells."""
+    """Signatures of C effects: the contribution of each one alone.
+
+    force: (q, nu, a, u, t, z, exact readings, p) -> generalised forces (n_q, C).
+    reading: the same arguments -> changes of the readings (n_readings, C).
+    flow: (q, nu, u, t, z, p) -> dz, the rates of all their memory states.
+    n_map_inputs: number of inputs from a map of the ground, the last ones of z.
+    """
 
     force: ca.Function
     reading: ca.Function
     flow: ca.Function
-    mapped: int
+    n_map_inputs: int
 
 
 def symbolic_sample(machine: Machine, standard: tuple[str, ...]) -> SymbolicSample:
+    """Make the symbols of one sample; standard: names of the standard parameters."""
     names = machine.coordinates
     n = len(names)
     q, nu, a = ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
@@ -120,16 +132,19 @@ def symbolic_sample(machine: Machine, standard: tuple[str, ...]) -> SymbolicSamp
 
 
 def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[PlacedEffect]) -> Equations:
-    """The functions of a machine with effects. Raises MachineError for a contact that can't turn as the law has it."""
+    """Build the functions of a machine with effects.
+
+    Raises MachineError for a contact whose axis does not fit the force law.
+    """
     for body in machine.contacts:
         _check_axis(machine, body)
     s = symbolic_sample(machine, standard)
-    memory, mapped, z, acting = _active_effects(s, placed)
+    memory, map_inputs, z, acting = _active_effects(s, placed)
     balance, slips = _balance(s, acting)
     time = ca.SX.sym("t")
     gain, offset, delay = _channels(s, acting, time)
     now = z[memory.index("time")] if "time" in memory else ca.SX(0)
-    read, readable = _readings(s, acting)
+    read, reading_names = _readings(s, acting)
     predict = ca.SX(balance)
     for k, body in enumerate(machine.actuated):
         row = s.row(body)
@@ -137,7 +152,7 @@ def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Plac
     rates = [ca.SX(1)] if "time" in memory else []
     for e in acting:
         rates += _memory_rates(e)
-    rates += [ca.SX(0)] * len(mapped)
+    rates += [ca.SX(0)] * len(map_inputs)
     beside = [s.u, z] if placed else []
     labels = ["q", "nu", "a", "p", "u", "z"][: 4 + len(beside)]
     sample = [s.q, s.nu, s.a, s.p, *beside]
@@ -152,71 +167,71 @@ def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Plac
         ca.Function("flow", [s.q, s.nu, s.u, z, s.p], [ca.vertcat(*rates, ca.SX(0, 1))]),
         ca.Function("read", [s.q, s.nu, s.wheels, s.u, z, s.p], [read]),
         ca.Function("channels", [time, s.p], [gain, offset, delay]),
-        readable,
+        reading_names,
         memory,
-        mapped,
+        map_inputs,
         tuple(name for name, bent in zip(standard, curved, strict=True) if bent),
     )
 
 
 def _check_axis(machine: Machine, body: Body) -> None:
-    """The law takes rolling along x of the carrier for a turn about its y; else the soil would push wrongly."""
+    """Raise MachineError unless the contact turns about y of an upright carrier, as the force law assumes."""
     assert not isinstance(body.antecedent, str)
     own, _ = mechanics.joint_transform(body, {c: ca.SX(0) for c in body.coordinates})
     axis = ca.DM(own[:, 2]).full()[:, 0]
     upright = mechanics.body_poses(machine, {})[body.antecedent][0][2, 2]
     if abs(axis[1] - 1) > 1e-9 or abs(upright - 1) > 1e-9:
         raise MachineError(
-            f"{machine.name}: body {body.name}: contact: must turn about y of an upright chassis, so that rolling"
-            f' forward counts forward (alpha = "-pi/2", gamma 0); its axis there is ({axis[0]:.2g}, {axis[1]:.2g},'
+            f"{machine.name}: body {body.name}: contact: must turn about y of an upright chassis, so that motion"
+            f' forward map_inputs forward (alpha = "-pi/2", gamma 0); its axis there is ({axis[0]:.2g}, {axis[1]:.2g},'
             f" {axis[2]:.2g})"
         )
 
 
 def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[PlacedEffect]) -> SignatureFunctions:
-    """What each of these effects alone adds to a machine with standard parameters of these names."""
+    """Build the signatures of these effects on a machine; standard: names of its standard parameters."""
     s = symbolic_sample(machine, standard)
     inertia = {b.index: mechanics.inertial_vector(b, s.by_name) for b in machine.body}
     time = ca.SX.sym("t")
     exact = ca.SX.sym("exact", sum(x.kind != "torque" for x in machine.sensors("full")))
     force, reading, rates = [], [], list[ca.SX]()
     states: list[ca.SX] = []
-    scene = _common_view(s, time)
-    counts = [ca.SX.sym(name) for name in _map_names(machine, placed)]
-    rollings = {b.index: _contact_motion(s, b) for b in machine.contacts}
+    view = _common_view(s, time)
+    map_inputs = [ca.SX.sym(name) for name in _map_names(machine, placed)]
+    motions = {b.index: _contact_motion(s, b) for b in machine.contacts}
     for e in placed:
         z = {m: ca.SX.sym(m) for m in e.memory}
-        (own,) = _with_shared_contacts([_active_effect(s, scene, e, z, counts)])
+        (own,) = _with_shared_contacts([_active_effect(s, view, e, z, map_inputs)])
         added = _effect_force(s, own, inertia)
-        if e.effect.further is not None or e.effect.soil is not None:
+        if e.effect.extra_radius is not None or e.effect.soil is not None:
             for k in e.bodies:
-                body, rolling, (plain, lever) = machine.find(k), own.scene.rolling[k], rollings[k]
-                added += _contact_force(body, _changed_soil(s, [own], body, rolling), lever, rolling)
+                body, motion, (plain, lever) = machine.find(k), own.view.contacts[k], motions[k]
+                added += _contact_force(body, _changed_soil(s, [own], body, motion), lever, motion)
                 added -= _contact_force(body, _plain_soil(s, body, plain), lever, plain)
         force.append(added)
         read = ca.SX.zeros(exact.numel())
         if e.effect.reading is not None:
             sensors = [x for x in machine.sensors("full") if x.kind != "torque"]
             at = next(i for i, x in enumerate(sensors) if x.name == e.sensor)
-            read[at] = e.effect.reading(own.scene, exact[at], sensors[at].body, own.values)
+            read[at] = e.effect.reading(own.view, exact[at], sensors[at].body, own.values)
         reading.append(read)
         states += z.values()
         rates += _memory_rates(own)
-    held = ca.vertcat(*states, *counts, ca.SX(0, 1))
+    held = ca.vertcat(*states, *map_inputs, ca.SX(0, 1))
     arguments = [s.q, s.nu, s.a, s.u, time, held, exact, s.p]
     return SignatureFunctions(
         ca.Function("force", arguments, [ca.horzcat(*force)]),
         ca.Function("reading", arguments, [ca.horzcat(*reading)]),
         ca.Function(
-            "flow", [s.q, s.nu, s.u, time, held, s.p], [ca.vertcat(*rates, *[ca.SX(0)] * len(counts), ca.SX(0, 1))]
+            "flow", [s.q, s.nu, s.u, time, held, s.p], [ca.vertcat(*rates, *[ca.SX(0)] * len(map_inputs), ca.SX(0, 1))]
         ),
-        len(counts),
+        len(map_inputs),
     )
 
 
 def _map_names(machine: Machine, placed: Sequence[PlacedEffect]) -> tuple[str, ...]:
-    """What a map of the ground tells, by name, if any of these effects look at it."""
-    if not any(e.mapped for e in placed):
+    """Name the inputs from a map of the ground, () if no effect uses it."""
+    if not any(e.uses_map for e in placed):
         return ()
     return tuple(f"over{b.index}.{n + 1}" for b in machine.contacts for n in range(effects.MAX_PASSES))
 
@@ -224,35 +239,34 @@ def _map_names(machine: Machine, placed: Sequence[PlacedEffect]) -> tuple[str, .
 def _active_effects(
     s: SymbolicSample, placed: Sequence[PlacedEffect]
 ) -> tuple[tuple[str, ...], tuple[str, ...], ca.SX, list[ActiveEffect]]:
-    """What effects remember, that which a map of the ground tells last; the latter; symbols z of all of it; and the
-    effects with what they see of a sample."""
-    mapped = _map_names(s.machine, placed)
+    """Return names of memory states (those from the map last), names from the map, symbols z, and active effects."""
+    map_names = _map_names(s.machine, placed)
     memory = ["time"] if any(e.effect.timed for e in placed) else []
     memory += [f"{e.name}.{m}" for e in placed for m in e.memory]
-    memory += mapped
+    memory += map_names
     z = ca.SX.sym("z", len(memory))
     known = dict(zip(memory, ca.vertsplit(z), strict=True))
-    scene = _common_view(s, known.get("time", ca.SX(0)))
-    counts = [known[name] for name in mapped]
-    acting = [_active_effect(s, scene, e, {m: known[f"{e.name}.{m}"] for m in e.memory}, counts) for e in placed]
-    return tuple(memory), mapped, z, _with_shared_contacts(acting)
+    view = _common_view(s, known.get("time", ca.SX(0)))
+    map_inputs = [known[name] for name in map_names]
+    acting = [_active_effect(s, view, e, {m: known[f"{e.name}.{m}"] for m in e.memory}, map_inputs) for e in placed]
+    return tuple(memory), map_names, z, _with_shared_contacts(acting)
 
 
 def _with_shared_contacts(acting: list[ActiveEffect]) -> list[ActiveEffect]:
-    """Effects that see the contacts as some of them make these."""
-    further: dict[int, ca.SX] = {}
+    """Show all effects the contacts as changed by those with an `extra_radius`."""
+    extra_radius: dict[int, ca.SX] = {}
     for e in acting:
-        if e.placed.effect.further is not None:
+        if e.placed.effect.extra_radius is not None:
             for k in e.placed.bodies:
-                further[k] = further.get(k, ca.SX(0)) + e.placed.effect.further(e.scene, k, e.values)
-    if not further:
+                extra_radius[k] = extra_radius.get(k, ca.SX(0)) + e.placed.effect.extra_radius(e.view, k, e.values)
+    if not extra_radius:
         return acting
-    rolling = {k: replace(r, further=further.get(k, 0.0)) for k, r in acting[0].scene.rolling.items()}
-    return [replace(e, scene=replace(e.scene, rolling=rolling)) for e in acting]
+    contacts = {k: replace(r, extra_radius=extra_radius.get(k, 0.0)) for k, r in acting[0].view.contacts.items()}
+    return [replace(e, view=replace(e.view, contacts=contacts)) for e in acting]
 
 
 def _common_view(s: SymbolicSample, time: ca.SX) -> SampleView:
-    """A sample as every effect sees it."""
+    """Return the view of a sample that effects have in common."""
     turning = [b for b in s.machine.body if b.coordinates and b.joint != "planar"]
     rubbing = [b for b in turning if b.friction is not None]
     return SampleView(
@@ -270,32 +284,32 @@ def _common_view(s: SymbolicSample, time: ca.SX) -> SampleView:
 
 
 def _active_effect(
-    s: SymbolicSample, scene: SampleView, e: PlacedEffect, z: dict[str, ca.SX], counts: Sequence[ca.SX]
+    s: SymbolicSample, view: SampleView, e: PlacedEffect, z: dict[str, ca.SX], map_inputs: Sequence[ca.SX]
 ) -> ActiveEffect:
-    """An effect that remembers z, and sees what a map of the ground tells where it looks at one."""
+    """Return an effect with its memory states z and, if it uses the map, the inputs from it."""
     values = {key: ca.SX(x) for key, x in e.values.items()}
     values |= {key: s.by_name[name] for name, (key, _) in e.parameters.items() if name in s.by_name}
-    over = {b.index: ca.SX.zeros(effects.MAX_PASSES) for b in s.machine.contacts}
-    if e.mapped:
-        over = {
-            k: ca.vertcat(*counts[effects.MAX_PASSES * i : effects.MAX_PASSES * (i + 1)]) for i, k in enumerate(over)
-        }
-    return ActiveEffect(e, replace(scene, z=dict.fromkeys(e.memories, ca.SX(0)) | z, over=over), values)
+    passes = {b.index: ca.SX.zeros(effects.MAX_PASSES) for b in s.machine.contacts}
+    if e.uses_map:
+        n = effects.MAX_PASSES
+        passes = {k: ca.vertcat(*map_inputs[n * i : n * (i + 1)]) for i, k in enumerate(passes)}
+    return ActiveEffect(e, replace(view, z=dict.fromkeys(e.memories, ca.SX(0)) | z, passes=passes), values)
 
 
 def _memory_rates(e: ActiveEffect) -> list[ca.SX]:
-    """How fast all that an effect remembers changes."""
-    return [own.rate(e.scene, k, e.values) for k, own in e.placed.memory.values()]
+    """Return the rates of an effect's memory states."""
+    return [own.rate(e.view, k, e.values) for k, own in e.placed.memory.values()]
 
 
 def _friction_torque(s: SymbolicSample, body: Body) -> ca.SX:
+    """Return Fv w + Fs sgn w [N m] of a joint."""
     assert body.friction is not None
     w, k = s.rate[body.coordinates[0]], body.index
     return s.by_name[f"Fv{k}"] * w + s.by_name[f"Fs{k}"] * ca.tanh(w / float(body.friction.smoothing))
 
 
 def _balance(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, dict[str, ca.SX]]:
-    """The generalised forces (n_q,) that the motors must deliver, as their sensors feel them flaws aside; the slips."""
+    """Return generalised forces (n_q,) that the motors must deliver, and slips by name."""
     machine = s.machine
     inertia = {b.index: mechanics.inertial_vector(b, s.by_name) for b in machine.body}
     rows = mechanics.generalised_forces(machine, s.at, s.frames, inertia)
@@ -308,56 +322,58 @@ def _balance(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, 
     slips: dict[str, ca.SX] = {}
     for body in machine.contacts:
         plain, lever = _contact_motion(s, body)
-        rolling = acting[0].scene.rolling[body.index] if acting else plain
+        motion = acting[0].view.contacts[body.index] if acting else plain
         slips |= {f"gx{body.index}": plain.slip.gx, f"gy{body.index}": plain.slip.gy}
-        force -= _contact_force(body, _changed_soil(s, acting, body, rolling), lever, rolling)
+        force -= _contact_force(body, _changed_soil(s, acting, body, motion), lever, motion)
     if machine.planar and machine.body[0].coordinates[1] in machine.locked:
         slips = {g: x for g, x in slips.items() if not g.startswith("gy")}
     return force, slips
 
 
 def _effect_force(s: SymbolicSample, e: ActiveEffect, inertia: Mapping[int, ca.SX]) -> ca.SX:
-    """Generalised force (n_q,) of an effect that isn't the soil's: torques, forces at contacts, gravity, inertia."""
+    """Return the generalised force (n_q,) of an effect: torques, forces at contacts, gravity, inertia; not the soil."""
     effect, machine = e.placed.effect, s.machine
     force = ca.SX.zeros(len(s.names))
     for k in e.placed.bodies:
         body = machine.find(k)
         if effect.torque is not None:
-            force[s.row(body)] += effect.torque(e.scene, k, e.values)
+            force[s.row(body)] += effect.torque(e.view, k, e.values)
         if effect.push is not None:
             lever = _contact_motion(s, body)[1]
-            force += lever[:2, :].T @ ca.vertcat(*effect.push(e.scene, k, e.values))
+            force += lever[:2, :].T @ ca.vertcat(*effect.push(e.view, k, e.values))
     if effect.gravity is not None:
-        pull = mechanics.rot_z(-s.heading) @ ca.vertcat(*effect.gravity(e.scene, e.values), 0)
+        pull = mechanics.rot_z(-s.heading) @ ca.vertcat(*effect.gravity(e.view, e.values), 0)
         still = {c: ca.SX(0) for c in s.at}
         frames = mechanics.body_motions(machine, s.at, still, still, pull)
         rows = mechanics.generalised_forces(machine, s.at, frames, dict(inertia))
         force -= ca.vertcat(*[rows[c] for c in s.names])
     if effect.inertia is not None:
-        told = effect.inertia(e.scene, e.values)
-        moved = effects.payload_change(machine, told)
+        changes = effect.inertia(e.view, e.values)
+        by_parameter = effects.payload_change(machine, changes)
         none = {n: ca.SX(0) for n in s.by_name}
-        change = ca.vertcat(*[mechanics.inertial_vector(b, {**none, **moved}) for b in machine.body])
+        change = ca.vertcat(*[mechanics.inertial_vector(b, {**none, **by_parameter}) for b in machine.body])
         force -= s.by_inertia @ change
         if effect.recoil is not None:
-            force += e.values[effect.recoil] * _recoil_force(s, e, told)
+            force += e.values[effect.recoil] * _recoil_force(s, e, changes)
     return force
 
 
 def _recoil_force(s: SymbolicSample, e: ActiveEffect, change: Mapping[str, ca.SX]) -> ca.SX:
-    """Generalised force (n_q,) on a body along whose x axis a load slides: the first moment MX and the inertia ZZ of it
-    change with time. -MX'' along, the Coriolis force -2 omega MX' across, the moment -omega ZZ' about the origin."""
+    """Return the generalised force (n_q,) of a load that slides along a body's x axis, from its MX(t) and ZZ(t).
+
+    -MX'' along x, the Coriolis force -2 omega MX' across, the moment -omega ZZ' about the body's origin.
+    """
     body = effects.payload_body(s.machine)
     assert body is not None
     frame = s.frames[body]
     lever = ca.jacobian(ca.vertcat(frame.velocity[:2], frame.omega[2]), s.nu)
-    MX, ZZ = (ca.jacobian(change[name], e.scene.time) for name in ("MX", "ZZ"))
+    MX, ZZ = (ca.jacobian(change[name], e.view.time) for name in ("MX", "ZZ"))
     yaw = frame.omega[2]
-    return lever.T @ ca.vertcat(-ca.jacobian(MX, e.scene.time), -2 * yaw * MX, -yaw * ZZ)
+    return lever.T @ ca.vertcat(-ca.jacobian(MX, e.view.time), -2 * yaw * MX, -yaw * ZZ)
 
 
 def _contact_motion(s: SymbolicSample, body: Body) -> tuple[ContactMotion, ca.SX]:
-    """How a contact moves, and how (Vx, Vy, spin, yaw) follow from the velocities (4, n_q)."""
+    """Return a contact's motion, and the Jacobian (4, n_q) of (Vx, Vy, spin, yaw) to the velocities."""
     assert body.contact is not None
     assert not isinstance(body.antecedent, str)
     carrier, own = s.frames[body.antecedent], s.frames[body.index]
@@ -370,35 +386,35 @@ def _contact_motion(s: SymbolicSample, body: Body) -> tuple[ContactMotion, ca.SX
     return ContactMotion(body.contact, centre[0], centre[1], spin, yaw), lever
 
 
-def _plain_soil(s: SymbolicSample, body: Body, rolling: ContactMotion) -> Soil:
-    """The soil under a contact as the machine file has it."""
-    contact = rolling.contact
+def _plain_soil(s: SymbolicSample, body: Body, motion: ContactMotion) -> Soil:
+    """Return the soil under a contact from the machine file."""
+    contact = motion.contact
     saturation = None
     if contact.law == "exponential":
         assert contact.saturation_slip is not None
         saturation = mechanics.Saturation(ca.SX(float(contact.saturation_slip)))
     Kx, Ky = s.by_name[f"Kx{body.index}"], s.by_name[f"Ky{body.index}"]
-    return Soil(rolling.slip, rolling.yaw, Kx, Ky, saturation)
+    return Soil(motion.slip, motion.yaw, Kx, Ky, saturation)
 
 
-def _changed_soil(s: SymbolicSample, acting: Sequence[ActiveEffect], body: Body, rolling: ContactMotion) -> Soil:
-    """The soil under a contact as effects make it, one after the other."""
-    soil = _plain_soil(s, body, rolling)
+def _changed_soil(s: SymbolicSample, acting: Sequence[ActiveEffect], body: Body, motion: ContactMotion) -> Soil:
+    """Return the soil under a contact, changed by the effects one after another."""
+    soil = _plain_soil(s, body, motion)
     for e in acting:
         if e.placed.effect.soil is not None and body.index in e.placed.bodies:
-            soil = e.placed.effect.soil(e.scene, body.index, e.values, soil)
+            soil = e.placed.effect.soil(e.view, body.index, e.values, soil)
     return soil
 
 
-def _contact_force(body: Body, soil: Soil, lever: ca.SX, rolling: ContactMotion) -> ca.SX:
-    """Generalised force (n_q,) of a contact (11), by virtual power."""
+def _contact_force(body: Body, soil: Soil, lever: ca.SX, motion: ContactMotion) -> ca.SX:
+    """Return the generalised force (n_q,) of a contact by virtual power (11)."""
     assert body.contact is not None
     w = soil.wrench(body.contact)
-    return lever.T @ ca.vertcat(w.Sx, w.Sy, -(float(body.contact.radius) + rolling.further) * w.Sx, -w.Tz)
+    return lever.T @ ca.vertcat(w.Sx, w.Sy, -(float(body.contact.radius) + motion.extra_radius) * w.Sx, -w.Tz)
 
 
 def _channels(s: SymbolicSample, acting: Sequence[ActiveEffect], time: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Gain, offset and delay (n_u,) of the torque sensors."""
+    """Return gain, offset [N m] and delay [s] of the torque sensors, (n_u,) each."""
     gain, offset, delay = [], [], []
     for body in s.machine.actuated:
         g, o, d = ca.SX(1), s.by_name[f"u{body.index}0"], ca.SX(0)
@@ -413,7 +429,7 @@ def _channels(s: SymbolicSample, acting: Sequence[ActiveEffect], time: ca.SX) ->
 
 
 def _readings(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, tuple[str, ...]]:
-    """What sensors read, those of torque aside, and their names."""
+    """Return readings and names of all sensors but those of torque."""
     machine, root = s.machine, s.machine.body[0]
     wheels = [x.name for x in machine.sensor if x.kind == "wheel"]
     readings: dict[str, ca.SX] = {}
@@ -434,14 +450,13 @@ def _readings(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX,
         exact = value
         for e in acting:
             if e.placed.effect.reading is not None and e.placed.sensor == sensor.name:
-                value = value + e.placed.effect.reading(e.scene, exact, body.index, e.values)
+                value = value + e.placed.effect.reading(e.view, exact, body.index, e.values)
         readings[sensor.name] = value
     return ca.vertcat(*readings.values(), ca.SX(0, 1)), tuple(readings)
 
 
 def contact_lines(s: SymbolicSample) -> ca.Function:
-    """q -> (4, n_contacts): where the middle of each contact is on the ground, x, y, and the way from its right end to
-    its left one [m]."""
+    """Build q -> (4, n_contacts) [m]: ground position x, y of each contact's middle, vector from right to left end."""
     machine, R = s.machine, mechanics.rot_z(s.heading)
     root = ca.vertcat(*[s.at[c] for c in machine.body[0].coordinates[:2]], 0) if machine.planar else ca.SX(3, 1)
     found = []
@@ -454,7 +469,7 @@ def contact_lines(s: SymbolicSample) -> ca.Function:
 
 
 def kinematics(s: SymbolicSample, slips: Mapping[str, ca.SX]) -> ca.Function:
-    """(q, nu) -> dq, slips, wheel rates, lateral and longitudinal speed of each body's origin, its ground position."""
+    """Build (q, nu) -> dq, slips, wheel rates; position on the ground, velocity and angular velocity of each body."""
     machine, at, rate, frames, nu = s.machine, s.at, s.rate, s.frames, s.nu
     dq = nu
     if machine.planar:

@@ -1,4 +1,4 @@
-"""What a model's parameters are, in words that need no table of symbols."""
+"""Descriptions of a model's parameters in words."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ ACTING = {
 
 
 def parameter_descriptions(model: Model) -> dict[str, str]:
-    """Every base parameter's name -> what it is and of which body: "viscous friction, JOINT". One that stands for
-    several is called regrouped; its sum is `model.base.grouping`."""
+    """Describe every base parameter, by name: "viscous friction, JOINT".
+
+    One that groups several standard parameters is called regrouped; `model.base.grouping` gives its sum.
+    """
     words = {name: text for body in model.machine.body for name, text in _body_descriptions(body).items()}
     masses = {f"M{b.index}" for b in model.machine.body if b.inertia is not None}
     found: dict[str, str] = {}
@@ -33,7 +35,7 @@ def parameter_descriptions(model: Model) -> dict[str, str]:
 
 
 def _body_descriptions(body: Body) -> dict[str, str]:
-    """A body's standard parameters: its inertia by the body's name, what acts on it by the joint's or contact's."""
+    """Describe a body's standard parameters: inertia by the body's name, forces by the joint's or contact's."""
     k, own, place = body.index, body.name.replace("_", " "), body.where.replace("_", " ")
     table = {f"M{k}": f"mass, {own}"}
     table |= {f"{letters}{k}": f"{what}, {own}" for letters, what in MOMENTS.items()}
@@ -44,7 +46,7 @@ def _body_descriptions(body: Body) -> dict[str, str]:
 
 
 def _effect_description(name: str) -> str:
-    """An effect's amount or shape, NAME@WHERE[.SHAPE]."""
+    """Describe an effect's magnitude or shape, NAME@WHERE[.SHAPE]."""
     effect, _, place = name.replace("_", " ").partition("@")
     place, _, shape = place.partition(".")
     return f"{shape} of {effect}, {place}" if shape else f"{effect}, {place}"

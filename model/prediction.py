@@ -1,9 +1,8 @@
-"""What each equation of a machine predicts, its parameters, and its regressor.
+"""The model of a machine: prediction, base parameters and regressor.
 
-Rows are the equations of motion written as the paper identifies them: an actuated row predicts the measured torque
-(dynamics + friction - contact + offset u0), any other row predicts zero. The regressor is the exact Jacobian of that
-prediction; nothing in the project spells the physics a second time. Effects of the machine file (`effects`) are part of
-the prediction, and their amounts are parameters like the others.
+Rows are the equations of motion in the paper's form: an actuated row predicts the measured torque (dynamics + friction
+- contact + offset u0), any other row predicts zero. The regressor is the exact Jacobian of that prediction, so the
+physics is written once. Effects of the machine file are part of the prediction; their magnitudes are parameters.
 """
 
 from __future__ import annotations
@@ -27,8 +26,11 @@ from excite.model.mechanics import independent_columns
 class BaseParameters:
     """The identifiable combinations of the standard parameters (Gautier, 1991).
 
-    `matrix` (n_base, n_standard): base values = matrix @ standard values. `independent`: the standard column that
-    stands for each base parameter. `invisible`: standard parameters that no motion shows.
+    names, units (n_base): of the base parameters.
+    independent (n_base): column of the standard parameter that stands for each base parameter.
+    matrix (n_base, n_standard): base values = matrix @ standard values.
+    invisible: standard parameters that no motion shows.
+    standard (n_standard): names of the standard parameters.
     """
 
     names: tuple[str, ...]
@@ -40,19 +42,19 @@ class BaseParameters:
 
     @cached_property
     def expand(self) -> np.ndarray:
-        """(n_standard, n_base): standard parameters with the same motions as the base parameters X (the rest zero)."""
+        """Map base values to standard values with the same motions (n_standard, n_base), all others zero."""
         matrix = np.zeros((len(self.standard), len(self.names)))
         matrix[list(self.independent), range(len(self.names))] = 1.0
         return matrix
 
     def grouping(self, name: str) -> dict[str, float]:
-        """The standard parameters that make up a base parameter, with their coefficients."""
+        """Return the standard parameters that make up a base parameter, with their coefficients."""
         row = self.matrix[self.names.index(name)]
         return {s: float(c) for s, c in zip(self.standard, row, strict=True) if c != 0}
 
 
 def standard_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
-    """Nominal value [SI] and unit of every standard parameter, chassis first, then joint by joint.
+    """Return nominal value [SI] and unit of every standard parameter: bodies first, then joints.
 
     The order decides which column of a dependent set stands for it, and it is the order of every table.
     """
@@ -78,8 +80,7 @@ def standard_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
 
 
 def required_signs(machine: Machine) -> dict[str, float]:
-    """The sign that standard parameters must have, of those that have one by themselves: joints only brake and the soil
-    only resists."""
+    """Return the physically required sign of friction (+1) and contact stiffness (-1), by standard parameter."""
     found: dict[str, float] = {}
     for body in machine.body:
         if body.friction is not None:
@@ -98,16 +99,20 @@ def _inertial_unit(name: str) -> str:
 class Model:
     """A machine's equations as CasADi functions; build it with `build`.
 
-    Samples: q (n_q,) coordinates [rad, m] with the pose on the ground; nu (n_q,) velocities and a (n_q,) their time
-    derivatives, those of a planar root in its own axes; u (n_u,) torques that the motors deliver [N m]. Functions
-    take (n_q, N) batches as they are. `nominal`, `scale`: (n_base,), of the base parameters X, behind which come the
-    amounts of the machine's effects. With effects, functions of a sample take two more arguments, `beside`: u, and
-    what the effects remember, z (n_z,), whose rates are `flow` (q, nu, u, z, X) and which starts as `fresh`. The last
-    ones of z, `mapped`, have no rate: a map of the ground tells them, at every sample anew (`ground`, axles: q -> where
-    contacts are).
+    A sample is q (n_q,) coordinates [rad, m], the pose on the ground; nu (n_q,) velocities and a (n_q,) their time
+    derivatives, those of a planar root in its own axes; u (n_u,) torques delivered by the motors [N m]; z (n_z,) memory
+    states of the effects. Functions also take batches (n_q, N). Without effects (`plain`) they take no u and z.
 
-    read: (q, nu, wheels, u, z, X) -> exact readings of the sensors that `readable` names. channels: (t, X) -> gain,
-    offset, delay (n_u,) of the torque sensors.
+    nominal, scale (n_base,): of the base parameters X; magnitudes of effects come last.
+    predict: (q, nu, a, p, u, z) -> Y (n_q,), p the standard parameters; standard_regressor: its Jacobian to p.
+    balance: as predict, but the torques delivered, without gain, offset and delay of the torque sensors.
+    kinematics: (q, nu) -> dq, slips, wheel rates, and per body position, velocity and angular velocity.
+    nonlinear: standard parameters in which the prediction is not linear.
+    flow: (q, nu, u, z, X) -> dz. It is zero for the last ones of z, `map_inputs`, which `new_ground_map` gives at every
+        sample; contact_lines: q -> ground position and width vector of the contacts.
+    read: (q, nu, wheels, u, z, X) -> exact readings of the sensors `reading_names`.
+    channels: (t, X) -> gain, offset, delay (n_u,) of the torque sensors.
+    fit_sensor_effects, fit_shapes: the arguments of `build`.
     """
 
     machine: Machine
@@ -125,62 +130,64 @@ class Model:
     flow: ca.Function
     read: ca.Function
     channels: ca.Function
-    readable: tuple[str, ...]
+    reading_names: tuple[str, ...]
     memory: tuple[str, ...]
-    mapped: tuple[str, ...]
-    axles: ca.Function
+    map_inputs: tuple[str, ...]
+    contact_lines: ca.Function
     effects: tuple[PlacedEffect, ...]
-    flaws: bool
-    shapes: bool
+    fit_sensor_effects: bool
+    fit_shapes: bool
 
     @property
     def plain(self) -> bool:
-        """Whether the machine file names no effect."""
+        """True if the machine file has no effects."""
         return not self.effects
 
     @property
-    def fresh(self) -> np.ndarray:
-        """What effects remember at rest, before a log begins (n_z,)."""
+    def initial_memory(self) -> np.ndarray:
+        """Memory states of the effects at rest, before a log begins (n_z,)."""
         return np.zeros(len(self.memory))
 
     @cached_property
     def positive(self) -> np.ndarray:
-        """Which parameters make sense above zero only (n_base,): some effects' amounts, shapes that aren't signed."""
+        """Mask (n_base,) of parameters that must be above zero: some magnitudes, and unsigned shapes."""
         above = {e.name for e in self.effects if e.effect.positive}
         above |= {f"{e.name}.{s}" for e in self.effects for s, shape in e.effect.shapes.items() if not shape.signed}
         return np.array([name in above for name in self.base.names])
 
-    def ground(self) -> Callable[[np.ndarray], np.ndarray]:
-        """A map of ground on which no contact has been yet: what it tells (n_contacts MOST,) when the machine has come
-        to coordinates (n_q,), called for one sample of a motion after the other."""
+    def new_ground_map(self) -> Callable[[np.ndarray], np.ndarray]:
+        """Return a function that enters contacts on a new map of the ground, one sample of a motion after another.
+
+        It takes coordinates (n_q,) and returns the map's inputs (n_contacts MAX_PASSES,).
+        """
         contacts = [b.contact for b in self.machine.contacts if b.contact is not None]
         ground = GroundMap([float(c.width) for c in contacts])
-        q, axles = np.zeros(len(self.coordinates)), np.zeros((len(contacts), 4))
-        told = self.axles.buffer()
-        told[0].set_arg(0, q.data)
-        told[0].set_res(0, axles.data)
+        q, lines = np.zeros(len(self.coordinates)), np.zeros((len(contacts), 4))
+        buffered = self.contact_lines.buffer()
+        buffered[0].set_arg(0, q.data)
+        buffered[0].set_res(0, lines.data)
 
-        def come(to: np.ndarray) -> np.ndarray:
+        def enter(to: np.ndarray) -> np.ndarray:
             q[:] = to
-            told[1]()  # not by itself: its buffer must not be gone
-            return ground.come(axles)
+            buffered[1]()  # through the pair: the buffer must outlive the call
+            return ground.update(lines)
 
-        return come
-
-    @property
-    def lasting(self) -> int:
-        """How many of z have a rate: those before what is `mapped`."""
-        return len(self.memory) - len(self.mapped)
+        return enter
 
     @property
-    def remembered(self) -> np.ndarray:
-        """How well `fresh` is known at the start of a log, of what is `lasting`."""
-        own = [m.spread for e in self.effects for _, m in e.memory.values()]
+    def n_dynamic_memory(self) -> int:
+        """Number of memory states that have a rate: those before `map_inputs`."""
+        return len(self.memory) - len(self.map_inputs)
+
+    @property
+    def initial_memory_std(self) -> np.ndarray:
+        """Standard deviation of `initial_memory` at the start of a log (n_dynamic_memory,)."""
+        own = [m.initial_std for e in self.effects for _, m in e.memory.values()]
         return np.array([1e-6] * ("time" in self.memory) + own)
 
     @cached_property
     def rows(self) -> tuple[str, ...]:
-        """Names of the equations: one per coordinate."""
+        """Names of the equations, one per coordinate."""
         return self.coordinates
 
     @cached_property
@@ -190,22 +197,22 @@ class Model:
 
     @property
     def expand(self) -> np.ndarray:
-        """(n_standard, n_base): standard parameters with the same motions as the base parameters X (the rest zero)."""
+        """The base parameters' `expand` (n_standard, n_base)."""
         return self.base.expand
 
     @cached_property
     def offsets(self) -> np.ndarray:
-        """(n_u, n_base): takes the offsets u0 of the torque channels [N m, N] out of the base parameters X."""
+        """Matrix (n_u, n_base) that selects the torque offsets u0 [N m, N] from the base parameters X."""
         return self.expand[[self.base.standard.index(f"u{b.index}0") for b in self.machine.actuated]]
 
     @cached_property
     def regressor(self) -> ca.Function:
-        """(q, nu, a) -> W (n_rows, n_base): the exact Jacobian of the prediction, so that Y = W X.
+        """(q, nu, a) -> W (n_rows, n_base), the exact Jacobian of the prediction: Y = W X.
 
-        With a batch of N samples the result is (n_rows, n_base N), sample after sample.
+        With effects u and z are further arguments. A batch of N samples gives (n_rows, n_base N), sample after sample.
         """
         q, nu, a = self.symbols()
-        beside = self.beside()
+        beside = self.effect_symbols()
         W = self.standard_regressor(q, nu, a, ca.DM(self.expand @ self.nominal), *beside)
         names = ["q", "nu", "a", "u", "z"][: 3 + len(beside)]
         return ca.Function(
@@ -214,7 +221,7 @@ class Model:
 
     @cached_property
     def acceleration(self) -> ca.Function:
-        """(q, nu, u, z, X) -> a, without z for a plain model: forward dynamics, mass matrix solved by LDL'."""
+        """(q, nu, u, z, X) -> a: forward dynamics, the mass matrix solved by LDL'. A plain model takes no z."""
         q, nu, _ = self.symbols()
         u, X = ca.SX.sym("u", len(self.inputs)), ca.SX.sym("X", len(self.base.names))
         z = () if self.plain else (ca.SX.sym("z", len(self.memory)),)
@@ -222,13 +229,14 @@ class Model:
         return ca.Function("acceleration", [q, nu, u, *z, X], [self.accelerate(q, nu, u, X, *z)], names, ["a"])
 
     @cached_property
-    def felt(self) -> tuple[str, ...]:
-        """Coordinates that the equations depend on, found by numbers: a balanced wheel's angle drops out only as
-        cos^2 + sin^2 = 1, which no look at the expressions tells.
+    def active_coordinates(self) -> tuple[str, ...]:
+        """Coordinates that the equations depend on, found numerically.
+
+        The expressions do not show it: a balanced wheel's angle drops out only because cos^2 + sin^2 = 1.
         """
         q, nu, a = self.symbols()
         p = ca.DM(self.expand @ self.nominal)
-        beside = self.beside()
+        beside = self.effect_symbols()
         slope = ca.Function("slope", [q, nu, a, *beside], [ca.jacobian(self.predict(q, nu, a, p, *beside), q)])
         rng = np.random.default_rng(0)
         change = np.zeros(len(self.coordinates))
@@ -241,14 +249,14 @@ class Model:
 
     @cached_property
     def pivots(self) -> ca.Function:
-        """(q, X) -> (n_q,) pivots of the mass matrix: all > 0 exactly where it is positive definite."""
+        """(q, X) -> pivots of the mass matrix (n_q,), all > 0 exactly if it is positive definite."""
         q, nu, _ = self.symbols()
         X = ca.SX.sym("X", len(self.base.names))
         D, _, _ = ca.ldl(self.equations(q, nu, X)[0])
         return ca.Function("pivots", [q, X], [D], ["q", "X"], ["D"])
 
     def accelerate(self, q: ca.SX, nu: ca.SX, u: ca.SX, X: ca.SX | ca.DM, z: ca.SX | None = None) -> ca.SX:
-        """Forward dynamics as an expression; with numbers for X the graph is smaller and faster."""
+        """Return the acceleration as an expression; numbers for X make the graph smaller and faster."""
         M, bias = self.equations(q, nu, X, u, z)
         drive = ca.SX(len(self.coordinates), 1)
         for k, row in enumerate(self.actuated):
@@ -259,9 +267,9 @@ class Model:
     def equations(
         self, q: ca.SX, nu: ca.SX, X: ca.SX | ca.DM, u: ca.SX | None = None, z: ca.SX | None = None
     ) -> tuple[ca.SX, ca.SX]:
-        """Mass matrix (n_q, n_q) and bias (n_q,): M a + bias = the torques u that the sensors feel, flaws aside.
+        """Return mass matrix (n_q, n_q) and bias (n_q,): M a + bias = u, the delivered torques [N m].
 
-        Of effects that answer to torques or remember, u and z are zero where not given.
+        u and z matter to effects only; they are zero by default.
         """
         p = ca.mtimes(ca.sparsify(ca.DM(self.expand)), X)
         a = ca.SX.sym("a", len(self.coordinates))
@@ -269,37 +277,38 @@ class Model:
         beside = () if self.plain else (none[0] if u is None else u, none[1] if z is None else z)
         return ca.jacobian(self.balance(q, nu, a, p, *beside), a), self.balance(q, nu, 0, p, *beside)
 
-    def beside(self) -> tuple[ca.SX, ...]:
-        """Symbols of what functions of a sample take beside q, nu and a: u and z with effects, nothing without."""
+    def effect_symbols(self) -> tuple[ca.SX, ...]:
+        """Return symbols of the further arguments (u, z) of a model with effects, () of a plain one."""
         return () if self.plain else (ca.SX.sym("u", len(self.inputs)), ca.SX.sym("z", len(self.memory)))
 
-    def of(self, machine: Machine) -> Model:
-        """The same kind of model of a changed machine. Raises MachineError."""
-        return build(machine, self.flaws, self.shapes)
+    def for_machine(self, machine: Machine) -> Model:
+        """Build the model of a changed machine with the same options. Raises MachineError."""
+        return build(machine, self.fit_sensor_effects, self.fit_shapes)
 
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         n = len(self.coordinates)
         return ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
 
-    def stacked(self, q: np.ndarray, nu: np.ndarray, a: np.ndarray, *beside: np.ndarray) -> np.ndarray:
-        """The regressor of N samples (n_q, N) as (N, n_rows, n_base); with effects also u (n_u, N), z (n_z, N)."""
+    def stacked_regressor(self, q: np.ndarray, nu: np.ndarray, a: np.ndarray, *beside: np.ndarray) -> np.ndarray:
+        """Return the regressor (N, n_rows, n_base) of N samples: q, nu, a (n_q, N); with effects also u, z."""
         n = q.shape[1]
         W: np.ndarray = self.regressor(q, nu, a, *beside).full()
         return W.reshape(W.shape[0], n, len(self.base.names)).transpose(1, 0, 2)
 
     def base_values(self, standard: Mapping[str, float] | None = None) -> np.ndarray:
-        """Base parameter values (n_base,) of standard values by name, the nominal ones where not given."""
+        """Return base parameter values (n_base,) from standard values by name, nominal by default."""
         nominal = {n: v for n, (v, _) in standard_parameters(self.machine).items()}
         values = nominal | dict(standard or {})
         X: np.ndarray = self.base.matrix @ np.array([values[n] for n in self.base.standard])
         return X
 
 
-def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
-    """The equations of a machine, with its base parameters found numerically.
+def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = False) -> Model:
+    """Build the model of a machine, its base parameters found numerically.
 
-    The amounts of its effects are parameters behind the base parameters; without `flaws` those that no equation of
-    motion shows, since they sit in a sensor, are constants; with `shapes` the shapes of effects are parameters as well.
+    Magnitudes of the machine's effects are parameters behind the base parameters.
+    fit_sensor_effects: False makes constants of magnitudes that only sensors show, no equation of motion.
+    fit_shapes: shapes of effects are parameters, too.
     Raises MachineError if no parameter is left, or for an effect that the machine can't have.
     """
     table = standard_parameters(machine)
@@ -322,13 +331,13 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
                 f"{machine.name}: scale.{s}: the nominal value is 0, give a scale > 0 in the machine file"
             )
     if placed:
-        amounts = _effect_parameters(machine, placed, shapes)
-        if not flaws:
-            shown = _visible_parameters(equations(machine, (*table, *amounts), placed))
-            amounts = {name: amount for name, amount in amounts.items() if name in shown}
-        base = _append_parameters(base, amounts)
-        nominal = np.concatenate([nominal, [v for v, _, _ in amounts.values()]])
-        scale = np.concatenate([scale, [size for _, _, size in amounts.values()]])
+        magnitudes = _effect_parameters(machine, placed, fit_shapes)
+        if not fit_sensor_effects:
+            shown = _visible_parameters(equations(machine, (*table, *magnitudes), placed))
+            magnitudes = {name: row for name, row in magnitudes.items() if name in shown}
+        base = _append_parameters(base, magnitudes)
+        nominal = np.concatenate([nominal, [v for v, _, _ in magnitudes.values()]])
+        scale = np.concatenate([scale, [size for _, _, size in magnitudes.values()]])
         found = equations(machine, base.standard, placed)
     return Model(
         machine,
@@ -346,79 +355,79 @@ def build(machine: Machine, flaws: bool = True, shapes: bool = False) -> Model:
         _as_base_function(found.flow, base),
         _as_base_function(_with_rate_readings(machine, found), base),
         _as_base_function(found.channels, base),
-        found.readable,
+        found.reading_names,
         found.memory,
-        found.mapped,
+        found.map_inputs,
         contact_lines(found.sample),
         placed,
-        flaws,
-        shapes,
+        fit_sensor_effects,
+        fit_shapes,
     )
 
 
 @lru_cache(maxsize=8)
 def build_cached(machine: str) -> Model:
-    """The model of a machine as JSON, built once in a process: CasADi functions are cheaper to build than to send."""
+    """Build the model of a machine given as JSON, once per process: building costs less than sending functions."""
     return build(Machine.model_validate_json(machine))
 
 
 def _visible_parameters(found: Equations) -> set[str]:
-    """Standard parameters that the prediction depends on."""
+    """Return the standard parameters that the prediction depends on."""
     columns = found.standard_regressor.sparsity_out(0).get_triplet()[1]
     return {list(found.sample.by_name)[k] for k in set(columns)}
 
 
 def _effect_parameters(
-    machine: Machine, placed: Sequence[PlacedEffect], shapes: bool
+    machine: Machine, placed: Sequence[PlacedEffect], fit_shapes: bool
 ) -> dict[str, tuple[float, str, float]]:
-    """Value, unit and typical size of every shape and amount that is a parameter, by name: amounts last."""
+    """Return value, unit and typical size of every shape and magnitude that is a parameter; magnitudes last."""
     found: dict[str, tuple[float, str, float]] = {}
     for e in placed:
         site = Site.of(machine, e.bodies)
         for name, (key, unit) in e.parameters.items():
             if key == "A":
-                size = abs(e.effect.amount(site))
-            elif shapes and not e.effect.shapes[key].whole:
+                size = abs(e.effect.typical_magnitude(site))
+            elif fit_shapes and not e.effect.shapes[key].whole:
                 shape = e.effect.shapes[key]
                 size = 1.0 if shape.signed else max(abs(shape.default * shape.size(site)), abs(e.values[key])) / 4
             else:
                 continue
             found[name] = e.values[key], unit, max(size, abs(e.values[key]) if key == "A" else 0.0)
-    amounts = {e.name: found.pop(e.name) for e in placed}
-    return found | amounts
+    magnitudes = {e.name: found.pop(e.name) for e in placed}
+    return found | magnitudes
 
 
-def _append_parameters(base: BaseParameters, amounts: Mapping[str, tuple[float, str, float]]) -> BaseParameters:
-    """Base parameters with amounts behind them, each standing for itself."""
-    n, k, m = len(base.names), len(base.standard), len(amounts)
+def _append_parameters(base: BaseParameters, magnitudes: Mapping[str, tuple[float, str, float]]) -> BaseParameters:
+    """Append parameters of effects to the base parameters, each independent of all others."""
+    n, k, m = len(base.names), len(base.standard), len(magnitudes)
     matrix = np.zeros((n + m, k + m))
     matrix[:n, :k], matrix[n:, k:] = base.matrix, np.eye(m)
     return BaseParameters(
-        base.names + tuple(amounts),
-        base.units + tuple(unit for _, unit, _ in amounts.values()),
+        base.names + tuple(magnitudes),
+        base.units + tuple(unit for _, unit, _ in magnitudes.values()),
         base.independent + tuple(range(k, k + m)),
         matrix,
         base.invisible,
-        base.standard + tuple(amounts),
+        base.standard + tuple(magnitudes),
     )
 
 
 def _with_rate_readings(machine: Machine, found: Equations) -> ca.Function:
-    """What sensors read; of those of a rate, how their angle and what is wrong with it change along the motion."""
+    """Return the readings; a rate sensor reads the time derivative of its angle and of the angle's error."""
     rates = {s.name for s in machine.sensor if s.is_rate}
-    if not rates & set(found.readable):
+    if not rates & set(found.reading_names):
         return found.read
     q, nu, wheels, u, z, p = found.read.sx_in()
     reading = found.read(q, nu, wheels, u, z, p)
     dq, _, rolled, *_ = kinematics(found.sample, found.slips)(q, nu)
-    for k, name in enumerate(found.readable):
+    for k, name in enumerate(found.reading_names):
         if name in rates:
             reading[k] = ca.jtimes(reading[k], ca.vertcat(q, wheels), ca.vertcat(dq, rolled))
     return ca.Function("read", [q, nu, wheels, u, z, p], [reading])
 
 
 def _as_base_function(function: ca.Function, base: BaseParameters) -> ca.Function:
-    """A function whose last argument is standard parameters, of base parameters instead."""
+    """Turn a function of standard parameters (its last argument) into one of base parameters."""
     arguments = function.sx_in()[:-1]
     X = ca.SX.sym("X", len(base.names))
     results = function.call([*arguments, ca.mtimes(ca.sparsify(ca.DM(base.expand)), X)])
@@ -426,7 +435,7 @@ def _as_base_function(function: ca.Function, base: BaseParameters) -> ca.Functio
 
 
 def _check_names(machine: Machine, standard: tuple[str, ...]) -> None:
-    """Names that the file gives to parameters or scales must exist, or a misspelt one would change nothing."""
+    """Raise MachineError for names of parameters or scales that don't exist: a misspelt one would change nothing."""
     for name in machine.parameter_names:
         if name not in standard:
             raise MachineError(
@@ -441,10 +450,10 @@ def _check_names(machine: Machine, standard: tuple[str, ...]) -> None:
 
 
 def base_parameters(machine: Machine, W: ca.Function, p: np.ndarray, units: dict[str, str]) -> BaseParameters:
-    """Base parameters by QR of the standard regressor over random motions (Gautier, 1991).
+    """Find base parameters by QR of the standard regressor over random motions (Gautier, 1991).
 
-    A column that depends on columns before it is grouped into them; coefficients are cleaned of rounding.
-    Raises MachineError when no parameter can be seen.
+    A column that depends on columns before it is grouped into them; coefficients are cleaned of rounding errors.
+    Raises MachineError if no motion shows any parameter.
     """
     standard = tuple(units)
     n = len(machine.coordinates)

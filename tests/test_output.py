@@ -99,8 +99,8 @@ def test_what_is_read_is_not_written_over(tmp_path: Path, monkeypatch: pytest.Mo
     with output.new_folder(tmp_path / "o") as place:
         (place / output.SUMMARY).write_text("{}")
     for given in (tmp_path / "o", tmp_path / "o" / "log.csv"):
-        with pytest.raises(FolderError, match="which is read"):
+        with pytest.raises(FolderError, match="contains the input"):
             output.check_out_folder(tmp_path / "o", [given])
     monkeypatch.chdir(tmp_path / "o")
-    with pytest.raises(FolderError, match="the folder that you are in"):
+    with pytest.raises(FolderError, match="the current folder"):
         output.check_out_folder(Path())

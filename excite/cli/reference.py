@@ -90,7 +90,7 @@ def effects_page() -> str:
             lines += [f"On va12, at a typical size: {', '.join(typical)}", ""]
         if e.shapes:
             bodies, _ = next(iter(sites.values()), ((1,), None))
-            beside = e.beside(Site.of(va12, bodies))
+            beside = e.extra_trials(Site.of(va12, bodies))
             lines += _table(
                 "shape | unit | default | looked for at | meaning",
                 (_shape(n, s) for n, s in e.shapes.items()),
@@ -104,7 +104,7 @@ def effects_page() -> str:
 
 
 def _typical(machine: Machine, e: Effect, bodies: tuple[int, ...]) -> float:
-    return e.amount(Site.of(machine, bodies))
+    return e.typical_magnitude(Site.of(machine, bodies))
 
 
 def _amount(e: Effect) -> str:

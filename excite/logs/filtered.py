@@ -50,7 +50,7 @@ def _blocks(model: Model, s: Samples, first: int, last: int, factor: int, block:
     for at in range(0, len(kept), count):
         mine = kept[at : at + count]
         low, high = max(first, mine[0] - reach), min(last, mine[-1] + 1 + reach)
-        W = model.stacked(*(x[:, low:high] for x in (s.q, s.nu, s.a, *s.beside))).transpose(1, 0, 2)
+        W = model.stacked_regressor(*(x[:, low:high] for x in (s.q, s.nu, s.a, *s.beside))).transpose(1, 0, 2)
         yield (W if factor == 1 else smooth(W, factor))[:, mine - low]
 
 
@@ -115,8 +115,8 @@ def remember(model: Model, q: np.ndarray, nu: np.ndarray, u: np.ndarray, X: np.n
     n_q, n_u, sample = len(model.coordinates), len(model.inputs), 1 / float(model.machine.sampling_hz)
     at, z = ca.SX.sym("at", 2 * n_q + n_u), ca.SX.sym("z", len(model.memory))
     rate = model.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q :], z, ca.DM(X))
-    over = passes(model, q, nu, sample) if model.mapped else np.zeros((len(q), 0))
-    return implicit(ca.Function("flow", [z, at], [rate]), model.fresh, np.hstack([q, nu, u]), sample, over)
+    over = passes(model, q, nu, sample) if model.map_inputs else np.zeros((len(q), 0))
+    return implicit(ca.Function("flow", [z, at], [rate]), model.initial_memory, np.hstack([q, nu, u]), sample, over)
 
 
 def passes(model: Model, q: np.ndarray, nu: np.ndarray, step: float) -> np.ndarray:
@@ -143,7 +143,7 @@ def passes(model: Model, q: np.ndarray, nu: np.ndarray, step: float) -> np.ndarr
         ):
             if k is not None:
                 at[:, k] = own
-    ground = model.ground()
+    ground = model.new_ground_map()
     return np.array([ground(one) for one in at])
 
 

@@ -116,7 +116,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
             signals[sensor.column] = (when, number, sensor.unit)
             continue
         readings[sensor.name] = values
-        signals[" - ".join(sensor.columns)] = (when, values, machine.si(sensor))
+        signals[" - ".join(sensor.columns)] = (when, values, machine.si_unit(sensor))
         jumps: list[str] = []
         _caught(lambda s=sensor, v=values: log.check_values(s, v, rate, machine, ""), jumps)  # type: ignore[misc]
         speed = _speed(sensor, values[unbroken], table.iloc[unbroken], machine) if jumps else ""

@@ -319,7 +319,7 @@ def _scale(sensor: Sensor, body: Body, machine: Machine, torque: np.ndarray) -> 
     if body.limit.torque is None:
         return ""
     top, most, name = float(np.abs(torque).max()), float(body.limit.torque), " - ".join(sensor.columns)
-    said = f"column {name}: the largest torque is {top:.3g} {machine.si(sensor)}, the drive's limit {most:g}"
+    said = f"column {name}: the largest torque is {top:.3g} {machine.si_unit(sensor)}, the drive's limit {most:g}"
     if 0 < top < SMALL * most:
         larger = THOUSAND.get(sensor.unit) if sensor.factor is None else None
         if larger is None:

@@ -62,7 +62,7 @@ def examine(model: Model, log: Log) -> Examination:
             shown = ", ".join(str(r + 1) for r in rows[:5]) + (", ..." if len(rows) > 5 else "")
             notes.append(
                 f"{log.source}: column {sensor.column}: {len(rows)} spike{'s' if len(rows) > 1 else ''} of up to"
-                f" {size:.3g} {model.machine.si(sensor)} replaced by the mean of the neighbours (row {shown})"
+                f" {size:.3g} {model.machine.si_unit(sensor)} replaced by the mean of the neighbours (row {shown})"
             )
         held = find_dropouts(sensor, values[sensor.name])
         if held:

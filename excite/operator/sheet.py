@@ -384,6 +384,6 @@ def sensor_line(machine: Machine, sensor: Sensor) -> str:
     if sensor.counts_per_turn is not None:
         extra.append(f"{float(sensor.counts_per_turn):g} counts per turn")
     if sensor.noise is not None:
-        extra.append(f"noise below {float(sensor.noise):g} {machine.si(sensor)}")
+        extra.append(f"noise below {float(sensor.noise):g} {machine.si_unit(sensor)}")
     kit = "" if "paper" in sensor.kits else "; optional"
     return f"{sensor.column} [{sensor.unit}]: {what}" + (f"; {', '.join(extra)}" if extra else "") + kit

@@ -1,18 +1,16 @@
-"""A person at the levers: follows speed and steered angles that can be seen coming, slowly and not quite.
+"""A driver model: a person who follows given speed and steering angles with preview, delay and slow errors.
 
-People do not play back torques. They set a speed lever and what steers; the hydrostatic drive makes the torques that
-bring the driven contacts to that speed and the steered joints to that rate, within the machine's limits.
+A driver sets a speed lever and a steering lever. The hydrostatic drive then produces the torques that bring the driven
+contacts to that speed and the steered joints to that rate, within the machine's limits.
 
-What is assumed of the person: the trace is seen ahead, as on the road (MacAdam, "Application of an optimal preview
-control for simulation of closed-loop automobile driving", IEEE Trans. SMC 11(6), 1981; Sheridan, 1966), so the hand
-moves early by about its own delay and only what the machine is late is left. What was not foreseen is corrected from
-what is seen, a reaction time late, against what the person expects of the machine: its usual lag is no error. The hand
-is slow (second order, McRuer and Jex, 1967) and all that it does goes through it, its slow errors too, so that nothing
-in the torques is faster than hand, drive and machine. With the lever in neutral there are no errors. Who steers several
-joints looks at each of them and at the speed less often: deviations are corrected more slowly by that share, and the
-variance of the slow errors grows by it (Levison, Elkind and Ward, "Studies of multivariable manual control systems: a
-model for task interference", NASA CR-1746, 1971). Not assumed: fatigue, learning within a drive, coupling of speed and
-steering, the place on the lane.
+Preview: the trace is visible ahead, so the hand moves early by about its own delay (MacAdam, "Application of an optimal
+preview control for simulation of closed-loop automobile driving", IEEE Trans. SMC 11(6), 1981; Sheridan, 1966).
+Feedback: deviations from the response that the driver expects, the usual lag of the machine included, are corrected
+after a reaction time. Hand: a second-order low-pass (McRuer and Jex, 1967) that every command and slow error passes.
+Neutral: errors and corrections fade as the lever nears its detent. Attention: a driver who steers several joints
+corrects each deviation more slowly, and the variance of the slow errors grows by the same share (Levison, Elkind and
+Ward, "Studies of multivariable manual control systems: a model for task interference", NASA CR-1746, 1971).
+Left out: fatigue, learning within a drive, coupling of speed and steering, position on the lane.
 """
 
 from __future__ import annotations
@@ -27,23 +25,25 @@ from excite.model import Model
 from excite.model.machine import Body
 from excite.simulation.integrator import Motion, respond
 
-DRIVER_STREAM = 2  # stream of random numbers, apart from the sensors'
-RESPONSE_TIME = 0.3  # s, in which a hydrostatic drive brings what it moves to speed
-WALKING_SPEED = 1.0  # m/s
-HOLDING_RATE = 5.0  # 1/s, with which the oil in the steering cylinders brings a joint back that the soil pushed away
-WANDER_TIME = 2.0  # s, twice: time constants of the slow errors
-WATCHED_SIGNALS = 2  # speed and one angle: what the driver's numbers are of
-NEUTRAL_SPEED = 0.2  # m/s: below it the lever nears its detent, and errors and corrections fade with it
+DRIVER_STREAM = 2  # stream of random numbers, independent of the sensors'
+RESPONSE_TIME = 0.3  # s, time constant of speed under a hydrostatic drive; chosen
+WALKING_SPEED = 1.0  # m/s, speed at which the resistance to steering is evaluated; chosen
+HOLDING_RATE = 5.0  # 1/s, rate at which steering cylinders return a joint pushed away by the soil; chosen
+WANDER_TIME = 2.0  # s, both time constants of the slow errors; chosen
+WATCHED_SIGNALS = 2  # speed and one angle, for which the numbers of `Driver` hold
+NEUTRAL_SPEED = 0.2  # m/s, below which errors and corrections fade with the lever; chosen
 
 
 @dataclass(frozen=True)
 class Driver:
-    """delay [s] of reaction, bandwidth [Hz] of hand and lever, slow errors of speed [m/s] and angle [rad].
+    """Parameters of the driver model; the defaults are those of a practised operator.
 
-    `attention` [1/s]: how fast a deviation seen is corrected. `preview` [s]: how early the hand moves for what comes;
-    0.6 makes up for reaction and hand. `hydraulics` [Hz]: no torque follows the drive's control loop faster. The values
-    are of a practised operator; delays of 0.2-0.4 s and bandwidths below 1 Hz are usual in manual tracking (McRuer and
-    Jex, 1967), swash plates of pumps settle in 0.05-0.2 s.
+    delay_s: reaction time, usually 0.2-0.4 s in manual tracking (McRuer and Jex, 1967).
+    bandwidth_hz: of hand and lever, usually below 1 Hz.
+    speed_error_m_s, angle_error_rad: standard deviations of the slow errors.
+    attention: rate at which a visible deviation is corrected [1/s].
+    preview_s: lead of the hand; 0.6 s compensates reaction and hand.
+    hydraulics_hz: bandwidth of the drive's torque control; swash plates of pumps settle in 0.05-0.2 s.
     """
 
     delay_s: float = 0.3
@@ -55,9 +55,7 @@ class Driver:
     hydraulics_hz: float = 3.0
 
 
-STEADY_DRIVER = Driver(
-    speed_error_m_s=0.0, angle_error_rad=0.0
-)  # a person without slow errors: the middle of all people
+STEADY_DRIVER = Driver(speed_error_m_s=0.0, angle_error_rad=0.0)  # a driver without slow errors
 
 
 def follow(
@@ -69,10 +67,10 @@ def follow(
     seed: int = 0,
     q0: np.ndarray | None = None,
 ) -> Motion:
-    """The motion (N samples) of a machine whose driver follows speed (N,) [m/s] and joint angles (N, n) [rad].
+    """Simulate a driver who follows speed (N,) [m/s] and joint angles (N, n) [rad]; return the motion (N samples).
 
-    `angles` belong to the driven joints without a contact, in the order of the machine file. X (n_base,): the true
-    machine. Torque and torque-rate limits hold. Raises SimulationError, and ValueError for shapes that don't fit.
+    angles: of the driven joints without contact, in the order of the machine file. X (n_base,): the true machine.
+    Torque and torque-rate limits hold. Raises SimulationError, and ValueError for shapes that don't fit.
     """
     driver = driver or Driver()
     machine, rate = model.machine, float(model.machine.sampling_hz)
@@ -90,7 +88,7 @@ def follow(
     aimed = [_previewed(np.asarray(a, float), driver, rate) for a in angles.T]
     wandered = [a + blur * driver.angle_error_rad * _slow_errors(n, rate, rng) for a in aimed]
     turned = [np.gradient(a) * rate for a in wandered]
-    # lists: the loop below works sample by sample, where they are faster than arrays
+    # lists, as they are faster than arrays in a loop over samples
     expected = [_expected_response(x, driver, rate).tolist() for x in (foreseen, *aimed)]
     commands = [x.tolist() for x in (pushed, *turned)]
     hands = [_Hand(driver.bandwidth_hz, rate) for _ in commands]
@@ -141,54 +139,56 @@ def follow(
 
 
 class _Hand:
-    """Second-order low-pass (Butterworth), a sample at a time, at rest at first."""
+    """Second-order Butterworth low-pass, sample by sample, initially at rest."""
 
     def __init__(self, bandwidth: float, rate: float) -> None:
         b, a = _hand_filter(bandwidth, rate)
         self._b, self._a, self._z = b.tolist(), a.tolist(), (0.0, 0.0)
 
     def moved(self, x: float) -> float:
+        """Return the output for the next input."""
         y = self._b[0] * x + self._z[0]
         self._z = (self._b[1] * x - self._a[1] * y + self._z[1], self._b[2] * x - self._a[2] * y)
         return y
 
 
 def _hand_filter(bandwidth: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the coefficients b, a of the hand's low-pass."""
     b, a = scipy.signal.butter(2, bandwidth / (rate / 2))
     return np.asarray(b), np.asarray(a)
 
 
 def _previewed(wanted: np.ndarray, driver: Driver, rate: float) -> np.ndarray:
-    """What the hand aims at, sample by sample: the trace, `preview` early and a reaction late, held at its ends."""
+    """Shift a trace by preview minus reaction time, its ends held: the aim of the hand."""
     at = np.arange(len(wanted)) + round((driver.preview_s - driver.delay_s) * rate)
     return np.asarray(wanted[np.clip(at, 0, len(wanted) - 1)])
 
 
 def _expected_response(aimed: np.ndarray, driver: Driver, rate: float) -> np.ndarray:
-    """What the person expects of the machine: what the hand aims at, as late as hand and drive always are."""
+    """Return the response that the driver expects: the aim, delayed by hand and drive."""
     keep = np.exp(-1 / (RESPONSE_TIME * rate))
     slow = scipy.signal.lfilter(*_hand_filter(driver.bandwidth_hz, rate), aimed - aimed[0])
     return np.asarray(scipy.signal.lfilter([1 - keep], [1, -keep], slow) + aimed[0])
 
 
 def _slow_errors(n: int, rate: float, rng: np.random.Generator) -> np.ndarray:
-    """Slow errors (n,) of deviation 1, that fade in the first and the last two seconds."""
+    """Draw slow errors (n,) of standard deviation 1 that fade in the first and the last two seconds."""
     keep = np.exp(-1 / (WANDER_TIME * rate))
     shape = [1, -2 * keep, keep**2]
-    size = np.sqrt((1 + keep**2) / (1 - keep**2) ** 3)  # deviation of what the filter makes of white noise
-    before = round(5 * WANDER_TIME * rate)  # so that the errors are stationary from the first sample on
+    size = np.sqrt((1 + keep**2) / (1 - keep**2) ** 3)  # standard deviation of filtered white noise
+    before = round(5 * WANDER_TIME * rate)  # makes the errors stationary from the first sample on
     noise = scipy.signal.lfilter([1 / size], shape, rng.standard_normal(before + n))[before:]
     fade = np.clip(np.minimum(np.arange(n), np.arange(n)[::-1]) / rate / 2, 0, 1)
     return np.asarray(noise * fade)
 
 
 def drive_gains(model: Model) -> np.ndarray:
-    """(n_u,) torque per speed error [N m s/rad] of each drive: its reflected inertia to speed in RESPONSE.
+    """Return torque per rate error (n_u,) [N m s/rad] of each drive: its reflected inertia over RESPONSE_TIME.
 
-    Of a joint no less than what resists its turning at a WALK: oil that flows in has to go somewhere.
+    For a steered joint it is at least the resistance to turning at WALKING_SPEED, as the oil flow enforces its rate.
     """
     q, nu, _ = model.symbols()
-    dry = [f"Fs{b.index}" for b in model.machine.body]  # is the same at any speed
+    dry = [f"Fs{b.index}" for b in model.machine.body]  # independent of speed
     mass, force = model.equations(q, nu, ca.DM(np.where(np.isin(model.base.names, dry), 0.0, model.nominal)))
     at = ca.Function("at", [q, nu], [mass, ca.jacobian(force, nu)])
     names, still = model.coordinates, np.zeros(len(model.coordinates))
@@ -211,7 +211,7 @@ def drive_gains(model: Model) -> np.ndarray:
 
 
 def left_turn_sign(model: Model, body: Body) -> int:
-    """The sign of a joint's angle that, alone, turns the machine left when rolling forward.
+    """Return the sign of a joint's angle that, alone, turns the machine left when rolling forward.
 
     From pure rolling: the lateral speeds of all contacts vanish, which is linear in the chassis' speeds.
     """

@@ -1,8 +1,8 @@
-"""Motion from torques: the machine's equations integrated with the torques that the motors deliver.
+"""Forward simulation: the machine's equations integrated under the torques that the motors deliver.
 
-The contact is stiff near standstill (about 1500 1/s) and mild at speed. A Rosenbrock method (RODAS, order 4(3), Hairer
-and Wanner, "Solving Ordinary Differential Equations II", IV.7) takes a whole sample in one step with the exact
-Jacobian and splits it where its error estimate asks for that: at reversals, where friction and slip turn sharply.
+The contact is stiff near standstill (about 1500 1/s). A Rosenbrock method (RODAS, order 4(3), Hairer and Wanner,
+"Solving Ordinary Differential Equations II", IV.7) takes a whole sample in one step with the exact Jacobian, and splits
+it where its error estimate asks for it: at reversals, where friction and slip turn sharply.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from excite.errors import SimulationError
 from excite.model import Model
 from excite.simulation.rosenbrock import A_ROWS, C_ROWS, GAMMA, STAGE_TIMES, TIME_DERIVATIVE_WEIGHTS, lu, lu_solve
 
-TOLERANCE = 3e-7  # of one step, relative to each state's typical size
-MIN_STATE_SCALE = 0.1
-MIN_STEP_SHARE = 1e-7  # share of a sample below which a step is not split further
+TOLERANCE = 3e-7  # error of one step relative to each state's size; chosen for 1e-6 over 60 s
+MIN_STATE_SCALE = 0.1  # added to a state's size in the error estimate [SI]; chosen
+MIN_STEP_SHARE = 1e-7  # share of a sample below which a step is not split further; chosen
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion at the samples t (N,) [s].
+    """A motion at the times t (N,) [s].
 
-    q (N, n_q) coordinates [rad, m], nu (N, n_q) velocities and a (N, n_q) their derivatives (a planar root's in its
-    own axes), u (N, n_u) delivered torques [N m], wheels (N, n_wheels) angles of the measuring wheels [rad]; memory
-    (N, n_z): what effects remember.
+    q (N, n_q) [rad, m]: coordinates; nu, a (N, n_q): velocities and their derivatives, a planar root's in its own axes.
+    u (N, n_u) [N m]: delivered torques; wheels (N, n_wheels) [rad]: angles of the measuring wheels.
+    memory (N, n_z): memory states of effects.
     """
 
     t: np.ndarray
@@ -42,7 +42,7 @@ class Motion:
 
 
 def effect_inputs(model: Model, motion: Motion) -> tuple[np.ndarray, ...]:
-    """What the model's functions of a sample take beside q, nu and a of a motion: nothing, or with effects u and z."""
+    """Return the further arguments (u, z) of the model's functions along a motion, () for a plain model."""
     return () if model.plain else (motion.u.T, motion.memory.T)
 
 
@@ -53,11 +53,12 @@ def simulate(
     q0: np.ndarray | None = None,
     nu0: np.ndarray | None = None,
 ) -> Motion:
-    """The motion under torques (N, n_u) [N m] at the machine's sampling rate, linear between samples.
+    """Simulate the motion under torques (N, n_u) [N m] at the machine's sampling rate, linear between samples.
 
-    X (n_base,) base parameters, the nominal ones by default; q0, nu0 (n_q,) the start, at rest at zero by default.
-    Relative error below 1e-6 over 60 s. Raises SimulationError where the motion leaves the finite numbers or the mass
-    matrix is not positive definite, and ValueError for torques of the wrong shape.
+    X (n_base,): base parameters, nominal by default; q0, nu0 (n_q,): the start, at rest at zero by default.
+    Relative error below 1e-6 over 60 s.
+    Raises SimulationError for a motion that diverges or a mass matrix that is not positive definite, ValueError for
+    torques of the wrong shape.
     """
     torque = np.ascontiguousarray(torque, float)
     n_u = len(model.inputs)
@@ -76,10 +77,10 @@ def respond(
     q0: np.ndarray | None = None,
     nu0: np.ndarray | None = None,
 ) -> Motion:
-    """The motion under torques that answer to it: torque(k, state) gives (n_u,) [N m] at sample k.
+    """Simulate the motion under feedback: torque(k, state) gives the torques (n_u,) [N m] at sample k.
 
-    For sample 0 and k >= 1 the state is that of samples 0 and k - 1: q, nu, angles of the measuring wheels. Arguments
-    and errors otherwise as in `simulate`.
+    The state (q, nu, angles of the measuring wheels) is that of sample k - 1, for k = 0 the initial one. Other
+    arguments and errors are those of `simulate`.
     """
     parameters = np.ascontiguousarray(model.nominal if X is None else X, float)
     n_u, n_q = len(model.inputs), len(model.coordinates)
@@ -88,17 +89,17 @@ def respond(
     state = np.zeros(2 * n_q + n_w + len(model.memory))
     state[:n_q] = 0.0 if q0 is None else q0
     state[n_q : 2 * n_q] = 0.0 if nu0 is None else nu0
-    state[2 * n_q + n_w :] = model.fresh
+    state[2 * n_q + n_w :] = model.initial_memory
     driven = np.empty((samples, n_u))
     history = _integrate(step, state, driven, torque, parameters, 1.0 / rate, _map_updater(model))
-    finite = np.isfinite(history).all(axis=1)  # an error estimate of many states overlooks one that is no number
+    finite = np.isfinite(history).all(axis=1)  # the maximum norm of the error can miss a NaN
     if not finite.all():
         raise SimulationError(
-            f"the motion is no number any more at t = {int(np.argmin(finite)) / rate:g} s: check the machine file's"
-            " values, those of its effects as well"
+            f"the motion is not finite at t = {int(np.argmin(finite)) / rate:g} s: check the values in the"
+            " machine file, those of effects as well"
         )
     q, nu, wheels, memory = np.split(history, [n_q, 2 * n_q, 2 * n_q + n_w], axis=1)
-    # an L-stable step damps even what must blow up, so a mass matrix that isn't one has to be looked for
+    # an L-stable step damps even an unstable motion, so an impossible mass matrix needs a check of its own
     solid = (model.pivots(q.T, parameters).full() > 0).all(axis=0)
     if not solid.all():
         raise SimulationError(
@@ -119,6 +120,10 @@ def _integrate(
     sample: float,
     look: Callable[[np.ndarray], None],
 ) -> np.ndarray:
+    """Integrate with step control and return the states (N, n); fills `driven` (N, n_u) with the torques.
+
+    look: updates the map inputs in a state, once per sample.
+    """
     look(state)
     start, end, error = state.copy(), np.zeros_like(state), np.zeros(1)
     left, slope, length = np.zeros(driven.shape[1]), np.zeros(driven.shape[1]), np.zeros(1)
@@ -162,23 +167,23 @@ def _integrate(
 
 
 def _map_updater(model: Model) -> Callable[[np.ndarray], None]:
-    """Puts into a state what a map of the ground tells there, and the contacts onto the map."""
-    if not model.mapped:
+    """Return a function that enters the contacts on a map of the ground and updates the map inputs in a state."""
+    if not model.map_inputs:
         return lambda state: None
-    ground, n_q = model.ground(), len(model.coordinates)
+    ground, n_q = model.new_ground_map(), len(model.coordinates)
 
     def look(state: np.ndarray) -> None:
-        state[len(state) - len(model.mapped) :] = ground(state[:n_q])
+        state[len(state) - len(model.map_inputs) :] = ground(state[:n_q])
 
     return look
 
 
 @lru_cache(maxsize=8)
 def _step_function(model: Model) -> tuple[ca.Function, int]:
-    """One step (state, u, du/dt, h, X) -> state after h, its error over the tolerance.
+    """Build one step (state, u, du/dt, h, X) -> state after h, error over tolerance; and count the measuring wheels.
 
-    Rosenbrock for the speeds, what effects remember, and the coordinates that the forces depend on. The others (pose,
-    angles of contacts and measuring wheels) are integrals of these, by the Hermite quadrature
+    The Rosenbrock method takes the speeds, the memory states and the coordinates that forces depend on. The others
+    (pose, angles of contacts and measuring wheels) are integrals of these, by the Hermite quadrature
     h/2 (f0 + f1) + h^2/12 (f0' - f1').
     """
     n_q, n_u = len(model.coordinates), len(model.inputs)
@@ -189,8 +194,8 @@ def _step_function(model: Model) -> tuple[ca.Function, int]:
     state = ca.vertcat(q, nu, ca.SX.sym("w", n_w), z)
     a = model.accelerate(q, nu, u, X, z)
     rhs = ca.vertcat(dq, a, wheels, model.flow(q, nu, u, z, X))
-    core = [k for k, c in enumerate(model.coordinates) if c in model.felt] + list(range(n_q, 2 * n_q))
-    core += range(2 * n_q + n_w, state.numel() - len(model.mapped))
+    core = [k for k, c in enumerate(model.coordinates) if c in model.active_coordinates] + list(range(n_q, 2 * n_q))
+    core += range(2 * n_q + n_w, state.numel() - len(model.map_inputs))
     rest = [k for k in range(2 * n_q + n_w) if k not in core]
     rate = ca.Function("rate", [state, u, X], [rhs[core]], {"cse": True})
     jacobian = ca.Function(
@@ -215,8 +220,7 @@ def _step_function(model: Model) -> tuple[ca.Function, int]:
     end[core] = at + stages[-1]
     error = ca.norm_inf(stages[-1] / (MIN_STATE_SCALE + ca.fabs(y[core]))) / TOLERANCE
 
-    # The heading must be at its end before the position that turns with it: the order of the table does that
-    # when taken backwards, since (x, y) come before theta.
+    # Backwards, since the position depends on the heading at the end, and (x, y) come before theta in the table.
     second = ca.Function("second", [state, u, X], [ca.jtimes(rhs[rest], state, rhs)], {"cse": True})
     first = ca.Function("first", [state], [rhs[rest]], {"cse": True})
     f0, d0 = first(y), second(y, left, X)

@@ -1,4 +1,4 @@
-"""The Rosenbrock method RODAS: its coefficients and the linear solves of its stages.
+"""The Rosenbrock method RODAS: coefficients and linear solves of its stages.
 
 Source: Hairer and Wanner, "Solving Ordinary Differential Equations II", IV.7.
 """
@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import casadi as ca
 
-# RODAS: (I/(gamma h) - J) U_i = f(y + sum a_ij U_j) + sum c_ij U_j / h + d_i h df/dt, y1 = y + sum a_6j U_j + U_6
+# (I/(gamma h) - J) U_i = f(t + alpha_i h, y + sum a_ij U_j) + sum c_ij U_j / h + d_i h df/dt
+# y1 = y + sum a_6j U_j + U_6, error estimate U_6
 GAMMA = 0.25
 
-
+# alpha_i
 STAGE_TIMES = (0.0, 0.386, 0.21, 0.63, 1.0, 1.0)
 
-
+# d_i
 TIME_DERIVATIVE_WEIGHTS = (0.25, -0.1043, 0.1035, -0.0362, 0.0, 0.0)
 
-
+# a_ij
 A_ROWS = (
     (),
     (1.544,),
@@ -26,7 +27,7 @@ A_ROWS = (
     (1.221224509226641, 6.019134481288629, 12.53708332932087, -0.6878860361058950, 1.0),
 )
 
-
+# c_ij
 C_ROWS = (
     (),
     (-5.6688,),
@@ -38,7 +39,10 @@ C_ROWS = (
 
 
 def lu(A: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """LU without pivoting, structural zeros kept: I/(gamma h) - J of a dissipative system has no small pivot."""
+    """Factorise A = lower upper without pivoting, structural zeros kept.
+
+    I/(gamma h) - J of a dissipative system has no small pivot.
+    """
     n = A.shape[0]
     lower, upper = ca.SX.eye(n), ca.SX(A)
     for k in range(n):
@@ -53,4 +57,5 @@ def lu(A: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 def lu_solve(lower: ca.SX, upper: ca.SX, b: ca.SX) -> ca.SX:
+    """Solve lower upper x = b."""
     return ca.solve(upper, ca.solve(lower, b))

@@ -1,8 +1,7 @@
-"""Machines that the designer may have in front of him: the nominal one with every value off by some per cent.
+"""Scenarios for robust design: the nominal machine with every value changed by some per cent.
 
-Who designs a drive does not know the parameters yet. A scenario is a machine whose bodies, friction and contacts differ
-from the machine file's, each value on its own, so that it stays physically possible: masses, centres of mass and
-inertias of bodies are changed, not base parameters.
+The parameters are unknown while a drive is designed. A scenario changes masses, centres of mass, inertias, friction and
+contacts one by one; these are values of bodies, not base parameters, so the machine stays physically possible.
 """
 
 from __future__ import annotations
@@ -14,13 +13,13 @@ from excite.model.machine import Body, Machine, Quantity
 from excite.simulation.driver import drive_gains
 from excite.simulation.integrator import Motion, respond
 
-SCENARIO_STREAM = 3  # stream of random numbers
-HOLDING_RATE = 5.0  # 1/s: how fast a steered joint that is off comes back
-GAIN_FACTOR = 5.0  # times the gain of the driver model's hydrostatic drive: a steady hand
+SCENARIO_STREAM = 3  # stream of random numbers, independent of the others
+HOLDING_RATE = 5.0  # 1/s, rate at which the angle error of a steered joint is corrected; chosen
+GAIN_FACTOR = 5.0  # feedback gain over that of the driver model's drive; chosen
 
 
 def perturbed_machines(model: Model, count: int, spread: float = 0.2, seed: int = 0) -> tuple[Model, ...]:
-    """The nominal machine and count - 1 others at random corners of the box of +-`spread` around it.
+    """Return the nominal machine and count - 1 others at random corners of the box of +-`spread` around it.
 
     Raises ValueError for a count below 2 or a spread that is not between 0 and 0.9.
     """
@@ -28,11 +27,14 @@ def perturbed_machines(model: Model, count: int, spread: float = 0.2, seed: int 
         raise ValueError(f"a robust design needs at least 2 machines (got {count})")
     rng = np.random.default_rng([seed, SCENARIO_STREAM])
     machines = [vary_machine(model.machine, spread, rng, corner=True) for _ in range(count - 1)]
-    return model, *(model.of(m) for m in machines)
+    return model, *(model.for_machine(m) for m in machines)
 
 
 def vary_machine(machine: Machine, spread: float, rng: np.random.Generator, corner: bool = False) -> Machine:
-    """The machine with values of bodies, friction and contacts multiplied by 1 +- spread: uniform, or one end of it."""
+    """Multiply values of bodies, friction and contacts by 1 +- spread, drawn uniformly, or at a corner of the box.
+
+    Raises ValueError for a spread that is not between 0 and 0.9.
+    """
     if not 0 < spread <= 0.9:
         raise ValueError(f"spread: must be above 0 and at most 0.9 (got {spread:g})")
 
@@ -67,9 +69,9 @@ def vary_machine(machine: Machine, spread: float, rng: np.random.Generator, corn
 
 
 def track_motion(machine: Model, nominal: Model, motion: Motion) -> Motion:
-    """What another machine does when someone makes it follow the speeds and steering of the nominal one's motion.
+    """Simulate another machine under the nominal torques and feedback that tracks the nominal motion.
 
-    The nominal torques, corrected by what the driven joints are off, within torque and torque-rate limits: an attentive
+    The feedback corrects rates and angles of the driven joints within torque and torque-rate limits: an attentive
     driver without delay. Raises SimulationError.
     """
     rate, rows = float(nominal.machine.sampling_hz), list(nominal.actuated)
@@ -82,7 +84,7 @@ def track_motion(machine: Model, nominal: Model, motion: Motion) -> Motion:
     last = np.zeros(len(rows))
 
     def torque(k: int, state: np.ndarray) -> np.ndarray:
-        at = max(k - 1, 0)  # the state is that of the sample before
+        at = max(k - 1, 0)  # the state is that of the previous sample
         off = motion.nu[at, rows] - state[n_q:][rows] + held * (motion.q[at, rows] - state[rows])
         wish = np.clip(motion.u[k] + gain * off, -top, top)
         last[:] += np.clip(wish - last, -climb / rate, climb / rate)

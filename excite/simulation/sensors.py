@@ -1,4 +1,4 @@
-"""What sensors make of a motion: counts, noise, offsets; and the profile of what is expected."""
+"""Simulated sensors: the log of a motion with quantisation, noise and offsets, and its inverse for torques."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from excite.model.machine import UNITS, Sensor
 from excite.simulation.integrator import Motion
 
 KITS = ("paper", "full")
-BOOST_PRESSURE = 15e5  # Pa in a hydraulic line that does not push (boost pressure)
-SENSOR_STREAM = 1  # stream of random numbers: one seed drives and measures, but not with the same numbers
+BOOST_PRESSURE = 15e5  # Pa, in the hydraulic line that does not push; chosen
+SENSOR_STREAM = 1  # stream of random numbers, independent of the driver's under the same seed
 
 
 def measure(
     model: Model, motion: Motion, X: np.ndarray | None = None, kit: str = "full", seed: int = 0, noise: bool = True
 ) -> pd.DataFrame:
-    """The log (N rows) that a kit's sensors would write, in their own units and columns.
+    """Return the log (N rows) of a motion that a kit's sensors would write, in their own units and columns.
 
-    X (n_base,) gives the torque offsets u0, which are parameters and stay without noise. An encoder counts whole
-    steps from where it was switched on, at a random place between two edges; noise is white and normal.
+    X (n_base,): parameters, with the torque offsets u0. noise: False for exact readings, which keep these offsets.
+    An encoder counts whole steps from a random phase between two edges; noise is white and normal.
     Raises ValueError for an unknown kit.
     """
     if kit not in KITS:
@@ -37,8 +37,10 @@ def measure(
 
 
 def _as_columns(sensor: Sensor, read: np.ndarray, angle: np.ndarray) -> dict[str, np.ndarray]:
-    """A reading (N,) [SI] as its columns: in the file's unit, or as the pressures of a motor or of cylinders at a joint
-    at `angle` (N,) [rad]: one side pushes, the other is at IDLE."""
+    """Convert a reading (N,) [SI] to its columns: in the file's unit, or two pressures at joint angles (N,) [rad].
+
+    One side of a motor or cylinder pushes, the other is at BOOST_PRESSURE.
+    """
     if sensor.return_column is None:
         return {sensor.column: read / sensor.gain}
     push, pull = machine.torque_per_pressure(sensor.displacement, sensor.cylinders, angle)
@@ -52,20 +54,20 @@ def _as_columns(sensor: Sensor, read: np.ndarray, angle: np.ndarray) -> dict[str
 
 
 def _joint_angle(model: Model, motion: Motion, sensor: Sensor) -> np.ndarray:
-    """(N,) [rad] the angle of a sensor's joint, zero where it is held or there is none."""
+    """Return the angle (N,) [rad] of a sensor's joint, zero if it is locked or has none."""
     names = model.machine.find(sensor.body).coordinates
     k = model.coordinates.index(names[0]) if names and names[0] in model.coordinates else None
     return np.zeros(len(motion.t)) if k is None else motion.q[:, k]
 
 
 def exact_readings(model: Model, motion: Motion, X: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """What ideal sensors would read, (N,) each by sensor name [SI]; torques include the offset u0.
+    """Return readings (N,) [SI] by sensor name without noise and quantisation.
 
-    Effects that sit in a sensor are in its reading.
+    Torques include the offset u0, and readings the effects that sit in a sensor.
     """
     X = model.nominal if X is None else X
     arrays = (motion.q, motion.nu, motion.wheels, motion.u, motion.memory)
-    values = dict(zip(model.readable, model.read(*(x.T for x in arrays), X).full(), strict=True))
+    values = dict(zip(model.reading_names, model.read(*(x.T for x in arrays), X).full(), strict=True))
     torques = measured_torques(model, motion.t, motion.u, X)
     for sensor in model.machine.sensors("full"):
         if sensor.kind == "torque":
@@ -74,7 +76,7 @@ def exact_readings(model: Model, motion: Motion, X: np.ndarray | None = None) ->
 
 
 def measured_torques(model: Model, t: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """What torque channels read (N, n_u) of delivered torques u (N, n_u) [N m] at times t (N,) [s]."""
+    """Return readings (N, n_u) of the torque channels from delivered torques u (N, n_u) [N m] at times t (N,) [s]."""
     channels = (x.full() for x in model.channels(t[None], X))
     each = zip(u.T, *channels, strict=True)
     return np.column_stack([gain * np.interp(t - delay, t, one) + offset for one, gain, offset, delay in each])
@@ -83,16 +85,20 @@ def measured_torques(model: Model, t: np.ndarray, u: np.ndarray, X: np.ndarray) 
 def delivered_torque(
     t: np.ndarray, read: np.ndarray, gain: np.ndarray, offset: np.ndarray, delay: np.ndarray
 ) -> np.ndarray:
-    """The reverse of one channel: the torque (N,) [N m] behind what is read (N,); gain, offset, delay [s] (N,)."""
+    """Return the delivered torque (N,) [N m] behind the readings (N,) of a channel; gain, offset, delay [s]: (N,)."""
     return np.asarray((np.interp(t + delay, t, read) - offset) / gain)
 
 
 def delivered_torques(t: np.ndarray, read: np.ndarray, channels: Sequence[np.ndarray]) -> np.ndarray:
-    """The same of all channels, (N, n_u) of (N, n_u); channels: gain, offset, delay, (n_u, N) each."""
+    """Return the delivered torques (N, n_u) [N m] behind the readings (N, n_u) of all channels.
+
+    channels: gain, offset, delay, (n_u, N) each.
+    """
     return np.column_stack([delivered_torque(t, *each) for each in zip(read.T, *channels, strict=True)])
 
 
 def _with_sensor_errors(sensor: Sensor, exact: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Add quantisation or noise to exact readings (N,)."""
     step = sensor.resolution
     if step is not None:
         phase = rng.uniform()

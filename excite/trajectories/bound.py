@@ -222,7 +222,7 @@ def _confirmed(
 
 def _states(model: Model, problem: Problem, degree: int) -> _States:
     machine, n_q = model.machine, len(model.coordinates)
-    core = tuple(k for k, c in enumerate(model.coordinates) if c in model.felt)
+    core = tuple(k for k, c in enumerate(model.coordinates) if c in model.active_coordinates)
     owner = {c: b for b in machine.body for c in b.coordinates}
     at_most = []
     for c in model.coordinates:

@@ -228,9 +228,9 @@ def transcribe(
     staged = [g for g in every if g.name in moved and g.name not in deferred]
     steered = [g for g in every if g.name not in moved and g.name not in deferred]
     pose = model.machine.body[0].coordinates if with_pose else ()
-    needed = {*pose, *model.felt, *(model.coordinates[k] for k in resting(model))}
+    needed = {*pose, *model.active_coordinates, *(model.coordinates[k] for k in resting(model))}
     used = [c for c in model.coordinates if c in needed]
-    names = (*used, *[c + "'" for c in model.coordinates], *model.memory[: model.lasting])
+    names = (*used, *[c + "'" for c in model.coordinates], *model.memory[: model.n_dynamic_memory])
     z_size = np.array([state_size[c] for c in names])
     u_size = np.array([float(b.limit.torque) if b.limit.torque is not None else 1.0 for b in model.machine.actuated])
     knot = float(problem.duration_s) / intervals
@@ -247,7 +247,7 @@ def transcribe(
     memory = len(used) + n_q
     nu, a = (ca.vertcat(*ca.vertsplit(x)[len(used) : memory]) for x in (z, rate))
     kept, kept_rate = (ca.vertcat(*ca.vertsplit(x)[memory:], ca.SX(0, 1)) for x in (z, rate))
-    over = ca.SX.sym("over", len(model.mapped))
+    over = ca.SX.sym("over", len(model.map_inputs))
     beside = () if model.plain else (u, ca.vertcat(kept, over))
     p = model.expand @ model.nominal
     drive = ca.SX(n_q, 1)
@@ -280,7 +280,7 @@ def transcribe(
     second = ca.Function("second", [sample, over, multipliers], [ca.densify(H)], options)
 
     nodes = ((np.arange(intervals)[:, None] + place) * knot).ravel()
-    told = motion.memory[:, model.lasting :]
+    told = motion.memory[:, model.n_dynamic_memory :]
     control, centre = _control(steered, s, u_size, knot)
     resting_states = [names.index(model.coordinates[k]) for k in resting(model)] + [
         names.index(c + "'") for c in model.coordinates

@@ -166,7 +166,7 @@ def _hinge(x: float) -> tuple[float, float, float]:
 
 def information(aim: Aim, model: Model, motion: Motion) -> list[np.ndarray]:
     """The matrices (n_base, n_base) of a motion in the scale, every sample counted, one for each of `aim.rows`."""
-    W = model.stacked(motion.q.T, motion.nu.T, motion.a.T, *effect_inputs(model, motion))
+    W = model.stacked_regressor(motion.q.T, motion.nu.T, motion.a.T, *effect_inputs(model, motion))
     found: list[np.ndarray] = []
     for weights in aim.rows:
         # by QR: squaring W would cost half of the digits

@@ -452,4 +452,4 @@ def soften(model: Model, friction: float, slip: float) -> Model:
             changed["contact"] = body.contact.model_copy(update={"v_eps": wider})
         bodies.append(body.model_copy(update=changed))
     machine: Machine = model.machine.model_copy(update={"body": tuple(bodies)})
-    return replace(model.of(machine), nominal=model.nominal, scale=model.scale)
+    return replace(model.for_machine(machine), nominal=model.nominal, scale=model.scale)

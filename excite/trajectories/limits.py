@@ -254,7 +254,7 @@ def resting(model: Model) -> tuple[int, ...]:
     limited = {
         body.coordinates[0]
         for body in model.machine.body
-        if body.coordinates and (body.limit.position is not None or body.coordinates[0] in model.felt)
+        if body.coordinates and (body.limit.position is not None or body.coordinates[0] in model.active_coordinates)
     }
     return tuple(k for k, c in enumerate(model.coordinates) if c in limited)
 

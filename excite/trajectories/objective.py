@@ -249,7 +249,7 @@ def weights(model: Model, objective: str) -> tuple[np.ndarray, np.ndarray]:
 def phi(model: Model, motion: Motion, objective: str = "cond") -> np.ndarray:
     """Phi = W diag(scale) (rows of all samples, n_base), rows and columns weighted as the objective asks."""
     rows, columns = weights(model, objective)
-    W = model.stacked(motion.q.T, motion.nu.T, motion.a.T, *effect_inputs(model, motion)) * rows[:, None]
+    W = model.stacked_regressor(motion.q.T, motion.nu.T, motion.a.T, *effect_inputs(model, motion)) * rows[:, None]
     return (W * columns).reshape(-1, len(columns))
 
 

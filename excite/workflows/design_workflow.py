@@ -24,7 +24,7 @@ def design(
     place: Path, machine: str, problem: str | None, duration: float | None, brief: Brief, bar: Bar = silent
 ) -> dict[str, Any]:
     """A drive for a machine as a brief asks for it."""
-    model = requests.build_model(machine, flaws=False)
+    model = requests.build_model(machine, fit_sensor_effects=False)
     name, chosen = requests.choose_problem(model.machine, problem, duration)
     if brief.between:
         model = briefs.rivals(model, brief.between, float(chosen.duration_s))
@@ -73,7 +73,7 @@ def compare(
     budget: float | None,
     bar: Bar = silent,
 ) -> dict[str, Any]:
-    model = requests.build_model(machine, flaws=False)
+    model = requests.build_model(machine, fit_sensor_effects=False)
     name, chosen = requests.choose_problem(model.machine, problem, None)
     briefs.graded(model)
     requests.require_positive("--budget", budget, "s")

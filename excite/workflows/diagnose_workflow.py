@@ -122,7 +122,7 @@ def separating_drive(
     name, problem = requests.choose_problem(machine, None, None)
     for pair in tied:
         try:
-            model = design_request.beside(build(pair.machine, flaws=False), pair.between)
+            model = design_request.beside(build(pair.machine, fit_sensor_effects=False), pair.between)
         except MachineError:
             continue  # a sensor's: no equation of motion shows it
         between = tuple(f"{e.label}={float(e.amount):.5g}" for e in pair.between)

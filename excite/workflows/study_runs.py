@@ -161,7 +161,9 @@ def designed(order: Order) -> Designed:
 def _designed(order: Order) -> Designed:
     asked = Brief(order.objective, starts=order.starts, seed=order.seed)
     try:
-        model = build(Machine.model_validate_json(order.machine), flaws=False)  # no drive shows what sits in a sensor
+        model = build(
+            Machine.model_validate_json(order.machine), fit_sensor_effects=False
+        )  # no drive shows what sits in a sensor
         answer = design_request.answer(model, order.problem, asked)
     except (InfeasibleError, SimulationError, NoEstimateError, MachineError) as err:
         return Designed("", {}, _said(err))

@@ -1,10 +1,8 @@
-"""The catalogue of effects: what real machines do beyond the model, each declared once.
+"""The catalogue of effects that real machines have beyond the plain model, each declared once.
 
-An effect says where it may sit, what its amount and shapes mean [unit], and what it does to one sample: to the torque
-that a joint gets, to the soil under a contact, to gravity, inertia, a sensor's reading or a torque channel. Simulation,
-regressor, smoothing, diagnosis, the documentation and the tests are made from that declaration; adding an effect is
-adding one entry to `CATALOGUE`. Amounts and names are those of the project's contract; where it leaves a shape open (a
-decay speed, a phase), the shape has a default for simulation and a grid on which diagnosis looks for it.
+A declaration gives the places of an effect, magnitude and shapes with units, and hooks: its action on one sample.
+Simulation, regressor, smoothing, diagnosis, documentation and tests follow from it, so adding an effect means adding
+one entry to `CATALOGUE`. A shape has a default for simulation and a grid of trial values for diagnosis.
 """
 
 from __future__ import annotations
@@ -16,13 +14,12 @@ import casadi as ca
 from excite.model.effects import friction, ground_map, sizes, soil
 from excite.model.effects.effect import Channel, Effect, Memory, SampleView, Shape, Site, Values
 
-TORQUE_SMOOTHING = 0.004  # of a joint's full torque, over which what depends on the torque's sign turns
-EDGE_TIME = 0.2  # [s] over which what acts between two instants begins and ends
-
-MAX_SLIDE_INSTANTS = 120  # at which a load is looked for that slides
-HARDENING_DEPTH = 0.1  # [rad] beyond a stop, at which its hardening is stated
-STOP_SMOOTHING = 0.003  # [rad] over which a stop begins to be pressed
-LOAD_ARM = 2.0  # [m] from the joint, where a load is put on or taken off
+TORQUE_SMOOTHING = 0.004  # share of a joint's large torque over which the torque's sign turns; chosen
+EDGE_TIME = 0.2  # s, duration of the start and end of a temporary effect; chosen
+MAX_SLIDE_INSTANTS = 120  # trial instants of a payload shift in a long log; chosen
+HARDENING_DEPTH = 0.1  # rad beyond a stop for which its hardening is stated; chosen
+STOP_SMOOTHING = 0.003  # rad over which a stop begins to press; chosen
+LOAD_ARM = 2.0  # m behind the joint, where trials put a load on or take it off; chosen
 
 PHASE = Shape("rad", 0.0, (0.0, pi / 2), circular=True)
 BEND = Shape("-", 0.0, (0.0,), meaning="0: exponential law; 1: hyperbola; the force's limit is (2 + bend) A K")
@@ -30,19 +27,21 @@ SECOND_HARMONIC = Shape("rad", 0.0, (0.0,), lambda site: 0.001)
 
 
 def _form_choice(meaning: str, only: tuple[float, ...] = (0.0, 1.0), grid: tuple[float, ...] = (0.0,)) -> Shape:
-    """A shape that chooses in which of several ways an effect acts."""
+    """Declare a shape that selects one of several forms of an effect."""
     return Shape("-", 0.0, grid, whole=True, only=only, meaning=meaning)
 
 
-# ------------------------------------------------------------------------------------------------ the hooks
+# Hooks
 
 
 def _softplus(x: ca.SX, width: float | ca.SX) -> ca.SX:
-    """max(x, 0), rounded over `width`."""
+    """Return max(x, 0), rounded over `width`."""
     return (x + ca.sqrt(x**2 + width**2)) / 2
 
 
 def _eccentricity_error(s: SampleView, angle: ca.SX, k: int, p: Values) -> ca.SX:
+    """Return the angle error, zero at angle zero, with first and second harmonic."""
+
     def error(at: ca.SX | float) -> ca.SX:
         return p["A"] * ca.sin(at + p["phase"]) + p["cos2"] * ca.cos(2 * at) + p["sin2"] * ca.sin(2 * at)
 
@@ -50,51 +49,58 @@ def _eccentricity_error(s: SampleView, angle: ca.SX, k: int, p: Values) -> ca.SX
 
 
 def _deadband_loss(s: SampleView, k: int, p: Values) -> ca.SX:
-    u, A, width = s.u[k], p["A"], TORQUE_SMOOTHING * s.full[k]
+    """Return the torque lost in a dead band of +-A."""
+    u, A, width = s.u[k], p["A"], TORQUE_SMOOTHING * s.large_torque[k]
     return _softplus(u - A, width) - _softplus(-u - A, width) - u + 0 * A
 
 
 def _coupled_torque(s: SampleView, k: int, p: Values) -> ca.SX:
-    felt = [(1 - p["hose"]) * s.u[j] + p["hose"] * s.z[f"late{j}"] for j in s.others(k)]
-    return p["A"] * sum(felt, ca.SX(0))
+    """Return the torque that the other driven contacts add, at once or through a hose."""
+    others = [(1 - p["hose"]) * s.u[j] + p["hose"] * s.z[f"late{j}"] for j in s.others(k)]
+    return p["A"] * sum(others, ca.SX(0))
 
 
 def _hose_rate(s: SampleView, k: int, p: Values) -> ca.SX:
-    """How a hose follows a contact's torque."""
+    """Return the rate of the lagged torque behind a hose."""
     return (s.u[k] - s.z[f"late{k}"]) / p["lag"]
 
 
 def _payload_change(s: SampleView, p: Values) -> dict[str, ca.SX]:
-    """What a load on the last chassis changes of its inertia when it slides, is put on or taken off within so long."""
+    """Return the changes of mass, first moment and yaw inertia due to a load that slides, is put on or taken off."""
     there = p["A"] * (1 + ca.tanh((s.time - p["instant"]) / ca.sqrt(p["takes"] ** 2 + 0.05**2))) / 2
     return {"M": p["mass"] * there, "MX": there, "ZZ": p["arm"] * there}
 
 
 def _between(t: ca.SX, begin: ca.SX, end: ca.SX) -> ca.SX:
+    """Return 1 between two instants, 0 outside, with edges of EDGE_TIME."""
     return (ca.tanh((t - begin) / EDGE_TIME) - ca.tanh((t - end) / EDGE_TIME)) / 2
 
 
 def _window(t: ca.SX, p: Values) -> ca.SX:
+    """Return 1 while the effect acts, else 0."""
     return _between(t, p["begin"], p["begin"] + p["length"])
 
 
 def _play_rate(s: SampleView, k: int, p: Values) -> ca.SX:
-    """How fast an actuator moves in its play, -1 to 1: to the side that it is pushed to by more than its own friction
-    has; pushed by less it creeps towards u / breakaway, the more slowly the more friction there is. A friction that
-    holds it there would be sharper than any fit finds a way to."""
-    width = TORQUE_SMOOTHING * s.full[k]
+    """Return the rate of an actuator's position in its play, -1 to 1.
+
+    Above its breakaway torque it moves to the side it is pushed to, below it creeps towards u / breakaway. Friction
+    that holds it exactly would be too sharp for a fit.
+    """
+    width = TORQUE_SMOOTHING * s.large_torque[k]
     ahead, back = _softplus(s.u[k] - p["breakaway"], width), _softplus(-s.u[k] - p["breakaway"], width)
     return (ahead * (1 - s.z["play"]) - back * (1 + s.z["play"])) / p["damping"]
 
 
 def _stop_torque(s: SampleView, k: int, p: Values) -> ca.SX:
+    """Return the torque of two stops with hardening springs."""
     q = s.q[k] - p["centre"]
     high, low = _softplus(q - p["stop"], STOP_SMOOTHING), _softplus(-q - p["stop"], STOP_SMOOTHING)
     return -p["A"] * (high - low) * (1 + p["hardening"] * ((high + low) / HARDENING_DEPTH) ** p["power"])
 
 
 def _one_sided_stops(site: Site) -> list[dict[str, float]]:
-    """Stops so far from the middle that only one of them is reached."""
+    """Return trials with the stops so far off the middle that only one is reached."""
     limit = sizes.angle_limit(site)
     stops = [x * limit for x in (0.15, 0.35, 0.55, 0.75)]
     sides = [{"stop": (limit + x) / 2, "centre": side * (x - limit) / 2} for x in stops for side in (1.0, -1.0)]
@@ -102,22 +108,24 @@ def _one_sided_stops(site: Site) -> list[dict[str, float]]:
 
 
 def _rubbing_plays(site: Site) -> list[dict[str, float]]:
-    """Plays that an actuator crosses against its own friction."""
+    """Return trials in which the actuator crosses its play against its own friction."""
     full = sizes.torque(site)
     held = [(damping, breakaway) for damping in (0.0001, 0.0005) for breakaway in (0.003, 0.01, 0.03)]
     return [{"turn": 0.02 * full, "rubs": 1.0, "damping": d * full, "breakaway": b * full} for d, b in held]
 
 
 def _relief_loss(s: SampleView, k: int, p: Values) -> ca.SX:
-    """A relief valve: what is above its torque is lost, to the share A."""
-    width = 2.5 * TORQUE_SMOOTHING * s.full[k]
+    """Return the torque lost through a relief valve: the share A of what exceeds its opening."""
+    width = 2.5 * TORQUE_SMOOTHING * s.large_torque[k]
     over = _softplus(s.u[k] - p["valve"], width) - _softplus(-s.u[k] - p["valve"], width)
     return -p["A"] * over
 
 
 def _payload_trials(site: Site) -> list[dict[str, float]]:
-    """A load that slides within a second, at every second, in long logs at MOMENTS: its recoil is short. And one that
-    is put on or taken off behind the joint, at every sixth of these."""
+    """Return trials of a load that slides at each of the instants, or is put on or taken off at every sixth.
+
+    The instants are 1 s apart as the recoil is short, further in logs longer than MAX_SLIDE_INSTANTS seconds.
+    """
     step = max(1.0, site.duration / MAX_SLIDE_INSTANTS)
     times = [k * step for k in range(1, round(site.duration / step))]
     slid = [{"instant": t, "takes": 0.5, "arm": 0.0, "mass": 0.0, "recoil": 1.0} for t in times]
@@ -129,6 +137,7 @@ CATALOGUE: dict[str, Effect] = {}
 
 
 def _declare(*effects: Effect) -> None:
+    """Add effects to the catalogue. Raises ValueError for a name given twice."""
     for e in effects:
         if e.name in CATALOGUE:
             raise ValueError(f"{e.name}: two effects have this name")
@@ -136,7 +145,7 @@ def _declare(*effects: Effect) -> None:
 
 
 _declare(
-    # ---------------------------------------------------------------- friction
+    # Friction
     Effect(
         "stribeck_friction",
         ("joints",),
@@ -162,7 +171,7 @@ _declare(
                 form=("bristles", 1.0),
             ),
         },
-        beside=friction.bristle_trials,
+        extra_trials=friction.bristle_trials,
         torque=friction.stribeck,
         memory={"bent": Memory(friction.bristle_rate, 1.0, form=("bristles", 1.0))},
     ),
@@ -180,7 +189,7 @@ _declare(
             )
         },
         grid=(1.0, 3.0, -1.0, -3.0),
-        beside=lambda site: [{"A": 0.05, "slow": 0.5}, {"A": 0.05, "slow": -0.5}],
+        extra_trials=lambda site: [{"A": 0.05, "slow": 0.5}, {"A": 0.05, "slow": -0.5}],
         torque=friction.transition,
     ),
     Effect(
@@ -191,7 +200,7 @@ _declare(
         "friction larger where the torque is large, at the same speed",
         "Dohring et al. 1993; Linderoth et al. 2013, load-dependent Coulomb friction",
         sizes.constant(0.05),
-        torque=lambda s, k, p: -p["A"] * ca.sqrt(s.u[k] ** 2 + (TORQUE_SMOOTHING * s.full[k]) ** 2) * s.sign(k),
+        torque=lambda s, k, p: -p["A"] * ca.sqrt(s.u[k] ** 2 + (TORQUE_SMOOTHING * s.large_torque[k]) ** 2) * s.sign(k),
     ),
     Effect(
         "asymmetric_coulomb",
@@ -221,7 +230,7 @@ _declare(
         "an error odd in speed, growing with its square",
         "turbulent losses of hydraulic motors, Merritt, Hydraulic Control Systems, 1967",
         sizes.viscous(0.5, 1.0),
-        torque=lambda s, k, p: -p["A"] * s.w[k] * ca.sqrt(s.w[k] ** 2 + s.smooth[k] ** 2),
+        torque=lambda s, k, p: -p["A"] * s.w[k] * ca.sqrt(s.w[k] ** 2 + s.friction_smoothing[k] ** 2),
     ),
     Effect(
         "friction_warm_up",
@@ -251,7 +260,7 @@ _declare(
         torque=lambda s, k, p: -p["A"] * s.sign(k) * ca.fmax(0, _between(s.time, p["begin"], p["end"])),
         timed=True,
     ),
-    # ---------------------------------------------------------------- drives and torque channels
+    # Drives and torque channels
     Effect(
         "actuator_lag",
         ("drives",),
@@ -322,9 +331,9 @@ _declare(
             "hose": _form_choice("0: the other's torque acts at once; 1: through a hose, with a first-order lag"),
             "lag": Shape("s", 0.1, (0.1,), meaning="time constant of the hose", form=("hose", 1.0)),
         },
-        beside=lambda site: [{"hose": 1.0, "lag": x} for x in (0.03, 0.1, 0.3)],
+        extra_trials=lambda site: [{"hose": 1.0, "lag": x} for x in (0.03, 0.1, 0.3)],
         torque=_coupled_torque,
-        memory={"late": Memory(_hose_rate, 1000.0, each=True, form=("hose", 1.0))},
+        memory={"late": Memory(_hose_rate, 1000.0, per_body=True, form=("hose", 1.0))},
     ),
     Effect(
         "relief_valve",
@@ -337,7 +346,7 @@ _declare(
         {"valve": Shape("N m", 0.6, (0.3, 0.5, 0.7, 0.85), sizes.torque)},
         torque=_relief_loss,
     ),
-    # ---------------------------------------------------------------- once or several times per turn
+    # Periodic in the angle
     Effect(
         "roll_unbalance",
         ("contacts",),
@@ -363,7 +372,7 @@ _declare(
                 "N", 0.5, (0.5,), sizes.weight(1.0), meaning="the weight that the axle carries", within=(0.1, 1.0)
             ),
         },
-        further=lambda s, k, p: p["A"] * ca.sin(s.q[k] + p["phase"]),
+        extra_radius=lambda s, k, p: p["A"] * ca.sin(s.q[k] + p["phase"]),
         torque=lambda s, k, p: -p["A"] * p["load"] * ca.cos(s.q[k] + p["phase"]),
     ),
     Effect(
@@ -376,7 +385,7 @@ _declare(
         sizes.constant(0.005),
         {"phase": PHASE, "cos2": SECOND_HARMONIC, "sin2": SECOND_HARMONIC},
         reading=_eccentricity_error,
-        angular=True,
+        angle_only=True,
     ),
     Effect(
         "torque_ripple",
@@ -392,7 +401,7 @@ _declare(
         },
         torque=lambda s, k, p: p["A"] * ca.sin(p["order"] * s.q[k] + p["phase"]),
     ),
-    # ---------------------------------------------------------------- soil
+    # Soil
     Effect(
         "shear_saturation",
         ("contacts",),
@@ -443,22 +452,23 @@ _declare(
         "compaction_per_pass",
         ("drive",),
         "-",
-        "Kx, Ky grow with the passes towards the factor 1 + A: A (1 - exp(-n / pass)), n the way, or passes",
+        "Kx, Ky grow with the passes towards the factor 1 + A: A (1 - exp(-n / pass)), n the distance or passes",
         "less slip at the same force, the longer the drive on the same lane",
         "soil compaction by passes, Forssblad, Vibratory Soil and Rock Fill Compaction, 1981",
         sizes.constant(0.3),
         {
             "pass": Shape("m", 15.0, (5.0, 15.0, 50.0)),
             "counted": _form_choice(
-                f"0: n is the way; 1: passes are counted by reversals; 2: place by place, on a map of the ground, for"
-                f" every contact; a pass is worth {ground_map.PASS_LENGTH:g} m of way, and each log begins on new ground",
+                f"0: n is the distance driven; 1: passes are counted by reversals; 2: place by place, on a map of the"
+                f" ground, for every contact; a pass counts as {ground_map.PASS_LENGTH:g} m, and each log begins on new"
+                f" ground",
                 (0.0, 1.0, 2.0),
             ),
         },
         soil=soil.compacted,
         memory=ground_map.MEMORY,
-        ground=("counted", 2.0),
-        beside=lambda site: [{"pass": x, "counted": form} for form in (1.0, 2.0) for x in (5.0, 15.0, 50.0)],
+        map_form=("counted", 2.0),
+        extra_trials=lambda site: [{"pass": x, "counted": form} for form in (1.0, 2.0) for x in (5.0, 15.0, 50.0)],
         positive=True,
     ),
     Effect(
@@ -499,7 +509,7 @@ _declare(
         shaking=_window,
         timed=True,
     ),
-    # ---------------------------------------------------------------- forces
+    # Forces and payload
     Effect(
         "rolling_resistance",
         ("contacts",),
@@ -509,7 +519,7 @@ _declare(
         "Bekker, Introduction to Terrain-Vehicle Systems, 1969",
         sizes.weight(0.002),
         {"rise": Shape("s2/m2", 0.0, (0.0,)), "soft": Shape("m/s", 1.0, (1.0,), sizes.constant(soil.SPEED_SMOOTHING))},
-        resisting=True,
+        opposes_motion=True,
         push=soil.resistance,
     ),
     Effect(
@@ -544,10 +554,10 @@ _declare(
         },
         inertia=_payload_change,
         recoil="recoil",
-        beside=_payload_trials,
+        extra_trials=_payload_trials,
         timed=True,
     ),
-    # ---------------------------------------------------------------- articulation
+    # Articulation
     Effect(
         "articulation_backlash",
         ("articulation",),
@@ -576,13 +586,13 @@ _declare(
                 form=("rubs", 1.0),
             ),
         },
-        beside=_rubbing_plays,
+        extra_trials=_rubbing_plays,
         positive=True,
         reading=lambda s, exact, k, p: (
             p["A"] / 2 * ((1 - p["rubs"]) * ca.tanh(s.u[k] / p["turn"]) + p["rubs"] * s.z["play"])
         ),
         memory={"play": Memory(_play_rate, 1.0, form=("rubs", 1.0))},
-        angular=True,
+        angle_only=True,
     ),
     Effect(
         "articulation_compliance",
@@ -594,7 +604,7 @@ _declare(
         sizes.compliance,
         positive=True,
         reading=lambda s, exact, k, p: p["A"] * s.u[k],
-        angular=True,
+        angle_only=True,
     ),
     Effect(
         "articulation_stop_spring",
@@ -613,9 +623,9 @@ _declare(
             "power": Shape("-", 2.0, (2.0,)),
         },
         torque=_stop_torque,
-        beside=_one_sided_stops,
+        extra_trials=_one_sided_stops,
     ),
-    # ---------------------------------------------------------------- sensors
+    # Sensors
     Effect(
         "measuring_wheel_radius",
         ("wheels",),
@@ -664,6 +674,6 @@ _declare(
         "a lateral speed proportional to the forward speed",
         "mounting angle of optical speed sensors",
         sizes.constant(0.01),
-        reading=lambda s, exact, k, p: p["A"] * s.ahead[k],
+        reading=lambda s, exact, k, p: p["A"] * s.forward_speed[k],
     ),
 )

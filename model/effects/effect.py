@@ -1,4 +1,4 @@
-"""What an effect is: what it sees of a sample, where it can sit, what its amount and shapes mean, what it does."""
+"""Records that declare an effect: its places, magnitude and shapes, its hooks, and the sample that hooks see."""
 
 from __future__ import annotations
 
@@ -11,36 +11,40 @@ import numpy as np
 from excite.model import mechanics
 from excite.model.machine import Body, Contact, Machine
 
-DEFAULT_DURATION = 60.0  # [s] of a log, where nobody says
-Values = Mapping[str, ca.SX]  # the amount "A" and the shapes by name
-Form = tuple[str, float]  # a shape that an effect's way of acting is chosen by, and its value
+DEFAULT_DURATION = 60.0  # s, length of a log if none is given; chosen
+Values = Mapping[str, ca.SX]  # magnitude "A" and shapes by name
+Form = tuple[str, float]  # name of a shape that selects one form of an effect, and its value
 
 
 @dataclass(frozen=True)
 class ContactMotion:
-    """How a contact, a roll or a wheel, moves: its centre's velocity along and across its chassis [m/s], spin and yaw
-    rate [rad/s]; further: by how much the ground is further from its axle than its radius [m]."""
+    """Motion of a contact, a roll or a wheel.
+
+    Vx, Vy [m/s]: velocity of its centre along and across its chassis; spin, yaw [rad/s]: rates of turn.
+    extra_radius [m]: distance from axle to ground, minus the radius.
+    """
 
     contact: Contact
     Vx: ca.SX
     Vy: ca.SX
     spin: ca.SX
     yaw: ca.SX
-    further: ca.SX | float = 0.0
+    extra_radius: ca.SX | float = 0.0
 
     @property
     def rim(self) -> ca.SX:
         """Speed of the rim at the ground [m/s]."""
-        return mechanics.rim_speed(self.contact, self.spin, self.further)
+        return mechanics.rim_speed(self.contact, self.spin, self.extra_radius)
 
     @property
     def slip(self) -> mechanics.Slip:
-        return mechanics.slip(self.contact, self.Vx, self.Vy, self.spin, self.further)
+        """Slips at the middle of the contact."""
+        return mechanics.slip(self.contact, self.Vx, self.Vy, self.spin, self.extra_radius)
 
 
 @dataclass(frozen=True)
 class Soil:
-    """What a contact's wrench is made from: slips, yaw rate, stiffnesses Kx, Ky [N], saturations (None: linear)."""
+    """Arguments of a contact's force law: slips, yaw rate [rad/s], Kx, Ky [N], saturations (None: linear)."""
 
     slip: mechanics.Slip
     yaw: ca.SX
@@ -50,20 +54,24 @@ class Soil:
     lateral: mechanics.Saturation | None = None
 
     def wrench(self, on: Contact) -> mechanics.Wrench:
-        """What it does to a contact."""
+        """Return forces and moment on a contact."""
         return mechanics.wrench(on, self.slip, self.yaw, self.Kx, self.Ky, self.saturation, self.lateral)
 
 
 @dataclass(frozen=True)
 class SampleView:
-    """One sample as an effect sees it.
+    """One sample as an effect's hooks see it; mappings are by index of the body, or of the joint that moves it.
 
-    q, w: angle and rate of a joint [rad, rad/s] by body; u: torque that its sensor feels, flaws aside [N m]; friction:
-    Fv w + Fs sgn w [N m]; coulomb: Fs [N m]; smooth: the rate over which sgn turns [rad/s]; full: what counts as a
-    large torque [N m]; rolling: of contacts; ahead: V_x of each body's origin in its own axes [m/s]; time [s] since the
-    log began; z: what this effect remembers, by name; zero what it does in another form only; over: the shares of each
-    contact's width that were passed over before, at least once, twice and so on, as a map of the ground has them
-    (`lane.Ground`); zero for an effect that doesn't look at it.
+    q [rad], w [rad/s]: angle and rate of a joint.
+    u [N m]: delivered torque, before gain, offset and delay of its sensor.
+    friction [N m]: Fv w + Fs sgn w; coulomb [N m]: Fs.
+    friction_smoothing [rad/s]: rate over which sgn turns; large_torque [N m]: see `sizes.large_torque`.
+    contacts: motion of each contact.
+    forward_speed [m/s]: V_x of a body's origin in its own axes.
+    time [s]: since the log began.
+    z: memory states of this effect by name; zero for those of a form that it does not have.
+    passes (MAX_PASSES,): shares of a contact's width passed over at least 1, 2, ... times (`GroundMap`); zero for an
+        effect that uses no map.
     """
 
     q: Mapping[int, ca.SX]
@@ -71,21 +79,21 @@ class SampleView:
     u: Mapping[int, ca.SX]
     friction: Mapping[int, ca.SX]
     coulomb: Mapping[int, ca.SX]
-    smooth: Mapping[int, float]
-    full: Mapping[int, float]
-    rolling: Mapping[int, ContactMotion]
-    ahead: Mapping[int, ca.SX]
+    friction_smoothing: Mapping[int, float]
+    large_torque: Mapping[int, float]
+    contacts: Mapping[int, ContactMotion]
+    forward_speed: Mapping[int, ca.SX]
     time: ca.SX
     z: Mapping[str, ca.SX] = field(default_factory=dict)
-    over: Mapping[int, ca.SX] = field(default_factory=dict)
+    passes: Mapping[int, ca.SX] = field(default_factory=dict)
 
     def sign(self, k: int) -> ca.SX:
-        """sgn of a joint's rate, smoothed as its friction is."""
-        return ca.tanh(self.w[k] / self.smooth[k])
+        """Return sgn of a joint's rate, smoothed as in its friction."""
+        return ca.tanh(self.w[k] / self.friction_smoothing[k])
 
     def others(self, k: int) -> list[int]:
-        """The other driven contacts."""
-        return [j for j in self.rolling if j != k and j in self.u]
+        """Return the other driven contacts."""
+        return [j for j in self.contacts if j != k and j in self.u]
 
 
 @dataclass(frozen=True)
@@ -99,7 +107,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Site:
-    """Where an effect is looked for: a body (the joint or the first of several), the log's length [s]."""
+    """A place for an effect: a body (the first of several) of a machine, and the length [s] of the log."""
 
     machine: Machine
     body: Body
@@ -107,7 +115,7 @@ class Site:
 
     @classmethod
     def of(cls, machine: Machine, bodies: Sequence[int], duration: float = DEFAULT_DURATION) -> Site:
-        """Where an effect acts on these bodies."""
+        """Return the site of an effect on these bodies."""
         return cls(machine, machine.find(bodies[0]), duration)
 
 
@@ -121,12 +129,15 @@ def no_trials(site: Site) -> list[dict[str, float]]:
 
 @dataclass(frozen=True)
 class Shape:
-    """What an effect's amount leaves open: default and grid in units of `size`, which belongs to the site.
+    """A further unknown of an effect, such as a decay speed or a phase.
 
-    `circular`: a phase, found by its sine and cosine; `whole`: not refined; `only`: the values that there are, if these
-    are few; `meaning`: what a name leaves open; `form`: the shape and its value with which alone it means anything;
-    `within`: what it can be, in units of `size`: where a fit finds less or more, something else acts.
-    What is zero by default may have either sign.
+    default, grid: value for simulation and trial values for diagnosis, in units of `size` at the site.
+    circular: a phase, fitted by its sine and cosine.
+    whole: never refined by a fit.
+    only: the allowed values, if they are few.
+    meaning: explanation, if the name needs one.
+    form: the form of the effect that has this shape, None for all.
+    within: range in units of `size`; a fit outside of it means that something else acts.
     """
 
     unit: str
@@ -142,18 +153,23 @@ class Shape:
 
     @property
     def signed(self) -> bool:
+        """True if it may have either sign: a phase, or zero by default."""
         return self.circular or self.default == 0
 
 
 @dataclass(frozen=True)
 class Memory:
-    """A state of its own that an effect has: its rate of change, and how far it may be from zero when a log begins.
-    each: one for each body that the effect acts on, named by the name and the body's index; form: the shape and its
-    value with which alone there is one, or None."""
+    """A state that an effect adds to the model.
+
+    rate: hook that gives its time derivative.
+    initial_std: standard deviation from zero at the start of a log.
+    per_body: one state for each body that the effect acts on, its name followed by the body's index.
+    form: the form of the effect that has this state, None for all.
+    """
 
     rate: Callable[[SampleView, int, Values], ca.SX]
-    spread: float
-    each: bool = False
+    initial_std: float
+    per_body: bool = False
     form: Form | None = None
 
 
@@ -161,18 +177,27 @@ class Memory:
 class Effect:
     """One entry of the catalogue.
 
-    `places`: joints (with friction), drives (driven joints), contacts, driven_contacts, drive (all of these together,
-    of soil all contacts), articulation (driven joints without contact), wheels (measuring ones), yaw_rate,
-    lateral_speed, machine. `amount`: a typical one [unit] at a site, `grid`: shares of it, of either sign, that are
-    tried where the signature isn't proportional to the amount; `beside`: shapes [unit] that are tried beside their
-    grids, and an amount "A" where it isn't the typical one. `positive`: a negative amount is never tried; `resisting`:
-    where a fit finds one, something else is the cause; `inverse`: the smaller the amount, the larger the effect;
-    `angular`: a reading's error that only a sensor of an angle has, none of a rate. `recoil`: the shape that says which
-    share of a changing `inertia`, of MX and ZZ, comes of a load that slides along x on its body and pushes it back.
-    `shaking`: while it acts, 0 to 1 over time [s], the torque sensor shakes as well; where it doesn't, something else
-    acts. `ground`: the shape and its value with which alone it sees a map of the ground.
-    Hooks take the scene, the body they act on, and the values; `further` [m] changes the contacts of the scene that all
-    effects see.
+    places: joints (with friction), drives (driven joints), contacts, driven_contacts, drive (all driven contacts
+        together, or all contacts for an effect on the soil), articulation (driven joints without contact), wheels
+        (measuring ones), yaw_rate, lateral_speed, machine.
+    unit, meaning, signature, source: unit of the magnitude A; formula; symptom in a log; reference.
+    typical_magnitude: a typical magnitude [unit] at a site.
+    grid: multiples of it to try; several if the signature is not proportional to the magnitude.
+    extra_trials: sets of shapes [unit] to try in addition to their grids, with "A" if it is not the typical one.
+    positive: negative magnitudes are never tried.
+    opposes_motion: a negative fitted magnitude means that something else is the cause.
+    inverse: a smaller magnitude is a larger effect.
+    timed: the effect depends on time.
+    angle_only: a reading error of angle sensors, not of rate sensors.
+    memory: states that the effect adds.
+    map_form: the form in which it uses a map of the ground.
+
+    Hooks take the sample, the body they act on and the values A and shapes, and return what the effect adds:
+    torque [N m]; extra_radius [m], which all effects see; soil; push: forces [N] along and across a contact;
+    gravity [m/s2] along the ground; inertia: changes of standard parameters of the payload body;
+    reading: error of a sensor; channel: of a torque sensor over time.
+    recoil: the shape that gives the share of `inertia` due to a load that slides along x and pushes its body back.
+    shaking: 0 to 1 over time, while the torque sensor shakes; without shaking something else acts.
     """
 
     name: str
@@ -181,15 +206,15 @@ class Effect:
     meaning: str
     signature: str
     source: str
-    amount: Callable[[Site], float]
+    typical_magnitude: Callable[[Site], float]
     shapes: Mapping[str, Shape] = field(default_factory=dict)
     grid: tuple[float, ...] = (1.0,)
-    beside: Callable[[Site], list[dict[str, float]]] = no_trials
+    extra_trials: Callable[[Site], list[dict[str, float]]] = no_trials
     positive: bool = False
-    resisting: bool = False
+    opposes_motion: bool = False
     inverse: bool = False
     torque: Callable[[SampleView, int, Values], ca.SX] | None = None
-    further: Callable[[SampleView, int, Values], ca.SX] | None = None
+    extra_radius: Callable[[SampleView, int, Values], ca.SX] | None = None
     soil: Callable[[SampleView, int, Values, Soil], Soil] | None = None
     push: Callable[[SampleView, int, Values], tuple[ca.SX, ca.SX]] | None = None
     gravity: Callable[[SampleView, Values], tuple[ca.SX, ca.SX]] | None = None
@@ -199,20 +224,22 @@ class Effect:
     channel: Callable[[ca.SX, Values], Channel] | None = None
     shaking: Callable[[ca.SX, Values], ca.SX] | None = None
     memory: Mapping[str, Memory] = field(default_factory=dict)
-    ground: Form | None = None
+    map_form: Form | None = None
     timed: bool = False
-    angular: bool = False
+    angle_only: bool = False
 
     @property
-    def sensed(self) -> bool:
-        """Whether it sits in a sensor only, so that no equation of motion shows it."""
-        felt = self.torque or self.further or self.soil or self.push or self.gravity or self.inertia or self.channel
+    def sensor_only(self) -> bool:
+        """True if only a sensor shows it, no equation of motion."""
+        felt = (
+            self.torque or self.extra_radius or self.soil or self.push or self.gravity or self.inertia or self.channel
+        )
         return not felt
 
 
 @dataclass(frozen=True)
 class PlacedEffect:
-    """An effect at a place: `bodies` it acts on, the sensor it sits in, values of amount and shapes."""
+    """An effect at a place: the bodies it acts on, the sensor it sits in, values of "A" and shapes [unit]."""
 
     effect: Effect
     where: str
@@ -226,64 +253,64 @@ class PlacedEffect:
 
     @property
     def parameters(self) -> dict[str, tuple[str, str]]:
-        """Names as parameters of the model -> (value's key, unit): the amount first, then the shapes."""
+        """Key of the value and unit, by name of the model's parameter: magnitude first, then shapes."""
         named = {self.name: ("A", self.effect.unit)}
         return named | {f"{self.name}.{s}": (s, shape.unit) for s, shape in self.shapes.items()}
 
     @property
     def shapes(self) -> dict[str, Shape]:
-        """Those shapes of the effect that mean something in the form that it has here."""
-        return {name: shape for name, shape in self.effect.shapes.items() if self._has(shape.form)}
+        """Shapes of the effect in its form here."""
+        return {name: shape for name, shape in self.effect.shapes.items() if self._in_form(shape.form)}
 
-    def _has(self, form: Form | None) -> bool:
+    def _in_form(self, form: Form | None) -> bool:
         return form is None or self.values[form[0]] == form[1]
 
     @property
     def memory(self) -> dict[str, tuple[int, Memory]]:
-        """What it remembers in the form that it has here, by name, each with the body that it is remembered of."""
-        return {name: (k, own) for name, (k, own) in self.memories.items() if self._has(own.form)}
+        """Memory states in its form here, by name, each with its body."""
+        return {name: (k, own) for name, (k, own) in self.memories.items() if self._in_form(own.form)}
 
     @property
     def memories(self) -> dict[str, tuple[int, Memory]]:
-        """The same of all forms."""
+        """Memory states of all forms, by name, each with its body."""
         found: dict[str, tuple[int, Memory]] = {}
         for name, own in self.effect.memory.items():
-            found |= {f"{name}{k}": (k, own) for k in self.bodies} if own.each else {name: (self.bodies[0], own)}
+            found |= {f"{name}{k}": (k, own) for k in self.bodies} if own.per_body else {name: (self.bodies[0], own)}
         return found
 
-    def beside(self, site: Site) -> list[dict[str, float]]:
-        """Of what is tried beside the effect's grid, that of the form that it has here."""
+    def extra_trials(self, site: Site) -> list[dict[str, float]]:
+        """Return the extra trials of its form here."""
         whole = {n: x for n, x in self.values.items() if n != "A" and self.effect.shapes[n].whole}
-        return [b for b in self.effect.beside(site) if all(whole.get(n, x) == x for n, x in b.items())]
+        return [b for b in self.effect.extra_trials(site) if all(whole.get(n, x) == x for n, x in b.items())]
 
     @property
-    def mapped(self) -> bool:
-        """Whether it sees a map of the ground in the form that it has here."""
-        return self.effect.ground is not None and self._has(self.effect.ground)
+    def uses_map(self) -> bool:
+        """True if its form here uses a map of the ground."""
+        return self.effect.map_form is not None and self._in_form(self.effect.map_form)
 
     def shaking(self, t: np.ndarray) -> np.ndarray:
-        """How much the effect shakes a torque sensor, 0 to 1, at times t (N,) [s]."""
+        """Return how much the effect shakes a torque sensor (N,), 0 to 1, at times t (N,) [s]."""
         hook = self.effect.shaking
         assert hook is not None
-        (felt,) = self._over(t, lambda time, values: [hook(time, values)])
+        (felt,) = self._evaluate(t, lambda time, values: [hook(time, values)])
         return felt
 
     def channel(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Gain, offset and delay (N,) that the effect gives a torque sensor at times t (N,) [s]."""
+        """Return gain, offset and delay [s], (N,) each, of a torque sensor with the effect at times t (N,) [s]."""
         hook = self.effect.channel
         assert hook is not None
 
-        def told(time: ca.SX, values: Values) -> list[ca.SX]:
+        def expressions(time: ca.SX, values: Values) -> list[ca.SX]:
             own = hook(time, values)
             return [ca.SX(x) for x in (own.gain, own.offset, own.delay)]
 
-        gain, offset, delay = self._over(t, told)
+        gain, offset, delay = self._evaluate(t, expressions)
         return gain, offset, delay
 
-    def _over(self, t: np.ndarray, hook: Callable[[ca.SX, Values], list[ca.SX]]) -> list[np.ndarray]:
-        """What a hook gives, each (N,), at times t (N,) [s]."""
+    def _evaluate(self, t: np.ndarray, hook: Callable[[ca.SX, Values], list[ca.SX]]) -> list[np.ndarray]:
+        """Evaluate a hook's expressions, each (N,), at times t (N,) [s]."""
         time = ca.SX.sym("t")
-        told = hook(time, {k: ca.SX(v) for k, v in self.values.items()})
-        read = ca.Function("over", [time], told)
-        at = t[None] if ca.depends_on(ca.vertcat(*told), time) else 0.0
+        results = hook(time, {k: ca.SX(v) for k, v in self.values.items()})
+        read = ca.Function("over", [time], results)
+        at = t[None] if ca.depends_on(ca.vertcat(*results), time) else 0.0
         return [np.broadcast_to(x.full()[0], t.shape) for x in read.call([ca.DM(at)])]

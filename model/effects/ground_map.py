@@ -1,4 +1,4 @@
-"""How often the ground under a contact has been driven over: the way, reversals, or a map of the ground."""
+"""Passes over the ground under a contact: counted by distance, by reversals, or on a map of the ground."""
 
 from __future__ import annotations
 
@@ -10,34 +10,37 @@ import numpy as np
 
 from excite.model.effects.effect import Memory, SampleView, Values
 
-PASS_LENGTH = 10.0  # [m] of way that a pass is worth where these are counted
-DIRECTION_SMOOTHING = 0.02  # [m/s] over which the way turns
-REVERSAL_LENGTH = 0.1  # [m] of way back, within which a reversal counts
-MAX_PASSES = 12  # passes that are told apart
-CELL_SIZE = 0.2  # [m] of the map's cells
-POINTS_PER_CELL = 1.5  # places looked at across a contact for each cell
-MIN_STEP = 0.03  # [m] of way from which a contact is looked at again
-LEAVING_LENGTH = 0.06  # [m] of way from a cell, after which it may be entered again
-FOOTPRINT_LENGTH = 0.15  # [m] of way over which what is under a contact becomes another
+PASS_LENGTH = 10.0  # m, distance that one counted pass stands for; chosen
+DIRECTION_SMOOTHING = 0.02  # m/s, speed over which the direction of travel turns; chosen
+REVERSAL_LENGTH = 0.1  # m, distance driven back within which a reversal is counted; chosen
+MAX_PASSES = 12  # passes counted separately; chosen
+CELL_SIZE = 0.2  # m, edge of a cell of the map; chosen
+POINTS_PER_CELL = 1.5  # points across a contact per cell; chosen
+MIN_STEP = 0.03  # m, distance after which a contact is entered again; chosen
+LEAVING_LENGTH = 0.06  # m, distance from a cell after which entering it is a new pass; chosen
+FOOTPRINT_LENGTH = 0.15  # m, distance over which the ground under a contact is exchanged; chosen
 
 
 def _travel(s: SampleView, k: int) -> tuple[ca.SX, ca.SX]:
-    """Speed of a contact's centre, forward or back, nothing at standstill, and which way it goes, 1 or -1."""
-    Vx = s.rolling[k].Vx
-    ahead = ca.tanh(Vx / DIRECTION_SMOOTHING)
-    return Vx * ahead, ahead
+    """Return speed [m/s] and direction (1 or -1) of a contact's centre, both smoothed to 0 at standstill."""
+    Vx = s.contacts[k].Vx
+    direction = ca.tanh(Vx / DIRECTION_SMOOTHING)
+    return Vx * direction, direction
 
 
 def _direction_rate(s: SampleView, k: int, p: Values) -> ca.SX:
-    """How fast the direction that a contact remembers follows the one that it goes."""
-    way, ahead = _travel(s, k)
-    return way * (ahead - s.z["facing"]) / REVERSAL_LENGTH
+    """Return the rate at which the remembered direction follows the direction of travel."""
+    speed, direction = _travel(s, k)
+    return speed * (direction - s.z["facing"]) / REVERSAL_LENGTH
 
 
 def _reversal_rate(s: SampleView, k: int, p: Values) -> ca.SX:
-    """One for each reversal: against the direction that it remembers, which is 0 before any and turns 2 exp(-x) - 1."""
-    way, ahead = _travel(s, k)
-    return ca.fmax(-way * ahead * s.z["facing"], 0) / (REVERSAL_LENGTH * (1 - log(2)))
+    """Return the rate of the count of reversals, which grows by 1 while the remembered direction turns.
+
+    That direction is 2 exp(-x) - 1 after a distance of x REVERSAL_LENGTH, hence the factor 1 - log(2).
+    """
+    speed, direction = _travel(s, k)
+    return ca.fmax(-speed * direction * s.z["facing"], 0) / (REVERSAL_LENGTH * (1 - log(2)))
 
 
 MEMORY = {
@@ -47,20 +50,23 @@ MEMORY = {
 }
 
 
-def pass_effect(over: ca.SX, each: ca.SX) -> ca.SX:
-    """What passes have made of the soil under a contact, 0 to 1, where each leaves exp(-PASS / each) of what was still
-    to come; over (MOST,): as a scene has it."""
-    left = ca.exp(-PASS_LENGTH / each)
-    return (1 - left) * ca.dot(over, ca.vertcat(*[left**n for n in range(MAX_PASSES)]))
+def pass_effect(passes: ca.SX, length: ca.SX) -> ca.SX:
+    """Return the compaction under a contact, 0 to 1; each pass leaves the share exp(-PASS_LENGTH / length) to go.
+
+    passes (MAX_PASSES,): see `SampleView`; length [m]: the effect's shape `pass`.
+    """
+    left = ca.exp(-PASS_LENGTH / length)
+    return (1 - left) * ca.dot(passes, ca.vertcat(*[left**n for n in range(MAX_PASSES)]))
 
 
 class GroundMap:
-    """A map of the ground that counts how often contacts have entered each of its cells: of every contact, the shares
-    of its width that were passed over at least 1, 2, ... MOST times before, each time by any of them. A cell counts as
-    left once a contact is LEFT away from where it was on it, so that who swings about a border doesn't pass over it.
+    """A map of the ground that counts how often contacts have entered each of its cells.
 
-    widths (n,) [m]: of the contacts; what is narrower than a cell is told as coarsely as that. Where a contact comes to
-    new ground its shares follow over PATCH, about the length of a footprint.
+    It gives the shares of every contact's width that any contact passed over at least 1, 2, ... MAX_PASSES times
+    before. A cell is left once a contact is LEAVING_LENGTH away from where it was on it, so that swinging about a
+    border is no pass. On new ground the shares follow over FOOTPRINT_LENGTH.
+
+    widths (n,) [m]: of the contacts; resolved no finer than a cell.
     """
 
     def __init__(self, widths: Sequence[float]) -> None:
@@ -72,13 +78,15 @@ class GroundMap:
         self.shares = np.zeros((len(widths), MAX_PASSES))
         self.last: list[tuple[float, float] | None] = [None] * len(widths)
 
-    def come(self, axles: np.ndarray) -> np.ndarray:
-        """The shares (n MOST,), contact after contact, when the contacts have come to axles (n, 4): x, y of the middle
-        and of the way from one end to the other [m]."""
-        for k, (x, y, across, along) in enumerate(axles.tolist()):
+    def update(self, lines: np.ndarray) -> np.ndarray:
+        """Enter the contacts and return the shares (n MAX_PASSES,), contact after contact.
+
+        lines (n, 4) [m]: x, y of the middle of each contact, and of the vector from one end to the other.
+        """
+        for k, (x, y, across, along) in enumerate(lines.tolist()):
             last = self.last[k]
             moved = inf if last is None else hypot(x - last[0], y - last[1])
-            if moved < MIN_STEP or not isfinite(x + y + across + along):  # a fit that goes astray may lead anywhere
+            if moved < MIN_STEP or not isfinite(x + y + across + along):  # a diverging fit may give any number
                 continue
             self.last[k] = x, y
             cells = [(floor((x + p * across) / CELL_SIZE), floor((y + p * along) / CELL_SIZE)) for p in self.places[k]]
@@ -87,8 +95,8 @@ class GroundMap:
             for cell in now.difference(*(under for _, _, under in near)):
                 self.entered[cell] = self.entered.get(cell, 0) + 1
             self.trail[k] = [*near, (x, y, now)]
-            before = [min(self.entered[cell] - 1, MAX_PASSES) for cell in cells]  # but for the pass that it is in
-            often = np.bincount(before, minlength=MAX_PASSES + 1)
-            target = often[:0:-1].cumsum()[::-1] / len(cells)
+            before = [min(self.entered[cell] - 1, MAX_PASSES) for cell in cells]  # without the pass under way
+            counts = np.bincount(before, minlength=MAX_PASSES + 1)
+            target = counts[:0:-1].cumsum()[::-1] / len(cells)
             self.shares[k] += (1 - exp(-moved / FOOTPRINT_LENGTH)) * (target - self.shares[k])
         return self.shares.ravel().copy()

@@ -1,4 +1,4 @@
-"""Effects on a machine: where each of the catalogue may sit, and entries of a machine file made into placed effects."""
+"""Effects on a machine: the places each may have, and checked effects from entries of a machine file."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from excite.model.effects.catalogue import CATALOGUE
 from excite.model.effects.effect import DEFAULT_DURATION, Effect, PlacedEffect, Site
 from excite.model.machine import Body, EffectEntry, Machine, Quantity, Sensor
 
-SUSPICIOUS_RATIO = 50.0  # times what an effect usually is, from which its amount is doubtful
-MIN_TYPICAL_FRICTION = 1e-5  # N m: a usual friction below which there is none to compare with
+SUSPICIOUS_RATIO = 50.0  # multiple of the typical magnitude that suggests a wrong unit; chosen
+MIN_TYPICAL_FRICTION = 1e-5  # N m, friction below this is no reference for others; chosen
 
 
 def allowed_places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...], str | None]]:
-    """Where an effect may sit on a machine: name of the place -> bodies, sensor."""
+    """Return the places where a machine may have an effect: name -> (indices of bodies, name of sensor)."""
     driven = list(machine.actuated)
     rubbing = [b for b in machine.body if b.friction is not None and b.coordinates[0] in machine.coordinates]
     pulling = [b for b in driven if b.contact is not None]
@@ -26,7 +26,7 @@ def allowed_places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[in
     each = {"joints": rubbing, "drives": driven, "contacts": machine.contacts, "driven_contacts": pulling}
     if machine.planar:
         each["articulation"] = [b for b in driven if b.contact is None]
-    sensors = [s for s in machine.sensors("full") if not (effect.angular and s.is_rate)]
+    sensors = [s for s in machine.sensors("full") if not (effect.angle_only and s.is_rate)]
     root = machine.body[0].index
     found: dict[str, tuple[tuple[int, ...], str | None]] = {}
     for place in effect.places:
@@ -42,24 +42,25 @@ def allowed_places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[in
             found["machine"] = (root,), None
     if effect.soil or effect.push:
         found = {w: at for w, at in found.items() if all(machine.find(k).contact for k in at[0])}
-    if effect.angular:
+    if effect.angle_only:
         found = {w: at for w, at in found.items() if at[1] is not None}
     return found
 
 
 def _angle_sensor(sensors: Sequence[Sensor], body: Body) -> str | None:
+    """Return the name of the sensor that measures a body's angle, None for none."""
     return next((s.name for s in sensors if s.kind == "angle" and s.body == body.index), None)
 
 
 def payload_body(machine: Machine) -> int | None:
-    """The body whose load may move: the last chassis of those that turn, as a moment that never turns shows nowhere."""
+    """Return the body whose payload may move: the last chassis that turns, as others do not show a first moment."""
     chassis = [b for b in machine.body if b.inertia is not None and not b.inertia.axisymmetric and b.contact is None]
     turning = [b.index for b in chassis if _turns_freely(machine, b)]
     return turning[-1] if turning else None
 
 
 def _turns_freely(machine: Machine, body: Body) -> bool:
-    """Whether a free joint turns a body: its own, or one that carries it."""
+    """True if a free joint turns the body: its own, or one below it in the tree."""
     own = {"planar": body.coordinates[2:], "revolute": body.coordinates}.get(body.joint, ())
     if set(own) & set(machine.coordinates):
         return True
@@ -67,12 +68,12 @@ def _turns_freely(machine: Machine, body: Body) -> bool:
 
 
 def payload_change(machine: Machine, change: Mapping[str, ca.SX]) -> dict[str, ca.SX]:
-    """What an `inertia` hook changes, by standard parameter of the body whose load may move."""
+    """Name the changes of an `inertia` hook by standard parameter of the payload's body."""
     return {f"{name}{payload_body(machine)}": value for name, value in change.items()}
 
 
 def parse_effect(text: str, machine: Machine, duration: float) -> EffectEntry:
-    """`NAME[@WHERE]=AMOUNT` as an entry of a machine file, shapes at their defaults for a log of duration [s].
+    """Parse `NAME[@WHERE]=AMOUNT` into an entry of a machine file, with default shapes for a log of duration [s].
 
     Raises MachineError.
     """
@@ -86,45 +87,46 @@ def parse_effect(text: str, machine: Machine, duration: float) -> EffectEntry:
         raise MachineError(f"effect {text}: must be NAME[@WHERE]=AMOUNT")
     entry = EffectEntry.model_construct(name=name, where=where or None, amount=value, std=None, shape={})
     found = place_effect(machine, entry, duration)
-    if found.effect.resisting and float(value) < 0:
-        raise MachineError(f"effect {text}: must not be negative, what resists doesn't push")
+    if found.effect.opposes_motion and float(value) < 0:
+        raise MachineError(f"effect {text}: must not be negative, a resistance does not push")
     shapes = {s: Quantity(value=found.values[s], source="assumed") for s in found.shapes}
     return EffectEntry(name=name, where=found.where, amount=value, shape=shapes)
 
 
 def with_effects(machine: Machine, *entries: EffectEntry) -> Machine:
-    """The machine with these effects beside those that it has."""
+    """Return the machine with further effects."""
     return machine.model_copy(update={"effect": (*machine.effect, *entries)})
 
 
 def without_effect(machine: Machine, name: str) -> Machine:
-    """The machine without the effect of this name (effect@place)."""
+    """Return the machine without one effect; name: effect@place."""
     rest = tuple(e for e in machine.effect if e.label != name)
     return machine.model_copy(update={"effect": rest})
 
 
 def shapes_possible(machine: Machine, effect: PlacedEffect) -> bool:
-    """Whether an effect's shapes are such as there are at its place."""
+    """True if all shapes are in their ranges (`Shape.within`)."""
     site = Site.of(machine, effect.bodies)
     ranges = {n: [x * s.size(site) for x in s.within] for n, s in effect.shapes.items() if s.within is not None}
     return all(low <= effect.values[n] <= high for n, (low, high) in ranges.items())
 
 
 def size_warning(machine: Machine, effect: PlacedEffect) -> str | None:
-    """What is said of an effect that is far larger than such effects are at its place."""
-    usual, amount = effect.effect.amount(Site.of(machine, effect.bodies)), effect.values["A"]
-    large, small = (usual, abs(amount)) if effect.effect.inverse else (abs(amount), usual)
+    """Return a warning if an effect is far larger than typical at its place, else None."""
+    typical, magnitude = effect.effect.typical_magnitude(Site.of(machine, effect.bodies)), effect.values["A"]
+    large, small = (typical, abs(magnitude)) if effect.effect.inverse else (abs(magnitude), typical)
     unit = effect.effect.unit
-    if large < SUSPICIOUS_RATIO * small or (usual < MIN_TYPICAL_FRICTION and unit.startswith("N m")):
+    if large < SUSPICIOUS_RATIO * small or (typical < MIN_TYPICAL_FRICTION and unit.startswith("N m")):
         return None
-    much = f"{amount:g} {unit}".removesuffix(" -")
-    return f"{effect.name}: {much}, usual are about {usual:.1g}: in another unit?"
+    much = f"{magnitude:g} {unit}".removesuffix(" -")
+    return f"{effect.name}: {much}, usual are about {typical:.1g}: in another unit?"
 
 
 def place_effect(machine: Machine, entry: EffectEntry, duration: float = DEFAULT_DURATION) -> PlacedEffect:
-    """An effect of a machine file, checked. Raises MachineError for an unknown name, place or shape.
+    """Check an entry of a machine file and return its effect.
 
-    duration [s]: of the log, which the defaults of some shapes are shares of.
+    duration [s]: length of the log; defaults of some shapes are shares of it.
+    Raises MachineError for an unknown name, place or shape, or a value out of range.
     """
     effect = CATALOGUE.get(entry.name)
     if effect is None:
@@ -132,7 +134,7 @@ def place_effect(machine: Machine, entry: EffectEntry, duration: float = DEFAULT
         like = difflib.get_close_matches(entry.name, CATALOGUE, n=3)
         like = like or [n for n in CATALOGUE if parts & set(n.split("_"))]
         hint = f", is {' or '.join(like)} meant?" if like else ":"
-        raise MachineError(f"{machine.name}: effect {entry.name}: unknown{hint} `excite docs` tells of all")
+        raise MachineError(f"{machine.name}: effect {entry.name}: unknown{hint} `excite docs` lists all")
     allowed = allowed_places(machine, effect)
     where = entry.where or (next(iter(allowed)) if len(allowed) == 1 else "")
     if where not in allowed:
@@ -145,7 +147,7 @@ def place_effect(machine: Machine, entry: EffectEntry, duration: float = DEFAULT
     if effect.positive and not float(entry.amount) > 0:
         raise MachineError(f"{machine.name}: effect {entry.name}: amount must be > 0 (got {float(entry.amount):g})")
     bodies, sensor = allowed[where]
-    if effect.sensed and sensor is None:
+    if effect.sensor_only and sensor is None:
         raise MachineError(f"{machine.name}: effect {entry.name}: {where} has no sensor that it could sit in")
     site = Site.of(machine, bodies, duration)
     values = {"A": float(entry.amount)}
@@ -161,8 +163,8 @@ def place_effect(machine: Machine, entry: EffectEntry, duration: float = DEFAULT
     for name, shape in made.shapes.items():
         stated = (
             name in entry.shape and entry.shape[name].source != "identified"
-        )  # a fit's are above zero by themselves
-        least = 0 in shape.grid or shape.size is sizes.duration  # an instant may be the log's beginning
+        )  # identified shapes are positive already
+        least = 0 in shape.grid or shape.size is sizes.duration  # an instant may be the start of the log
         if stated and not (shape.signed or shape.only) and (values[name] < 0 or (values[name] == 0 and not least)):
             raise MachineError(f"{machine.name}: effect {entry.name}: shape {name} must be > 0 (got {values[name]:g})")
     return made

@@ -1,6 +1,6 @@
-"""How large things typically are at a site: what amounts and shapes of effects are shares of.
+"""Typical sizes at a site [SI], of which magnitudes and shapes of effects are shares.
 
-Most are functions of the site; `constant` and `of` make one.
+A size is a function of the site, or makes one (`constant`, `share_of`, `coulomb`, `viscous`, `weight`).
 """
 
 from __future__ import annotations
@@ -10,31 +10,36 @@ from collections.abc import Callable
 from excite.model.effects.effect import Site
 from excite.model.machine import Body, Machine
 
-GRAVITY = 9.81
+GRAVITY = 9.81  # m/s2
 
 
 def constant(value: float) -> Callable[[Site], float]:
+    """Make a size that is the same at every site."""
     return lambda site: value
 
 
 def share_of(size: Callable[[Site], float], share: float) -> Callable[[Site], float]:
+    """Make a size that is a share of another."""
     return lambda site: share * size(site)
 
 
 def duration(site: Site) -> float:
+    """Length of the log [s]."""
     return site.duration
 
 
 def friction_smoothing(site: Site) -> float:
+    """Rate over which a joint's friction turns [rad/s]."""
     return float(site.body.friction.smoothing) if site.body.friction is not None else 1.0
 
 
 def angle_limit(site: Site) -> float:
+    """A joint's position limit [rad], 0.6 if it has none (chosen)."""
     return float(site.body.limit.position) if site.body.limit.position is not None else 0.6
 
 
 def large_torque(machine: Machine, body: Body) -> float:
-    """What counts as a large torque [N m] at a joint: its limit, the machine's largest, or what friction suggests."""
+    """Return a large torque [N m] at a joint: its limit, the machine's largest limit, or 30 Fs (chosen)."""
     if body.limit.torque is not None:
         return float(body.limit.torque)
     stated = [float(b.limit.torque) for b in machine.body if b.limit.torque is not None]
@@ -43,19 +48,22 @@ def large_torque(machine: Machine, body: Body) -> float:
 
 
 def torque(site: Site) -> float:
+    """A large torque at the site [N m]."""
     return large_torque(site.machine, site.body)
 
 
 def compliance(site: Site) -> float:
+    """Compliance [rad/(N m)] that winds up by 0.006 rad under a large torque (chosen)."""
     return 0.002 / torque(site) * 3
 
 
 def coulomb(share: float) -> Callable[[Site], float]:
+    """Make a share of dry friction Fs [N m]."""
     return lambda site: share * max(float(site.body.friction.Fs), 1e-6) if site.body.friction is not None else share
 
 
 def viscous(share: float, power: float = 0.0) -> Callable[[Site], float]:
-    """A share of Fv over a rate of 1 m/s at the rim, or half the rate limit, to a power."""
+    """Make a share of Fv / rate^power; rate is that of 1 m/s at a contact's rim, or half a joint's rate limit."""
 
     def size(site: Site) -> float:
         body = site.body
@@ -71,13 +79,15 @@ def viscous(share: float, power: float = 0.0) -> Callable[[Site], float]:
 
 
 def _machine_mass(machine: Machine) -> float:
+    """Sum the masses of all bodies [kg]."""
     return sum(float(b.inertia.mass) for b in machine.body if b.inertia is not None)
 
 
 def weight(share: float) -> Callable[[Site], float]:
-    """A share of the machine's weight [N]."""
+    """Make a share of the machine's weight [N]."""
     return lambda site: share * GRAVITY * _machine_mass(site.machine)
 
 
 def load_moment(site: Site) -> float:
+    """First moment [kg m] of 5 % of the machine's mass at 1 m (chosen)."""
     return 0.05 * _machine_mass(site.machine)

@@ -1,4 +1,4 @@
-"""A file that gives only what differs from another: `extends`, and how the two become one."""
+"""Machine files that `extends` another: read the chain and merge it into one."""
 
 from __future__ import annotations
 
@@ -7,18 +7,20 @@ from typing import Any
 
 from excite.model.machine.records import read_toml
 
-MAX_DEPTH = 4  # files that one may extend, one through another
-NAMED_LISTS = ("body", "sensor")  # lists of what has a name of its own
+MAX_DEPTH = 4  # files that one file may extend in a chain; chosen
+NAMED_LISTS = ("body", "sensor")  # lists of tables with a name
 
 
 def file_names(folder: Path) -> tuple[str, ...]:
-    """Names of the files in a folder that others may extend by name."""
+    """Return the names of the files in a folder that others may extend by name."""
     return tuple(sorted(p.stem for p in folder.glob("*.toml")))
 
 
 def chain(path: Path, shipped: Path) -> list[tuple[Path, dict[str, Any]]]:
-    """A TOML file and what it differs from, one after another, with what is in each: a file beside it, or a shipped one
-    by its name. Raises ValueError, one line."""
+    """Read a TOML file and those that it extends, one after another: files beside it, or shipped ones by name.
+
+    Raises ValueError, one line.
+    """
     found = [(path, read_toml(path))]
     while (base := _base(found[-1][0], found[-1][1].get("extends"), shipped)) is not None:
         if len(found) > MAX_DEPTH:
@@ -28,7 +30,7 @@ def chain(path: Path, shipped: Path) -> list[tuple[Path, dict[str, Any]]]:
 
 
 def read(path: Path, shipped: Path) -> dict[str, Any]:
-    """What is in a TOML file, with what it differs from (see `chain`). Raises ValueError, one line."""
+    """Read a TOML file merged over those that it extends (see `chain`). Raises ValueError, one line."""
     whole: dict[str, Any] = {}
     for one, raw in reversed(chain(path, shipped)):
         whole = _override(one, whole, raw, raw.pop("extends", None))
@@ -36,7 +38,7 @@ def read(path: Path, shipped: Path) -> dict[str, Any]:
 
 
 def _base(path: Path, parent: object, shipped: Path) -> Path | None:
-    """The file that one extends, None for none. Raises ValueError."""
+    """Return the file that one extends, None for none. Raises ValueError."""
     if parent is None:
         return None
     if not isinstance(parent, str):
@@ -49,12 +51,12 @@ def _base(path: Path, parent: object, shipped: Path) -> Path | None:
 
 
 def _override(path: Path, whole: dict[str, Any], raw: dict[str, Any], parent: str | None) -> dict[str, Any]:
-    """What a file extends, changed by what is in it."""
+    """Merge a file over the one that it extends. Raises ValueError."""
     own, listed = (x if isinstance(x, list) else [] for x in (raw.get("sensor"), whole.get("sensor")))
     sensors = [x.get("name") for x in listed if isinstance(x, dict)]
     if any(isinstance(x, dict) and x.get("name") in sensors and "kind" not in x for x in own):
         raise ValueError(
-            f"{path}: sensor: the list takes the place of that of {parent}, so that every sensor needs all its keys;"
+            f"{path}: sensor: a list replaces that of {parent}, so every sensor needs all its keys;"
             " [sensor.NAME] changes one, `excite machine new NAME --like` writes all"
         )
     for key in NAMED_LISTS:
@@ -64,18 +66,19 @@ def _override(path: Path, whole: dict[str, Any], raw: dict[str, Any], parent: st
 
 
 def _change_named(path: Path, key: str, known: list[Any], changes: dict[str, Any]) -> list[Any]:
-    """A list of named tables with some of them changed, each by a table of its name."""
+    """Change some of a list's named tables, each by the table of its name. Raises ValueError."""
     names = [x.get("name") if isinstance(x, dict) else None for x in known]
     for name, change in changes.items():
         if name not in names:
             allowed = ", ".join(str(x) for x in names)
             raise ValueError(f"{path}: {key}.{name}: no such {key}, allowed: {allowed}")
         if not isinstance(change, dict):
-            raise ValueError(f"{path}: {key}.{name}: must be a table of what differs (got {change!r})")
+            raise ValueError(f"{path}: {key}.{name}: must be a table of the keys that differ (got {change!r})")
     return [_merge(x, changes[n]) if n in changes else x for n, x in zip(names, known, strict=True)]
 
 
 def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+    """Merge tables, replace values and lists."""
     merged = dict(base)
     for key, value in change.items():
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)

@@ -12,7 +12,7 @@ from excite.model.machine.records import FileRecord, Number, Positive, Quantity,
 
 
 class Pin(FileRecord):
-    """A point [m] in the plane, seen from a joint's axis, in the axes that both of its bodies have at angle zero."""
+    """A point [m] in the plane relative to a joint's axis, in the axes that both bodies share at angle zero."""
 
     value: tuple[Number, Number]
     source: Source
@@ -20,11 +20,11 @@ class Pin(FileRecord):
 
 
 class Cylinder(FileRecord):
-    """A hydraulic cylinder that turns a joint: `area` [m2] of the piston, `rod_area` [m2] what the rod leaves of it.
+    """A hydraulic cylinder that turns a joint.
 
-    `piston`: the column with the pressure on the piston side, the rod side has the other one. Where it acts: `lever`
-    [m], how its length grows with the angle, constant; or `anchor` on the antecedent and `pin` on the body, of which
-    the lever at every angle follows.
+    `area` [m2]: of the piston; `rod_area` [m2]: of the piston without the rod. `piston`: the column with the pressure
+    of the piston side, the rod side has the other one. `lever` [m]: a constant lever arm, or `anchor` on the antecedent
+    and `pin` on the body, which give the lever arm at every angle.
     """
 
     area: Positive
@@ -44,10 +44,10 @@ class Cylinder(FileRecord):
 
 
 def lever_arm(cylinder: Cylinder, angle: np.ndarray) -> np.ndarray:
-    """How a cylinder's length grows with the joint's angle (N,) [m/rad]: its lever arm, signed.
+    """Return a cylinder's signed lever arm dL/dangle (N,) [m/rad] at joint angles (N,) [rad].
 
-    Of pins: L = |p(angle) - a|, a on the antecedent, p on the body and turned with it, both seen from the joint's axis,
-    dL/dangle = (a x p) / L.
+    With pins L = |p(angle) - a|, a on the antecedent, p on the body and turned with it, both relative to the joint's
+    axis, so dL/dangle = (a x p) / L.
     """
     if cylinder.lever is not None:
         return np.full(len(angle), float(cylinder.lever))
@@ -61,10 +61,10 @@ def lever_arm(cylinder: Cylinder, angle: np.ndarray) -> np.ndarray:
 def torque_per_pressure(
     displacement: Quantity | None, cylinders: Sequence[Cylinder], angle: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Torque [N m] of one pascal in `column` and of one in `return_column` at joint angles (N,) [rad].
+    """Return torque per pressure [N m/Pa] of `column` and of `return_column`, (N,) each, at joint angles (N,) [rad].
 
-    Of a motor displacement / (2 pi), and the same the other way. A cylinder pushes with its piston side and pulls with
-    its rod side: F = area p - rod_area p_rod, and turns by F dL/dangle (virtual work).
+    A motor has displacement / (2 pi) and its negative. A cylinder has F = area p - rod_area p_rod and the torque
+    F dL/dangle (virtual work).
     """
     if displacement is not None:
         one = np.full(len(angle), float(displacement) / (2 * np.pi))

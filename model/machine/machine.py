@@ -1,8 +1,8 @@
 """The machine file (TOML) as frozen, checked records.
 
 A machine is a tree of bodies given by its modified Denavit-Hartenberg table (Khalil and Kleinfinger, 1986), with
-inertias, joint friction, contacts with the ground, sensors, limits and the design problems that it is used for.
-Every number carries where it comes from. All values are SI.
+inertias, joint friction, contacts with the ground, sensors, limits and design problems. Every number names its source.
+All values are SI.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ Index = Annotated[int, Field(strict=True, ge=0, le=99)]
 
 
 def _zero() -> Quantity:
+    """Return the default of an optional entry."""
     return Quantity(value=0.0, source="definition")
 
 
@@ -105,7 +106,7 @@ class Contact(FileRecord):
 
 
 class JointLimit(FileRecord):
-    """What the drive of a joint allows. `rim_speed` is |radius x rate| of a contact [m/s]."""
+    """Limits of a joint's drive. `rim_speed` is |radius x rate| of a contact [m/s]."""
 
     torque: Positive | None = None
     torque_rate: Positive | None = None
@@ -115,6 +116,7 @@ class JointLimit(FileRecord):
 
 
 def _antecedent(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
+    """Check an antecedent. Raises ValueError that says what is allowed."""
     try:
         return handler(value)
     except ValidationError:
@@ -122,7 +124,7 @@ def _antecedent(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
 
 
 class Body(FileRecord):
-    """One row of the modified Denavit-Hartenberg table, and what hangs on it.
+    """One row of the modified Denavit-Hartenberg table, with inertia, friction, contact and limits.
 
     Transform from the antecedent: Rot(z, gamma) Trans(z, b) Rot(x, alpha) Trans(x, d) Rot(z, theta) Trans(z, r);
     the joint's coordinate replaces theta (revolute) or r (prismatic).
@@ -147,11 +149,12 @@ class Body(FileRecord):
 
     @property
     def where(self) -> str:
-        """The name of the joint or contact, as effects and reports call it."""
+        """Name of the joint or contact in effects and reports."""
         return self.place or self.name
 
     @property
     def coordinates(self) -> tuple[str, ...]:
+        """Names of the joint's coordinates."""
         i = self.index
         return {
             "planar": (f"x{i}", f"y{i}", f"theta{i}"),
@@ -181,16 +184,16 @@ class Body(FileRecord):
 class Sensor(FileRecord):
     """One column of a log, in `unit` (see `units`). SI value = `gain` x (number in the column).
 
-    A `factor` that is given is the SI value of one, whatever `unit` says; it is needed where the unit has none, V say.
-    A torque may come as the pressures on both sides of a hydraulic motor, in `column` and `return_column`, with the
-    `displacement` [m3 per turn of the joint, gear included]: u = displacement / (2 pi) (p - p_return); or as those on
-    both sides of `cylinders` (see `hydraulics`). `factor` is then the pressure of one [Pa], 4e6 for 0-10 V over
-    0-400 bar. An angle may come as a rate (rpm, deg/s): it then stays one, with the `noise` of a rate [rad/s].
+    `factor`: SI value of the number 1 in the column, in place of the unit's; needed for units without one, such as V.
 
     kind `angle`: encoder of a joint; `wheel`: measuring wheel of `radius` [m] at `lateral` [m] (+ left) on the axis
     through the body's origin (32); `torque`: delivered torque or force + u0; `yaw_rate`, `lateral_speed`: of the
     body, in its own frame; `x`, `y`: position of its origin on the ground. All but angles and torques sit on the first
-    chassis. Every sensor is in kit `full`.
+    chassis. Every sensor is in kit `full`. An angle given as a rate (rpm, deg/s) has the `noise` of a rate [rad/s].
+
+    A torque may be given as two pressures, in `column` and `return_column`: those of a hydraulic motor with its
+    `displacement` [m3 per turn of the joint, gear included], u = displacement / (2 pi) (p - p_return), or those of
+    `cylinders` (see `hydraulics`). `factor` is then the pressure of the number 1 [Pa], 4e6 for 0-10 V over 0-400 bar.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
@@ -215,25 +218,25 @@ class Sensor(FileRecord):
         return None if self.counts_per_turn is None else 2 * math.pi / self.counts_per_turn.value
 
     @property
-    def graded(self) -> bool:
-        """Whether it is said how well it measures, by noise or by counts."""
+    def has_noise_figure(self) -> bool:
+        """True if the file gives its noise or its counts per turn."""
         return self.noise is not None or self.counts_per_turn is not None
 
     @property
     def gain(self) -> float:
-        """SI value of one in the column; of a motor's pressures the torque [N m], of cylinders' the pressure [Pa]."""
+        """SI value of the number 1 in the column: torque [N m] for a motor's pressure, [Pa] for a cylinder's."""
         one = float(self.factor) if self.factor is not None else units.UNITS[self.unit][1]
         return one if self.displacement is None else one * float(self.displacement) / (2 * math.pi)
 
     @property
     def is_rate(self) -> bool:
-        """Whether the column holds the rate of the angle that the sensor stands for."""
+        """True if the column holds the rate of the sensor's angle."""
         known = units.UNITS.get(self.unit, ("", 1.0))[0]
         return self.kind in ("angle", "wheel") and known in units.RATES
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns of a log that it is in."""
+        """Its columns in a log."""
         return (self.column,) if self.return_column is None else (self.column, self.return_column)
 
     @model_validator(mode="after")
@@ -262,15 +265,17 @@ class Sensor(FileRecord):
         if self.factor is not None and self.factor.value == 0:
             raise ValueError("factor: must not be 0")
         if self.noise is not None and self.noise.value == 0 and self.counts_per_turn is None:
-            raise ValueError("noise: must be > 0 (got 0); leave it out where nobody knows it")
+            raise ValueError("noise: must be > 0 (got 0); leave it out if it is unknown")
         if "full" not in self.kits:
             raise ValueError(f'kits: "full" has every sensor, add it (got {", ".join(self.kits) or "none"})')
         return self
 
 
 class Filter(FileRecord):
-    """Default processing of a log before least squares: zero-phase Butterworth of positions, then `drop` samples at
-    the start and at the end are left out, and one row in `decimation` is kept. `source` is that of the whole numbers.
+    """Default processing of a log before least squares.
+
+    Positions pass a zero-phase Butterworth filter, `drop` samples are removed at the start and at the end, and one row
+    in `decimation` is kept. `source` is that of the whole numbers.
     """
 
     source: Source
@@ -281,10 +286,10 @@ class Filter(FileRecord):
 
 
 class Problem(FileRecord):
-    """A design problem: how long, where, how fine. `source` is that of the lane.
+    """A design problem: duration, lane and distance of knots. `source` is that of the lane.
 
-    lane_m: length and width of the lane area, centred on 0, 0; lane_polygon_m: corners of a convex area in which the
-    `lane_points` stay as well. reversals: of the direction of travel, at most.
+    lane_m: length and width of the lane area, centred on 0, 0; lane_polygon_m: corners of a convex area, a second limit
+    of the `lane_points`. reversals: most reversals of the direction of travel. rest: start and end at rest.
     """
 
     source: Source
@@ -309,7 +314,7 @@ class Problem(FileRecord):
 
 
 class EffectEntry(FileRecord):
-    """An effect that the machine has beyond the plain model: its name in the catalogue, place, amount and shapes."""
+    """An effect of the machine beyond the plain model: name in the catalogue, place, magnitude and shapes."""
 
     name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
     where: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
@@ -319,12 +324,12 @@ class EffectEntry(FileRecord):
 
     @property
     def label(self) -> str:
-        """As people give it: effect@place."""
+        """Name with place: effect@place."""
         return f"{self.name}@{self.where}"
 
 
 def _convex(corners: Sequence[tuple[float, float]]) -> bool:
-    """Whether corners, in order, go once around a convex area, turning the same way at every one."""
+    """True if corners, in order, go once around a convex area."""
     n = len(corners)
     turn, turns = 0.0, []
     for k in range(n):
@@ -337,7 +342,7 @@ def _convex(corners: Sequence[tuple[float, float]]) -> bool:
 
 
 class Machine(FileRecord):
-    """A machine as its file describes it. Frozen; `locked` coordinates are held at zero."""
+    """A machine file. `locked` coordinates are held at zero."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")]
     title: str
@@ -358,7 +363,7 @@ class Machine(FileRecord):
     effect: tuple[EffectEntry, ...] = ()
 
     def find(self, index: int) -> Body:
-        """The body with this index. Raises KeyError."""
+        """Return the body with this index. Raises KeyError."""
         for body in self.body:
             if body.index == index:
                 return body
@@ -371,7 +376,7 @@ class Machine(FileRecord):
 
     @property
     def planar(self) -> bool:
-        """Whether the root moves on the plane (velocities are then written in the chassis' own axes)."""
+        """True if the root moves on the plane; velocities are then in the chassis' own axes."""
         return self.body[0].joint == "planar"
 
     @property
@@ -381,14 +386,15 @@ class Machine(FileRecord):
 
     @property
     def contacts(self) -> tuple[Body, ...]:
+        """Bodies with a contact."""
         return tuple(b for b in self.body if b.contact)
 
     def sensors(self, kit: str) -> tuple[Sensor, ...]:
-        """The sensors of a kit that measure something which is free to move."""
+        """Return the sensors of a kit, without those of locked coordinates."""
         return tuple(s for s in self.sensor if kit in s.kits and self._visible(s))
 
-    def si(self, sensor: Sensor) -> str:
-        """The SI unit of a sensor's values, whatever its column is in."""
+    def si_unit(self, sensor: Sensor) -> str:
+        """Return the SI unit of a sensor's values."""
         straight = self.find(sensor.body).joint == "prismatic"
         if sensor.kind in ("angle", "wheel"):
             return ("m" if straight and sensor.kind == "angle" else "rad") + ("/s" if sensor.is_rate else "")
@@ -396,6 +402,7 @@ class Machine(FileRecord):
         return {"torque": torque, "yaw_rate": "rad/s", "lateral_speed": "m/s", "x": "m", "y": "m"}[sensor.kind]
 
     def _visible(self, sensor: Sensor) -> bool:
+        """True if a free coordinate moves what the sensor measures."""
         free = set(self.coordinates)
         body = self.find(sensor.body)
         if sensor.kind in ("angle", "torque"):
@@ -427,6 +434,7 @@ class Machine(FileRecord):
         return self
 
     def _check_tree(self) -> None:
+        """Check indices, names and antecedents of the bodies."""
         seen: set[int] = set()
         names: set[str] = set()
         for k, body in enumerate(self.body):
@@ -445,6 +453,7 @@ class Machine(FileRecord):
             names |= {body.name, body.where}
 
     def _check_locked(self) -> None:
+        """Check that locked coordinates exist and leave a machine that can be driven."""
         every = [c for b in self.body for c in b.coordinates]
         for c in self.locked:
             if c not in every:
@@ -462,6 +471,7 @@ class Machine(FileRecord):
             raise ValueError("body: no joint is actuated, so nothing can drive the machine")
 
     def _check_sensors(self) -> None:
+        """Check bodies, names and columns of the sensors."""
         known = {b.index: b for b in self.body}
         jointed = [i for i, b in known.items() if b.joint in ("revolute", "prismatic")]
         driven = [i for i, b in known.items() if b.actuated]
@@ -499,7 +509,7 @@ class Machine(FileRecord):
             names.add(sensor.name)
 
     def _check_cylinders(self, key: str, sensor: Sensor) -> None:
-        """Whether every pressure turns the joint the same way all along its range, at an angle that is measured."""
+        """Check that each pressure turns the joint the same way along its range, and that its angle is measured."""
         body = self.find(sensor.body)
         if body.joint != "revolute":
             raise ValueError(f"{key}: turn a revolute joint, joint {body.index} is {body.joint}")
@@ -514,16 +524,16 @@ class Machine(FileRecord):
 
 
 def shipped_machines() -> tuple[str, ...]:
-    """Names of the machines that come with the package."""
+    """Return the names of the machines in the package."""
     return extends.file_names(MACHINES)
 
 
 def load_machine(name: str | Path) -> Machine:
-    """The machine of a shipped name, or of a path to a TOML file.
+    """Load a machine by its shipped name, or from a TOML file.
 
     A file may say `extends = "va12"` and give only what differs: tables merge, values and lists replace; a table
     [body.NAME] or [sensor.NAME] changes the one of that name.
-    Raises MachineError: one line with file, key, what is wrong, what is allowed.
+    Raises MachineError: one line with file, key, problem and what is allowed.
     """
     path = _find(str(name))
     try:
@@ -537,8 +547,10 @@ def load_machine(name: str | Path) -> Machine:
 
 
 def machine_files(name: str | Path) -> list[Path]:
-    """The files of a machine of one's own, those that it extends included; none of a shipped name. Raises
-    MachineError."""
+    """Return the user's files behind a machine, including those it extends; none for a shipped machine.
+
+    Raises MachineError.
+    """
     try:
         whole = [] if str(name) in shipped_machines() else extends.chain(_find(str(name)), MACHINES)
     except ValueError as err:
@@ -547,6 +559,7 @@ def machine_files(name: str | Path) -> list[Path]:
 
 
 def _find(name: str) -> Path:
+    """Return the file of a machine. Raises MachineError."""
     if name in shipped_machines():
         return MACHINES / f"{name}.toml"
     path = Path(name)

@@ -1,7 +1,4 @@
-"""What files hold: numbers that say where they come from, in records that refuse what they don't know.
-
-And what is wrong with a file that holds such a record, in a line.
-"""
+"""Records for files: quantities with their source, strict about unknown keys, and one-line error messages."""
 
 from __future__ import annotations
 
@@ -19,12 +16,12 @@ Source = Literal["paper", "data sheet", "measured", "published", "identified", "
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """What is in a TOML file, with a byte-order mark or without. Raises ValueError, one line."""
+    """Read a TOML file, with or without byte-order mark. Raises ValueError, one line."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except UnicodeDecodeError as err:
         line = err.object.count(b"\n", 0, err.start) + 1
-        raise ValueError(f"{path}: not a TOML file: line {line} is no utf-8; save it as UTF-8") from None
+        raise ValueError(f"{path}: not a TOML file: line {line} is not UTF-8; save it as UTF-8") from None
     except (tomllib.TOMLDecodeError, RecursionError) as err:
         raise ValueError(f"{path}: not a TOML file: {err}") from None
     except OSError as err:
@@ -35,7 +32,7 @@ _PI = re.compile(r"^\s*([+-]?)\s*(?:(\d+(?:\.\d+)?)\s*\*\s*)?pi\s*(?:/\s*(\d+(?:
 
 
 def _number(value: Any) -> Any:
-    """Angles may be written as a multiple of pi, "-pi/2": the exact table entry, not a rounded one."""
+    """Read a number or a multiple of pi such as "-pi/2", which keeps table entries exact. Raises ValueError."""
     if isinstance(value, bool):
         raise ValueError("must be a number, not true/false")
     if isinstance(value, str):
@@ -76,7 +73,7 @@ def _negative(q: Quantity) -> Quantity:
 
 
 class FileRecord(BaseModel):
-    """Frozen, and refuses keys that it doesn't know: a misspelt key must not be silently ignored."""
+    """A frozen table of a file; unknown keys are errors, so that no misspelt key is silently ignored."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -86,7 +83,7 @@ Flag = Annotated[bool, Field(strict=True)]
 
 
 class Quantity(FileRecord):
-    """A value [SI] and where it comes from."""
+    """A value [SI] and its source."""
 
     value: Number
     source: Source
@@ -111,17 +108,18 @@ class BodyPoint(FileRecord):
 
 
 def error_line(path: Path | str, err: ValidationError, root: type[FileRecord]) -> str:
-    """What is wrong with a file that holds a `root` record: file, key, what is wrong, what is allowed, in a line."""
+    """Return the first error of a file that holds a `root` record: file, key, problem, what is allowed."""
     first, *more = error_lines(path, err, root)
     return f"{first} (and {len(more)} more)" if more else first
 
 
 def error_lines(path: Path | str, err: ValidationError, root: type[FileRecord]) -> list[str]:
-    """All that is wrong with a file that holds a `root` record, a line each."""
+    """Return all errors of a file that holds a `root` record, a line each."""
     return [_error_text(path, one, root) for one in err.errors(include_url=False)]
 
 
 def _error_text(path: Path | str, one: ErrorDetails, root: type[FileRecord]) -> str:
+    """Put a validation error into plain words, in one line."""
     key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in one["loc"]).lstrip(".")
     kind, message, got = one["type"], one["msg"], one.get("input")
     if kind == "extra_forbidden":
@@ -149,7 +147,7 @@ def _error_text(path: Path | str, one: ErrorDetails, root: type[FileRecord]) -> 
 
 
 def _record_at(where: tuple[int | str, ...], root: type[FileRecord]) -> type[FileRecord]:
-    """The record that the file holds at this key."""
+    """Return the type of the record at a key of the file."""
     record = root
     for step in where:
         field = record.model_fields.get(str(step))
@@ -160,6 +158,7 @@ def _record_at(where: tuple[int | str, ...], root: type[FileRecord]) -> type[Fil
 
 
 def _record_in(annotation: Any) -> type[FileRecord] | None:
+    """Return the type of record inside an annotation, None for none."""
     if isinstance(annotation, type) and issubclass(annotation, FileRecord):
         return annotation
     return next((r for a in get_args(annotation) if (r := _record_in(a)) is not None), None)

@@ -1,13 +1,15 @@
-"""Units that a log may be in: what kind of quantity each is, and its SI value. One table; values by definition."""
+"""Units of log columns: the quantity of each and its SI value, by definition."""
 
 from __future__ import annotations
 
 import math
 
-TURN = 2 * math.pi
-BAR, INCH, POUND_FORCE = 1e5, 0.0254, 4.4482216152605  # Pa, m, N
+TURN = 2 * math.pi  # rad
+BAR = 1e5  # Pa
+INCH = 0.0254  # m
+POUND_FORCE = 4.4482216152605  # N
 
-# unit -> (quantity, SI value of one of it)
+# unit -> (quantity, SI value of one unit)
 UNITS: dict[str, tuple[str, float]] = {
     "rad": ("angle", 1.0),
     "mrad": ("angle", 1e-3),
@@ -50,7 +52,7 @@ UNITS: dict[str, tuple[str, float]] = {
     "min": ("time", 60.0),
 }
 
-# what a column may hold for a sensor of each kind; an angle's rate is a reading of its own
+# kind of sensor -> quantities its column may hold; the rate of an angle is a reading of its own
 QUANTITIES_BY_KIND: dict[str, tuple[str, ...]] = {
     "angle": ("angle", "length", "angular rate", "speed"),
     "wheel": ("angle", "angular rate"),
@@ -64,5 +66,5 @@ RATES = ("angular rate", "speed")
 
 
 def units_of(quantities: tuple[str, ...]) -> str:
-    """The units of some quantities, as a message lists them."""
+    """List the units of some quantities for a message."""
     return ", ".join(unit for unit, (quantity, _) in UNITS.items() if quantity in quantities)

@@ -1,4 +1,12 @@
-"""."""
+"""Mechanics as CasADi expressions: trees of rigid bodies and contacts with the soil.
+
+`body_motions` computes the motion of every body (forward recursion of Newton-Euler), `generalised_forces` the forces
+behind it (backward recursion), linear in the standard inertial parameters `INERTIAL`. `joint_transform` and
+`body_poses` give the geometry, `standard_inertia` and `inertial_vector` the parameters of a body.
+
+`slip` and `wrench` are the contact law of the paper, linear (24, 25) or with a `Saturation` such as the exponential one
+(18). `independent_columns` finds the independent columns of a regressor.
+"""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""A contact, roll or wheel, and the ground: slips, forces, the linear law and the exponential one.
+"""Slips and forces between a contact, roll or wheel, and the soil: linear and exponential law.
 
 Slips divide by v_n = sqrt((R_c w)^2 + v_eps^2). The paper's (17) divides by R_c w: that changes sign in reverse, where
 the soil would push instead of resist, and is singular at rest. With v_n driving backward mirrors driving forward.
@@ -14,7 +14,7 @@ import numpy as np
 
 from excite.model.machine import Contact
 
-# Gauss-Legendre points on 0..1, for the exponential law on either side of the point where nothing slips.
+# Gauss-Legendre points on 0..1, for the exponential law on either side of the point without longitudinal slip.
 _GAUSS, _WEIGHTS = (v / 2 for v in np.polynomial.legendre.leggauss(6))
 _POINTS = _GAUSS + 0.5
 
@@ -30,21 +30,22 @@ class Wrench:
 
 @dataclass(frozen=True)
 class Saturation:
-    """How forces fall behind the linear law. slip: K / xi_s, at which the shear displacement is K at the patch's rear.
+    """Saturation of the forces of a contact.
 
-    bend: 0 as the exponential law (18) has it, 1 with the force along a hyperbola that begins alike (after Kondner, J.
-    Soil Mech. 89, 1963, who has it for a sample of soil); it must be above -2, the force's limit is (2 + bend) slip K.
-    Simpler readings of (18): with `strips` 0 all of the contact's width saturates as its middle does, with `untouched`
-    1 the moment does not.
+    slip: K / xi_s, at which the shear displacement is K at the rear of the patch.
+    bend: 0 for the exponential law (18), 1 for a hyperbola of the same initial slope (after Kondner, J. Soil Mech. 89,
+        1963, for samples of soil), or any value above -2; the force's limit is (2 + bend) slip K.
+    by_strip: 1 if every strip of the width saturates by its own slip, 0 if all do by that of the middle.
+    linear_moment: 1 if the moment T_z stays linear.
     """
 
     slip: ca.SX
     bend: ca.SX | float = 0.0
-    strips: ca.SX | float = 1.0
-    untouched: ca.SX | float = 0.0
+    by_strip: ca.SX | float = 1.0
+    linear_moment: ca.SX | float = 0.0
 
     def share(self, gx: ca.SX | float, gy: ca.SX) -> ca.SX:
-        """Of the linear law's force, at slips gx, gy."""
+        """Return the force at slips gx, gy as a share of the linear law's."""
         return mobilised_share(ca.sqrt(gx**2 + gy**2 + 1e-12) / self.slip, self.bend)
 
 
@@ -57,15 +58,17 @@ class Slip:
     vn: ca.SX
 
 
-def rim_speed(contact: Contact, spin: ca.SX, further: ca.SX | float = 0.0) -> ca.SX:
-    """Speed of the rim at the ground [m/s], of a contact that spins at `spin` [rad/s]; further [m]: by how much the
-    ground is further from its axle than its radius."""
-    return (float(contact.radius) + further) * spin
+def rim_speed(contact: Contact, spin: ca.SX, extra_radius: ca.SX | float = 0.0) -> ca.SX:
+    """Return the speed of the rim at the ground [m/s].
+
+    spin [rad/s]; extra_radius [m]: distance from axle to ground, minus the radius.
+    """
+    return (float(contact.radius) + extra_radius) * spin
 
 
-def slip(contact: Contact, Vx: ca.SX, Vy: ca.SX, spin: ca.SX, further: ca.SX | float = 0.0) -> Slip:
-    """Slips of a contact whose centre moves at Vx, Vy [m/s] in its chassis' axes, its rim as `rim` has it."""
-    at_ground = rim_speed(contact, spin, further)
+def slip(contact: Contact, Vx: ca.SX, Vy: ca.SX, spin: ca.SX, extra_radius: ca.SX | float = 0.0) -> Slip:
+    """Return the slips of a contact whose centre moves at Vx, Vy [m/s] in its chassis' axes; see `rim_speed`."""
+    at_ground = rim_speed(contact, spin, extra_radius)
     vn = ca.sqrt(at_ground**2 + float(contact.v_eps) ** 2)
     return Slip((Vx - at_ground) / vn, Vy / vn, vn)
 
@@ -79,28 +82,28 @@ def wrench(
     saturation: Saturation | None = None,
     lateral: Saturation | None = None,
 ) -> Wrench:
-    """What the soil does to a contact; yaw_rate [rad/s] of its chassis; Kx, Ky [N] < 0.
+    """Return forces and moment of the soil on a contact.
 
-    Linear (24, 25), or with `saturation` the exponential law (18) integrated over the patch. `lateral`: the same for
-    the lateral force alone, as a factor on it.
+    yaw_rate [rad/s]: of its chassis; Kx, Ky [N] < 0. Linear (24, 25), or with `saturation` the exponential law (18)
+    integrated over the patch. lateral: saturation of the lateral force alone, as a factor on Ky.
     """
     if lateral is not None:
         Ky = Ky * lateral.share(0.0, s.gy)
-    turning = Kx * (float(contact.width) ** 2 / 12) * (-yaw_rate) / s.vn
+    linear_Tz = Kx * (float(contact.width) ** 2 / 12) * (-yaw_rate) / s.vn
     if saturation is None:
-        return Wrench(Kx * s.gx, Ky * s.gy, turning)
+        return Wrench(Kx * s.gx, Ky * s.gy, linear_Tz)
     Sx, Sy, Tz = ca.SX(0), ca.SX(0), ca.SX(0)
-    for y, dy in _width_points(contact, s, saturation.strips * yaw_rate):
+    for y, dy in _width_points(contact, s, saturation.by_strip * yaw_rate):
         gx = s.gx - y * yaw_rate / s.vn
-        share = saturation.share(s.gx - saturation.strips * y * yaw_rate / s.vn, s.gy) * dy
+        share = saturation.share(s.gx - saturation.by_strip * y * yaw_rate / s.vn, s.gy) * dy
         Sx += Kx * gx * share
         Sy += Ky * s.gy * share
         Tz += Kx * gx * y * share
-    return Wrench(Sx, Sy, (1 - saturation.untouched) * Tz + saturation.untouched * turning)
+    return Wrench(Sx, Sy, (1 - saturation.linear_moment) * Tz + saturation.linear_moment * linear_Tz)
 
 
 def _width_points(contact: Contact, s: Slip, yaw_rate: ca.SX) -> Iterator[tuple[ca.SX, ca.SX]]:
-    """Points y [m] across the contact and their shares of its width (they add up to 1).
+    """Yield points y [m] across the contact and their shares of its width, which add up to 1.
 
     |g| has a kink where g_x(y) = 0, when the contact turns on the spot: the points meet there, denser towards it
     (y - y0 = h p^2). Relative error of the force below 1e-5 for |g| <= 0.15, K / xi_s >= 0.15; 5e-5 for 0.05.
@@ -115,11 +118,11 @@ def _width_points(contact: Contact, s: Slip, yaw_rate: ca.SX) -> Iterator[tuple[
 
 
 def mobilised_share(x: ca.SX, bend: ca.SX | float = 0.0) -> ca.SX:
-    """Force of the exponential law over that of its linear limit, for x = |g| xi_s / K: 2 (x - 1 + e^-x) / x^2.
+    """Return the exponential law's force over the linear one's at x = |g| xi_s / K: 2 (x - 1 + e^-x) / x^2.
 
-    The mean over the patch of (1 - exp(-j/K)), j = |g| xi, against j/K (18). Below x = 0.05 the series
-    1 - x/3 + x^2/12 - x^3/60 + x^4/360 replaces it, where the closed form cancels. `bend`: the share of the hyperbola
-    1 / (1 + x/3) in its place.
+    It is the mean over the patch of (1 - exp(-j/K)), j = |g| xi, over that of j/K (18). Below x = 0.05, where the
+    closed form cancels, the series 1 - x/3 + x^2/12 - x^3/60 + x^4/360 replaces it. bend: share of the hyperbola
+    1 / (1 + x/3).
     """
     series = 1 - x / 3 + x**2 / 12 - x**3 / 60 + x**4 / 360
     safe = ca.fmax(x, 0.05)

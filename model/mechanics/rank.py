@@ -1,19 +1,22 @@
-"""Which columns of a matrix others make up: of a regressor, parameters that no motion tells apart."""
+"""Linearly independent columns of a matrix, such as the identifiable parameters of a regressor."""
 
 from __future__ import annotations
 
 import numpy as np
 
 
-def independent_columns(A: np.ndarray, nothing: float) -> tuple[list[int], list[int]]:
-    """Columns of A longer than `nothing`: those whose part that no earlier ones make up is so too, and the others."""
+def independent_columns(A: np.ndarray, tolerance: float) -> tuple[list[int], list[int]]:
+    """Split the nonzero columns of A into independent and dependent ones, by Gram-Schmidt in their order.
+
+    tolerance: a column, or its part orthogonal to earlier ones, that is no longer than this counts as zero.
+    """
     kept: list[int] = []
     left: list[int] = []
     Q = np.zeros((len(A), 0))
-    for k in np.flatnonzero(np.linalg.norm(A, axis=0) > nothing):
+    for k in np.flatnonzero(np.linalg.norm(A, axis=0) > tolerance):
         rest = A[:, k] - Q @ (Q.T @ A[:, k])
         rest -= Q @ (Q.T @ rest)
-        if np.linalg.norm(rest) > nothing:
+        if np.linalg.norm(rest) > tolerance:
             kept.append(int(k))
             Q = np.column_stack([Q, rest / np.linalg.norm(rest)])
         else:

@@ -1,4 +1,4 @@
-"""Rigid bodies: modified Denavit-Hartenberg tree -> velocities, equations of motion.
+"""Velocities and equations of motion of a tree of rigid bodies (modified Denavit-Hartenberg).
 
 Recursive Newton-Euler in the form of Khalil and Dombre ("Modeling, Identification and Control of Robots", ch. 9):
 every force is linear in the standard inertial parameters (m, first moments, inertia about the frame's origin), so
@@ -20,15 +20,17 @@ import numpy as np
 
 from excite.model.machine import Body, Machine
 
+# standard inertial parameters of a body
 INERTIAL = ("M", "MX", "MY", "MZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
-Z = ca.DM([0, 0, 1])
+Z = ca.DM([0, 0, 1])  # axis of every joint in its own frame
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A body's motion, all vectors (3,) in the body's own axes: rates [rad/s], [m/s], accelerations minus gravity.
+    """Pose and motion of a body's frame.
 
-    `rotation` (3, 3) and `position` (3,) lead from the body to the root's axes at the root's origin.
+    rotation (3, 3), position (3,) [m]: from the body's axes to the root's, at the root's origin.
+    omega [rad/s], velocity [m/s], domega [rad/s2], acceleration minus gravity [m/s2]: (3,) in the body's own axes.
     """
 
     rotation: ca.SX
@@ -40,17 +42,18 @@ class Frame:
 
 
 def _snap_to_integer(value: float) -> float:
-    """cos(pi/2) as 0: keeps the symbolic graph free of 6e-17 terms."""
+    """Round cos(pi/2) to 0, which keeps the symbolic graph free of terms of 6e-17."""
     return round(value) if abs(value - round(value)) < 1e-15 else value
 
 
 def _rot_x(angle: float) -> ca.SX:
+    """Return the rotation (3, 3) about x by an angle [rad]."""
     c, s = _snap_to_integer(math.cos(angle)), _snap_to_integer(math.sin(angle))
     return ca.sparsify(ca.SX([[1, 0, 0], [0, c, -s], [0, s, c]]))
 
 
 def rot_z(angle: ca.SX | float) -> ca.SX:
-    """Rotation (3, 3) about z by an angle [rad]."""
+    """Return the rotation (3, 3) about z by an angle [rad]."""
     number = isinstance(angle, float)
     c = ca.SX(_snap_to_integer(math.cos(angle))) if number else ca.cos(angle)
     s = ca.SX(_snap_to_integer(math.sin(angle))) if number else ca.sin(angle)
@@ -60,7 +63,7 @@ def rot_z(angle: ca.SX | float) -> ca.SX:
 
 
 def joint_transform(body: Body, q: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
-    """Rotation (3, 3) and position (3,) [m] of the body's frame in its antecedent's."""
+    """Return rotation (3, 3) and position (3,) [m] of a body's frame in its antecedent's; q: coordinates by name."""
     c = body.coordinates[0] if body.coordinates else ""
     theta = q[c] if body.joint == "revolute" else float(body.theta)
     r = q[c] if body.joint == "prismatic" else float(body.r)
@@ -72,7 +75,7 @@ def joint_transform(body: Body, q: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
 def body_motions(
     machine: Machine, q: dict[str, ca.SX], dq: dict[str, ca.SX], ddq: dict[str, ca.SX], gravity: ca.SX
 ) -> dict[int, Frame]:
-    """Forward recursion: the motion of every body.
+    """Compute the motion of every body by forward recursion.
 
     q, dq, ddq by coordinate name [rad, m and per s, s2]; those of a planar root are velocities and accelerations in
     its own axes. gravity (3,) [m/s2] in the root's axes.
@@ -118,9 +121,9 @@ def body_motions(
 def generalised_forces(
     machine: Machine, q: dict[str, ca.SX], frames: dict[int, Frame], inertial: dict[int, ca.SX]
 ) -> dict[str, ca.SX]:
-    """Backward recursion: the generalised force [N or N m] of every coordinate, from (10,) parameters per body.
+    """Compute the generalised force [N or N m] of every coordinate by backward recursion.
 
-    Parameters in the order of INERTIAL, about the body's own frame.
+    inertial: (10,) parameters of each body in the order of INERTIAL, about its own frame.
     """
     force: dict[int, ca.SX] = {}
     moment: dict[int, ca.SX] = {}
@@ -150,9 +153,9 @@ def generalised_forces(
 
 
 def body_poses(machine: Machine, q: Mapping[str, float]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Rotation (3, 3) and position (3,) [m] of every body in the root's axes, by index.
+    """Return rotation (3, 3) and position (3,) [m] of every body in the root's axes, by index.
 
-    q: coordinates by name [rad, m], zero where not given; those of a planar root change nothing.
+    q: coordinates by name [rad, m], zero by default; those of a planar root change nothing.
     """
     every = [c for b in machine.body for c in b.coordinates]
     still = dict.fromkeys(every, ca.SX(0))
@@ -161,7 +164,7 @@ def body_poses(machine: Machine, q: Mapping[str, float]) -> dict[int, tuple[np.n
 
 
 def standard_inertia(body: Body) -> dict[str, float]:
-    """Standard parameters of a body that are free to differ, by name, from its mass, centre of mass and inertia.
+    """Return the free standard parameters of a body by name, from mass, centre of mass and inertia.
 
     First moments and inertia are about the body's frame (parallel axes); an axisymmetric body has M, XX (= YY), ZZ.
     """
@@ -187,7 +190,7 @@ def standard_inertia(body: Body) -> dict[str, float]:
 
 
 def inertial_vector(body: Body, p: dict[str, ca.SX]) -> ca.SX:
-    """The body's ten parameters in the order of INERTIAL; those that it doesn't have are zero."""
+    """Return the body's ten parameters in the order of INERTIAL, zero for those it does not have."""
     if body.inertia is None:
         return ca.SX.zeros(10)
     k = body.index

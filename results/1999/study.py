@@ -179,7 +179,7 @@ def equations(measurement: log.Log, cutoff: float) -> dict[str, tuple[np.ndarray
     default = model.machine.filter
     f = Filter.model_validate(default.model_dump() | {"cutoff_hz": {"value": cutoff, "source": "assumed"}})
     s = samples(model, measurement, f)
-    W = model.stacked(s.q, s.nu, s.a).transpose(1, 0, 2)
+    W = model.stacked_regressor(s.q, s.nu, s.a).transpose(1, 0, 2)
     kept = slice(f.drop[0], W.shape[1] - f.drop[1])
     Y = decimate(s.Y[:, kept], f.decimation)
     own = decimate(W[:, kept], f.decimation)

@@ -94,7 +94,7 @@ def one(hidden: str, runs: int, jobs: int) -> dict[str, Any]:
     if found.findings and found.verdict != "unexplained":
         files["new"] = prediction.build(placing.with_effects(old, *(f.entry for f in found.findings)))
         problem = old.problems["R60"]
-        planned = prediction.build(files["new"].machine, flaws=False)
+        planned = prediction.build(files["new"].machine, fit_sensor_effects=False)
         try:
             made = multistart.design(planned, problem, composite_objective.aim(planned, "accuracy"), starts=2, seed=0)
             row["cond_phi"] = made.cond_phi

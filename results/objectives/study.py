@@ -86,11 +86,11 @@ def _of(name: str) -> Callable[[Model, Motion], float]:
 
 def torque_noise(model: Model, motion: Motion) -> float:
     """Worst relative standard deviation [%] if the torques' noise were all there is, on the rows that have a torque."""
-    W = model.stacked(motion.q.T, motion.nu.T, motion.a.T)
+    W = model.stacked_regressor(motion.q.T, motion.nu.T, motion.a.T)
     noise = objective.row_noise(model)
     W = np.concatenate([W[:, row] / noise[row] for row in range(W.shape[1]) if row in model.actuated]) * model.scale
     # rows without a torque hold exactly: they count a thousand times as much
-    still = model.stacked(motion.q.T, motion.nu.T, motion.a.T)
+    still = model.stacked_regressor(motion.q.T, motion.nu.T, motion.a.T)
     exact = [row for row in range(still.shape[1]) if row not in model.actuated]
     held = np.concatenate([1e3 * still[:, row] / noise[row] for row in exact]) * model.scale
     C = np.linalg.inv(W.T @ W + held.T @ held)

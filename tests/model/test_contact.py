@@ -217,11 +217,13 @@ def test_exponential_law_is_the_integral_over_the_patch(m: Motion, g_K: float, t
 @pytest.mark.parametrize(
     "m", [Motion(1.0, 0.1, 1.4, 0.0), Motion(-0.9, -0.03, -1.2, -0.3), Motion(0.65, 0.0, 1.0, 0.5)]
 )
-@pytest.mark.parametrize("untouched", [0.0, 1.0])
-def test_simpler_readings_of_the_law_go_by_the_middle(m: Motion, untouched: float) -> None:
+@pytest.mark.parametrize("linear_moment", [0.0, 1.0])
+def test_simpler_readings_of_the_law_go_by_the_middle(m: Motion, linear_moment: float) -> None:
     Sx, Sy, Tz = of_the_middle(m, *STIFFNESS[1], 0.15)
-    want = Sx, Sy, linear(m, *STIFFNESS[1])[2] if untouched else Tz
-    assert wrench_of(ROLL, m, 0.15, strips=0.0, untouched=untouched) == pytest.approx(want, rel=1e-5, abs=1e-5)
+    want = Sx, Sy, linear(m, *STIFFNESS[1])[2] if linear_moment else Tz
+    assert wrench_of(ROLL, m, 0.15, by_strip=0.0, linear_moment=linear_moment) == pytest.approx(
+        want, rel=1e-5, abs=1e-5
+    )
     if m.yaw:
         assert abs(wrench_of(ROLL, m, 0.15)[2]) < 0.99 * abs(Tz)  # the ends slip more, and give way first
 

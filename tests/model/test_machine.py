@@ -259,7 +259,7 @@ BROKEN: dict[str, tuple[str | bytes, str, str]] = {
     "Latin-1": (
         edit("Albaret VA12", "Albaret VA12 à", text=VA12).encode("latin-1"),
         "",
-        "not a TOML file.*line 1 is no utf-8",
+        "not a TOML file.*line 1 is not UTF-8",
     ),
     "binary": (b"\x93NUMPY\x01\x00\xff", "", "not a TOML file"),
     "empty": ("", "", "missing"),
@@ -500,7 +500,7 @@ BROKEN: dict[str, tuple[str | bytes, str, str]] = {
     "extends, with a sensor's column alone": (
         'extends = "va12"\nname = "x"\n[[sensor]]\nname = "u1"\ncolumn = "Moment"\n',
         "sensor",
-        "takes the place of that of va12.*.sensor.NAME. changes one.*machine new NAME --like",
+        "a list replaces that of va12.*.sensor.NAME. changes one.*machine new NAME --like",
     ),
     "extends, with a value that nobody answers for": (
         'extends = "va12"\nname = "x"\n[body.front_roll.contact]\nKx = { value = -2e5 }\n',
@@ -515,7 +515,7 @@ BROKEN: dict[str, tuple[str | bytes, str, str]] = {
     "extends, with a number for a body": (
         'extends = "va12"\nname = "x"\n[body]\nfront_roll = 3\n',
         "body.front_roll",
-        "must be a table of what differs .got 3",
+        "must be a table of the keys that differ .got 3",
     ),
     "extends, with a key of a body that there is none of": (
         'extends = "va12"\nname = "x"\n[body.front_roll.limit]\ntorqe = 3\n',

@@ -125,7 +125,7 @@ def test_regressor_times_parameters_is_the_prediction(name: str, seed: int) -> N
     model = MODELS[name]
     q, nu, a = multisine(model, seed)
     Y = model.predict(q, nu, a, standard_values(model)).full()
-    WX = (model.stacked(q, nu, a) @ model.nominal).T
+    WX = (model.stacked_regressor(q, nu, a) @ model.nominal).T
     assert np.linalg.norm(WX - Y) <= 1e-9 * np.linalg.norm(Y)
     assert np.abs(WX - Y).max() <= 1e-9 * np.abs(Y).max()
 
@@ -154,7 +154,7 @@ def test_no_parameter_of_the_linear_law_enters_nonlinearly(model: Model) -> None
 
 def test_a_batch_is_its_samples_one_by_one(va12: Model) -> None:
     q, nu, a = states(va12, 7, seed=3)
-    batch = va12.stacked(q, nu, a)
+    batch = va12.stacked_regressor(q, nu, a)
     assert batch.shape == (7, 6, 22)
     for k in range(7):
         assert np.array_equal(batch[k], va12.regressor(q[:, k], nu[:, k], a[:, k]).full())
@@ -166,7 +166,7 @@ def test_pose_on_level_ground_changes_nothing(va12: Model) -> None:
     elsewhere[:3] += np.random.default_rng(5).normal(0, 10, (3, 50))
     p = standard_values(va12)
     assert np.array_equal(va12.predict(q, nu, a, p).full(), va12.predict(elsewhere, nu, a, p).full())
-    assert np.array_equal(va12.stacked(q, nu, a), va12.stacked(elsewhere, nu, a))
+    assert np.array_equal(va12.stacked_regressor(q, nu, a), va12.stacked_regressor(elsewhere, nu, a))
 
 
 def test_roll_angles_change_nothing(va12: Model) -> None:
@@ -174,7 +174,7 @@ def test_roll_angles_change_nothing(va12: Model) -> None:
     q, nu, a = states(va12, 50, seed=6)
     turned = q.copy()
     turned[[3, 5]] += 1.234
-    assert np.allclose(va12.stacked(q, nu, a), va12.stacked(turned, nu, a), rtol=1e-9, atol=1e-9)
+    assert np.allclose(va12.stacked_regressor(q, nu, a), va12.stacked_regressor(turned, nu, a), rtol=1e-9, atol=1e-9)
 
 
 # --------------------------------------------------------------------------------------------- base parameters
@@ -210,7 +210,7 @@ def test_rank_stays_under_random_motions(name: str, n: int, seed: int) -> None:
     """Neither fewer columns can be told apart nor, among all standard parameters, more."""
     model = MODELS[name]
     motion = multisine(model, seed)
-    assert rank(model.stacked(*motion).reshape(-1, n)) == n
+    assert rank(model.stacked_regressor(*motion).reshape(-1, n)) == n
     assert rank(stacked_standard(model, *motion)) == n
 
 
@@ -317,8 +317,8 @@ def test_forward_dynamics_inverts_the_prediction(name: str, seed: int) -> None:
     values = dict(zip(standard_parameters(model.machine), standard_values(model), strict=True))
     offsets = np.array([[values[f"u{b.index}0"]] for b in model.machine.actuated])
     want[list(model.actuated)] = u + offsets
-    WX = (model.stacked(q, nu, a) @ model.nominal).T
-    largest = np.abs(model.stacked(q, nu, a) * model.nominal).max()  # of the terms that cancel in a row
+    WX = (model.stacked_regressor(q, nu, a) @ model.nominal).T
+    largest = np.abs(model.stacked_regressor(q, nu, a) * model.nominal).max()  # of the terms that cancel in a row
     assert np.abs(Y - want).max() <= 1e-9 * largest
     assert np.abs(WX - want).max() <= 1e-9 * largest
 

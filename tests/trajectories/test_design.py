@@ -98,7 +98,7 @@ def fresh_check(model: Model, problem: Problem, d: Design) -> None:
     assert power.max() <= 20000 * 1.001
     assert np.abs(u[[0, -1]]).max() == 0
     assert np.abs(d.motion.nu[-1]).max() < 0.03
-    W = model.stacked(d.motion.q.T, d.motion.nu.T, d.motion.a.T).reshape(-1, len(model.scale))
+    W = model.stacked_regressor(d.motion.q.T, d.motion.nu.T, d.motion.a.T).reshape(-1, len(model.scale))
     assert d.cond_phi == pytest.approx(np.linalg.cond(W * model.scale), rel=1e-9)
     assert d.cond_w == pytest.approx(np.linalg.cond(W), rel=1e-6)
 
