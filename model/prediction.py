@@ -286,6 +286,7 @@ class Model:
         return build(machine, self.fit_sensor_effects, self.fit_shapes)
 
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Return symbols of coordinates, velocities and accelerations, (n_q,) each."""
         n = len(self.coordinates)
         return ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
 

@@ -75,8 +75,8 @@ def from_table(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (),
             moved = values_of(s, machine, table, source)
             if np.ptp(moved) > 0.05:
                 raise LogError(
-                    f"{source}: column {s.column}: moves by {np.ptp(moved):.2g} {machine.si_unit(s)}, {machine.name} holds"
-                    " it still; is this a log of another machine?"
+                    f"{source}: column {s.column}: moves by {np.ptp(moved):.2g} {machine.si_unit(s)}, {machine.name}"
+                    " holds it still; is this a log of another machine?"
                 )
     return Log(source, np.arange(len(t)) / rate, values)
 

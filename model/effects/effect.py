@@ -120,10 +120,12 @@ class Site:
 
 
 def unit_size(site: Site) -> float:
+    """Return 1, the size of a shape given in its unit."""
     return 1.0
 
 
 def no_trials(site: Site) -> list[dict[str, float]]:
+    """Return no trials beyond the grids of the shapes."""
     return []
 
 
@@ -249,6 +251,7 @@ class PlacedEffect:
 
     @property
     def name(self) -> str:
+        """Name with place: effect@where."""
         return f"{self.effect.name}@{self.where}"
 
     @property

@@ -214,7 +214,8 @@ def readme(rows: list[dict[str, Any]], runs: int) -> str:
         said = row["verdict"]
         if row["verdict"] in ("named", "tied"):
             said = ", ".join(
-                f"{' or '.join([f['name'], *f['tied_with']])}: {format_number(f['amount'], 3)} ± {format_number(f['std'], 2)}"
+                f"{' or '.join([f['name'], *f['tied_with']])}: "
+                f"{format_number(f['amount'], 3)} ± {format_number(f['std'], 2)}"
                 + (f" {f['unit']}" if f["unit"] != "-" else "")
                 for f in row["found"]
             )
