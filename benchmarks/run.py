@@ -114,7 +114,7 @@ def simulated() -> None:
 
 def designed() -> None:
     _, problem = requests.choose_problem(straight().machine, None, 8.0)
-    design_request.answer(straight(), problem, design_request.Brief("cond", starts=1))
+    design_request.design_from(straight(), problem, design_request.DesignRequest("cond", starts=1))
     get_reusable_executor().shutdown(wait=True)  # CPU time of a process counts when it has ended
 
 
@@ -291,7 +291,7 @@ def main() -> None:
         about = {
             "commit": commit(),
             "python": platform.python_version(),
-            "program": study_runs.program(),
+            "program": study_runs.program_hash(),
             "parts": rows,
         }
         with HISTORY.open("a", encoding="utf-8") as file:

@@ -23,7 +23,7 @@ from excite.model import Model
 from excite.model.machine import load_machine
 from excite.simulation import Motion
 from excite.trajectories import Comparison, Design
-from excite.workflows import Brief
+from excite.workflows import DesignRequest
 
 __version__ = version("excite")
 
@@ -81,8 +81,8 @@ def design(
     workflows.require_objective(objective, model.machine)
     workflows.require_positive("sigma_max", sigma_max, "%")
     workflows.require_positive("budget", budget, "s")
-    brief = Brief(objective, sigma_max, robust, (), starts, seed, budget)
-    return workflows.answer(model, chosen, brief, progress).design
+    brief = DesignRequest(objective, sigma_max, robust, (), starts, seed, budget)
+    return workflows.design_from(model, chosen, brief, progress).design
 
 
 def simulate(
@@ -168,7 +168,7 @@ def compare(
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
     _, chosen = workflows.choose_problem(model.machine, problem, None)
-    workflows.graded(model)
+    workflows.require_noise_figures(model)
     for usual in against:
         workflows.require_known("against", usual, tuple(trajectories.USUAL))
     return trajectories.compare(model, chosen, samples, seed, budget, None, against)

@@ -7,85 +7,24 @@ import os
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-import importlib.util
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import settings
+from support.commands import Excite
+from support.drives import drive
+from support.files import SHARED
+from support.logs import logged
 
-from excite.diagnosis import fits
-from excite.logs import log, profile
 from excite.model import Model, prediction
-from excite.model.effects import placing
-from excite.model.machine import EffectEntry, machine
-from excite.simulation import Motion, sensors, simulate
+from excite.model.machine import machine
+from excite.simulation import Motion, simulate
 
 settings.register_profile("calm", deadline=None)  # other work on the machine is no fault of the code
 settings.load_profile("calm")
-
-SHARED = Path(__file__).parents[2] / "shared" / "data"
-RESULTS = Path(__file__).parents[1] / "results"
-
-
-def drive(model: Model, duration: float, seed: int, amplitude: dict[str, float]) -> np.ndarray:
-    """A lively drive (N, n_u) [N m] from rest to about rest: a few sines of each torque, faded in and out."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(round(duration * float(model.machine.sampling_hz)) + 1) / float(model.machine.sampling_hz)
-    torque = np.zeros((len(t), len(model.inputs)))
-    for k, name in enumerate(model.inputs):
-        for frequency in (0.05, 0.08, 0.13, 0.2, 0.3):
-            torque[:, k] += amplitude[name] * np.sin(2 * np.pi * frequency * t + rng.uniform(0, 2 * np.pi))
-    return torque * np.minimum(1, np.minimum(t, duration - t) / 2)[:, None]
-
-
-def designed(name: str, model: Model) -> Motion:
-    """A committed design, its torques on a machine."""
-    torque, q0, nu0 = profile.read_profile(RESULTS / name / "design" / "profile.csv", model)
-    return simulate(model, torque, q0=q0, nu0=nu0)
-
-
-def study(name: str) -> ModuleType:
-    """The script of a study in results/, as a module."""
-    spec = importlib.util.spec_from_file_location(f"study_{name}", RESULTS / name / "study.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def logged(model: Model, motion: Motion, path: Path, seed: int, *texts: str) -> Path:
-    """The log of a motion's torques on a machine with effects, as the sensors write it."""
-    entries = [placing.parse(text, model.machine, float(motion.t[-1])) for text in texts]
-    extended = prediction.build(placing.extended(model.machine, *entries)) if entries else model
-    driven = simulate(extended, motion.u, q0=motion.q[0], nu0=motion.nu[0])
-    sensors.measure(extended, driven, seed=seed).to_csv(path, index=False)
-    return path
-
-
-def gentle(model: Model, seconds: float) -> Motion:
-    """Little torque for a short time."""
-    t = np.arange(0, seconds + 0.01, 0.01)
-    slow = np.minimum(1, np.minimum(t, seconds - t) / 2)
-    return simulate(model, np.column_stack([1500 * np.sin(1.7 * t) * slow, 1200 * np.sin(2.6 * t) * slow]))
-
-
-def calm(model: Model) -> fits.Stage:
-    """The model fitted to a log of that without anything hidden."""
-    one = log.from_table(sensors.measure(model, gentle(model, 12.0), seed=3), model.machine)
-    return fits.fitted(model.machine, [one], model.machine.filter)
-
-
-def slope(straight: Model) -> EffectEntry:
-    """What `sloping` has hidden."""
-    return placing.parse("ground_slope=0.01", straight.machine, 40.0)
 
 
 @pytest.fixture(scope="session")
@@ -141,19 +80,13 @@ def browser() -> Iterator[Any]:
         chromium.close()
 
 
-class Excite(Protocol):
-    """Runs a command in this process: exit code, stdout, stderr."""
-
-    def __call__(self, *args: object) -> tuple[int, str, str]: ...
-
-
 @pytest.fixture
 def excite(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Excite:
     from excite.__main__ import main
 
     def run(*args: object) -> tuple[int, str, str]:
         monkeypatch.setattr("sys.argv", ["excite", *map(str, args)])
-        monkeypatch.setattr("excite.interrupt.deaf", lambda: None)  # the tests go on
+        monkeypatch.setattr("excite.interrupt.ignore_interrupts", lambda: None)  # the tests go on
         with pytest.raises(SystemExit) as end:
             main()
         shown = capsys.readouterr()

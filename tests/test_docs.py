@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 import typer
-from conftest import Excite
+from support.commands import Excite
 
 from excite import output
 from excite.cli import app, reference, reference_html
@@ -76,7 +76,7 @@ def test_a_study_can_be_rebuilt_where_it_is(monkeypatch: pytest.MonkeyPatch) -> 
     places = re.findall(r"--out (results/[^ `]+)", (ROOT / "results" / "README.md").read_text(encoding="utf-8"))
     assert len(places) > 8
     for place in places:
-        output.claim(Path(place))
+        output.check_out_folder(Path(place))
         assert (ROOT / place / "summary.json").is_file() or (ROOT / place / "design" / "summary.json").is_file()
 
 

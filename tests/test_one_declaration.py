@@ -19,7 +19,9 @@ import casadi as ca
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import Excite, drive
+import test_effects
+from support.commands import Excite
+from support.drives import drive
 from trajectories.test_design import test_objective_slope_and_curvature as slope_and_curvature
 
 from excite.cli import app, reference
@@ -37,7 +39,6 @@ from excite.trajectories.excitation import knots
 from excite.trajectories.limits import Kind, Symbols
 from excite.trajectories.objective import Objective
 from excite.workflows import Study, machine_check, requests, study_plan
-from model import test_effects
 
 ROOT = Path(__file__).parents[1]
 STICKY = Effect(
@@ -108,10 +109,10 @@ def test_a_new_effect_is_one_declaration(
     without, sticky = (pd.read_csv(path)["theta4_rad"].to_numpy() for path in logs)
     assert np.abs(without - sticky).max() > 0.05
     # the regressor
-    model = build(placing.extended(va12.machine, placing.parse(wanted, va12.machine, 10.0)))
+    model = build(placing.with_effects(va12.machine, placing.parse_effect(wanted, va12.machine, 10.0)))
     assert model.base.names[-1] == "sticky_spot@rear_roll"
     q, nu, a, u, z = test_effects.samples(model)
-    assert np.abs(model.stacked(q, nu, a, u, z)[:, 5, -1]).max() > 0.9
+    assert np.abs(model.stacked_regressor(q, nu, a, u, z)[:, 5, -1]).max() > 0.9
     # estimated with the other parameters, by a machine file that holds it
     own = tmp_path / "own.toml"
     amount = '{ value = 40, source = "assumed" }'
@@ -130,8 +131,8 @@ def test_a_new_effect_is_one_declaration(
     assert "## sticky_spot" in reference.effects_page()
     assert "sticky_spot" in requests.choices("effect")
     with pytest.raises(MachineError, match=r"is sticky_spot meant[?]"):
-        placing.parse("sticky_spots=1", va12.machine, 10.0)
-    assert study_plan.ready(study(effects=[[], wanted])).total == 2
+        placing.parse_effect("sticky_spots=1", va12.machine, 10.0)
+    assert study_plan.plan_study(study(effects=[[], wanted])).total == 2
     # tested by the same tests as every other
     for test in (
         test_effects.test_what_an_effect_predicts_is_what_it_does,
@@ -161,7 +162,7 @@ def test_a_new_machine_is_one_file(
     code, _, err = excite("design", "light", "--out", tmp_path / "d")
     assert (code, "allowed: heavy, va12, va12_straight" in err) == (2, True)
     assert "| heavy | full |" in reference.choices_page()
-    assert study_plan.ready(study(machine="heavy")).total == 1
+    assert study_plan.plan_study(study(machine="heavy")).total == 1
     (tmp_path / "mine.toml").write_text(new.replace("heavy", "mine"))
     for name in ("heavy", tmp_path / "mine.toml"):
         path = tmp_path / f"{Path(name).stem}.log.csv"
@@ -171,7 +172,7 @@ def test_a_new_machine_is_one_file(
     guessed = inspection.guess_machine(pd.read_csv(path))
     assert guessed is not None
     assert guessed.name == "heavy"
-    assert machine_check.check(folder / "heavy.toml").model is not None
+    assert machine_check.check_file(folder / "heavy.toml").model is not None
 
 
 LAST = "three_wheel"  # the machine that came last
@@ -228,7 +229,7 @@ def test_a_new_objective_is_one_function(
     slope_and_curvature()
     offered(excite, "design", "objective", "spread")
     assert "| spread | log of the mean relative standard deviation. | variances | yes |" in reference.choices_page()
-    assert study_plan.ready(study(objective=["cond", "spread"])).total == 2
+    assert study_plan.plan_study(study(objective=["cond", "spread"])).total == 2
     assert objective.titled("spread", objective.reported("spread", 1.5)) == "objective spread 1.5"
 
 
@@ -242,7 +243,7 @@ def test_a_new_limit_is_one_function(monkeypatch: pytest.MonkeyPatch, straight: 
     sizes = dict.fromkeys(straight.coordinates, 1.0) | {c + "'": 1.0 for c in straight.coordinates}
     assert "wheelspin" in collocation.transcribe(straight, problem, sizes, 10, still).limit_names
     assert "| wheelspin | How much faster the front roll turns than the rear one. |" in reference.choices_page()
-    assert study_plan.ready(study(limits=[{"wheelspin": 0.5}])).total == 1
+    assert study_plan.plan_study(study(limits=[{"wheelspin": 0.5}])).total == 1
     with pytest.raises(ValueError, match=r"allowed: torque.*wheelspin"):
         study(limits=[{"charm": 2}])
 
@@ -260,8 +261,10 @@ def test_a_new_method_is_one_function(
     for command in ("identify", "verify", "run"):
         offered(excite, command, "method", "halves")
     assert "| halves | Half of what least squares finds. | none | yes |" in reference.choices_page()
-    assert study_plan.ready(study(method=["ols", "halves"])).total == 2
-    sloping = build(placing.extended(straight.machine, placing.parse("ground_slope=0.01", straight.machine, 9.0)))
+    assert study_plan.plan_study(study(method=["ols", "halves"])).total == 2
+    sloping = build(
+        placing.with_effects(straight.machine, placing.parse_effect("ground_slope=0.01", straight.machine, 9.0))
+    )
     with pytest.raises(MachineError, match="method halves doesn't know effects, use ols or joint"):
         methods.identify(sloping, [one], "halves")
 

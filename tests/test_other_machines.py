@@ -19,7 +19,8 @@ import casadi as ca
 import numpy as np
 import pandas as pd
 import pytest
-from model.test_tree import TOLERANCE, Case, relative
+from support.logs import make_log
+from test_tree import TOLERANCE, Case, relative
 
 from excite.diagnosis import Diagnosis, diagnosis as diagnose, residuals, separating_run
 from excite.errors import InfeasibleError
@@ -250,7 +251,7 @@ def test_a_log_gives_the_true_parameters_back(name: str, model: Model) -> None:
     drive = excitation.scaled(excitation.multisine(model, short(model.machine, 12.0), 1, top=0.4), CASES[name].share)
     motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
     table = sensors.measure(model, motion, kit="full", seed=1)
-    estimate = methods.identify(model, [log.from_table(table, model.machine)], methods.recommended(model))
+    estimate = methods.identify(model, [log.from_table(table, model.machine)], methods.recommend_method(model))
     assert estimate.unidentifiable == {}
     z = (estimate.value - model.nominal) / estimate.std
     assert np.abs(z).max() < 4, dict(zip(model.base.names, z.round(1), strict=True))
@@ -269,7 +270,7 @@ def test_a_drum_that_nothing_drives_is_found_as_well() -> None:
     assert "u50" in model.base.invisible
     drive = excitation.scaled(excitation.multisine(model, short(model.machine, 12.0), 1, top=0.4), 0.5)
     motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
-    measured = log.from_table(sensors.measure(model, motion, seed=1), model.machine)
+    measured = make_log(model, motion, seed=1)
     estimate = methods.identify(model, [measured], "joint")
     z = (estimate.value - model.nominal) / estimate.std
     assert np.nanmax(np.abs(z)) < 4
@@ -378,15 +379,15 @@ def test_torques_that_effects_take_are_of_the_machines_own_size(name: str) -> No
     plain = model_of(name)
     still, p = np.zeros(len(plain.coordinates)), plain.expand @ plain.nominal
     for k, (row, body) in enumerate(zip(plain.actuated, plain.machine.actuated, strict=True)):
-        full, nu = sizes.full_torque(plain.machine, body), np.zeros(len(still))
+        full, nu = sizes.large_torque(plain.machine, body), np.zeros(len(still))
         u, nu[row] = full * np.eye(len(plain.inputs))[k], 1.0
         for cause, share in (("torque_deadband", 1.0), ("relief_valve", 0.4 * full), ("load_dependent_friction", full)):
             effect = catalogue.CATALOGUE[cause]
-            if body.where not in placing.places(plain.machine, effect):
+            if body.where not in placing.allowed_places(plain.machine, effect):
                 continue
-            amount = effect.amount(Site(plain.machine, body, 10.0))
-            entry = placing.parse(f"{cause}@{body.where}={amount}", plain.machine, 10.0)
-            model = build(placing.extended(plain.machine, entry))
+            amount = effect.typical_magnitude(Site(plain.machine, body, 10.0))
+            entry = placing.parse_effect(f"{cause}@{body.where}={amount}", plain.machine, 10.0)
+            model = build(placing.with_effects(plain.machine, entry))
             more = model.balance(still, nu, still, model.expand @ model.nominal, u, [])
             assert 0.01 * full < amount * share < 0.5 * full
             assert float((more - plain.balance(still, nu, still, p))[row]) == pytest.approx(amount * share, rel=0.02)
@@ -396,7 +397,7 @@ def test_torques_that_effects_take_are_of_the_machines_own_size(name: str) -> No
 def test_what_is_advised_has_the_machines_names(own: str) -> None:
     """A robot and a loader have no rolls: neither in what a log hides, nor in what separates causes, nor in the cab."""
     model = model_of(own)
-    texts = [c.text for c in identifiability.changes(model, np.zeros(len(model.coordinates), bool))]
+    texts = [c.text for c in identifiability.list_manoeuvres(model, np.zeros(len(model.coordinates), bool))]
     texts += [separating_run._said(run, model.machine) for run in separating_run.RUNS]
     texts += sheet.set_up(model.machine)
     contacts = [b.where.replace("_", " ") for b in model.machine.contacts]
@@ -406,9 +407,9 @@ def test_what_is_advised_has_the_machines_names(own: str) -> None:
 
 def test_what_a_straight_log_of_a_skid_steered_robot_hides_is_seen_by_turning() -> None:
     model = model_of("skid_robot")
-    texts = [c.text for c in identifiability.changes(model, np.zeros(len(model.coordinates), bool))]
+    texts = [c.text for c in identifiability.list_manoeuvres(model, np.zeros(len(model.coordinates), bool))]
     assert "turn (drive its sides at different speeds)" in texts
-    assert not any("sides" in c.text for c in identifiability.changes(model_of("tandem"), np.zeros(7, bool)))
+    assert not any("sides" in c.text for c in identifiability.list_manoeuvres(model_of("tandem"), np.zeros(7, bool)))
 
 
 @pytest.fixture(scope="module")
@@ -417,10 +418,10 @@ def biased() -> tuple[Motion, Diagnosis]:
     model = model_of("skid_robot")
     drawn = json.loads((ROOT / "results" / "machines" / "skid_robot" / "drive.json").read_text())
     torque = excitation.Manoeuvre(np.array(drawn["times_s"]), np.array(drawn["torque"])).sample(100.0)[:801]
-    effect = placing.parse("yaw_rate_bias=0.01", model.machine, 8.0)
-    wrong = build(placing.extended(model.machine, effect))
+    effect = placing.parse_effect("yaw_rate_bias=0.01", model.machine, 8.0)
+    wrong = build(placing.with_effects(model.machine, effect))
     motion = simulate(wrong, torque)
-    measured = log.from_table(sensors.measure(wrong, motion, seed=3), model.machine)
+    measured = make_log(wrong, motion, seed=3, known=model)
     return motion, diagnose.diagnose(model, [measured], model.machine.filter)
 
 
@@ -453,11 +454,9 @@ def test_a_diagnosis_names_what_a_roll_has_that_nothing_drives(cause: str) -> No
     model = model_of("three_wheel")
     drawn = json.loads((ROOT / "results" / "machines" / "three_wheel" / "drive.json").read_text())
     torque = excitation.Manoeuvre(np.array(drawn["times_s"]), np.array(drawn["torque"])).sample(100.0)
-    wrong = build(placing.extended(model.machine, placing.parse(cause, model.machine, 20.0)))
+    wrong = build(placing.with_effects(model.machine, placing.parse_effect(cause, model.machine, 20.0)))
     motion = simulate(wrong, torque, q0=np.array(drawn["start"]))
-    found = diagnose.diagnose(
-        model, [log.from_table(sensors.measure(wrong, motion, seed=1), model.machine)], model.machine.filter
-    )
+    found = diagnose.diagnose(model, [make_log(wrong, motion, seed=1, known=model)], model.machine.filter)
     name, _, amount = cause.partition("=")
     assert (found.verdict, [f.name for f in found.findings]) == ("named", [name])
     assert abs(found.findings[0].amount - float(amount)) < 2 * found.findings[0].amount_std < 0.15 * float(amount)
@@ -477,7 +476,7 @@ def test_the_run_that_separates_has_the_machines_names(
     """No drive tells which of two wheels of one side resists: both push along the same line."""
     effect, _, where = cause.partition("@")
     machine = biased[1].before.machine
-    tied = (placing.parse(f"{rival}=1", machine, 8.0),)
+    tied = (placing.parse_effect(f"{rival}=1", machine, 8.0),)
     found = replace(biased[1].findings[0], effect=effect, where=where, rivals=tied)
     diagnosis = replace(biased[1], findings=(found,))
     assert separating_run.run(diagnosis) == said

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 from types import ModuleType
 
-import conftest
 import numpy as np
 import pytest
+from support import files
 
 
 @pytest.fixture(scope="module")
 def study() -> ModuleType:
-    return conftest.study("1999")
+    return files.study("1999")
 
 
 def truth(study: ModuleType) -> dict[str, float]:
@@ -77,7 +77,7 @@ def test_least_squares_agrees_with_the_library(study: ModuleType) -> None:
 
 
 def test_written_results_hold_what_the_readme_says(study: ModuleType) -> None:
-    result = json.loads((conftest.RESULTS / "1999" / "summary.json").read_text())
+    result = json.loads((files.RESULTS / "1999" / "summary.json").read_text())
     assert result["grid"]["fits_with_pattern"] > 0
     assert result["grid"]["fits_with_all"] == 0
     assert result["grid"]["scaled_fits_with_all"] == 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from excite.text import percent, rounded
+from excite.text import format_number, format_percent
 
 
 @pytest.mark.parametrize(
@@ -24,9 +24,9 @@ from excite.text import percent, rounded
     ],
 )
 def test_a_number_has_no_exponent_that_it_does_not_need(value: float | None, digits: int, text: str) -> None:
-    assert rounded(value, digits) == text
+    assert format_number(value, digits) == text
 
 
 def test_per_cent_in_a_sentence() -> None:
-    assert percent(171.3) == "170 %"
-    assert percent(4, 3) == "4 %"
+    assert format_percent(171.3) == "170 %"
+    assert format_percent(4, 3) == "4 %"

@@ -134,7 +134,7 @@ def design(
 ) -> None:
     """Designs a test drive."""
     from excite import workflows
-    from excite.workflows import Brief
+    from excite.workflows import DesignRequest
 
     if between:
         if len(between) != 2 or objective not in ("cond", "discrimination"):
@@ -143,8 +143,8 @@ def design(
     if phase_min != 3.0 and not driver:
         raise UsageError("--phase-min is for --driver, give that too")
     known, pair = tuple(after or ()), tuple(between or ())
-    brief = Brief(objective, sigma_max, robust, known, starts, seed, budget, pair, driver, phase_min)
-    out = out or Path(f"results/design-{workflows.stem(machine)}")
+    brief = DesignRequest(objective, sigma_max, robust, known, starts, seed, budget, pair, driver, phase_min)
+    out = out or Path(f"results/design-{workflows.machine_stem(machine)}")
     with _result(out, json, terminal.design_table, [*_file(machine), *(after or [])]) as (place, summary):
         summary |= workflows.design(place, machine, problem, duration, brief, terminal.bar)
 
@@ -189,7 +189,7 @@ def compare(
     """Compares a designed drive with the usual ones on the same problem, limits and time."""
     from excite import workflows
 
-    out = out or Path(f"results/compare-{workflows.stem(machine)}")
+    out = out or Path(f"results/compare-{workflows.machine_stem(machine)}")
     with _result(out, json, terminal.compare_table, _file(machine)) as (place, summary):
         summary |= workflows.compare(place, machine, problem, samples, tuple(against or ()), seed, budget, terminal.bar)
 
@@ -213,7 +213,7 @@ def run(
 ) -> None:
     """Designs a test drive and verifies it, in one go."""
     from excite import output, simulation, workflows
-    from excite.workflows import Brief
+    from excite.workflows import DesignRequest
 
     def show(both: dict[str, Any]) -> None:
         terminal.design_table(both["design"])
@@ -221,11 +221,11 @@ def run(
 
     workflows.require_known("--kit", kit, simulation.KITS)
     workflows.choose_method(method, workflows.build_model(machine), kit)
-    out = out or Path(f"results/run-{workflows.stem(machine)}")
+    out = out or Path(f"results/run-{workflows.machine_stem(machine)}")
     with _result(out, json, show, _file(machine)) as (place, summary):
         designed = place / "design"
         designed.mkdir()
-        brief = Brief(objective, sigma_max, robust, (), starts, seed, budget)
+        brief = DesignRequest(objective, sigma_max, robust, (), starts, seed, budget)
         first = workflows.design(designed, machine, problem, duration, brief, terminal.bar)
         if not first["complete"] and budget is None:
             raise KeyboardInterrupt
@@ -282,7 +282,7 @@ def drive(
         with terminal.bar("driving") as advance:
             made = operator.prepare(trajectories.read_design(design_dir), phases, shortest, seed, advance)
         summary |= {"machine": name, "design": str(design_dir), "seed": seed, **operator.write(made, place)}
-        summary["versions"] = workflows.versions()
+        summary["versions"] = workflows.package_versions()
         output.write_summary(place, summary)
     if serve:
         operator.serve(out, made, host, port, live, lambda address: typer.echo(f"{address} (Ctrl-C ends)", err=True))
@@ -368,7 +368,7 @@ def identify(
     out = out or Path(f"results/identify-{model.machine.name}")
     _had(logs, filtering)
     with _result(out, json, terminal.identify_table, [*_file(machine), *logs, *(validate or [])]) as (place, summary):
-        summary |= workflows.identify(place, model, logs, method, filtering, validate or [], terminal.bar)
+        summary |= workflows.identify(place, machine, logs, method, filtering, validate or [], terminal.bar)
 
 
 @app.command()
@@ -385,17 +385,13 @@ def diagnose(
     json: JsonOption = False,
 ) -> None:
     """Shows what the simulation gets wrong, names the cause, extends the machine file, measures the gain."""
-    from excite import reports, workflows
+    from excite import workflows
+    from excite.model.machine import load_machine
 
-    model = workflows.build_model(machine)
-    out = out or Path(f"results/diagnose-{model.machine.name}")
+    out = out or Path(f"results/diagnose-{load_machine(machine).name}")
     _had(logs, filtering)
     with _result(out, json, terminal.diagnose_table, [*_file(machine), *logs]) as (place, summary):
-        with terminal.bar("diagnosing") as advance:
-            found, tied = workflows.diagnose_logs(place, machine, model, logs, filtering, advance)
-        summary |= found
-        summary["separating_drive"] = workflows.separating_drive(place, model.machine, tied, onward, terminal.bar)
-        reports.write_report(place, "diagnose", summary)
+        summary |= workflows.diagnose(place, machine, logs, filtering, onward, terminal.bar)
 
 
 logs = typer.Typer(help="What is in a log.", rich_markup_mode=None)
@@ -414,7 +410,11 @@ def check_log(
 
     out = out or Path(f"results/log-{path.stem}")
     _checked(
-        path, out, json, lambda place: reports.check_log(place, path, machine, workflows.versions()), terminal.log_table
+        path,
+        out,
+        json,
+        lambda place: reports.check_log(place, path, machine, workflows.package_versions()),
+        terminal.log_table,
     )
 
 
@@ -487,7 +487,7 @@ def check_machine(
         file,
         out,
         json,
-        lambda place: workflows.check_machine(place, file, workflows.versions()),
+        lambda place: workflows.check_machine(place, file, workflows.package_versions()),
         terminal.machine_table,
     )
 
@@ -500,7 +500,7 @@ def docs(out: OutOption = None, json: JsonOption = False) -> None:
 
     out = out or Path("results/docs-excite")
     with _result(out, json, lambda s: terminal.say(", ".join(s["pages"]))) as (place, summary):
-        summary |= {"pages": reference.write(place, app), "versions": workflows.versions()}
+        summary |= {"pages": reference.write(place, app), "versions": workflows.package_versions()}
         output.write_summary(place, summary)
 
 

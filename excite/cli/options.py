@@ -33,7 +33,7 @@ class Choosing(typer.core.TyperCommand):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         for p in self.params:
             if isinstance(p, typer.core.TyperOption):
-                p.help = workflows.helped(p.name or "", p.help)
+                p.help = workflows.help_with_choices(p.name or "", p.help)
         super().format_help(ctx, formatter)
 
 

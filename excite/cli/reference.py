@@ -297,7 +297,7 @@ def _options(command: Any) -> Iterator[tuple[str, str, str]]:
         yield (
             label,
             "needed" if p.required else "" if none else str(p.default),
-            workflows.helped(p.name, getattr(p, "help", None)),
+            workflows.help_with_choices(p.name, getattr(p, "help", None)),
         )
 
 

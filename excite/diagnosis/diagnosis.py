@@ -27,7 +27,7 @@ from excite.diagnosis.selection import Advance, Choice
 from excite.logs import Log
 from excite.model import Model, effects
 from excite.model.machine import EffectEntry, Filter
-from excite.smoothing import NotConverged
+from excite.smoothing import NotConvergedError
 
 MOST = 4  # effects that are looked for; so many kinds, none of which explains MOSTLY, patch up what has no name
 MOSTLY = 0.7  # of the misfit
@@ -221,7 +221,7 @@ def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_tu
         rest, whole = queue[1:], queue[-1].stage
         try:
             stage = _without(first.name, whole)
-        except NotConverged:
+        except NotConvergedError:
             queue = [*rest, replace(first, stage=whole, loose=None)]  # nothing fits without it
             continue
         choice = selection.choose(
@@ -231,7 +231,7 @@ def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_tu
     whole, judged = queue[-1].stage, {x.name: x for x in queue}
     same = judged.keys() == {x.name for x in chosen}
     worse = whole.fit.cost - found.fit.cost > selection.LEVEL * found.spread
-    if same or worse or whole.fit.disturbed > found.fit.disturbed:
+    if same or worse or whole.fit.process_noise > found.fit.process_noise:
         judged = judged if same else {x.name: x for x in chosen}
         return [replace(x, rivals=_others(judged[x.name], judged)) for x in chosen]
     # The one that came last comes last again.
@@ -248,13 +248,13 @@ def _one_by_one(before: Stage, chosen: Sequence[Choice], whole: Stage) -> list[C
     try:
         for x in chosen:
             machine = effects.with_effects(made[-1].machine, selection.entry_of(whole, x.name))
-            made.append(refitted(machine, made[-1], before.fit.disturbed))
-        made[-1] = made[-1] if whole.fit.disturbed == before.fit.disturbed else whole
-    except NotConverged:
+            made.append(refitted(machine, made[-1], before.fit.process_noise))
+        made[-1] = made[-1] if whole.fit.process_noise == before.fit.process_noise else whole
+    except NotConvergedError:
         return []
     found = []
     for x, old, new in zip(chosen, made, made[1:], strict=False):
-        alike = old.settled and old.fit.disturbed == new.fit.disturbed
+        alike = old.settled and old.fit.process_noise == new.fit.process_noise
         gain = old.fit.cost - new.fit.cost if alike else x.gain
         found.append(replace(x, stage=new, gain=max(gain, x.gain), loose=None))
     return found
@@ -266,7 +266,7 @@ def _one_from_another(chosen: Sequence[Choice], whole: Stage) -> list[Choice]:
     try:
         for x in reversed(chosen[1:]):
             made.append(_without(x.name, made[-1]))
-    except NotConverged:
+    except NotConvergedError:
         return []
     return [replace(x, stage=stage, loose=None) for x, stage in zip(chosen, reversed(made), strict=True)]
 
@@ -282,9 +282,9 @@ def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
         if len(kept) == 1 or (_surely(x.name, whole) and not doubtful):
             continue
         beside = np.inf  # nothing fits without it
-        with suppress(NotConverged):
+        with suppress(NotConvergedError):
             without = _without(x.name, whole)
-            if without.fit.disturbed <= whole.fit.disturbed:
+            if without.fit.process_noise <= whole.fit.process_noise:
                 beside = without.fit.cost - whole.fit.cost
         proven = whole.placed(x.name).effect.inverse or np.isinf(beside)
         if beside < selection.threshold(x.name, whole, x.tried) or not (proven or _foretells(without, whole)):
@@ -328,9 +328,9 @@ def _without(name: str, stage: Stage) -> Stage:
     """A stage's model without one of its effects, fitted. Raises NotConverged."""
     machine = effects.without_effect(stage.machine, name)
     try:
-        return refitted(machine, stage, stage.fit.disturbed)
-    except NotConverged:
-        return refitted(machine, stage, max(stage.fit.disturbed, SMALL))
+        return refitted(machine, stage, stage.fit.process_noise)
+    except NotConvergedError:
+        return refitted(machine, stage, max(stage.fit.process_noise, SMALL))
 
 
 def _odd(stage: Stage) -> tuple[str, ...]:

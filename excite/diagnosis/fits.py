@@ -24,18 +24,18 @@ from excite.model import Model, build, required_signs
 from excite.model.effects import PlacedEffect
 from excite.model.machine import Filter, Machine
 from excite.smoothing import (
-    Chart,
     Fit,
-    NotConverged,
-    Point,
-    Record,
-    carried,
-    chart,
+    Measurements,
+    NotConvergedError,
+    StateSpace,
+    Trajectory,
+    build_state_space,
     common_sensors,
-    first_point,
-    innovation_sizes,
-    origins,
-    record,
+    encoders_with_offset,
+    initial_trajectory,
+    innovation_statistics,
+    prepare_measurements,
+    transfer_trajectory,
 )
 
 NEARER = 100.0  # of a cost, by which what was not found comes nearer to logs that are near already
@@ -46,23 +46,23 @@ SURELY, WRONG = 3.0, 0.5  # deviations, and a share of its usual size, by which 
 PASSES = 14  # of a fit that goes on from another
 COARSE = 10.0, 30.0  # times their noise that sensors are taken to have where nothing follows the logs, in turn
 LESS = 0.1, 0.3  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
-SMALL = LESS[0] * identification.DISTURBED[0]  # the smallest that are tried
+SMALL = LESS[0] * identification.PROCESS_NOISE_LEVELS[0]  # the smallest that are tried
 
 
 @dataclass(frozen=True)
 class Prepared:
     """Logs made ready for a model: chart, records, first guesses, parameters that they don't show."""
 
-    c: Chart
+    c: StateSpace
     logs: tuple[Log, ...]
-    records: tuple[Record, ...]
-    starts: tuple[Point, ...]
+    records: tuple[Measurements, ...]
+    starts: tuple[Trajectory, ...]
     held: np.ndarray
 
     @property
     def coarse(self) -> float:
         """How many times as noisy as they are sensors are taken to be."""
-        return self.records[0].coarse
+        return self.records[0].noise_inflation
 
     @property
     def readings(self) -> float:
@@ -100,7 +100,7 @@ class Stage:
 
     @property
     def exact(self) -> bool:
-        return self.fit.disturbed == 0
+        return self.fit.process_noise == 0
 
     @property
     def noise(self) -> float:
@@ -114,7 +114,7 @@ class Stage:
     @property
     def near(self) -> bool:
         """Whether the misfit is not far from what noise makes."""
-        return self.fit.cost <= smoothing.STRONG * self.noise
+        return self.fit.cost <= smoothing.CLOSE_FIT_COST_RATIO * self.noise
 
     @cached_property
     def ways(self) -> tuple[score_test.Way, ...]:
@@ -145,7 +145,7 @@ class Stage:
     @property
     def doubt(self) -> float:
         """How much larger deviations are than the fit has them, for what it leaves unexplained: slow innovations."""
-        sizes = np.concatenate([innovation_sizes(linear) for linear in self.fit.linear])
+        sizes = np.concatenate([innovation_statistics(linear) for linear in self.fit.linear])
         told = sizes[:, 2] > 0
         return float(np.sqrt(max(1.0, sizes[told, 1].mean()))) if told.any() else 1.0
 
@@ -154,7 +154,7 @@ class Stage:
         """Parameters that surely have a sign that no machine has, friction that drives or soil that pulls, a line each.
         What makes them so is no cause, however much it explains."""
         fit, base = self.fit, self.model.base
-        of = required_signs(self.machine) | {e.name: 1.0 for e in self.model.effects if e.effect.resisting}
+        of = required_signs(self.machine) | {e.name: 1.0 for e in self.model.effects if e.effect.opposes_motion}
         sure = np.maximum(SURELY * self.doubt * fit.std, WRONG * self.model.scale)
         found: list[str] = []
         for k, (name, unit) in enumerate(zip(base.names, base.units, strict=True)):
@@ -173,7 +173,7 @@ class Stage:
 
     @property
     def suspects(self) -> list[str]:
-        return identification.suspects(self.prepared.c, self.prepared.logs, self.fit)
+        return identification.find_suspect_sensors(self.prepared.c, self.prepared.logs, self.fit)
 
 
 Fits = tuple[Fit, Fit | None]  # of a stage and of the one with larger disturbing forces that it came from, if it did
@@ -197,8 +197,8 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Toge
     prepared = _prepared(machine, logs, filter)
     calls: list[Callable[[], Any]] = [
         partial(_strictly, prepared),
-        partial(with_forces, machine, prepared, identification.DISTURBED[0]),
-        *(partial(from_first, noisy(prepared, times), identification.DISTURBED[0]) for times in COARSE),
+        partial(with_forces, machine, prepared, identification.PROCESS_NOISE_LEVELS[0]),
+        *(partial(from_first, noisy(prepared, times), identification.PROCESS_NOISE_LEVELS[0]) for times in COARSE),
     ]
     ways = together(calls)
     with closing(ways):
@@ -214,7 +214,7 @@ def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Toge
     if stage is not None and stage.near:
         return exact_if_near(stage)
     return (
-        _forced(machine, prepared, identification.DISTURBED[1:], together)
+        _forced(machine, prepared, identification.PROCESS_NOISE_LEVELS[1:], together)
         if stage is None
         else _with_least(stage, together)
     )
@@ -226,7 +226,7 @@ def forced(stage: Stage, together: Together) -> Stage:
     to look. Raises NotConverged where those don't either."""
     if stage.loose is not None:
         return _with_least(stage.loose, together)
-    return _forced(stage.machine, noisy(stage.prepared, 1.0), identification.DISTURBED[1:], together)
+    return _forced(stage.machine, noisy(stage.prepared, 1.0), identification.PROCESS_NOISE_LEVELS[1:], together)
 
 
 def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float], together: Together) -> Stage:
@@ -246,19 +246,19 @@ def _as_filed(prepared: Prepared) -> Fit:
     """A fit with the file's parameters and small disturbing forces."""
     asis = replace(prepared, held=np.ones_like(prepared.held))
     try:
-        fit = iterated(asis, prepared.starts, prepared.c.model.nominal, identification.DISTURBED[0])
-    except NotConverged as failed:
+        fit = iterated(asis, prepared.starts, prepared.c.model.nominal, identification.PROCESS_NOISE_LEVELS[0])
+    except NotConvergedError as failed:
         if failed.fit is None:
             raise
         fit = failed.fit
     unknown = np.full_like(fit.covariance, np.nan)
     known = smoothing.prior_information(prepared.c.model, prepared.held, fit.X)
-    return light(replace(fit, unseen=prepared.held, prior=known, covariance=unknown))
+    return light(replace(fit, unidentifiable=prepared.held, prior=known, covariance=unknown))
 
 
 def noisy(prepared: Prepared, coarse: float) -> Prepared:
     """The same logs with sensors so coarse."""
-    return replace(prepared, records=tuple(replace(r, coarse=coarse) for r in prepared.records))
+    return replace(prepared, records=tuple(replace(r, noise_inflation=coarse) for r in prepared.records))
 
 
 def as_measured(stage: Stage) -> Stage:
@@ -266,7 +266,9 @@ def as_measured(stage: Stage) -> Stage:
     if stage.prepared.coarse == 1:
         return stage
     prepared, fit = noisy(stage.prepared, 1.0), stage.fit
-    linear = smoothing.linearised(prepared.c, prepared.records, fit.points, prepared.starts, fit.X, fit.disturbed)
+    linear = smoothing.linearise_logs(
+        prepared.c, prepared.records, fit.trajectories, prepared.starts, fit.X, fit.process_noise
+    )
     if linear is None:
         return stage
     cost = sum(float(x.Z[0, 0]) for x in linear)
@@ -290,8 +292,8 @@ def from_first(
     p = prepared
     try:
         return light(iterated(p, p.starts, p.c.model.nominal, disturbed, most=most, patient=patient, worth=worth))
-    except NotConverged as failed:
-        return None if failed.nearly is None or patient else light(failed.nearly)
+    except NotConvergedError as failed:
+        return None if failed.acceptable_fit is None or patient else light(failed.acceptable_fit)
 
 
 def _strictly(prepared: Prepared) -> Fits | None:
@@ -336,7 +338,7 @@ def _lessened(first: Stage, together: Together = in_turn) -> Fits:
 
 def _with_less(stage: Stage, together: Together) -> Stage | None:
     """The fit of a stage gone on with with smaller disturbing forces, None where there is none."""
-    smaller = [d for d in (less * stage.fit.disturbed for less in LESS) if d >= SMALL]
+    smaller = [d for d in (less * stage.fit.process_noise for less in LESS) if d >= SMALL]
     with closing(together([partial(_resumable, stage.prepared, stage, forces) for forces in smaller])) as fits:
         return next((replace(stage, fit=fit, bare=()) for fit in fits if fit is not None), None)
 
@@ -373,7 +375,7 @@ def refitted_and_freed(machine: Machine, of: Stage, together: Together) -> tuple
     """The model of a machine with other effects fitted from the fit of a stage, None where no fit is found, and beside
     it the stage itself without its disturbing forces, if it has any and is near, as it will be asked for."""
     prepared, frees = prepared_for(machine, of), of.near and not of.exact
-    calls = [partial(_resumable, prepared, of, of.fit.disturbed), *([partial(_exact, of)] if frees else [])]
+    calls = [partial(_resumable, prepared, of, of.fit.process_noise), *([partial(_exact, of)] if frees else [])]
     fit, *bare = together(calls)
     other = None if fit is None else staged(machine, prepared, fit)
     return other, replace(of, bare=tuple(bare)) if frees else of
@@ -402,7 +404,7 @@ def _exact(stage: Stage) -> Fit | None:
     most = FAR * stage.prepared.readings
     try:
         fit = resume(stage.prepared, stage, 0.0, most)
-    except NotConverged:
+    except NotConvergedError:
         return None
     return fit if fit.cost < most else None
 
@@ -410,7 +412,7 @@ def _exact(stage: Stage) -> Fit | None:
 def _resumable(prepared: Prepared, of: Stage, disturbed: float, most: float = np.inf) -> Fit | None:
     try:
         return resume(prepared, of, disturbed, most)
-    except NotConverged:
+    except NotConvergedError:
         return None
 
 
@@ -420,27 +422,30 @@ def resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.inf
     old = dict(zip(of.model.base.names, of.fit.X, strict=True))
     X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, c.model.nominal, strict=True)])
     X = np.where(prepared.held, c.model.nominal, X)
-    points = [carried(c, r, p, of.prepared.c, X) for r, p in zip(prepared.records, of.fit.points, strict=True)]
+    points = [
+        transfer_trajectory(c, r, p, of.prepared.c, X)
+        for r, p in zip(prepared.records, of.fit.trajectories, strict=True)
+    ]
     try:
         fit = _nearly(prepared, points, X, disturbed, most, untold)
-    except NotConverged as failed:
+    except NotConvergedError as failed:
         found = failed.fit
         if found is None:
             raise
         if disturbed > 0:
             # It came near the logs as the stage that it began from did not with such forces: what began or ended at an
             # instant may keep it from settling, and exact dynamics tell later what it is worth.
-            alike = of.fit.disturbed >= disturbed and of.prepared.coarse == prepared.coarse
-            if alike and not of.near and found.cost <= min(smoothing.STRONG * prepared.noise, most):
+            alike = of.fit.process_noise >= disturbed and of.prepared.coarse == prepared.coarse
+            if alike and not of.near and found.cost <= min(smoothing.CLOSE_FIT_COST_RATIO * prepared.noise, most):
                 return light(found)
             raise
         # By exact dynamics it came near the logs as the stage that it began from did not, or nearer by far: what does
         # that is right, from however far it came, and is gone on with.
         alike = of.near and of.prepared.coarse == prepared.coarse
-        near = of.fit.cost - NEARER if alike else smoothing.STRONG * prepared.noise
+        near = of.fit.cost - NEARER if alike else smoothing.CLOSE_FIT_COST_RATIO * prepared.noise
         if found.cost > min(near, most):
             raise
-        fit = _nearly(prepared, found.points, found.X, disturbed, most, untold)
+        fit = _nearly(prepared, found.trajectories, found.X, disturbed, most, untold)
     return light(fit)
 
 
@@ -449,20 +454,20 @@ def _untold(prepared: Prepared, of: Stage, disturbed: float) -> np.ndarray:
     finer sensors may show them now. Most often they don't with other effects either: left free they would first lead
     each of these fits astray."""
     names = prepared.c.model.base.names
-    if of.fit.disturbed > disturbed or of.prepared.coarse != prepared.coarse or not of.settled:
+    if of.fit.process_noise > disturbed or of.prepared.coarse != prepared.coarse or not of.settled:
         return np.zeros(len(names), bool)
-    unseen = {n for n, yes in zip(of.model.base.names, of.fit.unseen, strict=True) if yes}
+    unseen = {n for n, yes in zip(of.model.base.names, of.fit.unidentifiable, strict=True) if yes}
     return np.array([n in unseen for n in names])
 
 
 def _nearly(
-    prepared: Prepared, points: Sequence[Point], X: np.ndarray, disturbed: float, most: float, untold: np.ndarray
+    prepared: Prepared, points: Sequence[Trajectory], X: np.ndarray, disturbed: float, most: float, untold: np.ndarray
 ) -> Fit:
     """A fit that goes on from another, as far as it came if that is as good as found. Raises NotConverged."""
     try:
-        return iterated(prepared, points, X, disturbed, smoothing.RESUMED, PASSES, most, untold=untold)
-    except NotConverged as failed:
-        found = failed.nearly or failed.swinging
+        return iterated(prepared, points, X, disturbed, smoothing.RESUMED_DAMPING, PASSES, most, untold=untold)
+    except NotConvergedError as failed:
+        found = failed.acceptable_fit or failed.oscillating_fit
         if found is None:
             raise
         return found
@@ -470,11 +475,11 @@ def _nearly(
 
 def iterated(
     prepared: Prepared,
-    points: Sequence[Point],
+    points: Sequence[Trajectory],
     X: np.ndarray,
     disturbed: float,
-    damping: float = smoothing.DAMPING[0],
-    passes: int = smoothing.PASSES,
+    damping: float = smoothing.INITIAL_DAMPING,
+    passes: int = smoothing.MAX_PASSES,
     most: float = np.inf,
     patient: bool = False,
     worth: float = np.inf,
@@ -483,27 +488,32 @@ def iterated(
     """A fit from points and X. With large disturbing forces it is found as soon as it nearly is: gains are larger
     by far than what another pass would change. With the smallest, whose gains may be small, and by exact dynamics it
     leaves undone what is less than an amount is ever known to, the patient one nothing. Raises NotConverged."""
-    p, enough = prepared, smoothing.NEARLY if disturbed > SMALL else 0.0 if patient else smoothing.ENOUGH
-    return smoothing.iterate(
+    p, enough = (
+        prepared,
+        smoothing.ACCEPTABLE_STEP if disturbed > SMALL else 0.0 if patient else smoothing.SUFFICIENT_STEP,
+    )
+    return smoothing.fit_logs(
         p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, enough, most, patient, worth, untold
     )
 
 
 def light(fit: Fit) -> Fit:
     """A fit without what only its own iteration needs."""
-    return replace(fit, linear=tuple(replace(x, solved=x.solved.closed) for x in fit.linear))
+    return replace(fit, linear=tuple(replace(x, chain=x.chain.without_levels) for x in fit.linear))
 
 
-def _charted(machine: Machine, logs: Sequence[Log]) -> Chart:
-    model = build(machine, shapes=True)
-    return chart(model, common_sensors(model, logs))
+def _charted(machine: Machine, logs: Sequence[Log]) -> StateSpace:
+    model = build(machine, fit_shapes=True)
+    return build_state_space(model, common_sensors(model, logs))
 
 
 def _prepared(machine: Machine, logs: Sequence[Log], filter: Filter) -> Prepared:
     c = _charted(machine, logs)
-    records = tuple(record(c, log) for log in logs)
-    starts = tuple(first_point(c, r, log, filter) for r, log in zip(records, logs, strict=True))
-    return Prepared(c, tuple(logs), records, starts, identification.unmoved(c.model, logs, filter, slow=False))
+    records = tuple(prepare_measurements(c, log) for log in logs)
+    starts = tuple(initial_trajectory(c, r, log, filter) for r, log in zip(records, logs, strict=True))
+    return Prepared(
+        c, tuple(logs), records, starts, identification.parameters_at_rest(c.model, logs, filter, slow=False)
+    )
 
 
 def prepared_for(machine: Machine, of: Stage) -> Prepared:
@@ -513,7 +523,9 @@ def prepared_for(machine: Machine, of: Stage) -> Prepared:
         return before
     c = _charted(machine, before.logs)
     model = c.model
-    records = tuple(replace(r, origin=origins(c, r.counts)) for r in before.records)
-    starts = tuple(carried(c, r, p, before.c, model.nominal) for r, p in zip(records, before.starts, strict=True))
+    records = tuple(replace(r, offset_sensors=encoders_with_offset(c, r.read_at_edges)) for r in before.records)
+    starts = tuple(
+        transfer_trajectory(c, r, p, before.c, model.nominal) for r, p in zip(records, before.starts, strict=True)
+    )
     held = dict(zip(of.model.base.names, before.held, strict=True))
     return Prepared(c, before.logs, records, starts, np.array([held.get(n, False) for n in model.base.names]))

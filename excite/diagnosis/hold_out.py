@@ -17,7 +17,7 @@ import scipy.stats
 
 from excite import smoothing
 from excite.diagnosis.fits import Stage
-from excite.smoothing import Fit, NotConverged, readings
+from excite.smoothing import Fit, NotConvergedError, predict_readings
 
 HIDDEN, PERIOD = 2.0, 6.0  # [s] withheld of every so many
 ENOUGH, TURNS = 20, 3  # stretches that are wanted, and how often a short log is hidden in turn for them, at most
@@ -78,7 +78,7 @@ def withheld(stage: Stage) -> Withheld | None:
     """How well a fitted model predicts stretches that are hidden from it, or the machine file's where none could be
     fitted, not even to coarse sensors; None where no fit to the rest is found or logs are too short to hide any."""
     prepared, fit = stage.prepared, stage.fit
-    held = prepared.held | fit.unseen if stage.settled or prepared.coarse > 1 else np.ones_like(prepared.held)
+    held = prepared.held | fit.unidentifiable if stage.settled or prepared.coarse > 1 else np.ones_like(prepared.held)
     rate = float(stage.machine.sampling_hz)
     lengths = [len(r.used) for r in prepared.records]
     once = sum(len(_stretches(n, rate)) for n in lengths)
@@ -110,31 +110,31 @@ def _hidden(
             used[a:b] = 0.0
         masked.append(replace(r, used=used))
     rest: Fit | None = None
-    for disturbed in (fit.disturbed, *(x for x in LOOSER if x > fit.disturbed)):
+    for disturbed in (fit.process_noise, *(x for x in LOOSER if x > fit.process_noise)):
         try:
-            rest = smoothing.iterate(
+            rest = smoothing.fit_logs(
                 c,
                 masked,
-                fit.points,
+                fit.trajectories,
                 fit.X,
                 prepared.starts,
                 disturbed,
                 held,
-                smoothing.RESUMED,
+                smoothing.RESUMED_DAMPING,
                 # What it predicts is asked for, not its deviations.
-                enough=smoothing.NEARLY if disturbed > 0 else smoothing.ENOUGH,
+                sufficient_step=smoothing.ACCEPTABLE_STEP if disturbed > 0 else smoothing.SUFFICIENT_STEP,
                 patient=False,
             )
-        except NotConverged as failed:
-            rest = failed.nearly
+        except NotConvergedError as failed:
+            rest = failed.acceptable_fit
         if rest is not None:
             break
     if rest is None:
         return None
     squares, counts, motion, noise = [], [], [], []
-    for r, p, own in zip(prepared.records, rest.points, stretches, strict=True):
-        u = c.delivered(r.torque, rest.X)[0] + p.errors
-        h, _, weight, *_ = readings(c, r, p, u, rest.X)
+    for r, p, own in zip(prepared.records, rest.trajectories, stretches, strict=True):
+        u = c.delivered_torques(r.torque, rest.X)[0] + p.sampled_torque_error
+        h, _, weight, *_ = predict_readings(c, r, p, u, rest.X)
         noise.append(r.used.sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300))
         for a, b in own:
             told = r.used[a:b] > 0
@@ -142,7 +142,7 @@ def _hidden(
             squares.append((error**2).sum(axis=0))
             counts.append(told.sum(axis=0))
             motion.append(h[a:b].var(axis=0))
-    sensors = tuple((s.name, c.model.machine.si(s)) for s in c.sensors)
+    sensors = tuple((s.name, c.model.machine.si_unit(s)) for s in c.sensors)
     each = np.full(len(squares), turn)
     return Withheld(sensors, np.array(squares), np.array(counts), np.mean(motion, axis=0), np.mean(noise, axis=0), each)
 

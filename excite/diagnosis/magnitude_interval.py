@@ -27,7 +27,7 @@ def unsure(placed: PlacedEffect, after: Stage, together: Together) -> float:
     a fit holds for shapes nearby only."""
     fit, names = after.fit, after.model.base.names
     known = after.model.scale / np.sqrt(fit.prior)  # without any log
-    told = ~fit.unseen & (fit.std < HARDLY * known)
+    told = ~fit.unidentifiable & (fit.std < HARDLY * known)
     entry, own = selection.entry_of(after, placed.name), [placed.name, *(f"{placed.name}.{s}" for s in placed.shapes)]
     wishes: list[tuple[Machine, Stage, float]] = []
     held: list[str] = []
@@ -39,7 +39,7 @@ def unsure(placed: PlacedEffect, after: Stage, together: Together) -> float:
                 value = Quantity(value=float(x), source="assumed")
                 other = entry.model_copy(update={"shape": {**entry.shape, s: value}})
                 machine = effects.with_effects(effects.without_effect(after.machine, placed.name), other)
-                wishes.append((machine, after, fit.disturbed))
+                wishes.append((machine, after, fit.process_noise))
                 held.append(name)
     most = fit.cost + APART**2 * after.spread
     liked = _cost_of_data(after, own) + APART**2 * after.spread
@@ -56,7 +56,7 @@ def _usual(placed: PlacedEffect, name: str, machine: Machine) -> tuple[float, ..
         return ()
     size = shape.size(site)
     every = [x * size for x in (*shape.grid, *(shape.within or ()))]
-    every += [b[name] for b in placed.beside(site) if name in b]
+    every += [b[name] for b in placed.extra_trials(site) if name in b]
     return min(every), max(every)
 
 

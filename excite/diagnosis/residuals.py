@@ -16,7 +16,7 @@ import scipy
 from excite import identification
 from excite.diagnosis.fits import Stage, as_measured, refits
 from excite.diagnosis.parallel import in_turn
-from excite.smoothing import Linear, advance, differentiate, state_scale
+from excite.smoothing import LinearisedLog, advance, differentiate, state_scale
 
 BLOCK_S = 0.25  # [s] over which slow errors are means
 BINS = 24  # of a quantity
@@ -41,7 +41,7 @@ class Course:
     missing: Mapping[str, tuple[np.ndarray, str, float]]
     quantities: Mapping[str, tuple[str, Mapping[str, np.ndarray]]]
     sensors: tuple[str, ...]
-    linear: Linear
+    linear: LinearisedLog
 
     @property
     def innovations(self) -> np.ndarray:
@@ -75,8 +75,8 @@ class Size:
 
 def loosened(stage: Stage) -> Stage:
     """The same model with disturbing forces of some size; as it is where those find no fit."""
-    least, known = identification.DISTURBED[0], stage
-    while known.fit.disturbed < least or known.prepared.coarse > 1:
+    least, known = identification.PROCESS_NOISE_LEVELS[0], stage
+    while known.fit.process_noise < least or known.prepared.coarse > 1:
         if known.loose is None:
             (found,) = refits([(stage.machine, stage, least)], in_turn)
             return found or stage
@@ -92,13 +92,13 @@ def courses(stage: Stage) -> tuple[Course, ...]:
 
 def _course(stage: Stage, k: int) -> Course:
     c, fit, model = stage.prepared.c, stage.fit, stage.model
-    log, r, p = stage.prepared.logs[k], stage.prepared.records[k], fit.points[k]
-    N = len(p.s)
+    log, r, p = stage.prepared.logs[k], stage.prepared.records[k], fit.trajectories[k]
+    N = len(p.state)
     rate = float(stage.machine.sampling_hz)
     t = np.arange(N) / rate
-    w = p.errors
-    u = c.delivered(r.torque, fit.X)[0] + w
-    q, nu, _ = c.parts(p.s)
+    w = p.sampled_torque_error
+    u = c.delivered_torques(r.torque, fit.X)[0] + w
+    q, nu, _ = c.unpack(p.state)
     missing: dict[str, tuple[np.ndarray, str, float]] = {}
     own: dict[str, int | None] = {}
     for j, (name, body) in enumerate(zip(model.inputs, stage.machine.actuated, strict=True)):
@@ -106,7 +106,7 @@ def _course(stage: Stage, k: int) -> Course:
         missing[label] = w[:, j], "N m" if body.joint == "revolute" else "N", float(r.noise.torque[j])
         own[label] = body.index
     if not stage.exact:
-        for label, force, unit, index in _forces(stage, p.s, c.inputs(u, p.over)):
+        for label, force, unit, index in _forces(stage, p.state, c.inputs(u, p.ground_inputs)):
             before = missing.get(label)
             # Where forces act on a driven joint they are its missing torque as well.
             missing[label] = (before[0] + force, unit, float("nan")) if before else (force, unit, float("nan"))
@@ -133,7 +133,7 @@ def _forces(stage: Stage, s: np.ndarray, u: np.ndarray) -> list[tuple[str, np.nd
     names = {0: ("force ahead", "N"), 1: ("force to the left", "N"), 2: ("yaw moment", "N m")}
     root = stage.machine.body[0].coordinates
     found: list[tuple[str, np.ndarray, str, int | None]] = []
-    for j, row in enumerate(c.pushed):
+    for j, row in enumerate(c.forced_rows):
         coordinate = model.coordinates[row]
         if stage.machine.planar and coordinate in root:
             label, unit = names[root.index(coordinate)]

@@ -25,17 +25,17 @@ from excite.model.effects import CATALOGUE, Effect, PlacedEffect, Site
 from excite.model.machine import Machine
 from excite.simulation import delivered_torque
 from excite.smoothing import (
-    BATCH,
-    Batch,
-    Chart,
-    Linear,
-    Point,
-    Record,
-    White,
+    BATCH_SIZE,
+    BatchedFunction,
+    LinearisedLog,
+    Measurements,
+    StateSpace,
+    Trajectory,
+    WhitenedInnovations,
     differentiate,
-    smoothed,
-    whitened,
-    whitened_signatures,
+    smoothed_motion,
+    whiten,
+    whiten_signatures,
 )
 
 NEARBY = 0.6, 0.8, 1.0, 1.3, 1.7  # amounts that are tried about the grid's, where they aren't a factor
@@ -106,9 +106,9 @@ def _grid(effect: Effect, site: Site) -> list[tuple[dict[str, float], int]]:
     tried = []
     for share in effect.grid:
         for shapes in product(*grids):
-            values = {"A": share * effect.amount(site), **dict(zip(names, shapes, strict=True))}
+            values = {"A": share * effect.typical_magnitude(site), **dict(zip(names, shapes, strict=True))}
             tried.append((values | ({circular: 0.0} if circular else {}), 2 if circular else 1))
-    tried += [({"A": effect.amount(site), **shapes}, 1) for shapes in effect.beside(site)]
+    tried += [({"A": effect.typical_magnitude(site), **shapes}, 1) for shapes in effect.extra_trials(site)]
     return [x for x in tried if _within(x[0], site.duration)]
 
 
@@ -144,7 +144,7 @@ def _about(placed: PlacedEffect, site: Site, reach: float) -> list[dict[str, flo
     if len(effect.grid) > 1:
         families.append([{"A": own["A"] * f**reach} for f in NEARBY])
     unusual = _unusual(effect, own)
-    alike = [b for b in placed.beside(site) if unusual and _unusual(effect, b) == unusual]
+    alike = [b for b in placed.extra_trials(site) if unusual and _unusual(effect, b) == unusual]
     alike = [b for b in alike if all(b[n] * own[n] > 0 for n in unusual)]
     if alike:
         tried = {n: {b[n] for b in alike} for n, s in effect.shapes.items() if not s.whole}
@@ -191,8 +191,8 @@ class Way:
     the whitened innovations, and what a map of the ground tells, over (N, n_over). origins: how many offsets of counts
     the log has."""
 
-    chart: Chart
-    linear: Linear
+    chart: StateSpace
+    linear: LinearisedLog
     origins: int
     q: np.ndarray
     nu: np.ndarray
@@ -202,28 +202,30 @@ class Way:
     exact: np.ndarray
     standard: np.ndarray
     slopes: np.ndarray
-    white: White
+    white: WhitenedInnovations
     over: np.ndarray
 
 
-def ways(c: Chart, records: Sequence[Record], fit: smoothing.Fit) -> tuple[Way, ...]:
+def ways(c: StateSpace, records: Sequence[Measurements], fit: smoothing.Fit) -> tuple[Way, ...]:
     """Of every log."""
-    return tuple(_way(c, r, p, linear, fit.X) for r, p, linear in zip(records, fit.points, fit.linear, strict=True))
+    return tuple(
+        _way(c, r, p, linear, fit.X) for r, p, linear in zip(records, fit.trajectories, fit.linear, strict=True)
+    )
 
 
-def _way(c: Chart, r: Record, p: Point, linear: Linear, X: np.ndarray) -> Way:
+def _way(c: StateSpace, r: Measurements, p: Trajectory, linear: LinearisedLog, X: np.ndarray) -> Way:
     model = c.model
-    q, nu, z, u, a = smoothed(c, r, p, X)
+    q, nu, z, u, a = smoothed_motion(c, r, p, X)
     t = np.arange(len(u)) / float(model.machine.sampling_hz)
     wheels = np.zeros((len(u), sum(s.kind == "wheel" for s in model.machine.sensor)))
     n_q = q.shape[1]
     for k, at in enumerate(c.index):
         if 2 * n_q <= at < 2 * n_q + wheels.shape[1]:
-            wheels[:, at - 2 * n_q] = p.s[:, k]
+            wheels[:, at - 2 * n_q] = p.state[:, k]
     exact = model.read(q.T, nu.T, wheels.T, u.T, z.T, X).full().T
-    slopes, white = _slopes(c, p, u, X), whitened(linear, c.flawed)
-    over = p.over if model.mapped else passes(model, q, nu, 1 / float(model.machine.sampling_hz))
-    return Way(c, linear, len(r.origin), q, nu, a, u, t, exact, model.expand @ X, slopes, white, over)
+    slopes, white = _slopes(c, p, u, X), whiten(linear, c.reading_parameters)
+    over = p.ground_inputs if model.map_inputs else passes(model, q, nu, 1 / float(model.machine.sampling_hz))
+    return Way(c, linear, len(r.offset_sensors), q, nu, a, u, t, exact, model.expand @ X, slopes, white, over)
 
 
 class Signatures:
@@ -241,8 +243,8 @@ class Signatures:
                 every.append(PlacedEffect(x.placed.effect, x.placed.where, x.placed.bodies, x.placed.sensor, values))
         standard = tuple(n for n in model.base.standard if "@" not in n)
         made = signatures(model.machine, standard, every)
-        self.force, self.reading = Batch(made.force, (7,)), Batch(made.reading, (7,))
-        self.rows = [model.readable.index(s.name) for s in c.sensors]
+        self.force, self.reading = BatchedFunction(made.force, (7,)), BatchedFunction(made.reading, (7,))
+        self.rows = [model.reading_names.index(s.name) for s in c.sensors]
         self.p = way.standard[: len(standard)]
         memory = remembered(made, way.q, way.nu, way.u, way.t, self.p, way.over)
         self.samples = (way.q, way.nu, way.a, way.u, way.t[:, None], memory, way.exact)
@@ -258,7 +260,7 @@ class Signatures:
         way = self.way
         own = way.white.E.shape[2]
         form = np.zeros((own + self.columns, own + self.columns))
-        for at, E in whitened_signatures(way.linear, way.white, self._along):
+        for at, E in whiten_signatures(way.linear, way.white, self._along):
             both = np.concatenate([way.white.E[at], E], axis=2).reshape(-1, len(form))
             form += both.T @ both
         unbounded = own + np.flatnonzero(~self.bounded)
@@ -284,30 +286,30 @@ class Signatures:
         return push, reading
 
 
-def _free(c: Chart) -> list[int]:
+def _free(c: StateSpace) -> list[int]:
     """Which of the rows that disturbing forces act on have no actuator."""
-    return [k for k, row in enumerate(c.pushed) if row not in c.model.actuated]
+    return [k for k, row in enumerate(c.forced_rows) if row not in c.model.actuated]
 
 
-def _slopes(c: Chart, p: Point, u: np.ndarray, X: np.ndarray) -> np.ndarray:
+def _slopes(c: StateSpace, p: Trajectory, u: np.ndarray, X: np.ndarray) -> np.ndarray:
     """What half a torque and half a force on each row without an actuator, at both ends of each interval, do to the
     scaled state behind it (N - 1, n, n_u + n_free)."""
-    N, scale, free, inputs = len(p.s), smoothing.state_scale(c), _free(c), c.inputs(u, p.over)
+    N, scale, free, inputs = len(p.state), smoothing.state_scale(c), _free(c), c.inputs(u, p.ground_inputs)
     found = np.empty((N - 1, c.n, u.shape[1] + len(free)), np.float32)
-    for at in range(0, N - 1, BATCH):
-        until = min(at + BATCH, N - 1)
-        by = differentiate(c, p.s[at : until + 1], inputs[at:until], inputs[at + 1 : until + 1], X, force=True)
+    for at in range(0, N - 1, BATCH_SIZE):
+        until = min(at + BATCH_SIZE, N - 1)
+        by = differentiate(c, p.state[at : until + 1], inputs[at:until], inputs[at + 1 : until + 1], X, force=True)
         found[at:until] = np.concatenate([by.B, by.F[:, :, free]], axis=2) / (2 * scale[:, None])
     return found
 
 
-def _acting(c: Chart, force: np.ndarray) -> np.ndarray:
+def _acting(c: StateSpace, force: np.ndarray) -> np.ndarray:
     """Of forces (K, n_q, C) those on rows with an actuator, then those on rows without, in the order of `_slopes`."""
-    rows = [*c.model.actuated, *(c.pushed[k] for k in _free(c))]
+    rows = [*c.model.actuated, *(c.forced_rows[k] for k in _free(c))]
     return force[:, rows].astype(np.float32)
 
 
-def _misread(c: Chart, e: PlacedEffect, u: np.ndarray, t: np.ndarray) -> np.ndarray:
+def _misread(c: StateSpace, e: PlacedEffect, u: np.ndarray, t: np.ndarray) -> np.ndarray:
     """How much more torque would be delivered (N, n_u) where a channel reads as the effect has it.
 
     From smoothed torques u: measured ones would answer to their own noise.
@@ -336,7 +338,7 @@ def remembered(
     rate = made.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q : -1], at[-1], z, ca.DM(p))
     flow = ca.Function("flow", [z, at], [rate])
     along = np.hstack([q, nu, u, t[:, None]])
-    return implicit(flow, np.zeros(n_z), along, float(t[1] - t[0]), over[:, : made.mapped])
+    return implicit(flow, np.zeros(n_z), along, float(t[1] - t[0]), over[:, : made.n_map_inputs])
 
 
 def scan(

@@ -31,7 +31,7 @@ from excite.diagnosis.fits import (
 )
 from excite.diagnosis.parallel import Together
 from excite.model.machine import Machine
-from excite.smoothing import NotConverged, Point
+from excite.smoothing import NotConvergedError, Trajectory
 
 SHORTEST = 30.0  # [s] that the beginning of a log has at least
 # Passes after which an effect that leaves as much as the model without it, but for a share, is known to do nothing.
@@ -93,7 +93,7 @@ def _beginnings(prepared: Prepared) -> list[tuple[int, ...]]:
 def _until(prepared: Prepared, samples: Sequence[int]) -> Prepared:
     """The first samples of each log only."""
     records = tuple(r.until(n) for r, n in zip(prepared.records, samples, strict=True))
-    return replace(prepared, records=records, starts=tuple(map(Point.until, prepared.starts, samples)))
+    return replace(prepared, records=records, starts=tuple(map(Trajectory.until, prepared.starts, samples)))
 
 
 def _onset(of: Stage, disturbed: float, worth: float) -> Onset | None:
@@ -117,7 +117,9 @@ def _where_near(of: Stage) -> Onset | None:
     samples = next(iter(_beginnings(of.prepared)), None)
     if samples is None:
         return None
-    return Onset(samples, _until(of.prepared, samples).readings + (smoothing.STRONG - 1) * of.prepared.readings)
+    return Onset(
+        samples, _until(of.prepared, samples).readings + (smoothing.CLOSE_FIT_COST_RATIO - 1) * of.prepared.readings
+    )
 
 
 def _where_far(of: Stage) -> Onset | None:
@@ -151,20 +153,22 @@ def _sets_out(prepared: Prepared, onset: Onset | None, disturbed: float) -> bool
     if not np.isinf(brief) and _began(begin, disturbed, np.inf, BRIEF)[0] > brief:
         return False
     if onset.whole:
-        cost, found = _began(begin, disturbed, np.inf, smoothing.PASSES)
+        cost, found = _began(begin, disturbed, np.inf, smoothing.MAX_PASSES)
     else:
         cost, found = _began(begin, disturbed, onset.most)
     return cost <= onset.most or (found and onset.or_found)
 
 
-def _began(begin: Prepared, disturbed: float, most: float, passes: int = smoothing.SETTLED + 1) -> tuple[float, bool]:
+def _began(
+    begin: Prepared, disturbed: float, most: float, passes: int = smoothing.SETTLING_PASSES + 1
+) -> tuple[float, bool]:
     """What a fit to the beginning of logs costs after a few passes, nothing where there is none, and whether it is as
     good as found then. most: what it is given up above."""
     X = begin.c.model.nominal
     try:
         return iterated(begin, begin.starts, X, disturbed, passes=passes, most=most).cost, True
-    except NotConverged as failed:
-        return (0.0 if failed.fit is None else failed.fit.cost), failed.nearly is not None
+    except NotConvergedError as failed:
+        return (0.0 if failed.fit is None else failed.fit.cost), failed.acceptable_fit is not None
 
 
 def _begun(machine: Machine, of: Stage, onsets: Sequence[Onset | None], disturbed: float, worth: float) -> Fits | None:
@@ -173,7 +177,7 @@ def _begun(machine: Machine, of: Stage, onsets: Sequence[Onset | None], disturbe
     if not all(_sets_out(prepared, onset, disturbed) for onset in onsets):
         return None
     if disturbed > 0:
-        return with_forces(machine, prepared, disturbed, smoothing.STRONG * prepared.noise)
+        return with_forces(machine, prepared, disturbed, smoothing.CLOSE_FIT_COST_RATIO * prepared.noise)
     return _plain(machine, prepared, worth)
 
 
@@ -188,7 +192,7 @@ def _plain(machine: Machine, prepared: Prepared, worth: float) -> Fits | None:
         return fit, None
     try:
         loose = resume(prepared, stage, SMALL)
-    except NotConverged:
+    except NotConvergedError:
         return fit, None
     return (fit if stage.follows and not replace(stage, fit=loose).near else loose), None
 

@@ -36,7 +36,7 @@ from excite.logs import Log
 from excite.model import effects
 from excite.model.effects import Effect, PlacedEffect
 from excite.model.machine import EffectEntry, Quantity
-from excite.smoothing import NotConverged
+from excite.smoothing import NotConvergedError
 
 # Of twice the log-likelihood that an effect must gain; logs without any stayed below 16. Chi-squared gives 2.1 % of
 # logs of a minute above what `threshold` makes of it, 2.7 % of longer ones, at most: summed over the 371 and 441
@@ -105,7 +105,7 @@ def wald(name: str, stage: Stage) -> float:
     fit, squared (Wald's statistic): one may stand for the other. 0 of what was held, as nothing shows it."""
     shapes, names, fit = stage.placed(name).effect.shapes, stage.model.base.names, stage.fit
     told = [name, *(f"{name}.{s}" for s, shape in shapes.items() if shape.signed and not shape.circular)]
-    at = [k for k in (names.index(n) for n in told if n in names) if not fit.unseen[k]]
+    at = [k for k in (names.index(n) for n in told if n in names) if not fit.unidentifiable[k]]
     away = fit.X[at] / fit.std[at]
     return float(away @ np.linalg.solve(fit.covariance[np.ix_(at, at)] / np.outer(fit.std[at], fit.std[at]), away))
 
@@ -259,12 +259,12 @@ def choose(
     if stage.exact and _lost(likely, tries, refused):
         # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
         known = chosen[-1].loose if chosen else None
-        if known is not None and known.machine is stage.machine and known.fit.disturbed == SMALL:
+        if known is not None and known.machine is stage.machine and known.fit.process_noise == SMALL:
             stage = known
         else:
             try:
                 stage = refitted(stage.machine, stage, SMALL)
-            except NotConverged:
+            except NotConvergedError:
                 return None
         found = score_test.renumbered([s.candidate for s in likely])
         likely = _shortlist(stage, _scanned(stage, found, together), chosen)
@@ -331,7 +331,7 @@ def sharp(stage: Stage, together: Together) -> tuple[Stage, list[Choice]] | None
         return None
     alike = [x for x in tries if stage.fit.cost - x[1].fit.cost >= LIKE * gain]
     follow: list[_Try] = []
-    for disturbed in (0.0, identification.DISTURBED[0]) if gain >= SHARE * (gain + best.excess) else (0.0,):
+    for disturbed in (0.0, identification.PROCESS_NOISE_LEVELS[0]) if gain >= SHARE * (gain + best.excess) else (0.0,):
         sharp = zip(alike, sharpened([x for _, x in alike], disturbed, together), strict=True)
         found = [(score, x) for (score, _), x in sharp if x is not None and x.follows]
         found = [(score, x) for score, x in found if not _vanished(score.candidate.name, x)]
@@ -399,7 +399,7 @@ def unfollowed(stage: Stage, together: Together) -> tuple[Stage, list[Choice], f
     tried then."""
     scores = scored(stage, together)
     likely = _likely(stage, scores, (), together)
-    forces = 0.0, identification.DISTURBED[0], identification.DISTURBED[-1]
+    forces = 0.0, identification.PROCESS_NOISE_LEVELS[0], identification.PROCESS_NOISE_LEVELS[-1]
     found = _followed(stage, likely, forces, len(scores), together)
     return (*found, frozenset()) if found else (stage, [], frozenset(s.candidate.name for s in likely))
 
@@ -423,7 +423,7 @@ def _followed(
     machines = [effects.with_effects(stage.machine, _entry(s)) for s in likely]
     worth = stage.fit.cost - MAIN * stage.excess if stage.settled and stage.exact else np.inf
     for disturbed in forces if likely else ():
-        few = disturbed > identification.DISTURBED[0]
+        few = disturbed > identification.PROCESS_NOISE_LEVELS[0]
         names = _names(likely)[: PAIR if few else None]
         begin = [(s, m) for s, m in zip(likely, machines, strict=True) if s.candidate.name in names]
         enough = partial(_settles, [s.candidate.name for s, _ in begin])
@@ -434,9 +434,9 @@ def _followed(
             continue
         tries = _one_each([x for x in follow if x[1].near] or follow)
         score, best = tries[0]
-        comparable = stage.settled and stage.fit.disturbed == best.fit.disturbed
+        comparable = stage.settled and stage.fit.process_noise == best.fit.process_noise
         without, best = refitted_and_freed(stage.machine, best, together)
-        tries = [(score, best), *(x for x in tries[1:] if x[1].fit.disturbed == best.fit.disturbed)]
+        tries = [(score, best), *(x for x in tries[1:] if x[1].fit.process_noise == best.fit.process_noise)]
         if without is not None:
             stage = stage if comparable and stage.fit.cost < without.fit.cost else without
         # Wald's statistic is of the same kind, and smaller where much is gained.
@@ -457,7 +457,7 @@ def _least(stage: Stage, chosen: Sequence[Choice], candidate: score_test.Candida
     """What an effect must gain to be worth a place beside those that were chosen. hidden: of what they gained, where
     forces hide how good their formulas are; none where exact dynamics come near the logs with it."""
     part = max(SHAPE[0], TIMED * candidate.placed.effect.timed, hidden * (not stage.exact))
-    mapped = {e.name for e in stage.model.effects if e.mapped}
+    mapped = {e.name for e in stage.model.effects if e.uses_map}
     own = (max(min(ALIKE**2 / x.left, ABSORBED), MAPPED * (x.name in mapped)) for x in chosen)
     shape = sum(max(part, share) * x.gain for share, x in zip(own, chosen, strict=True))
     main = not stage.near if chosen else _hides(stage)
@@ -467,7 +467,7 @@ def _least(stage: Stage, chosen: Sequence[Choice], candidate: score_test.Candida
 
 def _hides(stage: Stage) -> bool:
     """Whether large disturbing forces leave much: these go far with any model, and with many an effect further."""
-    return stage.fit.disturbed >= identification.DISTURBED[0] and not stage.near
+    return stage.fit.process_noise >= identification.PROCESS_NOISE_LEVELS[0] and not stage.near
 
 
 def _completes(found: Stage, before: Stage) -> bool:
@@ -498,7 +498,7 @@ def _tries(
         gained = max((stage.fit.cost - found.fit.cost for _, found in tries), default=0.0)
         if not batch or (at >= near and gained > OVER * batch[0].gain):
             continue
-        wishes = [(effects.with_effects(stage.machine, _entry(s)), stage, stage.fit.disturbed) for s in batch]
+        wishes = [(effects.with_effects(stage.machine, _entry(s)), stage, stage.fit.process_noise) for s in batch]
         tell(at)
         most = min(ceiling, stage.fit.cost - BEHIND * gained if tries else np.inf)
         for k, (score, found) in enumerate(zip(batch, refits(wishes, together, most), strict=True)):
@@ -546,7 +546,7 @@ def _felt(name: str, stage: Stage) -> bool:
 def _vanished(name: str, stage: Stage) -> bool:
     """Whether a fit led an effect that makes sense above zero only to zero: that was no way to what it promised."""
     effect, fit, k = stage.placed(name).effect, stage.fit, stage.model.base.names.index(name)
-    return effect.positive and not effect.inverse and not fit.unseen[k] and bool(fit.X[k] < NONE * fit.std[k])
+    return effect.positive and not effect.inverse and not fit.unidentifiable[k] and bool(fit.X[k] < NONE * fit.std[k])
 
 
 def _is_any(name: str, stage: Stage) -> bool:
@@ -557,7 +557,7 @@ def _is_any(name: str, stage: Stage) -> bool:
 def _one_each(tries: Sequence[_Try]) -> list[_Try]:
     """The best variant of each name, best first: with as small disturbing forces as can be."""
     best: dict[str, _Try] = {}
-    for x in sorted(tries, key=lambda x: (x[1].fit.disturbed, x[1].fit.cost)):
+    for x in sorted(tries, key=lambda x: (x[1].fit.process_noise, x[1].fit.cost)):
         best.setdefault(x[0].candidate.name, x)
     return list(best.values())
 

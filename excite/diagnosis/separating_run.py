@@ -20,7 +20,7 @@ from excite.logs import passes
 from excite.model import SignatureFunctions, effects, signatures
 from excite.model.effects import PlacedEffect, Site
 from excite.model.machine import EffectEntry, Machine
-from excite.smoothing import smoothed
+from excite.smoothing import smoothed_motion
 
 APART = 0.4  # relative difference of two answers from which they are told apart
 SAME = 1e-6  # share of two signatures that isn't in common, below which no drive tells them apart
@@ -145,15 +145,15 @@ def _placed(stage: Stage, name: str) -> PlacedEffect:
     log = stage.prepared.logs[0]
     site = Site.of(stage.machine, bodies, float(log.t[-1] - log.t[0]))
     shapes = {n: s.default * s.size(site) for n, s in effect.shapes.items()}
-    return PlacedEffect(effect, where, bodies, sensor, {"A": effect.amount(site), **shapes})
+    return PlacedEffect(effect, where, bodies, sensor, {"A": effect.typical_magnitude(site), **shapes})
 
 
 def _motion(stage: Stage) -> Motion:
     """The longest log's smoothed motion, from its start, thinned to SAMPLES."""
     c, fit = stage.prepared.c, stage.fit
     k = int(np.argmax([len(log) for log in stage.prepared.logs]))
-    p, r = fit.points[k], stage.prepared.records[k]
-    q, nu, _, u, a = smoothed(c, r, p, fit.X)
+    p, r = fit.trajectories[k], stage.prepared.records[k]
+    q, nu, _, u, a = smoothed_motion(c, r, p, fit.X)
     root = stage.machine.body[0].coordinates
     if stage.machine.planar and root[2] in stage.model.coordinates:
         heading = stage.model.coordinates.index(root[2])
@@ -177,7 +177,7 @@ class _Asked:
 
     def __call__(self, m: Motion) -> np.ndarray:
         N, C = len(m.t), len(self.placed)
-        over = passes(self.model, m.q, m.nu, float(m.t[1] - m.t[0])) if self.made.mapped else np.zeros((N, 0))
+        over = passes(self.model, m.q, m.nu, float(m.t[1] - m.t[0])) if self.made.n_map_inputs else np.zeros((N, 0))
         z = remembered(self.made, m.q, m.nu, m.u, m.t, self.p, over)
         exact = np.broadcast_to(np.abs(m.t)[:, None], (N, self.readings)) * 0.1
         exact = exact * np.sign(m.nu.sum() or 1.0)

@@ -1,27 +1,27 @@
-from .bias import SURE as SURE
-from .delays import late_channels as late_channels
+from .bias import SIGNIFICANT_BIAS as SIGNIFICANT_BIAS
+from .delays import describe_late_channels as describe_late_channels
 from .estimate import Estimate as Estimate
 from .filter_choice import FILTERS as FILTERS
-from .identifiability import unmoved as unmoved
-from .joint import DISTURBED as DISTURBED, suspects as suspects
+from .identifiability import parameters_at_rest as parameters_at_rest
+from .joint import PROCESS_NOISE_LEVELS as PROCESS_NOISE_LEVELS, find_suspect_sensors as find_suspect_sensors
 from .methods import (
     METHODS as METHODS,
+    add_bias as add_bias,
     identify as identify,
-    measurable as measurable,
     needed_sensors as needed_sensors,
-    recommended as recommended,
-    with_bias as with_bias,
+    recommend_method as recommend_method,
+    require_sensors as require_sensors,
 )
 from .monte_carlo import (
     Verification as Verification,
-    biased as biased,
+    biased_parameters as biased_parameters,
     summarise_runs as summarise_runs,
     verify as verify,
 )
-from .prior import known_before as known_before
+from .prior import prior_from_logs as prior_from_logs
 from .validation import (
-    Comparison as Comparison,
+    SignalComparison as SignalComparison,
+    compare_motions as compare_motions,
+    compare_torques as compare_torques,
     far_from_nominal as far_from_nominal,
-    motions as motions,
-    torques as torques,
 )

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from excite.errors import NotIdentifiableError, SimulationError
-from excite.identification.estimate import Estimate, noted
-from excite.identification.noise_propagation import reread
+from excite.identification.estimate import Estimate, add_notes
+from excite.identification.noise_propagation import measure_again
 from excite.logs import Log, Samples, lowpass, samples, white_noise
 from excite.model import Model
 from excite.model.machine import Filter
@@ -18,18 +18,18 @@ from excite.simulation import Motion, exact_readings, respond
 from excite.text import format_number, format_percent
 
 RUNS = 8
-HOLD = 1.0  # time constant with which the simulated joints are held to the log's speeds [s]
-SURE = 3.0  # standard deviations of the mean that make a bias
-NOTABLE = 0.5  # of a parameter's own standard deviation: a smaller bias is not worth a remark
+HOLD_TIME = 1.0  # time constant with which the simulated joints are held to the log's speeds [s]
+SIGNIFICANT_BIAS = 3.0  # standard deviations of the mean that make a bias
+NOTABLE_BIAS = 0.5  # of a parameter's own standard deviation: a smaller bias is not worth a remark
 
-Find = Callable[[Model, Sequence[Log], Filter], Estimate]
+Estimator = Callable[[Model, Sequence[Log], Filter], Estimate]
 
 
-def with_bias(
+def add_bias(
     model: Model,
     logs: Sequence[Log],
     estimate: Estimate,
-    method: Find,
+    method: Estimator,
     filter: Filter,
     around: np.ndarray | None = None,
     runs: int = RUNS,
@@ -44,16 +44,20 @@ def with_bias(
     note says so where the machine can't be simulated.
     """
     from excite.errors import NotConsistentError
-    from excite.identification.consistency import consistent
+    from excite.identification.consistency import nearest_possible
 
     try:
         X = estimate.value if around is None else around
         X = np.where(np.isfinite(X), X, model.nominal)
-        if not _is_machine(model, X):
-            X = consistent(model, replace(estimate, value=X, covariance=_known(model, estimate))).value
-        motions = [replay(model, log, X, filter) for log in logs]
+        if not _is_possible(model, X):
+            X = nearest_possible(
+                model, replace(estimate, value=X, covariance=_covariance_with_defaults(model, estimate))
+            ).value
+        motions = [simulate_along_log(model, log, X, filter) for log in logs]
     except (SimulationError, NotConsistentError) as err:
-        return noted(estimate, f"{estimate.method}: bias unknown, the identified machine can't be simulated ({err})")
+        return add_notes(
+            estimate, f"{estimate.method}: bias unknown, the identified machine can't be simulated ({err})"
+        )
     rng = np.random.default_rng(seed)
     errors = []
     for _ in range(runs):
@@ -63,16 +67,20 @@ def with_bias(
         except NotIdentifiableError:
             continue
     if len(errors) < 2:
-        return noted(estimate, f"{estimate.method}: bias unknown, it fails on simulated logs of the identified machine")
+        return add_notes(
+            estimate, f"{estimate.method}: bias unknown, it fails on simulated logs of the identified machine"
+        )
     bias = np.mean(errors, axis=0)
     std = np.std(errors, axis=0, ddof=1) / np.sqrt(len(errors))
-    return noted(replace(estimate, bias=bias, bias_std=std), _remark(model, estimate, bias, std, len(errors)))
+    return add_notes(
+        replace(estimate, bias=bias, bias_std=std), _describe_bias(model, estimate, bias, std, len(errors))
+    )
 
 
-def _remark(model: Model, estimate: Estimate, bias: np.ndarray, std: np.ndarray, runs: int) -> str:
+def _describe_bias(model: Model, estimate: Estimate, bias: np.ndarray, std: np.ndarray, runs: int) -> str:
     size = np.maximum(np.abs(np.nan_to_num(estimate.value)), model.scale)
     with np.errstate(invalid="ignore"):
-        matters = (np.abs(bias) > SURE * std) & (np.abs(bias) > NOTABLE * estimate.std)
+        matters = (np.abs(bias) > SIGNIFICANT_BIAS * std) & (np.abs(bias) > NOTABLE_BIAS * estimate.std)
     if not matters.any():
         return f"{estimate.method}: no bias found on {runs} simulated logs of the identified machine"
     order = [k for k in np.argsort(-np.abs(bias) / size) if matters[k]]
@@ -87,13 +95,13 @@ def _remark(model: Model, estimate: Estimate, bias: np.ndarray, std: np.ndarray,
     )
 
 
-def _is_machine(model: Model, X: np.ndarray) -> bool:
+def _is_possible(model: Model, X: np.ndarray) -> bool:
     from excite.identification.consistency import is_possible
 
     return is_possible(model, X)
 
 
-def _known(model: Model, estimate: Estimate) -> np.ndarray:
+def _covariance_with_defaults(model: Model, estimate: Estimate) -> np.ndarray:
     """The covariance, with the scale in place of what is not known."""
     covariance = estimate.covariance.copy()
     lost = np.isnan(np.diag(covariance))
@@ -102,14 +110,14 @@ def _known(model: Model, estimate: Estimate) -> np.ndarray:
     return covariance
 
 
-def replay(model: Model, log: Log, X: np.ndarray, filter: Filter) -> Motion:
+def simulate_along_log(model: Model, log: Log, X: np.ndarray, filter: Filter) -> Motion:
     """The machine X (n_base,) driven as in a log: its low-passed torques, with a pull towards the speeds of its joints,
     so that small errors of torques don't lead elsewhere. Raises SimulationError."""
     s = samples(model, log, filter)
     rows, n_q = list(model.actuated), len(model.coordinates)
     torque = lowpass(s.Y[rows], float(model.machine.sampling_hz), filter).T - model.offsets @ X
     wanted = s.nu[rows].T
-    gain = _inertia(model, s, X, rows) / HOLD
+    gain = _inertia(model, s, X, rows) / HOLD_TIME
 
     def driven(k: int, state: np.ndarray) -> np.ndarray:
         return torque[k] + gain * (wanted[max(k - 1, 0)] - state[n_q:][rows])
@@ -130,7 +138,7 @@ def measured_again(model: Model, log: Log, motion: Motion, X: np.ndarray, rng: n
     """The log that the log's own sensors would write of a motion."""
     exact = exact_readings(model, motion, X)
     values = {
-        s.name: reread(s, exact[s.name], white_noise(log.values[s.name]), rng)
+        s.name: measure_again(s, exact[s.name], white_noise(log.values[s.name]), rng)
         for s in model.machine.sensors("full")
         if s.name in log.values
     }

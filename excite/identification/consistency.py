@@ -16,16 +16,16 @@ import cvxpy as cp
 import numpy as np
 
 from excite.errors import NotConsistentError
-from excite.identification.estimate import Estimate, noted
-from excite.identification.linear_methods import Block, residual, size
+from excite.identification.estimate import Estimate, add_notes
+from excite.identification.linear_methods import Block, residual, rms_torque
 from excite.model import Model, required_signs, standard_parameters
 from excite.model.mechanics import INERTIAL
 
-MARGIN = 1e-6  # of a parameter's scale, kept from the edge: a mass matrix must be invertible
-ACTIVE = 1e-3  # of a standard deviation: a shift larger than this is worth a remark
+INTERIOR_MARGIN = 1e-6  # of a parameter's scale, kept from the edge: a mass matrix must be invertible
+NOTABLE_SHIFT = 1e-3  # of a standard deviation: a shift larger than this is worth a remark
 
 
-def consistent(model: Model, estimate: Estimate) -> Estimate:
+def nearest_possible(model: Model, estimate: Estimate) -> Estimate:
     """The possible parameters nearest to an estimate, in the metric of its covariance.
 
     For least squares that is the minimum of |Y - W X| over all possible machines. Parameters that the log doesn't show
@@ -41,7 +41,9 @@ def consistent(model: Model, estimate: Estimate) -> Estimate:
     shift = (X[kept] - estimate.value[kept]) / model.scale[kept]
     covariance = estimate.covariance[np.ix_(kept, kept)] / np.outer(model.scale[kept], model.scale[kept])
     root = _inverse_root(covariance)
-    problem = cp.Problem(cp.Minimize(cp.sum_squares(root @ shift)), _possible(model, by_name, MARGIN))
+    problem = cp.Problem(
+        cp.Minimize(cp.sum_squares(root @ shift)), _possibility_constraints(model, by_name, INTERIOR_MARGIN)
+    )
     try:
         problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
     except cp.error.SolverError as err:
@@ -51,23 +53,23 @@ def consistent(model: Model, estimate: Estimate) -> Estimate:
     value = np.full(len(estimate.value), np.nan)
     value[kept] = np.asarray(X.value)[kept]
     moved = (value[kept] - estimate.value[kept]) / estimate.std[kept]
-    if np.abs(moved).max(initial=0.0) < ACTIVE:
-        return noted(replace(estimate, method=f"{estimate.method}+consistent"), "consistent: possible as it is")
+    if np.abs(moved).max(initial=0.0) < NOTABLE_SHIFT:
+        return add_notes(replace(estimate, method=f"{estimate.method}+consistent"), "consistent: possible as it is")
     distance = float(np.sqrt(max(problem.value, 0.0)))
     worst = [f"{estimate.names[kept[k]]} {moved[k]:+.1f}" for k in np.argsort(-np.abs(moved))[:3]]
     note = (
         f"consistent: no real machine has the unconstrained values; the nearest possible one is {distance:.1f} standard"
         f" deviations away (most: {', '.join(worst)})"
     )
-    return noted(replace(estimate, method=f"{estimate.method}+consistent", value=value), note)
+    return add_notes(replace(estimate, method=f"{estimate.method}+consistent", value=value), note)
 
 
-def constrained(model: Model, estimate: Estimate, blocks: Sequence[Block]) -> Estimate:
+def constrained_estimate(model: Model, estimate: Estimate, blocks: Sequence[Block]) -> Estimate:
     """`consistent`, with residual and relative error of the filtered rows at the possible values."""
-    found = consistent(model, estimate)
+    found = nearest_possible(model, estimate)
     x = np.where(np.isnan(found.value), model.nominal, found.value)
     e = np.concatenate([residual(b, x) for b in blocks], axis=1)
-    return replace(found, residual=e, relative_error_percent=100 * float(np.sqrt(np.mean(e**2))) / size(blocks))
+    return replace(found, residual=e, relative_error_percent=100 * float(np.sqrt(np.mean(e**2))) / rms_torque(blocks))
 
 
 def is_possible(model: Model, X: np.ndarray) -> bool:
@@ -77,12 +79,12 @@ def is_possible(model: Model, X: np.ndarray) -> bool:
     p = cp.Variable(len(table))
     by_name = {name: p[k] * scale[k] for k, name in enumerate(table)}
     same = ((model.base.matrix * scale) @ p - X) / model.scale == 0
-    problem = cp.Problem(cp.Minimize(0), [same, *_possible(model, by_name, 0.0)])
+    problem = cp.Problem(cp.Minimize(0), [same, *_possibility_constraints(model, by_name, 0.0)])
     problem.solve(solver=cp.CLARABEL)
     return problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
 
 
-def _possible(model: Model, p: dict[str, cp.Expression], margin: float) -> list[cp.Constraint]:
+def _possibility_constraints(model: Model, p: dict[str, cp.Expression], margin: float) -> list[cp.Constraint]:
     """What every real machine obeys, in standard parameters by name, `margin` of their nominal size inside."""
     nominal = {name: abs(value) for name, (value, _) in standard_parameters(model.machine).items()}
     found = [sign * p[name] >= margin * nominal[name] for name, sign in required_signs(model.machine).items()]
@@ -92,7 +94,7 @@ def _possible(model: Model, p: dict[str, cp.Expression], margin: float) -> list[
             own = {name: p[f"{name}{k}"] for name in INERTIAL if f"{name}{k}" in p}
             if body.inertia.axisymmetric:
                 own["YY"] = own["XX"]
-            m, h, second = _pseudo(own)
+            m, h, second = _pseudo_inertia(own)
             # One size per block: the matrix is scaled by a length, as its entries are masses, moments and inertias.
             inertia = nominal.get(f"ZZ{k}", 0.0)
             length = float(np.sqrt(inertia / nominal[f"M{k}"])) if inertia > 0 else 1.0
@@ -101,7 +103,7 @@ def _possible(model: Model, p: dict[str, cp.Expression], margin: float) -> list[
     return found
 
 
-def _pseudo(own: dict[str, cp.Expression]) -> tuple[cp.Expression, cp.Expression, cp.Expression]:
+def _pseudo_inertia(own: dict[str, cp.Expression]) -> tuple[cp.Expression, cp.Expression, cp.Expression]:
     """Mass, first moments (3, 1) and second moments (3, 3) = tr(I)/2 1 - I of a body; what it doesn't have is zero."""
 
     def at(name: str) -> cp.Expression:

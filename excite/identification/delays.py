@@ -8,17 +8,17 @@ import numpy as np
 
 from excite import simulation
 from excite.errors import LogError, SimulationError
-from excite.identification.linear_methods import sandwich, solved, whitened
-from excite.identification.noise_propagation import spread, whitener
-from excite.identification.validation import replayed
+from excite.identification.linear_methods import sandwich_covariance, solve_blocks, whiten_block
+from excite.identification.noise_propagation import filtered_noise, whitening_matrices
+from excite.identification.validation import simulate_open_loop
 from excite.logs import Log, decimate, derivative, from_table, lowpass, regression, samples
 from excite.model import Model
 from excite.model.machine import Filter
 
-LATE = 4.0  # standard deviations that make a delay worth a remark
+SIGNIFICANT_DELAY = 4.0  # standard deviations that make a delay worth a remark
 
 
-NOISY = 2e-3  # s: a deviation from which noise of slips hides a part of a delay
+PRECISE_STD = 2e-3  # s: a deviation from which noise of slips hides a part of a delay
 
 
 @dataclass(frozen=True)
@@ -31,14 +31,14 @@ class Delay:
 
     @property
     def significant(self) -> bool:
-        return abs(self.value) > LATE * self.std
+        return abs(self.value) > SIGNIFICANT_DELAY * self.std
 
     def beside(self, usual: Delay) -> Delay:
         """What is more than a usual one."""
         return Delay(self.name, self.value - usual.value, float(np.hypot(self.std, usual.std)))
 
 
-def delays(model: Model, log: Log, filter: Filter | None = None) -> tuple[Delay, ...]:
+def estimate_delays(model: Model, log: Log, filter: Filter | None = None) -> tuple[Delay, ...]:
     """How late each torque channel is against the motion.
 
     u_measured(t) = u(t - delay) + u0: to first order a column -du/dt beside the regressor. Rows are made white for the
@@ -55,10 +55,10 @@ def delays(model: Model, log: Log, filter: Filter | None = None) -> tuple[Delay,
     for k, row in enumerate(rows):
         slope = derivative(lowpass(s.Y[row], rate, filter), rate)[None, keep]
         slopes[row, :, k] = -decimate(slope, filter.decimation)[0]
-    L = whitener(model, s, model.nominal, spread(model, log, filter), filter)
-    block = [whitened((np.concatenate([W, slopes], axis=2), Y), L)]
-    solution = solved(block)
-    covariance = solution.spread(sandwich(block, solution))
+    L = whitening_matrices(model, s, model.nominal, filtered_noise(model, log, filter), filter)
+    block = [whiten_block((np.concatenate([W, slopes], axis=2), Y), L)]
+    solution = solve_blocks(block)
+    covariance = solution.spread(sandwich_covariance(block, solution))
     n = W.shape[2]
     names = [_torque_name(model, row) for row in rows]
     return tuple(
@@ -73,23 +73,25 @@ def _torque_name(model: Model, row: int) -> str:
     return next(s.name for s in model.machine.sensor if s.kind == "torque" and s.body == body.index)
 
 
-def late_channels(model: Model, log: Log, filter: Filter | None = None, X: np.ndarray | None = None) -> tuple[str, ...]:
+def describe_late_channels(
+    model: Model, log: Log, filter: Filter | None = None, X: np.ndarray | None = None
+) -> tuple[str, ...]:
     """A remark for every torque channel that is late or early beyond doubt.
 
     Where rows are mostly noise, what is left of it in them passes for a delay: so the same is asked of the machine X
     (n_base,) driven by the log's torques with every channel in time, and that is taken off. Nothing is said of such
     rows without X: the machine file's soil may be another one.
     """
-    found = [d for d in delays(model, log, filter) if d.significant]
+    found = [d for d in estimate_delays(model, log, filter) if d.significant]
     if X is not None and found:
         try:
-            usual = {d.name: d for d in delays(model, _in_time(model, log, filter, X), filter)}
+            usual = {d.name: d for d in estimate_delays(model, _simulate_without_delay(model, log, filter, X), filter)}
             found = [d.beside(usual[d.name]) if d.name in usual else d for d in found]
         except (SimulationError, LogError):
             X = None  # nothing to take off
     said = []
     for d in found:
-        precise = d.std < NOISY
+        precise = d.std < PRECISE_STD
         if not d.significant or not (precise or X is not None):
             continue
         which = f"{'late' if d.value > 0 else 'early'} against the motion"
@@ -103,8 +105,8 @@ def late_channels(model: Model, log: Log, filter: Filter | None = None, X: np.nd
     return tuple(said)
 
 
-def _in_time(model: Model, log: Log, filter: Filter | None, X: np.ndarray) -> Log:
+def _simulate_without_delay(model: Model, log: Log, filter: Filter | None, X: np.ndarray) -> Log:
     """What a log's sensors would read of a drive by its torques if no channel were late."""
-    motion = replayed(model, log, X, filter)
+    motion = simulate_open_loop(model, log, X, filter)
     made = from_table(simulation.measure(model, motion, X), model.machine)
     return Log(log.source, made.t, {n: made.values[n] for n in log.values if n in made.values})

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-UNMOVED = "the log says nothing of any parameter: does the machine move in it?"
+NOTHING_MOVES_MESSAGE = "the log says nothing of any parameter: does the machine move in it?"
 
 
 def held_note(names: Sequence[str]) -> str:
@@ -65,6 +65,6 @@ class Estimate:
         return np.array([self.value - self.quantile95 * below, self.value + self.quantile95 * above])
 
 
-def noted(estimate: Estimate, *notes: str) -> Estimate:
+def add_notes(estimate: Estimate, *notes: str) -> Estimate:
     """The estimate with remarks for the report added."""
     return replace(estimate, notes=estimate.notes + notes)

@@ -11,26 +11,26 @@ from excite.logs import Log
 from excite.model import Model
 from excite.model.machine import Filter
 
-FLOOR = 4.0  # times the noise floor where a spectrum counts as sunk
+FLOOR_RATIO = 4.0  # times the noise floor where a spectrum counts as sunk
 
 
-ROOM = 0.8  # of the Nyquist frequency after decimation is passed (see `decimate`)
+PASSED_SHARE = 0.8  # of the Nyquist frequency after decimation is passed (see `decimate`)
 
 
-def sinks(x: np.ndarray, rate: float) -> float:
+def noise_floor_frequency(x: np.ndarray, rate: float) -> float:
     """Frequency [Hz] above which a signal (N,) is nothing but its white noise floor: from Welch's spectrum."""
     length = min(len(x), max(256, int(8 * rate)))
     f, p = scipy.signal.welch(scipy.signal.detrend(x), rate, nperseg=length)
     floor = float(np.median(p[f > 0.6 * f[-1]]))
     smooth = np.convolve(np.pad(p, 1, mode="edge"), np.ones(3) / 3, mode="valid")
-    above = np.flatnonzero(smooth[1:] > FLOOR * floor) + 1
+    above = np.flatnonzero(smooth[1:] > FLOOR_RATIO * floor) + 1
     # The first gap ends it: a line at some high frequency is no reason to let noise in below it.
     gaps = np.flatnonzero(np.diff(above) > max(3, len(f) // 100))
     last = above[gaps[0]] if len(gaps) else (above[-1] if len(above) else 1)
     return float(f[last])
 
 
-def choose(model: Model, logs: Sequence[Log]) -> tuple[Filter, str]:
+def choose_from_spectra(model: Model, logs: Sequence[Log]) -> tuple[Filter, str]:
     """Cut-off and decimation by the logs' spectra, with the reason in a sentence.
 
     Motion is kept up to where the liveliest angle or speed sinks into the floor of its own sensor; beyond, derivatives
@@ -42,27 +42,30 @@ def choose(model: Model, logs: Sequence[Log]) -> tuple[Filter, str]:
     for sensor in machine.sensors("full"):
         if sensor.kind in ("torque", "x", "y"):
             continue
-        own = [sinks(log.values[sensor.name], rate) for log in logs if sensor.name in log.values]
+        own = [noise_floor_frequency(log.values[sensor.name], rate) for log in logs if sensor.name in log.values]
         if own:
             found[sensor.name] = max(own)
     liveliest = max(found, key=lambda name: found[name])
     cutoff = float(np.clip(found[liveliest], 0.5, rate / 5))
-    factor = max(1, int(ROOM * rate / (2 * cutoff)))
+    factor = max(1, int(PASSED_SHARE * rate / (2 * cutoff)))
     quantity = machine.filter.cutoff_hz.model_copy(
         update={"value": cutoff, "source": "measured", "note": f"{liveliest} sinks into its noise floor there"}
     )
     listed = ", ".join(f"{name} {f:.2g}" for name, f in found.items())
     reason = (
         f"filter: cut-off {cutoff:.2g} Hz, where {liveliest}, the liveliest signal, sinks into its sensor's noise floor"
-        f" (Hz: {listed}); one row in {factor} kept, which passes {ROOM * rate / 2 / factor:.2g} Hz"
+        f" (Hz: {listed}); one row in {factor} kept, which passes {PASSED_SHARE * rate / 2 / factor:.2g} Hz"
     )
     return machine.filter.model_copy(update={"cutoff_hz": quantity, "decimation": factor}), reason
 
 
-def stated(model: Model, logs: Sequence[Log]) -> tuple[Filter, str]:
+def use_machine_filter(model: Model, logs: Sequence[Log]) -> tuple[Filter, str]:
     """The machine file's own, for which there is nothing to say."""
     return model.machine.filter, ""
 
 
 # How a filter is chosen, by what `--filter` calls it: the filter and the reason in a sentence.
-FILTERS: dict[str, Callable[[Model, Sequence[Log]], tuple[Filter, str]]] = {"machine": stated, "auto": choose}
+FILTERS: dict[str, Callable[[Model, Sequence[Log]], tuple[Filter, str]]] = {
+    "machine": use_machine_filter,
+    "auto": choose_from_spectra,
+}

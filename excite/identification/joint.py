@@ -16,38 +16,40 @@ import numpy as np
 
 from excite.errors import NotIdentifiableError
 from excite.identification import identifiability
-from excite.identification.estimate import UNMOVED, Estimate, held_note
+from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Estimate, held_note
 from excite.logs import Log, decimate, derivative
 from excite.model import Model
 from excite.model.machine import Filter
 from excite.smoothing import (
-    UNSEEN,
-    Chart,
+    MAX_IDENTIFIABLE_STD,
     Fit,
-    NotConverged,
-    Point,
-    Record,
-    chart,
+    Measurements,
+    NotConvergedError,
+    StateSpace,
+    Trajectory,
+    build_state_space,
     common_sensors,
-    first_point,
-    innovation_sizes,
-    iterate,
-    noise_notes,
-    record,
-    smoothed,
-    sure,
+    describe_noise,
+    fit_logs,
+    initial_trajectory,
+    innovation_statistics,
+    prepare_measurements,
+    quantify_uncertainty,
+    smoothed_motion,
 )
 
-TOLERABLE = 0.1  # a step, in standard deviations, at which a fit that runs out of passes is an estimate
+ACCEPTED_STEP = 0.1  # a step, in standard deviations, at which a fit that runs out of passes is an estimate
 # Disturbing forces where the model is not trusted, larger until the innovations are what they should be.
-DISTURBED = (1.0, 4.0, 16.0)
-SUSPECT = 2.5  # mean square of innovations, all or slow ones, that the model can't explain; null logs stay below 1.6
-DOUBT = (
+PROCESS_NOISE_LEVELS = (1.0, 4.0, 16.0)
+SUSPECT_MEAN_SQUARE = (
+    2.5  # mean square of innovations, all or slow ones, that the model can't explain; null logs stay below 1.6
+)
+UNEXPLAINED_NOTE = (
     "the log shows something that the model doesn't know, so the intervals do not hold: these values allow for"
     " disturbing forces, and may be off by more than their intervals, much more where the cause is no such force (a"
     " sensor, a torque channel); run `excite diagnose`"
 )
-DRAWN = (
+BIASED_NOTE = (
     "what this log shows poorly may be off by a deviation more than its interval says, as no estimate without that bias"
     " was found: a drive that moves more tells more"
 )
@@ -62,16 +64,16 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     no estimate, the answer is that of a model with white disturbing forces, as large as it takes, with a note. Raises
     NotConverged where that fails too, NotIdentifiable where a torque is missing.
     """
-    c = chart(model, common_sensors(model, logs))
-    records = [record(c, log, unbiased=True) for log in logs]
-    steady = [replace(r, unbiased=False) for r in records]
-    starts = [first_point(c, r, log, filter) for r, log in zip(records, logs, strict=True)]
-    notes = noise_notes(c, records)
-    held = identifiability.unmoved(model, logs, filter, slow=False)
+    space = build_state_space(model, common_sensors(model, logs))
+    measurements = [prepare_measurements(space, log, unbiased=True) for log in logs]
+    steady = [replace(data, unbiased=False) for data in measurements]
+    starts = [initial_trajectory(space, data, log, filter) for data, log in zip(measurements, logs, strict=True)]
+    notes = describe_noise(space, measurements)
+    held = identifiability.parameters_at_rest(model, logs, filter, slow=False)
 
     def ways() -> Iterator[tuple[np.ndarray, bool]]:
         yield held, False
-        still = held | identifiability.unmoved(model, logs, filter, slow=True)
+        still = held | identifiability.parameters_at_rest(model, logs, filter, slow=True)
         less = (still & ~held).any()
         if less:
             yield still, False
@@ -80,24 +82,24 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         if less:
             yield still, True
 
-    trouble: NotConverged | None = None
+    trouble: NotConvergedError | None = None
     loose: Fit | None = None
     doubted: tuple[tuple[bool, float], Fit, np.ndarray, list[str]] | None = None
     for free, further in ways():
         try:
             if further:
-                loose = loosely(c, logs, steady, starts, model.nominal, starts, free)
-            points, X = (starts, model.nominal) if loose is None else (loose.points, loose.X)
-            fit, drawn = _exact(c, records, steady, points, X, starts, free)
-        except NotConverged as failed:
+                loose = fit_with_process_noise(space, logs, steady, starts, model.nominal, starts, free)
+            trajectories, X = (starts, model.nominal) if loose is None else (loose.trajectories, loose.X)
+            fit, drawn = _fit_exact(space, measurements, steady, trajectories, X, starts, free)
+        except NotConvergedError as failed:
             trouble = trouble or failed
             continue
-        found = suspects(c, logs, fit)
+        found = find_suspect_sensors(space, logs, fit)
         if not found:
             if drawn:
-                return _estimate(c, records, fit, filter, (*notes, *drawn))
-            fit, sides, flat = sure(c, records, starts, fit)
-            return _estimate(c, records, fit, filter, (*notes, *flat), sides)
+                return _build_estimate(space, measurements, fit, filter, (*notes, *drawn))
+            fit, sides, flat = quantify_uncertainty(space, measurements, starts, fit)
+            return _build_estimate(space, measurements, fit, filter, (*notes, *flat), sides)
         rank = bool(drawn), fit.cost  # costs of one kind of records can be compared
         if doubted is None or rank < doubted[0]:
             doubted = rank, fit, free, found
@@ -108,79 +110,79 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         _, fit, free, found = doubted
         said = "; ".join(found)
         try:
-            loose = loosely(c, logs, steady, fit.points, fit.X, starts, free)
-        except NotConverged as failed:
+            loose = fit_with_process_noise(space, logs, steady, fit.trajectories, fit.X, starts, free)
+        except NotConvergedError as failed:
             trouble = failed
     if loose is None:
         assert trouble is not None
         raise trouble
-    return _estimate(c, records, loose, filter, (*notes, said, DOUBT))
+    return _build_estimate(space, measurements, loose, filter, (*notes, said, UNEXPLAINED_NOTE))
 
 
-def _exact(
-    c: Chart,
-    records: Sequence[Record],
-    steady: Sequence[Record],
-    points: Sequence[Point],
+def _fit_exact(
+    space: StateSpace,
+    measurements: Sequence[Measurements],
+    steady: Sequence[Measurements],
+    trajectories: Sequence[Trajectory],
     X: np.ndarray,
-    starts: Sequence[Point],
+    starts: Sequence[Trajectory],
     held: np.ndarray,
 ) -> tuple[Fit, tuple[str, ...]]:
     """The fit with exact dynamics, unbiased where the log determines it, and what to say of it. Raises NotConverged."""
-    trouble: NotConverged | None = None
-    for own, said in ((records, ()), (steady, (DRAWN,))):
+    trouble: NotConvergedError | None = None
+    for own, said in ((measurements, ()), (steady, (BIASED_NOTE,))):
         try:
-            return iterate(c, own, points, X, starts, 0.0, held), said
-        except NotConverged as failed:
-            if failed.fit is not None and failed.step < TOLERABLE:
+            return fit_logs(space, own, trajectories, X, starts, 0.0, held), said
+        except NotConvergedError as failed:
+            if failed.fit is not None and failed.step < ACCEPTED_STEP:
                 return failed.fit, said
             trouble = trouble or failed
     assert trouble is not None
     raise trouble
 
 
-def loosely(
-    c: Chart,
+def fit_with_process_noise(
+    space: StateSpace,
     logs: Sequence[Log],
-    records: Sequence[Record],
-    points: Sequence[Point],
+    measurements: Sequence[Measurements],
+    trajectories: Sequence[Trajectory],
     X: np.ndarray,
-    starts: Sequence[Point],
+    starts: Sequence[Trajectory],
     held: np.ndarray,
 ) -> Fit:
     """The fit with disturbing forces as large as the innovations ask for. Raises NotConverged."""
-    trouble: NotConverged | None = None
+    trouble: NotConvergedError | None = None
     fit: Fit | None = None
-    for times in DISTURBED:
+    for times in PROCESS_NOISE_LEVELS:
         try:
-            fit = iterate(c, records, points, X, starts, times, held)
-        except NotConverged as failed:
+            fit = fit_logs(space, measurements, trajectories, X, starts, times, held)
+        except NotConvergedError as failed:
             trouble = failed
             continue
-        if not suspects(c, logs, fit):
+        if not find_suspect_sensors(space, logs, fit):
             return fit
-        points, X = fit.points, fit.X
+        trajectories, X = fit.trajectories, fit.X
     if fit is None:
         assert trouble is not None
         raise trouble
     return fit
 
 
-def _estimate(
-    c: Chart,
-    records: Sequence[Record],
+def _build_estimate(
+    space: StateSpace,
+    measurements: Sequence[Measurements],
     fit: Fit,
     filter: Filter,
     notes: tuple[str, ...],
     sides: np.ndarray | None = None,
 ) -> Estimate:
     """The answer as `identify` gives it: regressor along the smoothed states, residual of the torques."""
-    model = c.model
-    weak = fit.unseen | (fit.std > UNSEEN * np.maximum(np.abs(fit.X), model.scale))
+    model = space.model
+    weak = fit.unidentifiable | (fit.std > MAX_IDENTIFIABLE_STD * np.maximum(np.abs(fit.X), model.scale))
     if weak.all():
-        raise NotIdentifiableError(UNMOVED)
-    if fit.unseen.any():
-        held = [n for n, yes in zip(model.base.names, fit.unseen, strict=True) if yes]
+        raise NotIdentifiableError(NOTHING_MOVES_MESSAGE)
+    if fit.unidentifiable.any():
+        held = [n for n, yes in zip(model.base.names, fit.unidentifiable, strict=True) if yes]
         notes = (*notes, held_note(held))
     reasons = {
         name: "this log hardly moves with it: what is known of it is the machine file's value"
@@ -188,16 +190,16 @@ def _estimate(
         if yes
     }
     W, Y, errors = [], [], []
-    for r, p in zip(records, fit.points, strict=True):
-        q, nu, z, u, a = smoothed(c, r, p, fit.X)
+    for data, trajectory in zip(measurements, fit.trajectories, strict=True):
+        q, nu, z, u, a = smoothed_motion(space, data, trajectory, fit.X)
         beside = () if model.plain else (u.T, z.T)
-        forced = fit.disturbed > 0 and model.plain
+        forced = fit.process_noise > 0 and model.plain
         if forced:  # what the forces do is not the model's
             a = derivative(nu.T, float(model.machine.sampling_hz)).T
-        rows = model.stacked(q.T, nu.T, a.T, *beside)
+        rows = model.stacked_regressor(q.T, nu.T, a.T, *beside)
         W.append(rows.reshape(-1, len(fit.X)))
         measured, error = np.zeros((2, len(model.rows), len(u)))
-        measured[list(model.actuated)], error[list(model.actuated)] = r.torque.T, -p.errors.T
+        measured[list(model.actuated)], error[list(model.actuated)] = data.torque.T, -trajectory.sampled_torque_error.T
         if forced:
             error = measured - (rows @ fit.X).T
         Y.append(decimate(measured, filter.decimation))
@@ -221,19 +223,19 @@ def _estimate(
         ),
         100 * float(np.linalg.norm(residual) / np.linalg.norm(np.concatenate(Y, axis=1))),
         residual,
-        int(sum(r.used.sum() for r in records)) - len(fit.X),
+        int(sum(data.used.sum() for data in measurements)) - len(fit.X),
         reasons,
         notes,
         sides=None if sides is None else np.where(weak, np.nan, sides),
     )
 
 
-def suspects(c: Chart, logs: Sequence[Log], fit: Fit) -> list[str]:
+def find_suspect_sensors(space: StateSpace, logs: Sequence[Log], fit: Fit) -> list[str]:
     """Sensors whose innovations are not what the model and their noise say, each as a line for the report."""
     texts = []
     for log, linear in zip(logs, fit.linear, strict=True):
-        for sensor, (size, slow, blocks) in zip(c.sensors, innovation_sizes(linear), strict=True):
-            if max(size, slow) > max(SUSPECT, 1 + 6 * np.sqrt(2 / max(blocks, 1.0))):
+        for sensor, (size, slow, blocks) in zip(space.sensors, innovation_statistics(linear), strict=True):
+            if max(size, slow) > max(SUSPECT_MEAN_SQUARE, 1 + 6 * np.sqrt(2 / max(blocks, 1.0))):
                 texts.append(
                     f"{log.source}: {sensor.name}: innovations are {np.sqrt(size):.2f} times, slow ones"
                     f" {np.sqrt(slow):.2f} times what noise gives"

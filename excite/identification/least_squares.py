@@ -18,10 +18,10 @@ import scipy
 
 from excite.model.mechanics import independent_columns
 
-DEPENDENT = 1e-10  # a column this close to a combination of the others carries nothing [relative]
-BLOCK = 20_000  # rows of a tall matrix that are reduced at once
-MOST = 10.0  # times a column that is kept, of one that is left out
-MOST_LAGS = 20  # of the autoregression that describes noise
+DEPENDENCE_TOLERANCE = 1e-10  # a column this close to a combination of the others carries nothing [relative]
+BLOCK_ROWS = 20_000  # rows of a tall matrix that are reduced at once
+MAX_COLUMN_RATIO = 10.0  # times a column that is kept, of one that is left out
+MAX_LAGS = 20  # of the autoregression that describes noise
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class Solution:
 def reduce(A: np.ndarray, y: np.ndarray) -> Triangle:
     """The triangle of A (m, n), y (m,), block by block."""
     R = np.zeros((0, A.shape[1] + 1))
-    for at in range(0, len(y), BLOCK):
-        R = _stack(R, np.column_stack([A[at : at + BLOCK], y[at : at + BLOCK]]))
+    for at in range(0, len(y), BLOCK_ROWS):
+        R = _stack(R, np.column_stack([A[at : at + BLOCK_ROWS], y[at : at + BLOCK_ROWS]]))
     return Triangle(R, len(y))
 
 
@@ -92,7 +92,7 @@ def _stack(R: np.ndarray, block: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(both, mode="r"))
 
 
-def exchanged(A: np.ndarray, kept: Sequence[int], left: Sequence[int]) -> list[int]:
+def exchange_columns(A: np.ndarray, kept: Sequence[int], left: Sequence[int]) -> list[int]:
     """Of columns that make up one another those to keep, in order: none left out may be more than MOST times a kept
     one, which would stand for it and make its errors larger by that (a pivot rule of maximum volume).
 
@@ -104,13 +104,13 @@ def exchanged(A: np.ndarray, kept: Sequence[int], left: Sequence[int]) -> list[i
         C = np.linalg.lstsq(A[:, kept] / size[kept], A[:, left] / size[left], rcond=None)[0]
         C *= size[left] / size[kept][:, None]
         i, j = np.unravel_index(np.argmax(np.abs(C)), C.shape)
-        if abs(C[i, j]) <= MOST:
+        if abs(C[i, j]) <= MAX_COLUMN_RATIO:
             break
         kept[i], left[j] = left[j], kept[i]
     return sorted(kept)
 
 
-def solve(t: Triangle, tolerance: float = DEPENDENT, scale: np.ndarray | None = None) -> Solution:
+def solve(t: Triangle, tolerance: float = DEPENDENCE_TOLERANCE, scale: np.ndarray | None = None) -> Solution:
     """Least squares from a triangle; a column within `tolerance` of those before it is left out; with the size
     `scale` (n,) of the unknowns, maybe another of them (see `exchanged`).
 
@@ -123,7 +123,7 @@ def solve(t: Triangle, tolerance: float = DEPENDENT, scale: np.ndarray | None = 
     scaled = A / np.where(size > 0, size, 1.0)
     kept, left = independent_columns(scaled, tolerance)
     if scale is not None:
-        kept = exchanged(A * scale, kept, left)
+        kept = exchange_columns(A * scale, kept, left)
     dependent: dict[int, int | None] = {
         k: kept[int(np.argmax(np.abs(scaled[:, kept].T @ scaled[:, k])))] if size[k] > 0 else None
         for k in range(n)
@@ -149,7 +149,7 @@ def scores_covariance(Z: np.ndarray, e: np.ndarray) -> np.ndarray:
     n, one = e.shape[1], np.ones(1)
     scores = np.zeros((n, Z.shape[2]))
     for z, own in zip(Z, e, strict=True):
-        a = np.append(1.0, -autoregression(own, min(MOST_LAGS, n // 20)))
+        a = np.append(1.0, -autoregression(own, min(MAX_LAGS, n // 20)))
         innovation = scipy.signal.lfilter(a, one, own)
         effect = scipy.signal.lfilter(one, a, z[::-1], axis=0)[::-1]
         scores += effect * innovation[:, None]
@@ -176,7 +176,7 @@ def autoregression(x: np.ndarray, most: int) -> np.ndarray:
     return best
 
 
-def lag_one(e: np.ndarray) -> np.ndarray:
+def lag_one_correlation(e: np.ndarray) -> np.ndarray:
     """Correlation of each row (n_rows, n) with itself a sample later, (n_rows,); 0 for a row of zeros."""
     energy = (e**2).sum(axis=1)
     return np.asarray((e[:, 1:] * e[:, :-1]).sum(axis=1) / np.where(energy > 0, energy, 1.0))

@@ -8,19 +8,34 @@ import numpy as np
 import scipy
 
 from excite.errors import NotIdentifiableError
-from excite.identification.estimate import UNMOVED, Estimate, held_note, noted
-from excite.identification.identifiability import at_rest
-from excite.identification.least_squares import Solution, Triangle, lag_one, merge, reduce, scores_covariance, solve
-from excite.identification.noise_propagation import EXACT, row_errors, row_levels, second_moments, spread, whitener
+from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Estimate, add_notes, held_note
+from excite.identification.identifiability import rest_projection
+from excite.identification.least_squares import (
+    Solution,
+    Triangle,
+    lag_one_correlation,
+    merge,
+    reduce,
+    scores_covariance,
+    solve,
+)
+from excite.identification.noise_propagation import (
+    MIN_ROW_NOISE,
+    filtered_noise,
+    row_errors,
+    row_levels,
+    second_moments,
+    whitening_matrices,
+)
 from excite.logs import Log, filtered_regression, samples
 from excite.model import Model
 from excite.model.machine import Filter
 
 Block = tuple[np.ndarray, np.ndarray]  # W (n_rows, n, n_base) and Y (n_rows, n) of one log
 
-TURNS = 30  # of an iteration for weights, at most
-SETTLED = 1e-4  # relative change of weights that ends it
-NOTABLE = 1.2  # deviations too small by this factor are worth a remark
+MAX_REWEIGHTINGS = 30  # of an iteration for weights, at most
+SETTLED_WEIGHTS = 1e-4  # relative change of weights that ends it
+NOTABLE_STD_RATIO = 1.2  # deviations too small by this factor are worth a remark
 
 
 def ols(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
@@ -30,10 +45,12 @@ def ols(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     itself is measured with noise, as slips are, and the deviations then are too small. A note says how much too small
     the autocorrelation of the residuals alone makes them.
     """
-    blocks = regressions(model, logs, filter)
-    solution = solved(blocks, model.scale)
-    estimate = textbook(model, blocks, solution, "ols")
-    return noted(estimate, *_too_small(blocks, solution, estimate, sandwich(blocks, solution)))
+    blocks = filtered_blocks(model, logs, filter)
+    solution = solve_blocks(blocks, model.scale)
+    estimate = estimate_with_white_noise(model, blocks, solution, "ols")
+    return add_notes(
+        estimate, *_autocorrelation_note(blocks, solution, estimate, sandwich_covariance(blocks, solution))
+    )
 
 
 def wls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
@@ -44,22 +61,22 @@ def wls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     that varies along the log (kernel estimate of the scores). Biased like ols where the regressor is measured with
     noise, though less where noisy rows then count less.
     """
-    blocks = regressions(model, logs, filter)
+    blocks = filtered_blocks(model, logs, filter)
     least = row_levels([row_errors(model, log, filter, 1) for log in logs], model.nominal)
-    least = np.maximum(least, EXACT * size(blocks))  # exact logs have no residual to weigh by
+    least = np.maximum(least, MIN_ROW_NOISE * rms_torque(blocks))  # exact logs have no residual to weigh by
     count = sum(Y.shape[1] for _, Y in blocks)
-    level, own = least, scaled(blocks, least)
-    for _ in range(TURNS):
-        solution = solved(own, model.scale)
+    level, own = least, scale_rows(blocks, least)
+    for _ in range(MAX_REWEIGHTINGS):
+        solution = solve_blocks(own, model.scale)
         energy = sum((residual(b, solution.x) ** 2).sum(axis=1) for b in blocks)
         before, level = level, np.maximum(np.sqrt(energy / count), least)
-        if np.abs(level / before - 1).max() < SETTLED:
+        if np.abs(level / before - 1).max() < SETTLED_WEIGHTS:
             break
-        own = scaled(blocks, level)
-    covariance = sandwich(own, solution)
-    degrees = effective(solution, covariance)
-    x = at_file(model, blocks, solution, solution.x)
-    return assembled(model, blocks, solution, "wls", x, covariance, degrees, ())
+        own = scale_rows(blocks, level)
+    covariance = sandwich_covariance(own, solution)
+    degrees = effective_degrees(solution, covariance)
+    x = restore_tied_parameters(model, blocks, solution, solution.x)
+    return build_estimate(model, blocks, solution, "wls", x, covariance, degrees, ())
 
 
 def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
@@ -71,12 +88,15 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     noise, if C has the right shape (Van Huffel and Vandewalle, "The total least squares problem", 1991, ch. 10).
     Columns are scaled by the triangle of [W Y]. Raises NotIdentifiable where nothing has noise.
     """
-    blocks = regressions(model, logs, filter)
-    first = solved(blocks, model.scale)
+    blocks = filtered_blocks(model, logs, filter)
+    first = solve_blocks(blocks, model.scale)
     turned = [
-        whitener(model, samples(model, log, filter), model.nominal, spread(model, log, filter), filter) for log in logs
+        whitening_matrices(
+            model, samples(model, log, filter), model.nominal, filtered_noise(model, log, filter), filter
+        )
+        for log in logs
     ]
-    own = [whitened(b, L) for b, L in zip(blocks, turned, strict=True)]
+    own = [whiten_block(b, L) for b, L in zip(blocks, turned, strict=True)]
     errors = [
         [np.einsum("nij,jnp->inp", L, E) for E in row_errors(model, log, filter)]
         for log, L in zip(logs, turned, strict=True)
@@ -84,7 +104,7 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     kept = list(first.kept)
     use = [*kept, len(model.base.names)]
     C = second_moments(errors)[np.ix_(use, use)]
-    R = np.asarray(np.linalg.qr(triangle(own).R[:, use], mode="r"))
+    R = np.asarray(np.linalg.qr(reduce_blocks(own).R[:, use], mode="r"))
     half = scipy.linalg.solve_triangular(R, C, trans="T")
     relative = scipy.linalg.solve_triangular(R, half.T, trans="T")
     mu, v = np.linalg.eigh((relative + relative.T) / 2)
@@ -95,35 +115,42 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     x[kept] = -direction[:-1] / direction[-1]
     level = 1 / float(mu[-1])
     bread = np.linalg.inv(R[:, :-1].T @ R[:, :-1] - level * C[:-1, :-1])
-    covariance = bread @ scatter(own, x, kept) @ bread
+    covariance = bread @ total_scores_covariance(own, x, kept) @ bread
     note = f"tls: misfit {np.sqrt(level):.2f} times what the sensors' noise and counts explain"
-    x = at_file(model, blocks, first, x)
-    return assembled(
-        model, blocks, first, "tls", x, covariance, effective(solved(own, model.scale), covariance), (note,)
+    x = restore_tied_parameters(model, blocks, first, x)
+    return build_estimate(
+        model,
+        blocks,
+        first,
+        "tls",
+        x,
+        covariance,
+        effective_degrees(solve_blocks(own, model.scale), covariance),
+        (note,),
     )
 
 
 # ------------------------------------------------------------------------------------------------ the core
 
 
-def regressions(model: Model, logs: Sequence[Log], filter: Filter) -> list[Block]:
+def filtered_blocks(model: Model, logs: Sequence[Log], filter: Filter) -> list[Block]:
     """Filtered rows of every log; what stands still in all of them does so exactly."""
-    rest = at_rest(model, logs, filter)
-    return stilled([filtered_regression(model, log, filter) for log in logs], rest)
+    rest = rest_projection(model, logs, filter)
+    return project_blocks([filtered_regression(model, log, filter) for log in logs], rest)
 
 
-def stilled(blocks: Sequence[Block], rest: np.ndarray) -> list[Block]:
+def project_blocks(blocks: Sequence[Block], rest: np.ndarray) -> list[Block]:
     """Rows of a machine some of which stands still, by `at_rest` (n_base, n_base)."""
     return [(W @ rest, Y) for W, Y in blocks] if (np.diag(rest) == 0).any() else list(blocks)
 
 
-def at_file(model: Model, blocks: Sequence[Block], solution: Solution, x: np.ndarray) -> np.ndarray:
+def restore_tied_parameters(model: Model, blocks: Sequence[Block], solution: Solution, x: np.ndarray) -> np.ndarray:
     """x (n_base,) with parameters that move together with others at the machine file's values instead of zero, and the
     others such that all rows stay explained as they are: written to the machine file, they say the same of the log."""
     tied, kept = solution.tied, list(solution.kept)
     if not tied:
         return x
-    R = triangle(blocks).R[:, :-1] * model.scale
+    R = reduce_blocks(blocks).R[:, :-1] * model.scale
     found = x.copy()
     found[tied] = model.nominal[tied]
     along = np.linalg.lstsq(R[:, kept], R[:, tied] @ (found[tied] / model.scale[tied]), rcond=None)[0]
@@ -134,10 +161,10 @@ def at_file(model: Model, blocks: Sequence[Block], solution: Solution, x: np.nda
 def least_squares(model: Model, W: np.ndarray, Y: np.ndarray, method: str) -> Estimate:
     """QR least squares of W (n_rows, n, n_base) X = Y (n_rows, n), columns in dependence named and left out."""
     blocks = [(W, Y)]
-    return textbook(model, blocks, solved(blocks, model.scale), method)
+    return estimate_with_white_noise(model, blocks, solve_blocks(blocks, model.scale), method)
 
 
-def solved(blocks: Sequence[Block], scale: np.ndarray | None = None) -> Solution:
+def solve_blocks(blocks: Sequence[Block], scale: np.ndarray | None = None) -> Solution:
     """Least squares of all rows of all logs, the parameters being of size `scale` (n_base,). Raises NotIdentifiable."""
     n_base = blocks[0][0].shape[2]
     for W, Y in blocks:
@@ -148,29 +175,29 @@ def solved(blocks: Sequence[Block], scale: np.ndarray | None = None) -> Solution
         raise NotIdentifiableError("every torque is zero all along: are their sensors connected?")
     if rows <= n_base:
         raise NotIdentifiableError(f"{rows} filtered rows for {n_base} parameters: the log is too short")
-    solution = solve(triangle(blocks), scale=scale)
+    solution = solve(reduce_blocks(blocks), scale=scale)
     if not solution.kept:
-        raise NotIdentifiableError(UNMOVED)
+        raise NotIdentifiableError(NOTHING_MOVES_MESSAGE)
     return solution
 
 
-def triangle(blocks: Sequence[Block]) -> Triangle:
+def reduce_blocks(blocks: Sequence[Block]) -> Triangle:
     """[W Y] of all rows of all logs, reduced block by block."""
     return merge(reduce(w, y) for W, Y in blocks for w, y in zip(W, Y, strict=True))
 
 
-def scaled(blocks: Sequence[Block], level: np.ndarray) -> list[Block]:
+def scale_rows(blocks: Sequence[Block], level: np.ndarray) -> list[Block]:
     """Rows over their levels (n_rows,)."""
     return [(W / level[:, None, None], Y / level[:, None]) for W, Y in blocks]
 
 
-def whitened(block: Block, L: np.ndarray) -> Block:
+def whiten_block(block: Block, L: np.ndarray) -> Block:
     """Rows of each sample turned by L (n, n_rows, n_rows)."""
     W, Y = block
     return np.einsum("nij,jnp->inp", L, W), np.einsum("nij,jn->in", L, Y)
 
 
-def size(blocks: Sequence[Block]) -> float:
+def rms_torque(blocks: Sequence[Block]) -> float:
     """Root mean square of Y."""
     return float(np.sqrt(sum(float((Y**2).sum()) for _, Y in blocks) / sum(Y.size for _, Y in blocks)))
 
@@ -181,7 +208,9 @@ def residual(block: Block, x: np.ndarray) -> np.ndarray:
     return np.asarray(Y - W @ x)
 
 
-def scatter(blocks: Sequence[Block], x: np.ndarray, kept: Sequence[int], by: Sequence[np.ndarray] = ()) -> np.ndarray:
+def total_scores_covariance(
+    blocks: Sequence[Block], x: np.ndarray, kept: Sequence[int], by: Sequence[np.ndarray] = ()
+) -> np.ndarray:
     """Covariance (k, k) of Z'(Y - W x) over all logs; `by` gives Z (n_rows, n, n_base) of each, else it is W."""
     rows = sum(Y.size for _, Y in blocks)
     Z = by or [W for W, _ in blocks]
@@ -189,13 +218,13 @@ def scatter(blocks: Sequence[Block], x: np.ndarray, kept: Sequence[int], by: Seq
     return np.asarray(S * (rows / (rows - len(kept))))
 
 
-def sandwich(blocks: Sequence[Block], solution: Solution) -> np.ndarray:
+def sandwich_covariance(blocks: Sequence[Block], solution: Solution) -> np.ndarray:
     """Covariance (k, k) of a least-squares estimate, whatever the noise's colour and level along the log."""
     inverse = solution.inverse
-    return inverse @ scatter(blocks, solution.x, solution.kept) @ inverse
+    return inverse @ total_scores_covariance(blocks, solution.x, solution.kept) @ inverse
 
 
-def effective(solution: Solution, covariance: np.ndarray) -> int:
+def effective_degrees(solution: Solution, covariance: np.ndarray) -> int:
     """Degrees of freedom that autocorrelation leaves: rows over the inflation of the variance, less parameters."""
     white = solution.residual_norm**2 / solution.degrees * np.diag(solution.inverse)
     inflation = max(1.0, float(np.median(np.diag(covariance) / white)))
@@ -205,14 +234,14 @@ def effective(solution: Solution, covariance: np.ndarray) -> int:
 # ------------------------------------------------------------------------------------------------ the answer
 
 
-def textbook(model: Model, blocks: Sequence[Block], solution: Solution, method: str) -> Estimate:
+def estimate_with_white_noise(model: Model, blocks: Sequence[Block], solution: Solution, method: str) -> Estimate:
     """The estimate with deviations by (33), which hold for white noise on Y alone."""
     covariance = solution.residual_norm**2 / solution.degrees * solution.inverse
-    x = at_file(model, blocks, solution, solution.x)
-    return assembled(model, blocks, solution, method, x, covariance, solution.degrees, ())
+    x = restore_tied_parameters(model, blocks, solution, solution.x)
+    return build_estimate(model, blocks, solution, method, x, covariance, solution.degrees, ())
 
 
-def assembled(
+def build_estimate(
     model: Model,
     blocks: Sequence[Block],
     solution: Solution,
@@ -226,7 +255,7 @@ def assembled(
     names, kept = model.base.names, list(solution.kept)
     floor = np.array([float(model.machine.scale.get(s, 0.0)) for s in names])
     scale = np.maximum(np.abs(x), floor)[kept]
-    R = triangle(blocks).R[:, kept]
+    R = reduce_blocks(blocks).R[:, kept]
     value = np.full(len(names), np.nan)
     value[kept] = x[kept]
     e = np.concatenate([residual(b, x) for b in blocks], axis=1)
@@ -246,7 +275,7 @@ def assembled(
         solution.spread(covariance),
         float(np.linalg.cond(R)),
         float(np.linalg.cond(R * scale)),
-        100 * float(np.sqrt(np.mean(e**2))) / size(blocks),
+        100 * float(np.sqrt(np.mean(e**2))) / rms_torque(blocks),
         e,
         degrees,
         reasons,
@@ -254,13 +283,15 @@ def assembled(
     )
 
 
-def _too_small(blocks: Sequence[Block], solution: Solution, estimate: Estimate, honest: np.ndarray) -> tuple[str, ...]:
+def _autocorrelation_note(
+    blocks: Sequence[Block], solution: Solution, estimate: Estimate, honest: np.ndarray
+) -> tuple[str, ...]:
     """What autocorrelated residuals do to deviations by (33), as a note."""
     kept = list(solution.kept)
     ratio = np.sqrt(np.diag(honest)) / estimate.std[kept]
-    if not ratio.max() > NOTABLE:
+    if not ratio.max() > NOTABLE_STD_RATIO:
         return ()
-    first = max((float(np.abs(lag_one(residual(b, solution.x))).max()) for b in blocks), default=0.0)
+    first = max((float(np.abs(lag_one_correlation(residual(b, solution.x))).max()) for b in blocks), default=0.0)
     worst = int(np.argmax(ratio))
     return (
         f"ols: residuals are autocorrelated (lag 1: {first:.2f}), deviations by (33) are too small by a"

@@ -11,12 +11,12 @@ import numpy as np
 
 from excite.errors import MachineError, NoEstimateError, NotIdentifiableError
 from excite.identification import bias
-from excite.identification.bias import Find
-from excite.identification.estimate import Estimate, noted
-from excite.identification.identifiability import explained
+from excite.identification.bias import Estimator
+from excite.identification.estimate import Estimate, add_notes
+from excite.identification.identifiability import add_advice
 from excite.identification.instrumental_variables import iv
 from excite.identification.joint import joint
-from excite.identification.linear_methods import ols, regressions, tls, wls
+from excite.identification.linear_methods import filtered_blocks, ols, tls, wls
 from excite.identification.output_error import oe
 from excite.logs import NEEDED, Log, doubts_in_errors, examine
 from excite.model import Model
@@ -32,7 +32,7 @@ class Method:
     measured with noise, so that `excite identify` looks for how much.
     """
 
-    find: Find
+    find: Estimator
     effects: Literal["none", "linear", "any"] = "none"
     simulates: bool = False
     biased: bool = False
@@ -49,8 +49,8 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
         raise ValueError(f"method: {method} is unknown, allowed: {', '.join(METHODS)}")
     if not logs:
         raise ValueError("identify: no log given")
-    measurable(model)
-    _linear(model, method)
+    require_sensors(model)
+    _require_method_for_effects(model, method)
     examined = [examine(model, log) for log in logs]
     mended, filter = [e.log for e in examined], filter or model.machine.filter
     if not any(v.any() for log in mended for v in log.values.values()):
@@ -58,16 +58,16 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     doubtful = [line for e in examined for line in e.doubts]
     with doubts_in_errors(doubtful):
         try:
-            estimate = explained(model, mended, METHODS[method].find(model, mended, filter), filter)
+            estimate = add_advice(model, mended, METHODS[method].find(model, mended, filter), filter)
         except np.linalg.LinAlgError:
             raise NotIdentifiableError(
                 f"{mended[0].source}: the equations of {method} are singular along this log: check the sign and unit of"
                 " every column, and that the machine moves"
             ) from None
-    return noted(estimate, *(note for e in examined for note in e.notes), *doubtful)
+    return add_notes(estimate, *(note for e in examined for note in e.notes), *doubtful)
 
 
-def measurable(model: Model) -> None:
+def require_sensors(model: Model) -> None:
     """Refuses a machine file whose sensors can't say what its equations need. Raises MachineError."""
     machine = model.machine
     have = {(s.kind, s.body) for s in machine.sensor}
@@ -90,7 +90,7 @@ def measurable(model: Model) -> None:
         )
 
 
-def _linear(model: Model, method: str) -> None:
+def _require_method_for_effects(model: Model, method: str) -> None:
     """Refuses a method that can't estimate a machine's effects. Raises MachineError."""
     able = METHODS[method].effects
     if model.plain or able == "any":
@@ -99,14 +99,14 @@ def _linear(model: Model, method: str) -> None:
     if able == "none":
         raise MachineError(f"{machine}: effect: method {method} doesn't know effects, use {others}")
     for e in model.effects:
-        if e.name in model.nonlinear or e.effect.sensed:
+        if e.name in model.nonlinear or e.effect.sensor_only:
             raise MachineError(
                 f"{machine}: effect {e.name}: no least squares finds it, since the equations of motion are not linear"
                 " in its amount: use joint"
             )
 
 
-def with_bias(
+def add_bias(
     model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter | None = None, runs: int = bias.RUNS
 ) -> Estimate:
     """The estimate with its method's bias on these logs, from simulated ones (see `bootstrap`).
@@ -115,7 +115,7 @@ def with_bias(
     far off that its own machine says nothing of its bias.
     """
     if not model.plain:
-        return noted(estimate, "the method's bias on these logs was not looked for: the machine has effects")
+        return add_notes(estimate, "the method's bias on these logs was not looked for: the machine has effects")
     filter = filter or model.machine.filter
     around: np.ndarray | None = None
     if METHODS[estimate.method].biased:
@@ -123,10 +123,10 @@ def with_bias(
             with suppress(NoEstimateError):
                 around = find(model, logs, filter).value
                 break
-    return bias.with_bias(model, logs, estimate, METHODS[estimate.method].find, filter, around, runs)
+    return bias.add_bias(model, logs, estimate, METHODS[estimate.method].find, filter, around, runs)
 
 
-def recommended(model: Model) -> str:
+def recommend_method(model: Model) -> str:
     """The method that a machine calls for: joint smoothing where slips, which are measured with noise, make the
     regressor, and for a machine with effects; least squares where a joint's own motion makes it.
     """
@@ -140,27 +140,30 @@ def needed_sensors(model: Model, method: str) -> tuple[str, ...]:
     return tuple(s.name for s in model.machine.sensors("full") if s.kind in kinds)
 
 
-def possible(plain: Find) -> Find:
+def restrict_to_possible(plain: Estimator) -> Estimator:
     """A linear method held to physically possible machines."""
 
     def method(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         """The same, held to physically possible machines: the nearest one, by a convex program."""
-        from excite.identification.consistency import constrained  # cvxpy takes a second to load
+        from excite.identification.consistency import constrained_estimate  # cvxpy takes a second to load
 
-        return constrained(model, plain(model, logs, filter), regressions(model, logs, filter))
+        return constrained_estimate(model, plain(model, logs, filter), filtered_blocks(model, logs, filter))
 
     return method
 
 
-LINEAR: dict[str, Method] = {
+LINEAR_METHODS: dict[str, Method] = {
     "ols": Method(ols, effects="linear", biased=True),
     "wls": Method(wls, biased=True),
     "iv": Method(iv, simulates=True),
     "tls": Method(tls),
 }
 METHODS: dict[str, Method] = {
-    **LINEAR,
+    **LINEAR_METHODS,
     "oe": Method(oe, simulates=True),
     "joint": Method(joint, effects="any", simulates=True),
-    **{f"{name}+consistent": replace(m, find=possible(m.find), effects="none") for name, m in LINEAR.items()},
+    **{
+        f"{name}+consistent": replace(m, find=restrict_to_possible(m.find), effects="none")
+        for name, m in LINEAR_METHODS.items()
+    },
 }

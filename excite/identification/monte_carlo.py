@@ -142,7 +142,7 @@ def summarise_runs(v: Verification) -> dict[str, dict[str, float | str]]:
     return table
 
 
-def biased(table: dict[str, dict[str, float | str]]) -> list[str]:
+def biased_parameters(table: dict[str, dict[str, float | str]]) -> list[str]:
     """Parameters of a `summary` whose mean error is more than one predicted standard deviation, and beyond chance."""
     return [
         name

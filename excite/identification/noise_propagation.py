@@ -14,25 +14,27 @@ from excite.model import Model
 from excite.model.machine import Filter, Sensor
 
 REREADINGS = 6  # times that a log is measured again
-EXACT = 1e-6  # of the torques' size: no row is trusted further
+MIN_ROW_NOISE = 1e-6  # of the torques' size: no row is trusted further
 
 
 @dataclass(frozen=True)
-class Spread:
+class FilteredNoise:
     """Covariance (3 n_q, 3 n_q) of the errors of filtered, decimated (q, nu, a), variance (n_rows,) of those of Y."""
 
     motion: np.ndarray
     rows: np.ndarray
 
 
-def reread(sensor: Sensor, exact: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray:
+def measure_again(sensor: Sensor, exact: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray:
     """A signal (N,) measured anew: whole counts from a random place between two edges, or white noise of a level."""
     if sensor.resolution is not None:
         return (np.floor(exact / sensor.resolution + rng.uniform()) - 0.5) * sensor.resolution
     return exact + level * rng.standard_normal(len(exact))
 
 
-def rereadings(model: Model, log: Log, filter: Filter, count: int = REREADINGS, seed: int = 0) -> Iterator[Log]:
+def simulate_rereadings(
+    model: Model, log: Log, filter: Filter, count: int = REREADINGS, seed: int = 0
+) -> Iterator[Log]:
     """First the filtered log, which counts as the truth, then `count` times what its sensors would have read: white
     noise as found in the log, counts as in the machine file."""
     rate = float(model.machine.sampling_hz)
@@ -42,12 +44,12 @@ def rereadings(model: Model, log: Log, filter: Filter, count: int = REREADINGS, 
     level = {s.name: white_noise(log.values[s.name]) for s in present}
     yield Log(log.source, log.t, truth)
     for _ in range(count):
-        yield Log(log.source, log.t, {s.name: reread(s, truth[s.name], level[s.name], rng) for s in present})
+        yield Log(log.source, log.t, {s.name: measure_again(s, truth[s.name], level[s.name], rng) for s in present})
 
 
 def row_errors(model: Model, log: Log, filter: Filter, count: int = REREADINGS) -> list[np.ndarray]:
     """Errors of [W Y], (n_rows, n, n_base + 1) each, of `count` readings."""
-    again = rereadings(model, log, filter, count)
+    again = simulate_rereadings(model, log, filter, count)
     W0, Y0 = regression(model, samples(model, next(again), filter), filter)
     errors = []
     for reading in again:
@@ -56,9 +58,9 @@ def row_errors(model: Model, log: Log, filter: Filter, count: int = REREADINGS) 
     return errors
 
 
-def spread(model: Model, log: Log, filter: Filter, count: int = REREADINGS) -> Spread:
+def filtered_noise(model: Model, log: Log, filter: Filter, count: int = REREADINGS) -> FilteredNoise:
     """How far the filtered motion and torques of a log are from the truth, on average over the log."""
-    again = rereadings(model, log, filter, count)
+    again = simulate_rereadings(model, log, filter, count)
     first, last = filter.drop[0], len(log) - filter.drop[1]
 
     def motion(reading: Log) -> tuple[np.ndarray, np.ndarray]:
@@ -72,10 +74,10 @@ def spread(model: Model, log: Log, filter: Filter, count: int = REREADINGS) -> S
         q, Y = motion(reading)
         P += (q - q0) @ (q - q0).T / (q.shape[1] * count)
         R += ((Y - Y0) ** 2).mean(axis=1) / count
-    return Spread(P, R)
+    return FilteredNoise(P, R)
 
 
-def whitener(model: Model, s: Samples, x: np.ndarray, noise: Spread, filter: Filter) -> np.ndarray:
+def whitening_matrices(model: Model, s: Samples, x: np.ndarray, noise: FilteredNoise, filter: Filter) -> np.ndarray:
     """L (n, n_rows, n_rows) that makes the errors of Y - W x white across rows and even along the log.
 
     First order: errors of (q, nu, a) act through the slopes of the prediction at x (n_base,). Where the machine hardly
@@ -85,18 +87,18 @@ def whitener(model: Model, s: Samples, x: np.ndarray, noise: Spread, filter: Fil
     keep = kept_samples(filter.drop[0], s.q.shape[1] - filter.drop[1], filter.decimation)
     n_rows = len(noise.rows)
     sample = [v[:, keep] for v in (s.q, s.nu, s.a, *s.beside)]
-    J = _slopes(model)(*sample, model.expand @ x).full()
+    J = _prediction_jacobian(model)(*sample, model.expand @ x).full()
     J = J.reshape(n_rows, len(keep), 3 * n_rows).transpose(1, 0, 2)
-    least = noise.rows + (EXACT * np.sqrt(np.mean(s.Y**2))) ** 2
+    least = noise.rows + (MIN_ROW_NOISE * np.sqrt(np.mean(s.Y**2))) ** 2
     C = J @ noise.motion @ J.transpose(0, 2, 1) + np.diag(least)
     return np.linalg.inv(np.linalg.cholesky(C))
 
 
 @lru_cache(maxsize=8)
-def _slopes(model: Model) -> ca.Function:
+def _prediction_jacobian(model: Model) -> ca.Function:
     """(q, nu, a, beside, standard parameters) -> slopes (n_rows, 3 n_q) of the prediction by (q, nu, a)."""
     q, nu, a = model.symbols()
-    beside = model.beside()
+    beside = model.effect_symbols()
     p = ca.SX.sym("p", len(model.base.standard))
     slope = ca.jacobian(model.predict(q, nu, a, p, *beside), ca.vertcat(q, nu, a))
     return ca.Function("slopes", [q, nu, a, *beside, p], [ca.densify(slope)], {"cse": True})

@@ -17,12 +17,12 @@ from excite.identification.methods import identify
 from excite.logs import Log
 from excite.model import Model, required_signs
 
-POSES = 181  # at which the mass matrix is looked at
-SHARES = np.linspace(1, 0, 21)
+POSE_COUNT = 181  # at which the mass matrix is looked at
+STEP_SHARES = np.linspace(1, 0, 21)
 
 
 @dataclass(frozen=True)
-class Known:
+class PriorKnowledge:
     """What logs tell: the model with its estimate as nominal, and its information (n_base, n_base) [1/SI^2].
 
     share: how much of the way from the machine file's values to the estimate the new nominal went; below 1 where the
@@ -35,15 +35,15 @@ class Known:
     share: float
 
 
-def known_before(model: Model, logs: Sequence[Log]) -> Known:
+def prior_from_logs(model: Model, logs: Sequence[Log]) -> PriorKnowledge:
     """What logs tell of a machine. Parameters that they hardly show keep the machine file's value, and no information.
 
     Raises NotIdentifiable where the logs give no machine that is physically possible, and what `identify` raises.
     """
-    return from_estimate(model, identify(model, logs, "joint"))
+    return prior_from_estimate(model, identify(model, logs, "joint"))
 
 
-def from_estimate(model: Model, estimate: Estimate) -> Known:
+def prior_from_estimate(model: Model, estimate: Estimate) -> PriorKnowledge:
     """The same of an estimate that is there already."""
     seen = np.isfinite(estimate.value)
     information = np.zeros((len(seen), len(seen)))
@@ -51,24 +51,24 @@ def from_estimate(model: Model, estimate: Estimate) -> Known:
     by = np.outer(model.scale[seen], model.scale[seen])
     information[at] = np.linalg.inv(estimate.covariance[at] / by) / by
     X = np.where(seen, estimate.value, model.nominal)
-    for share in SHARES:
+    for share in STEP_SHARES:
         nominal = model.nominal + float(share) * (X - model.nominal)
-        if _possible(model, nominal):
+        if _is_possible(model, nominal):
             floor = [float(model.machine.scale.get(n, 0.0)) for n in model.base.names]
             scale = np.where(np.array(floor) > 0, floor, np.abs(nominal))
             scale = np.where(scale > 0, scale, model.scale)
-            return Known(replace(model, nominal=nominal, scale=scale), information, estimate, float(share))
+            return PriorKnowledge(replace(model, nominal=nominal, scale=scale), information, estimate, float(share))
     raise NotIdentifiableError("the machine file's own values have no positive definite mass matrix")
 
 
-def _possible(model: Model, X: np.ndarray) -> bool:
+def _is_possible(model: Model, X: np.ndarray) -> bool:
     """Whether the mass matrix is positive definite all over the joints' range, and friction and contacts resist."""
-    q = np.zeros((len(model.coordinates), POSES))
+    q = np.zeros((len(model.coordinates), POSE_COUNT))
     for body in model.machine.body:
         for c in body.coordinates:
-            if c in model.felt:
+            if c in model.active_coordinates:
                 wide = float(body.limit.position) if body.limit.position is not None else np.pi
-                q[model.coordinates.index(c)] = np.linspace(-wide, wide, POSES)
+                q[model.coordinates.index(c)] = np.linspace(-wide, wide, POSE_COUNT)
     if not (model.pivots(q, X).full() > 0).all():
         return False
     of = required_signs(model.machine)

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from excite import trajectories
-from excite.identification import Comparison, Verification
+from excite.identification import SignalComparison, Verification
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion
@@ -226,7 +226,7 @@ def _error_axis(ax: Axes, reach: float) -> None:
     ax.set_xlabel(label)
 
 
-def comparison_figure(model: Model, c: Comparison, title: str) -> Figure:
+def comparison_figure(model: Model, c: SignalComparison, title: str) -> Figure:
     """Measured beside predicted, signal by signal, with the residual below each."""
     n = len(c.names)
     figure = Figure(figsize=(10, 0.8 + 3.0 * n), layout="constrained")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from excite import output, trajectories
-from excite.identification import SURE
+from excite.identification import SIGNIFICANT_BIAS
 from excite.logs import guess_machine, inspect, read_table, table_of
 from excite.model.machine import load_machine
 from excite.reports import figures
@@ -193,7 +193,8 @@ def kept(s: Summary) -> str:
     free, hand = d["played_back"], d["by_hand"]
     return (
         f"In people's hands these {len(d['phases'])} phases give {trajectories.titled(s['objective'], hand['score'])},"
-        f" torques played back {free['score']:.4g}; the worst parameter can be told to {format_percent(hand['worst_percent'])}"
+        f" torques played back {free['score']:.4g}; the worst parameter can be told to"
+        f" {format_percent(hand['worst_percent'])}"
         f" ({hand['worst_parameter']}) instead of {format_percent(free['worst_percent'])}, the median one to"
         f" {format_percent(hand['median_percent'])} instead of {format_percent(free['median_percent'])}"
     )
@@ -229,7 +230,8 @@ def _verify(s: Summary) -> Said:
     cover = 100 * float(np.mean([rows[n]["coverage95"] for n in errors]))
     median = float(np.median(list(errors.values())))
     answer = (
-        f"In {s['runs']} simulated test days the parameters came out within {format_percent(median)} of the truth (median;"
+        f"In {s['runs']} simulated test days the parameters came out within {format_percent(median)} of the truth"
+        " (median;"
         f" worst {worst}, {format_percent(errors[worst])}), and the 95 % intervals held it in {cover:.0f} % of cases."
     )
     remarks = [f"Biased, the intervals do not hold: {', '.join(s['biased'])}."] if s["biased"] else []
@@ -310,7 +312,8 @@ def _identify(s: Summary) -> Said:
         most = max(off, key=lambda n: off[n])
         answer = (
             f"From {logs}, {s['method']} finds {count}, {len(off)} of them wrong by more than it says: on simulated"
-            f" logs like this by up to {format_percent(100 * off[most])} ({most}); the prediction leaves {format_percent(rest)} of"
+            f" logs like this by up to {format_percent(100 * off[most])} ({most}); the prediction leaves"
+            f" {format_percent(rest)} of"
             " what was measured."
         )
     remarks = [f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()] + list(s["notes"])
@@ -343,7 +346,7 @@ def _identify(s: Summary) -> Said:
 def _is_biased(row: Mapping[str, Any]) -> bool:
     """Whether the method's bias of a parameter is known to be more than its deviation."""
     bias, std = row.get("bias"), row.get("bias_std")
-    return bias is not None and std is not None and abs(bias) > max(row["std"], SURE * std)
+    return bias is not None and std is not None and abs(bias) > max(row["std"], SIGNIFICANT_BIAS * std)
 
 
 def _log(s: Summary) -> Said:

@@ -1,6 +1,6 @@
-"""The Cramer-Rao bound of a motion: the best accuracy that its sensors allow.
+"""Cramer-Rao bound of a motion: the best accuracy that its sensors allow.
 
-The covariance of joint smoothing along a motion that is known exactly, with no measurement at all.
+The bound is the covariance of joint smoothing along an exactly known motion, without any measurement.
 """
 
 from __future__ import annotations
@@ -9,42 +9,53 @@ import numpy as np
 
 from excite.model import Model
 from excite.simulation import Motion, measured_torques
-from excite.smoothing.gauss_newton import PRIOR, in_si, linearise_fit
-from excite.smoothing.linearisation import chart
-from excite.smoothing.measurements import Noise, Point, Record, expected, origins, torque_sensor
+from excite.smoothing.gauss_newton import PRIOR_STD, covariance_in_si, linearise_log
+from excite.smoothing.linearisation import build_state_space
+from excite.smoothing.measurements import (
+    Measurements,
+    SensorNoise,
+    Trajectory,
+    encoders_with_offset,
+    torque_sensor,
+    with_mean_edge_rates,
+)
 
 
 def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | None = None) -> np.ndarray:
-    """The covariance (n_base, n_base) that a kit's sensors make attainable along a motion: the Cramer-Rao bound of a
-    model of them in which every noise is normal.
+    """Compute the covariance (n_base, n_base) [SI] that the sensors of a kit allow along a motion.
 
-    The machine file's noise; an encoder tells something as often as it counts, and its edges are off by a tenth of a
-    count at least (a perfect encoder on a slow machine tells more than that). A weak prior (300 % of each scale) stays
-    in, so that a parameter which the drive doesn't show has a large deviation and not an infinite one.
-    Raises ValueError where a sensor has neither noise nor counts.
+    All noise counts as Gaussian, with the machine file's standard deviations. An encoder gives one reading per count,
+    and its edges are off by a tenth of a count at least. A weak prior (300 % of each scale) keeps the standard
+    deviation of a parameter finite that the motion does not excite.
+
+    X (n_base,): true parameters, the nominal ones by default. Raises ValueError for a sensor without noise or counts.
     """
     X = model.nominal if X is None else np.asarray(X, float)
     sensors = [s for s in model.machine.sensors(kit) if s.kind not in ("x", "y")]
     for s in sensors:
-        if not s.graded:
+        if not s.has_noise_figure:
             raise ValueError(
                 f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file"
             )
-    c = chart(model, tuple(s.name for s in model.machine.sensors("full") if s in sensors))
+    space = build_state_space(model, tuple(s.name for s in model.machine.sensors("full") if s in sensors))
     full = np.hstack([motion.q, motion.nu, motion.wheels, motion.memory])
-    state, over = c.charted(full)
-    counts = np.array([s.resolution is not None for s in c.sensors])
-    noise = Noise(
+    state, over = space.from_full_state(full)
+    counts = np.array([s.resolution is not None for s in space.sensors])
+    noise = SensorNoise(
         np.array([float(torque_sensor(model, b.index).noise or 0) for b in model.machine.actuated]),
-        np.array([s.resolution or float(s.noise or 0) for s in c.sensors]),
+        np.array([s.resolution or float(s.noise or 0) for s in space.sensors]),
     )
-    none = np.zeros((len(state), len(c.sensors)))
-    r = Record(measured_torques(model, motion.t, motion.u, X), none, none, counts, origins(c, counts), noise)
-    p = Point(state, np.zeros_like(motion.u[1:]), np.zeros(len(r.origin)), over)
-    linear = linearise_fit(c, expected(c, r, p, motion.u, X), p, state[0], X, 0.0, exact=True)
+    none = np.zeros((len(state), len(space.sensors)))
+    data = Measurements(
+        measured_torques(model, motion.t, motion.u, X), none, none, counts, encoders_with_offset(space, counts), noise
+    )
+    trajectory = Trajectory(state, np.zeros_like(motion.u[1:]), np.zeros(len(data.offset_sensors)), over)
+    linear = linearise_log(
+        space, with_mean_edge_rates(space, data, trajectory, motion.u, X), trajectory, state[0], X, 0.0, exact=True
+    )
     assert linear is not None
     information = linear.Z[1:, 1:].copy()
     information[np.diag_indices(len(information))] += np.concatenate(
-        [np.full(len(X), PRIOR**-2), np.ones(len(r.origin))]
+        [np.full(len(X), PRIOR_STD**-2), np.ones(len(data.offset_sensors))]
     )
-    return in_si(c, np.linalg.inv(information))
+    return covariance_in_si(space, np.linalg.inv(information))

@@ -1,8 +1,8 @@
-"""The most likely parameters and trajectories of logs: Gauss-Newton by multiple shooting.
+"""Most likely parameters and trajectories of logs: Gauss-Newton with multiple shooting.
 
-A log is linearised about a point (`linearise`), its states are integrated out by `chain`, which leaves a small
-quadratic form in the parameters; a step of these takes the states along (`moved`). Source: Bock, "Recent advances in
-parameter identification techniques for O.D.E.", 1983.
+Each pass linearises every log about its trajectory and integrates out the states with the parallel smoother, which
+leaves a quadratic form in the parameters. The step of the parameters then moves the states (`apply_step`). Source:
+Bock, "Recent advances in parameter identification techniques for O.D.E.", 1983.
 """
 
 from __future__ import annotations
@@ -16,86 +16,107 @@ import scipy
 from excite.errors import NoEstimateError
 from excite.model import Model
 from excite.smoothing import parallel_smoother
-from excite.smoothing.innovations import Linear
-from excite.smoothing.linearisation import BATCH, Chart, advance, differentiate
-from excite.smoothing.measurements import Point, Record, driven_over, one_count, readings
+from excite.smoothing.innovations import LinearisedLog
+from excite.smoothing.linearisation import BATCH_SIZE, StateSpace, advance, differentiate
+from excite.smoothing.measurements import Measurements, Trajectory, ground_inputs, offset_scale, predict_readings
 
-PRIOR = 3.0  # standard deviation of a parameter before any data, in its scale; of one that is further off, its size
-PASSES = 15  # at most
-UNSEEN = 1.0  # a parameter that a log tells less than this well, in its scale, stays at the machine file's value
-HELD = 1e-6  # standard deviation of such a parameter, in its scale
-AWAY = 1e-3  # of its scale, from which it isn't where it is held yet
-SETTLED = 3  # passes until the states fit the dynamics well enough to tell which these are
-DAMPING = 25.0, 0.1  # of the first step, as information in each parameter's scale, and its share from pass to pass
-RESUMED = DAMPING[0] * DAMPING[1] ** 2  # damping of a fit that goes on from another
-HOPELESS = (8, 10.0)  # after so many passes with a step still so large, in standard deviations
-LOST = (4, 30.0, 0.9)  # after more than so many with one so large that is more than a share of that two passes earlier
-LATELY = 4  # passes whose steps tell how small the last one will be
-IDLE = 0.5, 0.8  # share of a step two passes earlier above which it hardly shrinks: near an answer, far from any
-FALLING = 0.01  # of a cost, in two passes
-FELL = 1.0  # of a cost, in one pass: a parameter's way of one standard deviation
-ALIKE = 0.05  # of a cost: what swinging steps change
-NEARLY = 1.0  # a step, in standard deviations, at which a fit that runs out of passes is as good as found
-CONVERGED = 0.02  # left undone at the end of the iteration, in standard deviations
-ENOUGH = 0.2  # a step, in standard deviations, at which a fit is found whose deviations are no promise
-# Steps that turn back and hardly shrink are shortened by TURNED; others grow by SHARE up to the whole.
-TURNED, SHARE, SLOW = 0.7, 1.15, 0.3
-STRONG = 1.3  # misfit over what noise makes of it from which a fit isn't near the logs, and first-order gains are rough
-FREE = 0.05  # of a parameter's size, in the last step: it is hardly known
-DOWN = 0.8  # of a parameter that makes sense above zero only, by which it goes down in one pass at most
-ALONG = 0.9  # cosine between two steps that go the same way
-LARGEST_STEP = 0.5  # of a parameter in one pass, relative to its size
-# Where a step was cut short and the next pass asks for the rest of it, but for a share AGAIN of what was gone, the way
-# is straight, and the limit FURTHER times as far.
-FURTHER, AGAIN = 3.0, 0.3
-# Disturbing forces where the model is not trusted, white from sample to sample, as accelerations [m/s2, rad/s2]: on a
-# roller of 11 t they are 500 N.
-DISTURBANCE = 0.045
-SHORTER = 8  # times that a step is halved
-REJECTED = 4  # points in all that can't be integrated, of a fit on which no more passes are spent than it is worth
-PART = 200  # samples at a time: their chain stays in the processor's cache
-# Of the first state about the filtered log. Not wider: where the contact is stiff, at standstill, nothing is seen of
-# the first speeds, which are gone within milliseconds, and an iteration would play with them for ever.
-SPREAD_SPEED, SPREAD_ANGLE = 0.05, 0.1
+# Prior of the parameters, relative to each parameter's scale. All values are chosen.
+PRIOR_STD = 3.0  # prior standard deviation; a value further off than this counts as its own prior
+MAX_IDENTIFIABLE_STD = 1.0  # a parameter known less well than this is held at the machine file's value
+HELD_STD = 1e-6  # prior standard deviation of a held parameter
+HELD_TOLERANCE = 1e-3  # distance from the held value at which a parameter has not arrived there yet
+
+# Course of the iteration. Steps are the largest of all parameters, in standard deviations; values are chosen.
+MAX_PASSES = 15
+SETTLING_PASSES = 3  # until the states fit the dynamics well enough to judge which parameters are identifiable
+INITIAL_DAMPING = 25.0  # information added to each parameter in its scale (Levenberg), in the first pass
+DAMPING_DECAY = 0.1  # damping of a pass relative to the pass before
+RESUMED_DAMPING = INITIAL_DAMPING * DAMPING_DECAY**2  # of a fit that continues another one
+CONVERGED_STEP = 0.02  # expected sum of all steps to come at which the iteration ends
+SUFFICIENT_STEP = 0.2  # ends a fit whose intervals are not reported
+ACCEPTABLE_STEP = 1.0  # a fit that runs out of passes is accepted below this step
+
+# When a fit is given up; chosen.
+HOPELESS_PASSES = 8  # after this many passes the step must be below HOPELESS_STEP
+HOPELESS_STEP = 10.0  # [standard deviations]
+LOST_PASSES = 4  # after more than this many passes a step above LOST_STEP must shrink
+LOST_STEP = 30.0  # [standard deviations]
+LOST_RATIO = 0.9  # largest ratio of such a step to the one two passes before
+SHRINK_RATE_PASSES = 4  # passes from which the shrinking of the steps is extrapolated
+STAGNATION_RATIO_NEAR = 0.5  # ratio of a step to the one two passes before: an acceptable step that stagnates
+STAGNATION_RATIO_FAR = 0.8  # the same ratio for a larger step
+MIN_COST_DECREASE = 0.01  # smallest relative decrease of the cost in two passes
+MIN_DOWNHILL_DECREASE = 1.0  # decrease of the cost in one pass that one parameter's standard deviation makes
+MAX_SWING_COST_RANGE = 0.05  # relative range of the costs between which steps oscillate
+CLOSE_FIT_COST_RATIO = 1.3  # cost over its expectation from noise; above it first-order gains are rough
+MAX_HALVINGS = 8  # of a step to a point that cannot be integrated
+MAX_REJECTED_POINTS = 4  # points in all that cannot be integrated, in a fit that is not patient
+
+# Length of the steps; chosen.
+OSCILLATION_FACTOR = 0.7  # shortens a step that turns back and hardly shrinks
+MIN_STEP_FRACTION = 0.3  # of a shortened step
+RECOVERY_FACTOR = 1.15  # lengthens the other steps, up to the full step
+FAST_SHRINK_RATIO = 0.3  # ratio of two steps below which an oscillation needs no shortening
+CREEP_RATIO = 0.7  # ratio of two steps in one direction above which they are not extrapolated
+SAME_DIRECTION_COSINE = 0.9  # cosine between two steps that have the same direction
+MAX_RELATIVE_STEP = 0.5  # of a parameter in one pass, relative to its size
+MAX_RELATIVE_DECREASE = 0.8  # of a positive parameter in one pass, relative to its value
+HARDLY_KNOWN_STEP = 0.05  # relative last step of a parameter that the logs hardly determine
+# If a step was cut and the next pass asks for the rest of it, to within REPEATED_STEP_TOLERANCE of the part taken, the
+# path is straight and the limit grows by LIMIT_GROWTH.
+LIMIT_GROWTH = 3.0
+REPEATED_STEP_TOLERANCE = 0.3
+
+# Process noise of level 1, white from sample to sample, as acceleration [m/s2, rad/s2]: 500 N on a roller of 11 t.
+PROCESS_NOISE_UNIT = 0.045
+PART_SIZE = 200  # samples whose chain stays in the processor's cache; measured
+# Standard deviations of the first state about the filtered log; chosen. A wider prior lets the iteration oscillate: at
+# standstill on a stiff contact, nothing shows the first speeds, which decay within milliseconds.
+INITIAL_SPEED_STD = 0.05  # [m/s, rad/s]
+INITIAL_ANGLE_STD = 0.1  # [rad, m]
 
 
-class NotConverged(NoEstimateError):
-    """Joint smoothing found no estimate; the message says how far it came and what to do, `fit` where it stood, last or
-    as good as found, and `step` the step from there, in standard deviations. swung: the last steps led to and fro
-    between what costs alike."""
+class NotConvergedError(NoEstimateError):
+    """Joint smoothing found no estimate.
 
-    def __init__(self, message: str, fit: Fit | None = None, step: float = np.inf, swung: bool = False) -> None:
+    fit: the last fit, or the best one that is acceptable. step: the next step from there [standard deviations].
+    oscillates: the last steps moved to and fro between equal costs.
+    """
+
+    def __init__(self, message: str, fit: Fit | None = None, step: float = np.inf, oscillates: bool = False) -> None:
         super().__init__(message)
-        self.fit, self.step, self.swung = fit, step, swung
+        self.fit, self.step, self.oscillates = fit, step, oscillates
 
     @property
-    def nearly(self) -> Fit | None:
-        """The fit where it stood, if that is as good as found."""
-        return self.fit if self.step <= NEARLY else None
+    def acceptable_fit(self) -> Fit | None:
+        """The fit, if its next step is small enough to accept it."""
+        return self.fit if self.step <= ACCEPTABLE_STEP else None
 
     @property
-    def swinging(self) -> Fit | None:
-        """The fit where it stood, if steps swing without end between what costs alike, under disturbing forces, whose
-        deviations are no promise."""
-        if self.fit is None or self.fit.disturbed == 0 or self.step > HOPELESS[1]:
+    def oscillating_fit(self) -> Fit | None:
+        """The fit, if steps oscillate between equal costs and process noise is allowed; its intervals do not hold."""
+        if self.fit is None or self.fit.process_noise == 0 or self.step > HOPELESS_STEP:
             return None
-        return self.fit if self.swung else None
+        return self.fit if self.oscillates else None
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Base parameters X (n_base,), their covariance, which were held because nothing shows them, the prior information
-    about the machine file's values (n_base,), and the trajectories of the logs; twice the negative log-likelihood
-    `cost`, and the disturbing forces in units of DISTURBANCE."""
+    """Parameters and trajectories that explain logs best.
+
+    X (n_base,) [SI], covariance (n_base, n_base) [SI]. unidentifiable (n_base,): parameters held at the machine file's
+    values. prior (n_base,): information about these values, scaled. cost: twice the negative log-likelihood.
+    process_noise: level, in units of PROCESS_NOISE_UNIT.
+    """
 
     X: np.ndarray
     covariance: np.ndarray
-    unseen: np.ndarray
+    unidentifiable: np.ndarray
     prior: np.ndarray
-    points: tuple[Point, ...]
-    linear: tuple[Linear, ...]
+    trajectories: tuple[Trajectory, ...]
+    linear: tuple[LinearisedLog, ...]
     cost: float
-    disturbed: float
+    process_noise: float
 
     @property
     def std(self) -> np.ndarray:
@@ -103,308 +124,399 @@ class Fit:
 
 
 def prior_information(model: Model, held: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """Information (n_base,) about the machine file's values that stands before any data, where parameters are X. A file
-    that is far off must not pull: its error would be evidence of another cause. Effects have no such values."""
-    added = {name for e in model.effects for name in e.parameters}
-    own = np.array([n not in added for n in model.base.names])
-    return np.where(held, HELD**-2, np.maximum(own * np.abs(X) / model.scale, PRIOR) ** -2)
+    """Return the information (n_base,) about the machine file's values, scaled, at parameters X (n_base,).
 
-
-def linearise_fit(
-    c: Chart,
-    r: Record,
-    p: Point,
-    first: np.ndarray,
-    X: np.ndarray,
-    disturbed: float,
-    exact: bool = False,
-) -> Linear | None:
-    """The chain of a log about a point; None where the motion can't be integrated. first (n,): guess of s[0].
-
-    `exact`: the point is a motion of the machine, which needs no integration.
+    A value far from the estimate must not attract it, as the error would be taken for another cause. Parameters of
+    effects have no value in the machine file.
     """
-    delivered, behind = c.delivered(r.torque, X, p.errors)
-    noise = c.felt(r.noise.torque, X)
-    left, right = (c.inputs(d + p.w, o) for d, o in ((delivered[:-1], p.over[:-1]), (delivered[1:], p.over[1:])))
+    effect_parameters = {name for e in model.effects for name in e.parameters}
+    from_file = np.array([n not in effect_parameters for n in model.base.names])
+    return np.where(held, HELD_STD**-2, np.maximum(from_file * np.abs(X) / model.scale, PRIOR_STD) ** -2)
+
+
+def linearise_log(
+    space: StateSpace,
+    data: Measurements,
+    trajectory: Trajectory,
+    initial_guess: np.ndarray,
+    X: np.ndarray,
+    process_noise: float,
+    exact: bool = False,
+) -> LinearisedLog | None:
+    """Linearise a log about a trajectory; return None if the motion cannot be integrated.
+
+    initial_guess (n,): prior mean of the first state. exact: the trajectory is a motion of the model and needs no
+    integration.
+    """
+    delivered, behind = space.delivered_torques(data.torque, X, trajectory.sampled_torque_error)
+    noise = space.delivered_noise(data.noise.torque, X)
+    left, right = (
+        space.inputs(d + trajectory.torque_error, o)
+        for d, o in ((delivered[:-1], trajectory.ground_inputs[:-1]), (delivered[1:], trajectory.ground_inputs[1:]))
+    )
     if exact:
-        defect = np.zeros_like(p.s[1:])
+        defect = np.zeros_like(trajectory.state[1:])
     else:
-        defect = advance(c, p.s[:-1], left, right, X) - p.s[1:]
+        defect = advance(space, trajectory.state[:-1], left, right, X) - trajectory.state[1:]
         if not np.isfinite(defect).all():
             return None
-    u = delivered + p.errors
-    if not r.unbiased:
-        both = c.inputs(u, p.over)
-        left, right = both[:-1], both[1:]
-    h, H, weight, D, flaws, beats = readings(c, r, p, u, X)
-    residual = np.zeros_like(h) if exact else np.where(r.used > 0, r.reading - h, 0.0)
-    flaws = flaws * c.model.scale[list(c.flawed)]
-    scale, n_p, n_o = state_scale(c), len(X), len(r.origin)
-    S, unit = H * scale, one_count(c, r)
-    parts, stages, gains = [_known_before(c, p, first, 1 + n_p + n_o)], [], []
-    N = len(p.s)
-    for at in range(0, N - 1, BATCH):
-        until = min(at + BATCH, N - 1)
-        by = differentiate(c, p.s[at : until + 1], left[at:until], right[at:until], X, disturbed > 0)
-        gain = by.B * noise / scale[:, None]
+    u = delivered + trajectory.sampled_torque_error
+    if not data.unbiased:
+        inputs = space.inputs(u, trajectory.ground_inputs)
+        left, right = inputs[:-1], inputs[1:]
+    h, H, weight, D, reading_slopes, beat_inflation = predict_readings(space, data, trajectory, u, X)
+    residual = np.zeros_like(h) if exact else np.where(data.used > 0, data.reading - h, 0.0)
+    reading_slopes = reading_slopes * space.model.scale[list(space.reading_parameters)]
+    scale, n_p, n_o = state_scale(space), len(X), len(data.offset_sensors)
+    S, offset_unit = H * scale, offset_scale(space, data)
+    sections, stages, gains = [_initial_state_section(space, trajectory, initial_guess, 1 + n_p + n_o)], [], []
+    N = len(trajectory.state)
+    for begin in range(0, N - 1, BATCH_SIZE):
+        end = min(begin + BATCH_SIZE, N - 1)
+        jacobians = differentiate(
+            space, trajectory.state[begin : end + 1], left[begin:end], right[begin:end], X, process_noise > 0
+        )
+        gain = jacobians.B * noise / scale[:, None]
         C = gain @ gain.transpose(0, 2, 1)
-        if disturbed > 0:
-            push = by.F * (disturbed * DISTURBANCE * c.inertia) / scale[:, None]
-            C += push @ push.transpose(0, 2, 1)
-        A = by.A * (scale / scale[:, None])
-        b = np.zeros((until - at, c.n, 1 + n_p + n_o))
-        b[:, :, 0] = defect[at:until] / scale - (gain @ (p.w[at:until] / noise)[:, :, None])[:, :, 0]
-        b[:, :, 1 : 1 + n_p] = (by.X + by.B @ behind[at:until]) * (c.model.scale / scale[:, None])
+        if process_noise > 0:
+            process = jacobians.F * (process_noise * PROCESS_NOISE_UNIT * space.forced_inertia) / scale[:, None]
+            C += process @ process.transpose(0, 2, 1)
+        A = jacobians.A * (scale / scale[:, None])
+        b = np.zeros((end - begin, space.n, 1 + n_p + n_o))
+        b[:, :, 0] = (
+            defect[begin:end] / scale - (gain @ (trajectory.torque_error[begin:end] / noise)[:, :, None])[:, :, 0]
+        )
+        b[:, :, 1 : 1 + n_p] = (jacobians.X + jacobians.B @ behind[begin:end]) * (space.model.scale / scale[:, None])
         gains.append(gain)
-        for k in range(at, until, PART):
-            end = min(k + PART, until)
-            J, eta = _seen(c, S[k:end], weight[k:end], residual[k:end], D * unit, flaws[k:end])
-            own = slice(k - at, end - at)
-            stages.append(parallel_smoother.Stages(A[own], b[own], C[own], eta, J))
-            parts.append(parallel_smoother.section(stages[-1]))
-    # From the last sample nothing leads on.
-    J, eta = _seen(c, S[-1:], weight[-1:], residual[-1:], D * unit, flaws[-1:])
-    none = np.zeros_like(J)
-    stages.append(parallel_smoother.Stages(none, np.zeros_like(eta), none, eta, J))
-    parts.append(parallel_smoother.section(stages[-1]))
-    solved = parallel_smoother.solve(parts)
-    # What the readings say directly of offsets and of flaws of sensors; other parameters act through the states alone.
-    direct = np.concatenate([flaws, np.broadcast_to(D * unit, (*residual.shape, n_o))], axis=2)
+        for k in range(begin, end, PART_SIZE):
+            part_end = min(k + PART_SIZE, end)
+            J, eta = _reading_information(
+                space,
+                S[k:part_end],
+                weight[k:part_end],
+                residual[k:part_end],
+                D * offset_unit,
+                reading_slopes[k:part_end],
+            )
+            inside = slice(k - begin, part_end - begin)
+            stages.append(parallel_smoother.Elements(A[inside], b[inside], C[inside], eta, J))
+            sections.append(parallel_smoother.combine(stages[-1]))
+    # The last sample has no transition.
+    J, eta = _reading_information(space, S[-1:], weight[-1:], residual[-1:], D * offset_unit, reading_slopes[-1:])
+    zero = np.zeros_like(J)
+    stages.append(parallel_smoother.Elements(zero, np.zeros_like(eta), zero, eta, J))
+    sections.append(parallel_smoother.combine(stages[-1]))
+    chain = parallel_smoother.smooth_chain(sections)
+    # Offsets and sensor effects act on readings directly; the other parameters act through the states alone.
+    direct = np.concatenate([reading_slopes, np.broadcast_to(D * offset_unit, (*residual.shape, n_o))], axis=2)
     flat = np.concatenate([residual[:, :, None], -direct], axis=2) * np.sqrt(weight)[:, :, None]
     flat = flat.reshape(-1, flat.shape[2])
-    Z = solved.Z.copy()
-    place = np.concatenate([[0], 1 + np.array(c.flawed, int), np.arange(1 + n_p, 1 + n_p + n_o)])
-    Z[np.ix_(place, place)] += flat.T @ flat
-    return Linear(solved, Z, np.concatenate(gains), tuple(stages), S, weight, residual, direct, noise, beats)
-
-
-def _known_before(c: Chart, p: Point, first: np.ndarray, columns: int) -> parallel_smoother.Section:
-    """A stage that leads to the first state, from nothing: a guess and how far it may be off."""
-    n, scale = c.n, state_scale(c)
-    none = np.zeros((1, n, n))
-    b = np.zeros((1, n, columns))
-    b[0, :, 0] = (first - p.s[0]) / scale
-    spread = np.where(np.isfinite(c.known), c.known, np.where(_speeds(c), SPREAD_SPEED, SPREAD_ANGLE))
-    return parallel_smoother.section(
-        parallel_smoother.Stages(none, b, np.diag((spread / scale) ** 2)[None], np.zeros_like(b), none)
+    Z = chain.Z.copy()
+    columns = np.concatenate([[0], 1 + np.array(space.reading_parameters, int), np.arange(1 + n_p, 1 + n_p + n_o)])
+    Z[np.ix_(columns, columns)] += flat.T @ flat
+    return LinearisedLog(
+        chain, Z, np.concatenate(gains), tuple(stages), S, weight, residual, direct, noise, beat_inflation
     )
 
 
-def _seen(
-    c: Chart, H: np.ndarray, weight: np.ndarray, residual: np.ndarray, D: np.ndarray, flaws: np.ndarray
+def _initial_state_section(
+    space: StateSpace, trajectory: Trajectory, guess: np.ndarray, columns: int
+) -> parallel_smoother.CombinedElements:
+    """The prior of the first state, as a chain element without predecessor."""
+    n, scale = space.n, state_scale(space)
+    zero = np.zeros((1, n, n))
+    b = np.zeros((1, n, columns))
+    b[0, :, 0] = (guess - trajectory.state[0]) / scale
+    std = np.where(
+        np.isfinite(space.initial_std),
+        space.initial_std,
+        np.where(_is_speed(space), INITIAL_SPEED_STD, INITIAL_ANGLE_STD),
+    )
+    return parallel_smoother.combine(
+        parallel_smoother.Elements(zero, b, np.diag((std / scale) ** 2)[None], np.zeros_like(b), zero)
+    )
+
+
+def _reading_information(
+    space: StateSpace,
+    H: np.ndarray,
+    weight: np.ndarray,
+    residual: np.ndarray,
+    D: np.ndarray,
+    reading_slopes: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What readings tell of the states: J (K, n, n), eta (K, n, 1 + n_p + n_o)."""
-    n_p = len(c.model.scale)
+    """Information of the readings about the states: J (K, n, n) and eta (K, n, 1 + n_p + n_o)."""
+    n_p = len(space.model.scale)
     weighted = (H * weight[:, :, None]).transpose(0, 2, 1)
     eta = np.zeros((len(H), H.shape[2], 1 + n_p + D.shape[1]))
     eta[:, :, :1] = weighted @ residual[:, :, None]
-    if c.flawed:
-        eta[:, :, 1 + np.array(c.flawed)] = -(weighted @ flaws)
+    if space.reading_parameters:
+        eta[:, :, 1 + np.array(space.reading_parameters)] = -(weighted @ reading_slopes)
     eta[:, :, 1 + n_p :] = -(weighted @ D)
     return weighted @ H, eta
 
 
-def _speeds(c: Chart) -> np.ndarray:
-    n_q = len(c.model.coordinates)
-    return (c.index >= n_q) & (c.index < 2 * n_q)
+def _is_speed(space: StateSpace) -> np.ndarray:
+    n_q = len(space.model.coordinates)
+    return (space.index >= n_q) & (space.index < 2 * n_q)
 
 
-def state_scale(c: Chart) -> np.ndarray:
-    """Typical size of an error of each state (n,)."""
-    return np.where(_speeds(c), 1e-2, 1e-3)
+def state_scale(space: StateSpace) -> np.ndarray:
+    """Typical error of each state (n,), in its unit."""
+    return np.where(_is_speed(space), 1e-2, 1e-3)
 
 
-def iterate(
-    c: Chart,
-    records: Sequence[Record],
-    points: Sequence[Point],
+def fit_logs(
+    space: StateSpace,
+    measurements: Sequence[Measurements],
+    trajectories: Sequence[Trajectory],
     X: np.ndarray,
-    starts: Sequence[Point],
-    disturbed: float,
+    starts: Sequence[Trajectory],
+    process_noise: float,
     held: np.ndarray,
-    damping: float = DAMPING[0],
-    passes: int = PASSES,
-    enough: float | None = None,
-    most: float = np.inf,
+    damping: float = INITIAL_DAMPING,
+    passes: int = MAX_PASSES,
+    sufficient_step: float | None = None,
+    cost_limit: float = np.inf,
     patient: bool = True,
-    worth: float = np.inf,
-    untold: np.ndarray | None = None,
+    stalled_cost_limit: float = np.inf,
+    initially_held: np.ndarray | None = None,
 ) -> Fit:
-    """Gauss-Newton from points and X; the prior stands about the machine file's values and the states of `starts`.
-    Parameters `held` (n_base,) stay at the file's values. damping: of the first step; passes: at most; enough: a step,
-    in standard deviations, at which a fit is found, however much is left undone: ENOUGH with disturbing forces, none
-    without, if not given; most: cost above which a fit is given up once the states fit the dynamics; worth: cost above
-    which it is given up as soon as costs fall no more. Not `patient`: no passes are spent on steps that have ceased to
-    shrink, and far from the logs a step of NEARLY is small enough under disturbing forces, whatever is asked for. No
-    fit is given up for its steps, nor found where they grow again, as long as they lead on downhill near the logs.
-    untold (n_base,): parameters that start held, as they weren't seen in the fit that this one goes on from,
-    and are judged like the others.
+    """Find the most likely parameters and trajectories of logs.
 
-    Raises NotConverged.
+    space, measurements: state space of the model, and the logs in it.
+    trajectories, X (n_base,): where the iteration starts.
+    starts: trajectories whose first states are the prior means of the first states.
+    process_noise: level, in units of PROCESS_NOISE_UNIT; 0 for exact dynamics.
+    held (n_base,): parameters that stay at the machine file's values.
+    damping: information added to every parameter in the first pass (Levenberg).
+    passes: largest number of passes.
+    sufficient_step: step [standard deviations] that ends the fit early; by default SUFFICIENT_STEP with process noise
+        and no early end without.
+    cost_limit: cost above which the fit is given up once the states fit the dynamics.
+    patient: if False, end when steps stagnate; with process noise and a cost far above the noise, accept
+    ACCEPTABLE_STEP. stalled_cost_limit: cost above which the fit is given up as soon as costs stagnate.
+    initially_held (n_base,): parameters not identifiable in the fit that this one continues; held at first, then judged
+        like the others.
+
+    As long as steps keep their direction and the cost falls close to the logs, the fit is not given up for the size of
+    its steps.
+
+    Raises NotConvergedError.
     """
-    model = c.model
-    if enough is None:
-        enough = ENOUGH if disturbed > 0 else 0.0
+    model = space.model
+    if sufficient_step is None:
+        sufficient_step = SUFFICIENT_STEP if process_noise > 0 else 0.0
     step, before = np.inf, np.inf
-    sizes, costs = list[float](), list[float]()
-    shorter, rejected, here = 0, 0, (list(points), X)
-    there = here
-    noise = sum(float(r.used.sum()) / r.coarse**2 for r in records)
-    latest, best, nearest, waited = None, None, NEARLY, False
-    whole, last = 1.0, np.zeros(len(X))
-    reach, gone, rest = np.ones(len(X)), np.zeros(len(X)), np.zeros(len(X))
-    unseen = held.copy() if untold is None else held | untold
+    steps, costs = list[float](), list[float]()
+    halvings, rejected, current = 0, 0, (list(trajectories), X)
+    proposed = current
+    noise = sum(float(data.used.sum()) / data.noise_inflation**2 for data in measurements)
+    latest, best, best_step, stalled = None, None, ACCEPTABLE_STEP, False
+    fraction, last_direction = 1.0, np.zeros(len(X))
+    limit_factor, taken, remaining = np.ones(len(X)), np.zeros(len(X)), np.zeros(len(X))
+    unidentifiable = held.copy() if initially_held is None else held | initially_held
     for k in range(passes):
-        linear = linearised(c, records, there[0], starts, there[1], disturbed)
+        linear = linearise_logs(space, measurements, proposed[0], starts, proposed[1], process_noise)
         if linear is None:
-            # Too far: the mass matrix is not positive or a motion can't be integrated.
-            shorter, rejected = shorter + 1, rejected + 1
-            if shorter > SHORTER or here is there or (rejected > REJECTED and not patient):
+            # The step was too long: a mass matrix is not positive or a motion cannot be integrated.
+            halvings, rejected = halvings + 1, rejected + 1
+            if halvings > MAX_HALVINGS or current is proposed or (rejected > MAX_REJECTED_POINTS and not patient):
                 break
-            there = _between(here, there, 0.5)
+            proposed = _interpolate(current, proposed, 0.5)
             continue
-        here, shorter = there, 0
-        points, X = here
-        known = prior_information(model, unseen, X)
-        covariance, move, left, cost = newton_step(c, records, linear, points, X, known, damping)
-        if k == SETTLED:
-            unseen = _unseen(c, records, linear, points, X, held, unseen, covariance)
-            if unseen.any():
-                # Left free they would go anywhere, and take the mass matrix and the slips with them.
-                known = prior_information(model, unseen, X)
-                covariance, move, left, cost = newton_step(c, records, linear, points, X, known, damping)
-        damping *= DAMPING[1]
-        before, step = step, left
-        latest = X, covariance, unseen, known, points, cost
-        away = bool((np.abs(X - model.nominal) > AWAY * model.scale)[unseen].any())
-        costs.append(cost)
-        turned = np.where(unseen, 0.0, move[0][: len(X)] / np.sqrt(np.diag(covariance))[: len(X)])
-        along = turned @ last > ALONG * np.linalg.norm(turned) * np.linalg.norm(last)
-        downhill = along and len(costs) > 1 and cost < min(costs[-2] - FELL, STRONG * noise)
-        if downhill and step > before:
-            best, nearest = None, NEARLY  # the way was longer than it seemed
-        if k >= SETTLED and step <= nearest and not away:
-            best, nearest = latest, step
-        sizes.append(step)
-        if len(sizes) > LOST[0] and step > max(LOST[1], LOST[2] * sizes[-3]):
-            break
-        if k >= HOPELESS[0]:
-            shrinking = min((step / sizes[-1 - LATELY]) ** (1 / LATELY), 1.0) if len(sizes) > LATELY else 0.0
-            if step > HOPELESS[1] or (step * shrinking ** (passes - 1 - k) > NEARLY and not downhill):
-                break
-        if k >= SETTLED and cost > most and step > NEARLY:
-            break
-        if k >= SETTLED and cost > worth and _level(costs):
-            break
-        if not patient and _idle(sizes, costs) and not downhill:
-            waited = True
-            break
-        # Where Gauss-Newton swings about the answer, shorter steps end it.
-        swings = turned @ last < 0 and step > SLOW * before
-        whole = max(TURNED * min(whole, 1.0), 0.3) if swings else min(SHARE * whole, 1.0)
-        creeps = along and step < 1.0
-        if creeps and SLOW * before < step < 0.7 * before:
-            whole = 1 / (1 - step / before)  # Aitken: all the steps to come at once
-        last = turned
-        wanted = move[0][: len(X)].copy()
-        straight = (rest != 0) & (np.abs(wanted - rest) < AGAIN * np.abs(gone))
-        reach = np.where(straight, FURTHER * reach, 1.0)
-        limit = reach * LARGEST_STEP * np.maximum(np.abs(X) / model.scale, 1.0)
-        share, lowest = 1.0 if away else whole, _lowest(model, X)
-        for m in move:
-            # What is held from now on goes back to its value at once, and the others along as far as they may.
-            own = np.clip(share * m[: len(X)], -limit, limit)
-            # A lengthened step, or a rounded one, may go below the lowest that it was computed for.
-            m[: len(X)] = np.where(unseen, m[: len(X)], np.maximum(own, lowest))
-        gone = move[0][: len(X)]
-        rest = np.where(np.abs(share * wanted) > limit, wanted - gone, 0.0)
-        there = (
-            [moved(c, r, p, f, m) for r, p, f, m in zip(records, points, linear, move, strict=True)],
-            X + move[0][: len(X)] * model.scale,
+        current, halvings = proposed, 0
+        trajectories, X = current
+        prior = prior_information(model, unidentifiable, X)
+        covariance, moves, undamped_step, cost = newton_step(
+            space, measurements, linear, trajectories, X, prior, damping
         )
-        # What this step will have left undone, if steps go on shrinking as they do.
-        ratio = min(max(step / before, 1 - whole), 0.9)
-        done = step < 10 * CONVERGED and step * ratio / (1 - ratio) < CONVERGED
-        rough = not patient and disturbed > 0 and cost > STRONG * noise
-        if not away and (done or step < (NEARLY if rough else enough)):
-            if k < SETTLED and (unseen != held).any():
-                started, unseen = unseen, _unseen(c, records, linear, points, X, held, unseen, covariance)
-                if (unseen != started).any():
+        if k == SETTLING_PASSES:
+            unidentifiable = _find_unidentifiable(
+                space, measurements, linear, trajectories, X, held, unidentifiable, covariance
+            )
+            if unidentifiable.any():
+                # Free, they would drift and make the mass matrix or the slips meaningless.
+                prior = prior_information(model, unidentifiable, X)
+                covariance, moves, undamped_step, cost = newton_step(
+                    space, measurements, linear, trajectories, X, prior, damping
+                )
+        damping *= DAMPING_DECAY
+        before, step = step, undamped_step
+        latest = X, covariance, unidentifiable, prior, trajectories, cost
+        not_arrived = bool((np.abs(X - model.nominal) > HELD_TOLERANCE * model.scale)[unidentifiable].any())
+        costs.append(cost)
+        direction = np.where(unidentifiable, 0.0, moves[0][: len(X)] / np.sqrt(np.diag(covariance))[: len(X)])
+        lengths = np.linalg.norm(direction), np.linalg.norm(last_direction)
+        same_direction = direction @ last_direction > SAME_DIRECTION_COSINE * lengths[0] * lengths[1]
+        downhill = (
+            same_direction
+            and len(costs) > 1
+            and cost < min(costs[-2] - MIN_DOWNHILL_DECREASE, CLOSE_FIT_COST_RATIO * noise)
+        )
+        if downhill and step > before:
+            best, best_step = None, ACCEPTABLE_STEP  # the minimum is further than it seemed
+        if k >= SETTLING_PASSES and step <= best_step and not not_arrived:
+            best, best_step = latest, step
+        steps.append(step)
+        if len(steps) > LOST_PASSES and step > max(LOST_STEP, LOST_RATIO * steps[-3]):
+            break
+        if k >= HOPELESS_PASSES:
+            shrinking = (
+                min((step / steps[-1 - SHRINK_RATE_PASSES]) ** (1 / SHRINK_RATE_PASSES), 1.0)
+                if len(steps) > SHRINK_RATE_PASSES
+                else 0.0
+            )
+            if step > HOPELESS_STEP or (step * shrinking ** (passes - 1 - k) > ACCEPTABLE_STEP and not downhill):
+                break
+        if k >= SETTLING_PASSES and cost > cost_limit and step > ACCEPTABLE_STEP:
+            break
+        if k >= SETTLING_PASSES and cost > stalled_cost_limit and _cost_stagnates(costs):
+            break
+        if not patient and _stagnates(steps, costs) and not downhill:
+            stalled = True
+            break
+        # Shorter steps end an oscillation of Gauss-Newton about the minimum.
+        oscillates = direction @ last_direction < 0 and step > FAST_SHRINK_RATIO * before
+        fraction = (
+            max(OSCILLATION_FACTOR * min(fraction, 1.0), MIN_STEP_FRACTION)
+            if oscillates
+            else min(RECOVERY_FACTOR * fraction, 1.0)
+        )
+        creeps = same_direction and step < 1.0
+        if creeps and FAST_SHRINK_RATIO * before < step < CREEP_RATIO * before:
+            fraction = 1 / (1 - step / before)  # Aitken: the sum of all steps to come
+        last_direction = direction
+        wanted = moves[0][: len(X)].copy()
+        straight = (remaining != 0) & (np.abs(wanted - remaining) < REPEATED_STEP_TOLERANCE * np.abs(taken))
+        limit_factor = np.where(straight, LIMIT_GROWTH * limit_factor, 1.0)
+        limit = limit_factor * MAX_RELATIVE_STEP * np.maximum(np.abs(X) / model.scale, 1.0)
+        share, lowest = 1.0 if not_arrived else fraction, _lower_step_bound(model, X)
+        for m in moves:
+            # A newly held parameter returns to its value at once; the others move along within their limits.
+            own = np.clip(share * m[: len(X)], -limit, limit)
+            # A lengthened or rounded step may fall below the bound it was computed for.
+            m[: len(X)] = np.where(unidentifiable, m[: len(X)], np.maximum(own, lowest))
+        taken = moves[0][: len(X)]
+        remaining = np.where(np.abs(share * wanted) > limit, wanted - taken, 0.0)
+        proposed = (
+            [
+                apply_step(space, data, trajectory, found, m)
+                for data, trajectory, found, m in zip(measurements, trajectories, linear, moves, strict=True)
+            ],
+            X + moves[0][: len(X)] * model.scale,
+        )
+        # Sum of the steps to come, if they shrink at the present rate.
+        ratio = min(max(step / before, 1 - fraction), 0.9)
+        done = step < 10 * CONVERGED_STEP and step * ratio / (1 - ratio) < CONVERGED_STEP
+        rough = not patient and process_noise > 0 and cost > CLOSE_FIT_COST_RATIO * noise
+        if not not_arrived and (done or step < (ACCEPTABLE_STEP if rough else sufficient_step)):
+            if k < SETTLING_PASSES and (unidentifiable != held).any():
+                before_check = unidentifiable
+                unidentifiable = _find_unidentifiable(
+                    space, measurements, linear, trajectories, X, held, unidentifiable, covariance
+                )
+                if (unidentifiable != before_check).any():
                     continue
-            # What is hardly known may have gone where no motion is: other fits must be able to go on from here.
-            far = (np.abs(there[1] - X) > FREE * np.maximum(np.abs(X), model.scale)).any()
-            if far and linearised(c, records, there[0], starts, there[1], disturbed) is None:
-                there = here
-            return Fit(there[1], in_si(c, covariance), unseen, known, tuple(there[0]), tuple(linear), cost, disturbed)
+            # A hardly known parameter may have left the range of possible motions, and other fits continue from here.
+            moved_far = (np.abs(proposed[1] - X) > HARDLY_KNOWN_STEP * np.maximum(np.abs(X), model.scale)).any()
+            if (
+                moved_far
+                and linearise_logs(space, measurements, proposed[0], starts, proposed[1], process_noise) is None
+            ):
+                proposed = current
+            return Fit(
+                proposed[1],
+                covariance_in_si(space, covariance),
+                unidentifiable,
+                prior,
+                tuple(proposed[0]),
+                tuple(linear),
+                cost,
+                process_noise,
+            )
     else:
-        waited = True
-    stood = None
+        stalled = True
+    final = None
     if best is not None and (linear is None or best is not latest):
-        X, covariance, unseen, known, points, cost = best
-        linear = linearised(c, records, points, starts, X, disturbed)  # large: none is kept on the way
+        X, covariance, unidentifiable, prior, trajectories, cost = best
+        # Linearisations are large, so none but the last is kept.
+        linear = linearise_logs(space, measurements, trajectories, starts, X, process_noise)
     if linear is not None:
-        stood = Fit(X, in_si(c, covariance), unseen, known, tuple(points), tuple(linear), cost, disturbed)
-    raise NotConverged(
+        final = Fit(
+            X,
+            covariance_in_si(space, covariance),
+            unidentifiable,
+            prior,
+            tuple(trajectories),
+            tuple(linear),
+            cost,
+            process_noise,
+        )
+    raise NotConvergedError(
         f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
         " log with `excite log check` and `excite diagnose`, or start from better values in the machine file",
-        stood,
-        float(step if best is None else nearest),
-        waited and len(costs) > SETTLED + 2 and np.ptp(costs[-3:]) < ALIKE * costs[-1],
+        final,
+        float(step if best is None else best_step),
+        stalled and len(costs) > SETTLING_PASSES + 2 and np.ptp(costs[-3:]) < MAX_SWING_COST_RANGE * costs[-1],
     )
 
 
-def _unseen(
-    c: Chart,
-    records: Sequence[Record],
-    linear: Sequence[Linear],
-    points: Sequence[Point],
+def _find_unidentifiable(
+    space: StateSpace,
+    measurements: Sequence[Measurements],
+    linear: Sequence[LinearisedLog],
+    trajectories: Sequence[Trajectory],
     X: np.ndarray,
     held: np.ndarray,
-    unseen: np.ndarray,
+    unidentifiable: np.ndarray,
     covariance: np.ndarray,
 ) -> np.ndarray:
-    """Parameters (n_base,) that the logs don't show, by their deviations were all free but those that must be held,
-    and these. covariance: of a step with `unseen` held. Against the estimate as well: a file's value that is far too
-    small must not make a parameter unseen."""
-    if (unseen != held).any():
-        covariance, *_ = newton_step(c, records, linear, points, X, prior_information(c.model, held, X), 0.0)
+    """Find the parameters (n_base,) whose standard deviation exceeds their size if all but `held` are free.
+
+    covariance: of a step with `unidentifiable` held. The size is that of the estimate or the scale, whichever is
+    larger, as the machine file's value may be far too small.
+    """
+    if (unidentifiable != held).any():
+        covariance, *_ = newton_step(
+            space, measurements, linear, trajectories, X, prior_information(space.model, held, X), 0.0
+        )
     sigma = np.sqrt(np.diag(covariance))[: len(X)]
-    found: np.ndarray = held | (sigma > UNSEEN * np.maximum(np.abs(X) / c.model.scale, 1.0))
+    found: np.ndarray = held | (sigma > MAX_IDENTIFIABLE_STD * np.maximum(np.abs(X) / space.model.scale, 1.0))
     return found
 
 
-def _idle(steps: Sequence[float], costs: Sequence[float]) -> bool:
-    """Whether steps have ceased to shrink: swing about an answer as good as found, or far from any while costs have
-    ceased to fall."""
-    if len(steps) <= SETTLED + 1:
+def _stagnates(steps: Sequence[float], costs: Sequence[float]) -> bool:
+    """True if acceptable steps no longer shrink, or if larger steps and the cost no longer do."""
+    if len(steps) <= SETTLING_PASSES + 1:
         return False
-    if steps[-1] <= NEARLY:
-        return steps[-1] > IDLE[0] * steps[-3]
-    still = steps[-1] > IDLE[1] * steps[-3] and steps[-2] > IDLE[1] * steps[-4]
-    return len(steps) > SETTLED + 2 and still and _level(costs)
+    if steps[-1] <= ACCEPTABLE_STEP:
+        return steps[-1] > STAGNATION_RATIO_NEAR * steps[-3]
+    stagnant = steps[-1] > STAGNATION_RATIO_FAR * steps[-3] and steps[-2] > STAGNATION_RATIO_FAR * steps[-4]
+    return len(steps) > SETTLING_PASSES + 2 and stagnant and _cost_stagnates(costs)
 
 
-def _level(costs: Sequence[float]) -> bool:
-    """Whether costs have ceased to fall."""
-    return len(costs) > 2 and costs[-1] > (1 - FALLING) * costs[-3]
+def _cost_stagnates(costs: Sequence[float]) -> bool:
+    """True if the cost has not fallen in two passes."""
+    return len(costs) > 2 and costs[-1] > (1 - MIN_COST_DECREASE) * costs[-3]
 
 
-def linearised(
-    c: Chart,
-    records: Sequence[Record],
-    points: Sequence[Point],
-    starts: Sequence[Point],
+def linearise_logs(
+    space: StateSpace,
+    measurements: Sequence[Measurements],
+    trajectories: Sequence[Trajectory],
+    starts: Sequence[Trajectory],
     X: np.ndarray,
-    disturbed: float,
-) -> list[Linear] | None:
-    """Every log linearised; None where the mass matrix isn't positive or a motion can't be integrated."""
-    linear: list[Linear] = []
-    for r, p, begin in zip(records, points, starts, strict=True):
-        if not (c.pivots(p.s[::10], X)[0] > 0).all():
+    process_noise: float,
+) -> list[LinearisedLog] | None:
+    """Linearise every log; return None if a mass matrix is not positive or a motion cannot be integrated."""
+    linear: list[LinearisedLog] = []
+    for data, trajectory, start in zip(measurements, trajectories, starts, strict=True):
+        if not (space.pivots(trajectory.state[::10], X)[0] > 0).all():
             return None
         try:
-            found = linearise_fit(c, r, p, begin.s[0], X, disturbed)
-        except np.linalg.LinAlgError:  # so far off that the chain has no numbers any more
+            found = linearise_log(space, data, trajectory, start.state[0], X, process_noise)
+        except np.linalg.LinAlgError:  # the chain is numerically singular this far off
             found = None
         if found is None:
             return None
@@ -413,62 +525,72 @@ def linearised(
 
 
 def newton_step(
-    c: Chart,
-    records: Sequence[Record],
-    linear: Sequence[Linear],
-    points: Sequence[Point],
+    space: StateSpace,
+    measurements: Sequence[Measurements],
+    linear: Sequence[LinearisedLog],
+    trajectories: Sequence[Trajectory],
     X: np.ndarray,
     prior: np.ndarray,
     damping: float,
-    still: np.ndarray | None = None,
+    fixed: np.ndarray | None = None,
 ) -> tuple[np.ndarray, list[np.ndarray], float, float]:
-    """Covariance of all parameters and offsets (scaled), the step of those of each log, the largest of a parameter in
-    standard deviations as it would be undamped, of one that isn't held where there is one, and the cost behind that
-    step. Damping (Levenberg): what a log shows badly moves in small steps while the rest is still wrong. Parameters
-    that make sense above zero only go down by DOWN at most, and the others where they are best beside them; the
-    covariance knows no such ends. prior (n_base,): information about nominal. still (n_base,): parameters that stay
-    where they are, also as far as the covariance knows; the others go anywhere then."""
-    n, found_at = len(X), places(c, records)
-    size = n + sum(len(r.origin) for r in records)
+    """Compute one damped Gauss-Newton step of parameters and offsets, from linearised logs.
+
+    prior (n_base,): information about the nominal values, scaled.
+    damping: information added to every parameter; poorly known ones then move little while the others converge.
+    fixed (n_base,): parameters that stay at their values, also in the covariance; the others are unbounded then.
+
+    Returns the scaled covariance of all parameters and offsets (without damping and bounds), each log's step, the
+    largest undamped step of a free parameter [standard deviations], and the predicted cost after the undamped step. A
+    positive parameter decreases by MAX_RELATIVE_DECREASE at most; the others take their optimum given such a bound.
+
+    Raises NotConvergedError if the covariance is not positive.
+    """
+    n, indices = len(X), parameter_indices(space, measurements)
+    size = n + sum(len(data.offset_sensors) for data in measurements)
     information, slope = np.zeros((size, size)), np.zeros(size)
     information[range(n), range(n)] = prior
-    off = (X - c.model.nominal) / c.model.scale
-    slope[:n] = prior * off
-    cost = float(prior @ off**2)
-    if still is not None:
-        information[range(n), range(n)] += still * HELD**-2
-    for found, r, p, place in zip(linear, records, points, found_at, strict=True):
-        information[np.ix_(place, place)] += found.Z[1:, 1:]
-        slope[place] += found.Z[1:, 0]
-        own = place[n:]
-        information[own, own] += 1.0
-        away = p.offset / one_count(c, r) - 0.5
-        slope[own] += away
-        cost += float(found.Z[0, 0] + away @ away)
+    deviation = (X - space.model.nominal) / space.model.scale
+    slope[:n] = prior * deviation
+    cost = float(prior @ deviation**2)
+    if fixed is not None:
+        information[range(n), range(n)] += fixed * HELD_STD**-2
+    for log, data, trajectory, own in zip(linear, measurements, trajectories, indices, strict=True):
+        information[np.ix_(own, own)] += log.Z[1:, 1:]
+        slope[own] += log.Z[1:, 0]
+        offsets = own[n:]
+        information[offsets, offsets] += 1.0
+        offset_deviation = trajectory.offset / offset_scale(space, data) - 0.5
+        slope[offsets] += offset_deviation
+        cost += float(log.Z[0, 0] + offset_deviation @ offset_deviation)
     covariance = np.linalg.inv(information)
     if not (np.diag(covariance) > 0).all():
-        raise NotConverged("joint smoothing lost its numbers: check the log with `excite log check`")
-    sigma, told = np.sqrt(np.diag(covariance))[:n], prior < HELD**-2
+        raise NotConvergedError(
+            "joint smoothing: the parameters' covariance is not positive: check the log with `excite log check`"
+        )
+    sigma, free = np.sqrt(np.diag(covariance))[:n], prior < HELD_STD**-2
     lowest = np.full(size, -np.inf)
-    if still is None:
-        lowest[:n] = np.where(told, _lowest(c.model, X), -np.inf)
-    undamped = _above(lowest, -covariance @ slope, information, slope)
-    left = float(np.abs(undamped[:n] / sigma)[told if told.any() else slice(None)].max())
+    if fixed is None:
+        lowest[:n] = np.where(free, _lower_step_bound(space.model, X), -np.inf)
+    undamped = _bounded_step(lowest, -covariance @ slope, information, slope)
+    largest = float(np.abs(undamped[:n] / sigma)[free if free.any() else slice(None)].max())
     cost += float(2 * slope @ undamped + undamped @ information @ undamped)
     information[range(n), range(n)] += damping
-    step = _above(lowest, -np.linalg.solve(information, slope), information, slope)
-    return covariance, [step[place] for place in found_at], left, cost
+    step = _bounded_step(lowest, -np.linalg.solve(information, slope), information, slope)
+    return covariance, [step[own] for own in indices], largest, cost
 
 
-def _lowest(model: Model, X: np.ndarray) -> np.ndarray:
-    """Steps (n_base,), scaled, below which no parameter goes in one pass: what makes sense above zero only stays
-    there."""
-    return np.where(model.positive, -DOWN * X / model.scale, -np.inf)
+def _lower_step_bound(model: Model, X: np.ndarray) -> np.ndarray:
+    """Lower bounds (n_base,) of the scaled steps, which keep positive parameters positive."""
+    return np.where(model.positive, -MAX_RELATIVE_DECREASE * X / model.scale, -np.inf)
 
 
-def _above(lowest: np.ndarray, free: np.ndarray, information: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """The step (n,) to the lowest place that a cost of such information (n, n) and slope (n,) has where no step is
-    below its lowest: the free one, where that is nowhere below. That clipped, where information has no root."""
+def _bounded_step(lowest: np.ndarray, free: np.ndarray, information: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Minimise a quadratic cost with information (n, n) and slope (n,) under lower bounds on the step (n,).
+
+    free (n,): the unbounded minimum, returned if it satisfies the bounds. It is clipped if the information is not
+    positive definite.
+    """
     if (free >= lowest).all() or not np.isfinite(free).all():
         return free
     size = np.sqrt(np.diag(information))
@@ -481,36 +603,45 @@ def _above(lowest: np.ndarray, free: np.ndarray, information: np.ndarray, slope:
     return np.asarray(found.x / size)
 
 
-def places(c: Chart, records: Sequence[Record]) -> list[np.ndarray]:
-    """Where the parameters and each log's offsets stand among those of all logs."""
-    n = len(c.model.scale)
-    ends = n + np.cumsum([len(r.origin) for r in records])
-    return [np.r_[0:n, end - len(r.origin) : end] for r, end in zip(records, ends, strict=True)]
+def parameter_indices(space: StateSpace, measurements: Sequence[Measurements]) -> list[np.ndarray]:
+    """Return, for each log, the indices of the parameters and of its own offsets among those of all logs."""
+    n = len(space.model.scale)
+    ends = n + np.cumsum([len(data.offset_sensors) for data in measurements])
+    return [np.r_[0:n, end - len(data.offset_sensors) : end] for data, end in zip(measurements, ends, strict=True)]
 
 
-def in_si(c: Chart, covariance: np.ndarray) -> np.ndarray:
-    """The base parameters' part (n_base, n_base) [SI] of a scaled covariance of them and of offsets."""
-    scale = c.model.scale
+def covariance_in_si(space: StateSpace, covariance: np.ndarray) -> np.ndarray:
+    """Extract the base parameters' covariance (n_base, n_base) [SI] from a scaled one of parameters and offsets."""
+    scale = space.model.scale
     return np.asarray(covariance[: len(scale), : len(scale)] * np.outer(scale, scale))
 
 
-def moved(c: Chart, r: Record, p: Point, linear: Linear, move: np.ndarray) -> Point:
-    """The point after a step of parameters and offsets, with the states that go with it."""
-    x, slope = linear.solved.states(move)
-    w = (linear.gain.transpose(0, 2, 1) @ slope[1:, :, None])[:, :, 0] * linear.noise
-    offset = move[len(move) - len(r.origin) :]
-    s = p.s + x * state_scale(c)
-    return Point(s, w, p.offset + offset * one_count(c, r), driven_over(c, s))
+def apply_step(
+    space: StateSpace, data: Measurements, trajectory: Trajectory, linear: LinearisedLog, move: np.ndarray
+) -> Trajectory:
+    """Return the trajectory after a scaled step of parameters and offsets, with its most likely states."""
+    x, slope = linear.chain.states(move)
+    torque_error = (linear.gain.transpose(0, 2, 1) @ slope[1:, :, None])[:, :, 0] * linear.noise
+    offset = move[len(move) - len(data.offset_sensors) :]
+    state = trajectory.state + x * state_scale(space)
+    return Trajectory(
+        state, torque_error, trajectory.offset + offset * offset_scale(space, data), ground_inputs(space, state)
+    )
 
 
-def _between(
-    here: tuple[list[Point], np.ndarray], there: tuple[list[Point], np.ndarray], share: float
-) -> tuple[list[Point], np.ndarray]:
-    def mixed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return a + share * (b - a)
+def _interpolate(
+    current: tuple[list[Trajectory], np.ndarray], proposed: tuple[list[Trajectory], np.ndarray], fraction: float
+) -> tuple[list[Trajectory], np.ndarray]:
+    def mix(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return a + fraction * (b - a)
 
-    points = [
-        Point(mixed(a.s, b.s), mixed(a.w, b.w), mixed(a.offset, b.offset), mixed(a.over, b.over))
-        for a, b in zip(here[0], there[0], strict=True)
+    trajectories = [
+        Trajectory(
+            mix(a.state, b.state),
+            mix(a.torque_error, b.torque_error),
+            mix(a.offset, b.offset),
+            mix(a.ground_inputs, b.ground_inputs),
+        )
+        for a, b in zip(current[0], proposed[0], strict=True)
     ]
-    return points, mixed(here[1], there[1])
+    return trajectories, mix(current[1], proposed[1])

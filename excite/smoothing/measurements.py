@@ -1,8 +1,7 @@
-"""A log as joint smoothing sees it: what each sensor tells, when, and how well.
+"""Logs as the smoother reads them: what each sensor measures, when, and how accurately.
 
-Encoders count. A count between edges says little, and its error follows the motion; the moment of an edge says where
-the angle was, so only samples right after a count are used. Noise of the other sensors and of the torques is found in
-the log; the data sheet is for comparison.
+An encoder between edges says little, and its error follows the motion. The moment of an edge gives the angle, so only
+samples right after a count are used. The noise of other sensors and of torques is estimated from the log.
 """
 
 from __future__ import annotations
@@ -17,73 +16,87 @@ from excite.errors import NotIdentifiableError
 from excite.logs import Log, passes, remember, samples, white_noise
 from excite.model import Model
 from excite.model.machine import Filter, Sensor
-from excite.smoothing.linearisation import Chart
+from excite.smoothing.linearisation import StateSpace
 
-# Least standard deviation of an encoder edge [counts]: what a good encoder's divisions are off. Slow passages, where
-# edges come at exact moments, would be believed without end; a third of a count would make little of them.
-EDGE = 0.1
-BEAT_HZ, HARMONICS = 3.0, 4  # [Hz] below which a beat is as slow as the machine; those of a sawtooth that matter
-LONGEST = 200  # readings that one beat is taken to last, at most
+# Smallest standard deviation of an encoder edge [counts]: the division error of a good encoder. Without it, slow
+# passages, whose edges are timed exactly, would outweigh everything else.
+EDGE_STD = 0.1
+BEAT_HZ = 3.0  # a beat below this frequency is as slow as the machine's motion [Hz]; chosen
+HARMONICS = 4  # of the sawtooth error that are considered; chosen
+MAX_BEAT_READINGS = 200  # longest beat that is considered [readings]; chosen
+MAX_COUNT_ERROR = 0.01  # deviation from whole counts up to which a signal is read as counts [counts]; chosen
 
 
 @dataclass(frozen=True)
-class Noise:
-    """What the sensors' noise is taken to be: `torque` (n_u,) [N m]; `sensor` (m,) [SI] of those of a chart, for an
-    encoder that counts its step."""
+class SensorNoise:
+    """Standard deviations of the noise: torque (n_u,) [N m], sensor (m,) [SI]; for an encoder its count [rad]."""
 
     torque: np.ndarray
     sensor: np.ndarray
 
 
 @dataclass(frozen=True)
-class Record:
-    """A log as the smoother sees it: torque (N, n_u) as measured, reading (N, m) of the chart's sensors.
+class Measurements:
+    """A log as the smoother reads it.
 
-    used (N, m): which samples tell something; counts (m,): encoders read at their edges. origin (m_o,): sensors
-    whose absolute value matters and whose count starts anywhere. unbiased: torques' and encoders' noise are set against
-    each other as they are, or what a dull drive shows poorly would be off by half a deviation and more. An error of
-    the torques acts on its own interval alone; and readings weigh alike whether an encoder beats with the clock or
-    not, as noise that beats is white on average over a drive (how sure an estimate is counts the beats all the same).
-    Else each reading weighs by what it tells, and weak directions are drawn in a little: steadier, for evidence.
-    coarse: how many times as noisy as they are the sensors are taken to be.
+    torque (N, n_u) [N m], reading (N, m) [SI]: as measured by torque sensors and the sensors of the state space.
+    used (N, m): share of each sample that is used, 0 or 1 in a log.
+    read_at_edges (m,): encoders of which only the edges are used.
+    offset_sensors (m_o,): encoders with unknown start of the count, on whose angle forces depend.
+    unbiased: torque and encoder noise enter with their actual covariance, and encoder errors that beat with the clock
+        do not reduce a reading's weight (the uncertainty counts them). A torque error then acts on its own interval
+        alone. If False, readings are weighted by their information: estimates are steadier, and poorly known
+        directions are biased by half a standard deviation or more.
+    noise_inflation: factor on the standard deviations of the sensors.
     """
 
     torque: np.ndarray
     reading: np.ndarray
     used: np.ndarray
-    counts: np.ndarray
-    origin: tuple[int, ...]
-    noise: Noise
+    read_at_edges: np.ndarray
+    offset_sensors: tuple[int, ...]
+    noise: SensorNoise
     unbiased: bool = False
-    coarse: float = 1.0
+    noise_inflation: float = 1.0
 
-    def until(self, samples: int) -> Record:
+    def until(self, samples: int) -> Measurements:
         """The first samples only."""
         return replace(self, torque=self.torque[:samples], reading=self.reading[:samples], used=self.used[:samples])
 
 
 @dataclass(frozen=True)
-class Point:
-    """Where an iteration stands: states (N, n), torque errors (N - 1, n_u), offsets (m_o,) of one log, and over (N,
-    n_over), what a map of the ground tells along these states."""
+class Trajectory:
+    """States and errors that explain one log.
 
-    s: np.ndarray
-    w: np.ndarray
+    state (N, n), torque_error (N - 1, n_u) [N m] of each interval, offset (m_o,) of the encoders [SI], ground_inputs
+    (N, n_ground): inputs from a map of the ground along the states.
+    """
+
+    state: np.ndarray
+    torque_error: np.ndarray
     offset: np.ndarray
-    over: np.ndarray
+    ground_inputs: np.ndarray
 
     @property
-    def errors(self) -> np.ndarray:
-        """Torque errors of every sample (N, n_u); no interval leads on from the last, which has the one before."""
-        return np.concatenate([self.w, self.w[-1:]])
+    def sampled_torque_error(self) -> np.ndarray:
+        """Torque errors of every sample (N, n_u) [N m]; the last sample has the error of the last interval."""
+        return np.concatenate([self.torque_error, self.torque_error[-1:]])
 
-    def until(self, samples: int) -> Point:
+    def until(self, samples: int) -> Trajectory:
         """The first samples only."""
-        return replace(self, s=self.s[:samples], w=self.w[: samples - 1], over=self.over[:samples])
+        return replace(
+            self,
+            state=self.state[:samples],
+            torque_error=self.torque_error[: samples - 1],
+            ground_inputs=self.ground_inputs[:samples],
+        )
 
 
 def common_sensors(model: Model, logs: Sequence[Log]) -> tuple[str, ...]:
-    """Sensors that every log has."""
+    """Return the names of the sensors that every log has.
+
+    Raises NotIdentifiableError if a driven joint has no torque.
+    """
     common = set.intersection(*(set(log.values) for log in logs))
     for body in model.machine.actuated:
         if not any(s.kind == "torque" and s.body == body.index and s.name in common for s in model.machine.sensor):
@@ -91,193 +104,218 @@ def common_sensors(model: Model, logs: Sequence[Log]) -> tuple[str, ...]:
     return tuple(s.name for s in model.machine.sensors("full") if s.name in common)
 
 
-def record(c: Chart, log: Log, unbiased: bool = False) -> Record:
-    """A log prepared: encoder edges found, noise of the others estimated from the log itself."""
-    model = c.model
+def prepare_measurements(space: StateSpace, log: Log, unbiased: bool = False) -> Measurements:
+    """Find the encoder edges of a log and estimate the noise of its other sensors."""
+    model = space.model
     torques = [torque_sensor(model, body.index) for body in model.machine.actuated]
     torque = np.column_stack([log.values[s.name] for s in torques])
-    N, m = len(log), len(c.sensors)
+    N, m = len(log), len(space.sensors)
     reading, used = np.empty((N, m)), np.ones((N, m), bool)
-    counts = np.zeros(m, bool)
+    at_edges = np.zeros(m, bool)
     sigma = np.empty(m)
-    for j, sensor in enumerate(c.sensors):
+    for j, sensor in enumerate(space.sensors):
         value = log.values[sensor.name]
-        step = sensor.resolution
+        count_size = sensor.resolution
         reading[:, j] = value
-        if step is None:
+        if count_size is None:
             sigma[j] = max(white_noise(value), 1e-9 + 1e-3 * float(sensor.noise or 0))
             continue
-        sigma[j] = step
-        n = np.round(value / step)
-        if np.abs(value - n * step).max() > 0.01 * step:
-            sigma[j] = step / np.sqrt(12)
+        sigma[j] = count_size
+        counts = np.round(value / count_size)
+        if np.abs(value - counts * count_size).max() > MAX_COUNT_ERROR * count_size:
+            sigma[j] = count_size / np.sqrt(12)
             continue
-        counts[j] = True
-        change = np.diff(n, prepend=n[0])
-        reading[:, j] = (n + (change < 0)) * step
+        at_edges[j] = True
+        change = np.diff(counts, prepend=counts[0])
+        reading[:, j] = (counts + (change < 0)) * count_size
         used[:, j] = change != 0
-    level = np.array([max(white_noise(u), 1e-3 * float(s.noise or 1)) for u, s in zip(torque.T, torques, strict=True)])
-    return Record(torque, reading, used.astype(float), counts, origins(c, counts), Noise(level, sigma), unbiased)
+    torque_noise = np.array(
+        [max(white_noise(u), 1e-3 * float(s.noise or 1)) for u, s in zip(torque.T, torques, strict=True)]
+    )
+    return Measurements(
+        torque,
+        reading,
+        used.astype(float),
+        at_edges,
+        encoders_with_offset(space, at_edges),
+        SensorNoise(torque_noise, sigma),
+        unbiased,
+    )
 
 
-def origins(c: Chart, counts: np.ndarray) -> tuple[int, ...]:
-    """Encoders whose count starts anywhere while forces depend on the angle itself."""
-    return tuple(j for j in range(len(counts)) if counts[j] and c.angle[j] < c.core)
+def encoders_with_offset(space: StateSpace, read_at_edges: np.ndarray) -> tuple[int, ...]:
+    """Return the encoders with unknown start of the count, on whose angle forces depend."""
+    return tuple(j for j in range(len(read_at_edges)) if read_at_edges[j] and space.angle_state[j] < space.core)
 
 
 def torque_sensor(model: Model, body: int) -> Sensor:
     return next(s for s in model.machine.sensor if s.kind == "torque" and s.body == body)
 
 
-def first_point(c: Chart, r: Record, log: Log, filter: Filter) -> Point:
-    """States from the filtered log."""
-    guess = samples(c.model, log, filter)
-    full = np.zeros((len(log), c.full))
-    n_q, n_z = len(c.model.coordinates), len(c.model.memory)
-    full[:, :n_q], full[:, n_q : 2 * n_q] = guess.q.T, guess.nu.T
+def initial_trajectory(space: StateSpace, data: Measurements, log: Log, filter: Filter) -> Trajectory:
+    """Build a first trajectory from the filtered log."""
+    filtered = samples(space.model, log, filter)
+    full = np.zeros((len(log), space.full_size))
+    n_q, n_z = len(space.model.coordinates), len(space.model.memory)
+    full[:, :n_q], full[:, n_q : 2 * n_q] = filtered.q.T, filtered.nu.T
     if n_z:
-        u, _ = c.delivered(r.torque, c.model.nominal)
-        full[:, c.full - n_z :] = remember(c.model, guess.q.T, guess.nu.T, u, c.model.nominal)
-    s, over = c.charted(full)
-    rate = float(c.model.machine.sampling_hz)
-    for j, k in enumerate(c.angle):
-        if c.index[k] >= 2 * n_q and k >= 0:
-            speed = c.readings(s, c.inputs(r.torque, over), c.model.nominal)[2][:, j, 0]
-            s[:, k] = log.values[c.sensors[j].name][0] + np.concatenate(
+        u, _ = space.delivered_torques(data.torque, space.model.nominal)
+        full[:, space.full_size - n_z :] = remember(space.model, filtered.q.T, filtered.nu.T, u, space.model.nominal)
+    state, ground = space.from_full_state(full)
+    rate = float(space.model.machine.sampling_hz)
+    for j, k in enumerate(space.angle_state):
+        if space.index[k] >= 2 * n_q and k >= 0:
+            speed = space.readings(state, space.inputs(data.torque, ground), space.model.nominal)[2][:, j, 0]
+            state[:, k] = log.values[space.sensors[j].name][0] + np.concatenate(
                 [[0], np.cumsum(speed[1:] + speed[:-1]) / (2 * rate)]
             )
-    return Point(s, np.zeros_like(r.torque[1:]), np.zeros(len(r.origin)), over)
+    return Trajectory(state, np.zeros_like(data.torque[1:]), np.zeros(len(data.offset_sensors)), ground)
 
 
-def driven_over(c: Chart, s: np.ndarray) -> np.ndarray:
-    """What a map of the ground tells (N, n_over) along states (N, n)."""
-    if not c.model.mapped:
-        return np.zeros((len(s), 0))
-    q, nu, _ = c.parts(s)
-    return passes(c.model, q, nu, 1 / float(c.model.machine.sampling_hz))
+def ground_inputs(space: StateSpace, state: np.ndarray) -> np.ndarray:
+    """Compute the inputs from a map of the ground (N, n_ground) along states (N, n)."""
+    if not space.model.map_inputs:
+        return np.zeros((len(state), 0))
+    q, nu, _ = space.unpack(state)
+    return passes(space.model, q, nu, 1 / float(space.model.machine.sampling_hz))
 
 
-def smoothed(
-    c: Chart, r: Record, p: Point, X: np.ndarray
+def smoothed_motion(
+    space: StateSpace, data: Measurements, trajectory: Trajectory, X: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The motion at a point: q, nu (N, n_q), what effects remember (N, n_z), delivered torques u (N, n_u), and the
-    accelerations (N, n_q) that follow from these."""
-    q, nu, z = c.parts(p.s)
-    z[:, z.shape[1] - p.over.shape[1] :] = p.over
-    u = c.delivered(r.torque, X)[0] + p.errors
-    known = () if c.model.plain else (z.T,)
-    return q, nu, z, u, c.model.acceleration(q.T, nu.T, u.T, *known, X).full().T
+    """Return the motion of a trajectory: q, nu (N, n_q), memory (N, n_z), delivered torques u (N, n_u),
+    accelerations (N, n_q)."""
+    q, nu, z = space.unpack(trajectory.state)
+    z[:, z.shape[1] - trajectory.ground_inputs.shape[1] :] = trajectory.ground_inputs
+    u = space.delivered_torques(data.torque, X)[0] + trajectory.sampled_torque_error
+    known = () if space.model.plain else (z.T,)
+    return q, nu, z, u, space.model.acceleration(q.T, nu.T, u.T, *known, X).full().T
 
 
-def carried(c: Chart, r: Record, p: Point, of: Chart, X: np.ndarray) -> Point:
-    """A point of another chart of the same machine and sensors, whose effects differ, in this chart's states."""
-    q, nu, _ = of.parts(p.s)
-    machine, rate = c.model.machine, float(c.model.machine.sampling_hz)
-    n_q, n_z = len(c.model.coordinates), len(c.model.memory)
-    if machine.planar and machine.body[0].coordinates[2] in c.model.coordinates:
-        k = c.model.coordinates.index(machine.body[0].coordinates[2])
-        if k not in of.index:
+def transfer_trajectory(
+    space: StateSpace, data: Measurements, trajectory: Trajectory, source: StateSpace, X: np.ndarray
+) -> Trajectory:
+    """Convert a trajectory from the state space `source` of the same machine and sensors with other effects."""
+    q, nu, _ = source.unpack(trajectory.state)
+    machine, rate = space.model.machine, float(space.model.machine.sampling_hz)
+    n_q, n_z = len(space.model.coordinates), len(space.model.memory)
+    if machine.planar and machine.body[0].coordinates[2] in space.model.coordinates:
+        k = space.model.coordinates.index(machine.body[0].coordinates[2])
+        if k not in source.index:
             q[:, k] = scipy.integrate.cumulative_trapezoid(nu[:, k], dx=1 / rate, initial=0)
-    full = np.zeros((len(p.s), c.full))
-    shared = of.index < of.full - len(of.model.memory)
-    full[:, of.index[shared]] = p.s[:, shared]
+    full = np.zeros((len(trajectory.state), space.full_size))
+    shared = source.index < source.full_size - len(source.model.memory)
+    full[:, source.index[shared]] = trajectory.state[:, shared]
     full[:, :n_q] = q
     if n_z:
-        u, _ = c.delivered(r.torque, X)
-        full[:, c.full - n_z :] = remember(c.model, q, nu, u, X)
-    old = dict(zip(origins(of, r.counts), p.offset, strict=True))
-    offset = np.array([old.get(j, 0.0) for j in r.origin])
-    s, over = c.charted(full)
-    return Point(s, p.w, offset, over)
+        u, _ = space.delivered_torques(data.torque, X)
+        full[:, space.full_size - n_z :] = remember(space.model, q, nu, u, X)
+    offsets = dict(zip(encoders_with_offset(source, data.read_at_edges), trajectory.offset, strict=True))
+    offset = np.array([offsets.get(j, 0.0) for j in data.offset_sensors])
+    state, ground = space.from_full_state(full)
+    return Trajectory(state, trajectory.torque_error, offset, ground)
 
 
-def one_count(c: Chart, r: Record) -> np.ndarray:
-    """Scale of the offsets (m_o,): a count starts at a random place between two edges, half a count on average."""
-    return np.array([float(c.sensors[j].resolution or 0) for j in r.origin])
+def offset_scale(space: StateSpace, data: Measurements) -> np.ndarray:
+    """Scale of the encoder offsets (m_o,) [SI]: one count, as a count starts anywhere between two edges."""
+    return np.array([float(space.sensors[j].resolution or 0) for j in data.offset_sensors])
 
 
-def readings(
-    c: Chart, r: Record, p: Point, u: np.ndarray, X: np.ndarray
+def predict_readings(
+    space: StateSpace, data: Measurements, trajectory: Trajectory, u: np.ndarray, X: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Expected readings (N, m) under torques u (N, n_u), their slopes (N, m, n), weights (N, m) = 1 / variance, offset
-    columns (m, m_o), how readings move with the chart's `flawed` parameters (N, m, n_f), and by how much the noise
-    exceeds that variance where it beats, as far as the weights don't say so (N, m).
+    """Predict the readings along a trajectory under delivered torques u (N, n_u).
 
-    Right after a count the angle is past the edge by half of what it travels in a sample, at most half a step.
+    Right after a count, the angle is past the edge by half its travel in a sample, at most half a count.
+
+    Returns readings (N, m), slopes (N, m, n), weights 1 / variance (N, m), offset columns (m, m_o), slopes by
+    reading_parameters (N, m, n_f), and the factor by which beating encoder errors exceed this variance (N, m).
     """
-    sample = 1 / float(c.model.machine.sampling_hz)
-    h, H, rate, Hrate, *flaws = c.readings(p.s, c.inputs(u, p.over), X)
+    sample = 1 / float(space.model.machine.sampling_hz)
+    h, H, rate, Hrate, *direct_slopes = space.readings(trajectory.state, space.inputs(u, trajectory.ground_inputs), X)
     h, H, travel = h[:, :, 0].copy(), H.copy(), rate[:, :, 0] * sample
-    step = r.noise.sensor
-    slow = (np.abs(travel) < step) & r.counts
-    h -= np.where(r.counts, np.clip(travel, -step, step) / 2, 0.0)
+    count_size = data.noise.sensor
+    slow = (np.abs(travel) < count_size) & data.read_at_edges
+    h -= np.where(data.read_at_edges, np.clip(travel, -count_size, count_size) / 2, 0.0)
     H[slow] -= Hrate[slow] * (sample / 2)
-    width = np.where(r.counts, np.maximum(np.minimum(np.abs(travel), step) / np.sqrt(12), EDGE * step), step)
-    beats = np.where(r.counts, beating(travel / step, sample), 1.0)
-    if not r.unbiased:
-        width, beats = width * np.sqrt(beats), np.ones_like(beats)
-    width = width * r.coarse
-    own, width = width, np.hypot(width, _through(c, r, p, u, X))
-    beats = 1 + (beats - 1) * (own / width) ** 2
-    D = np.zeros((len(c.sensors), len(r.origin)))
-    for k, j in enumerate(r.origin):
+    std = np.where(
+        data.read_at_edges,
+        np.maximum(np.minimum(np.abs(travel), count_size) / np.sqrt(12), EDGE_STD * count_size),
+        count_size,
+    )
+    inflation = np.where(data.read_at_edges, beat_inflation(travel / count_size, sample), 1.0)
+    if not data.unbiased:
+        std, inflation = std * np.sqrt(inflation), np.ones_like(inflation)
+    std = std * data.noise_inflation
+    sensor_std, std = std, np.hypot(std, _torque_noise_in_readings(space, data, trajectory, u, X))
+    inflation = 1 + (inflation - 1) * (sensor_std / std) ** 2
+    D = np.zeros((len(space.sensors), len(data.offset_sensors)))
+    for k, j in enumerate(data.offset_sensors):
         D[j, k] = 1.0
-    by = flaws[0] if flaws else np.zeros((*h.shape, 0))
-    return h + D @ p.offset, H, r.used / width**2, D, by, beats
+    parameter_slopes = direct_slopes[0] if direct_slopes else np.zeros((*h.shape, 0))
+    return h + D @ trajectory.offset, H, data.used / std**2, D, parameter_slopes, inflation
 
 
-def beating(counts: np.ndarray, sample: float) -> np.ndarray:
-    """By how much more an encoder's error weighs (N, m) where it beats with the clock, from counts per sample (N, m).
+def beat_inflation(counts_per_sample: np.ndarray, sample: float) -> np.ndarray:
+    """Variance inflation (N, m) of encoder errors that beat with the clock, from counts per sample (N, m).
 
-    Where a multiple k of them is nearly whole, the k-th harmonic of the error (a sawtooth's: 6 / (pi k)^2 of its power)
-    is as slow as the machine, and a hundred readings tell no more than one: white noise that tells as little is larger
-    by half a period of the beat in readings, or by as many as it lasts. Between beats the error counts as white. Of an
-    encoder with less than one count per sample only its edges are read, and it is the clock's samples per edge that
-    count.
+    If a multiple k of the counts per sample is nearly whole, the k-th harmonic of the sawtooth error (6 / (pi k)^2 of
+    its power) is as slow as the machine, and many readings are worth one. White noise worth as little has a variance
+    larger by half the beat's period in readings, or by its duration. Between beats the error is white. An encoder with
+    less than one count per sample is read at its edges, and samples per edge take the place of counts per sample.
     """
-    speed = np.abs(counts)
+    speed = np.abs(counts_per_sample)
     change = np.abs(np.gradient(speed, axis=0)) if len(speed) > 1 else np.zeros_like(speed)
-    edges = np.clip(speed, 1e-3, 1.0)  # readings per sample
-    turns, change = np.maximum(speed, 1.0) / edges, change / edges**3  # per reading: of the one in periods of the other
-    slow = BEAT_HZ * sample / edges  # per reading
-    more = np.ones_like(speed)
+    edges = np.clip(speed, 1e-3, 1.0)  # per sample
+    periods, change = np.maximum(speed, 1.0) / edges, change / edges**3  # encoder periods per reading, or their inverse
+    slow = BEAT_HZ * sample / edges  # frequency per reading
+    inflation = np.ones_like(speed)
     for k in range(1, HARMONICS + 1):
-        off = np.abs(k * turns - np.round(k * turns))
-        lasts = 0.5 / np.sqrt(off**2 + k * change / 4 + (0.5 / LONGEST) ** 2)
-        more += 6 / (np.pi * k) ** 2 * np.where(slow < 0.5, lasts / (1 + (off / slow) ** 4) - 1, 0.0)
-    return np.maximum(more, 1.0)
+        distance = np.abs(k * periods - np.round(k * periods))
+        duration = 0.5 / np.sqrt(distance**2 + k * change / 4 + (0.5 / MAX_BEAT_READINGS) ** 2)
+        inflation += 6 / (np.pi * k) ** 2 * np.where(slow < 0.5, duration / (1 + (distance / slow) ** 4) - 1, 0.0)
+    return np.maximum(inflation, 1.0)
 
 
-def _through(c: Chart, r: Record, p: Point, u: np.ndarray, X: np.ndarray) -> np.ndarray | float:
-    """Standard deviation that noise of the torques makes in readings (N, m) which they enter at once, as by a play."""
-    if not c.leaning:
+def _torque_noise_in_readings(
+    space: StateSpace, data: Measurements, trajectory: Trajectory, u: np.ndarray, X: np.ndarray
+) -> np.ndarray | float:
+    """Standard deviation (N, m) of readings that depend on the torque at the same sample, from torque noise."""
+    if not space.readings_use_torque:
         return 0.0
     parts = []
-    for k, noise in enumerate(c.felt(r.noise.torque, X)):
+    for k, noise in enumerate(space.delivered_noise(data.noise.torque, X)):
         shift = np.eye(u.shape[1])[k] * noise
-        high, low = (c.readings(p.s, c.inputs(u + sign * shift, p.over), X)[0][:, :, 0] for sign in (1, -1))
+        high, low = (
+            space.readings(trajectory.state, space.inputs(u + sign * shift, trajectory.ground_inputs), X)[0][:, :, 0]
+            for sign in (1, -1)
+        )
         parts.append((high - low) / 2)
     return np.linalg.norm(parts, axis=0)
 
 
-def expected(c: Chart, r: Record, p: Point, u: np.ndarray, X: np.ndarray) -> Record:
-    """The record with how often each encoder counts, on average, in place of when."""
-    travel = np.abs(c.readings(p.s, c.inputs(u, p.over), X)[2][:, :, 0]) / float(c.model.machine.sampling_hz)
-    return replace(r, used=np.where(r.counts, np.minimum(travel / r.noise.sensor, 1.0), 1.0))
+def with_mean_edge_rates(
+    space: StateSpace, data: Measurements, trajectory: Trajectory, u: np.ndarray, X: np.ndarray
+) -> Measurements:
+    """Replace the moments of encoder edges by each encoder's expected rate of edges."""
+    travel = np.abs(space.readings(trajectory.state, space.inputs(u, trajectory.ground_inputs), X)[2][:, :, 0]) / float(
+        space.model.machine.sampling_hz
+    )
+    return replace(data, used=np.where(data.read_at_edges, np.minimum(travel / data.noise.sensor, 1.0), 1.0))
 
 
-def noise_notes(c: Chart, records: Sequence[Record]) -> tuple[str, ...]:
-    """The noise found in the logs beside the machine file's."""
-    model = c.model
-    found: list[tuple[Sensor, float]] = []
+def describe_noise(space: StateSpace, measurements: Sequence[Measurements]) -> tuple[str, ...]:
+    """Describe the noise found in the logs beside the machine file's, as a note."""
+    model = space.model
+    levels: list[tuple[Sensor, float]] = []
     for k, body in enumerate(model.machine.actuated):
-        level = float(np.sqrt(np.mean([r.noise.torque[k] ** 2 for r in records])))
-        found.append((torque_sensor(model, body.index), level))
-    for j, sensor in enumerate(c.sensors):
+        level = float(np.sqrt(np.mean([data.noise.torque[k] ** 2 for data in measurements])))
+        levels.append((torque_sensor(model, body.index), level))
+    for j, sensor in enumerate(space.sensors):
         if sensor.resolution is None:
-            found.append((sensor, float(np.sqrt(np.mean([r.noise.sensor[j] ** 2 for r in records])))))
+            levels.append((sensor, float(np.sqrt(np.mean([data.noise.sensor[j] ** 2 for data in measurements])))))
     texts = []
-    for sensor, level in found:
+    for sensor, level in levels:
         sheet = f"data sheet {float(sensor.noise):.3g}" if sensor.noise is not None else "no data sheet"
         texts.append(f"{sensor.name} {level:.3g} ({sheet})")
     return (f"noise per sample found in the log, SI: {', '.join(texts)}",)

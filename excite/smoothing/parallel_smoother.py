@@ -1,15 +1,15 @@
 """Smoothing of a chain of linear Gaussian stages by divide and conquer.
 
-A stage leads from x to the next x+ and sees x: x+ = A x + b + e with e ~ N(0, C), and a log-likelihood
-eta' x - x' J x / 2. Written with the multiplier l (the slope of what lies ahead, e = C l+) it is a scattering section
+A stage leads from x to the next state x+ and observes x: x+ = A x + b + e with e ~ N(0, C), and a log-likelihood
+eta' x - x' J x / 2. With the multiplier l (slope of the log-likelihood ahead, e = C l+) it is a scattering element
 
     x+ = A x + b + C l+          l = A' l+ + eta - J x
 
-and two sections in a row make one (Redheffer's star product; as an associative operation: Sarkka and Garcia-Fernandez,
-"Temporal Parallelization of Bayesian Smoothers", IEEE TAC 66, 2021). Pairs are joined level by level, all pairs of a
-level in one batched call, which is what makes it fast in numpy: a sequential filter spends its time in call overhead.
-No inverse of C or J is formed, so exact dynamics (C of low rank) and unseen states (J of low rank) need no special
-care. b and eta have columns: the first is the data, the others how they move with parameters shared by all stages.
+and two elements in a row combine to one (Redheffer star product; as an associative operation: Sarkka and
+Garcia-Fernandez, "Temporal Parallelization of Bayesian Smoothers", IEEE TAC 66, 2021). Pairs are combined level by
+level, each level in one batched call, as a sequential filter in numpy spends its time on call overhead. No inverse of C
+or J is formed, so exact dynamics (C of low rank) and unobserved states (J of low rank) need no special treatment.
+b and eta have c columns: the data, then the slopes by parameters shared by all stages.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ FIELDS = ("A", "b", "C", "eta", "J")
 
 
 @dataclass(frozen=True)
-class Stages:
-    """K stages: A, C, J (K, n, n), b, eta (K, n, c). A stage without transition has A, b, C zero."""
+class Elements:
+    """K elements of a chain: A, C, J (K, n, n), b, eta (K, n, c). An element without transition has zero A, b and C."""
 
     A: np.ndarray
     b: np.ndarray
@@ -35,128 +35,136 @@ class Stages:
     def __len__(self) -> int:
         return len(self.A)
 
-    def part(self, keep: slice) -> Stages:
-        return Stages(self.A[keep], self.b[keep], self.C[keep], self.eta[keep], self.J[keep])
+    def part(self, keep: slice) -> Elements:
+        return Elements(self.A[keep], self.b[keep], self.C[keep], self.eta[keep], self.J[keep])
 
 
 @dataclass(frozen=True)
-class _Level:
-    """What is needed to come back to the states between the two halves of each pair."""
+class _CombinationLevel:
+    """Pairs combined at one level, kept to recover the states between the two halves of each pair."""
 
     G: np.ndarray
-    first: Stages
-    second: Stages
+    first: Elements
+    second: Elements
     count: int
 
 
 @dataclass(frozen=True)
-class Section:
-    """Stages joined to one (`whole`), and the quadratic form Z (c, c) of what was integrated out."""
+class CombinedElements:
+    """Elements combined to one (`total`), and the quadratic form Z (c, c) of the states integrated out."""
 
     Z: np.ndarray
-    whole: Stages
-    levels: tuple[_Level, ...]
+    total: Elements
+    levels: tuple[_CombinationLevel, ...]
 
-    def between(self, weights: np.ndarray, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """States and slopes (K - 1, n, w) between the stages for weights (c, w) of the columns, the state (n, w) before
-        the first and the slope (n, w) behind the last."""
-        ins, outs = left[None], right[None]
+    def states_between(self, weights: np.ndarray, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States and slopes (K - 1, n, w) between the elements.
+
+        weights (c, w): of the columns. left (n, w): state before the first element. right (n, w): slope after the last.
+        """
+        before_all, after_all = left[None], right[None]
         for level in reversed(self.levels):
             pairs = len(level.G)
-            i, j = level.first, level.second
-            ahead = j.A.transpose(0, 2, 1) @ outs[:pairs] + j.eta @ weights
-            x = level.G @ (i.A @ ins[:pairs] + i.b @ weights + i.C @ ahead)
+            first, second = level.first, level.second
+            after = second.A.transpose(0, 2, 1) @ after_all[:pairs] + second.eta @ weights
+            state = level.G @ (first.A @ before_all[:pairs] + first.b @ weights + first.C @ after)
             before, behind = np.empty((2, level.count, *left.shape))
-            before[0 : 2 * pairs : 2], before[1 : 2 * pairs : 2] = ins[:pairs], x
-            behind[0 : 2 * pairs : 2], behind[1 : 2 * pairs : 2] = ahead - j.J @ x, outs[:pairs]
+            before[0 : 2 * pairs : 2], before[1 : 2 * pairs : 2] = before_all[:pairs], state
+            behind[0 : 2 * pairs : 2], behind[1 : 2 * pairs : 2] = after - second.J @ state, after_all[:pairs]
             if level.count % 2:
-                before[-1], behind[-1] = ins[-1], outs[-1]
-            ins, outs = before, behind
-        return ins[1:], outs[:-1]
+                before[-1], behind[-1] = before_all[-1], after_all[-1]
+            before_all, after_all = before, behind
+        return before_all[1:], after_all[:-1]
 
 
 @dataclass(frozen=True)
-class Solved:
+class SmoothedChain:
     """A chain reduced to one quadratic form.
 
-    Z (c, c): twice the negative log-likelihood of all states integrated out is [1 p]' Z [1 p] plus what doesn't depend
-    on p, for parameter steps p (c - 1,).
+    Z (c, c): for parameter steps p (c - 1,), twice the negative log-likelihood with all states integrated out is
+    [1 p]' Z [1 p] plus a constant.
     """
 
     Z: np.ndarray
-    top: Section
-    parts: tuple[Section, ...]
+    top: CombinedElements
+    parts: tuple[CombinedElements, ...]
 
     @property
-    def closed(self) -> Solved:
-        """Without the way back to the states, which is most of its memory."""
-        return Solved(self.Z, replace(self.top, levels=()), tuple(replace(p, levels=()) for p in self.parts))
+    def without_levels(self) -> SmoothedChain:
+        """The chain without the levels that recover its states, which take most of the memory."""
+        return SmoothedChain(self.Z, replace(self.top, levels=()), tuple(replace(p, levels=()) for p in self.parts))
 
     def states(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The most likely states and slopes (K - 1, n) between the stages for parameter steps p (c - 1,).
+        """Most likely states and slopes (K - 1, n) between the elements for parameter steps p (c - 1,).
 
-        The random part e of a stage is C times the slope behind it.
+        The random part e of a stage is C times the slope after it.
         """
-        states, slopes = self._weighed(np.concatenate([[1.0], p])[:, None])
+        states, slopes = self._states_for(np.concatenate([[1.0], p])[:, None])
         return states[:, :, 0], slopes[:, :, 0]
 
     def slopes(self, of: slice) -> np.ndarray:
-        """How the most likely states move with some of the parameters (K - 1, n, w)."""
-        return self._weighed(np.eye(len(self.Z))[:, 1:][:, of])[0]
+        """Derivatives of the most likely states by some of the parameters (K - 1, n, w)."""
+        return self._states_for(np.eye(len(self.Z))[:, 1:][:, of])[0]
 
-    def _weighed(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _states_for(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Most likely states and slopes (K - 1, n, w) for weights (c, w) of the columns of b and eta."""
-        zero = np.zeros((self.top.whole.A.shape[1], weights.shape[1]))
-        inner = self.top.between(weights, zero, zero)
+        zero = np.zeros((self.top.total.A.shape[1], weights.shape[1]))
+        inner = self.top.states_between(weights, zero, zero)
         before, behind = np.concatenate([zero[None], inner[0]]), np.concatenate([inner[1], zero[None]])
         states: list[np.ndarray] = []
         slopes: list[np.ndarray] = []
         for part, left, right in zip(self.parts, before, behind, strict=True):
-            x, slope = part.between(weights, left, right)
-            states += [left[None], x]
+            state, slope = part.states_between(weights, left, right)
+            states += [left[None], state]
             slopes += [slope, right[None]]
         return np.concatenate(states[1:]), np.concatenate(slopes[:-1])
 
 
-def solve(parts: Sequence[Section]) -> Solved:
-    """A chain given as sections in a row. The first begins with what is known of the first state (A zero), the last
-    ends with a stage without transition."""
-    top = section(Stages(*(np.concatenate([getattr(p.whole, f) for p in parts]) for f in FIELDS)))
-    return Solved(sum((p.Z for p in parts), top.Z), top, tuple(parts))
+def smooth_chain(parts: Sequence[CombinedElements]) -> SmoothedChain:
+    """Combine consecutive sections to one chain.
+
+    The first section begins with the prior of the first state (A zero), the last one ends with an element without
+    transition.
+    """
+    top = combine(Elements(*(np.concatenate([getattr(p.total, f) for p in parts]) for f in FIELDS)))
+    return SmoothedChain(sum((p.Z for p in parts), top.Z), top, tuple(parts))
 
 
-def section(stages: Stages) -> Section:
-    """Stages joined pair by pair: about log2(K) batched levels. Some 100 at a time stay in the processor's cache."""
-    n, c = stages.b.shape[1:]
+def combine(elements: Elements) -> CombinedElements:
+    """Combine elements pair by pair, in about log2(K) batched levels.
+
+    About 100 at a time stay in the processor's cache.
+    """
+    n, c = elements.b.shape[1:]
     Z = np.zeros((c, c))
-    levels: list[_Level] = []
+    levels: list[_CombinationLevel] = []
     eye = np.eye(n)
-    while len(stages) > 1:
-        pairs = len(stages) // 2
-        i, j = stages.part(slice(0, 2 * pairs, 2)), stages.part(slice(1, 2 * pairs, 2))
+    while len(elements) > 1:
+        pairs = len(elements) // 2
+        i, j = elements.part(slice(0, 2 * pairs, 2)), elements.part(slice(1, 2 * pairs, 2))
         G = np.linalg.inv(i.C @ j.J + eye)
-        # One product for the middle state as it follows from x, from l+ behind and from the data.
+        # The middle state as a function of x, of l+ and of the data, in one product.
         middle = G @ np.concatenate([i.A, i.C, i.b + i.C @ j.eta], axis=2)
         end = j.A @ middle
-        seen = j.J @ middle
-        slope = j.eta - seen[:, :, 2 * n :]
-        back = i.A.transpose(0, 2, 1) @ np.concatenate([seen[:, :, :n], slope], axis=2)
+        weighted = j.J @ middle
+        slope = j.eta - weighted[:, :, 2 * n :]
+        back = i.A.transpose(0, 2, 1) @ np.concatenate([weighted[:, :, :n], slope], axis=2)
         Z -= _sum_of_products(j.eta, middle[:, :, 2 * n :]) + _sum_of_products(i.b, slope)
         C = end[:, :, n : 2 * n] @ j.A.transpose(0, 2, 1) + j.C
         J = i.J + back[:, :, :n]
-        joined = Stages(
+        combined = Elements(
             end[:, :, :n],
             end[:, :, 2 * n :] + j.b,
             (C + C.transpose(0, 2, 1)) / 2,
             i.eta + back[:, :, n:],
             (J + J.transpose(0, 2, 1)) / 2,
         )
-        levels.append(_Level(G, i, j, len(stages)))
-        if len(stages) % 2:
-            rest = stages.part(slice(-1, None))
-            joined = Stages(*(np.concatenate([getattr(joined, f), getattr(rest, f)]) for f in FIELDS))
-        stages = joined
-    return Section((Z + Z.T) / 2, stages, tuple(levels))
+        levels.append(_CombinationLevel(G, i, j, len(elements)))
+        if len(elements) % 2:
+            last = elements.part(slice(-1, None))
+            combined = Elements(*(np.concatenate([getattr(combined, f), getattr(last, f)]) for f in FIELDS))
+        elements = combined
+    return CombinedElements((Z + Z.T) / 2, elements, tuple(levels))
 
 
 def _sum_of_products(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,9 +1,8 @@
-"""How sure joint smoothing's parameters are, where the inverse of the information at the answer doesn't tell.
+"""Uncertainty of joint smoothing beyond the inverse of the information.
 
-It doesn't in two ways. An encoder's errors are no noise: they follow from the motion but for where its count begins,
-and beat with the clock (`counted`). And where a drive shows a direction of the parameters poorly, the likelihood is no
-parabola as wide as it is deep: an estimate that is off looks surer than it is to one side, so the likelihood itself is
-followed to either side (`followed`).
+Two corrections: an encoder's errors follow from the motion and the start of its count, and are not white
+(`encoder_error_moments`). And for a poorly excited direction the likelihood is not parabolic, so its profile is
+computed on both sides (`profile_widths`).
 """
 
 from __future__ import annotations
@@ -13,169 +12,206 @@ from dataclasses import replace
 
 import numpy as np
 
-from excite.smoothing.gauss_newton import Fit, NotConverged, in_si, linearised, moved, newton_step, places
-from excite.smoothing.innovations import Linear
-from excite.smoothing.linearisation import Chart
-from excite.smoothing.measurements import Point, Record, readings
-
-PHASES = 64  # places between two edges at which an encoder's count may begin, to average over
-COLUMNS = 8  # parameters whose trajectories are held at a time
-WIDE = 0.03  # relative standard deviation from which a direction is followed
-FOLLOWED = 2.0  # standard deviations to either side
-LOPSIDED = 0.5, 4.0  # least and most that a side may be, in deviations at the answer
-FLAT = (
-    "the likelihood of {} is nearly flat to one side, so the intervals of these are as wide as it was followed, not as"
-    " wide as they should be: a drive that shows them better tells more"
+from excite.smoothing.gauss_newton import (
+    Fit,
+    NotConvergedError,
+    apply_step,
+    covariance_in_si,
+    linearise_logs,
+    newton_step,
+    parameter_indices,
 )
-HARDLY = 0.1  # deviations above zero
-MOST = 0.5  # of the largest part in a combination of parameters, from which one is told as part of it
+from excite.smoothing.innovations import LinearisedLog
+from excite.smoothing.linearisation import StateSpace
+from excite.smoothing.measurements import Measurements, Trajectory, predict_readings
+
+PHASE_COUNT = 64  # starts of an encoder's count, between two edges, over which errors are averaged; chosen
+COLUMNS_AT_A_TIME = 8  # parameters whose state sensitivities are in memory at a time; chosen
+MIN_PROFILED_STD = 0.03  # relative standard deviation above which the profile is computed; chosen
+PROFILE_DISTANCE = 2.0  # of the two profile points [standard deviations], near the ends of a 95 % interval
+MIN_SIDE = 0.5  # bounds of a one-sided standard deviation, relative to the symmetric one; chosen
+MAX_SIDE = 4.0
+FLAT_NOTE = (
+    "the likelihood of {} is nearly flat on one side, so their intervals are lower bounds: record a drive that excites"
+    " these parameters more"
+)
+NEAR_ZERO_STDS = 0.1  # distance above zero of a parameter that may be at its bound [standard deviations]; chosen
+NAMED_SHARE = 0.5  # of the largest share in a combination, from which a parameter is named; chosen
 
 
-def sure(
-    c: Chart, records: Sequence[Record], starts: Sequence[Point], fit: Fit
+def quantify_uncertainty(
+    space: StateSpace, measurements: Sequence[Measurements], starts: Sequence[Trajectory], fit: Fit
 ) -> tuple[Fit, np.ndarray, tuple[str, ...]]:
-    """A fit with exact dynamics and its true covariance, as far as that can be known; standard deviations below and
-    above (2, n_base) [SI]; and what to say of them."""
-    linear = linearised(c, records, fit.points, starts, fit.X, fit.disturbed)
-    fit = fit if linear is None else replace(fit, linear=tuple(linear))  # the last step was one from elsewhere
-    n = len(fit.X)
-    free = np.zeros(n, bool)
-    covariance, (step, *_), _, cost = newton_step(c, records, fit.linear, fit.points, fit.X, fit.prior, 0.0, free)
-    ended = at_end(c, fit, covariance, step)
-    beside = covariance
-    if ended.any():
-        beside, _, _, cost = newton_step(c, records, fit.linear, fit.points, fit.X, fit.prior, 0.0, ended)
-    added = np.zeros_like(covariance)
-    for r, p, found, place in zip(records, fit.points, fit.linear, places(c, records), strict=True):
-        own, white = counted(c, r, p, fit.X, found)
-        added[np.ix_(place, place)] += own - white
-    true = covariance + covariance @ added @ covariance
-    way = widest(c, fit, beside)
-    below, above = followed(c, records, starts, replace(fit, cost=cost), beside, way, ended)
-    along, true = in_deviations(true, way)[:n] * c.model.scale, in_si(c, true)
-    more = np.array([below**2, above**2]) - 1
-    sides = np.diag(true) + np.where(along > 0, more[:, None], more[::-1, None]) * along**2
-    widened = true + (((below + above) / 2) ** 2 - 1) * np.outer(along, along)
-    notes: tuple[str, ...] = ()
-    if max(below, above) >= LOPSIDED[1]:
-        part = np.abs(along) / np.maximum(np.abs(fit.X), c.model.scale)
-        told = [name for name, x in zip(c.model.base.names, part, strict=True) if x > MOST * part.max()]
-        notes = (FLAT.format(", ".join(told)),)
-    return replace(fit, covariance=widened), np.sqrt(sides), notes
+    """Return a fit with its corrected covariance, one-sided standard deviations (2, n_base) [SI], and notes.
 
-
-def counted(c: Chart, r: Record, p: Point, X: np.ndarray, found: Linear) -> tuple[np.ndarray, np.ndarray]:
-    """What encoders' errors make the slope of a log's cost, as second moments (n_p + n_o, n_p + n_o), scaled: their own
-    along the smoothed motion, averaged over where the count may begin, and white noise of their size.
-
-    The difference goes through the estimate as it was weighed: covariance + covariance @ (own - white) @ covariance
-    (the sandwich of White, Econometrica 48 (1980) 817). A motion that is played back meets the same errors each time
-    but for where the count begins, so they do more harm than white ones on one drive and less on another.
+    fit: with exact dynamics. The one-sided standard deviations are those below and above the estimate.
     """
-    sample = 1 / float(c.model.machine.sampling_hz)
-    u = c.delivered(r.torque, X)[0] + p.errors
-    weight = readings(c, replace(r, used=np.ones_like(r.used)), p, u, X)[2]
-    angle, _, rate, *_ = c.readings(p.s, c.inputs(u, p.over), X)
-    encoders = np.flatnonzero(r.counts)
-    step = r.noise.sensor[encoders]
-    by = _slopes(found, c.flawed, encoders)
-    own, white = np.zeros((2, by.shape[2], by.shape[2]))
-    phases = (np.arange(PHASES)[:, None] + 0.5) / PHASES
-    for k, j in enumerate(encoders):
-        travel = np.clip(rate[:, j, 0] * sample / step[k], -1, 1)
-        at = angle[:, j, 0] / step[k] - phases
-        count = np.floor(at)
-        change = np.diff(count, axis=1, prepend=count[:, :1])
-        error = np.where(change != 0, count + (change < 0) - at + travel / 2, 0.0) * step[k]
-        slope = (error * weight[:, j]) @ by[:, k]
-        own += slope.T @ slope / PHASES
-        size = r.used[:, j] * (weight[:, j] * step[k] * travel) ** 2 / 12
-        white += by[:, k].T @ (by[:, k] * size[:, None])
-    return own, white
-
-
-def _slopes(found: Linear, flawed: tuple[int, ...], sensors: np.ndarray) -> np.ndarray:
-    """How the readings of some sensors move with parameters and offsets (N, k, n_p + n_o), with the most likely states
-    that go with these. Single precision."""
-    N, _, n_o = found.direct.shape
-    n_o -= len(flawed)
-    count = found.solved.Z.shape[0] - 1
-    by = np.empty((N, len(sensors), count), np.float32)
-    H = found.H[:, sensors]
-    for k in range(0, count, COLUMNS):
-        by[:, :, k : k + COLUMNS] = H @ found.solved.slopes(slice(k, k + COLUMNS))
-    told = [*flawed, *range(count - n_o, count)]
-    by[:, :, told] += found.direct[:, sensors]
-    return by
-
-
-def at_end(c: Chart, fit: Fit, covariance: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Parameters (n_base,) that make sense above zero only and which the logs would like best below: a step leads there
-    from hardly above. The likelihood beside them is that with these where they are."""
-    n, value = len(fit.X), fit.X / c.model.scale
-    hardly = value < HARDLY * np.sqrt(np.diag(covariance)[:n])
-    return np.asarray(c.model.positive & ~fit.unseen & hardly & (value + step[:n] < 0))
-
-
-def widest(c: Chart, fit: Fit, covariance: np.ndarray) -> np.ndarray:
-    """The combination of parameters (n_p + offsets,) whose relative deviation is largest, zero where that is small."""
+    linear = linearise_logs(space, measurements, fit.trajectories, starts, fit.X, fit.process_noise)
+    fit = fit if linear is None else replace(fit, linear=tuple(linear))  # so far it was linearised one step before
     n = len(fit.X)
-    value = np.abs(fit.X) / c.model.scale
+    none_fixed = np.zeros(n, bool)
+    covariance, (step, *_), _, cost = newton_step(
+        space, measurements, fit.linear, fit.trajectories, fit.X, fit.prior, 0.0, none_fixed
+    )
+    at_bounds = at_bound(space, fit, covariance, step)
+    conditional = covariance
+    if at_bounds.any():
+        conditional, _, _, cost = newton_step(
+            space, measurements, fit.linear, fit.trajectories, fit.X, fit.prior, 0.0, at_bounds
+        )
+    excess = np.zeros_like(covariance)
+    for data, trajectory, log, columns in zip(
+        measurements, fit.trajectories, fit.linear, parameter_indices(space, measurements), strict=True
+    ):
+        encoder, white = encoder_error_moments(space, data, trajectory, fit.X, log)
+        excess[np.ix_(columns, columns)] += encoder - white
+    sandwich = covariance + covariance @ excess @ covariance
+    direction = least_certain_direction(space, fit, conditional)
+    below, above = profile_widths(
+        space, measurements, starts, replace(fit, cost=cost), conditional, direction, at_bounds
+    )
+    sigma_step, sandwich = (
+        one_sigma_step(sandwich, direction)[:n] * space.model.scale,
+        covariance_in_si(space, sandwich),
+    )
+    widening = np.array([below**2, above**2]) - 1
+    one_sided = np.diag(sandwich) + np.where(sigma_step > 0, widening[:, None], widening[::-1, None]) * sigma_step**2
+    widened = sandwich + (((below + above) / 2) ** 2 - 1) * np.outer(sigma_step, sigma_step)
+    notes: tuple[str, ...] = ()
+    if max(below, above) >= MAX_SIDE:
+        share = np.abs(sigma_step) / np.maximum(np.abs(fit.X), space.model.scale)
+        named = [name for name, x in zip(space.model.base.names, share, strict=True) if x > NAMED_SHARE * share.max()]
+        notes = (FLAT_NOTE.format(", ".join(named)),)
+    return replace(fit, covariance=widened), np.sqrt(one_sided), notes
+
+
+def encoder_error_moments(
+    space: StateSpace, data: Measurements, trajectory: Trajectory, X: np.ndarray, linear: LinearisedLog
+) -> tuple[np.ndarray, np.ndarray]:
+    """Second moments (n_p + n_o, n_p + n_o), scaled, that encoder errors give the slope of a log's cost.
+
+    Returns the moments of the actual errors along the smoothed motion, averaged over the start of the count, and those
+    of white noise of the same size. The estimate's covariance is covariance + covariance @ (actual - white) @
+    covariance (sandwich of White, Econometrica 48 (1980) 817). A repeated motion repeats these errors, so they affect
+    an estimate more than white noise on one drive and less on another.
+    """
+    sample = 1 / float(space.model.machine.sampling_hz)
+    u = space.delivered_torques(data.torque, X)[0] + trajectory.sampled_torque_error
+    weight = predict_readings(space, replace(data, used=np.ones_like(data.used)), trajectory, u, X)[2]
+    angle, _, rate, *_ = space.readings(trajectory.state, space.inputs(u, trajectory.ground_inputs), X)
+    encoders = np.flatnonzero(data.read_at_edges)
+    count_size = data.noise.sensor[encoders]
+    sensitivities = _reading_sensitivities(linear, space.reading_parameters, encoders)
+    encoder, white = np.zeros((2, sensitivities.shape[2], sensitivities.shape[2]))
+    phases = (np.arange(PHASE_COUNT)[:, None] + 0.5) / PHASE_COUNT
+    for k, j in enumerate(encoders):
+        travel = np.clip(rate[:, j, 0] * sample / count_size[k], -1, 1)
+        phase = angle[:, j, 0] / count_size[k] - phases
+        count = np.floor(phase)
+        change = np.diff(count, axis=1, prepend=count[:, :1])
+        error = np.where(change != 0, count + (change < 0) - phase + travel / 2, 0.0) * count_size[k]
+        slope = (error * weight[:, j]) @ sensitivities[:, k]
+        encoder += slope.T @ slope / PHASE_COUNT
+        variance = data.used[:, j] * (weight[:, j] * count_size[k] * travel) ** 2 / 12
+        white += sensitivities[:, k].T @ (sensitivities[:, k] * variance[:, None])
+    return encoder, white
+
+
+def _reading_sensitivities(
+    linear: LinearisedLog, reading_parameters: tuple[int, ...], sensors: np.ndarray
+) -> np.ndarray:
+    """Slopes of some sensors' readings by parameters and offsets (N, k, n_p + n_o), along the most likely states.
+
+    Single precision.
+    """
+    N, _, n_o = linear.direct.shape
+    n_o -= len(reading_parameters)
+    count = linear.chain.Z.shape[0] - 1
+    sensitivities = np.empty((N, len(sensors), count), np.float32)
+    H = linear.H[:, sensors]
+    for k in range(0, count, COLUMNS_AT_A_TIME):
+        sensitivities[:, :, k : k + COLUMNS_AT_A_TIME] = H @ linear.chain.slopes(slice(k, k + COLUMNS_AT_A_TIME))
+    direct_columns = [*reading_parameters, *range(count - n_o, count)]
+    sensitivities[:, :, direct_columns] += linear.direct[:, sensors]
+    return sensitivities
+
+
+def at_bound(space: StateSpace, fit: Fit, covariance: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Find positive parameters (n_base,) near zero whose likelihood is highest below zero.
+
+    The likelihood of the other parameters is then computed with these fixed.
+    """
+    n, relative = len(fit.X), fit.X / space.model.scale
+    near_zero = relative < NEAR_ZERO_STDS * np.sqrt(np.diag(covariance)[:n])
+    return np.asarray(space.model.positive & ~fit.unidentifiable & near_zero & (relative + step[:n] < 0))
+
+
+def least_certain_direction(space: StateSpace, fit: Fit, covariance: np.ndarray) -> np.ndarray:
+    """Return the combination of parameters (n_p + offsets,) with the largest relative standard deviation, zero if
+    small."""
+    n = len(fit.X)
+    value = np.abs(fit.X) / space.model.scale
     size = np.maximum(value, 1.0)
-    reach = np.where(c.model.positive, value, size)
-    # One that may as well be nothing can't be followed there.
-    free = ~fit.unseen & (np.sqrt(np.diag(covariance)[:n]) < reach / FOLLOWED)
+    span = np.where(space.model.positive, value, size)
+    # A positive parameter that may be zero cannot be profiled.
+    free = ~fit.unidentifiable & (np.sqrt(np.diag(covariance)[:n]) < span / PROFILE_DISTANCE)
     relative = np.where(np.outer(free, free), covariance[:n, :n] / np.outer(size, size), 0.0)
     variances, directions = np.linalg.eigh(relative)
-    way = np.zeros(len(covariance))
-    if variances[-1] > WIDE**2:
-        way[:n] = directions[:, -1] / size
-    return way
+    direction = np.zeros(len(covariance))
+    if variances[-1] > MIN_PROFILED_STD**2:
+        direction[:n] = directions[:, -1] / size
+    return direction
 
 
-def in_deviations(covariance: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """How all parameters go when a combination of them is off by one standard deviation; zero where there is none."""
-    return np.asarray(covariance @ way / np.sqrt(max(way @ covariance @ way, np.finfo(float).tiny)))
+def one_sigma_step(covariance: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return the step of all parameters that moves a combination of them by one standard deviation; zero if it is
+    zero."""
+    return np.asarray(covariance @ direction / np.sqrt(max(direction @ covariance @ direction, np.finfo(float).tiny)))
 
 
-def followed(
-    c: Chart,
-    records: Sequence[Record],
-    starts: Sequence[Point],
+def profile_widths(
+    space: StateSpace,
+    measurements: Sequence[Measurements],
+    starts: Sequence[Trajectory],
     fit: Fit,
     covariance: np.ndarray,
-    way: np.ndarray,
-    ended: np.ndarray,
+    direction: np.ndarray,
+    at_bounds: np.ndarray,
 ) -> tuple[float, float]:
-    """How many times as wide as at the answer the likelihood of a combination of parameters is below and above it, all
-    else as likely as it can be (profile likelihood; Venzon and Moolgavkar, Applied Statistics 37 (1988) 87).
+    """Widths of the profile likelihood of a combination of parameters below and above, in standard deviations at the
+    fit.
 
-    What one linearisation at either side says, which the next ones change by a few hundredths. ended (n_base,):
-    parameters that stay where they are. 1 and 1 where there is nothing to follow or the motion can't be followed.
+    One linearisation on each side gives the widths to a few hundredths. at_bounds (n_base,): parameters that stay
+    fixed. Returns 1 and 1 for a zero direction, or if the motion cannot be computed there. Source: Venzon and
+    Moolgavkar, Applied Statistics 37 (1988) 87.
     """
-    if not way.any():
+    if not direction.any():
         return 1.0, 1.0
     n = len(fit.X)
-    step = in_deviations(covariance, way)
+    step = one_sigma_step(covariance, direction)
     widths = []
-    for far in (-FOLLOWED, FOLLOWED):
-        X = fit.X + far * step[:n] * c.model.scale
-        if not (X[c.model.positive] > 0).all():
+    for distance in (-PROFILE_DISTANCE, PROFILE_DISTANCE):
+        X = fit.X + distance * step[:n] * space.model.scale
+        if not (X[space.model.positive] > 0).all():
             return 1.0, 1.0
-        points = [
-            moved(c, r, p, found, far * step[place])
-            for r, p, found, place in zip(records, fit.points, fit.linear, places(c, records), strict=True)
+        trajectories = [
+            apply_step(space, data, trajectory, log, distance * step[columns])
+            for data, trajectory, log, columns in zip(
+                measurements, fit.trajectories, fit.linear, parameter_indices(space, measurements), strict=True
+            )
         ]
-        linear = linearised(c, records, points, starts, X, fit.disturbed)
+        linear = linearise_logs(space, measurements, trajectories, starts, X, fit.process_noise)
         if linear is None:
             return 1.0, 1.0
         try:
-            there, steps, _, cost = newton_step(c, records, linear, points, X, fit.prior, 0.0, ended)
-        except (NotConverged, np.linalg.LinAlgError):
+            conditional, steps, _, cost = newton_step(
+                space, measurements, linear, trajectories, X, fit.prior, 0.0, at_bounds
+            )
+        except (NotConvergedError, np.linalg.LinAlgError):
             return 1.0, 1.0
         if not np.isfinite(cost):
             return 1.0, 1.0
-        back = way[:n] @ steps[0][:n]  # by which the most likely point of all lies elsewhere
-        risen = cost + back**2 / (way @ there @ way) - fit.cost
-        widths.append(float(np.clip(FOLLOWED / np.sqrt(max(risen, 1e-9)), *LOPSIDED)))
+        overshoot = direction[:n] @ steps[0][:n]  # distance of the most likely point from this one
+        rise = cost + overshoot**2 / (direction @ conditional @ direction) - fit.cost
+        widths.append(float(np.clip(PROFILE_DISTANCE / np.sqrt(max(rise, 1e-9)), MIN_SIDE, MAX_SIDE)))
     return widths[0], widths[1]

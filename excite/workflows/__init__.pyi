@@ -1,8 +1,12 @@
-from .design_request import Brief as Brief, answer as answer, graded as graded
+from .design_request import (
+    DesignRequest as DesignRequest,
+    design_from as design_from,
+    require_noise_figures as require_noise_figures,
+)
 from .design_workflow import compare as compare, design as design
 from .diagnose_workflow import (
+    diagnose as diagnose,
     diagnose_from as diagnose_from,
-    diagnose_logs as diagnose_logs,
     separating_drive as separating_drive,
 )
 from .identify_workflow import identify as identify, identify_from as identify_from
@@ -17,12 +21,12 @@ from .requests import (
     choices as choices,
     choose_method as choose_method,
     choose_problem as choose_problem,
-    helped as helped,
+    help_with_choices as help_with_choices,
+    machine_stem as machine_stem,
+    package_versions as package_versions,
     require_known as require_known,
     require_objective as require_objective,
     require_positive as require_positive,
-    stem as stem,
-    versions as versions,
 )
 from .simulate_workflow import doubtful_effects as doubtful_effects, with_effects as with_effects
 from .study_plan import Study as Study, read_study as read_study

@@ -1,8 +1,8 @@
-"""What is asked of a design, and what is said of the answer.
+"""A design request, and the design that fulfils it.
 
-A brief puts an objective together with an accuracy to keep (`sigma_max`), the machines that it could be (`robust`) and
-what earlier logs tell (`after`). The answer states its condition number and the accuracy that it makes attainable side
-by side, and says so where the one hides the other.
+A request combines an objective, a required accuracy (`sigma_max`), uncertain machines (`robust`) and information from
+earlier logs (`after`). The result's summary gives the condition number beside the attainable accuracy, with advice if
+a low condition number comes with poor accuracy.
 """
 
 from __future__ import annotations
@@ -22,14 +22,24 @@ from excite.model.machine import EffectEntry, Problem
 from excite.operator import Phased
 from excite.trajectories import Aim, Design, design
 
-POOR = 5.0  # attainable standard deviation [%] beyond which a design says what to do
-SCENARIOS, SPREAD = 5, 0.2  # machines of a robust design, and how far their values are from the nominal ones
+POOR_PERCENT = 5.0  # attainable standard deviation [%] above which the summary gives advice; chosen
+ROBUST_MACHINES = 5  # machines of a robust design; chosen
+ROBUST_SPREAD = 0.2  # share of the nominal values by which these machines may be off; chosen
 
 
 @dataclass(frozen=True)
-class Brief:
-    """objective: a name of the table. sigma_max [%]. robust: for every machine within SPREAD. after: logs. between: two
-    effects that the drive is to tell apart. driver: for people, in phases of phase_min_s [s] or more."""
+class DesignRequest:
+    """Options of a design.
+
+    objective: a name of `OBJECTIVES`.
+    sigma_max [%]: bound on the largest attainable standard deviation.
+    robust: design for machines up to ROBUST_SPREAD off the nominal one.
+    after: logs of earlier drives, whose information counts.
+    starts, seed: starting guesses and their random seed.
+    budget_s [s]: time after which the search stops.
+    between: two effects, NAME[@WHERE]=MAGNITUDE, that the drive must separate.
+    driver: design for people, in phases of phase_min_s [s] or more.
+    """
 
     objective: str = "cond"
     sigma_max: float | None = None
@@ -44,10 +54,11 @@ class Brief:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """A design, the model that it was made for (with `after`, the estimate is its nominal) and the aim.
+class DesignResult:
+    """A design with its model and objective.
 
-    phased: where it is for people, its phases and what they keep; the design is then what a steady person drives.
+    model: with `after`, its nominal values are the estimate from the logs.
+    phased: the phases of a design for people; `design` is then the motion of a steady driver.
     """
 
     model: Model
@@ -56,20 +67,22 @@ class Answer:
     phased: Phased | None = None
 
 
-def rivals(model: Model, between: tuple[str, ...], duration: float) -> Model:
-    """A model with two effects more, NAME[@WHERE]=AMOUNT each, that a drive of duration [s] is to tell apart.
+def add_rival_effects(model: Model, between: tuple[str, ...], duration: float) -> Model:
+    """Add two effects, NAME[@WHERE]=MAGNITUDE each, that a drive of some duration [s] must separate.
 
-    Raises MachineError for an effect that is unknown, that the machine can't have, or that driving doesn't show.
+    Raises MachineError for an effect that is unknown, impossible on this machine, or invisible to a drive.
     """
-    return beside(model, [effects.parse_effect(text, model.machine, duration) for text in between])
+    return with_rivals(model, [effects.parse_effect(text, model.machine, duration) for text in between])
 
 
-def beside(model: Model, rivals: Sequence[EffectEntry]) -> Model:
-    """The same for effects as a machine file has them. What they can be mistaken for may have any shape, so shapes of
-    effects are parameters too, unless they are times of a log. Raises MachineError."""
+def with_rivals(model: Model, rivals: Sequence[EffectEntry]) -> Model:
+    """Add the entries of two effects to a model. Raises MachineError for an effect that no drive shows.
+
+    Shapes become parameters too, unless they are times of a log: a rival effect may have any shape.
+    """
     machine = effects.with_effects(model.machine, *rivals)
     times = any(effects.CATALOGUE[e.name].timed for e in machine.effect)
-    both = build(machine, model.flaws, shapes=not times)
+    both = build(machine, model.fit_sensor_effects, fit_shapes=not times)
     for e in both.effects[-2:]:
         if e.name not in both.base.names:
             raise MachineError(
@@ -79,91 +92,97 @@ def beside(model: Model, rivals: Sequence[EffectEntry]) -> Model:
     return both
 
 
-def graded(model: Model) -> None:
-    """Refuses sensors of unknown noise, whose accuracy can't be stated. Raises MachineError."""
+def require_noise_figures(model: Model) -> None:
+    """Raise MachineError for a sensor of unknown noise, without which no accuracy can be stated."""
     for s in model.machine.sensors("full"):
-        if s.kind not in ("x", "y") and not s.graded:
+        if s.kind not in ("x", "y") and not s.has_noise_figure:
             raise MachineError(
                 f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file, a design"
                 " states the accuracy that it makes attainable"
             )
 
 
-def unmoved(problem: str) -> str:
-    """What is said where a design's information is singular, of a problem by its name."""
+def singular_message(problem: str) -> str:
+    """Return the message for a problem whose information matrix is singular."""
     return f"some parameter moves nothing in problem {problem}, so no drive shows it"
 
 
-def answer(
-    model: Model, problem: Problem, brief: Brief, progress: Callable[[int, int, float], None] | None = None
-) -> Answer:
-    """The design that a brief asks for.
+def design_from(
+    model: Model, problem: Problem, request: DesignRequest, progress: Callable[[int, int, float], None] | None = None
+) -> DesignResult:
+    """Design a drive for a model and a problem as requested.
 
-    Raises MachineError for sensors of unknown noise, whose accuracy can't be stated, DriveError for a drive that people
-    can't be asked for, and what `design`, `log.read` and `identify` raise.
+    Raises MachineError for sensors of unknown noise, UndrivableError for a drive that no person can follow, and the
+    errors of `trajectories.design`, `logs.read_log` and `identification.identify`.
     """
-    if brief.driver:
-        operator.check(model, problem, brief.phase_min_s)
-    graded(model)
+    if request.driver:
+        operator.check(model, problem, request.phase_min_s)
+    require_noise_figures(model)
     prior = None
-    if brief.after:
+    if request.after:
         needs = identification.needed_sensors(model, "joint")
-        known = identification.known_before(model, [logs.read_log(path, model.machine, needs) for path in brief.after])
+        known = identification.prior_from_logs(
+            model, [logs.read_log(path, model.machine, needs) for path in request.after]
+        )
         model, prior = known.model, known.information
-    machines = simulation.perturbed_machines(model, SCENARIOS, SPREAD, brief.seed) if brief.robust else ()
-    aim = trajectories.aim(model, brief.objective, brief.sigma_max, prior, machines)
-    if not brief.driver:
-        return Answer(model, aim, design(model, problem, aim, brief.starts, brief.seed, brief.budget_s, progress))
+    machines = (
+        simulation.perturbed_machines(model, ROBUST_MACHINES, ROBUST_SPREAD, request.seed) if request.robust else ()
+    )
+    aim = trajectories.aim(model, request.objective, request.sigma_max, prior, machines)
+    if not request.driver:
+        return DesignResult(
+            model, aim, design(model, problem, aim, request.starts, request.seed, request.budget_s, progress)
+        )
     begin = time.time()
-    half = None if brief.budget_s is None else brief.budget_s / 2
-    free = design(model, problem, aim, brief.starts, brief.seed, half, progress)
+    half = None if request.budget_s is None else request.budget_s / 2
+    free = design(model, problem, aim, request.starts, request.seed, half, progress)
 
-    def over() -> bool:
-        return brief.budget_s is not None and time.time() > begin + brief.budget_s
+    def out_of_time() -> bool:
+        return request.budget_s is not None and time.time() > begin + request.budget_s
 
-    made = operator.phased(model, problem, aim, free.motion, brief.phase_min_s, brief.seed, over, progress)
-    return Answer(model, aim, operator.as_design(model, problem, free, made), made)
+    made = operator.phased(model, problem, aim, free.motion, request.phase_min_s, request.seed, out_of_time, progress)
+    return DesignResult(model, aim, operator.as_design(model, problem, free, made), made)
 
 
-def summary(brief: Brief, a: Answer) -> dict[str, Any]:
-    """What there is to say of an answer: the brief, the scores, the accuracy, the limits."""
-    names, d = a.model.base.names, a.design
-    sigma = dict(zip(names, trajectories.sigma_percent(a.aim, a.model, d.motion).tolist(), strict=True))
+def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, Any]:
+    """Summarise a design: request, scores, attainable accuracy, limits."""
+    names, drive = result.model.base.names, result.design
+    sigma = dict(zip(names, trajectories.sigma_percent(result.aim, result.model, drive.motion).tolist(), strict=True))
     worst = max(sigma, key=lambda n: sigma[n])
-    said: dict[str, Any] = {
-        "objective": brief.objective,
-        "cond_phi": d.cond_phi,
-        "cond_w": d.cond_w,
-        "cond_phi_start": d.cond_phi_start,
+    summary: dict[str, Any] = {
+        "objective": request.objective,
+        "cond_phi": drive.cond_phi,
+        "cond_w": drive.cond_w,
+        "cond_phi_start": drive.cond_phi_start,
         "sigma_percent": sigma,
         "worst_parameter": worst,
         "worst_percent": sigma[worst],
         "median_percent": float(np.median(list(sigma.values()))),
-        "hides_poor_accuracy": sigma[worst] > POOR,
-        "advice": advice(brief, worst, sigma[worst]),
-        "complete": d.complete,
-        "max_violation": d.max_violation,
-        "violations": dict(d.violations),
-        "scores": list(d.scores),
-        "starts": brief.starts,
-        "seed": brief.seed,
+        "hides_poor_accuracy": sigma[worst] > POOR_PERCENT,
+        "advice": advice(request, worst, sigma[worst]),
+        "complete": drive.complete,
+        "max_violation": drive.max_violation,
+        "violations": dict(drive.violations),
+        "scores": list(drive.scores),
+        "starts": request.starts,
+        "seed": request.seed,
     }
-    if a.phased is not None:
-        said["driver"] = _by_hand(brief, a.aim, a.phased)
-    if brief.sigma_max is not None:
-        said["sigma_max"] = brief.sigma_max
-    if brief.between:
-        said["between"] = list(brief.between)
-    if brief.robust:
-        said["robust"] = {"machines": SCENARIOS, "spread": SPREAD}
-    if brief.after:
-        said["after"] = [str(p) for p in brief.after]
-        said["nominal"] = dict(zip(names, a.model.nominal.tolist(), strict=True))
-    return said
+    if result.phased is not None:
+        summary["driver"] = _by_hand(request, result.aim, result.phased)
+    if request.sigma_max is not None:
+        summary["sigma_max"] = request.sigma_max
+    if request.between:
+        summary["between"] = list(request.between)
+    if request.robust:
+        summary["robust"] = {"machines": ROBUST_MACHINES, "spread": ROBUST_SPREAD}
+    if request.after:
+        summary["after"] = [str(p) for p in request.after]
+        summary["nominal"] = dict(zip(names, result.model.nominal.tolist(), strict=True))
+    return summary
 
 
-def _by_hand(brief: Brief, aim: Aim, made: Phased) -> dict[str, Any]:
-    """What people keep of a design: phases, the score by three ways of driving, limits that they break."""
+def _by_hand(request: DesignRequest, aim: Aim, made: Phased) -> dict[str, Any]:
+    """Summarise a design for people: phases, scores of three ways of driving, limits that people exceed."""
     ways = ("played_back", "smoothed", "by_hand")
     scores = {
         way: {
@@ -176,7 +195,7 @@ def _by_hand(brief: Brief, aim: Aim, made: Phased) -> dict[str, Any]:
         for way, score, attained in zip(ways, made.scores, made.attained, strict=True)
     }
     return {
-        "phase_min_s": brief.phase_min_s,
+        "phase_min_s": request.phase_min_s,
         "people": len(made.people),
         **scores,
         "limits_broken": made.over,
@@ -185,13 +204,13 @@ def _by_hand(brief: Brief, aim: Aim, made: Phased) -> dict[str, Any]:
     }
 
 
-def advice(brief: Brief, worst: str, percent: float) -> str | None:
-    """What to do where a design lets one know some parameter poorly, None where all is well."""
-    if percent <= POOR:
+def advice(request: DesignRequest, worst: str, percent: float) -> str | None:
+    """Return what to do about a poorly identifiable parameter, None if all are below POOR_PERCENT."""
+    if percent <= POOR_PERCENT:
         return None
-    blind = trajectories.conditions(brief.objective) and brief.sigma_max is None
+    condition_only = trajectories.conditions(request.objective) and request.sigma_max is None
     poor = f"{worst} can't be found better than {wording.format_percent(percent)}"
-    if not blind:
+    if not condition_only:
         return f"poor accuracy: {poor}; drive longer, or on more room"
     return (
         f"cond(Phi) says nothing of accuracy here: {poor}; --objective accuracy designs for small errors"

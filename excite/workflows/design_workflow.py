@@ -1,4 +1,4 @@
-"""`excite design` and `excite compare`: a folder with the drive, its figures, a report and summary.json."""
+"""`excite design` and `excite compare`: from a machine to drives, figures, a report and summary.json."""
 
 from __future__ import annotations
 
@@ -15,34 +15,41 @@ from excite.errors import MachineError
 from excite.logs import profile_of, torque_column
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Problem
-from excite.workflows import design_request as briefs, requests
-from excite.workflows.design_request import Brief
-from excite.workflows.progress import Bar, silent
+from excite.workflows import design_request, requests
+from excite.workflows.design_request import DesignRequest
+from excite.workflows.progress import Bar, no_bar
 
 
 def design(
-    place: Path, machine: str, problem: str | None, duration: float | None, brief: Brief, bar: Bar = silent
+    place: Path, machine: str, problem: str | None, duration: float | None, request: DesignRequest, bar: Bar = no_bar
 ) -> dict[str, Any]:
-    """A drive for a machine as a brief asks for it."""
+    """Design a drive for a machine into a folder; return the summary.
+
+    machine: a shipped name or a path. problem: None for the machine's own. duration [s]: None for the problem's own.
+    Raises UsageError, MachineError, InfeasibleError, LogError.
+    """
     model = requests.build_model(machine, fit_sensor_effects=False)
     name, chosen = requests.choose_problem(model.machine, problem, duration)
-    if brief.between:
-        model = briefs.rivals(model, brief.between, float(chosen.duration_s))
-    requests.require_objective(brief.objective, model.machine)
-    requests.require_positive("--budget", brief.budget_s, "s")
-    requests.require_positive("--sigma-max", brief.sigma_max, "%")
-    return designed(place, model, name, chosen, brief, bar)
+    if request.between:
+        model = design_request.add_rival_effects(model, request.between, float(chosen.duration_s))
+    requests.require_objective(request.objective, model.machine)
+    requests.require_positive("--budget", request.budget_s, "s")
+    requests.require_positive("--sigma-max", request.sigma_max, "%")
+    return design_model(place, model, name, chosen, request, bar)
 
 
-def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief, bar: Bar = silent) -> dict[str, Any]:
-    """The same for a model and a problem of this name that are there already."""
+def design_model(
+    place: Path, model: Model, name: str, chosen: Problem, request: DesignRequest, bar: Bar = no_bar
+) -> dict[str, Any]:
+    """Design a drive for a model and a problem of some name into a folder; return the summary."""
     begin = time.perf_counter()
     with bar("designing") as advance:
         try:
-            found = briefs.answer(model, chosen, brief, advance)
+            found = design_request.design_from(model, chosen, request, advance)
         except np.linalg.LinAlgError:
             raise MachineError(
-                f"{model.machine.name}: {briefs.unmoved(name)}; is an effect outside of what the drive can reach?"
+                f"{model.machine.name}: {design_request.singular_message(name)}; is an effect outside of what the drive"
+                " can reach?"
             ) from None
     wall = time.perf_counter() - begin
     profile_of(found.model, found.design.motion).to_csv(place / "profile.csv", index=False)
@@ -51,10 +58,10 @@ def designed(place: Path, model: Model, name: str, chosen: Problem, brief: Brief
         "machine": model.machine.name,
         "problem": name,
         "duration_s": float(chosen.duration_s),
-        **briefs.summary(brief, found),
+        **design_request.summarise_result(request, found),
         "meanings": parameter_descriptions(found.model),
         "wall_s": wall,
-        "versions": requests.versions(),
+        "versions": requests.package_versions(),
     }
     title = f"{model.machine.title}: {name}, cond(Phi) = {found.design.cond_phi:.2f}"
     reports.save(reports.design_figure(found.model, chosen, found.design.motion, title), place / "design.png")
@@ -71,11 +78,16 @@ def compare(
     against: Sequence[str],
     seed: int,
     budget: float | None,
-    bar: Bar = silent,
+    bar: Bar = no_bar,
 ) -> dict[str, Any]:
+    """Compare the designed drive with usual ones into a folder; return the summary.
+
+    samples: drives of each random kind. against: names of `USUAL`, all of them if empty. budget [s].
+    Raises UsageError, MachineError.
+    """
     model = requests.build_model(machine, fit_sensor_effects=False)
     name, chosen = requests.choose_problem(model.machine, problem, None)
-    briefs.graded(model)
+    design_request.require_noise_figures(model)
     requests.require_positive("--budget", budget, "s")
     for usual in against:
         requests.require_known("--against", usual, tuple(trajectories.USUAL))
@@ -114,7 +126,7 @@ def compare(
         "budget_s": budget,
         "designs": designs,
         "ratio_equal_time": result.ratio_equal_time,
-        "versions": requests.versions(),
+        "versions": requests.package_versions(),
     }
     title = f"{model.machine.title}: {name}, the designed drive and the usual ones"
     reports.save(reports.compare_figure(result.rows, title), place / "compare.png")

@@ -20,10 +20,10 @@ import joblib
 
 from excite.errors import WorkerError
 
-AHEAD = 2  # pieces in flight per worker: one at work, one at hand
-TRIES = 3  # deaths of a worker that had a piece alone before the piece is to blame: others kill workers too
+PIECES_PER_WORKER = 2  # pieces in flight per worker: one at work, one at hand
+MAX_DEATHS = 3  # deaths of a worker that had a piece alone before the piece is to blame: others kill workers too
 LOGGERS = ("distributed", "distributed.client")  # of Dask, with levels of their own
-GONE = "the cluster's scheduler is gone; start it and repeat the command"
+SCHEDULER_GONE = "the cluster's scheduler is gone; start it and repeat the command"
 THREADS = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 T = TypeVar("T")
@@ -31,7 +31,7 @@ R = TypeVar("R")
 
 
 @dataclass(frozen=True)
-class Result(Generic[T, R]):
+class PieceResult(Generic[T, R]):
     """What came of a piece of work, in so many seconds; value None where it killed its workers."""
 
     piece: T
@@ -67,7 +67,7 @@ class _Inline(Executor):
         return future
 
 
-class Here:
+class ThisProcess:
     """This process."""
 
     size, shared, foreign = 1, False, False
@@ -81,12 +81,12 @@ class Here:
     def renew(self) -> None: ...
 
 
-def _deaf() -> None:
+def _ignore_interrupt() -> None:
     """Ctrl-C is for the driver; its workers end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-class Local:
+class LocalProcesses:
     """Processes of this machine."""
 
     shared, foreign = True, False
@@ -106,7 +106,7 @@ class Local:
 
         # One BLAS thread each: the same bytes whatever the number of workers.
         self._executor: Executor = get_reusable_executor(
-            max_workers=self.size, timeout=60, env=THREADS, initializer=_deaf
+            max_workers=self.size, timeout=60, env=THREADS, initializer=_ignore_interrupt
         )
 
     def close(self) -> None:
@@ -114,7 +114,7 @@ class Local:
         self._executor.shutdown(wait=True, kill_workers=True)  # type: ignore[call-arg]
 
 
-class Cluster:
+class DaskCluster:
     """The workers of a Dask scheduler, which itself repeats what was lost with a worker."""
 
     shared, foreign = False, True
@@ -152,7 +152,7 @@ class Cluster:
             yield
         except Exception as err:
             if isinstance(err, OSError) or self._client.status != "running":
-                raise WorkerError(GONE) from None
+                raise WorkerError(SCHEDULER_GONE) from None
             raise
 
     def died(self, err: BaseException) -> bool:
@@ -173,13 +173,13 @@ class Cluster:
 
 
 @contextmanager
-def pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[Pool]:
+def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[Pool]:
     """Workers: `jobs` processes of this machine (all its cores by default; 1: this process), or those of a cluster.
 
     Raises EngineError.
     """
     if cluster is not None:
-        remote = Cluster(cluster)
+        remote = DaskCluster(cluster)
         try:
             yield remote
         finally:
@@ -189,9 +189,9 @@ def pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[Pool]:
     if jobs < 1:
         raise ValueError(f"jobs: must be at least 1 (got {jobs})")
     if jobs == 1:
-        yield Here()
+        yield ThisProcess()
         return
-    local = Local(jobs)
+    local = LocalProcesses(jobs)
     try:
         yield local
     finally:
@@ -203,9 +203,9 @@ def _timed(call: Callable[[T], R], piece: T) -> tuple[R, float]:
     return call(piece), time.perf_counter() - begin
 
 
-def spread(
+def run_pieces(
     call: Callable[[T], R], pieces: Iterable[T], workers: Pool, split: Callable[[T], list[T]] = lambda piece: [piece]
-) -> Iterator[Result[T, R]]:
+) -> Iterator[PieceResult[T, R]]:
     """Results of `call` on the pieces as they come, AHEAD pieces per worker in flight; pieces are taken as needed.
 
     Where a worker dies, what was in flight is done again, a piece at a time, and split; a piece that kills TRIES
@@ -215,7 +215,7 @@ def spread(
     suspects: deque[tuple[T, int]] = deque()
     flying: dict[Future[tuple[R, float]], tuple[T, int]] = {}
     while True:
-        room = 1 if suspects else AHEAD * workers.size
+        room = 1 if suspects else PIECES_PER_WORKER * workers.size
         while len(flying) < room:
             if suspects:
                 piece, deaths = suspects.popleft()
@@ -241,7 +241,7 @@ def spread(
             try:
                 value, seconds = future.result()
             except CancelledError:
-                raise WorkerError(GONE) from None
+                raise WorkerError(SCHEDULER_GONE) from None
             except Exception as err:
                 if not workers.died(err):
                     raise
@@ -249,12 +249,12 @@ def spread(
                 parts = split(piece)
                 if len(parts) > 1:
                     suspects += [(p, 0) for p in parts]
-                elif alone and deaths + 1 >= TRIES:
-                    yield Result(piece, None, 0.0)
+                elif alone and deaths + 1 >= MAX_DEATHS:
+                    yield PieceResult(piece, None, 0.0)
                 else:
                     suspects.append((piece, deaths + alone))
             else:
-                yield Result(piece, value, seconds)
+                yield PieceResult(piece, value, seconds)
         if dead and workers.shared:
             suspects += [(p, deaths) for piece, deaths in flying.values() for p in split(piece)]
             flying.clear()

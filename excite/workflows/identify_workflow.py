@@ -1,4 +1,4 @@
-"""`excite identify`: logs in, a folder with parameters, figures and a report out."""
+"""`excite identify`: from logs to parameters with uncertainty, figures and a report."""
 
 from __future__ import annotations
 
@@ -11,56 +11,62 @@ import numpy as np
 
 from excite import identification, reports
 from excite.errors import SimulationError
-from excite.identification import FILTERS, Estimate, late_channels
+from excite.identification import FILTERS, Estimate, describe_late_channels
 from excite.logs import Log, examine, read_stretches
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Filter
 from excite.workflows import requests
-from excite.workflows.progress import Bar, silent
+from excite.workflows.progress import Bar, no_bar
 
 
 @dataclass(frozen=True)
-class Identified:
-    """An estimate with every remark, the logs as they were identified from, and the filter that was used."""
+class IdentifyResult:
+    """An estimate with its notes, the repaired logs it is from, and the filter that was used."""
 
     estimate: Estimate
     logs: list[Log]
     filter: Filter
 
 
-def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str = "machine") -> Identified:
-    """Estimate the parameters from checked logs, with the bias of the method and remarks on values and late channels.
+def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str = "machine") -> IdentifyResult:
+    """Estimate parameters from checked logs, with the method's bias and notes on values and late channels.
 
-    filtering: a name of `FILTERS`. Raises NoEstimate, LogError.
+    filtering: a name of `FILTERS`. Raises NoEstimateError, LogError.
     """
     chosen, reason = FILTERS[filtering](model, logs)
     estimate = identification.identify(model, logs, method, chosen)
     used = [examine(model, one).log for one in logs]
     if model.slips and identification.METHODS[method].biased:
-        estimate = identification.with_bias(model, used, estimate, chosen)
+        estimate = identification.add_bias(model, used, estimate, chosen)
     found = estimate.value if estimate.method == "joint" and np.isfinite(estimate.value).all() else None
-    late = [remark for one in used for remark in late_channels(model, one, chosen, found)]
+    late = [remark for one in used for remark in describe_late_channels(model, one, chosen, found)]
     first = (reason,) if reason else ()
     notes = (*first, *estimate.notes, *identification.far_from_nominal(model, estimate), *late)
-    return Identified(replace(estimate, notes=notes), used, chosen)
+    return IdentifyResult(replace(estimate, notes=notes), used, chosen)
 
 
 def identify(
     place: Path,
-    model: Model,
+    machine: str,
     logs: Sequence[Path],
-    method: str | None,
-    filtering: str,
-    validate: Sequence[Path],
-    bar: Bar = silent,
+    method: str | None = None,
+    filtering: str = "machine",
+    validate: Sequence[Path] = (),
+    bar: Bar = no_bar,
 ) -> dict[str, Any]:
-    """Parameters from logs. filtering: a name of `examine.FILTERS`; validate: logs that the result is to predict."""
+    """Estimate parameters from logs into a folder; return the summary.
+
+    machine: a shipped name or a path. method: None for the recommended one. filtering: a name of `FILTERS`.
+    validate: logs that are not fitted, only predicted. Raises LogError, NoEstimateError, UsageError.
+    """
+    model = requests.build_model(machine)
     method = requests.choose_method(method, model)
     needs = identification.needed_sensors(model, method)
     read, cut = read_stretches(logs, model.machine, needs)
-    others, torn = read_stretches(validate, model.machine, needs, "validated on")
-    seen = [examine(model, one) for one in others]
-    fresh, said = [e.log for e in seen], [*torn, *(line for e in seen for line in (*e.notes, *e.doubts))]
+    others, others_cut = read_stretches(validate, model.machine, needs, "validated on")
+    examined = [examine(model, one) for one in others]
+    unfitted = [e.log for e in examined]
+    more_notes = [*others_cut, *(line for e in examined for line in (*e.notes, *e.doubts))]
     with bar("identifying"):
         found = identify_from(model, read, method, filtering)
     read, estimate, chosen = found.logs, found.estimate, found.filter
@@ -75,14 +81,16 @@ def identify(
         "relative_error_percent": estimate.relative_error_percent,
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
-        "notes": [*cut, *estimate.notes, *said],
-        "validation": [_check(model, one, estimate, chosen) for one in fresh],
-        "versions": requests.versions(),
+        "notes": [*cut, *estimate.notes, *more_notes],
+        "validation": [_check(model, one, estimate, chosen) for one in unfitted],
+        "versions": requests.package_versions(),
     }
-    for kind, several in (("fit", read), ("validation", fresh)):
+    for kind, several in (("fit", read), ("validation", unfitted)):
         for k, one in enumerate(several):
             title = f"{model.machine.title}: {one.source}"
-            figure = reports.comparison_figure(model, identification.torques(model, one, estimate, chosen), title)
+            figure = reports.comparison_figure(
+                model, identification.compare_torques(model, one, estimate, chosen), title
+            )
             reports.save(figure, place / (f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png"))
     reports.write_report(place, "identify", summary)
     return summary
@@ -106,14 +114,14 @@ def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:
 
 
 def _check(model: Model, one: Log, estimate: Estimate, chosen: Filter) -> dict[str, Any]:
-    """How well an estimate predicts a log that it was not fitted on: torques, and signals by direct simulation."""
-    torques = identification.torques(model, one, estimate, chosen)
+    """Predict a log that was not fitted: errors of torques, and of signals by direct simulation."""
+    torques = identification.compare_torques(model, one, estimate, chosen)
     shown: dict[str, Any] = {
         "log": one.source,
         "torque_error_percent": dict(zip(torques.names, torques.percent, strict=True)),
     }
     try:
-        signals = identification.motions(model, one, estimate, chosen)
+        signals = identification.compare_motions(model, one, estimate, chosen)
     except (ValueError, SimulationError) as err:
         return shown | {"simulation": f"not possible: {err}"}
     return shown | {

@@ -23,7 +23,7 @@ from excite.model.machine import Machine, Problem, Quantity, error_lines as file
 from excite.reports import Picture, Table
 from excite.simulation import simulate
 from excite.text import format_number
-from excite.workflows.requests import LONGEST
+from excite.workflows.requests import LONGEST_DRIVE_S
 
 PICTURE = "machine.png"
 LINEAR = 0.15  # slip up to which the linear law holds, where a contact gives no limit
@@ -45,7 +45,7 @@ TRIAL = Problem(
 
 
 @dataclass(frozen=True)
-class Checked:
+class MachineCheck:
     """A machine file: what is wrong, what is doubtful, what else must be known, a line each; its model if it has one.
 
     sigma_percent: after the best of some random drives, one standard deviation by parameter (Cramer-Rao, all sensors);
@@ -59,27 +59,27 @@ class Checked:
     sigma_percent: dict[str, float]
 
 
-def check(path: Path) -> Checked:
+def check_file(path: Path) -> MachineCheck:
     """Everything that can be said of a machine file without a log. Raises MachineError where there is none to read."""
-    faults = complaints(path)
+    faults = file_errors(path)
     if faults:
-        return Checked(tuple(faults), (), (), None, {})
+        return MachineCheck(tuple(faults), (), (), None, {})
     try:
         model = build(load_machine(path))
     except MachineError as err:
-        return Checked((str(err),), (), (), None, {})
+        return MachineCheck((str(err),), (), (), None, {})
     faults = [line for rule in FAULTS for line in rule(model)]
     doubts = [line for rule in DOUBTS for line in rule(model)]
-    sigma = {} if faults or float(model.machine.sampling_hz) > FASTEST else _trial(model)
+    sigma = {} if faults or float(model.machine.sampling_hz) > FASTEST else _random_drive_sigma(model)
     doubts += [
         f"{name}: random drives leave it uncertain by {value:.0f} %: hardly any drive shows it apart from the others"
         for name, value in sigma.items()
         if value > HARDLY
     ]
-    return Checked(tuple(faults), tuple(doubts), tuple(unseen(model)), model, sigma)
+    return MachineCheck(tuple(faults), tuple(doubts), tuple(describe_invisible(model)), model, sigma)
 
 
-def complaints(path: Path) -> list[str]:
+def file_errors(path: Path) -> list[str]:
     """All that keeps a file from being a machine, a line each. Raises MachineError where there's none to read."""
     try:
         load_machine(path)
@@ -156,7 +156,7 @@ def _lane(model: Model) -> Iterator[str]:
 
 def _sensors(model: Model) -> Iterator[str]:
     try:
-        identification.measurable(model)
+        identification.require_sensors(model)
     except MachineError as err:
         yield str(err).removeprefix(f"{model.machine.name}: ")
 
@@ -279,9 +279,10 @@ def _times(model: Model) -> Iterator[str]:
                 f" {STEERING:g}: in deg/s?"
             )
     for name, problem in model.machine.problems.items():
-        if float(problem.duration_s) > LONGEST:
+        if float(problem.duration_s) > LONGEST_DRIVE_S:
             yield (
-                f"problems.{name}.duration_s: {float(problem.duration_s):g} s, usual are {LONGEST:g} at most: in ms?"
+                f"problems.{name}.duration_s: {float(problem.duration_s):g} s, usual are {LONGEST_DRIVE_S:g} at most:"
+                " in ms?"
             )
     f, rate = model.machine.filter, float(model.machine.sampling_hz)
     if rate > FASTEST:
@@ -321,7 +322,7 @@ def _turning(model: Model) -> Iterator[str]:
 
 def _noise(model: Model) -> Iterator[str]:
     for s in model.machine.sensors("full"):
-        if not s.graded:
+        if not s.has_noise_figure:
             yield f"sensor {s.name}: neither noise nor counts_per_turn: what accuracy is attainable can't be said"
 
 
@@ -349,7 +350,7 @@ DOUBTS: tuple[Callable[[Model], Iterator[str]], ...] = (
 # ------------------------------------------------------------------------------------------------ unseen
 
 
-def unseen(model: Model) -> Iterator[str]:
+def describe_invisible(model: Model) -> Iterator[str]:
     """Standard parameters other than zero that no drive reveals, and why; bodies that are only seen within others."""
     machine = model.machine
     table = dict(zip(model.base.standard, _standard(model), strict=True))
@@ -373,7 +374,7 @@ def _standard(model: Model) -> list[float]:
     return [values.get(n, 0.0) for n in model.base.standard]
 
 
-def _trial(model: Model) -> dict[str, float]:
+def _random_drive_sigma(model: Model) -> dict[str, float]:
     """One standard deviation [%] of every parameter after the best of some random drives; {} where there is none.
 
     Of the nominal value or the scale, whichever is larger: per cent of what is nearly zero mean little.
@@ -405,7 +406,7 @@ def _trial(model: Model) -> dict[str, float]:
 
 def check_machine(place: Path, path: Path, versions: dict[str, str]) -> dict[str, Any]:
     """What there is to say of a machine file, with its picture and report in a folder. Raises MachineError."""
-    found = check(path)
+    found = check_file(path)
     model = found.model
     summary: dict[str, Any] = {
         "file": str(path),

@@ -1,4 +1,4 @@
-"""Progress of a workflow: the caller gives a bar, the workflow says how far it is."""
+"""Progress of a workflow, reported to a bar that the caller supplies."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 Advance = Callable[[int, int, float | None], None]  # done, total, best score so far
-Bar = Callable[[str], AbstractContextManager[Advance]]  # opened with the name of what is being done
+Bar = Callable[[str], AbstractContextManager[Advance]]  # opened with the name of the work
 
 
 @contextmanager
-def silent(label: str) -> Iterator[Advance]:
-    """A bar that shows nothing."""
+def no_bar(label: str) -> Iterator[Advance]:
+    """Show nothing."""
     yield lambda done, total, best: None

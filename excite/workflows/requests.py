@@ -1,4 +1,4 @@
-"""What is asked for, checked: machines, problems, methods, sensors. Whatever can't be had is a UsageError."""
+"""Checks of what a command asks for by name or number; an unknown or impossible request is a UsageError."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ if TYPE_CHECKING:
     from excite.model import Model
     from excite.model.machine import Machine, Problem
 
-LONGEST = 3600.0  # drive [s]
+LONGEST_DRIVE_S = 3600.0  # [s]; chosen
 
 
-def build_model(name: str, flaws: bool = True) -> Model:
-    """The model of a machine; without `flaws` effects that no equation of motion shows are no parameters."""
+def build_model(name: str, fit_sensor_effects: bool = True) -> Model:
+    """Build the model of a machine by name; see `model.build` for fit_sensor_effects. Raises MachineError."""
     from excite.errors import MachineError
     from excite.model import build as prediction_build
     from excite.model.machine import load_machine
 
     loaded = load_machine(name)
     try:
-        return prediction_build(loaded, flaws)
+        return prediction_build(loaded, fit_sensor_effects)
     except MachineError as err:
         raise MachineError(f"{name}: {str(err).removeprefix(f'{loaded.name}: ')}") from None
 
 
 def choose_problem(machine: Machine, name: str | None, duration: float | None) -> tuple[str, Problem]:
-    """A machine's design problem, its own by default, with another duration [s] where given."""
+    """Return a machine's design problem by name, None for its own, with another duration [s] if given."""
     name = name or machine.problem
     if name is None or not machine.problems:
         raise UsageError(
@@ -41,18 +41,18 @@ def choose_problem(machine: Machine, name: str | None, duration: float | None) -
     found = machine.problems[name]
     if duration is not None:
         knot = float(found.knot_s)
-        if not 4 * knot <= duration <= LONGEST:
-            raise UsageError(f"--duration: must be between {4 * knot:g} and {LONGEST:g} s (got {duration:g})")
+        if not 4 * knot <= duration <= LONGEST_DRIVE_S:
+            raise UsageError(f"--duration: must be between {4 * knot:g} and {LONGEST_DRIVE_S:g} s (got {duration:g})")
         longer = found.duration_s.model_copy(update={"value": round(duration / knot) * knot})
         found = found.model_copy(update={"duration_s": longer})
     return name, found
 
 
 def choose_method(name: str | None, model: Model, kit: str | None = None) -> str:
-    """An estimator's name, the recommended one by default; all that it needs is measured by a kit."""
+    """Return the name of a method, None for the recommended one. Raises UsageError if the kit lacks a sensor for it."""
     from excite import identification
 
-    name = name or identification.recommended(model)
+    name = name or identification.recommend_method(model)
     require_known("--method", name, tuple(identification.METHODS))
     if kit is not None:
         have = {s.name for s in model.machine.sensors(kit)}
@@ -63,7 +63,7 @@ def choose_method(name: str | None, model: Model, kit: str | None = None) -> str
     return name
 
 
-# Where the tables are of what may be given by name: a new entry is in the help, the shell's completion and the errors.
+# Package and table of each option that takes a name: help, shell completion and errors read the names from there.
 CHOICES = {
     "objective": ("excite.trajectories", "OBJECTIVES"),
     "method": ("excite.identification", "METHODS"),
@@ -71,38 +71,41 @@ CHOICES = {
     "kit": ("excite.simulation", "KITS"),
     "effect": ("excite.model.effects", "CATALOGUE"),
 }
-LISTED = 12  # names that help still lists
+MAX_LISTED = 12  # names that the help of an option lists; chosen
 
 
 def choices(option: str) -> tuple[str, ...]:
-    """What may be given for an option by name; nothing for an option that takes something else."""
+    """Return the names that an option takes, none for an option that takes no name."""
     from importlib import import_module
 
     module, table = CHOICES.get(option, ("", ""))
     return tuple(getattr(import_module(module), table)) if module else ()
 
 
-def helped(option: str, text: str | None) -> str:
-    """An option's help with the names that may be given for it."""
+def help_with_choices(option: str, text: str | None) -> str:
+    """Return an option's help text, with the names that it takes."""
     names = choices(option)
-    return f"{text or ''}: {', '.join(names)}" if 0 < len(names) <= LISTED else text or ""
+    return f"{text or ''}: {', '.join(names)}" if 0 < len(names) <= MAX_LISTED else text or ""
 
 
 def require_known(what: str, value: str, allowed: Sequence[str]) -> None:
+    """Raise UsageError for a value that is not allowed. what: the option, as the message begins."""
     if value not in allowed:
         raise UsageError(f"{what}: {value} is unknown, allowed: {', '.join(allowed)}")
 
 
 def require_objective(name: str, machine: Machine) -> None:
-    """Refuses a design objective that there isn't, and `discrimination` without two effects that a drive shows. Raises
-    MachineError for effects that can't be had."""
+    """Raise UsageError for an unknown objective, or `discrimination` without two effects that a drive shows.
+
+    Raises MachineError for effects that this machine can't have.
+    """
     from excite.model import build
     from excite.trajectories import OBJECTIVES
 
     require_known("--objective", name, tuple(OBJECTIVES))
     if name != "discrimination":
         return
-    model = build(machine, flaws=False)
+    model = build(machine, fit_sensor_effects=False)
     shown = sum(e.name in model.base.names for e in model.effects)
     if shown < 2:
         raise UsageError(
@@ -112,15 +115,16 @@ def require_objective(name: str, machine: Machine) -> None:
 
 
 def require_positive(option: str, value: float | None, unit: str) -> None:
+    """Raise UsageError for a number that is given and not positive."""
     if value is not None and not value > 0:
         raise UsageError(f"{option}: must be > 0 {unit} (got {value:g})")
 
 
-def stem(machine: str) -> str:
-    """What folders of a machine are called."""
+def machine_stem(machine: str) -> str:
+    """Return the name of a machine in the names of output folders."""
     return Path(machine).stem if machine.endswith(".toml") else machine
 
 
-def versions() -> dict[str, str]:
-    """Of what numbers depend on."""
+def package_versions() -> dict[str, str]:
+    """Return the versions of the packages that results depend on."""
     return {name: version(name) for name in ("excite", "casadi", "numpy", "scipy")}

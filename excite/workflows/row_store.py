@@ -1,7 +1,7 @@
-"""Rows of a study that is under way, each there whole or not at all, each once.
+"""Store of the rows of a running study: one SQLite file.
 
-One SQLite file: a batch of rows is one transaction, so neither a kill nor a full disk leaves half of one; the number of
-the run is its key, so none is kept twice; and the file is locked while somebody writes, so two can't work on one study.
+A batch of rows is one transaction, so a kill or a full disk never leaves half a batch. The run's number is the key, so
+no row is stored twice. The file is locked while it is open, so only one process works on a study.
 """
 
 from __future__ import annotations
@@ -18,22 +18,24 @@ from excite.errors import FolderError, RowStoreError
 Row = dict[str, Any]
 
 
-class Store:
-    """The rows kept so far. Open it with `opened`."""
+class RowStore:
+    """The rows stored so far. Open it with `open_store`."""
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self.path, self._db = path, connection
 
-    def keep(self, rows: Iterable[tuple[int, Row]], seconds: float = 0.0) -> None:
-        """Keeps the rows of a batch, all or none, that took so long [s]. Raises StoreError; ValueError for a run that
-        is there already."""
+    def add_rows(self, rows: Iterable[tuple[int, Row]], seconds: float = 0.0) -> None:
+        """Store a batch of numbered rows, all or none, and the time [s] that they took.
+
+        Raises RowStoreError; ValueError for a run that is stored already.
+        """
         texts = [(n, json.dumps(row, allow_nan=False)) for n, row in rows]
         with self._guarded(), self._db:
             self._db.executemany("INSERT INTO runs VALUES (?, ?)", texts)
             self._db.execute("UPDATE spent SET seconds = seconds + ?", (seconds,))
 
-    def fail(self, drive: int, reason: str) -> None:
-        """Keeps why there is no such drive. Raises StoreError."""
+    def add_failure(self, drive: int, reason: str) -> None:
+        """Store the reason why a drive could not be designed. Raises RowStoreError."""
         with self._guarded(), self._db:
             self._db.execute("INSERT INTO failures VALUES (?, ?)", (drive, reason))
 
@@ -42,49 +44,49 @@ class Store:
         try:
             yield
         except sqlite3.IntegrityError as err:
-            raise ValueError(f"{self.path}: a run is there already: {err}") from None
+            raise ValueError(f"{self.path}: a run is stored already: {err}") from None
         except (sqlite3.OperationalError, sqlite3.DatabaseError) as err:
             raise RowStoreError(
-                f"{self.path}: can't be written: {err}; what was kept is safe, mend that and repeat the command"
+                f"{self.path}: can't be written: {err}; the rows so far are safe, correct this and repeat the command"
             ) from None
 
     def numbers(self) -> set[int]:
-        """Numbers of the runs that are kept."""
+        """Return the numbers of the stored runs."""
         return {n for (n,) in self._db.execute("SELECT number FROM runs")}
 
     def rows(self) -> Iterator[tuple[int, Row]]:
-        """All rows in the order of their runs, one at a time."""
+        """Yield number and row of every stored run, in order."""
         for number, text in self._db.execute("SELECT number, row FROM runs ORDER BY number"):
             yield number, json.loads(text)
 
     def failures(self) -> dict[int, str]:
-        """Drives that can't be had, with why."""
+        """Return the failed drives with their reasons."""
         return dict(self._db.execute("SELECT drive, reason FROM failures ORDER BY drive"))
 
     @property
     def seconds(self) -> float:
-        """Time [s] that the workers spent on the rows, all together."""
+        """Time [s] that all workers spent on the rows."""
         return float(self._db.execute("SELECT seconds FROM spent").fetchone()[0])
 
 
 @contextmanager
-def opened(path: Path, fingerprint: str) -> Iterator[Store]:
-    """The rows of the study with this fingerprint, kept in `path`, which is made where it isn't there.
+def open_store(path: Path, fingerprint: str) -> Iterator[RowStore]:
+    """Open the store of the study with this fingerprint, created if missing.
 
-    Raises FolderError where it holds another study's, is damaged, or somebody is at work on it.
+    Raises FolderError for a damaged store, one of another study, or one that another process has open.
     """
     try:
         db = sqlite3.connect(path, timeout=0)
     except sqlite3.Error as err:
         raise FolderError(f"{path}: can't be opened: {err}") from None
     try:
-        _begin(db, path, fingerprint)
-        yield Store(path, db)
+        _prepare_tables(db, path, fingerprint)
+        yield RowStore(path, db)
     finally:
         db.close()
 
 
-def _begin(db: sqlite3.Connection, path: Path, fingerprint: str) -> None:
+def _prepare_tables(db: sqlite3.Connection, path: Path, fingerprint: str) -> None:
     try:
         db.execute("PRAGMA locking_mode = EXCLUSIVE")
         db.execute("PRAGMA synchronous = FULL")
@@ -105,7 +107,7 @@ def _begin(db: sqlite3.Connection, path: Path, fingerprint: str) -> None:
         db.commit()
     except sqlite3.OperationalError as err:
         if "locked" in str(err):
-            raise FolderError(f"{path}: somebody is at work on this study, wait or choose another --out") from None
+            raise FolderError(f"{path}: another process works on this study, wait or choose another --out") from None
         raise RowStoreError(f"{path}: can't be written: {err}") from None
     except sqlite3.DatabaseError as err:
         raise FolderError(f"{path}: damaged ({err}), delete it to begin afresh") from None

@@ -1,4 +1,4 @@
-"""`excite simulate`: a profile and effects in, the log that the sensors would write out."""
+"""`excite simulate`: effects of a simulated machine, from their text on the command line."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from excite.model import Model, build, effects
 
 
 def with_effects(model: Model, texts: Sequence[str], samples: int) -> Model:
-    """The model with effects more, NAME[@WHERE]=MAGNITUDE each, for a drive of so many samples. Raises MachineError."""
+    """Add effects to a model, NAME[@WHERE]=MAGNITUDE each, for a drive of some samples. Raises MachineError."""
     if not texts:
         return model
     seconds = (samples - 1) / float(model.machine.sampling_hz)
@@ -17,7 +17,7 @@ def with_effects(model: Model, texts: Sequence[str], samples: int) -> Model:
 
 
 def doubtful_effects(model: Model, extended: Model) -> list[str]:
-    """A line for each effect that an extended model has more than a model, if its magnitude is doubtful."""
+    """Return a line for each effect that only the extended model has and whose magnitude is doubtful."""
     added = extended.machine.effect[len(model.machine.effect) :]
     placed = (effects.place_effect(model.machine, entry) for entry in added)
     return [line for e in placed if (line := effects.size_warning(model.machine, e)) is not None]

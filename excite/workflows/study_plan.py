@@ -1,8 +1,8 @@
-"""What a study asks for: its file (TOML) as checked records, and the cells that it spans.
+"""A study file (TOML) as checked records, and the cells that it spans.
 
     name = "soil"
     runs = 50                               # of every cell, each with other sensor noise
-    steps = ["verify"]                      # of design, simulate, identify, diagnose, verify
+    steps = ["verify"]                      # any of design, simulate, identify, diagnose, verify
 
     [grid]                                  # every combination; [[grid]] for several
     machine = ["va12", "my_roller.toml"]
@@ -18,8 +18,8 @@
     duration_s = [{ low = 20, high = 60 }]
     effects = [["ground_slope=0.0005..0.005"]]
 
-A cell is a drive (designed, or a given `profile`), a machine that drives it, sensors and an estimator. Cells that
-share a drive share its design. Paths are relative to the study file.
+A cell is one combination: a drive (designed, or a given `profile`), the machine that drives it, its sensors and a
+method. Cells with the same drive share its design. Paths are relative to the study file.
 """
 
 from __future__ import annotations
@@ -57,23 +57,23 @@ from excite.trajectories import KINDS
 from excite.workflows import requests
 
 STEPS = ("design", "simulate", "identify", "diagnose", "verify")
-MOST = 1_000_000  # runs of a study
-MOST_CELLS = 100_000
-MOST_TIMES = 10.0  # a machine's own limit: 50 is meant for per cent
+MAX_RUNS = 1_000_000  # of a study; chosen
+MAX_CELLS = 100_000  # of a study; chosen
+MAX_LIMIT_FACTOR = 10.0  # on a machine's own limit; chosen: a larger one is meant as per cent
 SPAN = re.compile(r"^(?P<what>[^=]*)=(?P<low>[^=]+)\.\.(?P<high>[^=]+)$")
 
 
-def _several(value: Any) -> Any:
+def _as_list(value: Any) -> Any:
     return value if isinstance(value, list | tuple) else [value]
 
 
-def _sets(value: Any) -> Any:
-    """Every entry a set of effects; one effect stands for the set that holds it alone."""
-    return [_several(v) for v in _several(value)]
+def _effect_sets(value: Any) -> Any:
+    """Make every entry a set of effects; a single effect becomes a set of one."""
+    return [_as_list(v) for v in _as_list(value)]
 
 
 class Range(FileRecord):
-    """Numbers from low to high, drawn evenly, or evenly in their logarithm."""
+    """Numbers from low to high, drawn uniformly, or uniformly in their logarithm."""
 
     low: Number
     high: Number
@@ -95,24 +95,26 @@ class Range(FileRecord):
 _NUMBER: TypeAdapter[float] = TypeAdapter(Number)
 
 
-def _varied(value: Any, _: object) -> Any:
-    """A table is a range, anything else a number: what is wrong is said of the one that is meant alone."""
+def _number_or_range(value: Any, _: object) -> Any:
+    """Read a table as a range and anything else as a number, so that an error names the one that is meant."""
     return Range.model_validate(value) if isinstance(value, dict) else _NUMBER.validate_python(value)
 
 
-Varied = Annotated[Number | Range, WrapValidator(_varied)]
+Varied = Annotated[Number | Range, WrapValidator(_number_or_range)]
 Text = Annotated[str, Field(min_length=1, max_length=1000)]
 Whole = Annotated[int, Field(strict=True, ge=0, le=2**32 - 1)]
 Starts = Annotated[int, Field(strict=True, ge=1, le=1000)]
 
 
 def _limits(value: Any) -> Any:
-    """Every set of limits has names that machine files know."""
+    """Raise ValidationError for a limit that no machine file has."""
     allowed = [known for known, kind in KINDS.items() if kind.stated]
     for name in value if isinstance(value, dict) else ():
         if name not in allowed:
-            said = PydanticCustomError("value_error", f"no such limit of a machine file, allowed: {', '.join(allowed)}")
-            raise ValidationError.from_exception_data("limits", [{"type": said, "loc": (name,), "input": name}])
+            error = PydanticCustomError(
+                "value_error", f"no such limit of a machine file, allowed: {', '.join(allowed)}"
+            )
+            raise ValidationError.from_exception_data("limits", [{"type": error, "loc": (name,), "input": name}])
     return value
 
 
@@ -121,22 +123,22 @@ VariedLimits = Annotated[dict[str, Varied], BeforeValidator(_limits)]
 
 
 class Axes(FileRecord):
-    """What varies; an axis that is left out has the one value that the commands take by default.
+    """Values to vary; an axis that is left out has the default of the commands.
 
-    limits: factors on the machine's own; effects: sets of NAME[@WHERE]=AMOUNT; profile: drives instead of designs.
-    seed: of the sensors' noise, as in `excite verify`; design_seed: of the search.
+    limits: factors on the machine's own limits. effects: sets of NAME[@WHERE]=MAGNITUDE. profile: drives in place of
+    designs. seed: of the sensor noise, as in `excite verify`. design_seed: of the search for a design.
     """
 
-    machine: Annotated[tuple[Text, ...], BeforeValidator(_several), Field(min_length=1)]
-    problem: Annotated[tuple[Text, ...], BeforeValidator(_several), Field(min_length=1)] = ()
-    objective: Annotated[tuple[Text, ...], BeforeValidator(_several), Field(min_length=1)] = ("cond",)
-    starts: Annotated[tuple[Starts, ...], BeforeValidator(_several), Field(min_length=1)] = (2,)
-    design_seed: Annotated[tuple[Whole, ...], BeforeValidator(_several), Field(min_length=1)] = (0,)
-    profile: Annotated[tuple[Text, ...], BeforeValidator(_several), Field(min_length=1)] = ()
-    kit: Annotated[tuple[Literal["paper", "full"], ...], BeforeValidator(_several), Field(min_length=1)] = ("full",)
-    method: Annotated[tuple[Text, ...], BeforeValidator(_several), Field(min_length=1)] = ()
-    effects: Annotated[tuple[tuple[Text, ...], ...], BeforeValidator(_sets), Field(min_length=1)] = ((),)
-    seed: Annotated[tuple[Whole, ...], BeforeValidator(_several), Field(min_length=1)] = (0,)
+    machine: Annotated[tuple[Text, ...], BeforeValidator(_as_list), Field(min_length=1)]
+    problem: Annotated[tuple[Text, ...], BeforeValidator(_as_list), Field(min_length=1)] = ()
+    objective: Annotated[tuple[Text, ...], BeforeValidator(_as_list), Field(min_length=1)] = ("cond",)
+    starts: Annotated[tuple[Starts, ...], BeforeValidator(_as_list), Field(min_length=1)] = (2,)
+    design_seed: Annotated[tuple[Whole, ...], BeforeValidator(_as_list), Field(min_length=1)] = (0,)
+    profile: Annotated[tuple[Text, ...], BeforeValidator(_as_list), Field(min_length=1)] = ()
+    kit: Annotated[tuple[Literal["paper", "full"], ...], BeforeValidator(_as_list), Field(min_length=1)] = ("full",)
+    method: Annotated[tuple[Text, ...], BeforeValidator(_as_list), Field(min_length=1)] = ()
+    effects: Annotated[tuple[tuple[Text, ...], ...], BeforeValidator(_effect_sets), Field(min_length=1)] = ((),)
+    seed: Annotated[tuple[Whole, ...], BeforeValidator(_as_list), Field(min_length=1)] = (0,)
 
     @model_validator(mode="after")
     def _consistent(self) -> Axes:
@@ -147,36 +149,36 @@ class Axes(FileRecord):
         return self
 
 
-def _typed(value: Any) -> str:
-    """A value about as a study file has it."""
+def _as_toml(value: Any) -> str:
+    """Format a value about as a study file has it."""
     if isinstance(value, tuple):
-        return f"[{', '.join(map(_typed, value))}]"
+        return f"[{', '.join(map(_as_toml, value))}]"
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{name} = {_typed(inner)}' for name, inner in value.items())}}}"
+        return f"{{{', '.join(f'{name} = {_as_toml(inner)}' for name, inner in value.items())}}}"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 class Grid(Axes):
-    """Every combination of its axes."""
+    """Cells of every combination of the axes."""
 
-    duration_s: Annotated[tuple[Number, ...], BeforeValidator(_several), Field(min_length=1)] = ()
-    limits: Annotated[tuple[Limits, ...], BeforeValidator(_several), Field(min_length=1)] = ({},)
+    duration_s: Annotated[tuple[Number, ...], BeforeValidator(_as_list), Field(min_length=1)] = ()
+    limits: Annotated[tuple[Limits, ...], BeforeValidator(_as_list), Field(min_length=1)] = ({},)
 
     @model_validator(mode="after")
     def _no_twins(self) -> Grid:
-        """A value that is given twice would make cells twice, with the same runs in them."""
+        """Raise ValueError for a value that is given twice, which would repeat cells with the same runs."""
         for name in AXES:
             seen: set[Any] = set()
             for value in getattr(self, name):
                 key = tuple(sorted(value.items())) if isinstance(value, dict) else value
                 if key in seen:
-                    raise ValueError(f"{name}: a value is given twice, leave one of them out (got {_typed(value)})")
+                    raise ValueError(f"{name}: a value is given twice, leave one of them out (got {_as_toml(value)})")
                 seen.add(key)
         return self
 
     @property
     def choices(self) -> dict[str, tuple[Any, ...]]:
-        """Values by axis; None stands for the machine's own."""
+        """Values by axis, None for the machine's own."""
         return {name: getattr(self, name) or (None,) for name in AXES}
 
     def __len__(self) -> int:
@@ -187,13 +189,13 @@ class Grid(Axes):
             yield _cell(dict(zip(AXES, values, strict=True)))
 
 
-class Sample(Axes):
-    """`count` cells, each axis drawn at random with this seed from its values, numbers from ranges."""
+class RandomSample(Axes):
+    """`count` cells, each axis drawn at random from its values, numbers from ranges."""
 
-    count: Annotated[int, Field(strict=True, ge=1, le=MOST)]
+    count: Annotated[int, Field(strict=True, ge=1, le=MAX_RUNS)]
     sample_seed: Whole = 0
-    duration_s: Annotated[tuple[Varied, ...], BeforeValidator(_several), Field(min_length=1)] = ()
-    limits: Annotated[tuple[VariedLimits, ...], BeforeValidator(_several), Field(min_length=1)] = ({},)
+    duration_s: Annotated[tuple[Varied, ...], BeforeValidator(_as_list), Field(min_length=1)] = ()
+    limits: Annotated[tuple[VariedLimits, ...], BeforeValidator(_as_list), Field(min_length=1)] = ({},)
 
     def __len__(self) -> int:
         return self.count
@@ -202,9 +204,9 @@ class Sample(Axes):
         for k in range(self.count):
             rng = np.random.default_rng([self.sample_seed, k])
             chosen = {n: _pick(getattr(self, n) or (None,), rng) for n in AXES}
-            chosen["duration_s"] = _drawn(chosen["duration_s"], rng)
-            chosen["limits"] = {n: _drawn(v, rng) for n, v in chosen["limits"].items()}
-            chosen["effects"] = tuple(_amount(text, rng) for text in chosen["effects"])
+            chosen["duration_s"] = _draw_number(chosen["duration_s"], rng)
+            chosen["limits"] = {n: _draw_number(v, rng) for n, v in chosen["limits"].items()}
+            chosen["effects"] = tuple(_draw_magnitude(text, rng) for text in chosen["effects"])
             yield _cell(chosen)
 
 
@@ -212,13 +214,13 @@ def _pick(values: Sequence[Any], rng: np.random.Generator) -> Any:
     return values[int(rng.integers(len(values)))]
 
 
-def _drawn(value: Any, rng: np.random.Generator) -> Any:
-    """Rounded to six digits, so that it can be typed again."""
+def _draw_number(value: Any, rng: np.random.Generator) -> Any:
+    """Draw a number from a range, rounded to six digits so that it can be typed again."""
     return float(f"{value.draw(rng):.6g}") if isinstance(value, Range) else value
 
 
-def _amount(text: str, rng: np.random.Generator) -> str:
-    """NAME=LOW..HIGH as NAME=AMOUNT. Raises StudyError."""
+def _draw_magnitude(text: str, rng: np.random.Generator) -> str:
+    """Turn NAME=LOW..HIGH into NAME=MAGNITUDE. Raises StudyError."""
     span = SPAN.match(text)
     if span is None:
         return text
@@ -226,12 +228,12 @@ def _amount(text: str, rng: np.random.Generator) -> str:
         between = Range(low=float(span["low"]), high=float(span["high"]))
     except (ValidationError, ValueError):
         raise StudyError(f"effects: {text}: must be NAME[@WHERE]=LOW..HIGH with LOW below HIGH") from None
-    return f"{span['what']}={_drawn(between, rng):.6g}"
+    return f"{span['what']}={_draw_number(between, rng):.6g}"
 
 
 @dataclass(frozen=True)
-class Drive:
-    """What is driven: a design of a machine within limits, or a profile. None: the machine's own."""
+class DriveSpec:
+    """A drive to design for a machine within limits, or a given profile. None: the machine's own value."""
 
     machine: str
     problem: str | None
@@ -245,9 +247,9 @@ class Drive:
 
 @dataclass(frozen=True)
 class Cell:
-    """One combination: a drive, and the machine, sensors and estimator that it is tried with."""
+    """One combination of a drive with effects, sensors and a method."""
 
-    drive: Drive
+    drive: DriveSpec
     kit: str
     method: str | None
     effects: tuple[str, ...]
@@ -262,40 +264,40 @@ AXES = (
 
 def _cell(v: dict[str, Any]) -> Cell:
     limits = tuple(sorted((n, float(f)) for n, f in v["limits"].items()))
-    own = (v["problem"], v["objective"], v["duration_s"], limits, v["starts"], v["design_seed"])
+    drive = (v["problem"], v["objective"], v["duration_s"], limits, v["starts"], v["design_seed"])
     if v["profile"] is not None:
-        own = (None, "", None, (), 0, 0)
-    return Cell(Drive(v["machine"], *own, v["profile"]), v["kit"], v["method"], tuple(v["effects"]), v["seed"])
+        drive = (None, "", None, (), 0, 0)
+    return Cell(DriveSpec(v["machine"], *drive, v["profile"]), v["kit"], v["method"], tuple(v["effects"]), v["seed"])
 
 
 class Study(FileRecord):
-    """A study file. runs: of every cell; steps: what is done with each."""
+    """A study file. runs: of every cell. steps: of every run."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,79}$")]
     title: Annotated[str, Field(max_length=200)] = ""
-    runs: Annotated[int, Field(strict=True, ge=1, le=MOST)] = 1
+    runs: Annotated[int, Field(strict=True, ge=1, le=MAX_RUNS)] = 1
     steps: Annotated[
         tuple[Literal["design", "simulate", "identify", "diagnose", "verify"], ...],
-        BeforeValidator(_several),
+        BeforeValidator(_as_list),
         Field(min_length=1),
     ] = ("verify",)
-    grid: Annotated[tuple[Grid, ...], BeforeValidator(_several)] = ()
-    sample: Annotated[tuple[Sample, ...], BeforeValidator(_several)] = ()
+    grid: Annotated[tuple[Grid, ...], BeforeValidator(_as_list)] = ()
+    sample: Annotated[tuple[RandomSample, ...], BeforeValidator(_as_list)] = ()
 
     @model_validator(mode="after")
     def _consistent(self) -> Study:
         if not self.grid and not self.sample:
             raise ValueError("grid: is missing, give [grid] or [sample] with the machines at least")
-        if len(self) > MOST:
-            raise ValueError(f"runs: {len(self)} runs in all, at most {MOST} are allowed")
-        if len(self) // self.runs > MOST_CELLS:
-            raise ValueError(f"grid: {len(self) // self.runs} cells, at most {MOST_CELLS} are allowed")
+        if len(self) > MAX_RUNS:
+            raise ValueError(f"runs: {len(self)} runs in all, at most {MAX_RUNS} are allowed")
+        if len(self) // self.runs > MAX_CELLS:
+            raise ValueError(f"grid: {len(self) // self.runs} cells, at most {MAX_CELLS} are allowed")
         if "design" in self.steps and any(a.profile for a in self.blocks):
             raise ValueError("steps: design goes without a profile, leave one of them out")
         return self
 
     @property
-    def blocks(self) -> tuple[Grid | Sample, ...]:
+    def blocks(self) -> tuple[Grid | RandomSample, ...]:
         return (*self.grid, *self.sample)
 
     def __len__(self) -> int:
@@ -308,10 +310,10 @@ class Study(FileRecord):
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A study made ready: its cells, checked, and the machines by the name that the study gives them.
+class StudyPlan:
+    """A study with its checked cells, and its machines by the name that the study gives them.
 
-    A run is numbered cell by cell: run r of cell c is number c * runs + r. drives: in the order of their first cell.
+    Runs are numbered cell by cell: run r of cell c is number c * runs + r. texts: files of each machine, by file name.
     """
 
     study: Study
@@ -321,12 +323,13 @@ class Plan:
     texts: dict[str, dict[str, str]] = field(default_factory=dict)
 
     @cached_property
-    def drives(self) -> tuple[Drive, ...]:
+    def drives(self) -> tuple[DriveSpec, ...]:
+        """Drives in the order of their first cell."""
         return tuple(dict.fromkeys(c.drive for c in self.cells))
 
     @cached_property
-    def number(self) -> dict[Drive, int]:
-        """The place of a drive in `drives`."""
+    def number(self) -> dict[DriveSpec, int]:
+        """Index of each drive in `drives`."""
         return {d: k for k, d in enumerate(self.drives)}
 
     @property
@@ -338,20 +341,20 @@ class Plan:
 
     @cached_property
     def recommended(self) -> dict[str, str]:
-        return {name: identification.recommended(build(m)) for name, m in self.machines.items()}
+        return {name: identification.recommend_method(build(m)) for name, m in self.machines.items()}
 
     @cached_property
     def parameters(self) -> dict[str, tuple[str, ...]]:
-        """Base parameters of each machine, in its own order."""
+        """Base parameters of each machine, in the machine's order."""
         return {name: build(m).base.names for name, m in self.machines.items()}
 
     def seeds(self, cell: Cell) -> np.ndarray:
-        """(runs,) of the sensors' noise; cells of one seed share them, so estimators meet the same logs."""
+        """Seeds (runs,) of the sensor noise; cells of one seed share them, so all methods meet the same logs."""
         return np.random.SeedSequence(cell.seed).generate_state(self.study.runs)
 
     @cached_property
     def fingerprint(self) -> str:
-        """Changes when anything that the rows depend on does, the program aside."""
+        """Hash of everything that the rows depend on, except the program."""
         seen = hashlib.sha256(self.study.model_dump_json().encode())
         for name in sorted(self.machines):
             seen.update(self.machines[name].model_dump_json().encode())
@@ -359,13 +362,13 @@ class Plan:
             seen.update((self.base / name).read_bytes())
         return seen.hexdigest()
 
-    def designed(self, drive: Drive) -> Machine:
-        """The machine that a drive is designed for: with the study's limits."""
-        return limited(self.machines[drive.machine], dict(drive.limits))
+    def design_machine(self, drive: DriveSpec) -> Machine:
+        """Return the machine that a drive is designed for, with the study's limits."""
+        return scale_limits(self.machines[drive.machine], dict(drive.limits))
 
 
-def read_study(path: str | Path) -> Plan:
-    """A study file, checked with everything that it names. Raises StudyError, MachineError, LogError."""
+def read_study(path: str | Path) -> StudyPlan:
+    """Read a study file and check everything that it names. Raises StudyError, MachineError, LogError."""
     path = Path(path)
     if path.suffix != ".toml":
         raise StudyError(f"{path}: must be a study file (.toml)")
@@ -378,7 +381,7 @@ def read_study(path: str | Path) -> Plan:
     except ValidationError as err:
         raise StudyError(error_line(path, err, Study)) from None
     try:
-        return ready(study, path.parent)
+        return plan_study(study, path.parent)
     except UsageError as err:
         said = str(err).removeprefix("--").replace("duration:", "duration_s:", 1)  # keys, not options
         raise StudyError(f"{path}: {said}") from None
@@ -386,8 +389,8 @@ def read_study(path: str | Path) -> Plan:
         raise type(err)(f"{path}: {err}") from None
 
 
-def ready(study: Study, base: Path | str = Path()) -> Plan:
-    """A study with its machines read and every cell checked before anything is computed. Paths are relative to `base`.
+def plan_study(study: Study, base: Path | str = Path()) -> StudyPlan:
+    """Read a study's machines and check every cell before anything is computed. Paths are relative to `base`.
 
     Raises UsageError, MachineError, LogError.
     """
@@ -400,15 +403,18 @@ def ready(study: Study, base: Path | str = Path()) -> Plan:
                 place = name if name in shipped_machines() else base / name
                 known[name] = load_machine(place)
                 texts[name] = {p.name: p.read_text(encoding="utf-8-sig") for p in machine_files(place)}
-    plan = Plan(study, base, tuple(study.cells()), known, texts)
+    plan = StudyPlan(study, base, tuple(study.cells()), known, texts)
     seen: set[Any] = set()
     for cell in plan.cells:
-        _check(plan, cell, seen)
+        _check_cell(plan, cell, seen)
     return plan
 
 
-def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:
-    """Refuses a cell that can't be had; what was checked once is not checked again. Raises StudyError, MachineError."""
+def _check_cell(plan: StudyPlan, cell: Cell, seen: set[Any]) -> None:
+    """Check a cell, except what `seen` says was checked before.
+
+    Raises UsageError, StudyError, MachineError, LogError.
+    """
     d, machine = cell.drive, plan.machines[cell.drive.machine]
 
     def fresh(*key: Any) -> bool:
@@ -421,7 +427,7 @@ def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:
             logs.read_profile(plan.base / d.profile, build(machine))
         else:
             requests.require_objective(d.objective, machine)
-            requests.choose_problem(plan.designed(d), d.problem, d.duration_s)
+            requests.choose_problem(plan.design_machine(d), d.problem, d.duration_s)
     if fresh(d.machine, cell.effects):
         own = [place_effect(machine, entry).name for entry in machine.effect]
         labels = [parse_effect(text, machine, DEFAULT_DURATION).label for text in cell.effects]
@@ -434,15 +440,16 @@ def _check(plan: Plan, cell: Cell, seen: set[Any]) -> None:
         requests.choose_method(plan.method(cell), build(machine), cell.kit)
 
 
-def limited(machine: Machine, factors: dict[str, float]) -> Machine:
-    """The machine with its limits multiplied. Raises StudyError where it has no such limit."""
+def scale_limits(machine: Machine, factors: dict[str, float]) -> Machine:
+    """Multiply limits of a machine by factors. Raises StudyError for a limit that the machine does not have."""
     if not factors:
         return machine
     raw = json.loads(machine.model_dump_json())
     for name, factor in factors.items():
-        if not 0 < factor <= MOST_TIMES:
+        if not 0 < factor <= MAX_LIMIT_FACTOR:
             raise StudyError(
-                f"limits: {name}: must be a factor on the machine's own limit, above 0 and at most {MOST_TIMES:g} (got"
+                f"limits: {name}: must be a factor on the machine's own limit, above 0 and at most {MAX_LIMIT_FACTOR:g}"
+                " (got"
                 f" {factor:g}); 0.5 is half of it"
             )
         stated = [_multiply(raw, path, factor) for path in KINDS[name].stated]
@@ -452,7 +459,7 @@ def limited(machine: Machine, factors: dict[str, float]) -> Machine:
 
 
 def _multiply(raw: dict[str, Any], path: str, factor: float) -> bool:
-    """Multiplies what a machine's JSON has at a path, in every body or problem on the way; whether it has anything."""
+    """Multiply the values at a path of a machine's JSON, in every body or problem; return whether there is any."""
     *way, last = path.split(".")
     places = [raw]
     for key in way:
@@ -466,7 +473,7 @@ def _multiply(raw: dict[str, Any], path: str, factor: float) -> bool:
 
 
 def _times(value: Any, factor: float) -> Any:
-    """A number of a machine's JSON, with its source, or in lists of lists."""
+    """Multiply a number of a machine's JSON: plain, with its source, or in nested lists."""
     if isinstance(value, dict):
         return value | {"value": factor * value["value"]}
     return [_times(x, factor) for x in value] if isinstance(value, list) else factor * value

@@ -22,16 +22,16 @@ from excite.identification import Verification
 from excite.model import build_cached
 from excite.reports import COLOURS, Picture, Table, report_page
 from excite.text import format_number, format_percent
-from excite.workflows import study_runs as cells
-from excite.workflows.study_plan import Cell, Plan
+from excite.workflows import study_runs
+from excite.workflows.study_plan import Cell, StudyPlan
 from excite.workflows.study_runs import DEFECT, DONE, Row
 
 TABLE, FIGURE = "runs.parquet", "study.png"
-GROUP = 2000  # rows that are in memory at a time
+ROW_GROUP = 2000  # rows that are in memory at a time
 REPEAT = f"{TABLE} has a row a run; what its column `command` says repeats the run, from within this folder"
 NAMED = 30  # cells that a figure or report names one by one
 
-ABOUT = {
+COLUMNS = {
     "run": pa.int64(),
     "cell": pa.int32(),
     "repeat": pa.int32(),
@@ -65,7 +65,7 @@ ABOUT = {
 
 
 @dataclass(frozen=True)
-class Seen:
+class CellResult:
     """A cell and what came of its runs: how many ended how, why those failed; per parameter what `verify.summary`
     says (empty without estimates); verdicts of its diagnoses."""
 
@@ -92,45 +92,48 @@ class Seen:
 
 
 def write_table(
-    wanted: Plan,
+    wanted: StudyPlan,
     rows: Iterator[tuple[int, Row]],
     track: Callable[[int], Any],
     files: Mapping[str, str],
     versions: Mapping[str, str],
     place: Path,
-) -> list[Seen]:
+) -> list[CellResult]:
     """Writes `runs.parquet` from rows in the order of their runs, a group at a time; what each cell comes to.
 
     track(k): drive k, None where there is none; files: each machine's name or file for the commands.
     """
     names = list(dict.fromkeys(n for names in wanted.parameters.values() for n in names))
-    estimates = {f"{kind}.{n}": pa.float64() for kind in (*cells.ESTIMATES, "true") for n in names}
+    estimates = {f"{kind}.{n}": pa.float64() for kind in (*study_runs.ESTIMATE_COLUMNS, "true") for n in names}
     if not set(wanted.study.steps) & {"identify", "verify"}:
         estimates = {}
-    schema = pa.schema(ABOUT | estimates, metadata={"study": wanted.study.name, "program": cells.program()})
+    schema = pa.schema(COLUMNS | estimates, metadata={"study": wanted.study.name, "program": study_runs.program_hash()})
     shas = {n: sha256(m.model_dump_json().encode()).hexdigest() for n, m in wanted.machines.items()}
-    made = json.dumps({**versions, "program": cells.program()})
-    seen: list[Seen] = []
+    made = json.dumps({**versions, "program": study_runs.program_hash()})
+    seen: list[CellResult] = []
     held: list[Row] = []
     with pq.ParquetWriter(place / TABLE, schema, compression="zstd") as writer:
         for c, group in groupby(rows, key=lambda both: both[0] // wanted.study.runs):
             cell, known = wanted.cells[c], track(wanted.number[wanted.cells[c].drive])
-            about = _about(wanted, c, known, files) | {"machine_sha256": shas[cell.drive.machine], "versions": made}
+            about = _cell_columns(wanted, c, known, files) | {
+                "machine_sha256": shas[cell.drive.machine],
+                "versions": made,
+            }
             seeds, found = wanted.seeds(cell), []
             for number, row in group:
                 seed = int(seeds[number % wanted.study.runs])
-                held.append(_line(wanted, number, cell, about, row, seed))
+                held.append(_table_row(wanted, number, cell, about, row, seed))
                 found.append(row)
-                if len(held) >= GROUP:
+                if len(held) >= ROW_GROUP:
                     writer.write_table(pa.Table.from_pylist(held, schema))
                     held = []
-            seen.append(_seen(wanted, c, cell, known, found))
+            seen.append(_cell_result(wanted, c, cell, known, found))
         if held:
             writer.write_table(pa.Table.from_pylist(held, schema))
     return seen
 
 
-def _about(wanted: Plan, c: int, track: Any, files: Mapping[str, str]) -> Row:
+def _cell_columns(wanted: StudyPlan, c: int, track: Any, files: Mapping[str, str]) -> Row:
     cell, drive = wanted.cells[c], wanted.cells[c].drive
     name = f"{wanted.number[drive] + 1:04d}"
     summary = track.summary if track is not None else {}
@@ -162,32 +165,32 @@ def _about(wanted: Plan, c: int, track: Any, files: Mapping[str, str]) -> Row:
     }
 
 
-def _line(wanted: Plan, number: int, cell: Cell, about: Row, row: Row, seed: int) -> Row:
+def _table_row(wanted: StudyPlan, number: int, cell: Cell, about: Row, row: Row, seed: int) -> Row:
     line = about | {"run": number, "repeat": number % wanted.study.runs, "seed": seed}
     line["command"] = about["command"].replace("SEED", str(seed))
-    line |= {k: v for k, v in row.items() if k in ABOUT}
+    line |= {k: v for k, v in row.items() if k in COLUMNS}
     if "findings" in row:
         line["findings"] = json.dumps(row["findings"])
     names = wanted.parameters[cell.drive.machine]
-    for kind in cells.ESTIMATES:
+    for kind in study_runs.ESTIMATE_COLUMNS:
         line |= {f"{kind}.{n}": x for n, x in zip(names, row.get(kind, ()), strict=False)}
     model = build_cached(wanted.machines[cell.drive.machine].model_dump_json())
     return line | {f"true.{n}": float(x) for n, x in zip(names, model.nominal, strict=True)}
 
 
-def _seen(wanted: Plan, c: int, cell: Cell, track: Any, rows: Sequence[Row]) -> Seen:
+def _cell_result(wanted: StudyPlan, c: int, cell: Cell, track: Any, rows: Sequence[Row]) -> CellResult:
     model = build_cached(wanted.machines[cell.drive.machine].model_dump_json())
     table: dict[str, dict[str, float | str]] = {}
     if any("value" in row for row in rows):
         nothing = [None] * len(model.base.names)
-        value, std, *ends = (np.array([row.get(k, nothing) for row in rows], float) for k in cells.ESTIMATES)
+        value, std, *ends = (np.array([row.get(k, nothing) for row in rows], float) for k in study_runs.ESTIMATE_COLUMNS)
         v = Verification(
             *(wanted.method(cell), cell.kit, model.base.names, model.base.units, model.nominal, model.scale),
             *(value, std, np.stack(ends, axis=1), {}),
         )
         table = identification.summarise_runs(v)
     reasons = Counter(row["reason"] for row in rows if row.get("reason"))
-    return Seen(
+    return CellResult(
         c,
         cell,
         wanted.method(cell),
@@ -195,19 +198,19 @@ def _seen(wanted: Plan, c: int, cell: Cell, track: Any, rows: Sequence[Row]) -> 
         Counter(row["status"] for row in rows),
         dict(reasons.most_common(3)),
         table,
-        identification.biased(table),
+        identification.biased_parameters(table),
         Counter(row["verdict"] for row in rows if row.get("verdict")),
     )
 
 
-def label(seen: Sequence[Seen]) -> list[str]:
+def cell_labels(seen: Sequence[CellResult]) -> list[str]:
     """A name for each cell: what tells it from the others."""
-    parts = [_axes(s) for s in seen]
+    parts = [_cell_axes(s) for s in seen]
     varied = [k for k in parts[0] if len({p[k] for p in parts}) > 1] if parts else []
     return [", ".join(p[k] for k in varied if p[k]) or "the one cell" for p in parts]
 
 
-def _axes(s: Seen) -> dict[str, str]:
+def _cell_axes(s: CellResult) -> dict[str, str]:
     d = s.cell.drive
     return {
         "machine": d.machine,
@@ -225,21 +228,21 @@ def _axes(s: Seen) -> dict[str, str]:
     }
 
 
-def summary(seen: Sequence[Seen]) -> dict[str, Any]:
+def summarise_cells(seen: Sequence[CellResult]) -> dict[str, Any]:
     """Counts over all, and a line for every cell."""
     total: Counter[str] = Counter()
     for s in seen:
         total.update(s.statuses)
     return {
         "done": total[DONE],
-        "failed": total[cells.FAILED],
+        "failed": total[study_runs.FAILED],
         "defects": total[DEFECT],
-        "cells": [_said(s, name) for s, name in zip(seen, label(seen), strict=True)],
+        "cells": [_cell_summary(s, name) for s, name in zip(seen, cell_labels(seen), strict=True)],
     }
 
 
-def _said(s: Seen, name: str) -> dict[str, Any]:
-    said: dict[str, Any] = {"cell": name, "cond_phi": s.cond_phi, **{k: s.statuses.get(k, 0) for k in cells.STATUSES}}
+def _cell_summary(s: CellResult, name: str) -> dict[str, Any]:
+    said: dict[str, Any] = {"cell": name, "cond_phi": s.cond_phi, **{k: s.statuses.get(k, 0) for k in study_runs.STATUSES}}
     if s.reasons:
         said["reasons"] = dict(s.reasons)
     if s.rms:
@@ -256,9 +259,9 @@ def _said(s: Seen, name: str) -> dict[str, Any]:
     return said
 
 
-def figure(seen: Sequence[Seen], title: str) -> Figure:
+def study_figure(seen: Sequence[CellResult], title: str) -> Figure:
     """Cell by cell: errors of the parameters and how often intervals hold, verdicts, or else the drives' scores."""
-    names, n = label(seen), len(seen)
+    names, n = cell_labels(seen), len(seen)
     shown = Figure(figsize=(11.5, 1.6 + 0.3 * min(n, NAMED) + (2.5 if n > NAMED else 0)), layout="constrained")
     shown.suptitle(reports.plain(title))
     y = np.arange(n)
@@ -302,10 +305,10 @@ def figure(seen: Sequence[Seen], title: str) -> Figure:
     return shown
 
 
-def draw(wanted: Plan, seen: Sequence[Seen], said: Mapping[str, Any], place: Path) -> None:
+def draw(wanted: StudyPlan, seen: Sequence[CellResult], said: Mapping[str, Any], place: Path) -> None:
     """Figure and report of a study's folder."""
     title = wanted.study.title or wanted.study.name
-    reports.save(figure(seen, f"{title}: {said['runs']} runs"), place / FIGURE)
+    reports.save(study_figure(seen, f"{title}: {said['runs']} runs"), place / FIGURE)
     (place / reports.REPORT).write_text(page(title, said, place / FIGURE), encoding="utf-8")
 
 

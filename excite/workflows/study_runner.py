@@ -1,9 +1,8 @@
-"""Studies: thousands of runs on one machine or a cluster, and nothing lost.
+"""Carry out a study of thousands of runs on one machine or a cluster, and resume it after any interruption.
 
-Drives are designed first; then runs are spread over the workers in batches. Workers only compute. This process alone
-writes: rows to a store (`store`) that survives any end, drives as whole folders. When all are there, the results appear
-as one folder: `runs.parquet` (a row a run, with all that is needed to repeat it), `summary.json`, figure, report, the
-drives and the machines' files. A study that is given again goes on where it was.
+Drives are designed first, then the runs go to the workers in batches. Only this process writes: rows to a store
+(`row_store`) that survives a kill, drives as whole folders. When every run is stored, the results appear as one folder:
+`runs.parquet` (one row per run, with its command), `summary.json`, figure, report, the drives and the machine files.
 """
 
 from __future__ import annotations
@@ -21,78 +20,78 @@ from typing import Any
 import numpy as np
 
 from excite import logs, output
-from excite.errors import FolderError, RowStoreError, StudyError, WorkerError
+from excite.errors import FolderError, RowStoreError, WorkerError
 from excite.model import build_cached, effects
 from excite.model.machine import Machine, shipped_machines
-from excite.workflows import executors, requests, row_store, study_results, study_runs as cells
+from excite.workflows import executors, requests, row_store, study_results, study_runs
 from excite.workflows.executors import Pool
-from excite.workflows.row_store import Store
-from excite.workflows.study_plan import Cell, Drive, Plan
-from excite.workflows.study_runs import DEFECT, FAILED, Designed, Driven, Order, Work
+from excite.workflows.row_store import RowStore
+from excite.workflows.study_plan import Cell, DriveSpec, StudyPlan
+from excite.workflows.study_runs import DEFECT, FAILED, DesignJob, DesignOutcome, RunBatch, TorqueInput
 
-__all__ = ["EngineError", "StoreError", "StudyError", "place_of", "run_study"]
-
-BATCH = 0.5  # s of work in a batch: a store's transaction costs a hundredth of that
-LARGEST = 256  # runs in a batch
+BATCH_S = 0.5  # work in a batch [s]; chosen: a transaction of the store takes a hundredth of it
+MAX_BATCH_RUNS = 256  # chosen
 DRIVES = "drives"
-Progress = Callable[[int, int, str], None]
+Progress = Callable[[int, int, str], None]  # done, total, what is being done
 
 
 def run_study(
-    wanted: Plan,
+    plan: StudyPlan,
     out: Path,
     jobs: int | None = None,
     cluster: str | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Carries a study out, or on, and writes its folder; returns its summary.
+    """Carry out a study, or resume it, and write its folder; return its summary.
 
-    jobs: processes, all cores by default; cluster: address of a Dask scheduler instead. The same study gives the same
-    table, byte by byte, whatever they are. progress(done, total, what) is called as things are done.
+    jobs: processes, all cores by default. cluster: address of a Dask scheduler instead of processes. The table has the
+    same bytes for any of them. progress(done, total, what) is called as drives and runs are done.
 
-    Raises FolderError for a place that can't be used, EngineError and StoreError where workers or disk give up: what
-    is done is kept, and the same call goes on. KeyboardInterrupt likewise.
+    Raises FolderError for a folder that can't be used, WorkerError if the workers are lost, RowStoreError if the disk
+    fails. After these and KeyboardInterrupt the rows are kept, and the same call resumes.
     """
-    tell = progress or (lambda done, total, what: None)
-    finger = hashlib.sha256(f"{wanted.fingerprint} {cells.program()} {requests.versions()}".encode()).hexdigest()
-    place = place_of(out)
-    before = _finished(out, finger)
+    report = progress or (lambda done, total, what: None)
+    fingerprint = hashlib.sha256(
+        f"{plan.fingerprint} {study_runs.program_hash()} {requests.package_versions()}".encode()
+    ).hexdigest()
+    folder = working_folder(out)
+    before = _finished_summary(out, fingerprint)
     if before is not None:
-        shutil.rmtree(place, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
         return before
-    output.check_out_folder(out, _inputs(wanted))
+    output.check_out_folder(out, _inputs(plan))
     try:
-        (place / DRIVES).mkdir(parents=True, exist_ok=True)
-        with row_store.opened(place / "runs.sqlite", finger) as kept:
+        (folder / DRIVES).mkdir(parents=True, exist_ok=True)
+        with row_store.open_store(folder / "runs.sqlite", fingerprint) as store:
             output.remove_partial_folders(out)
-            _design(wanted, place / DRIVES, kept, cluster, tell)
-            _run(wanted, place / DRIVES, kept, jobs, cluster, tell)
-            tell(wanted.total, wanted.total, "writing")
+            _design_drives(plan, folder / DRIVES, store, cluster, report)
+            _compute_runs(plan, folder / DRIVES, store, jobs, cluster, report)
+            report(plan.total, plan.total, "writing")
             with output.new_folder(out) as partial:
-                summary = _write(wanted, place / DRIVES, kept, partial, finger)
+                summary = _write_folder(plan, folder / DRIVES, store, partial, fingerprint)
     except OSError as err:
         if err.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG):
             raise
         raise RowStoreError(
-            f"{err.filename or out}: can't be written: {err.strerror}; what was kept is safe, mend that and repeat the"
+            f"{err.filename or out}: can't be written: {err.strerror}; the rows so far are safe, correct this and repeat the"
             " command"
         ) from None
-    shutil.rmtree(place, ignore_errors=True)
+    shutil.rmtree(folder, ignore_errors=True)
     return summary
 
 
-def place_of(out: Path) -> Path:
-    """The hidden folder beside `out` in which a study is kept while it is under way."""
+def working_folder(out: Path) -> Path:
+    """Return the hidden folder beside `out` that holds a study until it is complete."""
     return out.absolute().parent / f".{out.name}.study"
 
 
-def _inputs(wanted: Plan) -> list[Path]:
-    own = [wanted.base / n for n in wanted.machines if n not in shipped_machines()]
-    return own + [wanted.base / d.profile for d in wanted.drives if d.profile is not None]
+def _inputs(plan: StudyPlan) -> list[Path]:
+    own = [plan.base / n for n in plan.machines if n not in shipped_machines()]
+    return own + [plan.base / d.profile for d in plan.drives if d.profile is not None]
 
 
-def _finished(out: Path, finger: str) -> dict[str, Any] | None:
-    """The summary of a folder that holds this study whole. Raises FolderError where it holds another one."""
+def _finished_summary(out: Path, fingerprint: str) -> dict[str, Any] | None:
+    """Return the summary of a folder that holds this study complete. Raises FolderError for another study's folder."""
     path = out / output.SUMMARY
     if not path.is_file():
         return None
@@ -102,7 +101,7 @@ def _finished(out: Path, finger: str) -> dict[str, Any] | None:
         return None
     if not isinstance(found, dict) or "fingerprint" not in found:
         return None
-    if found["fingerprint"] != finger:
+    if found["fingerprint"] != fingerprint:
         raise FolderError(f"{out}: holds another study, or one of another version; choose another --out or delete it")
     return dict(found)
 
@@ -110,164 +109,170 @@ def _finished(out: Path, finger: str) -> dict[str, Any] | None:
 # ------------------------------------------------------------------------------------------------ drives
 
 
-def _name(number: int) -> str:
+def _drive_name(number: int) -> str:
     return f"{number + 1:04d}"
 
 
-def _design(wanted: Plan, place: Path, kept: Store, cluster: str | None, tell: Progress) -> None:
-    """Makes the drives that aren't there yet, each a whole folder."""
-    known = kept.failures()
-    missing = [k for k in range(len(wanted.drives)) if k not in known and not (place / _name(k)).is_dir()]
-    done = len(wanted.drives) - len(missing)
-    orders = []
+def _design_drives(plan: StudyPlan, folder: Path, store: RowStore, cluster: str | None, progress: Progress) -> None:
+    """Make the missing drives, each as a whole folder."""
+    known = store.failures()
+    missing = [k for k in range(len(plan.drives)) if k not in known and not (folder / _drive_name(k)).is_dir()]
+    done = len(plan.drives) - len(missing)
+    job_list = []
     for k in missing:
-        drive = wanted.drives[k]
+        drive = plan.drives[k]
         if drive.profile is not None:
-            with output.new_folder(place / _name(k)) as partial:
-                (partial / "profile.csv").write_bytes((wanted.base / drive.profile).read_bytes())
+            with output.new_folder(folder / _drive_name(k)) as partial:
+                (partial / "profile.csv").write_bytes((plan.base / drive.profile).read_bytes())
             done += 1
         else:
-            orders.append(_order(wanted, k, drive))
-    if not orders:
+            job_list.append(_design_job(plan, k, drive))
+    if not job_list:
         return
-    tell(done, len(wanted.drives), "designing")
-    for order, made in _made(orders, cluster):
+    progress(done, len(plan.drives), "designing")
+    for job, made in _run_design_jobs(job_list, cluster):
         if made.failure is not None:
-            kept.fail(order.number, made.failure)
+            store.add_failure(job.number, made.failure)
         else:
-            with output.new_folder(place / _name(order.number)) as partial:
+            with output.new_folder(folder / _drive_name(job.number)) as partial:
                 (partial / "profile.csv").write_text(made.profile, encoding="utf-8")
-                (partial / "machine.json").write_text(order.machine + "\n", encoding="utf-8")
-                output.write_summary(partial, made.summary | {"versions": requests.versions()})
+                (partial / "machine.json").write_text(job.machine + "\n", encoding="utf-8")
+                output.write_summary(partial, made.summary | {"versions": requests.package_versions()})
         done += 1
-        tell(done, len(wanted.drives), "designing")
+        progress(done, len(plan.drives), "designing")
 
 
-def _order(wanted: Plan, number: int, drive: Drive) -> Order:
-    machine = wanted.designed(drive)
+def _design_job(plan: StudyPlan, number: int, drive: DriveSpec) -> DesignJob:
+    machine = plan.design_machine(drive)
     name, problem = requests.choose_problem(machine, drive.problem, drive.duration_s)
     text = machine.model_dump_json(indent=1)
-    return Order(number, text, name, problem, drive.objective, drive.starts, drive.seed)
+    return DesignJob(number, text, name, problem, drive.objective, drive.starts, drive.seed)
 
 
-def _made(orders: list[Order], cluster: str | None) -> Iterator[tuple[Order, Designed]]:
-    """On this machine one after the other, as a design itself takes every core; on a cluster side by side."""
+def _run_design_jobs(job_list: list[DesignJob], cluster: str | None) -> Iterator[tuple[DesignJob, DesignOutcome]]:
+    """Design drives: here one after the other, as a design takes every core; on a cluster in parallel."""
     if cluster is None:
-        for order in orders:
-            yield order, cells.designed(order)
+        for job in job_list:
+            yield job, study_runs.design_drive(job)
         return
-    with executors.pool(cluster=cluster) as workers:
-        for result in executors.spread(cells.designed, orders, workers):
-            yield result.piece, result.value or Designed("", {}, f"{DEFECT}: the search killed its worker")
+    with executors.open_pool(cluster=cluster) as workers:
+        for result in executors.run_pieces(study_runs.design_drive, job_list, workers):
+            yield result.piece, result.value or DesignOutcome("", {}, f"{DEFECT}: the search killed its worker")
 
 
 @dataclass(frozen=True)
-class Track:
-    """A drive that is there: what is driven, for how long [s], and the design's summary (empty for a profile)."""
+class StoredDrive:
+    """A drive on disk: torques, duration [s], and the design's summary (empty for a profile)."""
 
-    driven: Driven
+    torque: TorqueInput
     duration_s: float
     summary: dict[str, Any]
 
 
-def _track(wanted: Plan, place: Path, number: int) -> Track:
-    drive = wanted.drives[number]
-    model = build_cached(wanted.machines[drive.machine].model_dump_json())
-    torque, q0, nu0 = logs.read_profile(place / _name(number) / "profile.csv", model)
-    driven = Driven(np.ascontiguousarray(torque, float).tobytes(), torque.shape[1], tuple(q0), tuple(nu0))
-    path = place / _name(number) / output.SUMMARY
+def _stored_drive(plan: StudyPlan, folder: Path, number: int) -> StoredDrive:
+    drive = plan.drives[number]
+    model = build_cached(plan.machines[drive.machine].model_dump_json())
+    torque, q0, nu0 = logs.read_profile(folder / _drive_name(number) / "profile.csv", model)
+    stored = TorqueInput(np.ascontiguousarray(torque, float).tobytes(), torque.shape[1], tuple(q0), tuple(nu0))
+    path = folder / _drive_name(number) / output.SUMMARY
     summary = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    return Track(driven, (len(torque) - 1) / float(model.machine.sampling_hz), summary)
+    return StoredDrive(stored, (len(torque) - 1) / float(model.machine.sampling_hz), summary)
 
 
 # ------------------------------------------------------------------------------------------------ runs
 
 
 @dataclass
-class _Pace:
-    """How many runs make a batch: from how long they take."""
+class _BatchSize:
+    """Number of runs in a batch, from the time that runs take."""
 
     size: int = 1
 
     def learn(self, runs: int, seconds: float) -> None:
         if seconds > 0:
-            self.size = int(min(LARGEST, max(1, BATCH * runs / seconds)))
+            self.size = int(min(MAX_BATCH_RUNS, max(1, BATCH_S * runs / seconds)))
 
 
-def _run(wanted: Plan, place: Path, kept: Store, jobs: int | None, cluster: str | None, tell: Progress) -> None:
-    """Computes the runs that aren't kept yet."""
-    there = kept.numbers()
-    done, total = len(there), wanted.total
-    tell(done, total, "running")
+def _compute_runs(
+    plan: StudyPlan, folder: Path, store: RowStore, jobs: int | None, cluster: str | None, progress: Progress
+) -> None:
+    """Compute and store the missing runs."""
+    there = store.numbers()
+    done, total = len(there), plan.total
+    progress(done, total, "running")
     if done == total:
         return
-    pace = _Pace()
-    with executors.pool(jobs, cluster) as workers:
-        for result in executors.spread(cells.carry, _works(wanted, place, kept, there, pace), workers, _split):
-            rows = _rows(result.piece, result.value, workers)
-            kept.keep(rows, result.seconds)
-            pace.learn(len(rows), result.seconds)
+    batch_size = _BatchSize()
+    with executors.open_pool(jobs, cluster) as workers:
+        for result in executors.run_pieces(
+            study_runs.run_batch, _batches(plan, folder, store, there, batch_size), workers, _split_batch
+        ):
+            rows = _batch_rows(result.piece, result.value, workers)
+            store.add_rows(rows, result.seconds)
+            batch_size.learn(len(rows), result.seconds)
             done += len(rows)
-            tell(done, total, "running")
-    # those without a drive
-    for number, reason in kept.failures().items():
-        for c, cell in enumerate(wanted.cells):
-            if wanted.number[cell.drive] == number:
-                numbers = range(c * wanted.study.runs, (c + 1) * wanted.study.runs)
+            progress(done, total, "running")
+    # runs whose drive failed
+    for number, reason in store.failures().items():
+        for c, cell in enumerate(plan.cells):
+            if plan.number[cell.drive] == number:
+                numbers = range(c * plan.study.runs, (c + 1) * plan.study.runs)
                 status = DEFECT if reason.startswith(DEFECT) else FAILED
-                kept.keep((n, {"status": status, "reason": f"no drive: {reason}"}) for n in numbers if n not in there)
-    tell(total, total, "running")
+                store.add_rows(
+                    (n, {"status": status, "reason": f"no drive: {reason}"}) for n in numbers if n not in there
+                )
+    progress(total, total, "running")
 
 
-def _rows(work: Work, value: tuple[str, list[tuple[int, cells.Row]]] | None, workers: Pool) -> list[Any]:
+def _batch_rows(batch: RunBatch, value: tuple[str, list[tuple[int, study_runs.Row]]] | None, workers: Pool) -> list[Any]:
     if value is None:
-        return [(n, {"status": DEFECT, "reason": "killed the worker that computed it"}) for n, _ in work.runs]
+        return [(n, {"status": DEFECT, "reason": "killed the worker that computed it"}) for n, _ in batch.runs]
     program, rows = value
-    if workers.foreign and program != cells.program():
+    if workers.foreign and program != study_runs.program_hash():
         raise WorkerError("a worker of the cluster has another version of the program: install the same everywhere")
     return rows
 
 
-def _split(work: Work) -> list[Work]:
-    return [replace(work, runs=(one,)) for one in work.runs]
+def _split_batch(batch: RunBatch) -> list[RunBatch]:
+    return [replace(batch, runs=(one,)) for one in batch.runs]
 
 
-def _works(wanted: Plan, place: Path, kept: Store, there: set[int], pace: _Pace) -> Iterator[Work]:
-    """The runs that are missing, as batches of one cell each, made as they are asked for."""
-    failed, runs = kept.failures(), wanted.study.runs
-    track = lru_cache(maxsize=4)(lambda k: _track(wanted, place, k))
-    for c, cell in enumerate(wanted.cells):
-        number = wanted.number[cell.drive]
+def _batches(plan: StudyPlan, folder: Path, store: RowStore, there: set[int], batch_size: _BatchSize) -> Iterator[RunBatch]:
+    """Yield the missing runs in batches of one cell each."""
+    failed, runs = store.failures(), plan.study.runs
+    stored = lru_cache(maxsize=4)(lambda k: _stored_drive(plan, folder, k))
+    for c, cell in enumerate(plan.cells):
+        number = plan.number[cell.drive]
         missing = [r for r in range(runs) if c * runs + r not in there]
         if number in failed or not missing:
             continue
-        whole, seeds = _work(wanted, cell, track(number)), wanted.seeds(cell)
+        whole, seeds = _cell_batch(plan, cell, stored(number)), plan.seeds(cell)
         while missing:
-            now, missing = missing[: pace.size], missing[pace.size :]
+            now, missing = missing[: batch_size.size], missing[batch_size.size :]
             yield replace(whole, runs=tuple((c * runs + r, int(seeds[r])) for r in now))
 
 
-def _work(wanted: Plan, cell: Cell, track: Track) -> Work:
-    machine = wanted.machines[cell.drive.machine]
+def _cell_batch(plan: StudyPlan, cell: Cell, drive: StoredDrive) -> RunBatch:
+    machine = plan.machines[cell.drive.machine]
     true: Machine = machine
     if cell.effects:
-        entries = [effects.parse_effect(text, machine, track.duration_s) for text in cell.effects]
+        entries = [effects.parse_effect(text, machine, drive.duration_s) for text in cell.effects]
         true = effects.with_effects(machine, *entries)
     known = machine.model_dump_json()
-    return Work(known, true.model_dump_json(), track.driven, wanted.study.steps, cell.kit, wanted.method(cell), ())
+    return RunBatch(known, true.model_dump_json(), drive.torque, plan.study.steps, cell.kit, plan.method(cell), ())
 
 
 # ------------------------------------------------------------------------------------------------ results
 
 
-def _write(wanted: Plan, drives: Path, kept: Store, partial: Path, finger: str) -> dict[str, Any]:
-    """The folder of a study that is complete; returns its summary."""
-    counted = len(kept.numbers())
-    if counted != wanted.total:
-        raise RuntimeError(f"{counted} of {wanted.total} runs are there: a defect of the program")
+def _write_folder(plan: StudyPlan, drives: Path, store: RowStore, partial: Path, fingerprint: str) -> dict[str, Any]:
+    """Write the folder of a complete study; return its summary."""
+    counted = len(store.numbers())
+    if counted != plan.total:
+        raise RuntimeError(f"{counted} of {plan.total} runs are there: a defect of the program")
     shutil.copytree(drives, partial / DRIVES, ignore=shutil.ignore_patterns(".*"))
     own: dict[str, str] = {}
-    for name, texts in wanted.texts.items():
+    for name, texts in plan.texts.items():
         own[name] = name
         if texts:
             sha = hashlib.sha256("".join(texts.values()).encode()).hexdigest()[:8]
@@ -275,24 +280,24 @@ def _write(wanted: Plan, drives: Path, kept: Store, partial: Path, finger: str) 
             for file, text in texts.items():
                 (partial / "machines" / sha / file).write_text(text, encoding="utf-8")
             own[name] = f"machines/{sha}/{next(iter(texts))}"
-    tracks = lru_cache(maxsize=8)(lambda k: _track(wanted, drives, k))
-    failed = kept.failures()
+    stored = lru_cache(maxsize=8)(lambda k: _stored_drive(plan, drives, k))
+    failed = store.failures()
     seen = study_results.write_table(
-        wanted, kept.rows(), lambda k: None if k in failed else tracks(k), own, requests.versions(), partial
+        plan, store.rows(), lambda k: None if k in failed else stored(k), own, requests.package_versions(), partial
     )
-    (partial / "study.json").write_text(wanted.study.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    (partial / "study.json").write_text(plan.study.model_dump_json(indent=1) + "\n", encoding="utf-8")
     summary = {
-        "study": wanted.study.name,
-        "title": wanted.study.title,
-        "steps": list(wanted.study.steps),
-        "runs": wanted.total,
-        **study_results.summary(seen),
-        "failed_drives": {_name(k): reason for k, reason in failed.items()},
-        "compute_s": kept.seconds,
-        "fingerprint": finger,
-        "program": cells.program(),
-        "versions": requests.versions(),
+        "study": plan.study.name,
+        "title": plan.study.title,
+        "steps": list(plan.study.steps),
+        "runs": plan.total,
+        **study_results.summarise_cells(seen),
+        "failed_drives": {_drive_name(k): reason for k, reason in failed.items()},
+        "compute_s": store.seconds,
+        "fingerprint": fingerprint,
+        "program": study_runs.program_hash(),
+        "versions": requests.package_versions(),
     }
-    study_results.draw(wanted, seen, summary, partial)
+    study_results.draw(plan, seen, summary, partial)
     output.write_summary(partial, summary)
     return summary

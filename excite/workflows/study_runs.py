@@ -1,4 +1,4 @@
-"""What one run of a study does: a drive in simulation, its log, what is found in the log. Pure, for any worker."""
+"""One run of a study: simulate a drive, measure a log, identify or diagnose from it. Pure functions for any worker."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from excite.model import Model, build, build_cached
 from excite.model.machine import Machine, Problem
 from excite.simulation import Motion, simulate
 from excite.workflows import design_request
-from excite.workflows.design_request import Brief
+from excite.workflows.design_request import DesignRequest
 
 DONE, FAILED, DEFECT = STATUSES = ("done", "failed", "defect")
 Row = dict[str, Any]
-ESTIMATES = ("value", "std", "low95", "high95")  # told of every parameter
-_ALONE = threading.Lock()  # CasADi's functions are not made for the threads of a cluster's worker
+ESTIMATE_COLUMNS = ("value", "std", "low95", "high95")  # of every parameter
+_CASADI_LOCK = threading.Lock()  # CasADi's functions are not safe in the threads of a cluster's worker
 
 
 @dataclass(frozen=True)
-class Driven:
-    """Torques (N, n_u) [N m] as bytes of float64, and the state q0, nu0 (n_q,) that they start from."""
+class TorqueInput:
+    """Torques (N, n_u) [N m] as bytes of float64, and the state q0, nu0 (n_q,) at their start."""
 
     torque: bytes
     inputs: int
@@ -39,13 +39,17 @@ class Driven:
 
 
 @dataclass(frozen=True)
-class Work:
-    """Some runs of one cell. known: the machine that identification knows; true: the one that drives, with its effects
-    (both as JSON); runs: number and seed of each."""
+class RunBatch:
+    """Some runs of one cell.
+
+    known: the machine that identification knows (JSON).
+    true: the machine that is simulated, with its effects (JSON).
+    runs: number and seed of each run.
+    """
 
     known: str
     true: str
-    driven: Driven
+    drive: TorqueInput
     steps: tuple[str, ...]
     kit: str
     method: str
@@ -53,87 +57,86 @@ class Work:
 
 
 @lru_cache(maxsize=4)
-def _motion(machine: str, driven: Driven) -> Motion:
-    torque = np.frombuffer(driven.torque).reshape(-1, driven.inputs)
-    return simulate(build_cached(machine), torque, q0=np.array(driven.q0), nu0=np.array(driven.nu0))
+def _motion(machine: str, drive: TorqueInput) -> Motion:
+    torque = np.frombuffer(drive.torque).reshape(-1, drive.inputs)
+    return simulate(build_cached(machine), torque, q0=np.array(drive.q0), nu0=np.array(drive.nu0))
 
 
-def carry(work: Work) -> tuple[str, list[tuple[int, Row]]]:
-    """The runs of a piece of work, in order: this worker's `program`; number and row of each (see `run`)."""
-    with _ALONE:
-        return program(), [(number, run(work, seed)) for number, seed in work.runs]
+def run_batch(batch: RunBatch) -> tuple[str, list[tuple[int, Row]]]:
+    """Compute a batch in order; return this worker's `program_hash`, and number and row of each run."""
+    with _CASADI_LOCK:
+        return program_hash(), [(number, run_once(batch, seed)) for number, seed in batch.runs]
 
 
-def run(work: Work, seed: int) -> Row:
-    """One run: status, reason where it failed, and what its steps found.
+def run_once(batch: RunBatch, seed: int) -> Row:
+    """Compute one run; return its status, the reason if it failed, and the results of its steps.
 
-    A failure of the method (no estimate, no motion, a log or a machine that can't be used) is `failed`; any other error
-    is a defect of the program, which is told as such and doesn't end the study. Raises KeyboardInterrupt for one that
-    came meanwhile, in whatever guise.
+    Status `failed`: no estimate, no motion, or a log or machine that can't be used. Status `defect`: any other error,
+    which does not end the study. Raises KeyboardInterrupt on Ctrl-C.
     """
-    return interrupt.call_interruptible(_judged, work, seed)
+    return interrupt.call_interruptible(_run_with_status, batch, seed)
 
 
-def _judged(work: Work, seed: int) -> Row:
+def _run_with_status(batch: RunBatch, seed: int) -> Row:
     try:
-        return {"status": DONE} | _run(work, seed)
+        return {"status": DONE} | _run_steps(batch, seed)
     except (NoEstimateError, SimulationError, LogError, MachineError) as err:
-        return {"status": FAILED, "reason": _said(err)}
+        return {"status": FAILED, "reason": _one_line(err)}
     except Exception as err:
-        return {"status": DEFECT, "reason": f"{type(err).__name__}: {_said(err)}"}
+        return {"status": DEFECT, "reason": f"{type(err).__name__}: {_one_line(err)}"}
 
 
-def _said(err: Exception) -> str:
+def _one_line(err: Exception) -> str:
     return " ".join(str(err).split())[:500]
 
 
-def _run(work: Work, seed: int) -> Row:
-    known, steps = build_cached(work.known), set(work.steps)
+def _run_steps(batch: RunBatch, seed: int) -> Row:
+    known, steps = build_cached(batch.known), set(batch.steps)
     row: Row = {}
     if not steps & {"simulate", "identify", "verify", "diagnose"}:
         return row
-    table = simulation.measure(build_cached(work.true), _motion(work.true, work.driven), kit=work.kit, seed=seed)
+    table = simulation.measure(build_cached(batch.true), _motion(batch.true, batch.drive), kit=batch.kit, seed=seed)
     row["log_sha256"] = hashlib.sha256(table.to_numpy(float).tobytes()).hexdigest()[:16]
     if steps & {"identify", "verify"}:
-        measured = from_table(table, known.machine, identification.needed_sensors(known, work.method))
-        estimate = identification.identify(known, [measured], work.method)
-        told = (estimate.value, estimate.std, *estimate.interval95)
-        row |= {name: _plain(numbers.tolist()) for name, numbers in zip(ESTIMATES, told, strict=True)}
-        row["relative_error_percent"] = _plain(estimate.relative_error_percent)
+        measured = from_table(table, known.machine, identification.needed_sensors(known, batch.method))
+        estimate = identification.identify(known, [measured], batch.method)
+        arrays = (estimate.value, estimate.std, *estimate.interval95)
+        row |= {name: _json_value(array.tolist()) for name, array in zip(ESTIMATE_COLUMNS, arrays, strict=True)}
+        row["relative_error_percent"] = _json_value(estimate.relative_error_percent)
     if "diagnose" in steps:
         needs = identification.needed_sensors(known, "joint")
-        row |= _diagnosed(known, [from_table(table, known.machine, needs)])
+        row |= _diagnose(known, [from_table(table, known.machine, needs)])
     return row
 
 
-def _diagnosed(model: Model, logs: Sequence[Log]) -> Row:
-    """The keys of `excite diagnose` that go into a table."""
+def _diagnose(model: Model, logs: Sequence[Log]) -> Row:
+    """Diagnose logs; return the keys of the summary that go into the table of runs."""
     from excite import diagnosis
     from excite.diagnosis import diagnose
 
-    mended = [examine(model, one).log for one in logs]
-    said = diagnosis.summarise(diagnosis.account(diagnose(model, mended, model.machine.filter)))
-    told = ("effect", "where", "tied_with", "p_value", "amount", "amount_std", "unit", "gain_percent", "gain_ci95")
+    repaired = [examine(model, one).log for one in logs]
+    summary = diagnosis.summarise(diagnosis.account(diagnose(model, repaired, model.machine.filter)))
+    keys = ("effect", "where", "tied_with", "p_value", "amount", "amount_std", "unit", "gain_percent", "gain_ci95")
     return {
-        "verdict": said["verdict"],
-        "findings": [{k: _plain(one.get(k)) for k in told} for one in said["findings"]],
-        "error_before_percent": _plain(said["error_before_percent"]),
-        "error_after_percent": _plain(said["error_after_percent"]),
+        "verdict": summary["verdict"],
+        "findings": [{k: _json_value(one.get(k)) for k in keys} for one in summary["findings"]],
+        "error_before_percent": _json_value(summary["error_before_percent"]),
+        "error_after_percent": _json_value(summary["error_after_percent"]),
     }
 
 
-def _plain(value: Any) -> Any:
-    """As JSON has it: a number that is not finite is none at all."""
+def _json_value(value: Any) -> Any:
+    """Return a value for JSON; a number that is not finite becomes None."""
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [_json_value(v) for v in value]
     if isinstance(value, float | np.floating):
         return float(value) if math.isfinite(value) else None
     return value
 
 
 @dataclass(frozen=True)
-class Order:
-    """A design that is wanted: of drive `number`, for a machine (JSON) and its problem."""
+class DesignJob:
+    """A design to be computed: drive `number`, for a machine (JSON) and its problem `name`."""
 
     number: int
     machine: str
@@ -145,46 +148,46 @@ class Order:
 
 
 @dataclass(frozen=True)
-class Designed:
-    """What came of it: the profile (CSV) and the summary, or why there is none."""
+class DesignOutcome:
+    """Profile (CSV) and summary of a design, or the reason of its failure."""
 
     profile: str
     summary: dict[str, Any]
     failure: str | None = None
 
 
-def designed(order: Order) -> Designed:
-    """A study's drive. Raises KeyboardInterrupt where it was cut short."""
-    return interrupt.call_interruptible(_designed, order)
+def design_drive(job: DesignJob) -> DesignOutcome:
+    """Design a drive of a study. Raises KeyboardInterrupt if the search was cut short."""
+    return interrupt.call_interruptible(_design_drive, job)
 
 
-def _designed(order: Order) -> Designed:
-    asked = Brief(order.objective, starts=order.starts, seed=order.seed)
+def _design_drive(job: DesignJob) -> DesignOutcome:
+    request = DesignRequest(job.objective, starts=job.starts, seed=job.seed)
     try:
         model = build(
-            Machine.model_validate_json(order.machine), fit_sensor_effects=False
+            Machine.model_validate_json(job.machine), fit_sensor_effects=False
         )  # no drive shows what sits in a sensor
-        answer = design_request.answer(model, order.problem, asked)
+        result = design_request.design_from(model, job.problem, request)
     except (InfeasibleError, SimulationError, NoEstimateError, MachineError) as err:
-        return Designed("", {}, _said(err))
+        return DesignOutcome("", {}, _one_line(err))
     except np.linalg.LinAlgError:
-        return Designed("", {}, design_request.unmoved(order.name))
+        return DesignOutcome("", {}, design_request.singular_message(job.name))
     except Exception as err:
-        return Designed("", {}, f"{DEFECT}: {type(err).__name__}: {_said(err)}")
-    if not answer.design.complete:
+        return DesignOutcome("", {}, f"{DEFECT}: {type(err).__name__}: {_one_line(err)}")
+    if not result.design.complete:
         raise KeyboardInterrupt
     summary = {
         "machine": model.machine.name,
-        "problem": order.name,
-        "duration_s": float(order.problem.duration_s),
-        **design_request.summary(asked, answer),
+        "problem": job.name,
+        "duration_s": float(job.problem.duration_s),
+        **design_request.summarise_result(request, result),
     }
-    return Designed(profile_of(answer.model, answer.design.motion).to_csv(index=False), summary)
+    return DesignOutcome(profile_of(result.model, result.design.motion).to_csv(index=False), summary)
 
 
 @lru_cache(maxsize=1)
-def program() -> str:
-    """Sixteen digits that change when the program does: rows of two programs are not put into one table."""
+def program_hash() -> str:
+    """Return 16 digits that change with the program's files: one table never mixes rows of two programs."""
     seen = hashlib.sha256()
     package = Path(__file__).parents[1]
     for part in (package, package / "model"):  # the second is a link in a checkout, which rglob doesn't follow

@@ -1,4 +1,4 @@
-"""`excite verify`: simulate a designed drive and identify from it, many times."""
+"""`excite verify`: from a design to the errors of identification over many simulated runs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from excite import identification, reports, simulation, trajectories
 from excite.errors import NotIdentifiableError, UsageError
 from excite.model import parameter_descriptions
 from excite.workflows import requests
-from excite.workflows.progress import Bar, silent
+from excite.workflows.progress import Bar, no_bar
 
 
 def verify(
@@ -19,16 +19,20 @@ def verify(
     method: str | None,
     kit: str,
     seed: int,
-    name: Path | None = None,
-    bar: Bar = silent,
+    shown_as: Path | None = None,
+    bar: Bar = no_bar,
 ) -> dict[str, Any]:
-    """How true and how sure parameters from a design are. name: what the design's folder will be called."""
+    """Simulate a design with sensor noise and identify from it, `runs` times, into a folder; return the summary.
+
+    method: None for the recommended one. kit: a name of `KITS`. shown_as: the design's folder as the summary gives it.
+    Raises UsageError, DesignFolderError, NotIdentifiableError if every run fails.
+    """
     requests.require_known("--kit", kit, simulation.KITS)
     made = trajectories.read_design(design_dir)
     if made.summary.get("after"):
         raise UsageError(
-            f"{design_dir}: was designed for the machine that {', '.join(made.summary['after'])} told of, not for the"
-            " machine file's; verify a design made without --after"
+            f"{design_dir}: was designed for the machine as identified from {', '.join(made.summary['after'])}, not as"
+            " in the machine file; verify a design made without --after"
         )
     model, motion = made.model, made.motion
     method = requests.choose_method(method, model, kit)
@@ -42,7 +46,7 @@ def verify(
     summary = {
         "machine": model.machine.name,
         "problem": made.summary.get("problem"),
-        "design": str(name or design_dir),
+        "design": str(shown_as or design_dir),
         "runs": runs,
         "method": method,
         "kit": kit,
@@ -51,8 +55,8 @@ def verify(
         "failures": result.failures,
         "parameters": parameters,
         "meanings": parameter_descriptions(model),
-        "biased": identification.biased(parameters),
-        "versions": requests.versions(),
+        "biased": identification.biased_parameters(parameters),
+        "versions": requests.package_versions(),
     }
     title = f"{model.machine.title}: {runs} simulated runs, {method}, kit {kit}"
     reports.save(reports.verify_figure(result, title), place / "verify.png")

@@ -141,7 +141,7 @@ def quiet(model: Model) -> Model:
 
 
 def verified(model: Model, motion: Motion, runs: int) -> dict[str, Any]:
-    method = methods.recommended(model)
+    method = methods.recommend_method(model)
     found = verify(model, motion, method, "full", runs, seed=0, jobs=1)
     return {
         "method": method,

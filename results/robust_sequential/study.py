@@ -148,7 +148,7 @@ def second(
     nominal: Model, true: Model, first: Motion, start: Manoeuvre, objective: str, number: int
 ) -> tuple[Model, Manoeuvre]:
     """The machine as the first log tells it, and the drive for what that leaves."""
-    known = prior.known_before(nominal, [measured(nominal, true, first, 1000 + number)])
+    known = prior.prior_from_logs(nominal, [measured(nominal, true, first, 1000 + number)])
     aim = aims.aim(known.model, objective, prior=known.information)
     turned = Manoeuvre(start.times, start.torque * [1, -1, 1])
     found = design(known.model, short(nominal), aim, starts=0, warm=[start, turned])
@@ -162,7 +162,7 @@ def measured(nominal: Model, true: Model, motion: Motion, seed: int) -> log.Log:
 
 def told(true: Model, motions: Sequence[Motion]) -> dict[str, object]:
     """Condition number of both drives together, Cramer-Rao bound, and the limit most exceeded, of the true machine."""
-    W = np.concatenate([true.stacked(m.q.T, m.nu.T, m.a.T).reshape(-1, len(true.scale)) for m in motions])
+    W = np.concatenate([true.stacked_regressor(m.q.T, m.nu.T, m.a.T).reshape(-1, len(true.scale)) for m in motions])
     by = np.outer(true.scale, true.scale)
     information = sum(np.linalg.inv(cramer_rao(true, m) / by) for m in motions)
     spread = objective.percent(true, np.linalg.inv(information) * by)

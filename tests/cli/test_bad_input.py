@@ -30,10 +30,18 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
-from conftest import Excite
 from hypothesis import given, settings, strategies as st
+from support.commands import Excite
 
-from excite.errors import InfeasibleError, LogError, MachineError, NoEstimate, SimulationError, StoredError, StudyError
+from excite.errors import (
+    DesignFolderError,
+    InfeasibleError,
+    LogError,
+    MachineError,
+    NoEstimateError,
+    SimulationError,
+    StudyError,
+)
 from excite.identification import methods
 from excite.logs import inspection, log, profile as profiles, tables
 from excite.model import Model, prediction
@@ -324,7 +332,7 @@ def test_logs(ground: dict[str, Any], straight: Model, tmp_path: Path, count: in
 def estimated(model: Model, read: log.Log) -> str:
     try:
         found = methods.identify(model, [read], "ols")
-    except (NoEstimate, LogError) as err:
+    except (NoEstimateError, LogError) as err:
         one_line(err)
         return "no estimate"
     known = [n not in dict(found.unidentifiable) for n in found.names]
@@ -438,7 +446,7 @@ def test_design_folders(ground: dict[str, Any], tmp_path: Path, count: int, seed
                 found = saved_design.read_design(tmp_path)
                 assert np.isfinite(found.motion.q).all()
                 told["read"] += 1
-            except (StoredError, LogError, SimulationError, MachineError) as err:
+            except (DesignFolderError, LogError, SimulationError, MachineError) as err:
                 one_line(err)
                 told["refused"] += 1
     show("design folders", told, count, seed, faults)
@@ -552,10 +560,10 @@ def test_command_lines(
     def cut(*_: Any, **__: Any) -> Any:
         raise InfeasibleError("cut out", "none", 1.0)
 
-    monkeypatch.setattr(design_request, "answer", cut)
+    monkeypatch.setattr(design_request, "design_from", cut)
     monkeypatch.setattr(baselines, "compare", cut)
     monkeypatch.setattr(study_runner, "run_study", cut)
-    monkeypatch.setattr(diagnose_workflow, "diagnose_logs", cut)
+    monkeypatch.setattr(diagnose_workflow, "diagnose", cut)
     monkeypatch.setattr(monte_carlo, "verify", cut)
     monkeypatch.setattr(driving_aids, "serve", cut)
     monkeypatch.setattr(driving_aids, "prepare", cut)
@@ -697,7 +705,7 @@ def test_titles_and_paths_are_text_in_figures_and_reports(
 @given(st.text(max_size=60))
 def test_any_text_is_an_effect_or_is_refused(text: str) -> None:
     try:
-        entry = placing.parse(text, VA12, 60.0)
+        entry = placing.parse_effect(text, VA12, 60.0)
     except MachineError as err:
         one_line(err)
     else:

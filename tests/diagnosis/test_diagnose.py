@@ -12,8 +12,10 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import Excite, calm, designed, gentle, logged, slope
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from support.commands import Excite
+from support.drives import designed, gentle
+from support.logs import calm, logged, make_log, slope
 
 from excite import smoothing
 from excite.diagnosis import (
@@ -54,7 +56,7 @@ def test_a_log_too_short_to_hide_stretches_has_no_gain(
 
 def test_short_logs_are_hidden_in_turn(straight: Model, straight_motion: Motion) -> None:
     """Forty seconds in six stretches and then in those beside them, so that noise is a small part of a gain."""
-    one = log.from_table(sensors.measure(straight, straight_motion, seed=3), straight.machine)
+    one = make_log(straight, straight_motion, seed=3)
     found = hold_out.withheld(fits.fitted(straight.machine, [one], straight.machine.filter))
     assert found is not None
     assert len(found.squares) >= 3 * 6 - 1
@@ -123,7 +125,7 @@ def test_a_slope_from_log_to_extended_machine(
 
     extended = prediction.build(machine.load_machine(out / "machine.toml"))
     assert extended.effects[0].values["A"] == pytest.approx(0.01, rel=0.01)
-    again = simulate(prediction.build(placing.extended(straight.machine, slope(straight))), straight_motion.u)
+    again = simulate(prediction.build(placing.with_effects(straight.machine, slope(straight))), straight_motion.u)
     right, wrong = (simulate(m, straight_motion.u) for m in (extended, straight))
     assert np.abs(right.q - again.q).max() < 0.05 * np.abs(wrong.q - again.q).max()
 
@@ -148,12 +150,12 @@ def test_a_second_cause_with_which_exact_dynamics_follow_is_no_flaw_of_the_first
 ) -> None:
     """Forces hide how good a first cause's formula is, so that what gains a sixth of it may be its flaw; but not where
     exact dynamics follow the log with both."""
-    slope = placing.parse("ground_slope=0.002", straight.machine, 30.0)
-    both = prediction.build(placing.extended(straight.machine, slope))
+    slope = placing.parse_effect("ground_slope=0.002", straight.machine, 30.0)
+    both = prediction.build(placing.with_effects(straight.machine, slope))
     motion = simulate(both, gentle(straight, 30.0).u)
-    one = log.from_table(sensors.measure(both, motion, seed=3), straight.machine)
+    one = make_log(both, motion, seed=3, known=straight)
     stage = fits.forced(fits.fitted(straight.machine, [one], straight.machine.filter), in_turn)
-    assert stage.fit.disturbed > 0
+    assert stage.fit.process_noise > 0
     scores = selection.scored(stage, in_turn)
     first = selection.Choice("torque_gain@rear_roll", stage, 6 * scores[0].gain, 1.0, 200, (), 1.0)
     found = selection.choose(stage, scores, [first], in_turn, lambda share, what: None, 0.0)
@@ -203,7 +205,7 @@ def test_a_phase_that_was_found_the_other_way_round_is_turned(sloping: Path, str
     downhill = uphill.model_copy(
         update={"amount": Quantity(value=-0.008, source="assumed"), "shape": turned},
     )
-    stage = fits.fitted(placing.extended(straight.machine, downhill), [one], straight.machine.filter)
+    stage = fits.fitted(placing.with_effects(straight.machine, downhill), [one], straight.machine.filter)
     assert dict(zip(stage.model.base.names, stage.fit.X, strict=True))["ground_slope@machine"] < 0
     choice = selection.Choice("ground_slope@machine", stage, 1e4, 1.0, 200, (), 0.5)
     found = diagnosis._finding(choice, stage, 0.0, alone=True)
@@ -269,7 +271,7 @@ def test_a_drive_is_designed_for_what_is_tied(straight: Model, tmp_path: Path) -
     )
     machine = straight.machine.model_copy(update={"problems": {"S40": short}, "problem": "S40"})
     told = ("torque_deadband@rear_roll=80", "asymmetric_coulomb@rear_roll=60", "encoder_eccentricity@rear_roll=0.01")
-    deadband, coulomb, eccentric = (placing.parse(text, machine, 12.0) for text in told)
+    deadband, coulomb, eccentric = (placing.parse_effect(text, machine, 12.0) for text in told)
     pairs = [Rivals(machine, (deadband, eccentric)), Rivals(machine, (deadband, coulomb))]
     assert diagnose_workflow.separating_drive(tmp_path, machine, pairs[:1], True) is None
     nowhere = machine.model_copy(update={"problem": None})
@@ -288,7 +290,7 @@ def test_a_drive_is_designed_for_what_is_tied(straight: Model, tmp_path: Path) -
 
     # Driven with the one, the log prefers it to the other by what the design promises.
     torque, q0, nu0 = profile.read_profile(tmp_path / said["folder"] / "profile.csv", straight)
-    both = [prediction.build(placing.extended(machine, e)) for e in (deadband, coulomb)]
+    both = [prediction.build(placing.with_effects(machine, e)) for e in (deadband, coulomb)]
     motion = simulate(both[0], torque, q0=q0, nu0=nu0)
     one = log.from_table(sensors.measure(both[0], motion, seed=2), machine)
     right, wrong = (fits.fitted(m.machine, [one], machine.filter).fit for m in both)
@@ -354,8 +356,8 @@ def test_what_is_found_stands_beside_what_the_file_has(
 @pytest.mark.parametrize("seed", [1, 6, 10])
 def test_a_drive_that_hardly_shows_the_machine_still_shows_a_cause(seed: int, straight: Model) -> None:
     """Along S40 masses are known to a half: a fit goes where no motion is (6), or stops short of the cause (1, 10)."""
-    hidden = placing.parse("stribeck_friction@front_roll=150", straight.machine, 40.0)
-    truth = prediction.build(placing.extended(straight.machine, hidden))
+    hidden = placing.parse_effect("stribeck_friction@front_roll=150", straight.machine, 40.0)
+    truth = prediction.build(placing.with_effects(straight.machine, hidden))
     table = sensors.measure(truth, designed("S40", truth), seed=seed)
     (found,) = diagnosis.diagnose(straight, [log.from_table(table, straight.machine)], straight.machine.filter).findings
     assert found.name == "stribeck_friction@front_roll"
@@ -367,7 +369,7 @@ def test_a_stop_tells_by_which_law_its_rubber_hardens(va12: Model) -> None:
     """What it is at first touch is seen nowhere alone: by the wrong law it would come out twice as stiff."""
     shapes = {"stop": 0.25, "hardening": 1.0, "power": 1.0}
     hidden = selection.identified("articulation_stop_spring", "articulation", 10000.0, shapes)
-    truth = prediction.build(placing.extended(va12.machine, hidden))
+    truth = prediction.build(placing.with_effects(va12.machine, hidden))
     table = sensors.measure(truth, designed("R60_accuracy", truth), kit="full", seed=5)
     (found,) = diagnosis.diagnose(va12, [log.from_table(table, va12.machine)], va12.machine.filter).findings
     assert found.name == hidden.label
@@ -381,11 +383,12 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
     """Two at once; found the other way round they stay, and a wrong name that came before or between them goes. Side by
     side or in turn, the numbers are the same."""
     true = [
-        placing.parse(text, straight.machine, 40.0) for text in ("ground_slope=0.004", "torque_deadband@rear_roll=60")
+        placing.parse_effect(text, straight.machine, 40.0)
+        for text in ("ground_slope=0.004", "torque_deadband@rear_roll=60")
     ]
-    both = prediction.build(placing.extended(straight.machine, *true))
+    both = prediction.build(placing.with_effects(straight.machine, *true))
     motion = simulate(both, straight_motion.u)
-    one = log.from_table(sensors.measure(both, motion, seed=4), straight.machine)
+    one = make_log(both, motion, seed=4, known=straight)
     found, same = (diagnosis.diagnose(straight, [one], straight.machine.filter, together=t) for t in (forked, in_turn))
     assert found.findings == same.findings
     np.testing.assert_array_equal(found.after.fit.X, same.after.fit.X)
@@ -394,8 +397,8 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
     for f, e in zip(sorted(found.findings, key=lambda f: f.name), true, strict=True):
         assert abs(f.amount - float(e.amount)) < 4 * f.amount_std
 
-    wrong = placing.parse("asymmetric_coulomb@rear_roll=60", straight.machine, 40.0)
-    more = fits.refitted(placing.extended(found.after.machine, wrong), found.after, 0.0)
+    wrong = placing.parse_effect("asymmetric_coulomb@rear_roll=60", straight.machine, 40.0)
+    more = fits.refitted(placing.with_effects(found.after.machine, wrong), found.after, 0.0)
     name = wrong.label
     for order, stage in (
         (names[::-1], found.after),
@@ -417,8 +420,8 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
     assert [e.name for e in left[0].stage.machine.effect] == [names[0].split("@")[0]]
     assert [x.name for x in diagnosis.needed(found.before, left)] == names
     # Nor does one stay whose amount says that it is nothing, however sure that amount seems to be.
-    faint = placing.parse("shear_saturation@rear_roll=6", straight.machine, 40.0)
-    more = fits.refitted(placing.extended(found.after.machine, faint), found.after, 0.0)
+    faint = placing.parse_effect("shear_saturation@rear_roll=6", straight.machine, 40.0)
+    more = fits.refitted(placing.with_effects(found.after.machine, faint), found.after, 0.0)
     name = faint.label
     chosen = [selection.Choice(n, more, 1000.0, 1.0, 100, (), 1.0) for n in (name, *names)]
     assert [x.name for x in diagnosis.needed(found.before, chosen)] == names
@@ -427,12 +430,10 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
 def test_what_gets_a_name_is_no_chance(straight: Model, straight_motion: Motion) -> None:
     """The more shapes an effect has, the more it must gain; with just that much its p-value is at most CHANCE."""
     told = ("torque_gain@rear_roll=0.1", "stribeck_friction@rear_roll=150", "vibration_on@rear_roll=0.2")
-    entries = [placing.parse(text, straight.machine, 40.0) for text in told]
-    has = prediction.build(placing.extended(straight.machine, *entries))
+    entries = [placing.parse_effect(text, straight.machine, 40.0) for text in told]
+    has = prediction.build(placing.with_effects(straight.machine, *entries))
     motion = simulate(has, straight_motion.u, q0=straight_motion.q[0], nu0=straight_motion.nu[0])
-    stage = fits.fitted(
-        has.machine, [log.from_table(sensors.measure(has, motion, seed=3), has.machine)], has.machine.filter
-    )
+    stage = fits.fitted(has.machine, [make_log(has, motion, seed=3)], has.machine.filter)
     names = [e.name for e in stage.model.effects]
     assert [selection.freedom(n, stage) for n in names] == [1, 2, 3]
     levels = [selection.threshold(n, stage, 2000) for n in names]
@@ -448,9 +449,9 @@ def test_an_amount_is_as_unsure_as_shapes_that_a_log_hardly_tells(straight: Mode
     name = "compaction_per_pass@drive"
 
     def packed(amount: float, each: float) -> machine.Machine:
-        entry = placing.parse(f"compaction_per_pass={amount}", straight.machine, 15.0)
+        entry = placing.parse_effect(f"compaction_per_pass={amount}", straight.machine, 15.0)
         values = {**entry.shape, "pass": told(each), "counted": told(2.0)}
-        return placing.extended(straight.machine, entry.model_copy(update={"shape": values}))
+        return placing.with_effects(straight.machine, entry.model_copy(update={"shape": values}))
 
     def told(value: float) -> Quantity:
         return Quantity(value=value, source="assumed")
@@ -460,7 +461,7 @@ def test_an_amount_is_as_unsure_as_shapes_that_a_log_hardly_tells(straight: Mode
     push = (2500 * np.sin(2 * np.pi * t / 7.5) + 600 * np.sin(2.6 * t)) * slow
     motion = simulate(hidden, np.column_stack([push, 0.8 * push]))
     assert 2 < np.ptp(motion.q[:, 0]) < 4
-    one = log.from_table(sensors.measure(hidden, motion, seed=3), straight.machine)
+    one = make_log(hidden, motion, seed=3, known=straight)
     before = fits.fitted(straight.machine, [one], straight.machine.filter)
     for amount, each in ((0.05, 3.0), (0.05, 15.0), (0.05, 50.0)):
         after = fits.refitted(packed(amount, each), before, 0.0)
@@ -472,7 +473,7 @@ def test_an_amount_is_as_unsure_as_shapes_that_a_log_hardly_tells(straight: Mode
         assert found.amount_std < found.amount
     # Nor does it where the shape is held, as nothing shows it at all; a shape that is told needs no other fit.
     shape = after.model.base.names.index(f"{name}.pass")
-    held = replace(after.fit, unseen=np.arange(len(after.fit.X)) == shape)
+    held = replace(after.fit, unidentifiable=np.arange(len(after.fit.X)) == shape)
     sure = after.fit.covariance.copy()
     sure[shape] = sure[:, shape] = 0.0
     for fit, more in ((replace(held, covariance=sure), True), (replace(after.fit, covariance=sure), False)):
@@ -490,9 +491,9 @@ def test_a_figure_says_that_nothing_could_be_withheld() -> None:
 
 def test_every_log_is_drawn(straight: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Forces that only the one model needs are shown for the other too."""
-    logs = [log.from_table(sensors.measure(straight, gentle(straight, 6.0), seed=k), straight.machine) for k in (3, 4)]
+    logs = [make_log(straight, gentle(straight, 6.0), seed=k) for k in (3, 4)]
     without = fits.fitted(straight.machine, logs, straight.machine.filter)
-    beside = replace(without, fit=replace(without.fit, disturbed=1.0))
+    beside = replace(without, fit=replace(without.fit, process_noise=1.0))
     loosened = list[fits.Stage]()
     monkeypatch.setattr(residuals, "loosened", lambda stage: (loosened.append(stage), beside)[1])
     for after, asked in ((without, []), (beside, [without, beside])):
@@ -527,9 +528,11 @@ def test_the_usual_range_of_a_shape(va12: Model) -> None:
     """Of all that is tried in its form, and of what there is; an instant has none."""
 
     def usual(text: str, shape: str, **values: float) -> tuple[float, ...]:
-        entry = placing.parse(text, va12.machine, 40.0)
+        entry = placing.parse_effect(text, va12.machine, 40.0)
         own = {**entry.shape, **{n: Quantity(value=x, source="assumed") for n, x in values.items()}}
-        (placed,) = prediction.build(placing.extended(va12.machine, entry.model_copy(update={"shape": own}))).effects
+        (placed,) = prediction.build(
+            placing.with_effects(va12.machine, entry.model_copy(update={"shape": own}))
+        ).effects
         return magnitude_interval._usual(placed, shape, va12.machine)
 
     assert usual("compaction_per_pass=0.3", "pass") == (5.0, 50.0)
@@ -544,10 +547,10 @@ def test_the_usual_range_of_a_shape(va12: Model) -> None:
 def test_what_no_machine_has_is_no_name(straight: Model, straight_motion: Motion) -> None:
     """Friction that drives, by whatever name the file calls it, or a resistance that pushes: unexplained, with what
     comes nearest and why it is none; as plain as it may be otherwise, and with nothing left that is odd."""
-    entry = placing.parse("rolling_resistance@rear_roll=400", straight.machine, 40.0)
-    one = log.from_table(sensors.measure(straight, straight_motion, seed=3), straight.machine)
+    entry = placing.parse_effect("rolling_resistance@rear_roll=400", straight.machine, 40.0)
+    one = make_log(straight, straight_motion, seed=3)
     before = fits.fitted(straight.machine, [one], straight.machine.filter)
-    after = fits.refitted(placing.extended(straight.machine, entry), before, 0.0)
+    after = fits.refitted(placing.with_effects(straight.machine, entry), before, 0.0)
     names = after.model.base.names
 
     def said(name: str, value: float) -> diagnosis.Diagnosis:
@@ -575,10 +578,10 @@ def test_a_name_that_is_faint_beside_another_is_none_under_forces(
 ) -> None:
     """Forces may leave nothing without any name: one that explains little by exact dynamics must gain with them what
     compares with another's promise."""
-    entry = placing.parse("rolling_resistance@rear_roll=400", straight.machine, 40.0)
-    one = log.from_table(sensors.measure(straight, straight_motion, seed=3), straight.machine)
+    entry = placing.parse_effect("rolling_resistance@rear_roll=400", straight.machine, 40.0)
+    one = make_log(straight, straight_motion, seed=3)
     before = fits.fitted(straight.machine, [one], straight.machine.filter)
-    loose = fits.refitted(placing.extended(straight.machine, entry), before, 0.0)
+    loose = fits.refitted(placing.with_effects(straight.machine, entry), before, 0.0)
     far = replace(loose, fit=replace(loose.fit, cost=3 * loose.noise))
     chosen = [selection.Choice("rolling_resistance@rear_roll", far, 100.0, 1.0, 100, (), 1.0, loose)]
     monkeypatch.setattr(diagnosis, "_odd", lambda stage: ("theta1: a slow error",) if stage is far else ())
@@ -588,14 +591,12 @@ def test_a_name_that_is_faint_beside_another_is_none_under_forces(
 
 def test_a_vibration_shakes_a_sensor_in_one_log_at_least(straight: Model) -> None:
     """A log too short to tell says nothing either way."""
-    entry = placing.parse("vibration_on@rear_roll=0.3", straight.machine, 20.0)
+    entry = placing.parse_effect("vibration_on@rear_roll=0.3", straight.machine, 20.0)
     told = {"begin": 5.0, "length": 6.0, "shake": 80.0, "frequency": 27.0}
     entry = entry.model_copy(update={"shape": {n: Quantity(value=v, source="assumed") for n, v in told.items()}})
-    shaken = prediction.build(placing.extended(straight.machine, entry))
-    quiet, loud = (
-        log.from_table(sensors.measure(m, gentle(m, 20.0), seed=3), straight.machine) for m in (straight, shaken)
-    )
-    short = log.from_table(sensors.measure(straight, gentle(straight, 4.0), seed=4), straight.machine)
+    shaken = prediction.build(placing.with_effects(straight.machine, entry))
+    quiet, loud = (make_log(m, gentle(m, 20.0), seed=3, known=straight) for m in (straight, shaken))
+    short = make_log(straight, gentle(straight, 4.0), seed=4)
     for logs, felt in (
         ([loud], True),
         ([quiet], False),
@@ -610,10 +611,10 @@ def test_a_vibration_shakes_a_sensor_in_one_log_at_least(straight: Model) -> Non
 @pytest.mark.parametrize(("load", "so"), [(50e3, True), (2e3, False), (400e3, False)])
 def test_a_roll_out_of_round_carries_a_share_of_the_machine(load: float, so: bool, straight: Model) -> None:
     """An eccentric encoder has no load at all, an unbalanced roll no eccentricity: both would fit otherwise."""
-    entry = placing.parse("roll_out_of_round@rear_roll=0.002", straight.machine, 12.0)
+    entry = placing.parse_effect("roll_out_of_round@rear_roll=0.002", straight.machine, 12.0)
     entry = entry.model_copy(update={"shape": {"load": Quantity(value=load, source="assumed")}})
-    known = placing.extended(straight.machine, entry)
-    one = log.from_table(sensors.measure(prediction.build(known), gentle(straight, 12.0), seed=3), straight.machine)
+    known = placing.with_effects(straight.machine, entry)
+    one = make_log(prediction.build(known), gentle(straight, 12.0), seed=3, known=straight)
     stage = fits.fitted(known, [one], straight.machine.filter)
     names = stage.model.base.names
     assert "roll_out_of_round@rear_roll.load" in names
@@ -624,7 +625,7 @@ def test_a_cause_without_which_nothing_is_left_and_no_machine_possible_stays_alo
     straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """There is nothing by which a further effect could tell that it makes the machine possible again."""
-    stage = calm(prediction.build(placing.extended(straight.machine, slope(straight))))
+    stage = calm(prediction.build(placing.with_effects(straight.machine, slope(straight))))
     choice = selection.Choice("ground_slope@machine", stage, 1e4, 1.0, 1, (), 1.0)
     asked = list[fits.Stage]()
 
@@ -664,11 +665,11 @@ def test_nothing_is_looked_for_beside_names_where_no_more_could_explain_the_misf
 ) -> None:
     """Names that explain 0.85 of it between them are needed, and only so many are looked for; what forces hide could be
     anything, and what has a name already keeps it."""
-    stage = calm(prediction.build(placing.extended(straight.machine, slope(straight))))
+    stage = calm(prediction.build(placing.with_effects(straight.machine, slope(straight))))
     excess = left / (1 - left) * 1000.0  # after a gain of 1000
-    far = replace(stage, fit=replace(stage.fit, cost=(1 + fits.SLACK) * stage.noise + excess, disturbed=forces))
+    far = replace(stage, fit=replace(stage.fit, cost=(1 + fits.SLACK) * stage.noise + excess, process_noise=forces))
     score = next(s for s in selection.scored(stage, in_turn) if s.values["A"] != 0)
-    forced = replace(stage, fit=replace(stage.fit, disturbed=fits.SMALL)) if named == "with forces" else None
+    forced = replace(stage, fit=replace(stage.fit, process_noise=fits.SMALL)) if named == "with forces" else None
     choice = selection.Choice("ground_slope@machine", far, 1000.0, 1.0, 1, (), 1.0, forced)
     monkeypatch.setattr(diagnosis, "_odd", lambda of: () if named == "nothing odd" else ("a roll that hops",))
     asked = list[int]()
@@ -712,9 +713,9 @@ def test_a_machine_that_can_be_is_preferred(
     scores = {s.candidate.name: s for s in selection.scored(stage, in_turn)}
     tries = []
     for k, text in enumerate(("ground_slope=0.009", "rolling_resistance@rear_roll=200")):
-        extended = placing.extended(straight.machine, placing.parse(text, straight.machine, 40.0))
+        extended = placing.with_effects(straight.machine, placing.parse_effect(text, straight.machine, 40.0))
         found = fits.refitted(extended, stage, 0.0)
-        fit = replace(found.fit, cost=(1 + fits.SLACK) * stage.noise - 1 + left + 3 * k, disturbed=forces * k)
+        fit = replace(found.fit, cost=(1 + fits.SLACK) * stage.noise - 1 + left + 3 * k, process_noise=forces * k)
         tries.append((scores[found.model.effects[0].name], replace(found, fit=fit, bare=(None,) * (forces > 0))))
     names = [s.candidate.name for s, _ in tries[:impossible]]
     lines = property(lambda of: ("Fv1 = -1",) if of.model.effects[0].name in names else ())
@@ -728,14 +729,14 @@ def test_where_exact_dynamics_find_no_way_a_known_fit_with_forces_is_gone_on_wit
     straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The one that the last name was judged with, if it was with such forces."""
-    sloped = placing.extended(straight.machine, slope(straight))
+    sloped = placing.with_effects(straight.machine, slope(straight))
     stage = calm(prediction.build(sloped))
-    small, large = (replace(stage, fit=replace(stage.fit, disturbed=d)) for d in (fits.SMALL, 1.0))
+    small, large = (replace(stage, fit=replace(stage.fit, process_noise=d)) for d in (fits.SMALL, 1.0))
     made, judged = list[float](), list[fits.Stage]()
 
     def refitted(machine: Any, of: fits.Stage, disturbed: float) -> fits.Stage:
         made.append(disturbed)
-        return replace(of, fit=replace(of.fit, disturbed=disturbed))
+        return replace(of, fit=replace(of.fit, process_noise=disturbed))
 
     def scanned(of: fits.Stage, *given: Any) -> list[Any]:
         judged.append(of)
@@ -753,7 +754,7 @@ def test_where_exact_dynamics_find_no_way_a_known_fit_with_forces_is_gone_on_wit
         before = selection.Choice("ground_slope@machine", stage, 1000.0, 1.0, 1, (), 1.0, loose)
         assert selection.choose(stage, scores, [before], in_turn, lambda share, what: None, 0.0) is None
         assert made == ([fits.SMALL] if again else [])
-        assert [x.fit.disturbed for x in judged] == [fits.SMALL]
+        assert [x.fit.process_noise for x in judged] == [fits.SMALL]
         assert again or judged == [small]
 
 
@@ -800,28 +801,30 @@ def test_what_a_fit_leads_to_zero_is_no_way_to_a_cause(straight: Model, monkeypa
 
 def test_an_amount_at_zero_can_be_written(straight: Model) -> None:
     """As a machine may have it: zero of what makes sense above it only is refused."""
-    machine = placing.extended(straight.machine, placing.parse("torque_deadband@front_roll=20", straight.machine, 10.0))
+    machine = placing.with_effects(
+        straight.machine, placing.parse_effect("torque_deadband@front_roll=20", straight.machine, 10.0)
+    )
     stage = calm(prediction.build(machine))
     k = stage.model.base.names.index("torque_deadband@front_roll")
     X = np.where(np.arange(len(stage.fit.X)) == k, 1e-15, stage.fit.X)
     entry = selection.entry_of(replace(stage, fit=replace(stage.fit, X=X)), "torque_deadband@front_roll")
-    assert placing.extended(straight.machine, entry).effect
+    assert placing.with_effects(straight.machine, entry).effect
 
 
 def test_stretches_are_withheld_from_fits_that_are_near_enough(
     straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What they predict is asked for, not how sure they are."""
-    stage, true, asked = calm(straight), gauss_newton.iterate, list[tuple[float, float]]()
+    stage, true, asked = calm(straight), gauss_newton.fit_logs, list[tuple[float, float]]()
 
     def noted(*given: Any, **more: Any) -> gauss_newton.Fit:
-        asked.append((given[5], more["enough"]))
+        asked.append((given[5], more["sufficient_step"]))
         return true(*given, **more)
 
-    monkeypatch.setattr(smoothing, "iterate", noted)
+    monkeypatch.setattr(smoothing, "fit_logs", noted)
     for disturbed in (0.0, 0.1):
-        assert hold_out.withheld(replace(stage, fit=replace(stage.fit, disturbed=disturbed))) is not None
-    assert set(asked) == {(0.0, gauss_newton.ENOUGH), (0.1, gauss_newton.NEARLY)}
+        assert hold_out.withheld(replace(stage, fit=replace(stage.fit, process_noise=disturbed))) is not None
+    assert set(asked) == {(0.0, gauss_newton.SUFFICIENT_STEP), (0.1, gauss_newton.ACCEPTABLE_STEP)}
 
 
 def test_candidates_are_scored_once_along_a_fit(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -851,7 +854,7 @@ def test_forces_hide_which_of_two_is_right(
     scores = {s.candidate.name: s for s in selection.scored(stage, in_turn)}
     noise, tries = stage.noise, []
     for text, cost in ((best, noise), (other, noise + 600.0)):
-        extended = placing.extended(straight.machine, placing.parse(text, straight.machine, 40.0))
+        extended = placing.with_effects(straight.machine, placing.parse_effect(text, straight.machine, 40.0))
         found = fits.refitted(extended, stage, 1.0)
         fit = replace(found.fit, cost=cost)
         tries.append((scores[found.model.effects[0].name], replace(found, fit=fit)))
@@ -860,7 +863,7 @@ def test_forces_hide_which_of_two_is_right(
         names = [s.candidate.name for s, _ in tries]
         for x in found:
             cost = noise * (1 + excess[names.index(x.model.effects[0].name)])
-            yield replace(x, fit=replace(x.fit, cost=cost, disturbed=0.0))
+            yield replace(x, fit=replace(x.fit, cost=cost, process_noise=0.0))
 
     monkeypatch.setattr(selection, "freed", freed)
     choice = selection._chosen(tries, 3000.0, 100, in_turn)
@@ -874,13 +877,13 @@ def test_a_harmonic_is_no_ripple_elsewhere(straight: Model, straight_motion: Mot
     """Straight on, all rolls turn alike: what is twice an order of a known ripple is one of the same machine's."""
 
     def ripple(amount: float, order: float) -> EffectEntry:
-        entry = placing.parse(f"torque_ripple@rear_roll={amount}", straight.machine, 40.0)
+        entry = placing.parse_effect(f"torque_ripple@rear_roll={amount}", straight.machine, 40.0)
         return entry.model_copy(update={"shape": {**entry.shape, "order": Quantity(value=order, source="assumed")}})
 
-    hiding = prediction.build(placing.extended(straight.machine, ripple(40, 14)))
-    one = log.from_table(sensors.measure(hiding, simulate(hiding, straight_motion.u), seed=3), straight.machine)
+    hiding = prediction.build(placing.with_effects(straight.machine, ripple(40, 14)))
+    one = make_log(hiding, simulate(hiding, straight_motion.u), seed=3, known=straight)
     found = []
-    for known in (straight.machine, placing.extended(straight.machine, ripple(40, 7))):
+    for known in (straight.machine, placing.with_effects(straight.machine, ripple(40, 7))):
         stage = fits.fitted(known, [one], straight.machine.filter)
         found.append({s.candidate.name: s.gain for s in reversed(selection.scored(stage, in_turn))})
     bare, rippled = found
@@ -916,7 +919,7 @@ def test_what_an_effect_must_gain_to_be_worth_a_place(
     known = SimpleNamespace(name="a@b", mapped=mapped)
     stage: Any = SimpleNamespace(
         model=SimpleNamespace(effects=[known]),
-        fit=SimpleNamespace(disturbed=forces),
+        fit=SimpleNamespace(process_noise=forces),
         exact=forces == 0,
         near=near,
         rough=forces > 0 or not near,
@@ -929,14 +932,14 @@ def test_what_an_effect_must_gain_to_be_worth_a_place(
 
 def unfit(monkeypatch: pytest.MonkeyPatch, refused: Callable[[Any, int], bool], coarse: float = 1.0) -> None:
     """Some fits to sensors as they are, or up to so coarse, find nothing: told are chart and number of passes."""
-    iterate = gauss_newton.iterate
+    iterate = gauss_newton.fit_logs
 
     def found(c: Any, records: Any, *args: Any, **more: Any) -> gauss_newton.Fit:
-        if records[0].coarse <= coarse and refused(c, args[6] if len(args) > 6 else 0):
-            raise gauss_newton.NotConverged("no fit")
+        if records[0].noise_inflation <= coarse and refused(c, args[6] if len(args) > 6 else 0):
+            raise gauss_newton.NotConvergedError("no fit")
         return iterate(c, records, *args, **more)
 
-    monkeypatch.setattr(smoothing, "iterate", found)
+    monkeypatch.setattr(smoothing, "fit_logs", found)
 
 
 @pytest.mark.parametrize(("refused", "followed"), [(1, fits.COARSE[0]), (fits.COARSE[0], fits.COARSE[1])])
@@ -959,9 +962,7 @@ def test_what_is_followed_with_coarse_sensors_only_is_named(
     assert told.located == ()
     assert all(np.isnan(row["std_before"]) and row["moved"] is None for row in findings.parameters(d).values())
     monkeypatch.setattr(diagnose_workflow, "diagnose", lambda *args: d)
-    said, _ = diagnose_workflow.diagnose_logs(
-        tmp_path, "va12_straight", straight, [sloping], "machine", lambda *a: None
-    )
+    said, _ = diagnose_workflow.diagnose(tmp_path, "va12_straight", straight, [sloping], "machine", lambda *a: None)
     assert any(f"fitted to sensors taken for {followed:g} times as noisy" in note for note in said["notes"])
     # Innovations are held against the sensors' true noise, not that of coarse ones.
     assert max(size.slow for size in told.before.values()) > 20
@@ -977,17 +978,19 @@ def test_a_value_that_is_nothing_can_be_written() -> None:
 
 def test_a_model_that_coarse_sensors_lead_to_needs_no_effect(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is wrong but the first guess, from which no fit to sensors as they are is found."""
-    one = log.from_table(sensors.measure(straight, gentle(straight, 20.0), seed=3), straight.machine)
-    unfit(monkeypatch, lambda c, passes: passes == gauss_newton.PASSES)
+    one = make_log(straight, gentle(straight, 20.0), seed=3)
+    unfit(monkeypatch, lambda c, passes: passes == gauss_newton.MAX_PASSES)
     d = diagnosis.diagnose(straight, [one], straight.machine.filter)
     assert (d.verdict, d.findings, d.before.prepared.coarse, d.before.exact) == ("clean", (), 1, True)
 
 
 def test_coarse_sensors_blur_no_estimate(straight: Model) -> None:
     """A right model has the misfit that noise makes, and parameters are where sharp sensors have them."""
-    one = log.from_table(sensors.measure(straight, gentle(straight, 20.0), seed=3), straight.machine)
+    one = make_log(straight, gentle(straight, 20.0), seed=3)
     sharp = fits.fitted(straight.machine, [one], straight.machine.filter)
-    coarse = replace(sharp.prepared, records=tuple(replace(r, coarse=fits.COARSE[0]) for r in sharp.prepared.records))
+    coarse = replace(
+        sharp.prepared, records=tuple(replace(r, noise_inflation=fits.COARSE[0]) for r in sharp.prepared.records)
+    )
     blurred = fits.refitted(straight.machine, replace(sharp, prepared=coarse), 0.0)
     assert not blurred.settled
     assert 0.5 < blurred.fit.cost / blurred.noise < 2
@@ -1001,8 +1004,8 @@ def test_coarse_sensors_blur_no_estimate(straight: Model) -> None:
 def unneeded(model: Model, *texts: str) -> tuple[fits.Stage, list[selection.Choice]]:
     """A clean log's stage, and effects chosen for it all the same, all in one fit."""
     clean = calm(model)
-    entries = [placing.parse(text, model.machine, 12.0) for text in texts]
-    both = fits.refitted(placing.extended(model.machine, *entries), clean, 0.0)
+    entries = [placing.parse_effect(text, model.machine, 12.0) for text in texts]
+    both = fits.refitted(placing.with_effects(model.machine, *entries), clean, 0.0)
     return clean, [selection.Choice(e.name, both, 1000.0, 1.0, 100, (), 1.0) for e in both.model.effects]
 
 
@@ -1010,15 +1013,15 @@ def test_an_amount_that_nothing_shows_is_not_sure(straight: Model) -> None:
     """It is held where it began and its deviation says nothing; the effect goes all the same, before one that is."""
     clean, chosen = unneeded(straight, "compaction_per_pass=0.3", "stribeck_friction@rear_roll=9")
     both, names = chosen[0].stage, [x.name for x in chosen]
-    assert [bool(both.fit.unseen[both.model.base.names.index(n)]) for n in names] == [True, False]
+    assert [bool(both.fit.unidentifiable[both.model.base.names.index(n)]) for n in names] == [True, False]
     assert [x.name for x in diagnosis.needed(clean, chosen)] == names[1:]
 
 
 def test_an_amount_and_its_shapes_are_sure_together(straight: Model) -> None:
     """Where each may stand for the other, neither is sure by itself."""
     name = "encoder_eccentricity@front_roll"
-    entry = placing.parse(f"{name}=0.01", straight.machine, 12.0)
-    stage = calm(prediction.build(placing.extended(straight.machine, entry), shapes=True))
+    entry = placing.parse_effect(f"{name}=0.01", straight.machine, 12.0)
+    stage = calm(prediction.build(placing.with_effects(straight.machine, entry), fit_shapes=True))
     fit, names = stage.fit, stage.model.base.names
     at = [names.index(n) for n in (name, f"{name}.cos2", f"{name}.sin2")]
     X, covariance = fit.X.copy(), np.diag(fit.std**2)
@@ -1028,7 +1031,7 @@ def test_an_amount_and_its_shapes_are_sure_together(straight: Model) -> None:
         unit * np.outer(fit.std[at], fit.std[at]),
     )
     for unseen, expected in (([], 8 / 0.05 + 1), (at[1:], 4.0), (at, 0.0)):
-        told = replace(fit, X=X, covariance=covariance, unseen=np.isin(np.arange(len(X)), unseen))
+        told = replace(fit, X=X, covariance=covariance, unidentifiable=np.isin(np.arange(len(X)), unseen))
         assert selection.wald(name, replace(stage, fit=told)) == pytest.approx(expected)
 
 
@@ -1054,7 +1057,7 @@ def test_what_foretells_nothing_is_no_name(percent: float, straight: Model, monk
 @pytest.mark.parametrize(("share", "seed"), [(0.03, 3), (0.03, 4), (0.2, 3), (0.4, 3), (3.0, 3), (30.0, 4)])
 def test_a_file_that_is_far_off_is_no_cause(straight: Model, share: float, seed: int) -> None:
     """A clean log, the file's contacts at so large a share of the true ones."""
-    one = log.from_table(sensors.measure(straight, gentle(straight, 20.0), seed=seed), straight.machine)
+    one = make_log(straight, gentle(straight, 20.0), seed=seed)
     bodies = []
     for b in straight.machine.body:
         if b.contact is not None:

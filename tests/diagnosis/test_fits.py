@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import calm, gentle, slope
+from support.drives import gentle
+from support.logs import calm, make_log, slope
 
 from excite import smoothing
 from excite.diagnosis import fits as stages, forked, screening, selection
@@ -20,7 +21,7 @@ from excite.diagnosis.parallel import in_turn
 from excite.logs import log
 from excite.model import Model, prediction
 from excite.model.effects import placing
-from excite.simulation import Motion, sensors, simulate
+from excite.simulation import Motion, simulate
 from excite.smoothing import gauss_newton
 
 
@@ -30,13 +31,13 @@ def test_what_a_process_found_can_be_sent_back(straight: Model, straight_motion:
     def sent(calls: Sequence[Callable[[], Any]]) -> Generator[Any, None, None]:
         return (pickle.loads(pickle.dumps(call())) for call in calls)
 
-    one = log.from_table(sensors.measure(straight, straight_motion, seed=3), straight.machine)
+    one = make_log(straight, straight_motion, seed=3)
     stage = stages.fitted(straight.machine, [one], straight.machine.filter)
-    sloped = placing.extended(straight.machine, placing.parse("ground_slope=0.001", straight.machine, 10.0))
+    sloped = placing.with_effects(straight.machine, placing.parse_effect("ground_slope=0.001", straight.machine, 10.0))
     for disturbed in (0.0, 1.0):
         (found,) = screening.begun([sloped], stage, disturbed, sent)
         assert found is not None
-        assert found.fit.disturbed < max(disturbed, 0.01)
+        assert found.fit.process_noise < max(disturbed, 0.01)
         assert (found.loose is None) == found.exact
     (found,) = stages.refits([(sloped, stage, 0.0)], sent)
     assert found is not None
@@ -53,7 +54,7 @@ def test_coarse_sensors_are_no_measure_of_how_near_sharp_ones_come(
     def nearly(*given: Any) -> gauss_newton.Fit:
         calls.append(given[3])
         if len(calls) == 1:
-            raise gauss_newton.NotConverged("no fit", replace(stage.fit, cost=1.1 * stage.noise), 5.0)
+            raise gauss_newton.NotConvergedError("no fit", replace(stage.fit, cost=1.1 * stage.noise), 5.0)
         return stage.fit
 
     monkeypatch.setattr(stages, "_nearly", nearly)
@@ -63,13 +64,13 @@ def test_coarse_sensors_are_no_measure_of_how_near_sharp_ones_come(
     assert stages.resume(stage.prepared, coarse, 0.0).cost == stage.fit.cost
     assert calls == [0.0, 0.0]
     calls.clear()
-    with pytest.raises(gauss_newton.NotConverged):
+    with pytest.raises(gauss_newton.NotConvergedError):
         stages.resume(stage.prepared, stage, 0.0)
 
 
 def test_ways_that_are_not_needed_are_given_up(straight: Model) -> None:
     """Of the ways to a fit the first one is enough for a clean log, whatever has been begun beside it."""
-    one = log.from_table(sensors.measure(straight, gentle(straight, 12.0), seed=3), straight.machine)
+    one = make_log(straight, gentle(straight, 12.0), seed=3)
     carried: list[int] = []
 
     def counted(calls: Sequence[Callable[[], Any]]) -> Generator[Any, None, None]:
@@ -99,13 +100,21 @@ def test_a_fit_whose_steps_cease_to_shrink_ends(straight: Model, monkeypatch: py
     for end, spent, found in ((0.3, 7, True), (30.0, 8, False)):
         for patient, passes in ((True, 14), (False, spent)):
             steps[:] = [500.0, 90.0, 80.0, 40.0, *[end] * 10]
-            with pytest.raises(gauss_newton.NotConverged) as failed:
-                gauss_newton.iterate(
-                    p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.0, p.held, passes=14, patient=patient
+            with pytest.raises(gauss_newton.NotConvergedError) as failed:
+                gauss_newton.fit_logs(
+                    p.c,
+                    p.records,
+                    stage.fit.trajectories,
+                    stage.fit.X,
+                    p.starts,
+                    0.0,
+                    p.held,
+                    passes=14,
+                    patient=patient,
                 )
-            hopeless = gauss_newton.HOPELESS[0] + 1 if patient and not found else passes
+            hopeless = gauss_newton.HOPELESS_PASSES + 1 if patient and not found else passes
             assert 14 - len(steps) == hopeless
-            assert (failed.value.nearly is not None) == found
+            assert (failed.value.acceptable_fit is not None) == found
 
 
 def test_a_fit_is_found_where_its_steps_are_small_enough(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,12 +131,20 @@ def test_a_fit_is_found_where_its_steps_are_small_enough(straight: Model, monkey
     for disturbed, enough, spent in (
         (0.0, None, 5),
         (0.1, None, 4),
-        (0.0, gauss_newton.ENOUGH, 4),
-        (0.1, gauss_newton.NEARLY, 3),
+        (0.0, gauss_newton.SUFFICIENT_STEP, 4),
+        (0.1, gauss_newton.ACCEPTABLE_STEP, 3),
     ):
         steps[:] = [5.0, 1.5, 0.5, 0.15, 1e-4, 1e-4]
-        gauss_newton.iterate(
-            p.c, p.records, stage.fit.points, stage.fit.X, p.starts, disturbed, p.held, passes=6, enough=enough
+        gauss_newton.fit_logs(
+            p.c,
+            p.records,
+            stage.fit.trajectories,
+            stage.fit.X,
+            p.starts,
+            disturbed,
+            p.held,
+            passes=6,
+            sufficient_step=enough,
         )
         assert 6 - len(steps) == spent
 
@@ -150,20 +167,20 @@ def test_a_fit_that_goes_downhill_goes_on(
 
     monkeypatch.setattr(gauss_newton, "newton_step", scripted)
     steps[:] = [500.0, 90.0, 3.0, 0.9, 1.0, 1.4, 1.8, 2.1, 1.9, 1.2, 0.3, 0.1, 0.01, 1e-4]
-    given = p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.0, p.held
+    given = p.c, p.records, stage.fit.trajectories, stage.fit.X, p.starts, 0.0, p.held
     if found:
         told = steps.copy()
-        fit = gauss_newton.iterate(*given, passes=14, patient=False)
+        fit = gauss_newton.fit_logs(*given, passes=14, patient=False)
         assert fit.cost == costs[-1]
         assert len(costs) >= 13
         # Where passes run out on the way, what was passed is not as good as found.
         steps[:], costs[:] = told, []
-        with pytest.raises(gauss_newton.NotConverged) as failed:
-            gauss_newton.iterate(*given, passes=8, patient=False)
-        assert (failed.value.step, failed.value.nearly) == (2.1, None)
+        with pytest.raises(gauss_newton.NotConvergedError) as failed:
+            gauss_newton.fit_logs(*given, passes=8, patient=False)
+        assert (failed.value.step, failed.value.acceptable_fit) == (2.1, None)
     else:
-        with pytest.raises(gauss_newton.NotConverged) as failed:
-            gauss_newton.iterate(*given, passes=14, patient=False)
+        with pytest.raises(gauss_newton.NotConvergedError) as failed:
+            gauss_newton.fit_logs(*given, passes=14, patient=False)
         assert failed.value.step == 0.9
         assert len(costs) < 9
 
@@ -184,8 +201,8 @@ def test_far_from_the_logs_forces_need_no_more_than_nearly(
         return covariance, move, steps.pop(0), misfit * stage.noise
 
     monkeypatch.setattr(gauss_newton, "newton_step", scripted)
-    given = p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.1, p.held
-    gauss_newton.iterate(*given, passes=5, patient=patient)
+    given = p.c, p.records, stage.fit.trajectories, stage.fit.X, p.starts, 0.1, p.held
+    gauss_newton.fit_logs(*given, passes=5, patient=patient)
     assert 5 - len(steps) == spent
 
 
@@ -197,23 +214,27 @@ def test_small_forces_are_fitted_as_closely_as_none(straight: Model, monkeypatch
         asked[given[5]] = given[9]
         return stage.fit
 
-    monkeypatch.setattr(smoothing, "iterate", noted)
+    monkeypatch.setattr(smoothing, "fit_logs", noted)
     for disturbed in (0.0, stages.SMALL, 1.0):
         stages.refitted(straight.machine, stage, disturbed)
-    assert asked == {0.0: gauss_newton.ENOUGH, stages.SMALL: gauss_newton.ENOUGH, 1.0: gauss_newton.NEARLY}
+    assert asked == {
+        0.0: gauss_newton.SUFFICIENT_STEP,
+        stages.SMALL: gauss_newton.SUFFICIENT_STEP,
+        1.0: gauss_newton.ACCEPTABLE_STEP,
+    }
 
 
 def test_smaller_forces_side_by_side_are_the_smallest_that_do(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever is done at once, the first of them counts with which there is a fit."""
     stage, asked = calm(straight), list[float]()
-    loose = replace(stage, fit=replace(stage.fit, disturbed=1.0))
+    loose = replace(stage, fit=replace(stage.fit, process_noise=1.0))
 
     def at_once(calls: Sequence[Callable[[], Any]]) -> Generator[Any, None, None]:
         return (x for x in [call() for call in calls])
 
     def resumable(prepared: Any, of: stages.Stage, disturbed: float, most: float = np.inf) -> gauss_newton.Fit | None:
         asked.append(disturbed)
-        return None if disturbed < least else replace(stage.fit, disturbed=disturbed)
+        return None if disturbed < least else replace(stage.fit, process_noise=disturbed)
 
     monkeypatch.setattr(stages, "_resumable", resumable)
     wanted = [x for x in stages.LESS if x >= stages.SMALL]
@@ -222,7 +243,7 @@ def test_smaller_forces_side_by_side_are_the_smallest_that_do(straight: Model, m
             asked.clear()
             less = stages._with_less(loose, together)
             assert less is not None
-            assert (less.fit.disturbed, asked) == (least, tried)
+            assert (less.fit.process_noise, asked) == (least, tried)
     least = np.inf
     assert stages._with_less(loose, at_once) is None
 
@@ -240,7 +261,7 @@ def test_a_stage_is_freed_once(straight: Model, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(stages, "resume", resume)
     (plain,) = stages.freed([loose], in_turn)
     assert plain is not None
-    sloped = placing.extended(straight.machine, slope(straight))
+    sloped = placing.with_effects(straight.machine, slope(straight))
     asked.clear()
     other, known = stages.refitted_and_freed(sloped, loose, in_turn)
     assert asked == [1.0, 0.0]
@@ -280,7 +301,7 @@ def test_a_fit_that_is_not_worth_more_passes_is_given_up(straight: Model, monkey
         return covariance, move, 50.0, costs[min(len(seen), len(costs)) - 1]
 
     monkeypatch.setattr(gauss_newton, "newton_step", scripted)
-    monkeypatch.setattr(gauss_newton, "LOST", (8, np.inf, 1.0))
+    monkeypatch.setattr(gauss_newton, "LOST_PASSES", 8)
     for costs, spent in (
         ([900.0, 900.0], 4),
         ([900.0, 800.0, 700.0, 600.0, 550.0, 549.0, 548.0], 7),
@@ -288,9 +309,17 @@ def test_a_fit_that_is_not_worth_more_passes_is_given_up(straight: Model, monkey
         ([900.0, 400.0, 300.0, 600.0], 4),
     ):
         seen.clear()
-        with pytest.raises(gauss_newton.NotConverged) as failed:
-            gauss_newton.iterate(
-                p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.0, p.held, passes=8, worth=500.0
+        with pytest.raises(gauss_newton.NotConvergedError) as failed:
+            gauss_newton.fit_logs(
+                p.c,
+                p.records,
+                stage.fit.trajectories,
+                stage.fit.X,
+                p.starts,
+                0.0,
+                p.held,
+                passes=8,
+                stalled_cost_limit=500.0,
             )
         assert len(seen) == spent
         assert failed.value.fit is not None
@@ -320,9 +349,9 @@ def test_steps_that_stay_large_end_a_fit(
         return covariance, move, steps[min(len(seen), len(steps)) - 1], 500.0
 
     monkeypatch.setattr(gauss_newton, "newton_step", scripted)
-    monkeypatch.setattr(gauss_newton, "HOPELESS", (8, 10.0))
-    with pytest.raises(gauss_newton.NotConverged):
-        gauss_newton.iterate(p.c, p.records, stage.fit.points, stage.fit.X, p.starts, 0.0, p.held, passes=8)
+    monkeypatch.setattr(gauss_newton, "HOPELESS_PASSES", 8)
+    with pytest.raises(gauss_newton.NotConvergedError):
+        gauss_newton.fit_logs(p.c, p.records, stage.fit.trajectories, stage.fit.X, p.starts, 0.0, p.held, passes=8)
     assert len(seen) == spent
 
 
@@ -332,9 +361,11 @@ def test_what_takes_too_little_of_a_beginning_is_not_fitted_to_the_whole(
     """Exact dynamics follow the log without its cause and leave much: of what begins anew only what takes a good part
     of that from the first quarter, beside what the model without it comes to there, is fitted to all of it."""
     stuck = prediction.build(
-        placing.extended(straight.machine, placing.parse("torque_deadband@rear_roll=150", straight.machine, 40.0))
+        placing.with_effects(
+            straight.machine, placing.parse_effect("torque_deadband@rear_roll=150", straight.machine, 40.0)
+        )
     )
-    one = log.from_table(sensors.measure(stuck, simulate(stuck, gentle(straight, 40.0).u), seed=3), straight.machine)
+    one = make_log(stuck, simulate(stuck, gentle(straight, 40.0).u), seed=3, known=straight)
     stage = stages.fitted(straight.machine, [one], straight.machine.filter)
     assert stage.exact
     assert stage.excess > 1000
@@ -343,7 +374,7 @@ def test_what_takes_too_little_of_a_beginning_is_not_fitted_to_the_whole(
     worth, whole = stage.fit.cost - 0.3 * stage.excess, len(one)
     for effect, found in (("torque_deadband@rear_roll=100", True), ("torque_offset_drift@front_roll=0.1", False)):
         lengths.clear()
-        machine = placing.extended(straight.machine, placing.parse(effect, straight.machine, 40.0))
+        machine = placing.with_effects(straight.machine, placing.parse_effect(effect, straight.machine, 40.0))
         (made,) = screening.begun([machine], stage, 0.0, in_turn, worth)
         assert (made is not None) == found
         assert lengths[:2] == [whole // 4] * 2  # without it, and with it
@@ -363,38 +394,40 @@ def test_what_is_held_is_where_it_is_held_a_pass_later(straight: Model, monkeypa
 
     def blind(c: Any, records: Any, linear: Any, points: Any, X: np.ndarray, prior: np.ndarray, damping: float) -> Any:
         covariance, move, step, cost = true(c, records, linear, points, X, prior, damping)
-        if prior[worst] < gauss_newton.HELD**-2:
+        if prior[worst] < gauss_newton.HELD_STD**-2:
             covariance[worst, worst] = 1e6
         seen.append((X[worst], step))
         return covariance, move, steps.pop(0) if steps else step, cost
 
     monkeypatch.setattr(gauss_newton, "newton_step", blind)
-    monkeypatch.setattr(gauss_newton, "LARGEST_STEP", 0.01)
+    monkeypatch.setattr(gauss_newton, "MAX_RELATIVE_STEP", 0.01)
     monkeypatch.setitem(vars(p.c.model), "positive", np.arange(len(scale)) == worst)
     X = stage.fit.X + 30 * scale * (np.arange(len(scale)) == worst)
     for told, disturbed in (([], 0.0), ([50.0, 50.0, 50.0, 50.0, 0.005], 0.0), ([50.0, 50.0, 50.0, 50.0, 0.1], 0.1)):
         seen.clear()
         steps[:] = [*told, *[50.0 for _ in told]]
-        with pytest.raises(gauss_newton.NotConverged) as failed:  # the others only creep
-            gauss_newton.iterate(p.c, p.records, stage.fit.points, X, p.starts, disturbed, p.held, 0.0, passes=7)
-        assert abs(seen[gauss_newton.SETTLED][0] - nominal[worst]) > 20 * scale[worst]
+        with pytest.raises(gauss_newton.NotConvergedError) as failed:  # the others only creep
+            gauss_newton.fit_logs(p.c, p.records, stage.fit.trajectories, X, p.starts, disturbed, p.held, 0.0, passes=7)
+        assert abs(seen[gauss_newton.SETTLING_PASSES][0] - nominal[worst]) > 20 * scale[worst]
         # The pass in which it is held is computed twice.
-        assert seen[gauss_newton.SETTLED + 2][0] == pytest.approx(nominal[worst], abs=gauss_newton.AWAY * scale[worst])
-        assert max(step for _, step in seen[gauss_newton.SETTLED + 1 :]) < 1e4
+        assert seen[gauss_newton.SETTLING_PASSES + 2][0] == pytest.approx(
+            nominal[worst], abs=gauss_newton.HELD_TOLERANCE * scale[worst]
+        )
+        assert max(step for _, step in seen[gauss_newton.SETTLING_PASSES + 1 :]) < 1e4
         assert failed.value.fit is not None
-        assert failed.value.fit.unseen[worst]
-        assert failed.value.nearly is None or not told
+        assert failed.value.fit.unidentifiable[worst]
+        assert failed.value.acceptable_fit is None or not told
 
 
 @pytest.mark.parametrize("effect", ["torque_deadband@front_roll=20", "torque_deadband@front_roll=0.001"])
 def test_what_makes_sense_above_zero_only_ends_there(straight: Model, effect: str) -> None:
     """A log that would like an amount best below zero has it near zero, all others where they are without it."""
     stage = calm(straight)
-    machine = placing.extended(straight.machine, placing.parse(effect, straight.machine, 10.0))
+    machine = placing.with_effects(straight.machine, placing.parse_effect(effect, straight.machine, 10.0))
     p, without = stages.prepared_for(machine, stage), stage.fit
     fit = stages.iterated(p, p.starts, p.c.model.nominal, 0.0, patient=True)
     (amount,) = (k for k, name in enumerate(p.c.model.base.names) if name not in straight.base.names)
-    assert 0 < fit.X[amount] < gauss_newton.CONVERGED * fit.std[amount]
+    assert 0 < fit.X[amount] < gauss_newton.CONVERGED_STEP * fit.std[amount]
     assert abs(fit.cost - without.cost) < 0.05
     assert (np.abs(np.delete(fit.X, amount) - without.X) < 0.05 * without.std).all()
     assert selection._vanished("torque_deadband@front_roll", stages.staged(machine, p, fit))
@@ -402,11 +435,11 @@ def test_what_makes_sense_above_zero_only_ends_there(straight: Model, effect: st
 
 def test_an_amount_that_began_near_zero_leaves_it(straight: Model) -> None:
     """Where the log wants it: what is at its end is asked anew in every pass."""
-    effect = placing.parse("torque_deadband@front_roll=60", straight.machine, 10.0)
-    hidden = prediction.build(placing.extended(straight.machine, effect))
-    one = log.from_table(sensors.measure(hidden, gentle(hidden, 12.0), seed=3), straight.machine)
-    effect = placing.parse("torque_deadband@front_roll=0.001", straight.machine, 10.0)
-    stage = stages.fitted(placing.extended(straight.machine, effect), [one], straight.machine.filter)
+    effect = placing.parse_effect("torque_deadband@front_roll=60", straight.machine, 10.0)
+    hidden = prediction.build(placing.with_effects(straight.machine, effect))
+    one = make_log(hidden, gentle(hidden, 12.0), seed=3, known=straight)
+    effect = placing.parse_effect("torque_deadband@front_roll=0.001", straight.machine, 10.0)
+    stage = stages.fitted(placing.with_effects(straight.machine, effect), [one], straight.machine.filter)
     fit, amount = stage.fit, hidden.base.names.index("torque_deadband@front_roll")
     assert abs(fit.X[amount] - 60) < 3 * fit.std[amount] < 30
     assert not selection._vanished("torque_deadband@front_roll", stage)
@@ -429,13 +462,13 @@ def test_steps_within_bounds_are_the_best_there_are(alike: float) -> None:
             cost = 2 * slope @ step + step @ information @ step
             if (step >= lowest - 1e-12).all() and cost < least:
                 best, least = step, cost
-        found = gauss_newton._above(lowest, -np.linalg.solve(information, slope), information, slope)
+        found = gauss_newton._bounded_step(lowest, -np.linalg.solve(information, slope), information, slope)
         np.testing.assert_allclose(found, best, atol=1e-9)
     unknown = np.full(3, np.nan)
-    np.testing.assert_array_equal(gauss_newton._above(lowest, unknown, information, unknown), unknown)
+    np.testing.assert_array_equal(gauss_newton._bounded_step(lowest, unknown, information, unknown), unknown)
     without_root = np.eye(3) + 2 * (np.eye(3, k=1) + np.eye(3, k=-1))
     np.testing.assert_array_equal(
-        gauss_newton._above(lowest, np.full(3, -1.0), without_root, slope), [-0.1, -0.2, -1.0]
+        gauss_newton._bounded_step(lowest, np.full(3, -1.0), without_root, slope), [-0.1, -0.2, -1.0]
     )
 
 
@@ -446,13 +479,13 @@ def test_a_step_that_was_cut_short_goes_further_when_it_is_told_again(
     stage = calm(straight)
     p, k = stage.prepared, stage.model.base.names.index("u10")
     start = stage.fit.X - 40 * stage.model.scale * (np.arange(len(stage.fit.X)) == k)
-    asked = p.c, p.records, stage.fit.points, start, p.starts, 0.0, p.held, 0.0
-    monkeypatch.setattr(gauss_newton, "LARGEST_STEP", 0.1)
-    found = gauss_newton.iterate(*asked)
+    asked = p.c, p.records, stage.fit.trajectories, start, p.starts, 0.0, p.held, 0.0
+    monkeypatch.setattr(gauss_newton, "MAX_RELATIVE_STEP", 0.1)
+    found = gauss_newton.fit_logs(*asked)
     assert (np.abs(found.X - stage.fit.X) < stage.fit.std).all()
-    monkeypatch.setattr(gauss_newton, "FURTHER", 1.0)
-    with pytest.raises(gauss_newton.NotConverged):
-        gauss_newton.iterate(*asked)
+    monkeypatch.setattr(gauss_newton, "LIMIT_GROWTH", 1.0)
+    with pytest.raises(gauss_newton.NotConvergedError):
+        gauss_newton.fit_logs(*asked)
 
 
 def test_the_whole_log_is_fitted_where_its_beginning_can_be(
@@ -463,8 +496,10 @@ def test_the_whole_log_is_fitted_where_its_beginning_can_be(
     one = log.read_log(sloping, straight.machine)
     stage = stages.fitted(straight.machine, [one], straight.machine.filter)
     lengths, forces = fits(monkeypatch)
-    right = placing.extended(straight.machine, slope(straight))
-    wrong = placing.extended(straight.machine, placing.parse("brake_drag@rear_roll=50", straight.machine, 40.0))
+    right = placing.with_effects(straight.machine, slope(straight))
+    wrong = placing.with_effects(
+        straight.machine, placing.parse_effect("brake_drag@rear_roll=50", straight.machine, 40.0)
+    )
     (good,) = screening.begun([right], stage, 0.0, in_turn)
     assert good is not None
     cost, whole = good.fit.cost, len(one)
@@ -505,8 +540,10 @@ def test_beside_a_cause_only_that_is_fitted_whose_beginning_tells_that_it_comes_
     lengths, _ = fits(monkeypatch)
     monkeypatch.setattr(screening, "SHORTEST", 5.0)
     monkeypatch.setattr(screening, "FAR", np.inf)
-    right = placing.extended(straight.machine, slope(straight))
-    wrong = placing.extended(straight.machine, placing.parse("torque_gain@front_roll=0.1", straight.machine, 40.0))
+    right = placing.with_effects(straight.machine, slope(straight))
+    wrong = placing.with_effects(
+        straight.machine, placing.parse_effect("torque_gain@front_roll=0.1", straight.machine, 40.0)
+    )
     for machines, near, enough, tried in (
         ([wrong], [False], True, True),
         ([right, wrong], [True, False], True, False),
@@ -533,7 +570,7 @@ def test_beside_a_cause_only_that_is_fitted_whose_beginning_tells_that_it_comes_
         assert made is not None
         assert selection._settles(["a", "b"], 1, made) == felt
         assert not selection._settles(["a", "b"], 0, made)
-        assert not selection._settles(["a", "b"], 1, replace(made, fit=replace(made.fit, disturbed=0.1)))
+        assert not selection._settles(["a", "b"], 1, replace(made, fit=replace(made.fit, process_noise=0.1)))
 
 
 @pytest.mark.parametrize(
@@ -552,11 +589,11 @@ def test_a_fit_goes_on_without_what_was_not_seen(
     forces: float, asked: float, coarse: float, settled: bool, held: bool, straight: Model
 ) -> None:
     stage = calm(straight)
-    names, unseen = stage.model.base.names, stage.fit.unseen.copy()
+    names, unseen = stage.model.base.names, stage.fit.unidentifiable.copy()
     unseen[names.index("u10")] = True
-    of = replace(stage, settled=settled, fit=replace(stage.fit, unseen=unseen, disturbed=forces))
+    of = replace(stage, settled=settled, fit=replace(stage.fit, unidentifiable=unseen, process_noise=forces))
     of = replace(of, prepared=stages.noisy(of.prepared, coarse))
-    more = stages.noisy(stages.prepared_for(placing.extended(straight.machine, slope(straight)), stage), 1.0)
+    more = stages.noisy(stages.prepared_for(placing.with_effects(straight.machine, slope(straight)), stage), 1.0)
     told = stages._untold(more, of, asked)
     assert [n for n, yes in zip(more.c.model.base.names, told, strict=True) if yes] == (["u10"] if held else [])
 
@@ -567,27 +604,29 @@ def test_what_was_not_seen_is_judged_again(straight: Model, monkeypatch: pytest.
     stage = calm(straight)
     p, names = stage.prepared, stage.model.base.names
     k = names.index("u10")
-    assert not stage.fit.unseen[k]
+    assert not stage.fit.unidentifiable[k]
     untold = np.arange(len(names)) == k
     start = np.where(untold, stage.model.nominal, stage.fit.X)
-    true, passes = gauss_newton.linearise_fit, list[float]()
+    true, passes = gauss_newton.linearise_log, list[float]()
 
     def noted(c: Any, r: Any, point: Any, first: Any, X: np.ndarray, *asked: Any) -> Any:
         passes.append(float(X[k]))
         return true(c, r, point, first, X, *asked)
 
-    monkeypatch.setattr(gauss_newton, "linearise_fit", noted)
-    asked = p.c, p.records, stage.fit.points, start, p.starts, 0.0, p.held, gauss_newton.RESUMED
-    found = gauss_newton.iterate(*asked, untold=untold)
-    assert not found.unseen[k]
+    monkeypatch.setattr(gauss_newton, "linearise_log", noted)
+    asked = p.c, p.records, stage.fit.trajectories, start, p.starts, 0.0, p.held, gauss_newton.RESUMED_DAMPING
+    found = gauss_newton.fit_logs(*asked, initially_held=untold)
+    assert not found.unidentifiable[k]
     assert abs(found.X[k] - stage.fit.X[k]) < 0.1 * stage.fit.std[k]
     passes.clear()
     monkeypatch.setattr(
-        gauss_newton, "UNSEEN", 0.5 * float(stage.fit.std[k] / max(abs(start[k]), stage.model.scale[k]))
+        gauss_newton, "MAX_IDENTIFIABLE_STD", 0.5 * float(stage.fit.std[k] / max(abs(start[k]), stage.model.scale[k]))
     )
-    held = gauss_newton.iterate(*asked, untold=untold)
-    assert held.unseen[k]
-    assert passes == pytest.approx([stage.model.nominal[k]] * len(passes), abs=gauss_newton.AWAY * stage.model.scale[k])
+    held = gauss_newton.fit_logs(*asked, initially_held=untold)
+    assert held.unidentifiable[k]
+    assert passes == pytest.approx(
+        [stage.model.nominal[k]] * len(passes), abs=gauss_newton.HELD_TOLERANCE * stage.model.scale[k]
+    )
 
 
 @pytest.mark.parametrize(
@@ -668,7 +707,7 @@ def iterated(
         fit = None if told is None else replace(stage.fit, cost=told * prepared.readings)
         if found and fit is not None:
             return fit
-        raise gauss_newton.NotConverged("no fit", fit, 50.0)
+        raise gauss_newton.NotConvergedError("no fit", fit, 50.0)
 
     monkeypatch.setattr(screening, "iterated", fit_of)
     return asked
@@ -692,7 +731,7 @@ def test_smaller_forces_are_tried_where_the_model_is_near(
         (0.1, 0.5, [], False),
     ):
         tried = list[str]()
-        monkeypatch.setattr(smoothing, "STRONG", strong)
+        monkeypatch.setattr(smoothing, "CLOSE_FIT_COST_RATIO", strong)
         monkeypatch.setattr(stages, "FAR", most)
         told = stages.forced(far, in_turn)
         assert (tried, told.settled) == (expected, settled)
@@ -711,7 +750,7 @@ def test_what_begins_anew_beside_exact_dynamics_must_take_a_good_part_of_the_mis
 
     monkeypatch.setattr("excite.diagnosis.selection.begun", begin)
     far = replace(stage, fit=replace(stage.fit, cost=2 * stage.noise))
-    for of in (far, replace(far, settled=False), replace(far, fit=replace(far.fit, disturbed=0.1))):
+    for of in (far, replace(far, settled=False), replace(far, fit=replace(far.fit, process_noise=0.1))):
         assert selection.unlikely(of, of, (), in_turn) == (of, [])
     assert asked == [pytest.approx(2 * stage.noise - 0.3 * 0.98 * stage.noise), np.inf, np.inf]
 
@@ -726,7 +765,7 @@ def test_a_fit_that_fails_stands_where_it_was_as_good_as_found(
     seen: list[np.ndarray] = []
     far = [500.0, 90.0, 80.0]
 
-    def failed(sizes: list[float], costs: list[float], disturbed: float) -> gauss_newton.NotConverged:
+    def failed(sizes: list[float], costs: list[float], disturbed: float) -> gauss_newton.NotConvergedError:
         steps = iter(zip(sizes, costs, strict=True))
         seen.clear()
 
@@ -736,14 +775,14 @@ def test_a_fit_that_fails_stands_where_it_was_as_good_as_found(
             return covariance, move, *next(steps)
 
         monkeypatch.setattr(gauss_newton, "newton_step", scripted)
-        points, X = stage.fit.points, stage.fit.X * 1.01
-        with pytest.raises(gauss_newton.NotConverged) as raised:
-            gauss_newton.iterate(p.c, p.records, points, X, p.starts, disturbed, p.held, passes=10, patient=False)
+        points, X = stage.fit.trajectories, stage.fit.X * 1.01
+        with pytest.raises(gauss_newton.NotConvergedError) as raised:
+            gauss_newton.fit_logs(p.c, p.records, points, X, p.starts, disturbed, p.held, passes=10, patient=False)
         return raised.value
 
     end = failed([*far, 4.0, 0.6, 0.8, 5.0, 4.0, 6.0, 20.0], [1000.0] * 10, 0.0)
-    assert end.nearly is not None
-    assert (end.step, end.nearly.X.tolist()) == (0.6, seen[4].tolist())
+    assert end.acceptable_fit is not None
+    assert (end.step, end.acceptable_fit.X.tolist()) == (0.6, seen[4].tolist())
     for costs, disturbed, swung in (
         ([1000.0, 1010.0] * 5, 0.1, True),
         ([1000.0, 1010.0] * 5, 0.0, False),
@@ -751,10 +790,10 @@ def test_a_fit_that_fails_stands_where_it_was_as_good_as_found(
         ([1000.0 / 1.2**k for k in range(10)], 0.1, False),
     ):
         end = failed([*far, *[5.0] * 7], costs, disturbed)
-        assert (end.nearly, end.step) == (None, 5.0)
+        assert (end.acceptable_fit, end.step) == (None, 5.0)
         assert end.fit is not None
         assert end.fit.X.tolist() == seen[-1].tolist()
-        assert (end.swinging is end.fit) == swung
+        assert (end.oscillating_fit is end.fit) == swung
 
 
 def test_a_fit_that_came_near_the_log_is_gone_on_with(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -771,7 +810,7 @@ def test_a_fit_that_came_near_the_log_is_gone_on_with(straight: Model, monkeypat
     monkeypatch.setattr(gauss_newton, "newton_step", scripted)
     lost = [500.0, 90.0, 80.0, 40.0, *[30.0] * 4]
     off = replace(stage, fit=replace(stage.fit, cost=2 * stage.noise))
-    loose = replace(off, fit=replace(off.fit, disturbed=0.1))
+    loose = replace(off, fit=replace(off.fit, process_noise=0.1))
     for of, disturbed, far, most, found in (
         (off, 0.0, 1.0, np.inf, True),
         (off, 0.0, 2.0, np.inf, False),
@@ -815,7 +854,7 @@ def test_who_gains_too_little_with_coarse_sensors_is_given_up(
 def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where forces leave much a candidate is fitted as long as it comes to half of what it must gain, and where those
     that were fitted first gained that, the others as long as they come to half of what these did."""
-    iterate = gauss_newton.iterate
+    iterate = gauss_newton.fit_logs
     bars: list[tuple[str, float]] = []
 
     def noted(c: Any, *args: Any, **more: Any) -> gauss_newton.Fit:
@@ -823,7 +862,7 @@ def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatc
             bars.append((c.model.effects[0].name, args[9]))
         return iterate(c, *args, **more)
 
-    monkeypatch.setattr(smoothing, "iterate", noted)
+    monkeypatch.setattr(smoothing, "fit_logs", noted)
     stage = stages.fitted(straight.machine, [log.read_log(sloping, straight.machine)], straight.machine.filter)
     likely = selection.scored(stage, in_turn)
     for pair, over in ((2, selection.OVER), (1, 1e3)):
@@ -840,20 +879,20 @@ def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatc
         bar = next(bar for name, bar in bars if name != choice.name)
         assert bar == pytest.approx(first if pair > 1 else stage.fit.cost - selection.BEHIND * choice.gain)
     texts = ("ground_slope=0.009", "roll_unbalance@rear_roll=500")
-    machines = [placing.extended(straight.machine, placing.parse(t, straight.machine, 40.0)) for t in texts]
+    machines = [placing.with_effects(straight.machine, placing.parse_effect(t, straight.machine, 40.0)) for t in texts]
     for most, found in ((np.inf, [True, True]), (bar, [True, False])):
-        tried = stages.refits([(m, stage, stage.fit.disturbed) for m in machines], in_turn, most)
+        tried = stages.refits([(m, stage, stage.fit.process_noise) for m in machines], in_turn, most)
         assert [x is not None for x in tried] == found
 
 
 def fits(monkeypatch: pytest.MonkeyPatch) -> tuple[list[int], list[float]]:
     """Of every fit from now on: how many samples of the first log it is made to, and with which disturbing forces."""
-    iterate, lengths, forces = gauss_newton.iterate, list[int](), list[float]()
+    iterate, lengths, forces = gauss_newton.fit_logs, list[int](), list[float]()
 
     def noted(c: Any, records: Any, *asked: Any) -> gauss_newton.Fit:
         lengths.append(len(records[0].used))
         forces.append(asked[3])
         return iterate(c, records, *asked)
 
-    monkeypatch.setattr(smoothing, "iterate", noted)
+    monkeypatch.setattr(smoothing, "fit_logs", noted)
     return lengths, forces

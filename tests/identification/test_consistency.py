@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from support.logs import make_log
 
 from excite.identification import Estimate, methods
-from excite.identification.consistency import consistent, is_possible
-from excite.logs import log
+from excite.identification.consistency import is_possible, nearest_possible
 from excite.model import Model, standard_parameters
-from excite.simulation import Motion, sensors
+from excite.simulation import Motion
 
 
 def estimate(model: Model, value: np.ndarray, std: np.ndarray) -> Estimate:
@@ -32,7 +32,7 @@ def test_wrong_signs_are_not_possible(va12: Model, name: str) -> None:
     X = va12.nominal.copy()
     X[va12.base.names.index(name)] *= -1
     assert not is_possible(va12, X)
-    found = consistent(va12, estimate(va12, X, 0.05 * va12.scale))
+    found = nearest_possible(va12, estimate(va12, X, 0.05 * va12.scale))
     assert is_possible(va12, found.value)
     assert "no real machine" in found.notes[-1]
 
@@ -56,7 +56,7 @@ def test_inertia_about_the_centre_of_mass_counts(va12: Model) -> None:
 
 def test_what_is_possible_stays_as_it_is(straight: Model) -> None:
     before = estimate(straight, 1.02 * straight.nominal, 0.1 * straight.scale)
-    after = consistent(straight, before)
+    after = nearest_possible(straight, before)
     assert (after.value == before.value).all()
     assert after.method == "ols+consistent"
     assert "possible as it is" in after.notes[-1]
@@ -71,7 +71,7 @@ def test_the_nearest_machine_in_the_metric_of_the_data(straight: Model) -> None:
     covariance = np.diag(std**2)
     covariance[a, b] = covariance[b, a] = 0.8 * std[a] * std[b]
     before = replace(estimate(straight, X, std), covariance=covariance)
-    after = consistent(straight, before)
+    after = nearest_possible(straight, before)
     assert after.value[a] == pytest.approx(0.0, abs=1e-3)
     assert after.value[b] == pytest.approx(X[b] + 10.0 * covariance[a, b] / covariance[a, a], rel=1e-4)
     others = [k for k in range(len(X)) if k not in (a, b)]
@@ -86,21 +86,21 @@ def test_random_bodies_are_possible_and_random_vectors_become_so(straight: Model
     bodies = {n: v * rng.uniform(0.3, 3) for n, (v, _) in table.items() if n[0] in "FK" or n in ("M1", "M4")}
     assert is_possible(straight, straight.base_values(bodies))
     X = straight.nominal * rng.uniform(-1, 2, len(straight.nominal))
-    assert is_possible(straight, consistent(straight, estimate(straight, X, 0.1 * straight.scale)).value)
+    assert is_possible(straight, nearest_possible(straight, estimate(straight, X, 0.1 * straight.scale)).value)
 
 
 def test_unknown_parameters_stay_unknown(straight: Model) -> None:
     X = straight.nominal.copy()
     X[0], X[2] = np.nan, -1.0
     std = np.where(np.isfinite(X), 0.1 * straight.scale, np.nan)
-    found = consistent(straight, estimate(straight, X, std))
+    found = nearest_possible(straight, estimate(straight, X, std))
     assert np.isnan(found.value[0])
     assert found.value[2] >= 0
 
 
 def test_composes_with_every_linear_method(va12: Model, va12_motion: Motion) -> None:
     """Ordinary least squares on this drive gives a negative viscous friction, ten times too large."""
-    one = log.from_table(sensors.measure(va12, va12_motion, seed=100), va12.machine)
+    one = make_log(va12, va12_motion, seed=100)
     plain = methods.identify(va12, [one], "ols")
     found = methods.identify(va12, [one], "ols+consistent")
     assert not is_possible(va12, plain.value)

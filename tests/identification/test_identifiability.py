@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+from support.logs import make_log
 
-from excite.errors import NoEstimate
+from excite.errors import NoEstimateError
 from excite.identification import identifiability, methods
 from excite.logs import log
 from excite.model import Model
@@ -47,7 +48,7 @@ def braked(va12: Model, angle: float) -> log.Log:
     motion = simulate(va12, push[:, None] * [1, 0, 0.8], held, q0, np.array([0.65, 0, 0, 1, 0, 1]))
     brake = (1e8 - va12.nominal[va12.base.names.index("Fv2")]) * motion.nu[:, va12.coordinates.index("theta2")]
     known = replace(motion, u=motion.u - brake[:, None] * [0, 1, 0])
-    return log.from_table(sensors.measure(va12, known, seed=1), va12.machine)
+    return make_log(va12, known, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +102,7 @@ def test_a_log_out_of_range_is_said_of_a_joint_at_rest_too(va12: Model, one_way:
     values = {name: x.copy() for name, x in one_way.values.items()}
     values["theta2"][:] = 0.0
     values["vy"][1500:1700] = 1.797e308
-    with pytest.raises(NoEstimate):
+    with pytest.raises(NoEstimateError):
         methods.identify(va12, [replace(one_way, values=values)], method)
 
 
@@ -110,7 +111,7 @@ def test_a_speed_that_nothing_measures_is_not_at_rest(va12: Model) -> None:
     bend = braked(va12, 0.35)
     lateral = next(s.name for s in va12.machine.sensors("full") if s.kind == "lateral_speed")
     bend = replace(bend, values={n: v for n, v in bend.values.items() if n != lateral})
-    shown = np.diag(identifiability.at_rest(va12, [bend], va12.machine.filter)) > 0
+    shown = np.diag(identifiability.rest_projection(va12, [bend], va12.machine.filter)) > 0
     assert {n for n, yes in zip(va12.base.names, shown, strict=True) if not yes} == {"Fv2", "Fs2", "u10", "u40"}
 
 
@@ -139,7 +140,7 @@ def test_one_way_is_told_to_go_both(straight: Model) -> None:
 
 
 def test_what_is_shown_gets_no_advice(straight: Model, straight_motion: Motion) -> None:
-    one = log.from_table(sensors.measure(straight, straight_motion, seed=1), straight.machine)
+    one = make_log(straight, straight_motion, seed=1)
     estimate = methods.identify(straight, [one], "iv")
     assert estimate.unidentifiable == {}
     assert not any("hardly shows" in note for note in estimate.notes)

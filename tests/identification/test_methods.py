@@ -8,20 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.signal
+from support.logs import make_log
 
-from excite.errors import NotIdentifiable
+from excite.errors import NotIdentifiableError
 from excite.identification import Estimate, linear_methods, methods, noise_propagation
 from excite.identification.least_squares import autoregression, merge, reduce, solve
 from excite.logs import Log, filtered, log
 from excite.model import Model, prediction
 from excite.model.machine import Filter, Machine
-from excite.simulation import Motion, sensors, simulate
+from excite.simulation import Motion, simulate
 
 LINEAR = ("ols", "wls", "iv", "tls")
 
 
 def measured(model: Model, motion: Motion, seed: int, kit: str = "full", noise: bool = True) -> Log:
-    return log.from_table(sensors.measure(model, motion, kit=kit, seed=seed, noise=noise), model.machine)
+    return make_log(model, motion, kit=kit, seed=seed, noise=noise)
 
 
 def errors(model: Model, estimates: Sequence[Estimate]) -> np.ndarray:
@@ -77,7 +78,7 @@ def test_a_disturbed_row_counts_less(straight: Model, straight_motion: Motion) -
     )
     level = np.sqrt((found.residual**2).mean(axis=1))
     assert level[2] > 2 * least[2]
-    again = linear_methods.solved(linear_methods.scaled(blocks, np.maximum(level, least)))
+    again = linear_methods.solve_blocks(linear_methods.scale_rows(blocks, np.maximum(level, least)))
     assert (np.abs(again.x - found.value) < 0.02 * found.std).all()
 
 
@@ -186,7 +187,7 @@ def test_kits_without_lateral_speed_are_known(va12: Model) -> None:
 @pytest.mark.parametrize(("pole", "zero"), [(0.0, 0.0), (0.5, 0.0), (0.8, 0.0), (-0.4, 0.0), (0.0, 1.0)])
 def test_deviations_hold_for_coloured_noise(straight: Model, straight_motion: Motion, pole: float, zero: float) -> None:
     """Coverage of the 95 % interval; (33) covers 51 % at a pole of 0.8 and 100 % for differentiated noise."""
-    W = straight.stacked(straight_motion.q.T, straight_motion.nu.T, straight_motion.a.T)
+    W = straight.stacked_regressor(straight_motion.q.T, straight_motion.nu.T, straight_motion.a.T)
     W = W.transpose(1, 0, 2)[:, ::10].copy()
     Y = W @ straight.nominal
     rng = np.random.default_rng(0)
@@ -195,10 +196,12 @@ def test_deviations_hold_for_coloured_noise(straight: Model, straight_motion: Mo
         white = rng.standard_normal((3, W.shape[1] + 200))
         coloured = scipy.signal.lfilter([1, -zero], [1, -pole], white, axis=1)[:, 200:]
         blocks = [(W, Y + 20 * coloured)]
-        solution = linear_methods.solved(blocks)
-        covariance = linear_methods.sandwich(blocks, solution)
-        degrees = linear_methods.effective(solution, covariance)
-        found.append(linear_methods.assembled(straight, blocks, solution, "wls", solution.x, covariance, degrees, ()))
+        solution = linear_methods.solve_blocks(blocks)
+        covariance = linear_methods.sandwich_covariance(blocks, solution)
+        degrees = linear_methods.effective_degrees(solution, covariance)
+        found.append(
+            linear_methods.build_estimate(straight, blocks, solution, "wls", solution.x, covariance, degrees, ())
+        )
     assert covered(straight, found) == pytest.approx(0.945, abs=0.05)
 
 
@@ -252,12 +255,12 @@ def test_instruments_say_when_they_find_no_machine(straight: Model, straight_mot
     """Torques that push the wrong way: the masses that fit are negative."""
     one = measured(straight, straight_motion, 100)
     wrong = {k: -v if k in ("u1", "u4") else v for k, v in one.values.items()}
-    with pytest.raises(NotIdentifiable, match="iv: "):
+    with pytest.raises(NotIdentifiableError, match="iv: "):
         methods.identify(straight, [Log("wrong", one.t, wrong)], "iv")
 
 
 def test_a_log_whose_torques_are_dead_is_refused(straight: Model, straight_motion: Motion) -> None:
-    one = log.from_table(sensors.measure(straight, straight_motion, seed=1), straight.machine)
+    one = make_log(straight, straight_motion, seed=1)
     dead = Log("dead", one.t, one.values | {name: np.zeros(len(one)) for name in ("u1", "u4")})
-    with pytest.raises(NotIdentifiable, match=r"every torque is zero all along.*never changes"):
+    with pytest.raises(NotIdentifiableError, match=r"every torque is zero all along.*never changes"):
         methods.identify(straight, [dead], "ols")

@@ -168,7 +168,7 @@ HOUR = """
 import sys, time
 sys.path.insert(0, sys.argv[2])
 import numpy as np
-from conftest import drive
+from support.drives import drive
 import excite
 from excite.identification import identify
 from excite.logs import Log, from_table

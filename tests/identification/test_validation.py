@@ -8,50 +8,52 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
-from conftest import drive, study
+from support.drives import drive
+from support.files import study
+from support.logs import make_log
 
 from excite.identification import Estimate, methods, validation
 from excite.logs import Log, log
 from excite.model import Model, build
 from excite.model.effects import placing
-from excite.simulation import Motion, sensors, simulate
+from excite.simulation import Motion, simulate
 
 
 @pytest.fixture(scope="module")
 def other(straight: Model) -> Log:
     """Another drive than the one that the parameters come from."""
     motion = simulate(straight, drive(straight, 30, 7, {"u1": 1000, "u4": 1400}))
-    return log.from_table(sensors.measure(straight, motion, seed=5), straight.machine)
+    return make_log(straight, motion, seed=5)
 
 
 @pytest.fixture(scope="module")
 def found(straight: Model, straight_motion: Motion) -> dict[str, Estimate]:
-    one = log.from_table(sensors.measure(straight, straight_motion, seed=100), straight.machine)
+    one = make_log(straight, straight_motion, seed=100)
     return {m: methods.identify(straight, [one], m) for m in ("ols", "iv")}
 
 
 def test_truth_explains_an_exact_log(straight: Model, found: dict[str, Estimate]) -> None:
     motion = simulate(straight, drive(straight, 30, 7, {"u1": 1000, "u4": 1400}))
-    exact = log.from_table(sensors.measure(straight, motion, noise=False), straight.machine)
+    exact = make_log(straight, motion, noise=False)
     truth = replace(found["iv"], value=straight.nominal)
-    assert validation.motions(straight, exact, truth).percent.max() < 0.2
-    assert validation.torques(straight, exact, truth).percent.max() < 5
+    assert validation.compare_motions(straight, exact, truth).percent.max() < 0.2
+    assert validation.compare_torques(straight, exact, truth).percent.max() < 5
 
 
 def test_what_a_torque_channel_adds_is_taken_away(straight: Model, found: dict[str, Estimate]) -> None:
     """A gain, a drift and a delay: the machine is driven by what was delivered, not by what was read."""
     texts = ("torque_gain@front_roll=0.3", "torque_offset_drift@rear_roll=20", "channel_delay@front_roll=0.1")
-    entries = [placing.parse(text, straight.machine, 30.0) for text in texts]
-    flawed = build(placing.extended(straight.machine, *entries))
+    entries = [placing.parse_effect(text, straight.machine, 30.0) for text in texts]
+    flawed = build(placing.with_effects(straight.machine, *entries))
     motion = simulate(flawed, drive(flawed, 30, 7, {"u1": 1000, "u4": 1400}))
-    exact = log.from_table(sensors.measure(flawed, motion, noise=False), flawed.machine)
+    exact = make_log(flawed, motion, noise=False)
     truth = replace(found["iv"], names=flawed.base.names, value=flawed.nominal)
-    assert validation.motions(flawed, exact, truth).percent.max() < 0.5
+    assert validation.compare_motions(flawed, exact, truth).percent.max() < 0.5
 
 
 def test_what_is_far_from_the_machine_file_is_said(straight: Model, straight_motion: Motion) -> None:
     """Least squares on a designed drive finds a mass fifteen times too small; joint smoothing the true one."""
-    one = log.from_table(sensors.measure(straight, straight_motion, seed=100), straight.machine)
+    one = make_log(straight, straight_motion, seed=100)
     estimate = methods.identify(straight, [one], "joint")
     assert validation.far_from_nominal(straight, estimate) == ()
     value = estimate.value.copy()
@@ -64,12 +66,12 @@ def test_what_is_far_from_the_machine_file_is_said(straight: Model, straight_mot
 
 def test_better_parameters_simulate_other_logs_better(straight: Model, found: dict[str, Estimate], other: Log) -> None:
     """Direct simulation tells a mass that is 5 % wrong; torques predicted from noisy slips do not."""
-    right, wrong = (validation.motions(straight, other, found[m]) for m in ("iv", "ols"))
+    right, wrong = (validation.compare_motions(straight, other, found[m]) for m in ("iv", "ols"))
     assert right.names == ("theta1", "theta4", "thetal", "thetar")
     assert right.measured.shape == right.predicted.shape == (4, len(other))
     assert (right.percent < 0.6 * wrong.percent).all()
     assert right.percent.max() < 3
-    both = [validation.torques(straight, other, found[m]) for m in ("iv", "ols")]
+    both = [validation.compare_torques(straight, other, found[m]) for m in ("iv", "ols")]
     assert both[0].names == ("u1", "u4")
     assert both[0].units == ("N m", "N m")
     assert both[0].percent.max() < 60
@@ -79,7 +81,7 @@ def test_an_unknown_parameter_is_asked_for(straight: Model, found: dict[str, Est
     value = found["iv"].value.copy()
     value[2] = np.nan
     with pytest.raises(ValueError, match="unknown: Fv1"):
-        validation.motions(straight, other, replace(found["iv"], value=value))
+        validation.compare_motions(straight, other, replace(found["iv"], value=value))
 
 
 def test_emps_in_closed_loop(emps: Model, emps_data: Path) -> None:

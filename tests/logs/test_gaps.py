@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import Excite, designed
+from support.commands import Excite
+from support.drives import designed
 
 from excite.errors import LogError
 from excite.identification import identify

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import Excite
+from support.commands import Excite
 
 from excite.errors import LogError
 from excite.logs import inspection, log, tables

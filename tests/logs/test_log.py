@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
-from conftest import Excite
+from support.commands import Excite
 
 from excite.logs import log, profile
 from excite.model import Model

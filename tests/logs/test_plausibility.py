@@ -10,16 +10,18 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.signal
-from conftest import Excite, drive
+from support.commands import Excite
+from support.drives import drive
+from support.logs import make_log
 
-from excite.errors import NoEstimate
+from excite.errors import NoEstimateError
 from excite.identification import methods
 from excite.logs import Log, log, plausibility
 from excite.model import Model, prediction
 from excite.model.effects import placing
 from excite.model.machine import machine
 from excite.simulation import Motion, follow, sensors, simulate
-from excite.smoothing import NotConverged
+from excite.smoothing import NotConvergedError
 from excite.workflows import diagnose_workflow
 
 T = np.arange(4001) / 100
@@ -45,7 +47,7 @@ ROLLS = {
 
 
 def checked(model: Model, motion: Motion, kit: str = "full") -> Log:
-    return log.from_table(sensors.measure(model, motion, kit=kit, seed=1), model.machine)
+    return make_log(model, motion, kit=kit, seed=1)
 
 
 def turned(model: Model, one: Log, *names: str) -> tuple[str, ...]:
@@ -103,8 +105,8 @@ def test_a_circle_on_a_slope_is_no_speed(va12: Model, slope: float) -> None:
     """Torques that come and go with the heading, and so with the angle of every roll."""
     circling = va12
     if slope:
-        entry = placing.parse(f"ground_slope={slope}", va12.machine, 40.0)
-        circling = prediction.build(placing.extended(va12.machine, entry))
+        entry = placing.parse_effect(f"ground_slope={slope}", va12.machine, 40.0)
+        circling = prediction.build(placing.with_effects(va12.machine, entry))
     motion = follow(circling, np.interp(T, [0, 3], [0, 1.0]), np.interp(T, [0, 4], [0, 0.3])[:, None], seed=3)
     assert not any("speed" in line for line in plausibility.doubts(va12.machine, checked(circling, motion).values))
 
@@ -184,7 +186,7 @@ def test_identify_says_what_is_doubtful(straight: Model, straight_motion: Motion
     wrong = Log("log.csv", one.t, one.values | {"u4": -one.values["u4"]})
     assert not any("sign" in note for note in methods.identify(straight, [one], "ols").notes)
     assert any("log.csv: the more torque u4_Nm" in note for note in methods.identify(straight, [wrong], "ols").notes)
-    with pytest.raises(NoEstimate, match=r"^iv: .*; log.csv: the more torque u4_Nm .* sign"):
+    with pytest.raises(NoEstimateError, match=r"^iv: .*; log.csv: the more torque u4_Nm .* sign"):
         methods.identify(straight, [wrong], "iv")
 
 
@@ -210,11 +212,11 @@ def test_diagnose_says_what_is_doubtful(
     table.assign(u1_Nm=table["u1_Nm"] / 1000).to_csv(tmp_path / "log.csv", index=False)
 
     def fails(*args: object) -> None:
-        raise NotConverged("no motion", None, 3.0)
+        raise NotConvergedError("no motion", None, 3.0)
 
     monkeypatch.setattr(diagnose_workflow, "diagnose", fails)
-    with pytest.raises(NotConverged, match=r"^no motion; .*log.csv: column u1_Nm: .* is it in kN m"):
-        diagnose_workflow.diagnose_logs(
+    with pytest.raises(NotConvergedError, match=r"^no motion; .*log.csv: column u1_Nm: .* is it in kN m"):
+        diagnose_workflow.diagnose(
             tmp_path, "va12_straight", straight, [tmp_path / "log.csv"], "machine", lambda *a: None
         )
 
@@ -229,5 +231,5 @@ def test_a_measuring_wheel_that_counts_backward_is_told(va12: Model, va12_motion
 def test_a_dead_channel_is_named_where_no_estimate_is_found(va12: Model, va12_motion: Motion, name: str) -> None:
     one = checked(va12, va12_motion)
     dead = Log("dead", one.t, one.values | {name: np.full(len(one), one.values[name][0])})
-    with pytest.raises(NoEstimate, match=rf"{name}_\w+: never changes \(.*is the sensor connected"):
+    with pytest.raises(NoEstimateError, match=rf"{name}_\w+: never changes \(.*is the sensor connected"):
         methods.identify(va12, [dead], "joint")

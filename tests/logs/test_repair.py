@@ -7,18 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import designed
+from support.drives import designed
+from support.logs import make_log
 
 from excite.errors import LogError
-from excite.identification import delays, filter_choice, methods
+from excite.identification import estimate_delays, filter_choice, methods
 from excite.logs import Log, log, repair
 from excite.model import Model
-from excite.simulation import Motion, sensors
+from excite.simulation import Motion
 
 
 @pytest.fixture(scope="module")
 def clean(straight: Model, straight_motion: Motion) -> Log:
-    return log.from_table(sensors.measure(straight, straight_motion, seed=100), straight.machine)
+    return make_log(straight, straight_motion, seed=100)
 
 
 def changed(one: Log, name: str, values: np.ndarray) -> Log:
@@ -30,7 +31,7 @@ def test_clean_logs_are_left_alone(
 ) -> None:
     for seed in range(5):
         for model, motion in ((straight, straight_motion), (va12, va12_motion)):
-            one = log.from_table(sensors.measure(model, motion, seed=seed, noise=seed > 0), model.machine)
+            one = make_log(model, motion, seed=seed, noise=seed > 0)
             found = repair.examine(model, one)
             assert (found.notes, found.spikes, found.dropouts) == ((), {}, {})
             assert all((found.log.values[k] == v).all() for k, v in one.values.items())
@@ -135,23 +136,23 @@ def test_what_stands_exactly_still_is_no_dropout(straight: Model, clean: Log) ->
 
 def test_late_channels_are_found_to_a_millisecond(straight: Model, clean: Log) -> None:
     """No alarm on a clean log; 30 ms on one channel is 30 ms on that one, and none on the other."""
-    assert delays.late_channels(straight, clean) == ()
+    assert estimate_delays.late_channels(straight, clean) == ()
     late = np.concatenate([np.full(3, clean.values["u1"][0]), clean.values["u1"][:-3]])
-    first, other = delays.delays(straight, changed(clean, "u1", late))
+    first, other = estimate_delays.delays(straight, changed(clean, "u1", late))
     assert first.name == "u1"
     assert first.value == pytest.approx(0.030, abs=0.002)
     assert first.significant
     assert abs(other.value) < 0.002
     assert not other.significant
-    (note,) = delays.late_channels(straight, changed(clean, "u1", late))
+    (note,) = estimate_delays.late_channels(straight, changed(clean, "u1", late))
     assert "ms (+-" in note
     assert "late" in note
 
 
 def test_early_channels_of_the_whole_machine(va12: Model, va12_motion: Motion) -> None:
-    one = log.from_table(sensors.measure(va12, va12_motion, seed=3), va12.machine)
+    one = make_log(va12, va12_motion, seed=3)
     early = np.concatenate([one.values["u2"][4:], np.full(4, one.values["u2"][-1])])
-    found = {d.name: d for d in delays.delays(va12, changed(one, "u2", early))}
+    found = {d.name: d for d in estimate_delays.delays(va12, changed(one, "u2", early))}
     assert found["u2"].value == pytest.approx(-0.040, abs=0.003)
     assert not found["u1"].significant
     assert not found["u4"].significant
@@ -160,12 +161,12 @@ def test_early_channels_of_the_whole_machine(va12: Model, va12_motion: Motion) -
 def test_noise_of_slips_is_no_delay(va12: Model) -> None:
     """Along R60 slips are small: what their noise leaves in the rows seems 15 ms early, in every log. It hides a part
     of 80 ms that a channel is late."""
-    one = log.from_table(sensors.measure(va12, designed("R60", va12), seed=3), va12.machine)
-    assert any(d.significant for d in delays.delays(va12, one))
+    one = make_log(va12, designed("R60", va12), seed=3)
+    assert any(d.significant for d in estimate_delays.delays(va12, one))
     for X in (va12.nominal, None):
-        assert delays.late_channels(va12, one, X=X) == ()
+        assert estimate_delays.late_channels(va12, one, X=X) == ()
     late = np.concatenate([np.full(8, one.values["u1"][0]), one.values["u1"][:-8]])
-    (note,) = delays.late_channels(va12, changed(one, "u1", late), X=va12.nominal)
+    (note,) = estimate_delays.late_channels(va12, changed(one, "u1", late), X=va12.nominal)
     told = re.search(r"u1 is late against the motion, by ([0-9.]+) ms .* as far as noise tells", note)
     assert told is not None
     assert 40 < float(told[1]) < 85
@@ -176,15 +177,17 @@ def test_a_spectrum_sinks_where_noise_begins() -> None:
     rng = np.random.default_rng(0)
     t = np.arange(6000) / 100
     x = sum(np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) / (1 + f) for f in np.arange(0.1, 5.0, 0.1))
-    assert filter_choice.sinks(x + 0.01 * rng.standard_normal(len(t)), 100.0) == pytest.approx(5.0, abs=0.5)
+    assert filter_choice.noise_floor_frequency(x + 0.01 * rng.standard_normal(len(t)), 100.0) == pytest.approx(
+        5.0, abs=0.5
+    )
 
 
 def test_filters_follow_the_log(straight: Model, clean: Log) -> None:
-    filter, reason = filter_choice.choose(straight, [clean])
+    filter, reason = filter_choice.choose_from_spectra(straight, [clean])
     assert 3 < float(filter.cutoff_hz) < 12
     assert 0.8 * 50 / filter.decimation >= float(filter.cutoff_hz)
     assert "noise floor" in reason
     assert "liveliest" in reason
     coarse = {k: v + 0.02 * np.random.default_rng(1).standard_normal(len(v)) for k, v in clean.values.items()}
-    lower, _ = filter_choice.choose(straight, [Log("coarse", clean.t, coarse)])
+    lower, _ = filter_choice.choose_from_spectra(straight, [Log("coarse", clean.t, coarse)])
     assert float(lower.cutoff_hz) < 0.7 * float(filter.cutoff_hz)

@@ -8,7 +8,8 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from conftest import designed, gentle
+from support.drives import designed, gentle
+from support.logs import make_log
 
 from excite.diagnosis import fits, score_test, selection
 from excite.diagnosis.diagnosis import opposite
@@ -16,7 +17,7 @@ from excite.errors import MachineError
 from excite.identification import identify
 from excite.logs import log, passes
 from excite.model import Model, build, signatures
-from excite.model.effects import CATALOGUE, DURATION, Effect, Placed, Site, ground_map, placing
+from excite.model.effects import CATALOGUE, DEFAULT_DURATION, Effect, PlacedEffect, Site, ground_map, placing
 from excite.model.machine import EffectEntry, Quantity, machine
 from excite.model.mechanics import tree
 from excite.simulation import Motion, sensors, simulate
@@ -57,18 +58,18 @@ VA12 = machine.load_machine("va12")
 
 
 def where(effect: Effect) -> str:
-    return next(iter(placing.places(VA12, effect)))
+    return next(iter(placing.allowed_places(VA12, effect)))
 
 
 def typical(effect: Effect) -> float:
-    bodies, _ = placing.places(VA12, effect)[where(effect)]
-    return effect.amount(Site.of(VA12, bodies))
+    bodies, _ = placing.allowed_places(VA12, effect)[where(effect)]
+    return effect.typical_magnitude(Site.of(VA12, bodies))
 
 
 def shaped(text: str, shapes: Mapping[str, float], known: machine.Machine = VA12) -> EffectEntry:
     """`NAME@WHERE=AMOUNT` with these shapes."""
     told = {name: Quantity(value=value, source="assumed") for name, value in shapes.items()}
-    return placing.parse(text, known, DURATION).model_copy(update={"shape": told})
+    return placing.parse_effect(text, known, DEFAULT_DURATION).model_copy(update={"shape": told})
 
 
 def there(effect: Effect, amount: float, shapes: Mapping[str, float]) -> EffectEntry:
@@ -77,7 +78,7 @@ def there(effect: Effect, amount: float, shapes: Mapping[str, float]) -> EffectE
 
 
 def extended(effect: Effect, amount: float, shapes: Mapping[str, float] = MappingProxyType({})) -> Model:
-    return build(placing.extended(VA12, there(effect, amount, shapes)))
+    return build(placing.with_effects(VA12, there(effect, amount, shapes)))
 
 
 CIRCULAR = {e.name: (e, s) for e in CATALOGUE.values() for s, shape in e.shapes.items() if shape.circular}
@@ -102,7 +103,7 @@ def test_dry_friction_may_turn_more_suddenly(va12: Model, slow: float) -> None:
     """From the formula: at rates from far within to far beyond the one over which it turns."""
     k, ws, Fs = 3, 0.02, 174.74
     w = np.array([-0.1, -0.02, -0.004, 0.001, 0.01, 0.3])
-    model = build(placing.extended(VA12, shaped("friction_transition@front_roll=0.7", {"slow": slow})))
+    model = build(placing.with_effects(VA12, shaped("friction_transition@front_roll=0.7", {"slow": slow})))
     nu = np.zeros((6, len(w)))
     nu[k] = w
     q, a, u, z = np.zeros((6, len(w))), np.zeros((6, len(w))), np.zeros((3, len(w))), np.zeros((0, len(w)))
@@ -117,7 +118,7 @@ def test_a_roll_out_of_round_rolls_as_far_as_it_reaches_and_climbs(va12: Model) 
     """Its weight is held by the slope of its outline; where its centre goes as fast as the ground under it the soil
     does nothing; what the soil does acts at the distance of the ground."""
     shapes = {"phase": 0.4, "load": 5e4}
-    model = build(placing.extended(VA12, shaped("roll_out_of_round@front_roll=0.01", shapes)))
+    model = build(placing.with_effects(VA12, shaped("roll_out_of_round@front_roll=0.01", shapes)))
     angle = np.linspace(0, 2 * np.pi, 9)
     distance = 0.65 + 0.01 * np.sin(angle + 0.4)
     q, still, u = (np.zeros((n, 9)) for n in (6, 6, 3))
@@ -146,7 +147,7 @@ def test_the_order_of_effects_at_one_roll_does_not_count(other: str) -> None:
     entries = [shaped("roll_out_of_round@front_roll=0.01", {"phase": 0.4, "load": 5e4}), shaped(other, {})]
     told = []
     for order in (entries, entries[::-1]):
-        model = build(placing.extended(VA12, *order))
+        model = build(placing.with_effects(VA12, *order))
         q, nu, a, u, z = samples(model)
         values = dict(zip(model.base.names, model.nominal, strict=True))
         assert len(values) == len(model.nominal)
@@ -160,14 +161,14 @@ def test_an_actuator_in_its_play_waits_for_a_push() -> None:
     after some tenths of a second; pushed back by less than its own friction it creeps, to that share of its play if one
     waits; pushed back by more it goes to the rear at once."""
     shapes = {"rubs": 1.0, "damping": 3.0, "breakaway": 400.0}
-    model = build(placing.extended(VA12, shaped("articulation_backlash=0.004", shapes)))
+    model = build(placing.with_effects(VA12, shaped("articulation_backlash=0.004", shapes)))
     t = np.arange(400) / 100
     torque = np.zeros((400, 3))
     torque[:, 1] = np.interp(
         t, [0, 0.2, 1.0, 1.2, 1.7, 1.8, 2.3, 2.5, 4.0], [0, 3e3, 3e3, 0, 0, -200, -200, -3e3, -3e3]
     )
     motion = simulate(model, torque)
-    play = (sensors.signals(model, motion)["theta2"] - motion.q[:, 4]) / 0.002
+    play = (sensors.exact_readings(model, motion)["theta2"] - motion.q[:, 4]) / 0.002
     assert model.memory == ("articulation_backlash@articulation.play",)
     assert play[90] == pytest.approx(1.0, abs=0.02)
     assert play[140] > 0.6
@@ -178,7 +179,7 @@ def test_an_actuator_in_its_play_waits_for_a_push() -> None:
 def test_a_pump_is_felt_through_a_hose(va12: Model) -> None:
     """A step of one roll's torque comes to the other by the share A, as a first-order lag has it; at once without."""
     hose: dict[str, float] = {"hose": 1.0, "lag": 0.2}
-    model, at_once = (build(placing.extended(VA12, shaped("pump_coupling=0.1", x))) for x in (hose, {}))
+    model, at_once = (build(placing.with_effects(VA12, shaped("pump_coupling=0.1", x))) for x in (hose, {}))
     t = np.arange(100) / 100
     torque = np.column_stack([1000 * (t >= 0.3), 0 * t, 0 * t])
     motion = simulate(model, torque)
@@ -204,7 +205,7 @@ def test_bristles_bend_before_a_joint_slides(va12: Model) -> None:
     """LuGre: from rest friction grows with the angle as a spring does, (Fs + A) / presliding; sliding steadily it is
     Stribeck's, Fs + A exp(-(w / decay)^2) against the motion either way (Canudas de Wit et al. 1995, (1) to (4))."""
     shapes = {"decay": 0.3, "power": 2.0, "bristles": 1.0, "presliding": 0.004}
-    model = build(placing.extended(VA12, shaped("stribeck_friction@rear_roll=250", shapes)))
+    model = build(placing.with_effects(VA12, shaped("stribeck_friction@rear_roll=250", shapes)))
     p, still, u = model.expand @ model.nominal, np.zeros(6), np.zeros(3)
     Fs, Fv = (float(p[model.base.standard.index(n)]) for n in ("Fs4", "Fv4"))
 
@@ -227,7 +228,7 @@ def test_bristles_bend_before_a_joint_slides(va12: Model) -> None:
 @pytest.mark.parametrize(("second", "share"), [(0.0, 0.0), (1.0, 0.5), (2.0, 1.0), (3.0, 0.5), (4.0, 0.0)])
 def test_a_brake_drags_between_its_instants(second: float, share: float, va12: Model) -> None:
     """Dry friction larger by its amount, against the motion either way."""
-    model = build(placing.extended(VA12, shaped("brake_drag@rear_roll=300", {"begin": 1.0, "end": 3.0})))
+    model = build(placing.with_effects(VA12, shaped("brake_drag@rear_roll=300", {"begin": 1.0, "end": 3.0})))
     nu = np.zeros((6, 2))
     nu[5] = 1.0, -1.0
     q, a, u = np.zeros((6, 2)), np.zeros((6, 2)), np.zeros((3, 2))
@@ -255,9 +256,9 @@ def test_the_contract_is_in_the_catalogue() -> None:
 
 def forms(effect: Effect) -> list[dict[str, float]]:
     """The shapes of every form that an effect has, the plain one first: the first of each that is tried."""
-    bodies, _ = placing.places(VA12, effect)[where(effect)]
+    bodies, _ = placing.allowed_places(VA12, effect)[where(effect)]
     found: dict[tuple[tuple[str, float], ...], dict[str, float]] = {(): {}}
-    for shapes in effect.beside(Site.of(VA12, bodies)):
+    for shapes in effect.extra_trials(Site.of(VA12, bodies)):
         form = tuple((n, x) for n, x in shapes.items() if n != "A" and effect.shapes[n].only)
         found.setdefault(form, {n: x for n, x in shapes.items() if n != "A"})
     return list(found.values())
@@ -278,7 +279,7 @@ def test_what_an_effect_predicts_is_what_it_does(effect: Effect) -> None:
         measured = np.zeros_like(Y)
         measured[list(model.actuated)] = gain * u + offset
         assert np.abs(Y - measured).max() < 1e-7 * np.abs(measured).max()
-        W = model.stacked(q, nu, a, u, z)
+        W = model.stacked_regressor(q, nu, a, u, z)
         for k in range(len(X)):
             step = 1e-5 * model.scale[k] * np.eye(len(X))[k]
             up, down = (model.predict(q, nu, a, model.expand @ (X + s * step), u, z).full() for s in (1, -1))
@@ -300,7 +301,7 @@ FORMED = {
 def test_an_effect_has_the_parameters_and_the_memory_of_its_form(effect: Effect, shapes: dict[str, float]) -> None:
     """Every shape that is a parameter changes torques, readings or what is remembered; what other forms remember is
     not there."""
-    model = build(placing.extended(VA12, there(effect, typical(effect), shapes)), shapes=True)
+    model = build(placing.with_effects(VA12, there(effect, typical(effect), shapes)), fit_shapes=True)
     q, nu, a, u, z = samples(model)
     wheels = np.ones((2, q.shape[1]))
 
@@ -320,8 +321,8 @@ def test_an_effect_has_the_parameters_and_the_memory_of_its_form(effect: Effect,
     def has(form: tuple[str, float] | None) -> bool:
         return form is not None and shapes.get(form[0], effect.shapes[form[0]].default) == form[1]
 
-    assert bool(model.lasting) == any(has(m.form) for m in effect.memory.values())
-    assert bool(model.mapped) == has(effect.ground)
+    assert bool(model.n_dynamic_memory) == any(has(m.form) for m in effect.memory.values())
+    assert bool(model.map_inputs) == has(effect.map_form)
 
 
 @pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
@@ -329,11 +330,11 @@ def test_an_effect_of_no_size_changes_nothing(effect: Effect, va12: Model) -> No
     """A motion of a few seconds, and what all sensors read of it: as without; with a typical amount it differs."""
     t = np.arange(400) / 100
     torque = np.column_stack([1500 * np.sin(1.5 * t), 4000 * np.sin(0.8 * t), 1500 * np.sin(1.5 * t)])
-    plain = sensors.signals(va12, simulate(va12, torque))
+    plain = sensors.exact_readings(va12, simulate(va12, torque))
 
     def change(amount: float) -> float:
         model = extended(effect, amount, WITHIN.get(effect.name, {}))
-        read = sensors.signals(model, simulate(model, torque))
+        read = sensors.exact_readings(model, simulate(model, torque))
         return max(float(np.abs(read[n] - x).max() / np.abs(x).max()) for n, x in plain.items())
 
     size = typical(effect)
@@ -373,7 +374,7 @@ def test_a_signature_is_what_the_extended_model_has_more(effect: Effect, va12: M
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("no_such_thing=1", "effect no_such_thing: unknown: `excite docs` tells of all"),
+        ("no_such_thing=1", "effect no_such_thing: unknown: `excite docs` lists all"),
         ("backlash=0.01", "is articulation_backlash meant[?]"),
         ("torque_ripples@front_roll=1", "unknown, is torque_ripple .*meant[?]"),
         ("shear_saturation=0.2", "where must be one of front_roll, rear_roll"),
@@ -386,24 +387,24 @@ def test_a_signature_is_what_the_extended_model_has_more(effect: Effect, va12: M
 )
 def test_a_wrong_effect_is_one_clear_line(text: str, said: str) -> None:
     with pytest.raises(MachineError, match=said) as caught:
-        placing.parse(text, VA12, 60.0)
+        placing.parse_effect(text, VA12, 60.0)
     assert "\n" not in str(caught.value)
 
 
 def test_an_effect_twice_at_one_place_is_refused() -> None:
-    entry = placing.parse("ground_slope=0.01", VA12, 60.0)
+    entry = placing.parse_effect("ground_slope=0.01", VA12, 60.0)
     with pytest.raises(MachineError, match="twice"):
-        build(placing.extended(VA12, entry, entry))
+        build(placing.with_effects(VA12, entry, entry))
 
 
 def test_phases_and_places_follow_the_machine() -> None:
     """The straight machine has no articulation and no gyro; a machine without contacts has joints only."""
     straight, bench = machine.load_machine("va12_straight"), machine.load_machine("emps")
-    assert not placing.places(straight, CATALOGUE["articulation_backlash"])
-    assert not placing.places(straight, CATALOGUE["yaw_rate_bias"])
-    assert set(placing.places(bench, CATALOGUE["asymmetric_viscous"])) == {"carriage"}
-    assert not placing.places(bench, CATALOGUE["ground_slope"])
-    assert isinstance(placing.placed(bench, placing.parse("torque_gain=0.1", bench, 10.0)), Placed)
+    assert not placing.allowed_places(straight, CATALOGUE["articulation_backlash"])
+    assert not placing.allowed_places(straight, CATALOGUE["yaw_rate_bias"])
+    assert set(placing.allowed_places(bench, CATALOGUE["asymmetric_viscous"])) == {"carriage"}
+    assert not placing.allowed_places(bench, CATALOGUE["ground_slope"])
+    assert isinstance(placing.place_effect(bench, placing.parse_effect("torque_gain=0.1", bench, 10.0)), PlacedEffect)
 
 
 LOADED = {
@@ -422,7 +423,7 @@ def test_a_load_slides_on_the_last_chassis(name: str, body: int) -> None:
     """Long after, the machine is one whose first moment is larger by the amount; no chassis that turns, no place."""
     known = machine.load_machine(name)
     plain, amount = build(known), 3.0
-    shifted = build(placing.extended(known, placing.parse(f"payload_shift={amount}", known, 10.0)))
+    shifted = build(placing.with_effects(known, placing.parse_effect(f"payload_shift={amount}", known, 10.0)))
     n, rng = len(plain.coordinates), np.random.default_rng(0)
     q, nu, a = rng.uniform(-1, 1, (3, n))
     u, late = np.zeros(len(plain.inputs)), np.full(len(shifted.memory), 1e3)
@@ -440,7 +441,7 @@ def test_a_load_is_put_on(name: str, body: int) -> None:
     known = machine.load_machine(name)
     plain, mass, x = build(known), 30.0, -1.5
     told = {"instant": 5.0, "takes": 0.5, "arm": x, "mass": 1 / x, "recoil": 0.0}
-    loaded = build(placing.extended(known, shaped(f"payload_shift={mass * x}", told, known)))
+    loaded = build(placing.with_effects(known, shaped(f"payload_shift={mass * x}", told, known)))
     n, rng = len(plain.coordinates), np.random.default_rng(1)
     q, nu, a = rng.uniform(-1, 1, (3, n))
     u, late = np.zeros(len(plain.inputs)), np.full(len(loaded.memory), 1e3)
@@ -455,7 +456,7 @@ def test_a_load_is_put_on(name: str, body: int) -> None:
 @pytest.mark.parametrize("V", [-1.5, -0.02, 0.01, 1.2])
 def test_what_resists_rolling_may_grow_with_speed(va12: Model, V: float) -> None:
     """A (1 + rise V^2) against the motion, fully so from a speed on that the file tells."""
-    model = build(placing.extended(VA12, shaped("rolling_resistance@front_roll=200", {"rise": 0.2, "soft": 0.05})))
+    model = build(placing.with_effects(VA12, shaped("rolling_resistance@front_roll=200", {"rise": 0.2, "soft": 0.05})))
     still, nu = np.zeros(6), np.array([V, 0, 0, V / 0.65, 0, V / 0.65])
     u, z = np.zeros(len(model.inputs)), np.zeros(len(model.memory))
     plain = va12.balance(still, nu, still, va12.expand @ va12.nominal).full()[:, 0]
@@ -464,9 +465,9 @@ def test_what_resists_rolling_may_grow_with_speed(va12: Model, V: float) -> None
 
 
 def compacting(known: machine.Machine, counted: float) -> Model:
-    entry = placing.parse("compaction_per_pass=0.3", known, 24.0)
+    entry = placing.parse_effect("compaction_per_pass=0.3", known, 24.0)
     told = {**entry.shape, "counted": Quantity(value=counted, source="assumed")}
-    return build(placing.extended(known, entry.model_copy(update={"shape": told})))
+    return build(placing.with_effects(known, entry.model_copy(update={"shape": told})))
 
 
 def with_and_without_soil(model: Model, nu: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -526,10 +527,10 @@ def test_passes_are_counted_place_by_place(straight: Model) -> None:
     way = np.interp(np.arange(N) / 100, [0, 10, 20, 30, 40, 45, 60], [0, 10, 0, 10, 0, 5, 20])
     nu = np.zeros((N, 3))
     nu[:, 0] = np.gradient(way, 0.01)
-    told = passes(model, np.zeros((N, 3)), nu, 0.01).reshape(N, 2, ground_map.MOST).sum(axis=2)
+    told = passes(model, np.zeros((N, 3)), nu, 0.01).reshape(N, 2, ground_map.MAX_PASSES).sum(axis=2)
 
     cells, under = np.zeros(1000, int), [-1, -1]
-    places = [tree.poses(straight.machine, {})[b.index][1][0] for b in straight.machine.contacts]
+    places = [tree.body_poses(straight.machine, {})[b.index][1][0] for b in straight.machine.contacts]
     counted = np.zeros((N, 2))
     for k, at in enumerate(way):
         for roll, x in enumerate(places):
@@ -546,13 +547,13 @@ def test_passes_are_counted_place_by_place(straight: Model) -> None:
 
 def test_a_map_of_the_ground_sees_tracks_that_part_cross_and_overlap() -> None:
     """Of a roll two metres wide: half of it on the track of the last pass, all of it, across it, and beside it."""
-    ground, width = ground_map.Ground([2.0]), 2.0
+    ground, width = ground_map.GroundMap([2.0]), 2.0
 
     def along(x: float, y: float, turned: float = 0.0) -> float:
         """How often was passed over what is under the roll in the middle of ten metres, ahead from there."""
         on = np.arange(-5, 5, 0.01)[:, None] * [np.cos(turned), np.sin(turned)] + [x, y]
         across = width * np.array([-np.sin(turned), np.cos(turned)])
-        return float([ground.come(np.concatenate([at, across])[None]).sum() for at in on][500])
+        return float([ground.update(np.concatenate([at, across])[None]).sum() for at in on][500])
 
     assert along(0.013, 0.017) == 0
     assert along(0.013, 1.017) == pytest.approx(0.5, abs=0.08)
@@ -564,16 +565,16 @@ def test_a_map_of_the_ground_sees_tracks_that_part_cross_and_overlap() -> None:
 @pytest.mark.parametrize(("swing", "often"), [(0.0, 0), (1e-4, 0), (0.025, 0), (1.0, 11)])
 def test_who_swings_about_a_place_does_not_pass_over_it(swing: float, often: int) -> None:
     """On the very border of two cells; to a metre and back is a pass each time, the last of which has just begun."""
-    ground = ground_map.Ground([2.1])
+    ground = ground_map.GroundMap([2.1])
     for x in swing * np.sin(np.arange(0, 2 * np.pi * 6 + 0.01, np.pi / 200)):
-        told = ground.come(np.array([[x, 0.0, 0.0, 2.1]]))
+        told = ground.update(np.array([[x, 0.0, 0.0, 2.1]]))
     assert told.sum() == pytest.approx(often, abs=0.05)
 
 
 def test_what_is_nowhere_is_on_no_map() -> None:
-    ground = ground_map.Ground([2.1])
+    ground = ground_map.GroundMap([2.1])
     for x in (0.013, np.nan, np.inf, 1.013, 0.013):
-        told = ground.come(np.array([[x, 0.0, 0.0, 2.1]]))
+        told = ground.update(np.array([[x, 0.0, 0.0, 2.1]]))
     assert told.sum() == pytest.approx(1, abs=0.01)
 
 
@@ -584,7 +585,7 @@ def test_a_simulation_and_a_smoothed_motion_look_at_the_same_map(va12: Model) ->
     push, steer = 2500 * np.sin(2 * np.pi * t / 10), 2000 * np.sin(2 * np.pi * t / 20)
     motion = simulate(model, np.column_stack([push, steer, push]))
     told = passes(model, motion.q, motion.nu, 0.01)
-    kept = motion.memory[:, model.lasting :]
+    kept = motion.memory[:, model.n_dynamic_memory :]
     assert kept.max() > 0.9
     assert np.abs(motion.q[:, 2]).max() > 0.2
     assert np.mean(np.abs(told - kept)) < 0.002
@@ -603,8 +604,8 @@ def test_what_a_map_tells_is_identified_and_designed_with(straight: Model) -> No
     sizes = dict.fromkeys(model.coordinates, 1.0) | {c + "'": 1.0 for c in model.coordinates}
     problem = model.machine.problems["S40"].model_copy(update={"duration_s": Quantity(value=24.0, source="assumed")})
     tr = transcribe(model, problem, sizes, 48, motion)
-    assert not set(tr.state_names) & set(model.mapped)
-    told = motion.memory[:, model.lasting :]
+    assert not set(tr.state_names) & set(model.map_inputs)
+    told = motion.memory[:, model.n_dynamic_memory :]
     assert tr.over[2:-1:3] == pytest.approx(told[50::50], abs=0.1)
     entries = tr.values(np.full((48 * tr.nodes, tr.n_s), 0.3), tr.over)[2]
     amount = np.array([len(model.scale) - 1 in (a, b) for a, b in zip(tr.rows, tr.columns, strict=True)])
@@ -616,7 +617,7 @@ def test_every_log_begins_on_ground_of_its_own(straight: Model) -> None:
     what the first has left, and tell another one."""
     model = compacting(straight.machine, 2.0)
     motion = to_and_fro(model)
-    logs = [log.from_table(sensors.measure(model, motion, kit="full", seed=k), model.machine) for k in (2, 5)]
+    logs = [make_log(model, motion, kit="full", seed=k) for k in (2, 5)]
     one, two = (identify(model, some, "joint") for some in (logs[:1], logs))
     k = two.names.index("compaction_per_pass@drive")
     assert abs(two.value[k] - 0.3) < 3 * two.std[k]
@@ -629,10 +630,10 @@ def test_wheels_beside_each_other_pass_over_ground_of_their_own() -> None:
 
     def often(*across: float) -> float:
         """How often the first was on the ground that it comes back to."""
-        ground = ground_map.Ground([1.0] * len(across))
+        ground = ground_map.GroundMap([1.0] * len(across))
         for x in [*np.arange(0.013, 8, 0.01), *np.arange(8, 4, -0.01)]:
-            told = ground.come(np.array([[x, y + 0.017, 0.0, 1.0] for y in across]))
-        return float(told[: ground_map.MOST].sum())
+            told = ground.update(np.array([[x, y + 0.017, 0.0, 1.0] for y in across]))
+        return float(told[: ground_map.MAX_PASSES].sum())
 
     assert often(0.0) == pytest.approx(1)
     assert often(0.0, 1.2) == pytest.approx(1)
@@ -643,9 +644,9 @@ def test_wheels_beside_each_other_pass_over_ground_of_their_own() -> None:
 def test_a_shape_is_as_unsure_as_where_it_begins(straight: Model) -> None:
     """A quarter of that, or of its usual size where that is more: 15 m a pass."""
     for each, unsure in ((5.0, 3.75), (60.0, 15.0)):
-        entry = placing.parse("compaction_per_pass=0.3", straight.machine, 24.0)
+        entry = placing.parse_effect("compaction_per_pass=0.3", straight.machine, 24.0)
         entry = entry.model_copy(update={"shape": entry.shape | {"pass": Quantity(value=each, source="assumed")}})
-        model = build(placing.extended(straight.machine, entry), shapes=True)
+        model = build(placing.with_effects(straight.machine, entry), fit_shapes=True)
         assert model.scale[model.base.names.index("compaction_per_pass@drive.pass")] == unsure
 
 
@@ -679,7 +680,7 @@ def test_stops_may_be_out_of_the_middle_and_harden(
     entry = shaped(
         "articulation_stop_spring=10000", {"stop": 0.4, "centre": -0.2, "hardening": hardening, "power": power}
     )
-    plain, sprung = build(VA12), build(placing.extended(VA12, entry))
+    plain, sprung = build(VA12), build(placing.with_effects(VA12, entry))
     still = np.zeros(len(plain.coordinates))
 
     def more(angle: float) -> float:
@@ -705,7 +706,7 @@ def test_a_rate_has_no_errors_of_an_angle() -> None:
     known = VA12.model_copy(update={"sensor": tuple(rated)})
 
     def offered(name: str) -> set[str]:
-        return set(placing.places(known, CATALOGUE[name]))
+        return set(placing.allowed_places(known, CATALOGUE[name]))
 
     assert offered("encoder_eccentricity") == {"rear_roll", "measuring_wheel_right"}
     assert not offered("articulation_backlash") | offered("articulation_compliance")
@@ -715,22 +716,24 @@ def test_a_rate_has_no_errors_of_an_angle() -> None:
     assert "encoder_eccentricity@rear_roll" in names
     assert not names & {"encoder_eccentricity@front_roll", "articulation_backlash@articulation"}
     with pytest.raises(MachineError, match="where must be one of rear_roll, measuring_wheel_right"):
-        placing.parse("encoder_eccentricity@front_roll=0.01", known, 60.0)
+        placing.parse_effect("encoder_eccentricity@front_roll=0.01", known, 60.0)
 
 
 def test_effects_of_one_contact_on_others_need_a_drive() -> None:
     """Of the three-wheel roller the steered front roll is driven by nothing: nothing couples to it."""
     known = machine.load_machine("three_wheel")
-    assert placing.places(known, CATALOGUE["pump_coupling"]) == {"drive": ((1, 2), None)}
-    model = build(placing.extended(known, placing.parse("pump_coupling=0.1", known, 10.0)))
+    assert placing.allowed_places(known, CATALOGUE["pump_coupling"]) == {"drive": ((1, 2), None)}
+    model = build(placing.with_effects(known, placing.parse_effect("pump_coupling=0.1", known, 10.0)))
     still, torque = np.zeros(len(model.coordinates)), np.array([100.0, 200.0, 0.0])
     more = model.balance(still, still, still, model.expand @ model.nominal, torque, []).full()
     assert more[list(model.actuated), 0] == pytest.approx([-20, -10, 0])
-    assert not placing.places(machine.load_machine("va12_straight"), CATALOGUE["payload_shift"])
+    assert not placing.allowed_places(machine.load_machine("va12_straight"), CATALOGUE["payload_shift"])
 
 
 THREE = machine.load_machine("three_wheel")
-TOWED = {e.name: e for e in CATALOGUE.values() if any(4 in bodies for bodies, _ in placing.places(THREE, e).values())}
+TOWED = {
+    e.name: e for e in CATALOGUE.values() if any(4 in bodies for bodies, _ in placing.allowed_places(THREE, e).values())
+}
 
 
 def test_what_needs_no_motor_may_sit_at_a_contact_that_has_none() -> None:
@@ -740,17 +743,17 @@ def test_what_needs_no_motor_may_sit_at_a_contact_that_has_none() -> None:
     assert set(TOWED) == possible | {"compaction_per_pass"}
     assert not set(TOWED) & needing
     assert {e.name for e in CATALOGUE.values() if e.soil or e.push} <= set(TOWED)
-    assert placing.places(THREE, CATALOGUE["compaction_per_pass"]) == {"drive": ((1, 2, 4), None)}
+    assert placing.allowed_places(THREE, CATALOGUE["compaction_per_pass"]) == {"drive": ((1, 2, 4), None)}
     with pytest.raises(MachineError, match="where must be one of left_roll, right_roll"):
-        placing.parse("torque_deadband@front_roll=100", THREE, 10.0)
+        placing.parse_effect("torque_deadband@front_roll=100", THREE, 10.0)
 
 
 @pytest.mark.parametrize("effect", TOWED.values(), ids=list(TOWED))
 def test_at_a_towed_contact_prediction_is_dynamics(effect: Effect) -> None:
     """No torque acts on its joint, whatever the effect does there; and the effect does something."""
-    place = next(w for w, (bodies, _) in placing.places(THREE, effect).items() if 4 in bodies)
-    amount = effect.amount(Site.of(THREE, (4,), 10.0))
-    model = build(placing.extended(THREE, placing.parse(f"{effect.name}@{place}={amount}", THREE, 10.0)))
+    place = next(w for w, (bodies, _) in placing.allowed_places(THREE, effect).items() if 4 in bodies)
+    amount = effect.typical_magnitude(Site.of(THREE, (4,), 10.0))
+    model = build(placing.with_effects(THREE, placing.parse_effect(f"{effect.name}@{place}={amount}", THREE, 10.0)))
     plain, rng, n = build(THREE), np.random.default_rng(2), 40
     q, nu = rng.uniform(-1, 1, (2, len(model.coordinates), n))
     u, z = rng.uniform(-2000, 2000, (3, n)), rng.uniform(0.1, 0.5, (len(model.memory), n))
@@ -775,7 +778,7 @@ def test_noise_of_torques_is_no_gain_and_no_delay() -> None:
     measured = log.from_table(sensors.measure(known, designed("R60", known), seed=3), VA12)
     plain = fits.fitted(VA12, [measured], VA12.filter)
     entry = EffectEntry(name="torque_gain", where="articulation", amount=Quantity(value=0.005, source="assumed"))
-    found = fits.refitted(placing.extended(VA12, entry), plain, 0.0)
+    found = fits.refitted(placing.with_effects(VA12, entry), plain, 0.0)
     at = found.model.base.names.index("torque_gain@articulation")
     assert abs(found.fit.X[at]) < 3.5 * found.fit.std[at]
     assert found.fit.cost < plain.fit.cost + 1  # both are found to so much
@@ -791,9 +794,9 @@ def test_stretch_by_stretch_tells_what_the_whole_log_does(
     """Whatever is left over at its end."""
     way, known = _along(straight, samples)
     found = score_test.Signatures(way, known).products()
-    monkeypatch.setattr(innovations, "BATCH", 10**9)
+    monkeypatch.setattr(innovations, "BATCH_SIZE", 10**9)
     once, _ = _along(straight, samples)
-    for name in ("E", "reach", "through"):
+    for name in ("E", "start_response", "transitions"):
         np.testing.assert_allclose(getattr(way.white, name), getattr(once.white, name), rtol=1e-5, atol=1e-5)
     off = found - score_test.Signatures(once, known).products()
     size = np.sqrt(np.diag(found))
@@ -823,7 +826,7 @@ def test_what_has_no_bounds_tells_nothing_and_spoils_nothing(far: float, straigh
 
 def _along(model: Model, samples: int) -> tuple[score_test.Way, list[score_test.Candidate]]:
     """A fitted log without anything hidden, and some candidates."""
-    one = log.from_table(sensors.measure(model, gentle(model, (samples - 1) / 100), seed=3), model.machine)
+    one = make_log(model, gentle(model, (samples - 1) / 100), seed=3)
     stage = fits.fitted(model.machine, [one], model.machine.filter)
     names = "ground_slope", "torque_gain", "measuring_wheel_radius"
     every = score_test.candidates(model.machine, [s.name for s in stage.prepared.c.sensors], samples / 100)

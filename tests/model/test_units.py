@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 import tomli_w
 from hypothesis import given, strategies as st
+from support.logs import make_log
 
 from excite.errors import LogError, MachineError
 from excite.identification import identify
@@ -19,7 +20,7 @@ from excite.logs import log, samples
 from excite.model import prediction
 from excite.model.machine import UNITS, Sensor, hydraulics, machine
 from excite.model.machine.hydraulics import Cylinder
-from excite.model.machine.units import MEASURES
+from excite.model.machine.units import QUANTITIES_BY_KIND
 from excite.simulation import Motion, sensors
 from excite.smoothing import cramer_rao
 
@@ -98,7 +99,7 @@ def test_values_are_those_of_the_definitions() -> None:
     assert UNITS["psi"][1] == pytest.approx(6894.757293168, rel=1e-12)  # NIST SP 811
     assert UNITS["lbf ft"][1] == pytest.approx(1.3558179483314, rel=1e-12)
     assert UNITS["mph"][1] == pytest.approx(0.44704)
-    assert {q for qs in MEASURES.values() for q in qs} <= {q for q, _ in UNITS.values()}
+    assert {q for qs in QUANTITIES_BY_KIND.values() for q in qs} <= {q for q, _ in UNITS.values()}
 
 
 def test_pressures_become_torque(hydraulic: prediction.Model) -> None:
@@ -116,7 +117,7 @@ def test_a_log_in_other_units_says_the_same(
     hydraulic: prediction.Model, va12: prediction.Model, va12_motion: Motion
 ) -> None:
     """One motion through both machine files: the checked logs agree, sensor by sensor."""
-    one = log.from_table(sensors.measure(va12, va12_motion, noise=False), va12.machine)
+    one = make_log(va12, va12_motion, noise=False)
     wheelless = replace(va12_motion, wheels=va12_motion.wheels[:, :0])
     table = sensors.measure(hydraulic, wheelless, noise=False)
     assert table["Time"].iloc[-1] == pytest.approx(60_000)
@@ -251,7 +252,7 @@ def test_cylinders_do_the_work_that_their_oil_does(
     )
     turn = 1e-5
     grown = length(c, angle + turn) - length(c, angle - turn)
-    push, pull = hydraulics.arms(sensor.displacement, sensor.cylinders, np.array([angle]))
+    push, pull = hydraulics.torque_per_pressure(sensor.displacement, sensor.cylinders, np.array([angle]))
     work = (5e-3 * left - 3e-3 * right) * grown
     assert 2 * turn * (push[0] * left + pull[0] * right) == pytest.approx(work, rel=1e-5, abs=1e-7)
 
@@ -273,7 +274,7 @@ def test_a_log_of_cylinders_says_the_torque_that_was_delivered(
     table = sensors.measure(cylinders, va12_motion, noise=False)
     assert table[["p2 left", "p2 right"]].to_numpy().min() > 0
     read = log.from_table(table, cylinders.machine)
-    true = sensors.signals(cylinders, va12_motion)["u2"]
+    true = sensors.exact_readings(cylinders, va12_motion)["u2"]
     assert read.values["u2"] == pytest.approx(true, abs=1e-6 * np.abs(true).max())
     bent = np.abs(va12_motion.q[:, 4]) > 0.3
     straight = log.values_of(
@@ -354,10 +355,7 @@ def test_a_rate_that_is_summed_up_or_differentiated_is_the_same_motion(
 ) -> None:
     """What classic methods make of a log: rates and angles of one motion give the same samples."""
     model = prediction.build(variant(tmp_path, RATES))
-    one, other = (
-        samples(m, log.from_table(sensors.measure(m, va12_motion, noise=False), m.machine), m.machine.filter)
-        for m in (va12, model)
-    )
+    one, other = (samples(m, make_log(m, va12_motion, noise=False), m.machine.filter) for m in (va12, model))
     rolls = [va12.coordinates.index(n) for n in ("x0", "theta0", "theta1", "theta4")]
     inner = slice(200, -200)
     assert other.nu[rolls, inner] == pytest.approx(one.nu[rolls, inner], abs=3e-3)
@@ -369,10 +367,10 @@ def test_a_rate_that_is_summed_up_or_differentiated_is_the_same_motion(
 def test_values_are_told_in_the_unit_that_they_are_in(tmp_path: Path, va12: prediction.Model) -> None:
     """A log is SI once it is read, whatever its columns were in; a sliding joint's angle is a length."""
     emps = machine.load_machine("emps")
-    assert {s.kind: emps.si(s) for s in emps.sensor} == {"angle": "m", "torque": "N"}
+    assert {s.kind: emps.si_unit(s) for s in emps.sensor} == {"angle": "m", "torque": "N"}
     rpm = prediction.build(variant(tmp_path, RATES)).machine
-    assert {s.name: rpm.si(s) for s in rpm.sensor if s.unit == "rpm"} == dict.fromkeys(
+    assert {s.name: rpm.si_unit(s) for s in rpm.sensor if s.unit == "rpm"} == dict.fromkeys(
         ("theta1", "theta4", "thetal", "thetar"), "rad/s"
     )
-    told = {s.kind: va12.machine.si(s) for s in va12.machine.sensor}
+    told = {s.kind: va12.machine.si_unit(s) for s in va12.machine.sensor}
     assert told == {"angle": "rad", "wheel": "rad", "torque": "N m", "yaw_rate": "rad/s", "lateral_speed": "m/s"}

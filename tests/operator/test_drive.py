@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Excite
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from support.commands import Excite
 
-from excite.errors import DriveError
+from excite.errors import UndrivableError
 from excite.model import Model, build
 from excite.model.machine import load_machine
 from excite.operator import Trace, driving_aids, ground, page, sheet
-from excite.simulation import STEADY, Motion, simulate
+from excite.simulation import STEADY_DRIVER, Motion, simulate
 from excite.trajectories import Manoeuvre, saved_design
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -75,12 +75,12 @@ def test_more_phases_are_nearer_to_the_design(va12: Model, va12_motion: Motion) 
 def test_what_makes_no_phases_is_refused(
     va12: Model, va12_motion: Motion, most: int, shortest: float, words: str
 ) -> None:
-    with pytest.raises(DriveError, match=words):
+    with pytest.raises(UndrivableError, match=words):
         ground.phases(va12, va12_motion, shortest, most)
 
 
 def test_a_machine_without_wheels_has_no_driver(emps: Model) -> None:
-    with pytest.raises(DriveError, match="emps"):
+    with pytest.raises(UndrivableError, match="emps"):
         ground.levers(emps)
 
 
@@ -192,7 +192,7 @@ def test_words_name_each_of_several_joints() -> None:
 def test_phases_that_cannot_be_read_are_refused(va12: Model, change: dict[str, str], why: str) -> None:
     trace = Trace(KNOTS, SPEED, ANGLE, ground.levers(va12))
     rows = [{change.get(name, name): value for name, value in row.items()} for row in ground.trace_table(trace)]
-    with pytest.raises(DriveError, match=why):
+    with pytest.raises(UndrivableError, match=why):
         ground.from_table(va12, rows)
 
 
@@ -206,7 +206,7 @@ def test_left_is_where_the_machine_goes(name: str) -> None:
     def heading(*sides: int) -> float:
         angle = np.outer([0.0, 1, 1], 0.2 * np.multiply(sides, [lever.left for lever in levers]))
         trace = Trace(np.array([0.0, 4, 10]), np.array([0.0, 1, 1]), angle, levers)
-        return float(ground.driven(model, trace, STEADY, 0).q[-1, model.coordinates.index("theta0")])
+        return float(ground.driven(model, trace, STEADY_DRIVER, 0).q[-1, model.coordinates.index("theta0")])
 
     alone = [heading(*row) for row in np.eye(len(levers), dtype=int)]
     assert min(alone) > 0.1
@@ -286,7 +286,7 @@ def first_page(model: Model, lane: tuple[float, float], speed: float = 1.5) -> F
     t = np.array([0.0, 2, 6, 8, 10, 12, 14, 16])
     v = np.array([0.0, speed, speed, 0, 0, -0.5, -0.5, 0])
     trace = Trace(t, v, -np.deg2rad([[0.0], [0], [0], [-14], [-14], [0], [0], [0]])[:, : len(levers)], levers)
-    motions = (ground.driven(model, trace, STEADY, 0),)
+    motions = (ground.driven(model, trace, STEADY_DRIVER, 0),)
     made = sheet.Sheet("A drive", model, trace, motions, ground.room(model, motions), lane, (), (), "Good.")
     figure = sheet._first(made)
     figure.draw_without_rendering()

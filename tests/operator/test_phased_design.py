@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Excite
 from hypothesis import given, settings, strategies as st
+from support.commands import Excite
 
-from excite.errors import DriveError
+from excite.errors import UndrivableError
 from excite.model import Model, build
 from excite.model.machine import load_machine
 from excite.operator import Trace, ground, phased_design
 from excite.operator.ground import ANGLE_STEP, GRID, SPEED_STEP
-from excite.simulation import STEADY, Motion
+from excite.simulation import STEADY_DRIVER, Motion
 from excite.trajectories import composite_objective, limits, saved_design
 
 
@@ -85,12 +85,12 @@ def test_a_design_as_phases_stands_still_at_its_end(va12: Model, va12_motion: Mo
 
 @pytest.mark.parametrize("shortest", [0.0, 0.4, 16.0, float("nan")])
 def test_phases_that_do_not_fit_are_refused(va12: Model, shortest: float) -> None:
-    with pytest.raises(DriveError, match=r"--phase-min.: must be between 0.5 and 15 s"):
+    with pytest.raises(UndrivableError, match=r"--phase-min.: must be between 0.5 and 15 s"):
         phased_design.check(va12, va12.machine.problems["R60"], shortest)
 
 
 def test_a_machine_without_wheels_has_nobody_to_drive_it(emps: Model, va12: Model) -> None:
-    with pytest.raises(DriveError, match="emps"):
+    with pytest.raises(UndrivableError, match="emps"):
         phased_design.check(emps, va12.machine.problems["R60"], 3.0)
 
 
@@ -122,7 +122,7 @@ def test_the_command_designs_for_people_and_says_what_they_keep(
     assert ground.middle([ground.score(found.model, m) for m in ways]).cond_phi == pytest.approx(
         by_hand["by_hand"]["cond_phi"], rel=1e-6
     )
-    steady = ground.driven(found.model, trace, STEADY, 0)
+    steady = ground.driven(found.model, trace, STEADY_DRIVER, 0)
     for m in ground.placed(found.model, found.problem, (steady, *ways)):
         over = limits.check_limits(found.model, found.problem, m)
         assert {n for n, x in over.items() if x > 1e-3} <= set(by_hand["limits_broken"])
@@ -137,7 +137,7 @@ def test_the_command_designs_for_people_and_says_what_they_keep(
 
 def test_a_damaged_table_of_phases_is_one_clear_line(straight: Model) -> None:
     for rows in ([{"end_s": 3.0}], [], [{"end_s": -1, "speed_m_s": [0, 1]}]):
-        with pytest.raises(DriveError, match="design again"):
+        with pytest.raises(UndrivableError, match="design again"):
             ground.from_table(straight, rows)
 
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Excite
 from matplotlib.figure import Figure
+from support.commands import Excite
 
 from excite.logs import profile as profiles
 from excite.model import Model

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import drive
 from scipy.integrate import solve_ivp
+from support.drives import drive
 
 from excite.errors import MachineError, SimulationError
 from excite.model import Model, prediction
@@ -122,12 +122,12 @@ def test_what_an_effect_remembers_is_a_number_as_well(va12: Model) -> None:
     """0 / 0 in one state of many, which the largest of their errors overlooks. A file that says so is refused."""
 
     def rubbing(source: Source) -> Model:
-        entry = placing.parse("articulation_backlash=0.005", va12.machine, 60.0)
+        entry = placing.parse_effect("articulation_backlash=0.005", va12.machine, 60.0)
         own = {"rubs": 1.0, "damping": 0.0, "breakaway": 0.0}
         shape = {name: Quantity(value=x, source=source) for name, x in own.items()}
-        return prediction.build(placing.extended(va12.machine, entry.model_copy(update={"shape": shape})))
+        return prediction.build(placing.with_effects(va12.machine, entry.model_copy(update={"shape": shape})))
 
-    with pytest.raises(SimulationError, match="no number any more at t = "):
+    with pytest.raises(SimulationError, match="not finite at t = "):
         simulate(rubbing("identified"), np.full((20, 3), 1000.0))
     with pytest.raises(MachineError, match="articulation_backlash: shape damping must be > 0"):
         rubbing("assumed")
@@ -230,3 +230,22 @@ def test_quantisation_can_be_made_coarse(straight: Model, straight_motion: Motio
     model = prediction.build(straight.machine.model_copy(update={"sensor": coarse}))
     log = sensors.measure(model, straight_motion)
     assert len(np.unique(np.diff(log["theta1_rad"]).round(9))) <= 3
+
+
+def test_encoder_edges_lie_anywhere_from_log_to_log(straight: Model, straight_motion: Motion) -> None:
+    """An encoder is switched on within a count: its edges of several logs fall on all parts of one, evenly."""
+    sensor = next(s for s in straight.machine.sensors("full") if s.name == "theta1")
+    turned = straight_motion.q[:, straight.coordinates.index("theta1")]
+    step = float(sensor.resolution or 0)
+    parts = []
+    for seed in range(60):
+        counts = np.round(sensors.measure(straight, straight_motion, seed=seed)[sensor.column].to_numpy() / step)
+        at = np.flatnonzero(np.diff(counts) == 1)[:50]  # one count forward from one row to the next
+        low, high = turned[at] / step, turned[at + 1] / step
+        # The edge lies between both rows for every such pair, at the same part of a count.
+        grid = np.arange(0.01, 1, 0.02)
+        fits = np.array([np.mean(np.ceil(low - g) + g <= high) for g in grid])
+        best = grid[fits > fits.max() - 1e-9]
+        parts.append(np.angle(np.exp(2j * np.pi * best).mean()) / (2 * np.pi) % 1)
+    quarters = np.histogram(parts, bins=4, range=(0, 1))[0]
+    assert (quarters >= 5).all(), quarters

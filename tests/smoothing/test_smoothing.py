@@ -12,29 +12,30 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.signal
+from support.logs import make_log
 
 from excite import smoothing
 from excite.identification import identify, joint
-from excite.logs import Log, from_table
+from excite.logs import Log
 from excite.model import Model, prediction
 from excite.model.effects import placing
 from excite.model.machine import machine
-from excite.simulation import Motion, follow, sensors, simulate
+from excite.simulation import Motion, follow, simulate
 from excite.smoothing import (
-    Batch,
-    Chart,
-    Record,
+    BatchedFunction,
+    Measurements,
+    StateSpace,
     advance,
-    chart,
+    build_state_space,
     common_sensors,
     differentiate,
-    first_point,
     gauss_newton,
+    initial_trajectory,
     parallel_smoother,
-    record,
+    prepare_measurements,
     uncertainty,
 )
-from excite.smoothing.measurements import beating
+from excite.smoothing.measurements import beat_inflation
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +103,7 @@ def perturbed(model: Model, seed: int, by: float = 0.2) -> np.ndarray:
 
 
 def measured(model: Model, motion: Motion, X: np.ndarray, kit: str = "full", seed: int = 0, noise: bool = True) -> Log:
-    return from_table(sensors.measure(model, motion, X, kit, seed, noise), model.machine)
+    return make_log(model, motion, X, kit, seed, noise)
 
 
 def test_chain_agrees_with_dense_algebra() -> None:
@@ -114,9 +115,9 @@ def test_chain_agrees_with_dense_algebra() -> None:
     eta = H.transpose(0, 2, 1) @ rng.normal(size=(K, 2, c))
     A[0], J[0], eta[0], C[0] = 0, 0, 0, np.eye(n)
     A[-1], b[-1], C[-1] = 0, 0, 0
-    stages = parallel_smoother.Stages(A, b, C, eta, J)
+    stages = parallel_smoother.Elements(A, b, C, eta, J)
     cuts = (slice(0, 5), slice(5, 6), slice(6, None))
-    solved = parallel_smoother.solve([parallel_smoother.section(stages.part(cut)) for cut in cuts])
+    solved = parallel_smoother.smooth_chain([parallel_smoother.combine(stages.part(cut)) for cut in cuts])
 
     N = K - 1
     mean, P, info, pull = np.zeros((N, n, c)), np.zeros((N, n, N, n)), np.zeros((N, n, N, n)), np.zeros((N, n, c))
@@ -155,7 +156,7 @@ def test_an_effect_may_use_any_elementary_function() -> None:
     told += [ca.logic_and(x - 0.5 > 0, y > 0.5), ca.logic_or(x > 0.5, y > 0.5), ca.if_else(x > y, x, y)]
     f = ca.Function("f", [x, y], [ca.horzcat(*told)])
     at = np.random.default_rng(0).uniform(-0.95, 0.95, (2, 200))
-    (found,) = Batch(f, ())(at[0][:, None], at[1][:, None])
+    (found,) = BatchedFunction(f, ())(at[0][:, None], at[1][:, None])
     np.testing.assert_allclose(
         found.reshape(200, -1), f(at[:1], at[1:]).full().reshape(200, -1), rtol=1e-12, atol=1e-12
     )
@@ -169,7 +170,7 @@ def test_what_many_samples_share_and_what_is_no_calculation(N: int) -> None:
     step, least = x[0] * p[1], ca.fmin(p[0], p[1])
     many = ca.vertcat(step, p[0], 3, x[1], step, 0, least, ca.fmax(x[0], least))
     f = ca.Function("f", [x, p], [many, ca.exp(step) + step, ca.vertcat(p, 3)])
-    made = Batch(f, (1,))
+    made = BatchedFunction(f, (1,))
     for given in (np.array([0.5, -2.0]), np.array([4.0, 0.1])):  # nothing stays of what was shared before
         at = np.random.default_rng(0).uniform(-1, 1, (N, 2))
         for found, exact in zip(made(at, given), zip(*(f(row, given) for row in at), strict=True), strict=True):
@@ -179,7 +180,7 @@ def test_what_many_samples_share_and_what_is_no_calculation(N: int) -> None:
 def test_where_samples_lead_and_how_that_moves(va12: Model) -> None:
     X = perturbed(va12, 2)
     motion = simulate(va12, energetic(20), X)
-    c = chart(va12, tuple(s.name for s in va12.machine.sensor))
+    c = build_state_space(va12, tuple(s.name for s in va12.machine.sensor))
     assert c.core == 7  # theta2 and six velocities: no roll's own angle, though the expressions hold it
     s = np.hstack([motion.q, motion.nu, motion.wheels])[:, c.index]
     end = advance(c, s[:-1], motion.u[:-1], motion.u[1:], X)
@@ -347,9 +348,9 @@ def test_what_the_model_does_not_know_is_seen_in_the_innovations(
     X = perturbed(va12, 1)
     real = nature(va12, amount)
     estimate = identify(va12, [measured(real, simulate(real, energetic(), X), X)], "joint")
-    assert joint.DOUBT in estimate.notes
-    assert "more than their intervals" in joint.DOUBT
-    assert "excite diagnose" in joint.DOUBT
+    assert joint.UNEXPLAINED_NOTE in estimate.notes
+    assert "more than their intervals" in joint.UNEXPLAINED_NOTE
+    assert "excite diagnose" in joint.UNEXPLAINED_NOTE
     assert any("innovations" in note or "no estimate" in note for note in estimate.notes)
     assert (estimate.std > undisturbed).all()
     assert np.median(np.abs(estimate.value - X) / np.maximum(np.abs(X), va12.scale)) < 0.03
@@ -357,20 +358,20 @@ def test_what_the_model_does_not_know_is_seen_in_the_innovations(
 
 def test_an_estimate_that_is_drawn_in_says_so(va12: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the unbiased way finds nothing, as on logs that hardly show anything: the steadier answer, and a note."""
-    exact = joint.iterate
+    exact = joint.fit_logs
 
-    def lost(c: Chart, records: Sequence[Record], *rest: Any, **more: Any) -> joint.Fit:
+    def lost(c: StateSpace, records: Sequence[Measurements], *rest: Any, **more: Any) -> joint.Fit:
         if records[0].unbiased:
-            raise joint.NotConverged("lost")
+            raise joint.NotConvergedError("lost")
         return exact(c, records, *rest, **more)
 
     X = perturbed(va12, 6)
     log = measured(va12, simulate(va12, energetic(), X), X, "full", 6)
     known = identify(va12, [log], "joint")
-    monkeypatch.setattr(joint, "iterate", lost)
+    monkeypatch.setattr(joint, "fit_logs", lost)
     estimate = identify(va12, [log], "joint")
-    assert joint.DRAWN in estimate.notes
-    assert joint.DRAWN not in known.notes
+    assert joint.BIASED_NOTE in estimate.notes
+    assert joint.BIASED_NOTE not in known.notes
     assert (np.abs(estimate.value - known.value) < 2 * known.std).all()
 
 
@@ -381,7 +382,7 @@ def test_spikes_are_taken_out_first(va12: Model) -> None:
     log.values["thetal"][1800] += 0.3
     estimate = identify(va12, [log], "joint")
     assert sum("spike" in note for note in estimate.notes) == 2
-    assert joint.DOUBT not in estimate.notes
+    assert joint.UNEXPLAINED_NOTE not in estimate.notes
     assert np.sqrt(np.mean(((estimate.value - X) / estimate.std) ** 2)) < 1.6
 
 
@@ -390,7 +391,7 @@ def test_a_log_of_something_else_gives_no_number(va12: Model) -> None:
     rng = np.random.default_rng(0)
     good = measured(va12, simulate(va12, energetic(20)), va12.nominal)
     values = {name: rng.permutation(value) for name, value in good.values.items()}
-    with pytest.raises(joint.NotConverged, match="excite diagnose"):
+    with pytest.raises(joint.NotConvergedError, match="excite diagnose"):
         identify(va12, [Log("shuffled", good.t, values)], "joint")
 
 
@@ -417,7 +418,7 @@ def test_an_encoder_that_beats_with_the_clock_tells_less(counts: float) -> None:
     error = np.where(counted, phases[:, None] + counts * samples - reading - past, 0.0)[:, 1:]
     found = np.mean((error.sum(axis=1) / np.maximum(counted[:, 1:].sum(axis=1), 1)) ** 2)
     white = min(counts, 1.0) ** 2 / 12 / (min(counts, 1.0) * 32)
-    more = beating(np.full((33, 1), counts), 0.01)[5, 0]
+    more = beat_inflation(np.full((33, 1), counts), 0.01)[5, 0]
     assert found < 1.5 * more * white
     if abs(counts - 40) < 0.02:
         assert found > 10 * white
@@ -432,22 +433,29 @@ def design(name: str) -> np.ndarray:
 def test_the_likelihood_is_followed_where_a_drive_shows_little(va12: Model) -> None:
     """Below and above one parameter, as wide as a fit says that starts anew with that parameter held there."""
     log = measured(va12, simulate(va12, design("R60")), va12.nominal, seed=8)
-    c = chart(va12, common_sensors(va12, [log]))
-    records = [record(c, log, unbiased=True)]
-    starts = [first_point(c, records[0], log, va12.machine.filter)]
+    c = build_state_space(va12, common_sensors(va12, [log]))
+    records = [prepare_measurements(c, log, unbiased=True)]
+    starts = [initial_trajectory(c, records[0], log, va12.machine.filter)]
     n = len(va12.scale)
     free = np.zeros(n, bool)
-    fit = gauss_newton.iterate(c, records, starts, va12.nominal, starts, 0.0, free)
-    prior = np.full(n, gauss_newton.PRIOR**-2)
-    covariance, *_ = gauss_newton.newton_step(c, records, fit.linear, fit.points, fit.X, prior, 0.0)
+    fit = gauss_newton.fit_logs(c, records, starts, va12.nominal, starts, 0.0, free)
+    prior = np.full(n, gauss_newton.PRIOR_STD**-2)
+    covariance, *_ = gauss_newton.newton_step(c, records, fit.linear, fit.trajectories, fit.X, prior, 0.0)
     k = va12.base.names.index("Ky4")
     way = (np.arange(len(covariance)) == k).astype(float)
-    widths = uncertainty.followed(c, records, starts, fit, covariance, way, free)
+    widths = uncertainty.profile_widths(c, records, starts, fit, covariance, way, free)
     for far, width in zip((-2.0, 2.0), widths, strict=True):
-        X = fit.X + far * uncertainty.in_deviations(covariance, way)[:n] * va12.scale
+        X = fit.X + far * uncertainty.one_sigma_step(covariance, way)[:n] * va12.scale
         there = replace(va12, nominal=np.where(way[:n] > 0, X, va12.nominal))
-        held = gauss_newton.iterate(
-            replace(c, model=there), records, fit.points, X, starts, 0.0, way[:n] > 0, damping=gauss_newton.RESUMED
+        held = gauss_newton.fit_logs(
+            replace(c, model=there),
+            records,
+            fit.trajectories,
+            X,
+            starts,
+            0.0,
+            way[:n] > 0,
+            damping=gauss_newton.RESUMED_DAMPING,
         )
         assert width == pytest.approx(2 / np.sqrt(held.cost - fit.cost), rel=0.05)
     assert max(widths) > 1.2 * min(widths)
@@ -460,17 +468,17 @@ def test_the_likelihood_is_followed_where_a_drive_shows_little(va12: Model) -> N
 def test_the_likelihood_is_followed_beside_an_amount_at_its_end(va12: Model) -> None:
     """As it is without the effect: what the logs would like best below zero has no say there."""
     log = measured(va12, simulate(va12, design("R60")), va12.nominal, seed=8)
-    effect = placing.parse("torque_deadband@front_roll=20", va12.machine, 60.0)
+    effect = placing.parse_effect("torque_deadband@front_roll=20", va12.machine, 60.0)
     told = []
-    for model in (va12, prediction.build(placing.extended(va12.machine, effect))):
-        c = chart(model, common_sensors(model, [log]))
-        records = [record(c, log, unbiased=True)]
-        starts = [first_point(c, records[0], log, model.machine.filter)]
-        fit = gauss_newton.iterate(c, records, starts, model.nominal, starts, 0.0, np.zeros(len(model.scale), bool))
-        _, sides, _ = uncertainty.sure(c, records, starts, fit)
+    for model in (va12, prediction.build(placing.with_effects(va12.machine, effect))):
+        c = build_state_space(model, common_sensors(model, [log]))
+        records = [prepare_measurements(c, log, unbiased=True)]
+        starts = [initial_trajectory(c, records[0], log, model.machine.filter)]
+        fit = gauss_newton.fit_logs(c, records, starts, model.nominal, starts, 0.0, np.zeros(len(model.scale), bool))
+        _, sides, _ = uncertainty.quantify_uncertainty(c, records, starts, fit)
         told.append(sides[:, model.base.names.index("Ky4")])
         added = [k for k, name in enumerate(model.base.names) if name not in va12.base.names]
-        assert (fit.X[added] < uncertainty.HARDLY * fit.std[added]).all()
+        assert (fit.X[added] < uncertainty.NEAR_ZERO_STDS * fit.std[added]).all()
     np.testing.assert_allclose(told[1], told[0], rtol=0.02)
 
 
@@ -478,12 +486,12 @@ def test_what_counting_does_to_an_estimate_is_foreseen(straight: Model) -> None:
     """Estimates from one motion, exact but that counts begin anywhere, scatter as said, not as from white noise."""
     motion = simulate(straight, energetic(30)[:, [0, 2]])
     log = measured(straight, motion, straight.nominal, "paper")
-    c = chart(straight, common_sensors(straight, [log]))
-    noise = record(c, log, unbiased=True).noise
-    start = first_point(c, record(c, log), log, straight.machine.filter)
+    c = build_state_space(straight, common_sensors(straight, [log]))
+    noise = prepare_measurements(c, log, unbiased=True).noise
+    start = initial_trajectory(c, prepare_measurements(c, log), log, straight.machine.filter)
     full = np.hstack([motion.q, motion.nu, motion.wheels])[:, c.index]
     angle = c.readings(full, motion.u, straight.nominal)[0][:, :, 0]
-    torque = motion.u - c.delivered(np.zeros_like(motion.u), straight.nominal)[0]
+    torque = motion.u - c.delivered_torques(np.zeros_like(motion.u), straight.nominal)[0]
     n = len(straight.scale)
     rng = np.random.default_rng(0)
     errors, foreseen, plain = [], [], []
@@ -493,10 +501,12 @@ def test_what_counting_does_to_an_estimate_is_foreseen(straight: Model) -> None:
             log.values[sensor.name][:] = (
                 angle[:, j] if step is None else step * np.floor(angle[:, j] / step + rng.uniform())
             )
-        r = replace(record(c, log, unbiased=True), noise=noise, torque=torque)
-        fit = gauss_newton.iterate(c, [r], [start], straight.nominal, [start], 0.0, np.zeros(n, bool))
-        C, *_ = gauss_newton.newton_step(c, [r], fit.linear, fit.points, fit.X, np.full(n, gauss_newton.PRIOR**-2), 0.0)
-        own, white = uncertainty.counted(c, r, fit.points[0], fit.X, fit.linear[0])
+        r = replace(prepare_measurements(c, log, unbiased=True), noise=noise, torque=torque)
+        fit = gauss_newton.fit_logs(c, [r], [start], straight.nominal, [start], 0.0, np.zeros(n, bool))
+        C, *_ = gauss_newton.newton_step(
+            c, [r], fit.linear, fit.trajectories, fit.X, np.full(n, gauss_newton.PRIOR_STD**-2), 0.0
+        )
+        own, white = uncertainty.encoder_error_moments(c, r, fit.trajectories[0], fit.X, fit.linear[0])
         errors.append((fit.X - straight.nominal) / straight.scale)
         foreseen.append(np.diag(C @ own @ C)[:n])
         plain.append(np.diag(C @ white @ C)[:n])

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import Excite
+from support.commands import Excite
 
-from excite.errors import UnsettledError
+from excite.errors import CollocationError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import simulate
@@ -111,7 +111,7 @@ def test_soft_machines_that_do_not_follow_leave_it_to_the_sharp_one(
     def settled(tr: Transcription, *args: np.ndarray) -> np.ndarray:
         asked.append(tr.intervals)
         if len(asked) <= refused:
-            raise UnsettledError("no motion follows")
+            raise CollocationError("no motion follows")
         return settle(tr, *args)
 
     wish = multisine(straight, problem, 2)

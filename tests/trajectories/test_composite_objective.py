@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import drive
+from support.drives import drive
 
 from excite.errors import InfeasibleError
 from excite.identification import methods, prior as sequential
@@ -140,14 +140,14 @@ def test_another_machine_follows_the_nominal_motion(va12: Model) -> None:
     wanted = simulate(va12, drive(va12, 30, 1, {"u1": 800, "u2": 2500, "u4": 800}))
     other = scenarios.perturbed_machines(va12, 2, 0.2, seed=3)[1]
     played = simulate(other, wanted.u)
-    driven = scenarios.followed(other, va12, wanted)
+    driven = scenarios.track_motion(other, va12, wanted)
 
     def off(m: Motion) -> np.ndarray:
         return np.sqrt(((m.nu[:, [0, 3, 5]] - wanted.nu[:, [0, 3, 5]]) ** 2).mean(axis=0))
 
     assert (off(driven) < 0.5 * off(played)).all()
     assert np.abs(driven.q[:, 4] - wanted.q[:, 4]).max() < 0.05
-    same = scenarios.followed(va12, va12, wanted)
+    same = scenarios.track_motion(va12, va12, wanted)
     assert np.abs(same.nu - wanted.nu).max() < 1e-6
 
 
@@ -158,7 +158,7 @@ def test_limits_hold_for_every_machine_of_a_robust_design(straight: Model) -> No
     found, motion = verdict(straight, problem, aim, d.manoeuvre)
     assert found.feasible
     for m in aim.machines[1:]:
-        driven = scenarios.followed(m, straight, motion)
+        driven = scenarios.track_motion(m, straight, motion)
         slips = m.kinematics(driven.q.T, driven.nu.T)[1].full()
         assert np.abs(slips).max() <= 0.15 * (1 + 3e-3)
         assert np.abs(0.65 * driven.nu[:, 1:]).max() <= 2.0 * (1 + 3e-3)
@@ -167,7 +167,7 @@ def test_limits_hold_for_every_machine_of_a_robust_design(straight: Model) -> No
 def test_after_a_log_its_information_is_there(straight: Model, motion: Motion) -> None:
     table = sensors.measure(straight, motion, seed=4)
     one = log.from_table(table, straight.machine, methods.needed_sensors(straight, "joint"))
-    known = sequential.known_before(straight, [one])
+    known = sequential.prior_from_logs(straight, [one])
     assert known.share == 1.0
     assert np.array_equal(known.model.nominal, known.estimate.value)
     C = np.linalg.inv(known.information)
@@ -178,8 +178,8 @@ def test_signs_are_known_whatever_a_machine_calls_its_parameters(emps: Model) ->
     """Dry friction of the rig is Fc, that of the roller Fs1: neither drives."""
     wrong = emps.nominal.copy()
     wrong[emps.base.names.index("Fc")] *= -1
-    assert sequential._possible(emps, emps.nominal)
-    assert not sequential._possible(emps, wrong)
+    assert sequential._is_possible(emps, emps.nominal)
+    assert not sequential._is_possible(emps, wrong)
 
 
 def test_an_impossible_estimate_is_not_designed_for(straight: Model, motion: Motion) -> None:
@@ -188,6 +188,6 @@ def test_an_impossible_estimate_is_not_designed_for(straight: Model, motion: Mot
     found = methods.identify(straight, [one], "joint")
     wrong = found.value.copy()
     wrong[straight.base.names.index("M")] = -3000.0
-    known = sequential.from_estimate(straight, replace(found, value=wrong))
+    known = sequential.prior_from_estimate(straight, replace(found, value=wrong))
     assert 0 < known.share < 1
     assert known.model.nominal[straight.base.names.index("M")] > 0

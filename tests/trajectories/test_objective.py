@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import drive
 from scipy.stats import spearmanr
+from support.drives import drive
 
 from excite import smoothing
 from excite.model import Model

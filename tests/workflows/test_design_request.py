@@ -7,29 +7,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Excite, designed
+from support.commands import Excite
+from support.drives import designed
 
-from excite.errors import StoredError
+from excite.errors import DesignFolderError
 from excite.logs import profile as profiles
 from excite.model import Model, build
 from excite.model.machine import load_machine
 from excite.simulation import Motion, sensors
 from excite.smoothing import cramer_rao
 from excite.trajectories import saved_design
-from excite.workflows import Brief
-from excite.workflows.design_request import POOR, advice
+from excite.workflows import DesignRequest
+from excite.workflows.design_request import POOR_PERCENT, advice
 
 
 def test_advice_names_what_to_do() -> None:
-    assert advice(Brief(), "Kx1", POOR) is None
-    text = advice(Brief(), "Kx1", 3 * POOR)
+    assert advice(DesignRequest(), "Kx1", POOR_PERCENT) is None
+    text = advice(DesignRequest(), "Kx1", 3 * POOR_PERCENT)
     assert text is not None
     assert "cond(Phi) says nothing of accuracy here: Kx1 can't be found better than 15 %" in text
-    assert "170 %" in str(advice(Brief(), "Kx1", 171.0))
+    assert "170 %" in str(advice(DesignRequest(), "Kx1", 171.0))
     assert "--objective accuracy" in text
     assert "--sigma-max" in text
-    for brief in (Brief("accuracy"), Brief("cond", sigma_max=20.0)):
-        said = advice(brief, "Kx1", 3 * POOR)
+    for brief in (DesignRequest("accuracy"), DesignRequest("cond", sigma_max=20.0)):
+        said = advice(brief, "Kx1", 3 * POOR_PERCENT)
         assert said is not None
         assert "cond(Phi) says nothing" not in said
 
@@ -46,8 +47,8 @@ def test_a_design_says_score_and_accuracy(excite: Excite, tmp_path: Path) -> Non
     assert list(summary["sigma_percent"].values()) == pytest.approx(spread.tolist(), rel=1e-6)
     assert summary["worst_percent"] == pytest.approx(spread.max(), rel=1e-6)
     assert summary["median_percent"] == pytest.approx(np.median(spread), rel=1e-6)
-    assert summary["hides_poor_accuracy"] == (spread.max() > POOR)
-    assert (summary["advice"] is not None) == (spread.max() > POOR)
+    assert summary["hides_poor_accuracy"] == (spread.max() > POOR_PERCENT)
+    assert (summary["advice"] is not None) == (spread.max() > POOR_PERCENT)
 
 
 def test_after_a_log_the_next_drive_is_for_the_estimated_machine(
@@ -89,7 +90,7 @@ def test_what_sits_in_a_sensor_is_no_part_of_a_design_that_is_read_back(excite: 
     assert "measuring_wheel_radius@measuring_wheel_left" in saved_design.read_design(out).model.base.names
     text = json.loads((out / "summary.json").read_text())
     (out / "summary.json").write_text(json.dumps(text | {"duration_s": None}))
-    with pytest.raises(StoredError, match="damaged, design again"):
+    with pytest.raises(DesignFolderError, match="damaged, design again"):
         saved_design.read_design(out)
 
 

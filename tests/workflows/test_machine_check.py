@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
-from conftest import Excite
+from support.commands import Excite
 
 from excite.cli import machine_template
 from excite.errors import MachineError
@@ -48,7 +48,7 @@ def assumed(value: float) -> dict[str, Any]:
 
 # ---------------------------------------------------------------------------------------------------- to start from
 def test_the_file_to_start_from_is_beyond_doubt(tmp_path: Path) -> None:
-    found = machine_check.check(spoilt(tmp_path))
+    found = machine_check.check_file(spoilt(tmp_path))
     assert (found.faults, found.doubts) == ((), ())
     assert found.model is not None
     assert set(found.sigma_percent) == set(found.model.base.names)
@@ -88,7 +88,7 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_what_is_wrong_is_said(case: str, tmp_path: Path) -> None:
     changes, says = WRONG[case]
-    found = machine_check.check(spoilt(tmp_path, *changes))
+    found = machine_check.check_file(spoilt(tmp_path, *changes))
     assert [line for line in found.faults if says in line], found.faults
     assert found.sigma_percent == {}
 
@@ -164,7 +164,7 @@ def test_what_is_doubtful_is_said(case: str, tmp_path: Path) -> None:
 
 def test_a_parameter_that_no_drive_shows_well_is_doubtful(tmp_path: Path) -> None:
     """Friction of a hundredth of a newton metre beside noise of 30."""
-    found = machine_check.check(spoilt(tmp_path, ("body.1.friction.Fs.value", 0.01)))
+    found = machine_check.check_file(spoilt(tmp_path, ("body.1.friction.Fs.value", 0.01)))
     assert [line for line in found.doubts if line.startswith("Fs1: random drives leave it uncertain")] == list(
         found.doubts
     )
@@ -173,7 +173,7 @@ def test_a_parameter_that_no_drive_shows_well_is_doubtful(tmp_path: Path) -> Non
 def test_everything_wrong_is_said_at_once(tmp_path: Path) -> None:
     """Not only the first complaint, as the other commands do."""
     path = spoilt(tmp_path, ("body.0.inertia.mass.value", -1), ("body.2.limit.torque.value", -3), ("colour", "red"))
-    found = machine_check.complaints(path)
+    found = machine_check.file_errors(path)
     assert len(found) == 3
     for says in ("body[0].inertia.mass: must be > 0", "body[2].limit.torque: must be > 0", "colour: no such key"):
         assert sum(says in line for line in found) == 1
@@ -196,14 +196,14 @@ def test_nothing_is_doubtful_in_what_ships(name: str) -> None:
 
 def test_no_drive_is_tried_at_a_rate_that_no_logger_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A slip of the keyboard must not take minutes."""
-    monkeypatch.setattr(machine_check, "_trial", lambda model: pytest.fail("drives are tried"))
-    found = machine_check.check(spoilt(tmp_path, ("sampling_hz.value", 1e6)))
+    monkeypatch.setattr(machine_check, "_random_drive_sigma", lambda model: pytest.fail("drives are tried"))
+    found = machine_check.check_file(spoilt(tmp_path, ("sampling_hz.value", 1e6)))
     assert found.faults == ()
     assert [line for line in found.doubts if "no random drive is tried at such a rate" in line]
 
 
 def test_a_pendulum_on_the_plane_is_said_to_be_unseen() -> None:
-    lines = list(machine_check.unseen(build(load_machine("pendulum_loader"))))
+    lines = list(machine_check.describe_invisible(build(load_machine("pendulum_loader"))))
     assert lines[0] == ("pendulum: theta3 is held at zero, no drive reveals what belongs to it alone: Fv3, Fs3")
     assert "XX4" in lines[1]
     assert "YY4" in lines[1]
@@ -211,17 +211,17 @@ def test_a_pendulum_on_the_plane_is_said_to_be_unseen() -> None:
 
 # ----------------------------------------------------------------------------------------------------- from above
 def test_a_machine_held_on_a_line_is_said_to_be() -> None:
-    lines = list(machine_check.unseen(build(load_machine("va12_straight"))))
+    lines = list(machine_check.describe_invisible(build(load_machine("va12_straight"))))
     assert lines[0] == "y0, theta0: held at zero, the machine keeps to a line"
 
 
 def test_poses_are_where_the_table_puts_the_bodies() -> None:
     """The tandem's yokes turned by hand; the robot's wheels at the corners of its wheelbase and track."""
-    poses = tree.poses(load_machine("tandem"), {"theta1": 0.3, "theta3": -0.2})
+    poses = tree.body_poses(load_machine("tandem"), {"theta1": 0.3, "theta3": -0.2})
     assert poses[2][1] == pytest.approx([1.7, 0, 0])
     assert poses[1][0] @ [1, 0, 0] == pytest.approx([np.cos(0.3), np.sin(0.3), 0])
     assert poses[3][0] @ [1, 0, 0] == pytest.approx([np.cos(0.2), -np.sin(0.2), 0])
-    robot = tree.poses(load_machine("skid_robot"), {})
+    robot = tree.body_poses(load_machine("skid_robot"), {})
     assert robot[3][1] == pytest.approx([-0.249, 0.29153, 0])
     assert robot[3][0][:, 2] == pytest.approx([0, 1, 0])
 

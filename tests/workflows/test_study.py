@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import Excite
+from support.commands import Excite
 
-from excite.errors import EngineError, FolderError, InfeasibleError, MachineError, StoreError
+from excite.errors import FolderError, InfeasibleError, MachineError, RowStoreError, WorkerError
 from excite.identification import monte_carlo as verification
 from excite.logs import profile
 from excite.model import Model, build
@@ -32,7 +32,7 @@ from excite.model.machine import Problem, machine as machines
 from excite.simulation import Motion, simulate
 from excite.trajectories import saved_design
 from excite.workflows import executors, row_store, study_plan, study_results, study_runner, study_runs
-from excite.workflows.study_plan import Plan
+from excite.workflows.study_plan import StudyPlan
 
 ROOT = Path(__file__).parents[2]
 TINY = """
@@ -59,11 +59,11 @@ def short(straight: Model) -> Motion:
 
 
 @pytest.fixture
-def tiny(tmp_path: Path, straight: Model, short: Motion) -> Callable[..., Plan]:
+def tiny(tmp_path: Path, straight: Model, short: Motion) -> Callable[..., StudyPlan]:
     """A study of two cells on a drive of 2.5 s."""
     profile.profile_of(straight, short).to_csv(tmp_path / "drive.csv", index=False)
 
-    def make(runs: int = 3, text: str = TINY) -> Plan:
+    def make(runs: int = 3, text: str = TINY) -> StudyPlan:
         (tmp_path / "tiny.toml").write_text(text.replace("{runs}", str(runs)))
         return study_plan.read_study(tmp_path / "tiny.toml")
 
@@ -239,7 +239,7 @@ def test_limits_are_multiplied() -> None:
     from excite.model.machine import machine
 
     one = machine.load_machine("va12")
-    half = study_plan.limited(one, {"rim_speed": 0.5, "slip": 2.0, "power": 0.1, "lane": 3.0})
+    half = study_plan.scale_limits(one, {"rim_speed": 0.5, "slip": 2.0, "power": 0.1, "lane": 3.0})
     for before, after in zip(one.contacts, half.contacts, strict=True):
         assert before.contact is not None
         assert after.contact is not None
@@ -253,7 +253,9 @@ def test_limits_are_multiplied() -> None:
 # ------------------------------------------------------------------------------------------------ what comes out
 
 
-def test_runs_are_those_of_verify(tiny: Callable[..., Plan], tmp_path: Path, straight: Model, short: Motion) -> None:
+def test_runs_are_those_of_verify(
+    tiny: Callable[..., StudyPlan], tmp_path: Path, straight: Model, short: Motion
+) -> None:
     """The same seeds, logs and estimates as `excite verify`, and the same sums."""
     summary = study_runner.run_study(tiny(4), tmp_path / "out", jobs=1)
     table = pd.read_parquet(tmp_path / "out" / "runs.parquet")
@@ -293,7 +295,7 @@ def test_the_page_says_which_cell_is_best_and_what_made_it(tmp_path: Path) -> No
 
 
 def test_each_row_tells_how_to_repeat_it(
-    tiny: Callable[..., Plan], tmp_path: Path, excite: Excite, monkeypatch: pytest.MonkeyPatch
+    tiny: Callable[..., StudyPlan], tmp_path: Path, excite: Excite, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With a machine file of its own and what it extends: the command of a row gives the row's numbers again."""
     machine = tmp_path / "roller.toml"
@@ -315,22 +317,22 @@ def test_each_row_tells_how_to_repeat_it(
 
 
 def test_what_can_not_be_had_is_said_and_does_not_end_the_study(
-    tiny: Callable[..., Plan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Callable[..., StudyPlan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from excite.errors import NotIdentifiable
+    from excite.errors import NotIdentifiableError
 
-    plain = study_runs._run
+    plain = study_runs._run_steps
 
-    def moody(work: study_runs.Work, seed: int) -> study_runs.Row:
+    def moody(work: study_runs.RunBatch, seed: int) -> study_runs.Row:
         if seed == int(np.random.SeedSequence(0).generate_state(4)[1]):
-            raise NotIdentifiable("nothing\nmoves")
+            raise NotIdentifiableError("nothing\nmoves")
         if seed == int(np.random.SeedSequence(0).generate_state(4)[2]):
             raise TypeError("a slip of ours")
         if seed == int(np.random.SeedSequence(0).generate_state(4)[3]):
             raise MachineError("no such machine")
         return plain(work, seed)
 
-    monkeypatch.setattr(study_runs, "_run", moody)
+    monkeypatch.setattr(study_runs, "_run_steps", moody)
     summary = study_runner.run_study(tiny(4), tmp_path / "out", jobs=1)
     table = pd.read_parquet(tmp_path / "out" / "runs.parquet")
     assert list(table["status"])[:4] == ["done", "failed", "defect", "failed"]
@@ -342,7 +344,7 @@ def test_what_can_not_be_had_is_said_and_does_not_end_the_study(
 def test_designs_are_made_once_and_can_be_verified(
     tmp_path: Path, excite: Excite, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plain, asked = study_runs.design_request.answer, []
+    plain, asked = study_runs.design_request.design_from, []
 
     def answer(model: Model, problem: Problem, *rest: Any) -> Any:
         asked.append(problem.lane_m[0])
@@ -350,7 +352,7 @@ def test_designs_are_made_once_and_can_be_verified(
             raise InfeasibleError("no drive found that keeps every limit", "lane", 1.0)
         return plain(model, problem, *rest)
 
-    monkeypatch.setattr(study_runs.design_request, "answer", answer)
+    monkeypatch.setattr(study_runs.design_request, "design_from", answer)
     path = tmp_path / "d.toml"
     path.write_text(
         'name = "d"\nruns = 2\nsteps = ["verify"]\n[grid]\nmachine = "va12_straight"\nduration_s = 8\nstarts = 1\n'
@@ -376,29 +378,29 @@ def test_designs_are_made_once_and_can_be_verified(
 def test_a_drive_is_designed_for_what_drives_show(monkeypatch: pytest.MonkeyPatch) -> None:
     """As `excite design` does it: what sits in a sensor is no parameter, where cond(Phi) would be infinite."""
     roller = machines.load_machine("va12")
-    machine = placing.extended(roller, placing.parse("yaw_rate_bias=0.01", roller, 60.0))
+    machine = placing.with_effects(roller, placing.parse_effect("yaw_rate_bias=0.01", roller, 60.0))
     asked: list[Model] = []
 
     def answer(model: Model, *_: Any) -> Any:
         asked.append(model)
         raise refused
 
-    monkeypatch.setattr(study_runs.design_request, "answer", answer)
-    order = study_runs.Order(0, machine.model_dump_json(), "R60", machine.problems["R60"], "cond", 1, 0)
+    monkeypatch.setattr(study_runs.design_request, "design_from", answer)
+    order = study_runs.DesignJob(0, machine.model_dump_json(), "R60", machine.problems["R60"], "cond", 1, 0)
     refused: Exception = MachineError("sensor vy: give noise")
-    assert study_runs.designed(order).failure == "sensor vy: give noise"
+    assert study_runs.design_drive(order).failure == "sensor vy: give noise"
     assert asked[0].base.names == build(roller).base.names
     refused = np.linalg.LinAlgError("Singular matrix")
-    assert study_runs.designed(order).failure == "some parameter moves nothing in problem R60, so no drive shows it"
+    assert study_runs.design_drive(order).failure == "some parameter moves nothing in problem R60, so no drive shows it"
     twice = machine.model_copy(update={"effect": machine.effect * 2})
     order = replace(order, machine=twice.model_dump_json())
-    assert "given twice at one place: yaw_rate_bias@yaw_rate" in (study_runs.designed(order).failure or "")
+    assert "given twice at one place: yaw_rate_bias@yaw_rate" in (study_runs.design_drive(order).failure or "")
 
 
 # ------------------------------------------------------------------------------------------------ interrupted
 
 
-def test_the_table_does_not_depend_on_the_workers(tiny: Callable[..., Plan], tmp_path: Path) -> None:
+def test_the_table_does_not_depend_on_the_workers(tiny: Callable[..., StudyPlan], tmp_path: Path) -> None:
     for jobs in (1, 2):
         study_runner.run_study(tiny(3), tmp_path / f"out{jobs}", jobs=jobs)
     for name in ("runs.parquet", "study.png", "study.json"):
@@ -408,17 +410,19 @@ def test_the_table_does_not_depend_on_the_workers(tiny: Callable[..., Plan], tmp
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Seeds of the runs that are computed in this process."""
     seen: list[int] = []
-    plain = study_runs.run
+    plain = study_runs.run_once
 
-    def run(work: study_runs.Work, seed: int) -> study_runs.Row:
+    def run(work: study_runs.RunBatch, seed: int) -> study_runs.Row:
         seen.append(seed)
         return plain(work, seed)
 
-    monkeypatch.setattr(study_runs, "run", run)
+    monkeypatch.setattr(study_runs, "run_once", run)
     return seen
 
 
-def test_it_goes_on_where_it_was(tiny: Callable[..., Plan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_goes_on_where_it_was(
+    tiny: Callable[..., StudyPlan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     study_runner.run_study(tiny(5), tmp_path / "whole", jobs=1)
     seen = counted(monkeypatch)
 
@@ -438,12 +442,12 @@ def test_it_goes_on_where_it_was(tiny: Callable[..., Plan], tmp_path: Path, monk
     study_runner.run_study(tiny(5), tmp_path / "out", jobs=1)
     assert len(seen) - before == 10 - kept
     assert (tmp_path / "out" / "runs.parquet").read_bytes() == (tmp_path / "whole" / "runs.parquet").read_bytes()
-    assert not study_runner.place_of(tmp_path / "out").exists()
+    assert not study_runner.working_folder(tmp_path / "out").exists()
     study_runner.run_study(tiny(5), tmp_path / "out", jobs=1)  # done: nothing is computed
     assert len(seen) - before == 10 - kept
 
 
-def test_another_study_is_not_mixed_in(tiny: Callable[..., Plan], tmp_path: Path) -> None:
+def test_another_study_is_not_mixed_in(tiny: Callable[..., StudyPlan], tmp_path: Path) -> None:
     def stop(done: int, total: int, what: str) -> None:
         if done == 2:
             raise KeyboardInterrupt
@@ -459,39 +463,39 @@ def test_another_study_is_not_mixed_in(tiny: Callable[..., Plan], tmp_path: Path
 
 def test_two_can_not_work_on_one_study(tmp_path: Path) -> None:
     with (
-        row_store.opened(tmp_path / "s", "f"),
-        pytest.raises(FolderError, match="somebody is at work"),
-        row_store.opened(tmp_path / "s", "f"),
+        row_store.open_store(tmp_path / "s", "f"),
+        pytest.raises(FolderError, match="another process works on this study"),
+        row_store.open_store(tmp_path / "s", "f"),
     ):
         pass
 
 
 def test_rows_are_kept_once_and_whole(tmp_path: Path) -> None:
-    with row_store.opened(tmp_path / "s", "f") as kept:
-        kept.keep([(3, {"a": 1.5}), (1, {"a": None})])
+    with row_store.open_store(tmp_path / "s", "f") as kept:
+        kept.add_rows([(3, {"a": 1.5}), (1, {"a": None})])
         with pytest.raises(ValueError, match="there already"):
-            kept.keep([(2, {}), (3, {})])
+            kept.add_rows([(2, {}), (3, {})])
         with pytest.raises(ValueError, match="not JSON compliant"):
-            kept.keep([(4, {}), (5, {"a": float("nan")})])
-    with row_store.opened(tmp_path / "s", "f") as kept:
+            kept.add_rows([(4, {}), (5, {"a": float("nan")})])
+    with row_store.open_store(tmp_path / "s", "f") as kept:
         assert list(kept.rows()) == [(1, {"a": None}), (3, {"a": 1.5})]
 
 
 def test_a_damaged_store_is_not_read(tmp_path: Path) -> None:
     (tmp_path / "s").write_bytes(b"SQLite format 3\0" + bytes(range(256)) * 20)
-    with pytest.raises(FolderError, match="damaged"), row_store.opened(tmp_path / "s", "f"):
+    with pytest.raises(FolderError, match="damaged"), row_store.open_store(tmp_path / "s", "f"):
         pass
 
 
 def test_a_full_disk_loses_nothing(tmp_path: Path) -> None:
-    with row_store.opened(tmp_path / "s", "f") as kept:
-        kept.keep([(k, {"a": k}) for k in range(10)])
+    with row_store.open_store(tmp_path / "s", "f") as kept:
+        kept.add_rows([(k, {"a": k}) for k in range(10)])
         kept._db.execute(f"PRAGMA max_page_count = {kept._db.execute('PRAGMA page_count').fetchone()[0] + 2}")
-        with pytest.raises(StoreError, match=r"full.*repeat the command"):
-            kept.keep([(k, {"text": "x" * 500}) for k in range(10, 200)])
-    with row_store.opened(tmp_path / "s", "f") as kept:
+        with pytest.raises(RowStoreError, match=r"full.*repeat the command"):
+            kept.add_rows([(k, {"text": "x" * 500}) for k in range(10, 200)])
+    with row_store.open_store(tmp_path / "s", "f") as kept:
         assert kept.numbers() == set(range(10))
-        kept.keep([(k, {}) for k in range(10, 200)])
+        kept.add_rows([(k, {}) for k in range(10, 200)])
 
 
 def test_a_worker_that_dies_costs_nothing_and_a_deadly_piece_is_found(tmp_path: Path) -> None:
@@ -504,9 +508,9 @@ def test_a_worker_that_dies_costs_nothing_and_a_deadly_piece_is_found(tmp_path: 
             os.kill(os.getpid(), signal.SIGKILL)
         return number
 
-    with executors.pool(2) as workers:
-        results = list(executors.spread(dies, range(8), workers))
-        [chance] = executors.spread(dies, [9], workers)
+    with executors.open_pool(2) as workers:
+        results = list(executors.run_pieces(dies, range(8), workers))
+        [chance] = executors.run_pieces(dies, [9], workers)
     assert sorted(r.piece for r in results) == list(range(8))
     assert {r.piece for r in results if r.value is None} == {3}
     assert chance.value == 9, "workers that were killed twice from outside are not the fault of what they had alone"
@@ -516,7 +520,7 @@ def test_a_batch_that_dies_is_no_fault_of_its_runs() -> None:
     """Two runs whose batch kills its worker, and each of them alone as often as may be by chance."""
     deaths: dict[tuple[int, ...], int] = {}
 
-    class Dying(executors.Here):
+    class Dying(executors.ThisProcess):
         shared = True
 
         def died(self, err: BaseException) -> bool:
@@ -524,13 +528,13 @@ def test_a_batch_that_dies_is_no_fault_of_its_runs() -> None:
 
     def dies(batch: tuple[int, ...]) -> int:
         deaths[batch] = deaths.get(batch, 0) + 1
-        if len(batch) > 1 or deaths[batch] < executors.TRIES:
+        if len(batch) > 1 or deaths[batch] < executors.MAX_DEATHS:
             raise BrokenExecutor
         return sum(batch)
 
-    results = executors.spread(dies, [(1, 2)], Dying(), lambda batch: [(k,) for k in batch])
+    results = executors.run_pieces(dies, [(1, 2)], Dying(), lambda batch: [(k,) for k in batch])
     assert {r.piece: r.value for r in results} == {(1,): 1, (2,): 2}
-    assert deaths == {(1, 2): 1, (1,): executors.TRIES, (2,): executors.TRIES}
+    assert deaths == {(1, 2): 1, (1,): executors.MAX_DEATHS, (2,): executors.MAX_DEATHS}
 
 
 def test_pieces_are_taken_as_they_are_needed() -> None:
@@ -542,13 +546,13 @@ def test_pieces_are_taken_as_they_are_needed() -> None:
             yield k
 
     ahead = 0
-    with executors.pool(1) as workers:
-        for k, _ in enumerate(executors.spread(abs, pieces(), workers)):
+    with executors.open_pool(1) as workers:
+        for k, _ in enumerate(executors.run_pieces(abs, pieces(), workers)):
             ahead = max(ahead, len(taken) - k)
-    assert ahead <= executors.AHEAD + 1
+    assert ahead <= executors.PIECES_PER_WORKER + 1
 
 
-def test_no_cluster_is_said_in_a_line(tiny: Callable[..., Plan], tmp_path: Path, excite: Excite) -> None:
+def test_no_cluster_is_said_in_a_line(tiny: Callable[..., StudyPlan], tmp_path: Path, excite: Excite) -> None:
     pytest.importorskip("distributed")
     tiny(2)
     code, _, stderr = excite("study", tmp_path / "tiny.toml", "--cluster", "nonsense://x", "--out", tmp_path / "out")
@@ -588,7 +592,7 @@ def attentive() -> Iterator[None]:
 @pytest.mark.usefixtures("attentive")
 @pytest.mark.parametrize("lost_as", [None, TypeError("'NoneType' object is not iterable")])
 def test_ctrl_c_that_casadi_loses_ends_a_run_all_the_same(
-    tiny: Callable[..., Plan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lost_as: Exception | None
+    tiny: Callable[..., StudyPlan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lost_as: Exception | None
 ) -> None:
     """A KeyboardInterrupt within CasADi's calls comes out as another error, or not at all: never a row of the table."""
 
@@ -601,7 +605,7 @@ def test_ctrl_c_that_casadi_loses_ends_a_run_all_the_same(
 
     wanted = tiny(2)
     with monkeypatch.context() as patched:
-        patched.setattr(study_runs, "_run", lost)
+        patched.setattr(study_runs, "_run_steps", lost)
         with pytest.raises(KeyboardInterrupt):
             study_runner.run_study(wanted, tmp_path / "out", jobs=1)
     assert kept_rows(tmp_path / "out") == 0
@@ -613,11 +617,11 @@ NURSERY = '''
 """Forks drivers of a study and kills each at a random time; says what was computed and what was kept."""
 import json, os, random, signal, sqlite3, sys, time
 from pathlib import Path
-from excite import cell, plan, study
+from excite.workflows import study_plan, study_runner, study_runs
 
 file, out, seed, kills = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
 rng = random.Random(seed)
-plain = cell.run
+plain = study_runs.run_once
 
 def logged(work, s):
     row = plain(work, s)
@@ -627,20 +631,20 @@ def logged(work, s):
     os.close(handle)
     return row
 
-cell.run = logged
+study_runs.run_once = logged
 
 def kept():
     try:
-        with sqlite3.connect(study.place_of(out) / "runs.sqlite") as db:
+        with sqlite3.connect(study_runner.working_folder(out) / "runs.sqlite") as db:
             return [n for (n,) in db.execute("SELECT number FROM runs")]
     except sqlite3.Error:
         return []
 
-wanted = plan.read(file)
+wanted = study_plan.read_study(file)
 whole, trials, finished = 0.0, [], 0
 for name in ("warm", "measure"):  # models are built once, here
     begin = time.perf_counter()
-    study.carry(wanted, Path(name), jobs=1)
+    study_runner.run_study(wanted, Path(name), jobs=1)
     whole = time.perf_counter() - begin
 os.unlink("computed")
 count = 0
@@ -648,7 +652,7 @@ while count < kills:
     pid = os.fork()
     if pid == 0:
         try:
-            study.carry(wanted, out, jobs=1)
+            study_runner.run_study(wanted, out, jobs=1)
             os._exit(0)
         except BaseException as err:
             print(repr(err), file=sys.stderr)
@@ -674,13 +678,13 @@ while count < kills:
     told = {"trials": trials, "whole": whole, "finished": finished}
     Path("told.json").write_text(json.dumps(told))
 while not out.exists():
-    study.carry(wanted, out, jobs=1)
+    study_runner.run_study(wanted, out, jobs=1)
 '''
 
 
 @pytest.mark.slow
 def test_killed_at_random_times_it_loses_nothing(
-    tiny: Callable[..., Plan], tmp_path: Path, snapshot: dict[str, str]
+    tiny: Callable[..., StudyPlan], tmp_path: Path, snapshot: dict[str, str]
 ) -> None:
     """Sixty kills (-9, Ctrl-C) of the driver: what was kept stays, is not computed again, and the table is the same."""
     tiny(10)
@@ -710,7 +714,7 @@ def test_killed_at_random_times_it_loses_nothing(
 
 def kept_rows(out: Path) -> int:
     try:
-        db = sqlite3.connect(f"file:{study_runner.place_of(out) / 'runs.sqlite'}?mode=ro&immutable=1", uri=True)
+        db = sqlite3.connect(f"file:{study_runner.working_folder(out) / 'runs.sqlite'}?mode=ro&immutable=1", uri=True)
         return int(db.execute("SELECT count(*) FROM runs").fetchone()[0])
     except sqlite3.Error:
         return 0
@@ -718,7 +722,7 @@ def kept_rows(out: Path) -> int:
 
 @pytest.mark.slow
 def test_a_full_file_system_is_said_and_the_study_goes_on_after(
-    tiny: Callable[..., Plan], tmp_path: Path, snapshot: dict[str, str]
+    tiny: Callable[..., StudyPlan], tmp_path: Path, snapshot: dict[str, str]
 ) -> None:
     """A real file system of 160 kB: exit 1 with a line that says so; with room again the same command goes on."""
     small = tmp_path / "small"
@@ -925,15 +929,15 @@ def test_a_killed_scheduler_is_said_and_the_study_goes_on(
 def test_a_scheduler_that_is_gone_is_said_whatever_is_asked(dask: Dask) -> None:
     """While the client still tries to reach it, and after it gave up."""
     dask.worker()
-    with executors.pool(cluster=dask.address) as workers:
+    with executors.open_pool(cluster=dask.address) as workers:
         assert workers.size == 1
         assert workers.submit(abs, -1).result(timeout=60) == 1
         dask.close()
         for _ in range(2):
-            with pytest.raises(EngineError, match="repeat the command"):
+            with pytest.raises(WorkerError, match="repeat the command"):
                 assert workers.size
         time.sleep(5)
-        with pytest.raises(EngineError, match="repeat the command"):
+        with pytest.raises(WorkerError, match="repeat the command"):
             workers.submit(abs, -1)
 
 

@@ -1,0 +1,34 @@
+"""Drives that many tests share."""
+
+from __future__ import annotations
+
+import numpy as np
+from support.files import RESULTS
+
+from excite.logs import profile
+from excite.model import Model
+from excite.simulation import Motion, simulate
+
+
+def drive(model: Model, duration: float, seed: int, amplitude: dict[str, float]) -> np.ndarray:
+    """A lively drive (N, n_u) [N m] from rest to about rest: a few sines of each torque, faded in and out."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(duration * float(model.machine.sampling_hz)) + 1) / float(model.machine.sampling_hz)
+    torque = np.zeros((len(t), len(model.inputs)))
+    for k, name in enumerate(model.inputs):
+        for frequency in (0.05, 0.08, 0.13, 0.2, 0.3):
+            torque[:, k] += amplitude[name] * np.sin(2 * np.pi * frequency * t + rng.uniform(0, 2 * np.pi))
+    return torque * np.minimum(1, np.minimum(t, duration - t) / 2)[:, None]
+
+
+def designed(name: str, model: Model) -> Motion:
+    """A committed design, its torques on a machine."""
+    torque, q0, nu0 = profile.read_profile(RESULTS / name / "design" / "profile.csv", model)
+    return simulate(model, torque, q0=q0, nu0=nu0)
+
+
+def gentle(model: Model, seconds: float) -> Motion:
+    """Little torque for a short time."""
+    t = np.arange(0, seconds + 0.01, 0.01)
+    slow = np.minimum(1, np.minimum(t, seconds - t) / 2)
+    return simulate(model, np.column_stack([1500 * np.sin(1.7 * t) * slow, 1200 * np.sin(2.6 * t) * slow]))

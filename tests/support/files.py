@@ -1,0 +1,24 @@
+"""Places of committed results and shared measurements."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+
+
+RESULTS = Path(__file__).parents[2] / "results"
+
+
+def study(name: str) -> ModuleType:
+    """The script of a study in results/, as a module."""
+    spec = importlib.util.spec_from_file_location(f"study_{name}", RESULTS / name / "study.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module

@@ -1,0 +1,46 @@
+"""Four logs whose verdict and numbers are held: a change of any is a change of what users get, and must be meant."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.files import RESULTS
+
+import excite
+
+GOLDEN = json.loads((Path(__file__).parent / "golden.json").read_text(encoding="utf-8"))
+HIDDEN = {
+    "clean": ((), 2),
+    "deadband": (("torque_deadband@rear_roll=80",), 3),
+    "rolling_resistance": (("rolling_resistance@front_roll=250",), 5),
+    "surprise": ((), 7),  # an encoder error that no effect of the catalogue has
+}
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_golden_log(name: str) -> None:
+    """Values to a thousandth of their deviation: other processors differ in rounding."""
+    effects, seed = HIDDEN[name]
+    drive = RESULTS / "S40" / "design"
+    log = excite.simulate("va12_straight", drive, seed=seed, effects=effects)
+    if name == "surprise":
+        log["theta4_rad"] += 0.004 * np.sin(2 * np.pi * log["t_s"] ** 1.5 / 20)
+    want = GOLDEN[name]
+    estimate = excite.identify("va12_straight", log)
+    value, std = np.array(list(want["parameters"].values())).T
+    assert list(want["parameters"]) == list(estimate.names)
+    assert (np.abs(estimate.value - value) / std).max() < 1e-3
+    np.testing.assert_allclose(estimate.std, std, rtol=1e-3)
+    assert estimate.cond_phi == pytest.approx(want["cond_phi"], rel=1e-4)
+    account = excite.diagnose("va12_straight", log)
+    found = account.diagnosis.findings
+    assert account.diagnosis.verdict == want["verdict"]
+    assert [[f.effect, f.where] for f in found] == [f[:2] for f in want["findings"]]
+    for finding, gain, (_, _, amount, amount_std, percent) in zip(found, account.single, want["findings"], strict=True):
+        assert finding.amount == pytest.approx(amount, abs=0.01 * amount_std)
+        assert finding.amount_std == pytest.approx(amount_std, rel=0.01)
+        assert gain is not None
+        assert gain.percent == pytest.approx(percent, abs=0.5)
