@@ -1,10 +1,11 @@
-"""The commands. Heavy imports happen inside them, so that --help is there at once."""
+"""The commands. Heavy imports stand inside them, so that --help takes no time."""
 
 from __future__ import annotations
 
 import ipaddress
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +16,7 @@ from excite.cli import options, terminal
 from excite.cli.options import (
     AfterOption,
     BudgetOption,
-    Choosing,
+    CommandWithChoices,
     DesignArgument,
     DurationOption,
     JsonOption,
@@ -55,42 +56,47 @@ def every(
         bool, typer.Option("--version", help="print the version and end", callback=_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Designs test drives that make a machine tell you its parameters, verifies them, and identifies from a log."""
+    """Design test drives for machines, simulate them, identify parameters from logs, and diagnose model errors.
+
+    Start with `excite machines`, then `excite run MACHINE`; `excite COMMAND --help` explains each command.
+    """
 
 
 @contextmanager
 def _result(
-    out: Path, json: bool, show: Callable[[dict[str, Any]], None], inputs: Sequence[Path] = ()
+    out: Path, json: bool, describe: Callable[[dict[str, Any]], None], inputs: Sequence[Path] = ()
 ) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """What most commands do: before the work it is checked that the folder can be written, and said which result it
-    will replace; the summary is told at the end. Given are a place to write to and the summary, still empty."""
+    """Give a command a folder to write into and an empty summary, and describe the summary at the end.
+
+    Before the work the folder is checked, and the result that it will replace is named.
+    """
     from excite import output
 
     output.check_out_folder(out, inputs)
     before = output.describe_result(out)
     if before is not None and not json:
-        terminal.say(f"{out}/ will be replaced, what is there is of {before}; --out keeps both")
+        terminal.say(f"{out}/ will be replaced, it holds the result of {before}; --out FOLDER keeps both")
     summary: dict[str, Any] = {}
     with output.new_folder(out) as place:
         yield place, summary
-    terminal.finish(summary, out, json, show)
+    terminal.finish(summary, out, json, describe)
 
 
-def _file(machine: str) -> list[Path]:
-    """The machine's file, which no result may take the place of; none of a shipped one."""
+def _machine_file(machine: str) -> list[Path]:
+    """Return the machine's file, which no result may replace; none for a shipped machine."""
     return [Path(machine)] if Path(machine).is_file() else []
 
 
 @app.command()
 def machines(json: JsonOption = False) -> None:
-    """Lists the machines that come with excite."""
-    from excite.model import build as prediction_build
+    """List the machines that come with excite."""
+    from excite.model import build
     from excite.model.machine import load_machine, shipped_machines
 
     rows: list[dict[str, Any]] = []
     for name in shipped_machines():
         loaded = load_machine(name)
-        model = prediction_build(loaded)
+        model = build(loaded)
         rows.append(
             {
                 "machine": name,
@@ -111,7 +117,7 @@ def machines(json: JsonOption = False) -> None:
     terminal.say(table)
 
 
-@app.command(cls=Choosing)
+@app.command(cls=CommandWithChoices)
 def design(
     machine: MachineArgument,
     problem: ProblemOption = None,
@@ -122,18 +128,26 @@ def design(
     after: AfterOption = None,
     between: Annotated[
         list[str] | None,
-        typer.Option("--between", help="twice: NAME[@WHERE]=AMOUNT, two effects that the drive is to tell apart"),
+        typer.Option(
+            "--between",
+            help="given twice: two effects NAME[@WHERE]=MAGNITUDE that the drive must separate, such as"
+            " ground_slope=0.01; `excite docs` lists effects and units",
+        ),
     ] = None,
-    driver: Annotated[bool, typer.Option("--driver", help="a drive that people can follow, in phases")] = False,
-    phase_min: Annotated[float, typer.Option("--phase-min", help="shortest phase for --driver [s]")] = 3.0,
+    driver: Annotated[bool, typer.Option("--driver", help="design for a person at the levers, in phases")] = False,
+    phase_min: Annotated[float, typer.Option("--phase-min", help="shortest phase for --driver, in seconds")] = 3.0,
     starts: StartsOption = 2,
     seed: SeedOption = 0,
     budget: BudgetOption = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Designs a test drive."""
-    from excite import workflows
+    """Design a test drive within the machine's limits.
+
+    Finds the torques over time that make every parameter identifiable, and states the attainable accuracy.
+
+    Example: excite design va12 --duration 30 --objective accuracy
+    """
     from excite.workflows import DesignRequest
 
     if between:
@@ -141,15 +155,18 @@ def design(
             raise UsageError("--between: give it twice, two effects, and no other --objective")
         objective = "discrimination"
     if phase_min != 3.0 and not driver:
-        raise UsageError("--phase-min is for --driver, give that too")
-    known, pair = tuple(after or ()), tuple(between or ())
-    brief = DesignRequest(objective, sigma_max, robust, known, starts, seed, budget, pair, driver, phase_min)
+        raise UsageError("--phase-min needs --driver as well")
+    earlier, pair = tuple(after or ()), tuple(between or ())
+    request = DesignRequest(objective, sigma_max, robust, earlier, starts, seed, budget, pair, driver, phase_min)
     out = out or Path(f"results/design-{workflows.machine_stem(machine)}")
-    with _result(out, json, terminal.design_table, [*_file(machine), *(after or [])]) as (place, summary):
-        summary |= workflows.design(place, machine, problem, duration, brief, terminal.bar)
+    with _result(out, json, partial(terminal.show, "design"), [*_machine_file(machine), *(after or [])]) as (
+        place,
+        summary,
+    ):
+        summary |= workflows.design(place, machine, problem, duration, request, terminal.bar)
 
 
-@app.command(cls=Choosing)
+@app.command(cls=CommandWithChoices)
 def verify(
     design_dir: DesignArgument,
     runs: RunsOption = 50,
@@ -159,25 +176,30 @@ def verify(
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Simulates a designed drive and identifies from it, many times: how true and how sure is each parameter."""
-    from excite import trajectories, workflows
+    """Simulate a design with sensor noise, and identify, many times.
+
+    Gives each parameter's bias, standard deviation, and the share of 95 % intervals that hold the truth.
+
+    Example: excite verify results/design-va12 --runs 100
+    """
+    from excite import trajectories
 
     name = trajectories.read_design_summary(design_dir)["machine"]
     out = out or Path(f"results/verify-{name}")
-    with _result(out, json, terminal.verify_table, [design_dir]) as (place, summary):
+    with _result(out, json, partial(terminal.show, "verify"), [design_dir]) as (place, summary):
         summary |= workflows.verify(place, design_dir, runs, method, kit, seed, bar=terminal.bar)
 
 
-@app.command(cls=Choosing)
+@app.command(cls=CommandWithChoices)
 def compare(
     machine: MachineArgument,
     problem: ProblemOption = None,
-    samples: Annotated[int, typer.Option("--samples", "--runs", min=1, help="of every random kind of drive")] = 20,
+    samples: Annotated[int, typer.Option("--samples", "--runs", min=1, help="drives of each random kind")] = 20,
     against: Annotated[
         list[str] | None,
         typer.Option(
             "--against",
-            help="one of the usual drives (repeatable), all by default",
+            help="usual drive to compare with (repeatable); all by default",
             autocompletion=options.names("against"),
         ),
     ] = None,
@@ -186,15 +208,16 @@ def compare(
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Compares a designed drive with the usual ones on the same problem, limits and time."""
-    from excite import workflows
+    """Compare the designed drive with usual ones.
 
+    All have the same problem, limits and computing time.
+    """
     out = out or Path(f"results/compare-{workflows.machine_stem(machine)}")
-    with _result(out, json, terminal.compare_table, _file(machine)) as (place, summary):
+    with _result(out, json, partial(terminal.show, "compare"), _machine_file(machine)) as (place, summary):
         summary |= workflows.compare(place, machine, problem, samples, tuple(against or ()), seed, budget, terminal.bar)
 
 
-@app.command(cls=Choosing)
+@app.command(cls=CommandWithChoices)
 def run(
     machine: MachineArgument,
     problem: ProblemOption = None,
@@ -211,22 +234,25 @@ def run(
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Designs a test drive and verifies it, in one go."""
-    from excite import output, simulation, workflows
+    """Design a test drive and verify it.
+
+    Example: excite run va12_straight
+    """
+    from excite import output, simulation
     from excite.workflows import DesignRequest
 
-    def show(both: dict[str, Any]) -> None:
-        terminal.design_table(both["design"])
-        terminal.verify_table(both["verify"])
+    def describe(both: dict[str, Any]) -> None:
+        terminal.show("design", both["design"])
+        terminal.show("verify", both["verify"])
 
     workflows.require_known("--kit", kit, simulation.KITS)
     workflows.choose_method(method, workflows.build_model(machine), kit)
     out = out or Path(f"results/run-{workflows.machine_stem(machine)}")
-    with _result(out, json, show, _file(machine)) as (place, summary):
+    with _result(out, json, describe, _machine_file(machine)) as (place, summary):
         designed = place / "design"
         designed.mkdir()
-        brief = DesignRequest(objective, sigma_max, robust, (), starts, seed, budget)
-        first = workflows.design(designed, machine, problem, duration, brief, terminal.bar)
+        request = DesignRequest(objective, sigma_max, robust, (), starts, seed, budget)
+        first = workflows.design(designed, machine, problem, duration, request, terminal.bar)
         if not first["complete"] and budget is None:
             raise KeyboardInterrupt
         checked = place / "verify"
@@ -240,45 +266,54 @@ def run(
 def drive(
     design_dir: DesignArgument,
     phases: Annotated[
-        int | None, typer.Option("--phases", min=2, help="at most so many phases; as many as it takes by default")
+        int | None, typer.Option("--phases", min=2, help="largest number of phases; as many as it takes by default")
     ] = None,
-    shortest: Annotated[float, typer.Option("--shortest", help="of a phase [s]")] = 2.0,
+    shortest: Annotated[float, typer.Option("--shortest", help="shortest phase, in seconds")] = 2.0,
     seed: SeedOption = 0,
     serve: Annotated[
         bool,
         typer.Option(
             "--serve",
-            help="show the page with live values until Ctrl-C: of --live, or of a program that sends JSON such as"
-            ' {"t_s": 3.5, "v_m_s": 1.2, "JOINT_rad": 0.1} to ws://HOST:PORT/live, JOINT the machine file\'s name of a'
-            " steered joint (columns as in phases.csv); v_m_s is needed",
+            help="serve the driver's page with live values until Ctrl-C. The values come from --live, or from a program"
+            ' that sends JSON such as {"t_s": 3.5, "v_m_s": 1.2, "JOINT_rad": 0.1} to ws://HOST:PORT/live: time, speed'
+            " (needed) and the angle of each steered joint, JOINT being its name in the machine file",
         ),
     ] = False,
-    live: Annotated[Path | None, typer.Option("--live", help="log (.csv) that grows, for --serve")] = None,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="for --serve; 0: any free one")] = 8765,
+    live: Annotated[
+        Path | None, typer.Option("--live", help="for --serve: log (.csv) that grows during the drive")
+    ] = None,
+    port: Annotated[
+        int, typer.Option("--port", min=0, max=65535, help="for --serve: port to listen on, 0 for any free one")
+    ] = 8765,
     host: Annotated[
         str,
         typer.Option(
             "--host",
-            help="for --serve, the address to listen on: 127.0.0.1 is for this machine alone, 0.0.0.0 lets a phone on"
-            " the same network open the page; anybody there can, and can send values",
+            help="for --serve: address to listen on. 127.0.0.1 serves this computer alone; 0.0.0.0 lets a phone, and"
+            " anybody else on the same network, open the page and send values",
         ),
     ] = "127.0.0.1",
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Turns a design into a drive that a person can follow: sheet (PDF) and page (HTML) for the driver."""
+    """Turn a design into a drive that a person can follow.
+
+    Writes a sheet (PDF) and a page (HTML) for the driver.
+
+    Example: excite drive results/design-va12 --serve
+    """
     from excite import operator, output, trajectories
 
     if (live is not None or port != 8765 or host != "127.0.0.1") and not serve:
-        raise UsageError("--live, --host and --port are for --serve, give that too")
+        raise UsageError("--live, --host and --port need --serve as well")
     try:
         ipaddress.ip_address(host)
     except ValueError:
-        raise UsageError(f"--host {host}: is no address, give a number such as 0.0.0.0 or 192.168.1.7") from None
+        raise UsageError(f"--host {host}: is no address, give one such as 0.0.0.0 or 192.168.1.7") from None
 
     name = trajectories.read_design_summary(design_dir)["machine"]
     out = out or Path(f"results/drive-{name}")
-    with _result(out, json, terminal.drive_table, [design_dir]) as (place, summary):
+    with _result(out, json, partial(terminal.show, "drive"), [design_dir]) as (place, summary):
         with terminal.bar("driving") as advance:
             made = operator.prepare(trajectories.read_design(design_dir), phases, shortest, seed, advance)
         summary |= {"machine": name, "design": str(design_dir), "seed": seed, **operator.write(made, place)}
@@ -288,25 +323,31 @@ def drive(
         operator.serve(out, made, host, port, live, lambda address: typer.echo(f"{address} (Ctrl-C ends)", err=True))
 
 
-@app.command(cls=Choosing)
+@app.command(cls=CommandWithChoices)
 def simulate(
     machine: MachineArgument,
-    profile: Annotated[Path, typer.Argument(metavar="PROFILE.csv", help="torques to drive")],
+    profile: Annotated[
+        Path, typer.Argument(metavar="PROFILE.csv", help="torques over time, as in a design's profile.csv")
+    ],
     out: Annotated[Path, typer.Option("--out", help="log to write (.csv or .parquet)")],
     seed: SeedOption = 0,
-    noise: Annotated[str, typer.Option("--noise", help="on, or off for exact signals")] = "on",
+    noise: Annotated[str, typer.Option("--noise", help="on: sensor noise and quantisation; off: exact signals")] = "on",
     kit: KitOption = "full",
     effect: Annotated[
         list[str] | None,
         typer.Option(
             "--effect",
-            help="NAME[@WHERE]=AMOUNT: what else the machine does; `excite docs` lists all (repeatable)",
+            help="effect that the model lacks, NAME[@WHERE]=MAGNITUDE (repeatable), such as"
+            " rolling_resistance@front_roll=30; `excite docs` lists effects, places and units",
             autocompletion=options.names("effect"),
         ),
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Drives a profile in simulation and writes the log that the sensors would write."""
+    """Simulate a drive and write the log that the sensors would write.
+
+    Example: excite simulate va12 results/design-va12/profile.csv --out log.csv
+    """
     from excite import output, simulation
     from excite.logs import read_profile
     from excite.simulation import simulate as drive
@@ -317,7 +358,7 @@ def simulate(
     writers = {".csv": lambda t, p: t.to_csv(p, index=False), ".parquet": lambda t, p: t.to_parquet(p, index=False)}
     workflows.require_known("--out: ending", out.suffix.lower(), tuple(writers))
     model = workflows.build_model(machine)
-    if out.resolve() in [path.resolve() for path in (profile, *_file(machine))]:
+    if out.resolve() in [path.resolve() for path in (profile, *_machine_file(machine))]:
         raise UsageError(f"--out {out}: is what the log is made from, choose another file")
     torque, q0, nu0 = read_profile(profile, model)
     nominal, model = model, workflows.with_effects(model, effect or (), len(torque))
@@ -347,27 +388,30 @@ def simulate(
             terminal.say(line)
 
 
-@app.command(cls=Choosing)
+@app.command(cls=CommandWithChoices)
 def identify(
     machine: MachineArgument,
     logs: LogsArgument,
     method: MethodOption = None,
     filtering: Annotated[
-        str, typer.Option("--filter", help="machine: the machine file's, or auto: by evidence")
+        str, typer.Option("--filter", help="low-pass filter; machine: of the machine file, auto: chosen from the logs")
     ] = "machine",
     validate: Annotated[
-        list[Path] | None, typer.Option("--validate", help="another log: how well the result predicts it (repeatable)")
+        list[Path] | None, typer.Option("--validate", help="log that is predicted, not fitted (repeatable)")
     ] = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Estimates the parameters, with uncertainty, from logs."""
-    from excite import workflows
+    """Estimate the parameters, with uncertainty, from logs.
 
-    model = workflows.build_model(machine)
-    out = out or Path(f"results/identify-{model.machine.name}")
-    _had(logs, filtering)
-    with _result(out, json, terminal.identify_table, [*_file(machine), *logs, *(validate or [])]) as (place, summary):
+    Example: excite identify va12 log.csv --validate other.csv
+    """
+    from excite.model.machine import load_machine
+
+    out = out or Path(f"results/identify-{load_machine(machine).name}")
+    _check_logs_and_filter(logs, filtering)
+    inputs = [*_machine_file(machine), *logs, *(validate or [])]
+    with _result(out, json, partial(terminal.show, "identify"), inputs) as (place, summary):
         summary |= workflows.identify(place, machine, logs, method, filtering, validate or [], terminal.bar)
 
 
@@ -376,50 +420,67 @@ def diagnose(
     machine: MachineArgument,
     logs: LogsArgument,
     filtering: Annotated[
-        str, typer.Option("--filter", help="of the first guess; machine: the machine file's, or auto: by evidence")
+        str,
+        typer.Option(
+            "--filter",
+            help="low-pass filter of the first guess; machine: of the machine file, auto: chosen from the logs",
+        ),
     ] = "machine",
-    onward: Annotated[
-        bool, typer.Option("--next", help="also design the drive that separates what is tied (folder next/; minutes)")
+    design_next: Annotated[
+        bool,
+        typer.Option(
+            "--next", help="also design the drive that separates tied causes, into the folder next/ (minutes)"
+        ),
     ] = False,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Shows what the simulation gets wrong, names the cause, extends the machine file, measures the gain."""
-    from excite import workflows
+    """Find and name what the model gets wrong along logs.
+
+    Gives the magnitude of each cause, and how much the error falls with it in the model. Writes the machine
+    file with the causes in it.
+
+    Example: excite diagnose va12 log.csv
+    """
     from excite.model.machine import load_machine
 
     out = out or Path(f"results/diagnose-{load_machine(machine).name}")
-    _had(logs, filtering)
-    with _result(out, json, terminal.diagnose_table, [*_file(machine), *logs]) as (place, summary):
-        summary |= workflows.diagnose(place, machine, logs, filtering, onward, terminal.bar)
+    _check_logs_and_filter(logs, filtering)
+    with _result(out, json, partial(terminal.show, "diagnose"), [*_machine_file(machine), *logs]) as (place, summary):
+        summary |= workflows.diagnose(place, machine, logs, filtering, design_next, terminal.bar)
 
 
-logs = typer.Typer(help="What is in a log.", rich_markup_mode=None)
+logs = typer.Typer(help="Check a log.", rich_markup_mode=None)
 app.add_typer(logs, name="log")
 
 
 @logs.command("check")
 def check_log(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="a log (.csv, .txt, .parquet, .mat, .mf4)")],
-    machine: Annotated[str | None, typer.Option("--machine", help="whose log it is; guessed by default")] = None,
+    machine: Annotated[
+        str | None, typer.Option("--machine", help="machine of the log; guessed from its columns by default")
+    ] = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Says what is in a log and everything that is wrong with it, with a picture."""
+    """Check a log: its columns, everything that is wrong with it, and a figure.
+
+    Ends with exit code 1 if anything is wrong.
+    """
     from excite import reports
 
     out = out or Path(f"results/log-{path.stem}")
-    _checked(
+    _write_check(
         path,
         out,
         json,
         lambda place: reports.check_log(place, path, machine, workflows.package_versions()),
-        terminal.log_table,
+        partial(terminal.show, "log"),
     )
 
 
-def _had(logs: Sequence[Path], filtering: str) -> None:
-    """Raises UsageError for logs or a filter that can't be had."""
+def _check_logs_and_filter(logs: Sequence[Path], filtering: str) -> None:
+    """Raise UsageError for a log given twice or an unknown filter."""
     from excite.identification import FILTERS
 
     workflows.require_known("--filter", filtering, tuple(FILTERS))
@@ -427,39 +488,39 @@ def _had(logs: Sequence[Path], filtering: str) -> None:
         raise UsageError("LOG: the same file is given twice, which would count it twice")
 
 
-def _checked(
+def _write_check(
     file: Path,
     out: Path,
     json: bool,
     work: Callable[[Path], dict[str, Any]],
-    show: Callable[[dict[str, Any]], None],
+    describe: Callable[[dict[str, Any]], None],
 ) -> None:
-    """What is wrong with a file, as a folder and on the terminal; exit code 1 where anything is."""
-    with _result(out, json, show, [file]) as (place, summary):
+    """Write and describe the check of a file; end with exit code 1 if anything is wrong."""
+    with _result(out, json, describe, [file]) as (place, summary):
         summary |= work(place)
     if summary["faults"]:
         raise typer.Exit(1)
 
 
-machine_files = typer.Typer(help="A machine file: one to start from, what is wrong with one.", rich_markup_mode=None)
+machine_files = typer.Typer(help="Start or check a machine file.", rich_markup_mode=None)
 app.add_typer(machine_files, name="machine")
 
 
 @machine_files.command("new")
 def new_machine(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="of the machine")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="name of the machine")],
     like: Annotated[
         str | None,
         typer.Option(
             "--like",
-            help="a shipped machine that it is but for its logger: columns and units to change",
+            help="shipped machine to copy, if only the logger differs: columns and units are left to change",
             autocompletion=options.machine_names,
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="file to write [NAME.toml]")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Writes a commented machine file to start from."""
+    """Write a commented machine file to start from."""
     from excite.cli import machine_template
     from excite.model.machine import shipped_machines
 
@@ -479,22 +540,26 @@ def check_machine(
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Says what is wrong or doubtful in a machine file, and draws the machine from above."""
-    from excite import workflows
+    """Check a machine file: everything that is wrong or doubtful, and a drawing from above.
 
+    Ends with exit code 1 if anything is wrong.
+    """
     out = out or Path(f"results/machine-{file.stem}")
-    _checked(
+    _write_check(
         file,
         out,
         json,
         lambda place: workflows.check_machine(place, file, workflows.package_versions()),
-        terminal.machine_table,
+        partial(terminal.show, "machine"),
     )
 
 
 @app.command()
 def docs(out: OutOption = None, json: JsonOption = False) -> None:
-    """Writes reference pages made from the code: effects, machine file, units, commands, Python interface."""
+    """Write the reference pages.
+
+    Effects, machine file, units, study file, commands, Python interface.
+    """
     from excite import output
     from excite.cli import reference
 
@@ -506,24 +571,24 @@ def docs(out: OutOption = None, json: JsonOption = False) -> None:
 
 @app.command()
 def study(
-    file: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="what to vary, and what to do with each")],
-    jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="processes; every core by default")] = None,
+    file: Annotated[
+        Path, typer.Argument(metavar="STUDY.toml", help="study file: what to vary and what to do (see `excite docs`)")
+    ],
+    jobs: Annotated[int | None, typer.Option("--jobs", min=1, help="number of processes; all cores by default")] = None,
     cluster: Annotated[
-        str | None, typer.Option("--cluster", help="address of a Dask scheduler (tcp://...) to compute on")
+        str | None, typer.Option("--cluster", help="address of a Dask scheduler (tcp://HOST:PORT) to compute on")
     ] = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Carries out a scripted study, or goes on with one that was interrupted."""
-    from excite import workflows
-
+    """Carry out a study of many runs, or resume it."""
     wanted = workflows.read_study(file)
     out = out or Path(f"results/study-{wanted.study.name}")
     if jobs is not None and cluster is not None:
-        raise UsageError("--jobs: the cluster's workers are as many as they are, leave --jobs or --cluster out")
+        raise UsageError("--jobs: a cluster has its own number of workers, leave --jobs or --cluster out")
     try:
         with terminal.study_bar() as tell:
             summary = workflows.run_study(wanted, out, jobs, cluster, tell)
     except (KeyboardInterrupt, typer.Abort):
-        terminal.fail("interrupted; what is done is kept, the same command goes on", terminal.INTERRUPTED)
-    terminal.finish(summary, out, json, terminal.study_table)
+        terminal.fail("interrupted; finished runs are kept, the same command resumes", terminal.INTERRUPTED)
+    terminal.finish(summary, out, json, partial(terminal.show, "study"))

@@ -1,4 +1,4 @@
-"""Arguments and options that commands share, and the shell's completion of what may be given by name."""
+"""Arguments and options that commands share, with shell completion of names."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from excite import workflows
 
 
 def machine_names(incomplete: str) -> list[str]:
-    """For the shell's completion: shipped names, looked up without loading anything."""
+    """Complete the name of a shipped machine, without loading any."""
     from importlib.resources import files
 
     found = (
@@ -23,12 +23,12 @@ def machine_names(incomplete: str) -> list[str]:
 
 
 def names(option: str) -> Callable[[str], list[str]]:
-    """For the shell's completion: what may be given for an option by name."""
+    """Return the completion of an option that takes a name."""
     return lambda incomplete: [n for n in workflows.choices(option) if n.startswith(incomplete)]
 
 
-class Choosing(typer.core.TyperCommand):
-    """A command whose help lists what may be given by name; it takes the tables' time to load."""
+class CommandWithChoices(typer.core.TyperCommand):
+    """A command whose help lists the names that its options take."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         for p in self.params:
@@ -39,32 +39,47 @@ class Choosing(typer.core.TyperCommand):
 
 MachineArgument = Annotated[
     str,
-    typer.Argument(metavar="MACHINE", help="a shipped name or a machine file (.toml)", autocompletion=machine_names),
+    typer.Argument(
+        metavar="MACHINE",
+        help="a shipped machine (`excite machines` lists them) or a machine file (.toml)",
+        autocompletion=machine_names,
+    ),
 ]
-DesignArgument = Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="what `excite design` wrote")]
+DesignArgument = Annotated[Path, typer.Argument(metavar="DESIGN_DIR", help="folder that `excite design` wrote")]
 LogsArgument = Annotated[
     list[Path], typer.Argument(metavar="LOG...", help="one log or several (.csv, .txt, .parquet, .mat, .mf4)")
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="folder to write [results/<command>-<machine>]")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the summary as JSON and nothing else")]
-SeedOption = Annotated[int, typer.Option("--seed", min=0, help="same seed, same result")]
-KitOption = Annotated[str, typer.Option("--kit", help="sensors", autocompletion=names("kit"))]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="seed of random numbers: same seed, same result")]
+KitOption = Annotated[str, typer.Option("--kit", help="set of sensors", autocompletion=names("kit"))]
 MethodOption = Annotated[
     str | None,
-    typer.Option("--method", help="estimator, the recommended one by default", autocompletion=names("method")),
+    typer.Option(
+        "--method", help="method of identification, the recommended one by default", autocompletion=names("method")
+    ),
 ]
-ProblemOption = Annotated[str | None, typer.Option("--problem", help="design problem; the machine's own by default")]
-DurationOption = Annotated[float | None, typer.Option("--duration", help="length of the drive [s]")]
+ProblemOption = Annotated[
+    str | None, typer.Option("--problem", help="design problem of the machine file; the machine's own by default")
+]
+DurationOption = Annotated[
+    float | None, typer.Option("--duration", help="length of the drive, in seconds; the problem's own by default")
+]
 ObjectiveOption = Annotated[
-    str, typer.Option("--objective", help="what the drive is best for", autocompletion=names("objective"))
+    str, typer.Option("--objective", help="property of the drive to minimise", autocompletion=names("objective"))
 ]
-StartsOption = Annotated[int, typer.Option("--starts", min=1, help="number of starting guesses")]
+StartsOption = Annotated[int, typer.Option("--starts", min=1, help="number of starting guesses of the search")]
 SigmaMaxOption = Annotated[
-    float | None, typer.Option("--sigma-max", help="what the worst parameter's standard deviation may be [%]")
+    float | None,
+    typer.Option(
+        "--sigma-max", help="largest standard deviation that any parameter may have, in per cent of its nominal value"
+    ),
 ]
-RobustOption = Annotated[bool, typer.Option("--robust", help="for machines up to 20 % off, not the nominal one alone")]
+RobustOption = Annotated[
+    bool, typer.Option("--robust", help="design for machines up to 20 % off the machine file as well")
+]
 AfterOption = Annotated[
-    list[Path] | None, typer.Option("--after", help="log of an earlier drive: design for what it leaves (repeatable)")
+    list[Path] | None, typer.Option("--after", help="log of an earlier drive, whose information counts (repeatable)")
 ]
 BudgetOption = Annotated[float | None, typer.Option("--budget", help="stop improving after this many seconds")]
-RunsOption = Annotated[int, typer.Option("--runs", min=1, help="simulated test days")]
+RunsOption = Annotated[int, typer.Option("--runs", min=1, help="number of simulated test days")]

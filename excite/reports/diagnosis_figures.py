@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from excite import diagnosis
 from excite.diagnosis import Course, Diagnosis
-from excite.reports.figures import COLOURS, plain, save
+from excite.reports.figures import COLOURS, escape_dollar, save
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 SHOWN, WIDE = 3, 4  # torques and forces in a figure, panels side by side
@@ -28,7 +28,7 @@ CLEAR = 4.0  # strength from which a quantity is pointed out
 HIGHEST = 30.0  # mean square of innovations at which the colours end
 
 
-def drawings(place: Path, d: Diagnosis, title: str) -> list[Callable[[], None]]:
+def figure_calls(place: Path, d: Diagnosis, title: str) -> list[Callable[[], None]]:
     """Calls that draw misfit.png and when.png of each log into the folder of a diagnosis: they need neither one another
     nor what was gained."""
     return [partial(_drawn, place, d, title, kind) for kind in ("misfit", "when")]
@@ -57,7 +57,7 @@ def misfit_figure(before: Course, after: Course | None, title: str) -> Figure:
     block = HEAD + -(-panels // WIDE) * PANEL[1]
     width, height = WIDE * PANEL[0], len(rows) * block + 2 * EDGE
     figure = Figure(figsize=(width, height))
-    figure.suptitle(plain(title), fontsize=11, y=1 - EDGE / 2 / height, va="center")
+    figure.suptitle(escape_dollar(title), fontsize=11, y=1 - EDGE / 2 / height, va="center")
     left, below, right, above = INSET
     share = (PANEL[0] - left - right) / width, (PANEL[1] - below - above) / height
     for k, row in enumerate(rows):
@@ -127,7 +127,7 @@ def when_figure(before: Course, after: Course | None, title: str) -> Figure:
         shown.append((after, "with it"))
     m = len(before.sensors)
     figure = Figure(figsize=(12, (0.34 * m + 1.7) * len(shown) + 0.6), layout="constrained")
-    figure.suptitle(plain(title), fontsize=11)
+    figure.suptitle(escape_dollar(title), fontsize=11)
     axes = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(2.2, 1), sharex="col")
     norm = LogNorm(1 / 3, HIGHEST)
     picture = None
@@ -180,7 +180,7 @@ def signals_figure(signals: Mapping[str, Mapping[str, Any]], found: bool, title:
     was found, after."""
     names = list(signals)
     figure = Figure(figsize=(11, 0.5 * len(names) + 1.9), layout="constrained")
-    figure.suptitle(plain(title), fontsize=11)
+    figure.suptitle(escape_dollar(title), fontsize=11)
     left, right = figure.subplots(1, 2, sharey=True)
     places = np.arange(len(names))[::-1].astype(float)
     kinds = (("before", BEFORE, 0.2, ""), ("after", AFTER, -0.2, "//")) if found else (("before", BEFORE, 0.0, ""),)

@@ -29,7 +29,7 @@ def save(figure: Figure, path: Path) -> None:
     figure.savefig(path, dpi=160, metadata={"Software": None} if path.suffix == ".png" else None)
 
 
-def plain(text: str) -> str:
+def escape_dollar(text: str) -> str:
     """Text as it is written: a dollar sign in a machine's title or a file's name begins no formula."""
     return text.replace("$", r"\$")
 
@@ -71,7 +71,7 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
     assert isinstance(halves, np.ndarray)
     left, right = halves
     axes = left.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
-    figure.suptitle(plain(title))
+    figure.suptitle(escape_dollar(title))
 
     # torques in per cent of their limit where the joints differ in size, so that one panel shows all
     named = {
@@ -150,7 +150,7 @@ def sigma_figure(sigma: Mapping[str, float], title: str) -> Figure:
     n = len(sigma)
     figure = Figure(figsize=(7.5, 1.2 + 0.27 * n), layout="constrained")
     ax = figure.subplots()
-    figure.suptitle(plain(title), fontsize=11)
+    figure.suptitle(escape_dollar(title), fontsize=11)
     names = list(sigma)[::-1]
     values = np.array([sigma[s] for s in names])
     low, high = 10.0 ** np.floor(np.log10(values.min())), 10.0 ** np.ceil(np.log10(values.max()) + 1e-9)
@@ -185,7 +185,7 @@ def verify_figure(v: Verification, title: str) -> Figure:
     n = len(v.names)
     figure = Figure(figsize=(10, 1.6 + 0.34 * n), layout="constrained")
     errors, cover = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
-    figure.suptitle(plain(title))
+    figure.suptitle(escape_dollar(title))
     places = np.arange(n)[::-1]
     e = v.error_percent
     # An error is within its interval where the truth is: as far below the value as the interval reaches down.
@@ -230,7 +230,7 @@ def comparison_figure(model: Model, c: SignalComparison, title: str) -> Figure:
     """Measured beside predicted, signal by signal, with the residual below each."""
     n = len(c.names)
     figure = Figure(figsize=(10, 0.8 + 3.0 * n), layout="constrained")
-    figure.suptitle(plain(title), fontsize=11)
+    figure.suptitle(escape_dollar(title), fontsize=11)
     axes = figure.subplots(2 * n, 1, sharex=True, squeeze=False, height_ratios=(2, 1) * n)[:, 0]
     places = {name: b.where.replace("_", " ") for name, b in zip(model.inputs, model.machine.actuated, strict=True)}
     for k, (name, unit) in enumerate(zip(c.names, c.units, strict=True)):
@@ -249,7 +249,7 @@ def compare_figure(rows: Sequence[Row], title: str) -> Figure:
     rows = sorted(rows, key=lambda r: r.cond_phi, reverse=True)
     figure = Figure(figsize=(10.5, 1.5 + 0.36 * len(rows)), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
-    figure.suptitle(plain(title), fontsize=11)
+    figure.suptitle(escape_dollar(title), fontsize=11)
     values = ([r.cond_phi for r in rows], [r.worst_std_percent for r in rows])
     places = np.arange(len(rows))
     for ax, x, label in zip(
@@ -277,7 +277,7 @@ def log_figure(signals: Mapping[str, tuple[np.ndarray, np.ndarray, str]], gaps: 
     """What a log holds, channel by channel over time [SI]: name -> (t (N,) [s], values (N,), unit); gaps [s] dashed."""
     count = max(len(signals), 1)
     figure = Figure(figsize=(10, 0.8 + 1.15 * count), layout="constrained")
-    figure.suptitle(plain(title), fontsize=11)
+    figure.suptitle(escape_dollar(title), fontsize=11)
     axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
     for ax, (name, (t, values, unit)) in zip(axes, signals.items(), strict=False):
         ax.plot(t, values, color=COLOURS[0], linewidth=1)

@@ -11,7 +11,7 @@ from matplotlib.patches import Polygon
 
 from excite.model import mechanics
 from excite.model.machine import Body, Machine
-from excite.reports.figures import COLOURS, plain
+from excite.reports.figures import COLOURS, escape_dollar
 
 NARROW = 0.25  # drawn width of a contact that is a point, in its radius
 FRAME, GHOST = "0.55", "0.6"
@@ -24,14 +24,16 @@ def top_view_figure(machine: Machine) -> Figure:
         raise ValueError(f"{machine.name}: does not move on the plane, so there is nothing to see from above")
     fig = Figure(figsize=(9, 6), layout="constrained")
     ax = fig.subplots()
-    fig.suptitle(plain(machine.title), fontsize=11)
-    outline(ax, machine)
+    fig.suptitle(escape_dollar(machine.title), fontsize=11)
+    draw_machine(ax, machine)
     return fig
 
 
-def outline(ax: Axes, machine: Machine) -> None:
+def draw_machine(ax: Axes, machine: Machine) -> None:
     """Draws it: forward is to the right, left is up [m]. Dots are centres of mass, green outlines measuring wheels."""
-    at_stop = {b.coordinates[0]: float(b.limit.position) for b in steered(machine) if b.limit.position is not None}
+    at_stop = {
+        b.coordinates[0]: float(b.limit.position) for b in steered_joints(machine) if b.limit.position is not None
+    }
     if at_stop:
         _contacts(ax, machine, at_stop, ghost=True)
     poses = mechanics.body_poses(machine, {})
@@ -57,7 +59,7 @@ def outline(ax: Axes, machine: Machine) -> None:
     ax.grid(alpha=0.3)
 
 
-def steered(machine: Machine) -> list[Body]:
+def steered_joints(machine: Machine) -> list[Body]:
     """Driven joints that turn about the vertical."""
     poses = mechanics.body_poses(machine, {})
     driven = [b for b in machine.actuated if b.contact is None and b.joint == "revolute"]

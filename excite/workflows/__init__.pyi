@@ -4,18 +4,9 @@ from .design_request import (
     require_noise_figures as require_noise_figures,
 )
 from .design_workflow import compare as compare, design as design
-from .diagnose_workflow import (
-    diagnose as diagnose,
-    diagnose_from as diagnose_from,
-    separating_drive as separating_drive,
-)
+from .diagnose_workflow import diagnose as diagnose, diagnose_from as diagnose_from
 from .identify_workflow import identify as identify, identify_from as identify_from
-from .machine_check import (
-    MACHINE_COLUMNS as MACHINE_COLUMNS,
-    check_machine as check_machine,
-    machine_answer as machine_answer,
-    machine_rows as machine_rows,
-)
+from .machine_check import check_machine as check_machine
 from .requests import (
     build_model as build_model,
     choices as choices,

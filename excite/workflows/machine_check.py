@@ -15,14 +15,12 @@ import casadi as ca
 import numpy as np
 from pydantic import ValidationError
 
-from excite import identification, output, reports, smoothing, trajectories
+from excite import identification, reports, smoothing, trajectories
 from excite.errors import MachineError, SimulationError
 from excite.model import Model, build, effects, mechanics, parameter_descriptions, standard_parameters
 from excite.model.effects import GRAVITY
 from excite.model.machine import Machine, Problem, Quantity, error_lines as files_complaints, load_machine
-from excite.reports import Picture, Table
 from excite.simulation import simulate
-from excite.text import format_number
 from excite.workflows.requests import LONGEST_DRIVE_S
 
 PICTURE = "machine.png"
@@ -272,7 +270,7 @@ def _slips(model: Model) -> Iterator[str]:
 
 def _times(model: Model) -> Iterator[str]:
     """Rates and durations as no machine has them, and a filter whose decimation takes more than its cut-off."""
-    for b in reports.steered(model.machine):
+    for b in reports.steered_joints(model.machine):
         if b.limit.rate is not None and float(b.limit.rate) > STEERING:
             yield (
                 f"{b.name}: limit.rate: {float(b.limit.rate):g} rad/s, steered joints turn by less than"
@@ -423,8 +421,7 @@ def check_machine(place: Path, path: Path, versions: dict[str, str]) -> dict[str
     }
     if model is not None and model.machine.planar:
         reports.save(reports.top_view_figure(model.machine), place / PICTURE)
-    (place / "report.html").write_text(_page(summary, place), encoding="utf-8")
-    output.write_summary(place, summary)
+    reports.write_report(place, "machine", summary)
     return summary
 
 
@@ -440,59 +437,3 @@ def _parameters(model: Model, sigma: dict[str, float]) -> dict[str, dict[str, An
         }
         for name, unit, value in zip(model.base.names, model.base.units, model.nominal, strict=True)
     }
-
-
-def machine_answer(summary: dict[str, Any]) -> str:
-    """A check in a sentence."""
-    name, faults, doubts = summary["machine"] or summary["file"], summary["faults"], summary["doubts"]
-    if faults:
-        return f"{_count(len(faults), 'thing')} wrong with {name}."
-    said = f"{name} can be used: {len(summary['parameters'])} parameters can be told"
-    return f"{said}, {_count(len(doubts), 'thing')} doubtful." if doubts else f"{said}, nothing is doubtful."
-
-
-def _count(n: int, what: str) -> str:
-    return f"1 {what} is" if n == 1 else f"{n} {what}s are"
-
-
-def grouping(parts: dict[str, float]) -> str:
-    """What a base parameter stands for, as a sum: "MX0 + 1.45 M3"."""
-    said = ""
-    for name, c in parts.items():
-        said += ("-" if not said else " - ") if c < 0 else " + " if said else ""
-        said += name if abs(abs(c) - 1) < 1e-9 else f"{abs(c):.4g} {name}"
-    return said
-
-
-def machine_rows(summary: dict[str, Any]) -> list[tuple[str, ...]]:
-    """The table of parameters: name, what it is, what it stands for, value, unit, what random drives leave [%]."""
-    return [
-        (
-            *(n, r["what"], grouping(r["stands_for"]), format_number(r["value"]), r["unit"]),
-            format_number(r["random_drive_percent"], 2),
-        )
-        for n, r in summary["parameters"].items()
-    ]
-
-
-MACHINE_COLUMNS = ("parameter", "what it is", "stands for", "value", "unit", "random drives: std %")
-
-
-def _page(summary: dict[str, Any], place: Path) -> str:
-    caption = (
-        "The machine from above: dots its centres of mass, green its measuring wheels, dashed with every steered joint"
-        " at its stop."
-    )
-    pictures = [Picture(place / PICTURE, caption)] if (place / PICTURE).is_file() else []
-    remarks = [
-        *(f"Wrong: {x}" for x in summary["faults"]),
-        *(f"Doubtful: {x}" for x in summary["doubts"]),
-        *(x[:1].upper() + x[1:] for x in summary["remarks"]),
-    ]
-    tables = (
-        [Table("What a drive can tell of it.", MACHINE_COLUMNS, tuple(machine_rows(summary)))]
-        if summary["parameters"]
-        else []
-    )
-    title = f"The machine file {summary['file']}"
-    return reports.report_page(title, machine_answer(summary), pictures, tables, reports.how(summary), remarks)

@@ -73,8 +73,8 @@ def run_study(
         if err.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG):
             raise
         raise RowStoreError(
-            f"{err.filename or out}: can't be written: {err.strerror}; the rows so far are safe, correct this and repeat the"
-            " command"
+            f"{err.filename or out}: can't be written: {err.strerror}; the rows so far are safe, correct this and"
+            " repeat the command"
         ) from None
     shutil.rmtree(folder, ignore_errors=True)
     return summary
@@ -224,7 +224,9 @@ def _compute_runs(
     progress(total, total, "running")
 
 
-def _batch_rows(batch: RunBatch, value: tuple[str, list[tuple[int, study_runs.Row]]] | None, workers: Pool) -> list[Any]:
+def _batch_rows(
+    batch: RunBatch, value: tuple[str, list[tuple[int, study_runs.Row]]] | None, workers: Pool
+) -> list[Any]:
     if value is None:
         return [(n, {"status": DEFECT, "reason": "killed the worker that computed it"}) for n, _ in batch.runs]
     program, rows = value
@@ -237,7 +239,9 @@ def _split_batch(batch: RunBatch) -> list[RunBatch]:
     return [replace(batch, runs=(one,)) for one in batch.runs]
 
 
-def _batches(plan: StudyPlan, folder: Path, store: RowStore, there: set[int], batch_size: _BatchSize) -> Iterator[RunBatch]:
+def _batches(
+    plan: StudyPlan, folder: Path, store: RowStore, there: set[int], batch_size: _BatchSize
+) -> Iterator[RunBatch]:
     """Yield the missing runs in batches of one cell each."""
     failed, runs = store.failures(), plan.study.runs
     stored = lru_cache(maxsize=4)(lambda k: _stored_drive(plan, folder, k))
@@ -282,7 +286,7 @@ def _write_folder(plan: StudyPlan, drives: Path, store: RowStore, partial: Path,
             own[name] = f"machines/{sha}/{next(iter(texts))}"
     stored = lru_cache(maxsize=8)(lambda k: _stored_drive(plan, drives, k))
     failed = store.failures()
-    seen = study_results.write_table(
+    results = study_results.write_table(
         plan, store.rows(), lambda k: None if k in failed else stored(k), own, requests.package_versions(), partial
     )
     (partial / "study.json").write_text(plan.study.model_dump_json(indent=1) + "\n", encoding="utf-8")
@@ -291,13 +295,12 @@ def _write_folder(plan: StudyPlan, drives: Path, store: RowStore, partial: Path,
         "title": plan.study.title,
         "steps": list(plan.study.steps),
         "runs": plan.total,
-        **study_results.summarise_cells(seen),
+        **study_results.summarise_cells(results),
         "failed_drives": {_drive_name(k): reason for k, reason in failed.items()},
         "compute_s": store.seconds,
         "fingerprint": fingerprint,
         "program": study_runs.program_hash(),
         "versions": requests.package_versions(),
     }
-    study_results.draw(plan, seen, summary, partial)
-    output.write_summary(partial, summary)
+    study_results.write_report(plan, results, summary, partial)
     return summary

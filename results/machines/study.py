@@ -31,12 +31,11 @@ from excite import output, smoothing
 from excite.identification import methods, summarise_runs, verify
 from excite.model import Model, prediction
 from excite.model.machine import Problem, machine
-from excite.reports import COLOURS, save
-from excite.reports.top_view import outline
+from excite.reports import COLOURS, format_sum, save
+from excite.reports.top_view import draw_machine
 from excite.simulation import Motion, simulate
 from excite.text import format_number
 from excite.trajectories import Manoeuvre, baselines, excitation, multistart, objective
-from excite.workflows.machine_check import grouping
 
 HERE = Path(__file__).parent
 SECONDS, BUDGET = 20.0, 240.0  # of every drive, and for its design [s]; quiet cores need less than 60
@@ -178,7 +177,7 @@ def figure(model: Model, drive: dict[str, Any], runs: dict[str, Any], others: li
     fig = Figure(figsize=(11.5, max(4.5, 1.2 + 0.21 * n)), layout="constrained")
     above, errors, among = fig.subplots(1, 3, width_ratios=(1.0, 1.2, 1.0))
     fig.suptitle(model.machine.title, fontsize=11)
-    outline(above, model.machine)
+    draw_machine(above, model.machine)
     _errors(errors, runs)
     for good, face, label in ((True, COLOURS[0], "random multisine"), (False, "none", "the same, breaks a limit")):
         some = [r for r in others if r["kept"] == good]
@@ -286,7 +285,7 @@ def page(
     lines += ["|---|---|---|---|---|---|"]
     for n, row in rows.items():
         value = f"{format_number(row['true'])} {row['unit']}"
-        parts = grouping(base.grouping(n))
+        parts = format_sum(base.grouping(n))
         lines.append(
             f"| {n} | {parts} | {value} | {sizes[n]:.2g} | {row['rms_percent']:.2g} | {100 * row['coverage95']:.0f} % |"
         )

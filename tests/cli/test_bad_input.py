@@ -552,10 +552,11 @@ def test_command_lines(
 
     Searches and studies are cut out: what is tested is what leads to them.
     """
+    from excite import diagnosis
     from excite.identification import monte_carlo
     from excite.operator import driving_aids
     from excite.trajectories import baselines
-    from excite.workflows import design_request, diagnose_workflow, study_runner
+    from excite.workflows import design_request, study_runner
 
     def cut(*_: Any, **__: Any) -> Any:
         raise InfeasibleError("cut out", "none", 1.0)
@@ -563,7 +564,7 @@ def test_command_lines(
     monkeypatch.setattr(design_request, "design_from", cut)
     monkeypatch.setattr(baselines, "compare", cut)
     monkeypatch.setattr(study_runner, "run_study", cut)
-    monkeypatch.setattr(diagnose_workflow, "diagnose", cut)
+    monkeypatch.setattr(diagnosis, "diagnose", cut)
     monkeypatch.setattr(monte_carlo, "verify", cut)
     monkeypatch.setattr(driving_aids, "serve", cut)
     monkeypatch.setattr(driving_aids, "prepare", cut)

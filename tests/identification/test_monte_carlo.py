@@ -9,7 +9,7 @@ import pytest
 
 from excite.identification import Verification, summarise_runs, verify
 from excite.model import Model
-from excite.reports import figures, pages
+from excite.reports import describe, figures
 from excite.simulation import Motion
 
 
@@ -103,7 +103,7 @@ def test_what_no_run_finds_is_left_out_of_the_answer(straight: Model, straight_m
     lost[:, 0] = np.nan
     for v, words in ((one, "worst"), (replace(one, value=lost), "worst"), (replace(one, value=lost * np.nan), "none")):
         made = {"machine": "x", "runs": 1, "failed": 0, "biased": [], "meanings": {}, "parameters": summarise_runs(v)}
-        answer = pages.KINDS["verify"](made)[1]
+        answer = describe("verify", made).headline
         assert words in answer
         assert "nan" not in answer
         assert " - %" not in answer

@@ -14,6 +14,7 @@ from support.commands import Excite
 from support.drives import drive
 from support.logs import make_log
 
+from excite import diagnosis, workflows
 from excite.errors import NoEstimateError
 from excite.identification import methods
 from excite.logs import Log, log, plausibility
@@ -22,7 +23,6 @@ from excite.model.effects import placing
 from excite.model.machine import machine
 from excite.simulation import Motion, follow, sensors, simulate
 from excite.smoothing import NotConvergedError
-from excite.workflows import diagnose_workflow
 
 T = np.arange(4001) / 100
 RISE = np.clip(np.minimum(T, T[-1] - T) / 2, 0, 1)
@@ -214,11 +214,9 @@ def test_diagnose_says_what_is_doubtful(
     def fails(*args: object) -> None:
         raise NotConvergedError("no motion", None, 3.0)
 
-    monkeypatch.setattr(diagnose_workflow, "diagnose", fails)
+    monkeypatch.setattr(diagnosis, "diagnose", fails)
     with pytest.raises(NotConvergedError, match=r"^no motion; .*log.csv: column u1_Nm: .* is it in kN m"):
-        diagnose_workflow.diagnose(
-            tmp_path, "va12_straight", straight, [tmp_path / "log.csv"], "machine", lambda *a: None
-        )
+        workflows.diagnose(tmp_path, "va12_straight", [tmp_path / "log.csv"])
 
 
 @pytest.mark.parametrize("name", ["thetal", "thetar"])

@@ -449,7 +449,7 @@ def test_an_address_that_is_not_this_machines_is_refused(html: str, excite: Exci
     for host in ("", "roller"):
         code, _, said = excite("drive", "nowhere", "--serve", "--host", host)
         assert code == 2
-        assert f"--host {host}: is no address, give a number" in said
+        assert f"--host {host}: is no address, give one such as" in said
     code, _, said = excite("drive", "nowhere", "--host", "0.0.0.0")
     assert code == 2
     assert "for --serve, give that too" in said
@@ -631,4 +631,4 @@ def test_words_stand_left_and_numbers_right() -> None:
     table = html_page.Table(
         "t", ("what", "unit", "value", "95 %", "kept"), (("M", "kg", "-3.1", "-", "3/20"), ("x", "m", "-", "-", "-"))
     )
-    assert table.texts == (0, 1, 3)
+    assert table.text_columns == (0, 1, 3)

@@ -14,7 +14,7 @@ from support.commands import Excite
 
 from excite.logs import profile as profiles
 from excite.model import Model
-from excite.reports import Picture, Table, figures, html, pages
+from excite.reports import Picture, Table, describe, figures, html, pages
 from excite.simulation import Motion
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -77,33 +77,37 @@ def test_verify_answers_with_error_against_the_truth() -> None:
         "failed": 0,
         "versions": VERSIONS,
     }
-    _, answer, remarks, (table,) = pages.KINDS["verify"](summary)
+    described = describe("verify", summary)
+    answer, (table,) = described.headline, described.tables
     assert "7 simulated" in answer
     assert "within 2 % of the truth" in answer
     assert "worst a, 5 %" in answer
     assert "held it in 90 % of cases" in answer
-    assert remarks == ["Biased, the intervals do not hold: a."]
+    assert described.remarks == ("Biased, the intervals do not hold: a.",)
     assert table.marked == (0,)
 
 
 def test_design_answers_with_what_can_be_known() -> None:
     summary = json.loads((RESULTS / "R60_accuracy" / "design" / "summary.json").read_text())
-    _, answer, _, tables = pages.KINDS["design"](summary)
+    described = describe("design", summary)
+    answer, tables = described.headline, described.tables
     assert "every parameter to 0.87 %" in answer
     assert "every limit is kept" in answer
     assert tables[0].rows[0][0] == "u20"
-    _, answer, _, tables = pages.KINDS["design"](summary | {"max_violation": 0.02, "violations": {"power": 0.02}})
+    described = describe("design", summary | {"max_violation": 0.02, "violations": {"power": 0.02}})
+    answer, tables = described.headline, described.tables
     assert "limits are exceeded by 2.00 %" in answer
     assert tables[1].rows == (("power", "2.000"),)
 
 
 def test_compare_says_which_way() -> None:
     summary = json.loads((RESULTS / "compare_R60" / "summary.json").read_text())
-    _, answer, _, (table,) = pages.KINDS["compare"](summary | {"ratio_equal_time": 6.8})
-    assert "6.8 times lower" in answer
+    described = describe("compare", summary | {"ratio_equal_time": 6.8})
+    (table,) = described.tables
+    assert "6.8 times lower" in described.headline
     assert table.rows[table.marked[0]][0] == "designed"
-    assert "3 times higher" in pages.KINDS["compare"](summary | {"ratio_equal_time": 1 / 3})[1]
-    assert "No usual drive" in pages.KINDS["compare"](summary | {"ratio_equal_time": None})[1]
+    assert "3 times higher" in describe("compare", summary | {"ratio_equal_time": 1 / 3}).headline
+    assert "No usual drive" in describe("compare", summary | {"ratio_equal_time": None}).headline
 
 
 def test_identify_reports_what_was_found(
@@ -133,7 +137,7 @@ def test_what_a_method_errs_by_comes_first(excite: Excite, tmp_path: Path) -> No
     excite("simulate", "va12_straight", profile, "--seed", 3, "--out", tmp_path / "log.csv")
     for method, words in (
         ("ols", "of them wrong by more than it says: on simulated logs"),
-        ("joint", "are found to"),
+        ("joint", "are identified to"),
     ):
         out = tmp_path / method
         code, _, _ = excite("identify", "va12_straight", tmp_path / "log.csv", "--method", method, "--out", out)
@@ -183,7 +187,7 @@ def test_report_in_a_browser_fits_screen_and_paper(browser: Any, tmp_path: Path)
     source = RESULTS / "R60_accuracy" / "verify"
     summary = json.loads((source / "summary.json").read_text())
     (tmp_path / "verify.png").write_bytes((source / "verify.png").read_bytes())
-    pages.write(tmp_path, "verify", summary)
+    pages.write_page(tmp_path, "verify", summary)
     for size in ((1000, 800), (390, 844)):
         tab = browser.new_page(viewport={"width": size[0], "height": size[1]})
         said: list[str] = []

@@ -238,7 +238,7 @@ def test_the_drawing_has_every_wheel_where_it_stands() -> None:
 
 def test_only_vertical_driven_joints_are_steered() -> None:
     def names(machine: Machine) -> list[str]:
-        return [b.where for b in top_view.steered(machine)]
+        return [b.where for b in top_view.steered_joints(machine)]
 
     assert names(load_machine("tandem")) == ["front_steering", "rear_steering"]
     assert names(load_machine("pendulum_loader")) == ["articulation"]
@@ -268,7 +268,7 @@ def test_a_faulty_file_ends_with_1_and_a_missing_one_with_2(tmp_path: Path, exci
     path = spoilt(tmp_path, ("body.1.limit.torque.value", 90))
     code, stdout, _ = excite("machine", "check", path, "--out", tmp_path / "out")
     assert code == 1
-    assert "wrong: front_axle: limit.torque: 90 is not above" in " ".join(stdout.split())
+    assert "Wrong: front_axle: limit.torque: 90 is not above" in " ".join(stdout.split())
     code, _, stderr = excite("machine", "check", tmp_path / "nowhere.toml", "--out", tmp_path / "no")
     assert code == 2
     assert "no such file" in stderr

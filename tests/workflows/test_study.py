@@ -29,9 +29,11 @@ from excite.logs import profile
 from excite.model import Model, build
 from excite.model.effects import placing
 from excite.model.machine import Problem, machine as machines
+from excite.reports import describe
+from excite.reports.pages import write_page
 from excite.simulation import Motion, simulate
 from excite.trajectories import saved_design
-from excite.workflows import executors, row_store, study_plan, study_results, study_runner, study_runs
+from excite.workflows import executors, row_store, study_plan, study_runner, study_runs
 from excite.workflows.study_plan import StudyPlan
 
 ROOT = Path(__file__).parents[2]
@@ -281,17 +283,17 @@ RANKED = (
 
 
 def test_the_page_says_which_cell_is_best_and_what_made_it(tmp_path: Path) -> None:
-    picture = tmp_path / "study.png"
-    picture.touch()
     row = {"done": 5, "failed": 0, "defect": 0, "median_rms_percent": 0.5, "coverage95": 0.95}
     cells = [row | {"cell": c, "worst_parameter": n, "worst_rms_percent": x} for c, n, x in RANKED]
     said = {"done": 20, "failed": 0, "runs": 20, "defects": 0, "steps": ["verify"], "compute_s": 1.0}
     said |= {"cells": cells, "program": "0123456789abcdef", "versions": {"excite": "0"}}
-    text = study_results.page("Study", said, picture)
+    (tmp_path / "study.png").touch()
+    write_page(tmp_path, "study", said)
+    text = (tmp_path / "report.html").read_text()
     assert "cond, 20 s (Ky1 0.81 % rms) is the best of 3 cells, cond, 40 s (u20 170 % rms) the worst." in text
     assert "0123456789abcdef" in text
-    assert "repeats the run, from within this folder" in text
-    assert "the best" not in study_results.page("Study", said | {"cells": cells[:1]}, picture)
+    assert "the command in its column <code>command</code>, given in this folder, repeats it" in text
+    assert "the best" not in describe("study", said | {"cells": cells[:1]}).headline
 
 
 def test_each_row_tells_how_to_repeat_it(
@@ -473,7 +475,7 @@ def test_two_can_not_work_on_one_study(tmp_path: Path) -> None:
 def test_rows_are_kept_once_and_whole(tmp_path: Path) -> None:
     with row_store.open_store(tmp_path / "s", "f") as kept:
         kept.add_rows([(3, {"a": 1.5}), (1, {"a": None})])
-        with pytest.raises(ValueError, match="there already"):
+        with pytest.raises(ValueError, match="stored already"):
             kept.add_rows([(2, {}), (3, {})])
         with pytest.raises(ValueError, match="not JSON compliant"):
             kept.add_rows([(4, {}), (5, {"a": float("nan")})])

@@ -1,0 +1,547 @@
+"""Results in words and tables: one description of each kind of summary, shown by the terminal and by report.html."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from excite import trajectories
+from excite.identification import SIGNIFICANT_BIAS
+from excite.text import first_lines, format_number, format_p_value, format_percent
+from excite.trajectories import TOLERANCE
+
+Summary = Mapping[str, Any]
+
+WORD = re.compile(r"a|[a-z]{3,},?")  # a word that a sentence may begin with in a capital letter; a name stays as it is
+NUMBER = re.compile(r"[<≤]?\s*[-+−]?\d")
+MAX_CELLS = 200  # cells of a study in a table; chosen
+SHOWN_VIOLATION = 5e-6  # of a limit's range: smaller ones round to 0.000 %
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text cells.
+
+    marked: rows (indices) that are set off. optional: columns (indices) that a narrow terminal leaves out.
+    """
+
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    marked: tuple[int, ...] = ()
+    optional: tuple[int, ...] = ()
+
+    @property
+    def text_columns(self) -> tuple[int, ...]:
+        """Columns of words, aligned left; columns of numbers are aligned right."""
+        return tuple(
+            k for k in range(len(self.columns)) if k == 0 or not any(NUMBER.match(row[k]) for row in self.rows)
+        )
+
+    def __post_init__(self) -> None:
+        for k, row in enumerate(self.rows):
+            if len(row) != len(self.columns):
+                raise ValueError(f"table {self.caption!r}: row {k} has {len(row)} cells, not {len(self.columns)}")
+
+
+@dataclass(frozen=True)
+class Description:
+    """A result for people.
+
+    title: what it is. headline: the answer in a sentence. remarks: what else the reader must know, a sentence each.
+    """
+
+    title: str
+    headline: str
+    tables: tuple[Table, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+
+def describe(kind: str, summary: Summary) -> Description:
+    """Describe a summary. Raises KeyError for an unknown kind."""
+    return DESCRIPTIONS[kind](summary)
+
+
+def as_sentence(text: str) -> str:
+    """Begin a remark with a capital letter, unless it begins with a name, and end it with a full stop."""
+    first = text.partition(" ")[0]
+    text = text[:1].upper() + text[1:] if WORD.fullmatch(first) else text
+    return text if text.endswith((".", "!", "?", ":")) else f"{text}."
+
+
+def _meaning_column(s: Summary) -> tuple[str, ...]:
+    """Heading of the column that explains parameters, if the summary does."""
+    return ("what it is",) if s.get("meanings") else ()
+
+
+def _meaning(s: Summary, name: str) -> tuple[str, ...]:
+    return (s["meanings"].get(name, "-"),) if s.get("meanings") else ()
+
+
+def _meaning_index(s: Summary) -> tuple[int, ...]:
+    return (1,) if s.get("meanings") else ()
+
+
+# ------------------------------------------------------------------------------------------------ design and drive
+
+
+def describe_design(s: Summary) -> Description:
+    """Describe a design: attainable accuracy, limits, condition numbers, advice."""
+    sigma = s["sigma_percent"]
+    worst = max(sigma, key=lambda n: sigma[n])
+    kept = s["max_violation"] <= TOLERANCE
+    limits = (
+        "every limit is kept" if kept else f"limits are exceeded by {100 * s['max_violation']:.2f} % of their range"
+    )
+    driven = "Driven by a steady person" if s.get("driver") else "Driven as designed"
+    headline = (
+        f"{driven}, these {s['duration_s']:g} s identify every parameter to {format_percent(sigma[worst])} or better"
+        f" (one standard deviation, Cramer-Rao bound; worst {worst}, median"
+        f" {format_percent(np.median(list(sigma.values())))}); {limits}."
+    )
+    remarks = [
+        f"Condition number of Phi {s['cond_phi']:.4g}, of W {s['cond_w']:.4g}; best start {s['cond_phi_start']:.4g}."
+    ]
+    if not s["complete"]:
+        remarks.append("Cut short: this is the best drive so far, more time may find a better one.")
+    if s.get("advice"):
+        remarks.append(s["advice"])
+    ordered = sorted(sigma.items(), key=lambda x: -x[1])
+    rows = tuple((name, *_meaning(s, name), format_number(value, 3)) for name, value in ordered)
+    names = ("parameter", *_meaning_column(s), "%")
+    caption = "Attainable standard deviation of each parameter, the worst first."
+    tables = [Table(caption, names, rows, optional=_meaning_index(s))]
+    if s.get("driver"):
+        by_hand_remarks, by_hand_tables = _describe_by_hand(s)
+        remarks = [*by_hand_remarks, *remarks]
+        tables = [*by_hand_tables, *tables]
+    else:
+        remarks.append(
+            "A person at the levers drives something else: `excite drive` makes phases of this drive and says what they"
+            " keep of it, `excite design --driver` designs for people from the start."
+        )
+    if s.get("violations"):
+        over = tuple(
+            (name, f"{100 * value:.3f}") for name, value in s["violations"].items() if value >= SHOWN_VIOLATION
+        )
+        if over:
+            tables.append(Table("Limits that are exceeded, in per cent of their range.", ("limit", "%"), over))
+    return Description(
+        f"Test drive for {s['machine']}, problem {s['problem']}", headline, tuple(tables), tuple(remarks)
+    )
+
+
+WAYS_OF_DRIVING = {
+    "played_back": "torques played back: the design without a driver",
+    "smoothed": "people, on phases that only follow these torques",
+    "by_hand": "people, on this drive",
+}
+
+
+def _describe_by_hand(s: Summary) -> tuple[list[str], list[Table]]:
+    """Describe what people keep of a design that was made for them: remarks and tables."""
+    d = s["driver"]
+    free, hand = d["played_back"], d["by_hand"]
+    over = ", ".join(f"{name} by {format_percent(100 * value)}" for name, value in d["limits_broken"].items())
+    remarks = [
+        f"In people's hands these {len(d['phases'])} phases give {trajectories.titled(s['objective'], hand['score'])},"
+        f" torques played back {free['score']:.4g}; the worst parameter is identified to"
+        f" {format_percent(hand['worst_percent'])} ({hand['worst_parameter']}) instead of"
+        f" {format_percent(free['worst_percent'])}, the median one to {format_percent(hand['median_percent'])} instead"
+        f" of {format_percent(free['median_percent'])}.",
+        f"In the hands of {d['people']} simulated people these limits are exceeded: {over} of their range."
+        if over
+        else f"In the hands of {d['people']} simulated people every limit is kept.",
+        "The accuracy of single parameters is of a steady person; `excite drive` makes the driver's sheet and page of"
+        " this drive.",
+    ]
+    keys = ("score", "cond_phi", "worst_percent", "median_percent")
+    rows = tuple(
+        (words, *(format_number(d[way][k], 4) for k in keys), d[way]["worst_parameter"])
+        for way, words in WAYS_OF_DRIVING.items()
+    )
+    names = ("driven by", "objective", "cond(Phi)", "worst std %", "median std %", "worst parameter")
+    phases = tuple((f"{r['start_s']:g}", f"{r['end_s'] - r['start_s']:g}", r["do"]) for r in d["phases"])
+    return remarks, [
+        Table(f"What people keep, objective {s['objective']} (lower is better).", names, rows, (2,)),
+        Table(f"The drive, phases of {d['phase_min_s']:g} s or more.", ("from s", "for s", "what to do"), phases),
+    ]
+
+
+def describe_drive(s: Summary) -> Description:
+    """Describe a drive for a person: what it keeps of the design, its phases, what to mind."""
+
+    def clock(seconds: float) -> str:
+        return f"{int(seconds // 60)}:{seconds % 60:04.1f}"
+
+    phases = tuple((clock(phase["start_s"]), phase["do"]) for phase in s["phases"])
+    table = Table("The phases, each from its time (min:s).", ("at", "what to do"), phases)
+    return Description(f"Drive for a person on {s['machine']}", s["verdict"], (table,), tuple(s["warnings"]))
+
+
+def describe_compare(s: Summary) -> Description:
+    """Describe a comparison of the designed drive with usual ones."""
+    ratio = s["ratio_equal_time"]
+    kept = [d for d in s["designs"] if d["breaks"] is None]
+    best = min(kept, key=lambda d: d["cond_phi"]) if kept else None
+    if ratio is None or not np.isfinite(ratio):
+        headline = "No usual drive found in the same time keeps every limit; the designed one does."
+    else:
+        word = "lower" if ratio > 1 else "higher"
+        headline = (
+            f"In the same time the designed drive reaches a condition number {max(ratio, 1 / ratio):.2g} times {word}"
+            " than the best usual one."
+        )
+    remarks = (
+        (f"Lowest among those that keep every limit: {best['name']}, cond(Phi) {best['cond_phi']:.4g}.",)
+        if best
+        else ()
+    )
+    rows = tuple(
+        (
+            d["name"],
+            *(format_number(d[k], 4) for k in ("cond_phi", "cond_w", "worst_std_percent", "median_std_percent")),
+            f"{d['kept']}/{d['samples']}",
+            "-" if d["breaks"] is None else f"{d['breaks']} by {format_percent(100 * d['max_violation'])}",
+            f"{d['wall_s']:.1f}",
+            f"not in {d['wall_s']:.0f}" if d["equal_score_s"] is None else f"{d['equal_score_s']:.0f}",
+        )
+        for d in s["designs"]
+    )
+    names = ("drive", "cond(Phi)", "cond(W)", "worst std %", "median std %", "kept", "limit broken", "time s")
+    caption = (
+        "Drives on the same problem, limits and time; the designed one is set off. Kept: drives that keep every limit,"
+        " of those drawn. As good in: time until a drive of this kind had the designed drive's cond(Phi)."
+    )
+    ours = tuple(k for k, d in enumerate(s["designs"]) if d["name"].startswith("designed"))
+    table = Table(caption, (*names, "as good in s"), rows, ours, (2, 7, 8))
+    return Description(f"Drives compared for {s['machine']}, problem {s['problem']}", headline, (table,), remarks)
+
+
+# ------------------------------------------------------------------------------------------------ parameters
+
+
+def describe_verify(s: Summary) -> Description:
+    """Describe a verification: errors against the truth, coverage of the intervals, biased parameters."""
+    title, rows = f"Verification of a drive for {s['machine']}", s["parameters"]
+    errors = {n: float(r["rms_percent"]) for n, r in rows.items() if np.isfinite(r["rms_percent"])}
+    if not errors:
+        return Description(title, f"No parameter was identified in any of {s['runs']} simulated test days.")
+    worst = max(errors, key=lambda n: errors[n])
+    cover = 100 * float(np.mean([rows[n]["coverage95"] for n in errors]))
+    median = float(np.median(list(errors.values())))
+    headline = (
+        f"In {s['runs']} simulated test days the parameters came out within {format_percent(median)} of the truth"
+        f" (median; worst {worst}, {format_percent(errors[worst])}), and the 95 % intervals held it in {cover:.0f} % of"
+        " cases."
+    )
+    remarks = [f"Biased, the intervals do not hold: {', '.join(s['biased'])}."] if s["biased"] else []
+    if s["failed"]:
+        remarks.append(f"{s['failed']} runs gave no estimate.")
+    table = tuple(
+        (
+            n,
+            *_meaning(s, n),
+            r["unit"],
+            format_number(r["true"], 6),
+            format_number(r["mean"], 6),
+            *(format_number(r[k], 3) for k in ("bias_percent", "std_percent", "predicted_std_percent")),
+            format_number(100 * r["coverage95"], 3),
+        )
+        for n, r in rows.items()
+    )
+    names = ("parameter", *_meaning_column(s), "unit", "true", "mean", "bias %", "std %", "predicted std %")
+    marked = tuple(k for k, n in enumerate(rows) if n in s["biased"])
+    caption = "True and estimated parameters; biased ones are set off."
+    if s.get("method"):
+        caption = f"True and estimated parameters, method {s['method']}, kit {s['kit']}; biased ones are set off."
+    tables = (Table(caption, (*names, "coverage %"), table, marked, _meaning_index(s)),)
+    return Description(title, headline, tables, tuple(remarks))
+
+
+ESTIMATE_COLUMNS = (  # of a parameter: heading, key, digits
+    ("value", "value", 6),
+    ("std", "std", 3),
+    ("std %", "std_percent", 3),
+    ("95 % from", "low95", 6),
+    ("to", "high95", 6),
+)
+
+
+def describe_identify(s: Summary) -> Description:
+    """Describe an estimate: accuracy, prediction error, bias of the method, parameters that are not identifiable."""
+    rows = s["parameters"]
+    known = {n: abs(r["std_percent"]) for n, r in rows.items() if r["std_percent"] is not None}
+    known = {n: v for n, v in known.items() if np.isfinite(v)}
+    worst = max(known, key=lambda n: known[n])
+    count = (
+        f"{len(known)} parameters"
+        if not s["unidentifiable"]
+        else f"{len(known)} of {len(known) + len(s['unidentifiable'])} parameters"
+    )
+    logs = "one log" if len(s["logs"]) == 1 else f"{len(s['logs'])} logs"
+    median, error = float(np.median(list(known.values()))), format_percent(float(s["relative_error_percent"]))
+    headline = (
+        f"From {logs}, {count} are identified to {format_percent(median)} (median, one standard deviation; worst"
+        f" {worst}, {format_percent(known[worst])}); the prediction error is {error} of what was measured."
+    )
+    off = {n: abs(r["bias"] / (r["value"] - r["bias"])) for n, r in rows.items() if n in known and _is_biased(r)}
+    if off:
+        most = max(off, key=lambda n: off[n])
+        headline = (
+            f"From {logs}, {s['method']} identifies {count}, {len(off)} of them wrong by more than it says: on"
+            f" simulated logs like this by up to {format_percent(100 * off[most])} ({most}); the prediction error is"
+            f" {error} of what was measured."
+        )
+    remarks = [f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()] + list(s["notes"])
+    for check in s["validation"]:
+        errors = ", ".join(f"{n} {v:.1f} %" for n, v in check["torque_error_percent"].items())
+        remarks.append(f"On {check['log']}, which was not fitted, the torque errors are: {errors}.")
+    biased = any("bias" in r for r in rows.values())
+    table = tuple(
+        (
+            n,
+            *_meaning(s, n),
+            r["unit"],
+            *(format_number(r[k], d) for _, k, d in ESTIMATE_COLUMNS),
+            *((format_number(r.get("bias"), 3),) if biased else ()),
+        )
+        for n, r in rows.items()
+    )
+    names = (
+        "parameter",
+        *_meaning_column(s),
+        "unit",
+        *(heading for heading, *_ in ESTIMATE_COLUMNS),
+        *(("bias of the method",) if biased else ()),
+    )
+    conds = f"cond(W) {s['cond_w']:.4g}, cond(Phi) {s['cond_phi']:.4g}"
+    caption = f"Parameters with one standard deviation and 95 % interval, method {s['method']}; {conds}."
+    tables = (Table(caption, names, table, optional=_meaning_index(s)),)
+    return Description(f"Parameters of {s['machine']}", headline, tables, tuple(remarks))
+
+
+def _is_biased(row: Mapping[str, Any]) -> bool:
+    """Return whether the method's bias of a parameter is significant and larger than its standard deviation."""
+    bias, std = row.get("bias"), row.get("bias_std")
+    return bias is not None and std is not None and abs(bias) > max(row["std"], SIGNIFICANT_BIAS * std)
+
+
+# ------------------------------------------------------------------------------------------------ checks
+
+
+def describe_log(s: Summary) -> Description:
+    """Describe a log: whether it is usable, its columns, its faults."""
+    faults, name = s["faults"], s["log"]
+    span = f"{s['rows']} rows" + (f", {s['duration_s']:.4g} s at {s['rate_hz']:.4g} Hz" if s["rate_hz"] else "")
+    if s["machine"] is None:
+        headline = f"{name} is a table of {span}; no machine was named that it could be checked against."
+    elif faults:
+        headline = f"{_count_things(len(faults))} wrong with {name} as a log of {s['machine']} ({span})."
+    else:
+        headline = f"{name} is a usable log of {s['machine']}: {span}."
+    rows = tuple(
+        (
+            c["name"],
+            c["what"] or "-",
+            c["unit"] or "-",
+            format_number(c["low"], 5),
+            format_number(c["high"], 5),
+            str(c["bad"]),
+        )
+        for c in s["columns"]
+    )
+    names = ("column", "what it is", "unit", "lowest", "highest", "bad cells")
+    tables = (Table("Columns as the file has them.", names, rows),)
+    return Description(f"The log {name}", headline, tables, _check_remarks(s))
+
+
+MACHINE_COLUMNS = ("parameter", "what it is", "stands for", "value", "unit", "random drives: std %")
+
+
+def describe_machine(s: Summary) -> Description:
+    """Describe a check of a machine file: faults, doubts, and the parameters with their attainable accuracy."""
+    name, faults, doubts = s["machine"] or s["file"], s["faults"], s["doubts"]
+    if faults:
+        headline = f"{_count_things(len(faults))} wrong with {name}."
+    else:
+        doubtful = f"{_count_things(len(doubts)).lower()} doubtful" if doubts else "nothing is doubtful"
+        headline = f"{name} can be used: {len(s['parameters'])} parameters are identifiable, {doubtful}."
+    rows = tuple(
+        (
+            *(n, r["what"], format_sum(r["stands_for"]), format_number(r["value"]), r["unit"]),
+            format_number(r["random_drive_percent"], 2),
+        )
+        for n, r in s["parameters"].items()
+    )
+    caption = (
+        "Base parameters, the standard parameters that each stands for, and the standard deviation that the best of"
+        " some random drives leaves."
+    )
+    tables = (Table(caption, MACHINE_COLUMNS, rows, optional=(1, 2)),) if rows else ()
+    return Description(f"The machine file {s['file']}", headline, tables, _check_remarks(s))
+
+
+def format_sum(parts: Mapping[str, float]) -> str:
+    """Write the sum that a base parameter stands for: "MX0 + 1.45 M3"."""
+    text = ""
+    for name, c in parts.items():
+        text += ("-" if not text else " - ") if c < 0 else " + " if text else ""
+        text += name if abs(abs(c) - 1) < 1e-9 else f"{abs(c):.4g} {name}"
+    return text
+
+
+def _count_things(n: int) -> str:
+    return "One thing is" if n == 1 else f"{n} things are"
+
+
+def _check_remarks(s: Summary) -> tuple[str, ...]:
+    """Return the faults, doubts and remarks of a check."""
+    return (*(f"Wrong: {x}" for x in s["faults"]), *(f"Doubtful: {x}" for x in s["doubts"]), *s["remarks"])
+
+
+# ------------------------------------------------------------------------------------------------ diagnosis
+
+
+def describe_diagnose(s: Summary) -> Description:
+    """Describe a diagnosis: the answer, the findings, errors signal by signal, what to drive next."""
+    remarks = []
+    if s["separating_run"]:
+        remarks.append(f"To separate the tied causes, drive: {s['separating_run']}.")
+    if s["separating_drive"]:
+        remarks.append(_describe_separating_drive(s["separating_drive"]))
+    remarks += [f"Still unexplained: {line}." for line in first_lines(s["located"])]
+    if s["machine_file"]:
+        remarks.append(
+            f"{s['machine_file']} in this folder is the machine with the findings in it: `excite design`, `verify`,"
+            " `simulate` and `identify` take it."
+        )
+    remarks += s["notes"]
+    tables = []
+    if s["findings"]:
+        tables.append(_table_of_findings(s["findings"]))
+    rows = tuple(
+        (
+            n,
+            r["unit"],
+            *(format_number(r[k], 3) for k in ("rms_before", "rms_after")),
+            *(format_number(r[f"systematic_{k}_percent"], 2) for k in ("before", "after")),
+        )
+        for n, r in s["signals"].items()
+    )
+    heads = ("signal", "unit", "error before", "error after", "systematic before %", "systematic after %")
+    caption = (
+        "Signal by signal: root mean square error on stretches that were withheld from the fit (it includes the"
+        " sensor's noise), and the share of the one-step-ahead error that noise does not explain."
+    )
+    tables.append(Table(caption, heads, rows))
+    if s["findings"]:
+        moved = tuple(
+            (
+                n,
+                r["unit"],
+                *(format_number(r[k], 6) for k in ("before", "after")),
+                *(format_number(r[k], 2) for k in ("std_before", "std_after", "moved")),
+            )
+            for n, r in s["parameters"].items()
+        )
+        titles = ("parameter", "unit", "before", "after", "std before", "std after", "moved by std")
+        caption = "The parameters before and after: the bias that the findings took away."
+        tables.append(Table(caption, titles, moved, optional=(4, 5)))
+    return Description(f"Diagnosis of {s['machine']}", s["answer"], tuple(tables), tuple(remarks))
+
+
+def _table_of_findings(findings: Sequence[Mapping[str, Any]]) -> Table:
+    rows = tuple(
+        (
+            f"{f['effect']}@{f['where']}",
+            format_number(f["amount"], 5),
+            format_number(f["amount_std"], 2),
+            f["unit"],
+            "; ".join(f"{n} {format_number(x['value'], 4)} {x['unit']}" for n, x in f["shapes"].items()) or "-",
+            format_p_value(f["p_value"]),
+            format_number(f["gain_percent"], 3),
+            "-" if f["gain_ci95"] is None else " to ".join(format_number(x, 3) for x in f["gain_ci95"]),
+            ", ".join(f["tied_with"]) or "-",
+        )
+        for f in findings
+    )
+    names = ("effect", "magnitude", "std", "unit", "shape", "p-value", "gain %", "95 % interval", "tied with")
+    caption = (
+        "Findings, in the order in which they were found. p-value: of no such effect, corrected for all the causes that"
+        " were tried. Gain: by how much the error falls on stretches that were not fitted."
+    )
+    return Table(caption, names, rows, optional=(4,))
+
+
+def _describe_separating_drive(drive: Mapping[str, Any]) -> str:
+    """Describe the drive that was, or could be, designed to separate two tied causes."""
+    first, second = (x.partition("=")[0] for x in drive["between"])
+    if "failed" in drive:
+        return f"No drive was designed to separate {first} from {second}: {drive['failed']}."
+    if drive["folder"] is None:
+        return f"A drive can be designed to separate {first} from {second}: `excite diagnose` with `--next` does."
+    return (
+        f"The folder {drive['folder']}/ holds a drive designed to separate {first} from {second} (`profile.csv`;"
+        f" `excite drive` makes a sheet of it): its log gives the magnitude of each within"
+        f" {format_percent(drive['sigma_percent'])}." + ("" if drive["complete"] else " Its search was stopped early.")
+    )
+
+
+# ------------------------------------------------------------------------------------------------ studies
+
+
+def describe_study(s: Summary) -> Description:
+    """Describe a study: how its runs ended, the best and the worst cell, all cells as a table."""
+    headline = f"{s['done']} of {s['runs']} runs gave a result, {s['failed']} could not give one"
+    headline += f", {s['defects']} showed a defect of the program." if s["defects"] else "."
+    ranked = [r for r in s["cells"] if np.isfinite(r.get("worst_rms_percent") or np.nan)]
+    if len(ranked) > 1:
+        best, worst = (pick(ranked, key=lambda r: r["worst_rms_percent"]) for pick in (min, max))
+        headline += f" By the error of its worst parameter, {_cell_error(best)} is the best of {len(ranked)} cells,"
+        headline += f" {_cell_error(worst)} the worst."
+    remarks = [
+        "runs.parquet has one row per run; the command in its column `command`, given in this folder, repeats it"
+    ]
+    if s["defects"]:
+        remarks.append("The column `reason` of runs.parquet names each defect of the program.")
+    rows = tuple(
+        (
+            row["cell"],
+            str(row["done"]),
+            str(row["failed"] + row["defect"]),
+            row.get("worst_parameter", "-"),
+            format_number(row.get("worst_rms_percent"), 3),
+            format_number(row.get("median_rms_percent"), 3),
+            format_number(100 * row["coverage95"] if row.get("coverage95") is not None else None, 3),
+            ", ".join(f"{k} {v}" for k, v in row.get("verdicts", {}).items()) or "-",
+        )
+        for row in s["cells"][:MAX_CELLS]
+    )
+    columns = ("cell", "done", "failed", "worst parameter", "rms %", "median rms %", "coverage %", "verdicts")
+    caption = "Results of each cell. rms: error of the worst parameter over the runs; coverage: of the 95 % intervals."
+    if len(s["cells"]) > MAX_CELLS:
+        caption += f" {len(s['cells']) - MAX_CELLS} cells more are in summary.json."
+    title = s.get("title") or s.get("study", "")
+    return Description(f"Study {title}", headline, (Table(caption, columns, rows),), tuple(remarks))
+
+
+def _cell_error(row: Mapping[str, Any]) -> str:
+    return f"{row['cell']} ({row['worst_parameter']} {format_percent(row['worst_rms_percent'])} rms)"
+
+
+DESCRIPTIONS: dict[str, Callable[[Summary], Description]] = {
+    "design": describe_design,
+    "drive": describe_drive,
+    "compare": describe_compare,
+    "verify": describe_verify,
+    "identify": describe_identify,
+    "log": describe_log,
+    "machine": describe_machine,
+    "diagnose": describe_diagnose,
+    "study": describe_study,
+}
