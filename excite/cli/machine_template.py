@@ -1,4 +1,4 @@
-"""A machine file to start from: a commented one, or a shipped machine's with columns to change."""
+"""A machine file to start from: a commented template, or a shipped machine with columns to change."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ TEMPLATE = "machine.toml"
 
 
 def start(name: str, file: Path, like: str | None = None) -> None:
-    """Writes a file to start from, or a shipped machine's with its columns to change.
+    """Write the template, or a copy of the shipped machine `like` with its columns to change.
 
-    Raises MachineError where there is one already, or for a name that can't be one.
+    Raises MachineError for an existing file or an impossible name.
     """
     text = fresh(name, file) if like is None else renamed(name, file, machine.load_machine(like))
     if file.exists():
-        raise MachineError(f"{file}: is there already, give another --out")
+        raise MachineError(f"{file}: exists already, give another --out")
     with output.new_file(file) as place:
         place.write_text(text, encoding="utf-8")
 
 
 def fresh(name: str, file: Path) -> str:
-    """A commented machine file to start from. Raises MachineError for a name that can't be one."""
+    """Return the commented template. Raises MachineError for an impossible name."""
     _named(name)
     text = jinja2.Environment(
         loader=jinja2.PackageLoader("excite", "templates"), keep_trailing_newline=True, undefined=jinja2.StrictUndefined
@@ -38,14 +38,14 @@ def fresh(name: str, file: Path) -> str:
 
 
 def renamed(name: str, file: Path, like: Machine) -> str:
-    """A shipped machine's file with its columns to change. Raises MachineError for a name that can't be one."""
+    """Return a file that extends a shipped machine, with columns to change. Raises MachineError."""
     _named(name)
     lines = [
         f"# {name}: the machine {like.name} with a logger of its own. Change columns and units to those of the log,",
-        "# leave out sensors that are not there, then",
+        "# leave out sensors that are not there, then run",
         f"#     excite log check LOG --machine {file}",
-        "# says what is still wrong. Noise and sizes are in SI units, whatever the columns are in; `excite docs` lists",
-        "# the units and every other key. Give here as well what else differs.",
+        "# to find what is still wrong. Noise and sizes are in SI units, whatever the columns are in; `excite docs`",
+        "# lists the units and all other keys. Add what else differs.",
         '# For a speed instead of an angle (unit = "rpm") delete counts_per_turn and give its noise [rad/s], say',
         '#     noise = { value = 0.01, source = "assumed" }',
         "",
@@ -62,7 +62,7 @@ def renamed(name: str, file: Path, like: Machine) -> str:
 
 
 def _toml(value: Any) -> str:
-    """A value on one line of a TOML file."""
+    """Write a value on one line of a TOML file."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{key} = {_toml(inner)}" for key, inner in value.items()) + " }"
     if isinstance(value, list):

@@ -1,5 +1,4 @@
-"""Reference pages made from the code: effects, machine file and units, what there is to choose from, study file,
-commands, Python interface."""
+"""Reference pages made from the code: effects, machine file, units, choices, study file, commands, Python interface."""
 
 from __future__ import annotations
 
@@ -23,11 +22,11 @@ from excite.model import effects
 from excite.model.effects import DEFAULT_DURATION, Effect, Shape, Site, unit_size
 from excite.model.machine import UNITS, FileRecord, Machine, load_machine, shipped_machines
 
-SETS = 8  # shapes that go together, from which not all are told
-PLAIN = (str, int, float, tuple, type(None))  # defaults that read as they are
+MAX_SHAPE_SETS = 8  # sets of shapes that are listed one by one; chosen
+PLAIN_DEFAULTS = (str, int, float, tuple, type(None))  # types of defaults that are shown
 ADDRESS = re.compile(r"<(?:function |bound method |built-in function )?_?(\S+?)(?: object)? at 0x[0-9a-f]+>")
 WORDS: Mapping[type, str] = {str: "text", int: "whole number", float: "number", bool: "true or false"}
-FORMULA = re.compile(r"\S*[_=()]")  # no sentence begins with a capital letter here
+FORMULA = re.compile(r"\S*[_=()]")  # begins with a formula or name, which keeps its small letter
 PLACES = {
     "joints": "each joint with friction",
     "drives": "each driven joint",
@@ -45,7 +44,7 @@ PLACES = {
 def write(place: Path, app: typer.Typer) -> list[str]:
     """Write every page into a folder, and all of them as one `index.html`; return their names. app: the commands."""
     texts = {"commands.md": commands_page(app), **{name: page() for name, page in PAGES.items()}}
-    texts = {name: ADDRESS.sub(r"\1", text) for name, text in texts.items()}  # addresses in memory say nothing
+    texts = {name: ADDRESS.sub(r"\1", text) for name, text in texts.items()}  # without addresses in memory
     for name, text in texts.items():
         (place / name).write_text(text, encoding="utf-8")
     (place / reference_html.NAME).write_text(reference_html.page(texts), encoding="utf-8")
@@ -53,7 +52,7 @@ def write(place: Path, app: typer.Typer) -> list[str]:
 
 
 def _table(heads: str, rows: Iterable[Sequence[object]]) -> list[str]:
-    """A table's lines; heads: with bars in between."""
+    """Return the lines of a Markdown table. heads: separated by bars."""
     lines = [f"| {heads} |", "|" + "---|" * (heads.count("|") + 1)]
     return [*lines, *("| " + " | ".join(_cell(str(cell)) for cell in row) + " |" for row in rows), ""]
 
@@ -66,37 +65,37 @@ def _page(*lines: str) -> str:
 
 
 def effects_page() -> str:
-    """The catalogue of effects: what each does, where it may sit, its amount and shapes, its trace in a log, source."""
+    """Write the page of effects: formula, places, magnitude and shapes, trace in a log, source."""
     catalogue, va12 = effects.CATALOGUE.values(), load_machine("va12")
     lines = [
         "# Effects",
         "",
-        "What a real machine may do beyond the model. `excite simulate MACHINE PROFILE --effect NAME[@WHERE]=AMOUNT`",
-        "puts one into a log, `excite diagnose` looks for all of them, a machine file may hold one for good",
-        "(`[[effect]]`). In the formulas A is the amount, in SI units, w a joint's speed, u its torque.",
+        "What a real machine may do beyond the model. `excite diagnose` tests all of them, a machine file may",
+        "contain them (`[[effect]]`), and `excite simulate MACHINE PROFILE --effect NAME[@WHERE]=MAGNITUDE` puts one into a log.",
+        "In the formulas A is the magnitude in SI units, w a joint's speed, u its torque.",
         "",
-        *_table("where | what it stands for", PLACES.items()),
+        *_table("where | meaning", PLACES.items()),
         *_table(
-            "effect | where | unit | what it does",
+            "effect | where | unit | meaning",
             ((f"[{e.name}](#{e.name})", ", ".join(e.places), e.unit, e.meaning) for e in catalogue),
         ),
     ]
     for e in catalogue:
         sites = effects.allowed_places(va12, e)
         typical = [f"`{e.name}@{where}={_typical(va12, e, bodies):.3g}`" for where, (bodies, _) in sites.items()]
-        lines += [f"## {e.name}", "", f"{_sentence(e.meaning)} {_amount(e)}", ""]
+        lines += [f"## {e.name}", "", f"{_sentence(e.meaning)} {_magnitude(e)}", ""]
         lines += [f"Seen in a log: {e.signature.strip('.')}.", "", f"Source: {e.source.strip('.')}.", ""]
         if typical:
-            lines += [f"On va12, at a typical size: {', '.join(typical)}", ""]
+            lines += [f"Typical magnitudes on va12: {', '.join(typical)}", ""]
         if e.shapes:
             bodies, _ = next(iter(sites.values()), ((1,), None))
             beside = e.extra_trials(Site.of(va12, bodies))
             lines += _table(
-                "shape | unit | default | looked for at | meaning",
+                "shape | unit | default | tried values | meaning",
                 (_shape(n, s) for n, s in e.shapes.items()),
             )
             lines += (
-                [f"Looked for as well, on va12 in a log of {DEFAULT_DURATION:g} s: {_sets(beside)}.", ""]
+                [f"Also tried, on va12 in a log of {DEFAULT_DURATION:g} s: {_shape_sets(beside)}.", ""]
                 if beside
                 else []
             )
@@ -107,10 +106,10 @@ def _typical(machine: Machine, e: Effect, bodies: tuple[int, ...]) -> float:
     return e.typical_magnitude(Site.of(machine, bodies))
 
 
-def _amount(e: Effect) -> str:
+def _magnitude(e: Effect) -> str:
     unit = "without unit" if e.unit == "-" else f"in {e.unit}"
     sign = ", positive" if e.positive else "; the smaller, the larger the effect" if e.inverse else ""
-    return f"Amount {unit}{sign}."
+    return f"Magnitude {unit}{sign}."
 
 
 def _shape(name: str, shape: Shape) -> tuple[str, str, str, str, str]:
@@ -121,17 +120,19 @@ def _shape(name: str, shape: Shape) -> tuple[str, str, str, str, str]:
     return name, shape.unit, f"{shape.default:.3g}{of}", tried, "; ".join(filter(None, (shape.meaning, ends, form)))
 
 
-def _sets(beside: Sequence[Mapping[str, float]]) -> str:
-    """Shapes that go together; of many the first and the last."""
-    told = ["`" + ",".join(f"{name}={x:.3g}" for name, x in shapes.items()) + "`" for shapes in beside]
-    return "; ".join(told) if len(told) <= SETS else f"{told[0]}; {told[1]}; and so on to {told[-1]}"
+def _shape_sets(beside: Sequence[Mapping[str, float]]) -> str:
+    """List sets of shapes; of many the first and the last."""
+    listed = ["`" + ",".join(f"{name}={x:.3g}" for name, x in shapes.items()) + "`" for shapes in beside]
+    return (
+        "; ".join(listed) if len(listed) <= MAX_SHAPE_SETS else f"{listed[0]}; {listed[1]}; and so on to {listed[-1]}"
+    )
 
 
 # ------------------------------------------------------------------------------------------------ files
 
 
 def machine_page() -> str:
-    """The machine file: every record with its keys, and the units that columns may be in."""
+    """Write the page of the machine file: every record with its keys, and the units of columns."""
     return _page(
         "# Machine file",
         "",
@@ -141,26 +142,26 @@ def machine_page() -> str:
         *_keys(Machine),
         "## Units",
         "",
-        "What columns of logs may be in.",
+        "Units of columns in logs.",
         "",
         *_table("unit | quantity | SI value of one", ((u, quantity, f"{x:.9g}") for u, (quantity, x) in UNITS.items())),
     )
 
 
 def study_page() -> str:
-    """The study file: every record with its keys."""
+    """Write the page of the study file: every record with its keys."""
     return _page("# Study file", "", _doc(inspect.getmodule(workflows.Study)), "", *_keys(workflows.Study))
 
 
 def _keys(root: type[FileRecord]) -> Iterator[str]:
-    """Every key of a record and of those inside it, a table for each."""
+    """Yield the lines of a table of keys for a record and each record inside it."""
     for record in _records(root, set()):
         yield from (f"## {record.__name__}", "", _doc(record), "")
-        yield from _table("key | what | default", ((n, _type(f), _default(f)) for n, f in record.model_fields.items()))
+        yield from _table("key | value | default", ((n, _type(f), _default(f)) for n, f in record.model_fields.items()))
 
 
 def _records(record: type[FileRecord], seen: set[type[FileRecord]]) -> Iterator[type[FileRecord]]:
-    """A record and those inside it, each once."""
+    """Yield a record and those inside it, each once."""
     if record in seen:
         return
     seen.add(record)
@@ -177,7 +178,7 @@ def _inside(annotation: Any) -> list[type[FileRecord]]:
 
 
 def _type(field: Any) -> str:
-    """What a key holds, in words."""
+    """Describe the type of a key in words."""
     return _worded(field.annotation) + _checked(field.metadata)
 
 
@@ -199,7 +200,7 @@ def _worded(annotation: Any) -> str:
 
 
 def _checked(metadata: Iterable[Any]) -> str:
-    """What a value must be, by the names of its checks."""
+    """Describe the range of a value by the names of its checks."""
     names = [m.func.__name__.strip("_").replace("_", " ") for m in metadata if isinstance(m, AfterValidator)]
     return "".join(f", {name}" for name in names if name in ("positive", "not negative", "negative"))
 
@@ -219,14 +220,14 @@ def _default(field: Any) -> str:
 
 
 def choices_page() -> str:
-    """What commands and studies may ask for by name: objectives, limits, methods, kits, usual drives."""
+    """Write the page of names that commands and studies take: objectives, limits, methods, kits, usual drives."""
     every, yes = [load_machine(name) for name in shipped_machines()], {True: "yes", False: "no"}
     return _page(
-        "# What there is to choose from",
+        "# Choices",
         "",
         "## Objectives",
         "",
-        "What a drive is best for, by the information that it gives: `--objective`. Lower is better.",
+        "Scores of a drive by the information that it gives: `--objective`. Lower is better.",
         "",
         *_table(
             "objective | what it is | of | equations count by their noise",
@@ -234,21 +235,21 @@ def choices_page() -> str:
         ),
         "## Limits",
         "",
-        "What every drive keeps. The `limits` of a study are factors on what the machine file states.",
+        "Every drive keeps them. The `limits` of a study are factors on the machine file's values.",
         "",
         *_table(
-            "limit | what it bounds | stated in the machine file as",
+            "limit | bounded quantity | key in the machine file",
             (
                 *(
                     (n, _what(k.bounds), ", ".join(f"`{s}`" for s in k.stated) or "-")
-                    for n, k in trajectories.KINDS.items()
+                    for n, k in trajectories.LIMITS.items()
                 ),
-                *((n, _what(whole), "-") for n, whole in trajectories.WHOLE.items()),
+                *((n, _what(whole), "-") for n, whole in trajectories.MOTION_LIMITS.items()),
             ),
         ),
         "## Methods",
         "",
-        "How parameters are found: `--method`; by default `joint` where slips are measured, `ols` where none are.",
+        "Methods of identification: `--method`; by default `joint` if slips are measured, `ols` otherwise.",
         "",
         *_table(
             "method | what it does | effects that it estimates | needs the lateral speed",
@@ -256,7 +257,7 @@ def choices_page() -> str:
         ),
         "## Kits",
         "",
-        "Which sensors there are: `--kit`.",
+        "Sets of sensors: `--kit`.",
         "",
         *_table(
             "machine | kit | columns",
@@ -264,17 +265,17 @@ def choices_page() -> str:
         ),
         "## Usual drives",
         "",
-        "What `excite compare` sets a design against: all of them, or those given by `--against`.",
+        "`excite compare` compares a design with all of them, or those given by `--against`.",
         "",
         *_table(
             "drive | what it is | drawn at random",
-            ((n, _what(u.make), yes[u.random]) for n, u in trajectories.USUAL.items()),
+            ((n, _what(u.make), yes[u.random]) for n, u in trajectories.BASELINES.items()),
         ),
     )
 
 
 def _what(function: Callable[..., object]) -> str:
-    """The first paragraph of what a function says of itself."""
+    """Return the first paragraph of a function's docstring."""
     return _doc(function).partition("\n\n")[0]
 
 
@@ -282,10 +283,10 @@ def _what(function: Callable[..., object]) -> str:
 
 
 def commands_page(app: typer.Typer) -> str:
-    """Every command with its arguments and options, as `--help` says them."""
-    lines = ["# Commands", "", "`excite COMMAND --help` says the same.", ""]
+    """Write the page of commands with their arguments and options."""
+    lines = ["# Commands", "", "`excite COMMAND --help` shows the same.", ""]
     for name, command in _commands(typer.main.get_command(app), "excite"):
-        lines += [f"## {name}", "", command.help or "", "", *_table("option | default | what", _options(command))]
+        lines += [f"## {name}", "", command.help or "", "", *_table("option | default | meaning", _options(command))]
     return _page(*lines)
 
 
@@ -310,7 +311,7 @@ def _commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
 
 
 def python_page() -> str:
-    """Every public function and class, by package, with its docstring."""
+    """Write the page of the Python interface: public functions and classes by package, with their docstrings."""
     lines = ["# Python interface", ""]
     for package in _packages(excite):
         lines += [f"## {package.__name__}", "", _doc(package), ""]
@@ -323,7 +324,7 @@ def python_page() -> str:
 
 
 def _packages(package: ModuleType) -> Iterator[ModuleType]:
-    """A package and those inside it but for the command line's, which has a page of its own."""
+    """Yield a package and those inside it, except the command line, which has a page of its own."""
     yield package
     for found in sorted(pkgutil.iter_modules(package.__path__), key=lambda m: m.name):
         if found.ispkg and found.name != "cli":
@@ -336,7 +337,7 @@ def _signature(name: str, thing: Any) -> str:
         bases = ", ".join(b.__name__ for b in thing.__bases__ if b is not object)
         head = f"class {name}({bases})" if bases else f"class {name}"
         fields = [
-            f"    {key}: {kind}" + (f" = {own[key]!r}" if isinstance(own.get(key, ...), PLAIN) else "")
+            f"    {key}: {kind}" + (f" = {own[key]!r}" if isinstance(own.get(key, ...), PLAIN_DEFAULTS) else "")
             for key, kind in inspect.get_annotations(thing).items()
             if key[0] != "_"
         ]

@@ -1,6 +1,6 @@
-"""The reference pages as one file that opens in a browser, without a network.
+"""The reference pages as one HTML file that needs no network.
 
-Of Markdown it reads what the pages are written in: headings, paragraphs, tables, code, `names` and links.
+It reads the part of Markdown that the pages use: headings, paragraphs, tables, code, `names` and links.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ READ = ("heading", "table", "fence", "code", "backticks", "link")
 
 @dataclass(frozen=True)
 class Part:
-    """A heading of level 1, 2 or 3 and what stands below it, up to the next."""
+    """A heading of level 1, 2 or 3 with the text up to the next heading."""
 
     level: int
     title: str
@@ -32,13 +32,13 @@ class Part:
 
 
 def page(texts: Mapping[str, str]) -> str:
-    """Pages by name (`commands.md`) -> Markdown, as one page with its list of contents."""
+    """Render pages, name (`commands.md`) -> Markdown, as one page with a table of contents."""
     parts = [part for name, text in texts.items() for part in parts_of(name.removesuffix(".md"), text)]
     return templates().get_template("handbook.html").render(title="excite: reference", parts=parts)
 
 
 def parts_of(name: str, text: str) -> Iterator[Part]:
-    """A page's headings with what is below; anchors begin with the page's name, so that pages don't clash."""
+    """Yield the parts of a page; anchors begin with the page's name, so that pages don't clash."""
     tokens = _reader().parse(text)
     starts = [k for k, token in enumerate(tokens) if token.type == "heading_open"]
     for start, end in zip(starts, [*starts[1:], len(tokens)], strict=True):
@@ -52,7 +52,7 @@ def parts_of(name: str, text: str) -> Iterator[Part]:
 
 
 def _lead(name: str, tokens: Sequence[Token]) -> None:
-    """Links within a page lead to where it stands in the whole."""
+    """Redirect links within a page to its anchors in the whole."""
     for token in tokens:
         href = str(token.attrGet("href") or "")
         if href.startswith("#"):

@@ -4,7 +4,12 @@ from .ground import (
     BAND_S as BAND_S,
     BAND_SPEED as BAND_SPEED,
     Trace as Trace,
-    trace_parts as trace_parts,
+    phase_parts as phase_parts,
     trace_table as trace_table,
 )
-from .phased_design import Phased as Phased, as_design as as_design, check as check, phased as phased
+from .phased_design import (
+    PhasedDrive as PhasedDrive,
+    as_design as as_design,
+    check_phase_length as check_phase_length,
+    design_phases as design_phases,
+)

@@ -1,4 +1,4 @@
-"""What goes into the cab: from a designed motion to the driver's sheet, the driver's page and their numbers."""
+"""Turn a design into the driver's sheet, the driver's page and their numbers."""
 
 from __future__ import annotations
 
@@ -17,48 +17,49 @@ from excite.errors import SimulationError, UndrivableError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.operator import ground, page, sheet
-from excite.operator.ground import Score, Trace
-from excite.operator.server import Tail, run
+from excite.operator.ground import DriveQuality, Trace
+from excite.operator.server import GrowingLog, serve_page
 from excite.operator.sheet import Sheet
 from excite.simulation import Motion
-from excite.trajectories import Stored
+from excite.trajectories import SavedDesign
 
-PEOPLE = 3  # drives by different people, in simulation
+PEOPLE = 3  # simulated drivers; chosen
 PAGE = "driver.html"
-PACES = (4.0, 3.0, 2.5)  # s per phase that are tried where nobody says how many phases
-ENOUGH = 1.2
-NEAR = 0.8  # of a steered joint's stop
-SLOWER = (0.95, 0.9, 0.8)  # of a trace's speeds, where people exceed limits on it
+SECONDS_PER_PHASE = (4.0, 3.0, 2.5)  # mean lengths of phases to try if no number of phases is given [s]; chosen
+MAX_LOSS_RATIO = 1.2  # error product over the best one, up to which fewer phases are preferred; chosen
+NEAR_STOP = 0.8  # share of a steered joint's stop from which the sheet warns; chosen
+SLOWER_SHARES = (0.95, 0.9, 0.8)  # of a trace's speeds, to try if people exceed limits; chosen
 Progress = Callable[[int, int, float | None], None]
 
-PLAYED, TRACED, PHASED = "torques played back", "a person on the design's own trace", "a person on these phases"
+PLAYED_BACK, TRACED, PHASED = "torques played back", "a person on the design's own trace", "a person on these phases"
 
 
 def prepare(
-    design: Stored, most: int | None = None, shortest: float = 2.0, seed: int = 0, progress: Progress | None = None
+    design: SavedDesign, most: int | None = None, shortest: float = 2.0, seed: int = 0, progress: Progress | None = None
 ) -> Sheet:
-    """Everything that the sheet and the page show of a design: phases, paths, room, warnings, what a person keeps.
+    """Make the sheet of a design: phases, paths, ground, warnings, and the accuracy that a person keeps.
 
-    Raises DriveError and SimulationError as `drive.phases` and `drive.driven`.
+    most: largest number of phases, None to choose. shortest [s]: shortest phase.
+    Raises UndrivableError for a machine that nobody drives, SimulationError if no person can follow the phases.
     """
     model, motion, problem = design.model, design.motion, design.problem
     if problem is None:
         raise UndrivableError(f"{model.machine.name}: has no problem {design.summary.get('problem')}, design again")
-    made = design.summary.get("driver") if most is None else None  # by `--driver`: of phases already
+    made = design.summary.get("driver") if most is None else None  # of `excite design --driver`: phases already
     if made is not None:
-        choices = [ground.from_table(model, made["phases"])]
+        choices = [ground.trace_from_table(model, made["phases"])]
         free = made["played_back"]
-        played = Score(free["cond_phi"], free["worst_percent"], free["worst_parameter"], free["median_percent"])
+        played = DriveQuality(free["cond_phi"], free["worst_percent"], free["worst_parameter"], free["median_percent"])
     else:
-        counts = [most] if most is not None else [round(motion.t[-1] / pace) for pace in PACES]
-        choices = [ground.phases(model, motion, shortest, max(2, n)) for n in counts]
+        counts = [most] if most is not None else [round(motion.t[-1] / pace) for pace in SECONDS_PER_PHASE]
+        choices = [ground.trace_from_motion(model, motion, shortest, max(2, n)) for n in counts]
         choices = [c for k, c in enumerate(choices) if len(c) not in [len(b) for b in choices[:k]]]
-        played = ground.score(model, motion)
+        played = ground.rate_motion(model, motion)
     done, total = 0, (1 if made is not None else 2) * PEOPLE + len(choices)
 
     def person(way: Trace, who: int) -> Motion:
         nonlocal done
-        driven = ground.driven(model, way, None, seed + who, motion.q[0])
+        driven = ground.follow_trace(model, way, None, seed + who, motion.q[0])
         done += 1
         if progress is not None:
             progress(done, total, None)
@@ -68,22 +69,22 @@ def prepare(
         return tuple(person(way, k) for k in range(PEOPLE))
 
     trace = choices[0]
-    if len(choices) > 1:  # the fewest phases that keep about what the best keep
-        lost = [_loss(ground.score(model, person(c, 0))) for c in choices]
-        trace = next(c for c, x in zip(choices, lost, strict=True) if x <= ENOUGH * min(lost))
+    if len(choices) > 1:  # the fewest phases with about the best accuracy
+        lost = [_error_product(ground.rate_motion(model, person(c, 0))) for c in choices]
+        trace = next(c for c, x in zip(choices, lost, strict=True) if x <= MAX_LOSS_RATIO * min(lost))
 
-    scores: list[tuple[str, Score]] = [(PLAYED, played)]
+    scores: list[tuple[str, DriveQuality]] = [(PLAYED_BACK, played)]
     if made is None:
         try:
-            own = ground.as_designed(model, motion)
-            scores.append((TRACED, ground.middle([ground.score(model, m) for m in people(own)])))
-        except SimulationError:  # a trace that no one can follow need not stop the phases
+            own = ground.trace_as_designed(model, motion)
+            scores.append((TRACED, ground.middle_quality([ground.rate_motion(model, m) for m in people(own)])))
+        except SimulationError:  # nobody can follow the unsmoothed trace; the phases may still work
             done = PEOPLE
-    motions = ground.placed(model, problem, people(trace))
-    scores.append((PHASED, ground.middle([ground.score(model, m) for m in motions])))
-    room = ground.room(model, motions)
+    motions = ground.place_in_lane(model, problem, people(trace))
+    scores.append((PHASED, ground.middle_quality([ground.rate_motion(model, m) for m in motions])))
+    room = ground.touched_ground(model, motions)
     lane = (float(problem.lane_m[0]), float(problem.lane_m[1]))
-    over = _exceeded(model, problem, motions)
+    over = _exceeded_limits(model, problem, motions)
     said = verdict(
         scores[0][1],
         scores[-1][1],
@@ -91,7 +92,7 @@ def prepare(
         by_hand=design.summary.get("driver") is not None,
         fewer=most is not None,
         over=over,
-        slower=_slower(model, problem, trace, motion.q[0], seed) if over else None,
+        slower=_slower_share(model, problem, trace, motion.q[0], seed) if over else None,
     )
     return Sheet(
         design.title,
@@ -106,14 +107,14 @@ def prepare(
     )
 
 
-def _loss(score: Score) -> float:
-    """How poor a score is: worst and median error alike."""
+def _error_product(score: DriveQuality) -> float:
+    """Return the product of worst and median error."""
     return score.worst_percent * score.median_percent
 
 
 def verdict(
-    played: Score,
-    person: Score,
+    played: DriveQuality,
+    person: DriveQuality,
     objective: str = "accuracy",
     *,
     by_hand: bool = False,
@@ -121,21 +122,21 @@ def verdict(
     over: Mapping[str, float] | None = None,
     slower: float | None = None,
 ) -> str:
-    """What a person keeps of a design, in a sentence, and what still helps where that is too little.
+    """Say in a sentence what a person keeps of a design, and what to do if that is too little.
 
-    by_hand: the design was made with `--driver`; fewer: on phases of its own (`--phases`). over: limits that people
-    exceed, in their range; slower: the share of the speeds that keeps them.
+    by_hand: the design was made with `--driver`. fewer: `--phases` replaced its phases. over: limits that people
+    exceed, as shares of their range. slower: share of the speeds at which they keep them.
     """
     worst, median = person.worst_percent / played.worst_percent, person.median_percent / played.median_percent
     ratio = max(worst, median)
-    again = _again(trajectories.conditions(objective), by_hand, fewer)
+    again = _what_to_ask(trajectories.is_condition_number(objective), by_hand, fewer)
     if ratio <= 1.1:
         said = "nothing that counts is lost"
-    elif ratio <= ground.LOST:
+    elif ratio <= ground.MAX_ERROR_RATIO:
         said = "good enough to drive"
     else:
         said = f"too much is lost; {again}, or play back the torques"
-    text = f"A person on these phases {_attained(median, worst)}: {said}."
+    text = f"A person on these phases {_attained_words(median, worst)}: {said}."
     if not over:
         return text
     named = ", ".join(f"{n.replace('_', ' ')} by {100 * v:.0f} %" for n, v in over.items())
@@ -148,8 +149,8 @@ def verdict(
     )
 
 
-def _attained(median: float, worst: float) -> str:
-    """Errors as multiples of those with torques played back, in words."""
+def _attained_words(median: float, worst: float) -> str:
+    """Describe errors as multiples of those with torques played back."""
     exact = "torques played back exactly"
     factors = {name: f"{x:.2g}" for name, x in (("median", median), ("worst", worst))}
     more = [f"{x} times the {name} error" for name, x in factors.items() if x != "1"]
@@ -159,8 +160,8 @@ def _attained(median: float, worst: float) -> str:
     return f"attains {' and '.join(more)} of {exact}" + "".join(f" and is as good in the {n} parameter" for n in same)
 
 
-def _again(conditions: bool, by_hand: bool, fewer: bool) -> str:
-    """What to ask for instead: nothing that was asked for already."""
+def _what_to_ask(conditions: bool, by_hand: bool, fewer: bool) -> str:
+    """Say which options of `excite design` help, without those that were used."""
     if not by_hand:
         return "design again with " + ("--objective accuracy --driver" if conditions else "--driver, or a longer drive")
     if fewer:
@@ -169,39 +170,39 @@ def _again(conditions: bool, by_hand: bool, fewer: bool) -> str:
     return f"design again with {first}a longer --duration, more --starts or, where there was one, a larger --budget"
 
 
-def _exceeded(model: Model, problem: Problem, motions: tuple[Motion, ...]) -> dict[str, float]:
-    """The limits that any of the drives exceeds, with the largest excess in their range."""
+def _exceeded_limits(model: Model, problem: Problem, motions: tuple[Motion, ...]) -> dict[str, float]:
+    """Return the limits that any drive exceeds, with the largest excess as a share of their range."""
     over: dict[str, float] = {}
     for m in motions:
-        for name, value in ground.broken(model, problem, m).items():
+        for name, value in ground.broken_limits(model, problem, m).items():
             over[name] = max(over.get(name, 0.0), value)
     return over
 
 
-def _slower(model: Model, problem: Problem, trace: Trace, start: np.ndarray, seed: int) -> float | None:
-    """The largest share of the speeds at which people keep every limit, in simulation; None where none helps."""
-    for share in SLOWER:
+def _slower_share(model: Model, problem: Problem, trace: Trace, start: np.ndarray, seed: int) -> float | None:
+    """Return the largest share of the speeds at which simulated people keep every limit, None if none helps."""
+    for share in SLOWER_SHARES:
         slow = replace(trace, speed=share * trace.speed)
         with contextlib.suppress(SimulationError):
-            motions = tuple(ground.driven(model, slow, None, seed + k, start) for k in range(PEOPLE))
-            if not _exceeded(model, problem, ground.placed(model, problem, motions)):
+            motions = tuple(ground.follow_trace(model, slow, None, seed + k, start) for k in range(PEOPLE))
+            if not _exceeded_limits(model, problem, ground.place_in_lane(model, problem, motions)):
                 return share
     return None
 
 
-def _warnings(model: Model, trace: Trace, motions: tuple[Motion, ...], room: ground.Room) -> list[str]:
-    free = (np.ceil(room.length + 2 * sheet.AHEAD), np.ceil(room.width + 2 * sheet.AHEAD))
+def _warnings(model: Model, trace: Trace, motions: tuple[Motion, ...], room: ground.TouchedGround) -> list[str]:
+    free = (np.ceil(room.length + 2 * sheet.FREE_MARGIN_M), np.ceil(room.width + 2 * sheet.FREE_MARGIN_M))
     lines = [
         f"Keep everybody off {free[0]:.0f} m x {free[1]:.0f} m: the machine touches {room.length:.1f} m x"
-        f" {room.width:.1f} m of ground, {sheet.AHEAD:g} m are left all around for overhangs and for stopping. Stop at"
-        " once if anybody comes near.",
+        f" {room.width:.1f} m of ground, {sheet.FREE_MARGIN_M:g} m are left all around for overhangs and for stopping."
+        " Stop at once if anybody comes near.",
         "Engine speed and drive settings the same all along, whatever else shakes or moves off; ground level and firm.",
     ]
-    turns = len(ground.reversals(trace))
+    turns = len(ground.reversal_times(trace))
     if turns:
         times = "once" if turns == 1 else f"{turns} times"
         lines.append(f"The machine changes direction {times}: somebody must see the ground behind it.")
-    ends = np.array([ground.edges(model, m)[0].mean(axis=0)[-1] for m in motions])
+    ends = np.array([ground.contact_edges(model, m)[0].mean(axis=0)[-1] for m in motions])
     spread = float(np.hypot(*(ends.max(axis=0) - ends.min(axis=0))))
     *others, last = ("speed", *(lever.name for lever in trace.levers))
     followed = f"{', '.join(others)} and {last}" if others else "the speed"
@@ -216,19 +217,19 @@ def _warnings(model: Model, trace: Trace, motions: tuple[Motion, ...], room: gro
         )
     for lever, angle in zip(trace.levers, trace.angle.T, strict=True):
         stop = lever.body.limit.position
-        if stop is not None and (top := float(np.abs(angle).max()) / float(stop)) > NEAR:
+        if stop is not None and (top := float(np.abs(angle).max()) / float(stop)) > NEAR_STOP:
             lines.append(f"The {lever.name} goes to {100 * top:.0f} % of its stop: hands and feet away from the joint.")
     return lines
 
 
-def summary(made: Sheet) -> dict[str, Any]:
-    """The numbers of a sheet: phases, room, scores by way of driving, warnings."""
+def summarise_sheet(made: Sheet) -> dict[str, Any]:
+    """Summarise a sheet: phases, ground, accuracy by way of driving, warnings."""
     trace = made.trace
     return {
         "duration_s": trace.duration,
         "start": ground.start_words(made.model, made.motions[0], trace),
         "phases": ground.trace_table(trace),
-        "direction_changes_s": ground.reversals(trace),
+        "direction_changes_s": ground.reversal_times(trace),
         "room_m": [made.room.length, made.room.width],
         "tolerance": {
             "speed_m_s": ground.BAND_SPEED,
@@ -250,9 +251,9 @@ def summary(made: Sheet) -> dict[str, Any]:
 
 
 def write(made: Sheet, place: Path) -> dict[str, Any]:
-    """sheet.pdf, driver.html and phases.csv into a folder; returns the numbers."""
-    sheet.save(made, place / "sheet.pdf")
-    said = summary(made)
+    """Write sheet.pdf, driver.html and phases.csv into a folder; return the summary."""
+    sheet.save_sheet(made, place / "sheet.pdf")
+    said = summarise_sheet(made)
     text = page.driver_page(made.model, made.trace, made.title, said["start"])
     (place / PAGE).write_text(text, encoding="utf-8")
     t = made.trace.times
@@ -263,9 +264,9 @@ def write(made: Sheet, place: Path) -> dict[str, Any]:
 
 
 def serve(out: Path, made: Sheet, host: str, port: int, live: Path | None, ready: Callable[[str], None]) -> None:
-    """The page of a written folder with live values, until Ctrl-C; `ready` gets its addresses. Raises ServeError."""
+    """Serve the page of a folder with live values until Ctrl-C; `ready` gets its addresses. Raises ServeError."""
     text = (out / PAGE).read_text(encoding="utf-8")
     levers = made.trace.levers
-    tail = Tail(live, made.model.machine, levers) if live is not None else None
+    tail = GrowingLog(live, made.model.machine, levers) if live is not None else None
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(run(text, [lever.column for lever in levers], host, port, tail, ready))
+        asyncio.run(serve_page(text, [lever.column for lever in levers], host, port, tail, ready))

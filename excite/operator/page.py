@@ -1,4 +1,4 @@
-"""The driver's page: one HTML file with the trace to follow, for a phone in the cab."""
+"""The driver's page: one HTML file that shows the trace to follow, for a phone in the cab."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 
 from excite.model import Model
 from excite.model.machine import UNITS
-from excite.operator.ground import BAND_ANGLE, BAND_S, BAND_SPEED, Trace, trace_parts
+from excite.operator.ground import BAND_ANGLE, BAND_S, BAND_SPEED, Trace, phase_parts
 from excite.reports import templates
 
-TIMES = re.compile(r" (in|for) [\d.]+ s| at \d+:[\d.]+")  # the page counts down, so its words need no times
+TIMES = re.compile(r" (in|for) [\d.]+ s| at \d+:[\d.]+")  # the page counts down: its words need no times
 
 
 def driver_page(model: Model, trace: Trace, title: str, start: str = "") -> str:
-    """The driver's aid: a moving reference of speed and steering, with the countdown to what comes next.
+    """Render the page: a moving reference of speed and steering with a countdown to the next phase.
 
-    It shows what was driven beside it, from a log in the machine's own columns or from `serve`, and scores it.
-    start: where to place the machine, in words, shown until the drive begins.
+    It also shows and scores what was driven, from a log in the machine's columns or live values of `serve`.
+    start: where to place the machine, shown until the drive begins.
     """
     return templates().get_template("driver.html").render(data={**driver_data(model, trace, title), "start": start})
 
 
 def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
-    """What the page knows: the trace (angles in degrees, positive to the left), its phases in words, the columns."""
+    """Return the page's data: trace (angles in degrees, positive left), phases in words, tolerances, log columns."""
     machine = model.machine
     by_body = {s.body: s for s in machine.sensors("full") if s.kind == "angle"}
     rims = [
@@ -51,7 +51,7 @@ def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
                 "values": degrees.tolist(),
             }
         )
-    words = [trace_parts(trace, k) for k in range(len(trace))]
+    words = [phase_parts(trace, k) for k in range(len(trace))]
     words = [(TIMES.sub("", go), steer) for go, steer in words]
     return {
         "title": title,

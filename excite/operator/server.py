@@ -1,10 +1,9 @@
-"""The driver's page with live values: `excite drive --serve`.
+"""Serve the driver's page with live values: `excite drive --serve`.
 
-One small server gives the page and passes on what is measured: from a log that grows, or from any program that sends
-`{"v_m_s": 1.2, "JOINT_rad": 0.1}` to ws://127.0.0.1:PORT/live, JOINT being the machine file's name of a steered joint.
-It listens on the loopback address unless another is asked for, takes no connection that a page from elsewhere asks for
-(Origin and Host are checked: a web site in the same browser must neither read nor fake measurements) and no message
-longer than MESSAGE bytes. Whoever reaches another address may open the page and send values.
+The server gives the page and passes on measured values, from a growing log or from any program that sends
+`{"v_m_s": 1.2, "JOINT_rad": 0.1}` to ws://127.0.0.1:PORT/live (JOINT: a steered joint's name in the machine file).
+It listens on the loopback address by default. Origin and Host are checked, so that no web site in the same browser can
+read or fake values. On another address anybody who reaches it may open the page and send values.
 """
 
 from __future__ import annotations
@@ -32,40 +31,41 @@ from excite.model.machine import UNITS, Machine
 from excite.operator.ground import Lever
 
 HOST = "127.0.0.1"
-OWN = "ws://127.0.0.1:* ws://localhost:*"  # where a page may connect to, as it says itself
-MESSAGE, REASON = 1024, 120  # bytes of a message, and of why a connection ends
-CLIENTS = 16
-TIME, SPEED = "t_s", "v_m_s"  # and the angle of each steered joint, by the machine file's name of it
-POLL = 0.05  # s between looks at a growing log
-SPAN = 0.2  # s of rolling that a speed is taken from
+LOOPBACK_SOURCES = "ws://127.0.0.1:* ws://localhost:*"  # addresses in the page's content security policy
+MAX_MESSAGE = 1024  # of a message [bytes]; chosen
+MAX_REASON = 120  # of the reason for closing a connection [bytes]; the protocol allows 123
+MAX_CLIENTS = 16  # chosen
+TIME, SPEED = "t_s", "v_m_s"  # keys of a message, beside the angle of each steered joint
+POLL_S = 0.05  # between looks at a growing log [s]; chosen
+SPEED_SPAN_S = 0.2  # time over which a speed is measured [s]; chosen
 
 
 @asynccontextmanager
-async def serving(
+async def running_server(
     page: str, angles: Sequence[str], port: int = 0, host: str = HOST
 ) -> AsyncIterator[tuple[Server, Callable[[dict[str, float]], None]]]:
-    """The running server and a function that sends values to every page. Port 0 takes a free one.
+    """Run the server; give it and a function that sends values to every page.
 
-    angles: the names of steered joints' angles in a message; host: the address to listen on, 0.0.0.0 for all. Raises
-    ServeError where the port is taken or the address is not this machine's.
+    angles: keys of the steered joints' angles. port: 0 for any free one. host: address to listen on, 0.0.0.0 for all.
+    Raises ServeError if the port is taken or the address is not this computer's.
     """
-    keys, at = (TIME, SPEED, *angles), str(ipaddress.ip_address(host))  # an empty one would be all addresses
+    keys, at = (TIME, SPEED, *angles), str(ipaddress.ip_address(host))  # an empty address would mean all
     pages: set[ServerConnection] = set()
 
     def answer(connection: ServerConnection, request: Request) -> Response | None:
-        # By the number that was dialled: a name could point here from anywhere.
+        # Compare with the numeric address: a foreign host name could point here.
         own, taken = connection.local_address[:2]
-        allowed = {f"{literal(own)}:{taken}"} | ({f"localhost:{taken}"} if own == HOST else set())
+        allowed = {f"{url_host(own)}:{taken}"} | ({f"localhost:{taken}"} if own == HOST else set())
         host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
         if host not in allowed or (origin is not None and origin not in {f"http://{h}" for h in allowed}):
             return connection.respond(HTTPStatus.FORBIDDEN, "for pages of this server alone\n")
         if request.path == "/live":
-            if len(pages) >= CLIENTS:
+            if len(pages) >= MAX_CLIENTS:
                 return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many pages\n")
             return None
         if request.path != "/":
             return connection.respond(HTTPStatus.NOT_FOUND, "only / and /live are here\n")
-        body = page.replace(OWN, f"{OWN} ws://{host}").encode()
+        body = page.replace(LOOPBACK_SOURCES, f"{LOOPBACK_SOURCES} ws://{host}").encode()
         headers = Headers(
             [
                 ("Content-Type", "text/html; charset=utf-8"),
@@ -81,9 +81,9 @@ async def serving(
         pages.add(connection)
         try:
             async for message in connection:
-                said = checked(message, keys)
+                said = parse_message(message, keys)
                 if said is None:
-                    await connection.close(1007, f"send a JSON object of numbers {', '.join(keys)}"[:REASON])
+                    await connection.close(1007, f"send a JSON object of numbers {', '.join(keys)}"[:MAX_REASON])
                     return
                 broadcast(pages - {connection}, json.dumps(said))
         except ConnectionClosed:
@@ -92,7 +92,9 @@ async def serving(
             pages.discard(connection)
 
     try:
-        server = await serve(talk, at, port, process_request=answer, max_size=MESSAGE, max_queue=16, compression=None)
+        server = await serve(
+            talk, at, port, process_request=answer, max_size=MAX_MESSAGE, max_queue=16, compression=None
+        )
     except OSError as err:
         if err.errno == errno.EADDRNOTAVAIL:
             said = f"--host {host}: is no address of this machine; 0.0.0.0 listens on all that it has"
@@ -103,29 +105,29 @@ async def serving(
         yield server, lambda said: broadcast(set(pages), json.dumps(said))
 
 
-def literal(address: str) -> str:
-    """An address as it stands in a URL: IPv6 in brackets."""
+def url_host(address: str) -> str:
+    """Write an address for a URL: IPv6 in brackets."""
     return f"[{address}]" if ":" in address else address
 
 
-def reached(host: str) -> list[str]:
-    """The addresses to open a page at that listens on `host`: for 0.0.0.0 and :: those that this machine has."""
+def reachable_addresses(host: str) -> list[str]:
+    """Return the addresses at which a page can be opened; for 0.0.0.0 and :: all that this computer has."""
     if not ipaddress.ip_address(host).is_unspecified:
-        return [literal(host)]
+        return [url_host(host)]
     four = ":" not in host
     family, outside, own = (socket.AF_INET, "192.0.2.1", HOST) if four else (socket.AF_INET6, "2001:db8::1", "::1")
     found: list[str] = []
     with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as udp:
-        udp.connect((outside, 9))  # sends nothing: tells which of our addresses would go out
+        udp.connect((outside, 9))  # sends nothing: shows which address would be used
         found.append(str(udp.getsockname()[0]))
     with contextlib.suppress(OSError):
         found += [str(told[4][0]) for told in socket.getaddrinfo(socket.gethostname(), None, family)]
     ways = {a: ipaddress.ip_address(a) for a in found}  # each once, in order
-    return [*(literal(a) for a, ip in ways.items() if not (ip.is_loopback or ip.is_link_local)), literal(own)]
+    return [*(url_host(a) for a, ip in ways.items() if not (ip.is_loopback or ip.is_link_local)), url_host(own)]
 
 
-def checked(message: str | bytes, keys: Sequence[str]) -> dict[str, float] | None:
-    """A message as numbers by known keys, the speed at least; None where it is anything else."""
+def parse_message(message: str | bytes, keys: Sequence[str]) -> dict[str, float] | None:
+    """Parse a message into numbers by known keys, the speed among them; None for anything else."""
     try:
         said = json.loads(message)
     except ValueError:
@@ -138,8 +140,8 @@ def checked(message: str | bytes, keys: Sequence[str]) -> dict[str, float] | Non
     return {k: float(v) for k, v in said.items()}
 
 
-class Tail:
-    """A growing CSV log in a machine's own columns, read as it grows: speed of the contacts' rims, steered angles."""
+class GrowingLog:
+    """A growing CSV log in a machine's columns, read as it grows: rim speed of the contacts, steering angles."""
 
     def __init__(self, path: Path, machine: Machine, levers: Sequence[Lever]) -> None:
         self.path, self.machine, self.levers = path, machine, levers
@@ -154,7 +156,7 @@ class Tail:
         self.turned: dict[str, float] = {}  # the last angles [rad]
 
     def new(self) -> list[dict[str, float]]:
-        """The values of the rows that are new since the last call; lines that are no numbers are left out."""
+        """Return the values of rows added since the last call; lines without numbers are skipped."""
         if not self.path.is_file():
             return []
         if self.path.stat().st_size < self.place:  # begun afresh
@@ -190,7 +192,7 @@ class Tail:
             return None
         angles = self._angles(cells, t - self.rows[-1][0] if self.rows else 0.0)
         self.rows.append((t, sum(ways) / len(ways)))
-        while len(self.rows) > 2 and self.rows[1][0] <= t - SPAN:
+        while len(self.rows) > 2 and self.rows[1][0] <= t - SPEED_SPAN_S:
             self.rows.pop(0)
         before = self.rows[0]
         if t <= before[0]:
@@ -198,8 +200,7 @@ class Tail:
         return {TIME: t, SPEED: (self.rows[-1][1] - before[1]) / (t - before[0]), **angles}
 
     def _angles(self, cells: dict[str, str], seconds: float) -> dict[str, float]:
-        """The steered angles that a row has, so long after the one before it: the page keeps the last value of any
-        other. A rate is summed up from zero."""
+        """Return the steering angles of a row, `seconds` after the row before; a rate is integrated from zero."""
         found = {}
         for key, s in self.angles:
             with contextlib.suppress(KeyError, ValueError):
@@ -211,20 +212,20 @@ class Tail:
         return found
 
 
-async def run(
-    page: str, angles: Sequence[str], host: str, port: int, tail: Tail | None, ready: Callable[[str], None]
+async def serve_page(
+    page: str, angles: Sequence[str], host: str, port: int, tail: GrowingLog | None, ready: Callable[[str], None]
 ) -> None:
-    """Serves the page until Ctrl-C or a polite kill; `ready` gets each of its addresses. Raises as `serving`."""
+    """Serve the page until Ctrl-C or SIGTERM; `ready` gets each of its addresses. Raises ServeError."""
     stop = asyncio.Event()
-    with contextlib.suppress(RuntimeError, ValueError):  # not in the main thread: whoever started it stops it
-        # A KeyboardInterrupt may be raised anywhere in the loop and get lost there.
+    with contextlib.suppress(RuntimeError, ValueError):  # outside the main thread there are no signals
+        # A KeyboardInterrupt inside the event loop may be lost.
         for number in interrupt.SIGNALS:
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    async with serving(page, angles, port, host) as (server, send):
-        for address in reached(host):
+    async with running_server(page, angles, port, host) as (server, send):
+        for address in reachable_addresses(host):
             ready(f"http://{address}:{server.sockets[0].getsockname()[1]}/")
         while not stop.is_set():
             for said in tail.new() if tail else ():
                 send(said)
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(stop.wait(), POLL)
+                await asyncio.wait_for(stop.wait(), POLL_S)

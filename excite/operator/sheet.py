@@ -1,4 +1,4 @@
-"""The driver's sheet: two pages A4 in print, what to drive where and when, what to set up, what to mind."""
+"""The driver's sheet (PDF, two pages A4): path and phases, warnings, sensors to set up, attainable accuracy."""
 
 from __future__ import annotations
 
@@ -17,56 +17,63 @@ from excite import reports
 from excite.model import Model
 from excite.model.machine import Machine, Sensor
 from excite.operator import ground
-from excite.operator.ground import Room, Score, Trace
+from excite.operator.ground import DriveQuality, TouchedGround, Trace
 from excite.reports import COLOURS
 from excite.simulation import Motion
 
 A4 = (8.27, 11.69)
 LEFT, RIGHT = 0.08, 0.95
-GAP = 0.02  # between columns
-TAKEN_IN = 1.5  # a map that shows the whole lane is at most so many times as coarse
-AHEAD = 3.0  # m of free ground around what the machine touches: overhangs, and a person who has to stop
+GAP = 0.02  # between columns, as a share of the page's width
+MAX_COARSER = 1.5  # scale of a map of the whole lane over one of the touched ground; chosen
+FREE_MARGIN_M = 3.0  # free ground around what the machine touches, for overhangs and stopping [m]; chosen
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """What the sheet shows. motions: the trace driven by several people, the first one's path is drawn; scores: what
-    each way of driving makes attainable, by name."""
+    """Content of a driver's sheet.
+
+    motions: the trace as driven by several people; the first path is drawn. room: the ground they touch.
+    scores: attainable accuracy by way of driving. verdict: what a person keeps of the design, in a sentence.
+    """
 
     title: str
     model: Model
     trace: Trace
     motions: tuple[Motion, ...]
-    room: Room
+    room: TouchedGround
     lane: tuple[float, float]
     warnings: tuple[str, ...]
-    scores: tuple[tuple[str, Score], ...]
+    scores: tuple[tuple[str, DriveQuality], ...]
     verdict: str
 
 
-def save(sheet: Sheet, path: Path) -> None:
-    """Writes the PDF, without the clock in it: the same drive gives the same bytes."""
+def save_sheet(sheet: Sheet, path: Path) -> None:
+    """Write the PDF without a date: the same drive gives the same bytes."""
     with PdfPages(path, metadata={"CreationDate": None, "Title": f"Driver's sheet: {sheet.title}"}) as pdf:
         for page in (_first(sheet), _second(sheet)):
             pdf.savefig(page)
 
 
-def facts(sheet: Sheet) -> list[tuple[str, str]]:
-    """The drive in numbers, name and value."""
+def drive_facts(sheet: Sheet) -> list[tuple[str, str]]:
+    """Return name and value of the drive's main numbers."""
     trace = sheet.trace
     top = float(np.abs(trace.speed).max())
     length = float(np.abs(trace.at(np.arange(0, trace.duration, 0.01))[0]).sum() * 0.01)
     rows = [
-        ("time", f"{ground.clock(trace.duration)} min"),
+        ("time", f"{ground.format_clock(trace.duration)} min"),
         ("phases", str(len(trace))),
-        ("direction changes", str(len(ground.reversals(trace)))),
+        ("direction changes", str(len(ground.reversal_times(trace)))),
         ("distance", f"{length:.0f} m"),
         ("top speed", f"{top:.1f} m/s, {3.6 * top:.1f} km/h"),
     ]
     tops = np.abs(trace.degrees).max(axis=0)
     rows += [(f"{lever.name} up to", f"{top:.0f}°") for lever, top in zip(trace.levers, tops, strict=True)]
     rows.append(
-        ("free ground", f"{np.ceil(sheet.room.length + 2 * AHEAD):.0f} x {np.ceil(sheet.room.width + 2 * AHEAD):.0f} m")
+        (
+            "free ground",
+            f"{np.ceil(sheet.room.length + 2 * FREE_MARGIN_M):.0f} x"
+            f" {np.ceil(sheet.room.width + 2 * FREE_MARGIN_M):.0f} m",
+        )
     )
     return rows
 
@@ -74,7 +81,7 @@ def facts(sheet: Sheet) -> list[tuple[str, str]]:
 def _first(sheet: Sheet) -> Figure:
     figure = Figure(figsize=A4)
     _head(figure, sheet, 1)
-    rows = facts(sheet)
+    rows = drive_facts(sheet)
     widths = np.array([max(len(value) * 1.35, len(name)) + 3 for name, value in rows], float)
     starts = LEFT + (RIGHT - LEFT) * np.concatenate([[0.0], np.cumsum(widths)[:-1]]) / widths.sum()
     for x, (name, value) in zip(starts, rows, strict=True):
@@ -107,9 +114,9 @@ def _head(figure: Figure, sheet: Sheet, page: int) -> None:
 
 
 def _lane(ax: Axes, sheet: Sheet) -> None:
-    """The lane from above: what is touched, the way of the first contact, start, turning points, end."""
+    """Draw the lane from above: touched ground, path of the first contact, start, changes of direction, end."""
     motion, model = sheet.motions[0], sheet.model
-    edges = ground.edges(model, motion)
+    edges = ground.contact_edges(model, motion)
     for right, left in edges:
         step = max(1, len(right) // 400)
         for k in range(0, len(right) - step, step):
@@ -123,14 +130,14 @@ def _lane(ax: Axes, sheet: Sheet) -> None:
             part = np.where((forward == ahead)[:, None], centre, np.nan)
             ax.plot(*part.T, color=colour, linestyle=style, linewidth=1.8, label=name, zorder=3)
     start = dict(zip(model.coordinates, motion.q[0], strict=True))
-    for outline in reports.footprints(model.machine, start):  # the machine as it stands at the start
+    for outline in reports.footprints(model.machine, start):  # the machine at the start
         ax.add_patch(Polygon(outline, closed=True, facecolor="white", edgecolor="black", zorder=4))
     ax.plot(*edges.mean(axis=1)[:, 0].T, color="black", linewidth=1.5, zorder=4)
     marks = [("o", "START", centre[0]), ("s", "END", centre[-1])]
-    for k, t in enumerate(ground.reversals(sheet.trace)):
+    for k, t in enumerate(ground.reversal_times(sheet.trace)):
         at = centre[min(round(t * float(model.machine.sampling_hz)), len(centre) - 1)]
-        marks.append(("D", ground.letter(k), at))
-    for t in np.arange(3.0, sheet.trace.duration, 6.0):  # which way along the path
+        marks.append(("D", ground.reversal_letter(k), at))
+    for t in np.arange(3.0, sheet.trace.duration, 6.0):  # direction of travel
         k = min(round(t * float(model.machine.sampling_hz)), len(centre) - 11)
         step = centre[k + 10] - centre[k]
         if np.hypot(*step) > 0.05:
@@ -138,7 +145,7 @@ def _lane(ax: Axes, sheet: Sheet) -> None:
             ax.annotate("", tip, centre[k], arrowprops={"arrowstyle": "-|>", "color": "black"}, zorder=5)
     scale = _view(ax, sheet)
     half, view = np.array(sheet.lane) / 2, np.array([ax.get_xlim(), ax.get_ylim()])
-    if not (np.abs(view) < half[:, None]).all():  # some of its edge is in the picture
+    if not (np.abs(view) < half[:, None]).all():  # an edge of the lane is in the picture
         corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * half
         lane = f"lane {sheet.lane[0]:g} x {sheet.lane[1]:g} m"
         ax.plot(*corners.T, color="black", linestyle=":", linewidth=1.2, label=lane)
@@ -158,14 +165,14 @@ def _lane(ax: Axes, sheet: Sheet) -> None:
 
 
 def _view(ax: Axes, sheet: Sheet) -> float:
-    """Equal axes over all that is touched, and over the lane where that isn't much more; half the metres an inch."""
+    """Set equal axes over the touched ground, or the whole lane if not much larger; return half the metres per inch."""
     size = np.array([ax.get_position().width, ax.get_position().height]) * A4
     touched = np.array([sheet.room.corner, np.add(sheet.room.corner, (sheet.room.length, sheet.room.width))])
-    touched += [[-0.7 * AHEAD], [0.7 * AHEAD]]
+    touched += [[-0.7 * FREE_MARGIN_M], [0.7 * FREE_MARGIN_M]]
     half = np.array(sheet.lane) / 2 + 0.5
     both = np.array([np.minimum(touched[0], -half), np.maximum(touched[1], half)])
     near, far = (float((np.ptp(box, axis=0) / 2 / size).max()) for box in (touched, both))
-    box, scale = (both, far) if far <= TAKEN_IN * near else (touched, near)
+    box, scale = (both, far) if far <= MAX_COARSER * near else (touched, near)
     low, high = box.mean(axis=0) - scale * size, box.mean(axis=0) + scale * size
     ax.set_xlim(low[0], high[0])
     ax.set_ylim(low[1], high[1])
@@ -174,14 +181,14 @@ def _view(ax: Axes, sheet: Sheet) -> float:
 
 
 def _box(points: np.ndarray) -> tuple[float, float, float, float]:
-    """The box (centre x, centre y, width, height) around points (n, 2)."""
+    """Return the box (centre x, centre y, width, height) around points (n, 2)."""
     return (*points.min(axis=0) / 2 + points.max(axis=0) / 2, *np.ptp(points, axis=0))
 
 
 def _merged(
     marks: Sequence[tuple[str, str, np.ndarray]], metre: float, near: float = 7.0
 ) -> list[tuple[str, str, np.ndarray]]:
-    """Marks of one kind that would hide each other, fewer than `near` points apart, as one with all their names."""
+    """Merge marks of one kind that are less than `near` points apart into one with all their names."""
     made: list[tuple[str, str, np.ndarray]] = []
     for marker, text, at in marks:
         for k, (other, names, there) in enumerate(made):
@@ -199,9 +206,10 @@ def _mark(
     metre: float,
     drawn: Sequence[tuple[float, float, float, float]] = (),
 ) -> None:
-    """Markers with their names (marker, name, place), each name where it hides least; a metre is so many points.
+    """Draw markers with names, each name where it hides least.
 
-    drawn: boxes (centre x, centre y, width, height) [points] of what else names should not hide.
+    marks: (marker, name, place). metre: points per metre. drawn: boxes (centre x, centre y, width, height) [points]
+    that names should not hide.
     """
     marks, turns = _merged(marks, metre), np.deg2rad(np.arange(45, 405, 30))
     taken: list[tuple[float, float, float, float]] = [*drawn, *((*(at * metre), 7.0, 7.0) for _, _, at in marks)]
@@ -234,7 +242,7 @@ def _mark(
 
 
 def _overlap(one: tuple[float, ...], other: tuple[float, ...]) -> float:
-    """Common area of two boxes (centre x, centre y, width, height)."""
+    """Return the common area of two boxes (centre x, centre y, width, height)."""
     wide, high = (max(0.0, (one[k + 2] + other[k + 2]) / 2 - abs(one[k] - other[k])) for k in (0, 1))
     return wide * high
 
@@ -242,10 +250,10 @@ def _overlap(one: tuple[float, ...], other: tuple[float, ...]) -> float:
 def _trace(
     ax: Axes, sheet: Sheet, label: str, ends: tuple[str, str], value: np.ndarray, band: float, least: float
 ) -> None:
-    """A channel of the trace in its band; ends: what is up and what is down, said as on the page."""
+    """Draw a channel of the trace in its tolerance band. ends: words for up and down."""
     trace = sheet.trace
     t = np.arange(0, trace.duration + 0.005, 0.05)
-    low, high = ground.band(t, np.interp(t, trace.times, value), band)
+    low, high = ground.tolerance_band(t, np.interp(t, trace.times, value), band)
     ax.fill_between(t, low, high, color="0.85", linewidth=0)
     ax.plot(trace.times, value, color="black", linewidth=1.8)
     for k in range(len(trace)):
@@ -265,7 +273,7 @@ def _trace(
 
 
 def _numbers(ax: Axes, trace: Trace) -> None:
-    """The phases' numbers above the trace."""
+    """Write the phases' numbers above the trace."""
     for k in range(len(trace)):
         middle = (trace.times[k] + trace.times[k + 1]) / 2
         ax.annotate(
@@ -293,21 +301,20 @@ def _second(sheet: Sheet) -> Figure:
     for k in range(len(trace)):
         turned = [ground.angle_words(degrees) for degrees in trace.degrees[k + 1]]
         speed = f"{trace.speed[k + 1]:+.1f} m/s".replace("+0.0", "0").replace("-", "\N{MINUS SIGN}")
-        do = ground.trace_parts(trace, k, letters=True)[0] if several else ground.words(trace, k, letters=True)
-        rows.append((str(k + 1), ground.clock(trace.times[k]), do, *(() if several else (speed,)), *turned))
+        do = ground.phase_parts(trace, k, letters=True)[0] if several else ground.phase_words(trace, k, letters=True)
+        rows.append((str(k + 1), ground.format_clock(trace.times[k]), do, *(() if several else (speed,)), *turned))
     y = _table(figure, y, rows, space, size)
     y = _title(figure, y - 0.008, "Mind")
     y = _list(figure, y, sheet.warnings)
     y = _title(figure, y - 0.008, "Set up")
-    y = _list(figure, y, set_up(sheet.model.machine))
+    y = _list(figure, y, set_up_lines(sheet.model.machine))
     y = _title(figure, y - 0.008, "What this drive gives in a person's hands")
     y = _list(figure, y, [sheet.verdict, *(_score_line(name, score) for name, score in sheet.scores)])
     return figure
 
 
 def _table(figure: Figure, y: float, rows: Sequence[Sequence[str]], space: float, size: float) -> float:
-    """Rows of texts, titles first, each column as wide as its texts; what is left is behind the third. Where all of it
-    is wider than the page, the letters are smaller."""
+    """Draw rows of texts, titles first; return the height below. Letters shrink if the table is wider than the page."""
     texts = [
         [
             figure.text(LEFT, y - k * space, text, fontsize=size if k else 7, color="black" if k else "0.25")
@@ -331,7 +338,7 @@ def _table(figure: Figure, y: float, rows: Sequence[Sequence[str]], space: float
     return y - len(rows) * space
 
 
-def _score_line(name: str, score: Score) -> str:
+def _score_line(name: str, score: DriveQuality) -> str:
     return (
         f"{name}: attainable error {score.median_percent:.2g} % (median parameter), {score.worst_percent:.2g} %"
         f" (worst, {score.worst}); cond(Phi) {score.cond_phi:.3g}"
@@ -351,15 +358,15 @@ def _list(figure: Figure, y: float, lines: Sequence[str]) -> float:
     return y
 
 
-def set_up(machine: Machine) -> list[str]:
-    """The list of sensors to mount and to check before the drive, a line each."""
+def set_up_lines(machine: Machine) -> list[str]:
+    """Return a line for each sensor to mount and check before the drive."""
     rate = float(machine.sampling_hz)
     lines = [f"Log all columns at {rate:g} Hz, from 5 s before the drive to 5 s after it, the machine at rest."]
     return lines + [sensor_line(machine, s) for s in machine.sensors("full")]
 
 
 def sensor_line(machine: Machine, sensor: Sensor) -> str:
-    """One sensor: what it reads, where, its column and how fine it must be."""
+    """Describe a sensor: column, quantity, place, size, resolution and noise."""
     body = machine.find(sensor.body)
     where = (sensor.place or body.where).replace("_", " ")
     what = {

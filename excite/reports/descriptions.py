@@ -147,12 +147,12 @@ def _describe_by_hand(s: Summary) -> tuple[list[str], list[Table]]:
     d = s["driver"]
     free, hand = d["played_back"], d["by_hand"]
     over = ", ".join(f"{name} by {format_percent(100 * value)}" for name, value in d["limits_broken"].items())
+    value = trajectories.describe_value(s["objective"], hand["score"])
     remarks = [
-        f"In people's hands these {len(d['phases'])} phases give {trajectories.titled(s['objective'], hand['score'])},"
-        f" torques played back {free['score']:.4g}; the worst parameter is identified to"
-        f" {format_percent(hand['worst_percent'])} ({hand['worst_parameter']}) instead of"
-        f" {format_percent(free['worst_percent'])}, the median one to {format_percent(hand['median_percent'])} instead"
-        f" of {format_percent(free['median_percent'])}.",
+        f"In people's hands these {len(d['phases'])} phases give {value}, torques played back {free['score']:.4g}; the"
+        f" worst parameter is identified to {format_percent(hand['worst_percent'])} ({hand['worst_parameter']}) instead"
+        f" of {format_percent(free['worst_percent'])}, the median one to {format_percent(hand['median_percent'])}"
+        f" instead of {format_percent(free['median_percent'])}.",
         f"In the hands of {d['people']} simulated people these limits are exceeded: {over} of their range."
         if over
         else f"In the hands of {d['people']} simulated people every limit is kept.",

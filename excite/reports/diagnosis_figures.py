@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: what the model misses against all that the machine does, before and after."""
+"""Figures of a diagnosis: missing torques, innovations and errors by signal, before and after the findings."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from excite.diagnosis import Course, Diagnosis
 from excite.reports.figures import COLOURS, escape_dollar, save
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
-SHOWN, WIDE = 3, 4  # torques and forces in a figure, panels side by side
-# Sizes in inches are given, as to measure all labels takes as long as to draw them.
-PANEL = 2.9, 1.8  # with its labels
-INSET = 0.52, 0.4, 0.08, 0.14  # of a panel, that labels take: left, below, right, above
-HEAD = 0.28  # over the panels of one torque or force
+MAX_ROWS = 3  # torques and forces in a figure; chosen
+MAX_COLUMNS = 4  # panels side by side; chosen
+# Sizes are given in inches: measuring all labels would take as long as drawing them.
+PANEL = 2.9, 1.8  # width and height with labels
+INSET = 0.52, 0.4, 0.08, 0.14  # room for labels: left, below, right, above
+HEAD = 0.28  # above the panels of one torque or force
 EDGE = 0.35  # for the title, and for the legend
-PLAIN = -3, 5  # powers of ten of the numbers beside an axis that are written as they are
-CLEAR = 4.0  # strength from which a quantity is pointed out
-HIGHEST = 30.0  # mean square of innovations at which the colours end
+PLAIN_POWERS = -3, 5  # powers of ten that axes write without an exponent; chosen
+CLEAR_STRENGTH = 4.0  # strength of a dependence from which its panel gets a thick frame; chosen
+MAX_INNOVATION = 30.0  # mean square of innovations at which the colours end; chosen
 
 
 def figure_calls(place: Path, d: Diagnosis, title: str) -> list[Callable[[], None]]:
-    """Calls that draw misfit.png and when.png of each log into the folder of a diagnosis: they need neither one another
-    nor what was gained."""
-    return [partial(_drawn, place, d, title, kind) for kind in ("misfit", "when")]
+    """Return independent calls that draw misfit.png and when.png of each log into the folder of a diagnosis."""
+    return [partial(_draw, place, d, title, kind) for kind in ("misfit", "when")]
 
 
-def _drawn(place: Path, d: Diagnosis, title: str, kind: str) -> None:
-    """One of the two figures of every log."""
+def _draw(place: Path, d: Diagnosis, title: str, kind: str) -> None:
+    """Draw one of the two figures of every log."""
     before, after = d.before, d.after
     if kind == "misfit" and before.exact != after.exact:
-        # Forces that the one needs must be shown for the other too.
+        # Show forces that one of the two models needs for the other as well.
         before, after = diagnosis.loosened(before), diagnosis.loosened(after)
     without = diagnosis.courses(before)
     beside = diagnosis.courses(after) if d.stages else [None] * len(without)
@@ -49,13 +49,15 @@ def _drawn(place: Path, d: Diagnosis, title: str, kind: str) -> None:
 
 
 def misfit_figure(before: Course, after: Course | None, title: str) -> Figure:
-    """What is missing most, at most SHOWN torques and forces, against everything that the machine does, and its
-    spectrum. A thick frame: against this it shows most clearly."""
+    """Plot the largest missing torques and forces against the state of the machine, and their spectra.
+
+    A thick frame marks the quantity on which a torque depends most clearly.
+    """
     evidence = {row: {q: diagnosis.strength(before, row, q) for q in before.quantities} for row in before.missing}
-    rows = sorted(evidence, key=lambda row: -max(evidence[row].values()))[:SHOWN]
+    rows = sorted(evidence, key=lambda row: -max(evidence[row].values()))[:MAX_ROWS]
     panels = max(sum(row in v for _, v in before.quantities.values()) for row in rows) + 1
-    block = HEAD + -(-panels // WIDE) * PANEL[1]
-    width, height = WIDE * PANEL[0], len(rows) * block + 2 * EDGE
+    block = HEAD + -(-panels // MAX_COLUMNS) * PANEL[1]
+    width, height = MAX_COLUMNS * PANEL[0], len(rows) * block + 2 * EDGE
     figure = Figure(figsize=(width, height))
     figure.suptitle(escape_dollar(title), fontsize=11, y=1 - EDGE / 2 / height, va="center")
     left, below, right, above = INSET
@@ -67,14 +69,14 @@ def misfit_figure(before: Course, after: Course | None, title: str) -> Figure:
         own = [q for q, (_, values) in before.quantities.items() if row in values]
         clearest = max(own, key=lambda q: evidence[row][q])
         for n, name in enumerate([*own, None]):
-            down, across = divmod(n, WIDE)
+            down, across = divmod(n, MAX_COLUMNS)
             x, y = across * PANEL[0] + left, top - (down + 1) * PANEL[1] + below
             ax = figure.add_axes((x / width, y / height, *share))
             if name is None:
                 _spectrum(ax, before, after, row)
             else:
                 _against(ax, before, after, row, name)
-            if name == clearest and evidence[row][name] > CLEAR:
+            if name == clearest and evidence[row][name] > CLEAR_STRENGTH:
                 for spine in ax.spines.values():
                     spine.set_linewidth(2.2)
             ax.tick_params(which="both", labelsize=7)
@@ -103,7 +105,7 @@ def _against(ax: Axes, before: Course, after: Course | None, row: str, column: s
             centre, mean, _ = diagnosis.binned(at, after.missing[row][0], 0.0)
             ax.plot(centre, mean, color=AFTER, linewidth=1.4, linestyle="--")
     ax.locator_params("x", nbins=6, steps=(1, 2, 5, 10))
-    ax.ticklabel_format(scilimits=PLAIN, useOffset=False)
+    ax.ticklabel_format(scilimits=PLAIN_POWERS, useOffset=False)
     for axis in (ax.xaxis, ax.yaxis):
         axis.get_offset_text().set_fontsize(7)
     ax.set_xlabel(f"{column.replace('_', ' ')} [{before.quantities[column][0]}]", fontsize=8, labelpad=1)
@@ -121,7 +123,7 @@ def _spectrum(ax: Axes, before: Course, after: Course | None, row: str) -> None:
 
 
 def when_figure(before: Course, after: Course | None, title: str) -> Figure:
-    """When and in which signal: innovations over time, 1 is noise; and where in speed and steering or torque."""
+    """Plot innovations over time by signal (1 is noise), and over speed and steering angle or torque."""
     shown = [(before, "without what was found" if after is not None else "")]
     if after is not None:
         shown.append((after, "with it"))
@@ -129,7 +131,7 @@ def when_figure(before: Course, after: Course | None, title: str) -> Figure:
     figure = Figure(figsize=(12, (0.34 * m + 1.7) * len(shown) + 0.6), layout="constrained")
     figure.suptitle(escape_dollar(title), fontsize=11)
     axes = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(2.2, 1), sharex="col")
-    norm = LogNorm(1 / 3, HIGHEST)
+    norm = LogNorm(1 / 3, MAX_INNOVATION)
     picture = None
     for k, (course, words) in enumerate(shown):
         t, size = diagnosis.over_time(course)
@@ -151,17 +153,17 @@ def when_figure(before: Course, after: Course | None, title: str) -> Figure:
 
 
 def _map(ax: Axes, course: Course, norm: LogNorm) -> None:
-    """Where in the state space: speed across, steering angle (or torque where nothing steers) up."""
+    """Plot innovations over speed and steering angle, or torque if nothing steers."""
     names = list(course.quantities)
     up = next((n for n in names if n.endswith(" angle")), None)
     up = up or next(n for n in names if n in ("torque", "force"))
     (x_unit, xs), (y_unit, ys) = course.quantities["speed"], course.quantities[up]
     x, y = next(iter(xs.values())), next(iter(ys.values()))
     z = course.innovations**2
-    told = np.isfinite(z)
+    finite = np.isfinite(z)
     bins = [_edges(x), _edges(y)]
-    total = np.histogram2d(x, y, bins, weights=np.where(told, z, 0.0).sum(axis=1))[0]
-    count = np.histogram2d(x, y, bins, weights=told.sum(axis=1).astype(float))[0]
+    total = np.histogram2d(x, y, bins, weights=np.where(finite, z, 0.0).sum(axis=1))[0]
+    count = np.histogram2d(x, y, bins, weights=finite.sum(axis=1).astype(float))[0]
     mean = np.where(count >= diagnosis.FEWEST, total / np.maximum(count, 1), np.nan)
     ax.pcolormesh(*bins, mean.T, norm=norm, cmap="inferno_r", rasterized=True)
     ax.set_title("where, over all signals", fontsize=9, loc="left")
@@ -170,14 +172,16 @@ def _map(ax: Axes, course: Course, norm: LogNorm) -> None:
 
 
 def _edges(x: np.ndarray) -> np.ndarray:
-    """Edges of bins that hold all but the outermost values."""
+    """Return the edges of bins that hold all but the outermost values."""
     low, high = (float(v) for v in np.quantile(x, (0.002, 0.998)))
     return np.arange(17) / 16 * (max(high - low, 1e-9)) + low
 
 
 def signals_figure(signals: Mapping[str, Mapping[str, Any]], found: bool, title: str) -> Figure:
-    """Signal by signal: how much of the error is systematic, and errors on withheld stretches, before and, if anything
-    was found, after."""
+    """Plot the systematic share of each signal's error, and errors on withheld stretches, before and after.
+
+    found: whether there are findings; without them only the errors before are plotted.
+    """
     names = list(signals)
     figure = Figure(figsize=(11, 0.5 * len(names) + 1.9), layout="constrained")
     figure.suptitle(escape_dollar(title), fontsize=11)

@@ -1,4 +1,4 @@
-"""Figures that answer at a glance: labelled, with units, readable in black and white."""
+"""Figures of designs, verifications, comparisons and logs: labelled with units, readable in black and white."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from excite.identification import SignalComparison, Verification
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion
-from excite.trajectories import OURS, Row
+from excite.trajectories import DESIGNED, ComparisonRow
 
-# Okabe-Ito, told apart by the colour-blind; line styles tell them apart in black and white.
+# Okabe-Ito colours, distinct for the colour-blind; line styles are distinct in black and white.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
-EVEN = 5.0  # errors [%] up to which their axis is linear
-DECADES = 3  # on a logarithmic axis, up to which there are ticks between the powers of ten
+LINEAR_UP_TO = 5.0  # errors [%] up to which their axis is linear; chosen
+TICKED_DECADES = 3  # of a logarithmic axis, up to which it has ticks between powers of ten; chosen
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Writes a figure at print resolution, without the clock in it: the same data give the same bytes."""
+    """Write a figure at print resolution without a date: the same data give the same bytes."""
     figure.savefig(path, dpi=160, metadata={"Software": None} if path.suffix == ".png" else None)
 
 
 def escape_dollar(text: str) -> str:
-    """Text as it is written: a dollar sign in a machine's title or a file's name begins no formula."""
+    """Escape dollar signs, which would begin a formula."""
     return text.replace("$", r"\$")
 
 
 def _style(k: int) -> dict[str, Any]:
-    """Colour and dashes of the k-th of several lines."""
+    """Return colour and dashes of the k-th of several lines."""
     return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
 
 
@@ -61,7 +61,7 @@ def _bound(ax: Axes, value: float) -> None:
 
 
 def design_figure(model: Model, problem: Problem, motion: Motion, title: str) -> Figure:
-    """A drive: torques, speeds, joint angles and slips over time, the path, and how much of each limit is used."""
+    """Plot a drive: torques, speeds, joint angles and slips over time, the path, and the used share of each limit."""
     machine, t = model.machine, motion.t
     moving = [b for b in machine.actuated if b.limit.position is not None]
     slips = model.kinematics(motion.q.T, motion.nu.T)[1].full()
@@ -73,7 +73,7 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
     axes = left.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
     figure.suptitle(escape_dollar(title))
 
-    # torques in per cent of their limit where the joints differ in size, so that one panel shows all
+    # Torques in per cent of their limits, so that one panel shows joints of all sizes.
     named = {
         f"{name} {b.where.replace('_', ' ')}": k
         for k, (name, b) in enumerate(zip(model.inputs, machine.actuated, strict=True))
@@ -146,7 +146,7 @@ def _path(ax: Axes, model: Model, problem: Problem, motion: Motion) -> None:
 
 
 def sigma_figure(sigma: Mapping[str, float], title: str) -> Figure:
-    """What accuracy a drive makes attainable: the Cramer-Rao bound of every parameter, one standard deviation [%]."""
+    """Plot the attainable standard deviation [%] of every parameter (Cramer-Rao bound)."""
     n = len(sigma)
     figure = Figure(figsize=(7.5, 1.2 + 0.27 * n), layout="constrained")
     ax = figure.subplots()
@@ -168,7 +168,7 @@ def sigma_figure(sigma: Mapping[str, float], title: str) -> Figure:
 
 
 def limit_use(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
-    """How much of each limit the motion uses at most: 1 is the limit itself."""
+    """Return the largest used share of each limit; 1 is the limit itself."""
     du = np.gradient(motion.u, motion.t, axis=0)
     use: dict[str, float] = {}
     for bound in trajectories.machine_limits(model, problem):
@@ -181,14 +181,14 @@ def limit_use(model: Model, problem: Problem, motion: Motion) -> dict[str, float
 
 
 def verify_figure(v: Verification, title: str) -> Figure:
-    """Every run's error of every parameter against the predicted spread, and the coverage of 95 % intervals."""
+    """Plot every run's error of every parameter with the predicted 95 % interval, and the intervals' coverage."""
     n = len(v.names)
     figure = Figure(figsize=(10, 1.6 + 0.34 * n), layout="constrained")
     errors, cover = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
     figure.suptitle(escape_dollar(title))
     places = np.arange(n)[::-1]
     e = v.error_percent
-    # An error is within its interval where the truth is: as far below the value as the interval reaches down.
+    # The error lies within these ends exactly if the interval around the value holds the truth.
     ends = 100 * np.nanmean((v.value[:, None] - v.interval) / v.reference, axis=0)
     for k, y in enumerate(places):
         errors.plot(ends[:, k], [y, y], color="0.75", linewidth=9, solid_capstyle="butt", zorder=1)
@@ -210,10 +210,10 @@ def verify_figure(v: Verification, title: str) -> Figure:
 
 
 def _error_axis(ax: Axes, reach: float) -> None:
-    """Errors [%] up to `reach`: evenly where they are alike, otherwise by decades, with ticks that show it."""
+    """Scale an axis of errors [%] up to `reach`: linear for small errors, logarithmic beyond 1 % otherwise."""
     label, top = "error [% of the true value]", reach or 1.0
-    if reach >= EVEN:
-        heads = (1, 2, 5) if reach < 10**DECADES else (1,)
+    if reach >= LINEAR_UP_TO:
+        heads = (1, 2, 5) if reach < 10**TICKED_DECADES else (1,)
         ticks = [float(f"{head}e{k}") for k in range(int(np.log10(reach)) + 2) for head in heads]
         top = next(tick for tick in ticks if tick >= reach)
         ticks = [tick for tick in ticks if tick <= top]
@@ -227,7 +227,7 @@ def _error_axis(ax: Axes, reach: float) -> None:
 
 
 def comparison_figure(model: Model, c: SignalComparison, title: str) -> Figure:
-    """Measured beside predicted, signal by signal, with the residual below each."""
+    """Plot measured and predicted signals, with the residual below each."""
     n = len(c.names)
     figure = Figure(figsize=(10, 0.8 + 3.0 * n), layout="constrained")
     figure.suptitle(escape_dollar(title), fontsize=11)
@@ -241,10 +241,10 @@ def comparison_figure(model: Model, c: SignalComparison, title: str) -> Figure:
     return figure
 
 
-def compare_figure(rows: Sequence[Row], title: str) -> Figure:
-    """Drives side by side, the lowest cond(Phi) on top: cond(Phi), and the attainable accuracy of the worst parameter.
+def compare_figure(rows: Sequence[ComparisonRow], title: str) -> Figure:
+    """Plot cond(Phi) and the attainable accuracy of the worst parameter of several drives, lowest cond(Phi) on top.
 
-    Hatched: a drive that breaks a limit, which its label names.
+    A hatched drive breaks the limit that its label names.
     """
     rows = sorted(rows, key=lambda r: r.cond_phi, reverse=True)
     figure = Figure(figsize=(10.5, 1.5 + 0.36 * len(rows)), layout="constrained")
@@ -256,7 +256,7 @@ def compare_figure(rows: Sequence[Row], title: str) -> Figure:
         axes, values, ("cond(Phi)", "worst parameter: attainable standard deviation [%]"), strict=True
     ):
         for y, (r, value) in enumerate(zip(rows, x, strict=True)):
-            ours, hatch = r.name == OURS, "" if r.breaks is None else "///"
+            ours, hatch = r.name == DESIGNED, "" if r.breaks is None else "///"
             ax.barh(y, value, height=0.65, color=COLOURS[1 if ours else 0], edgecolor="black", hatch=hatch)
             ax.annotate(f"{value:.3g}", (value, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8)
         ax.set_xscale("log")
@@ -268,13 +268,16 @@ def compare_figure(rows: Sequence[Row], title: str) -> Figure:
         ax.set_axisbelow(True)
     names = [r.name if r.breaks is None else f"{r.name}\n(breaks {r.breaks})" for r in rows]
     axes[0].set_yticks(places, names, fontsize=9)
-    for label, r in zip(axes[0].get_yticklabels(), rows, strict=True):  # in black and white colour tells nothing
-        label.set_fontweight("bold" if r.name == OURS else "normal")
+    for label, r in zip(axes[0].get_yticklabels(), rows, strict=True):  # bold, as colour is lost in black and white
+        label.set_fontweight("bold" if r.name == DESIGNED else "normal")
     return figure
 
 
 def log_figure(signals: Mapping[str, tuple[np.ndarray, np.ndarray, str]], gaps: Sequence[float], title: str) -> Figure:
-    """What a log holds, channel by channel over time [SI]: name -> (t (N,) [s], values (N,), unit); gaps [s] dashed."""
+    """Plot a log channel by channel over time.
+
+    signals: name -> times (N,) [s], values (N,) [SI], unit. gaps [s]: dashed lines.
+    """
     count = max(len(signals), 1)
     figure = Figure(figsize=(10, 0.8 + 1.15 * count), layout="constrained")
     figure.suptitle(escape_dollar(title), fontsize=11)

@@ -1,4 +1,4 @@
-"""A machine from above: bodies, joints, what stands on the ground, centres of mass, measuring wheels."""
+"""Drawing of a machine from above: bodies, joints, contacts, centres of mass, measuring wheels."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from excite.model import mechanics
 from excite.model.machine import Body, Machine
 from excite.reports.figures import COLOURS, escape_dollar
 
-NARROW = 0.25  # drawn width of a contact that is a point, in its radius
+POINT_WIDTH = 0.25  # drawn width of a point contact over its radius; chosen
 FRAME, GHOST = "0.55", "0.6"
 
 
 def top_view_figure(machine: Machine) -> Figure:
-    """The machine in its rest position; in grey, with every steered joint at its stop. Raises ValueError without a
-    root that moves on the plane."""
+    """Draw the machine in its rest position, and in grey with every steered joint at its stop.
+
+    Raises ValueError for a machine that does not move on the plane.
+    """
     if not machine.planar:
         raise ValueError(f"{machine.name}: does not move on the plane, so there is nothing to see from above")
     fig = Figure(figsize=(9, 6), layout="constrained")
@@ -30,7 +32,7 @@ def top_view_figure(machine: Machine) -> Figure:
 
 
 def draw_machine(ax: Axes, machine: Machine) -> None:
-    """Draws it: forward is to the right, left is up [m]. Dots are centres of mass, green outlines measuring wheels."""
+    """Draw a machine, forward to the right [m]. Dots are centres of mass, green outlines measuring wheels."""
     at_stop = {
         b.coordinates[0]: float(b.limit.position) for b in steered_joints(machine) if b.limit.position is not None
     }
@@ -60,16 +62,16 @@ def draw_machine(ax: Axes, machine: Machine) -> None:
 
 
 def steered_joints(machine: Machine) -> list[Body]:
-    """Driven joints that turn about the vertical."""
+    """Return the driven joints that turn about the vertical."""
     poses = mechanics.body_poses(machine, {})
     driven = [b for b in machine.actuated if b.contact is None and b.joint == "revolute"]
     return [b for b in driven if abs(poses[b.index][0][2, 2]) > 0.9]
 
 
 def footprints(machine: Machine, q: Mapping[str, float]) -> list[np.ndarray]:
-    """(4, 2) corners [m] of every contact as it stands on the ground at coordinates q, those of the root too.
+    """Return the corners (4, 2) [m] of every contact on the ground at coordinates q, the root's included.
 
-    As long as it is high; a contact that is a point is drawn NARROW.
+    A contact is drawn as long as it is high; a point contact is POINT_WIDTH wide.
     """
     poses = mechanics.body_poses(machine, q)
     x, y, heading = (q.get(c, 0.0) for c in machine.body[0].coordinates)
@@ -80,14 +82,14 @@ def footprints(machine: Machine, q: Mapping[str, float]) -> list[np.ndarray]:
         assert not isinstance(b.antecedent, str)
         radius = float(b.contact.radius)
         own = _footprint(
-            poses[b.antecedent][0], poses[b.index][1], radius, float(b.contact.width) or NARROW * radius, 0.0
+            poses[b.antecedent][0], poses[b.index][1], radius, float(b.contact.width) or POINT_WIDTH * radius, 0.0
         )
         shapes.append(own @ np.array([[c, s], [-s, c]]) + [x, y])
     return shapes
 
 
 def _contacts(ax: Axes, machine: Machine, q: Mapping[str, float], ghost: bool) -> None:
-    """Contacts as rectangles, as long as they are high, their names beside them."""
+    """Draw contacts as rectangles with names; as ghosts only those that moved."""
     poses, still = mechanics.body_poses(machine, q), footprints(machine, {})
     for b, shape, before in zip(machine.contacts, footprints(machine, q), still, strict=True):
         place = poses[b.index][1]
@@ -113,7 +115,7 @@ def _contacts(ax: Axes, machine: Machine, q: Mapping[str, float], ghost: bool) -
 
 
 def _footprint(turned: np.ndarray, place: np.ndarray, radius: float, width: float, lateral: float) -> np.ndarray:
-    """(4, 2) corners of a wheel [m] that stands at `place` in a frame `turned`, to its left by `lateral`."""
+    """Return the corners (4, 2) [m] of a wheel at `place`, shifted left by `lateral`, in the frame `turned`."""
     corners = np.array([[x * radius, lateral + y * width / 2, 0] for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))])
     return np.asarray((corners @ turned.T + place)[:, :2])
 
@@ -143,7 +145,7 @@ def _joints(ax: Axes, machine: Machine, poses: Mapping[int, tuple[np.ndarray, np
 
 
 def _masses(ax: Axes, machine: Machine, poses: Mapping[int, tuple[np.ndarray, np.ndarray]]) -> None:
-    """Centres of mass; the size of the mark goes with the mass."""
+    """Mark the centres of mass; larger marks are heavier bodies."""
     bodies = [b for b in machine.body if b.inertia is not None]
     most = max(float(b.inertia.mass) for b in bodies if b.inertia is not None) if bodies else 1.0
     for b in bodies:

@@ -1,7 +1,7 @@
-"""Where work is computed: in this process, in processes of this machine, or on a Dask cluster.
+"""Compute pieces of work in this process, in processes of this computer, or on a Dask cluster.
 
-All three are executors of `concurrent.futures`; what is here keeps a bounded number of pieces in flight, sees to it
-that a worker that dies costs no result, and finds the piece that kills every worker that takes it.
+All three are executors of `concurrent.futures`. A bounded number of pieces is in flight; pieces of a worker that dies
+are computed again, and a piece that kills every worker is given up.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ import joblib
 
 from excite.errors import WorkerError
 
-PIECES_PER_WORKER = 2  # pieces in flight per worker: one at work, one at hand
-MAX_DEATHS = 3  # deaths of a worker that had a piece alone before the piece is to blame: others kill workers too
-LOGGERS = ("distributed", "distributed.client")  # of Dask, with levels of their own
+PIECES_PER_WORKER = 2  # in flight: one being computed, one waiting
+MAX_DEATHS = (
+    3  # of workers that had a piece alone, before the piece is given up; chosen: workers die by other causes too
+)
+LOGGERS = ("distributed", "distributed.client")  # Dask's
 SCHEDULER_GONE = "the cluster's scheduler is gone; start it and repeat the command"
 THREADS = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
@@ -32,7 +34,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class PieceResult(Generic[T, R]):
-    """What came of a piece of work, in so many seconds; value None where it killed its workers."""
+    """Value of a piece of work, None if it killed its workers, and the time [s] it took."""
 
     piece: T
     value: R | None
@@ -40,9 +42,9 @@ class PieceResult(Generic[T, R]):
 
 
 class Pool(Protocol):
-    """Workers, and what to do where they die.
+    """Workers of some kind.
 
-    shared: one's death is the end of all that is in flight; foreign: they have a program of their own.
+    shared: the death of one ends everything in flight. foreign: the workers have their own copy of the program.
     """
 
     shared: bool
@@ -56,7 +58,7 @@ class Pool(Protocol):
 
 
 class _Inline(Executor):
-    """In this process, at once."""
+    """An executor that computes at once, in this process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -68,7 +70,7 @@ class _Inline(Executor):
 
 
 class ThisProcess:
-    """This process."""
+    """This process as the only worker."""
 
     size, shared, foreign = 1, False, False
 
@@ -82,12 +84,12 @@ class ThisProcess:
 
 
 def _ignore_interrupt() -> None:
-    """Ctrl-C is for the driver; its workers end with it."""
+    """Ignore Ctrl-C in a worker: the main process ends its workers."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class LocalProcesses:
-    """Processes of this machine."""
+    """Processes of this computer."""
 
     shared, foreign = True, False
 
@@ -104,18 +106,18 @@ class LocalProcesses:
     def renew(self) -> None:
         from joblib.externals.loky import get_reusable_executor
 
-        # One BLAS thread each: the same bytes whatever the number of workers.
+        # One BLAS thread each, so that results do not depend on the number of workers.
         self._executor: Executor = get_reusable_executor(
             max_workers=self.size, timeout=60, env=THREADS, initializer=_ignore_interrupt
         )
 
     def close(self) -> None:
-        """Ends the processes; those at work are killed."""
+        """End the processes, killing those at work."""
         self._executor.shutdown(wait=True, kill_workers=True)  # type: ignore[call-arg]
 
 
 class DaskCluster:
-    """The workers of a Dask scheduler, which itself repeats what was lost with a worker."""
+    """Workers of a Dask scheduler, which repeats the work of a lost worker itself."""
 
     shared, foreign = False, True
 
@@ -125,7 +127,7 @@ class DaskCluster:
         except ImportError:
             raise WorkerError("--cluster needs Dask: pip install 'excite[cluster]'") from None
         self._levels = {logger: logger.level for logger in map(logging.getLogger, LOGGERS)}
-        for logger in self._levels:  # their tracebacks of a lost connection: what it means is said in a line
+        for logger in self._levels:  # a lost connection is reported in one line instead
             logger.setLevel(logging.CRITICAL)
         try:
             client: Any = distributed.Client  # has no types
@@ -147,7 +149,7 @@ class DaskCluster:
 
     @contextmanager
     def _asked(self) -> Iterator[None]:
-        """What is asked of the scheduler fails in several ways once that is gone. Raises EngineError."""
+        """Turn any failure of a call to a lost scheduler into a WorkerError."""
         try:
             yield
         except Exception as err:
@@ -174,9 +176,9 @@ class DaskCluster:
 
 @contextmanager
 def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[Pool]:
-    """Workers: `jobs` processes of this machine (all its cores by default; 1: this process), or those of a cluster.
+    """Open workers: `jobs` processes (all cores by default; 1: this process), or those of a cluster.
 
-    Raises EngineError.
+    Raises WorkerError.
     """
     if cluster is not None:
         remote = DaskCluster(cluster)
@@ -206,10 +208,10 @@ def _timed(call: Callable[[T], R], piece: T) -> tuple[R, float]:
 def run_pieces(
     call: Callable[[T], R], pieces: Iterable[T], workers: Pool, split: Callable[[T], list[T]] = lambda piece: [piece]
 ) -> Iterator[PieceResult[T, R]]:
-    """Results of `call` on the pieces as they come, AHEAD pieces per worker in flight; pieces are taken as needed.
+    """Yield the results of `call` on pieces as they come; pieces are taken from the iterable as needed.
 
-    Where a worker dies, what was in flight is done again, a piece at a time, and split; a piece that kills TRIES
-    workers alone comes back without a value. Exceptions of `call` are passed on. Raises EngineError.
+    After the death of a worker, pieces in flight are split and computed again one at a time. A piece that kills
+    MAX_DEATHS workers alone comes back without a value. Raises WorkerError, and the exceptions of `call`.
     """
     source = iter(pieces)
     suspects: deque[tuple[T, int]] = deque()
@@ -226,7 +228,7 @@ def run_pieces(
                     break
             try:
                 flying[workers.submit(_timed, call, piece)] = piece, deaths
-            except BrokenExecutor:  # died before it got anything
+            except BrokenExecutor:  # the pool died before it got the piece
                 workers.renew()
                 suspects.append((piece, deaths))
             if suspects:

@@ -1,7 +1,7 @@
-"""What is wrong or doubtful in a machine file.
+"""Check a machine file.
 
-One plain function per kind of complaint, in the tables FAULTS (the machine can't be as the file says, or nothing can be
-done with it) and DOUBTS (it can, but hardly is); each takes a model and yields lines.
+Each rule is a function that takes a model and yields lines. FAULTS holds rules for impossible or unusable machines,
+DOUBTS rules for unlikely ones.
 """
 
 from __future__ import annotations
@@ -19,20 +19,22 @@ from excite import identification, reports, smoothing, trajectories
 from excite.errors import MachineError, SimulationError
 from excite.model import Model, build, effects, mechanics, parameter_descriptions, standard_parameters
 from excite.model.effects import GRAVITY
-from excite.model.machine import Machine, Problem, Quantity, error_lines as files_complaints, load_machine
+from excite.model.machine import Machine, Problem, Quantity, error_lines, load_machine
 from excite.simulation import simulate
 from excite.workflows.requests import LONGEST_DRIVE_S
 
 PICTURE = "machine.png"
-LINEAR = 0.15  # slip up to which the linear law holds, where a contact gives no limit
-CRAWL = 0.05  # m/s2: a machine that can't be accelerated so much hardly moves
-LOADS = (0.3, 50.0)  # stiffness of a contact over the load on it
-WHEELS = (0.02, 2.0)  # radius of a measuring wheel [m]
-ASIDE = 10.0  # m: a measuring wheel runs nearer than that
-LARGEST, WIDEST = 5.0, 20.0  # radius and width of a contact [m]
-STEERING = 3.5  # rad/s: a joint that turns a chassis by 200 degrees in a second is none
-FASTEST = 10e3  # Hz: beyond it no random drive is tried, which would take minutes
-TRIED, HARDLY = (0, 1), 50.0  # random drives; what is uncertain by so much [%] after the best of them
+LINEAR_SLIP = 0.15  # slip up to which the linear law holds, for a contact without a limit; as on va12
+MIN_ACCELERATION = 0.05  # [m/s2] that the contacts must allow; chosen
+STIFFNESS_PER_LOAD = (0.3, 50.0)  # usual stiffness of a contact over its load; chosen
+WHEEL_RADIUS = (0.02, 2.0)  # usual radius of a measuring wheel [m]; chosen
+MAX_LATERAL = 10.0  # usual lateral distance of a measuring wheel [m]; chosen
+MAX_RADIUS = 5.0  # usual radius of a contact [m]; chosen
+MAX_WIDTH = 20.0  # usual width of a contact [m]; chosen
+MAX_STEERING_RATE = 3.5  # usual rate of a steered joint [rad/s]: 200 degrees in a second; chosen
+MAX_SAMPLING_HZ = 10e3  # above it no random drive is tried, which would take minutes; chosen
+TRIAL_SEEDS = (0, 1)  # of the random drives
+POORLY_IDENTIFIABLE = 50.0  # standard deviation [%] after the best random drive, from which to warn; chosen
 TRIAL = Problem(
     source="definition",
     duration_s=Quantity(value=20.0, source="definition"),
@@ -44,10 +46,10 @@ TRIAL = Problem(
 
 @dataclass(frozen=True)
 class MachineCheck:
-    """A machine file: what is wrong, what is doubtful, what else must be known, a line each; its model if it has one.
+    """Faults, doubts and remarks of a machine file, a line each, and its model if it has one.
 
-    sigma_percent: after the best of some random drives, one standard deviation by parameter (Cramer-Rao, all sensors);
-    empty where none could be driven, or none was tried.
+    sigma_percent: standard deviation by parameter after the best of some random drives (Cramer-Rao bound, all sensors);
+    empty if no drive was tried or possible.
     """
 
     faults: tuple[str, ...]
@@ -58,7 +60,7 @@ class MachineCheck:
 
 
 def check_file(path: Path) -> MachineCheck:
-    """Everything that can be said of a machine file without a log. Raises MachineError where there is none to read."""
+    """Check a machine file. Raises MachineError for a file that can't be read."""
     faults = file_errors(path)
     if faults:
         return MachineCheck(tuple(faults), (), (), None, {})
@@ -68,27 +70,27 @@ def check_file(path: Path) -> MachineCheck:
         return MachineCheck((str(err),), (), (), None, {})
     faults = [line for rule in FAULTS for line in rule(model)]
     doubts = [line for rule in DOUBTS for line in rule(model)]
-    sigma = {} if faults or float(model.machine.sampling_hz) > FASTEST else _random_drive_sigma(model)
+    sigma = {} if faults or float(model.machine.sampling_hz) > MAX_SAMPLING_HZ else _random_drive_sigma(model)
     doubts += [
         f"{name}: random drives leave it uncertain by {value:.0f} %: hardly any drive shows it apart from the others"
         for name, value in sigma.items()
-        if value > HARDLY
+        if value > POORLY_IDENTIFIABLE
     ]
     return MachineCheck(tuple(faults), tuple(doubts), tuple(describe_invisible(model)), model, sigma)
 
 
 def file_errors(path: Path) -> list[str]:
-    """All that keeps a file from being a machine, a line each. Raises MachineError where there's none to read."""
+    """Return every error of a file's keys, a line each. Raises MachineError for a file that can't be read."""
     try:
         load_machine(path)
     except MachineError as err:
         if not isinstance(err.__context__, ValidationError):
             raise
-        return files_complaints(path, err.__context__, Machine)
+        return error_lines(path, err.__context__, Machine)
     return []
 
 
-# ------------------------------------------------------------------------------------------------ wrong
+# ------------------------------------------------------------------------------------------------ faults
 
 
 def _mass(model: Model) -> Iterator[str]:
@@ -162,7 +164,7 @@ def _sensors(model: Model) -> Iterator[str]:
 FAULTS: tuple[Callable[[Model], Iterator[str]], ...] = (_mass, _tensor, _stuck, _lane, _sensors)
 
 
-# ------------------------------------------------------------------------------------------------ doubtful
+# ------------------------------------------------------------------------------------------------ doubts
 
 
 def _traction(model: Model) -> Iterator[str]:
@@ -173,14 +175,14 @@ def _traction(model: Model) -> Iterator[str]:
     push = 0.0
     for b in machine.contacts:
         assert b.contact is not None
-        slip = float(b.contact.slip_limit) if b.contact.slip_limit is not None else LINEAR
+        slip = float(b.contact.slip_limit) if b.contact.slip_limit is not None else LINEAR_SLIP
         push += abs(float(b.contact.Kx)) * slip * b.actuated
         load = mass * GRAVITY / len(machine.contacts)
         for key in ("Kx", "Ky"):
             stiff = abs(float(getattr(b.contact, key)))
-            if not LOADS[0] * load < stiff < LOADS[1] * load:
+            if not STIFFNESS_PER_LOAD[0] * load < stiff < STIFFNESS_PER_LOAD[1] * load:
                 yield f"{b.name}: contact.{key}: {stiff:.3g} N per slip, {stiff / load:.2g} times its load"
-    if push < CRAWL * mass:
+    if push < MIN_ACCELERATION * mass:
         yield f"contacts: with all slip that is allowed they push {push:.3g} N, {push / mass:.2g} m/s2 for {mass:g} kg"
 
 
@@ -219,7 +221,7 @@ def _bounds(model: Model) -> Iterator[str]:
 
 
 def _bodies(model: Model) -> Iterator[str]:
-    """Centres of mass and radii of gyration against the size of the machine; spin inertia against a flat disc's."""
+    """Compare centres of mass and radii of gyration with the machine's size, spin inertia with a flat disc's."""
     poses = mechanics.body_poses(model.machine, {})
     places = np.array([P for _, P in poses.values()])
     reach = float(np.ptp(places, axis=0).max()) + 2 * max(
@@ -244,16 +246,16 @@ def _bodies(model: Model) -> Iterator[str]:
 
 
 def _sizes(model: Model) -> Iterator[str]:
-    """Lengths as no machine has them."""
+    """Find lengths in wrong units."""
     for s in model.machine.sensors("full"):
-        if s.radius is not None and not WHEELS[0] <= float(s.radius) <= WHEELS[1]:
-            low, high = WHEELS
+        if s.radius is not None and not WHEEL_RADIUS[0] <= float(s.radius) <= WHEEL_RADIUS[1]:
+            low, high = WHEEL_RADIUS
             yield f"sensor {s.name}: radius: {float(s.radius):g} m, usual are {low:g} to {high:g}: in mm?"
-        if s.lateral is not None and abs(float(s.lateral)) > ASIDE:
-            yield f"sensor {s.name}: lateral: {float(s.lateral):g} m, usual are {ASIDE:g} at most: in mm?"
+        if s.lateral is not None and abs(float(s.lateral)) > MAX_LATERAL:
+            yield f"sensor {s.name}: lateral: {float(s.lateral):g} m, usual are {MAX_LATERAL:g} at most: in mm?"
     for b in model.machine.contacts:
         assert b.contact is not None
-        for key, most in (("radius", LARGEST), ("width", WIDEST)):
+        for key, most in (("radius", MAX_RADIUS), ("width", MAX_WIDTH)):
             size = float(getattr(b.contact, key))
             if size > most:
                 yield f"{b.name}: contact.{key}: {size:g} m, usual are {most:g} at most: in mm?"
@@ -264,17 +266,17 @@ def _slips(model: Model) -> Iterator[str]:
         if b.contact is not None and b.contact.slip_limit is not None and float(b.contact.slip_limit) > 1:
             yield (
                 f"{b.name}: contact.slip_limit: {float(b.contact.slip_limit):g}, the linear law holds to about"
-                f" {LINEAR:g}: in per cent?"
+                f" {LINEAR_SLIP:g}: in per cent?"
             )
 
 
 def _times(model: Model) -> Iterator[str]:
-    """Rates and durations as no machine has them, and a filter whose decimation takes more than its cut-off."""
+    """Find rates and durations in wrong units, and a decimation that removes more than the filter's cut-off."""
     for b in reports.steered_joints(model.machine):
-        if b.limit.rate is not None and float(b.limit.rate) > STEERING:
+        if b.limit.rate is not None and float(b.limit.rate) > MAX_STEERING_RATE:
             yield (
                 f"{b.name}: limit.rate: {float(b.limit.rate):g} rad/s, steered joints turn by less than"
-                f" {STEERING:g}: in deg/s?"
+                f" {MAX_STEERING_RATE:g}: in deg/s?"
             )
     for name, problem in model.machine.problems.items():
         if float(problem.duration_s) > LONGEST_DRIVE_S:
@@ -283,13 +285,15 @@ def _times(model: Model) -> Iterator[str]:
                 " in ms?"
             )
     f, rate = model.machine.filter, float(model.machine.sampling_hz)
-    if rate > FASTEST:
+    if rate > MAX_SAMPLING_HZ:
         yield (
-            f"sampling_hz: {rate:g} Hz, usual are {FASTEST:g} at most: samples in a second? (no random drive is"
+            f"sampling_hz: {rate:g} Hz, usual are {MAX_SAMPLING_HZ:g} at most: samples in a second? (no random drive is"
             " tried at such a rate)"
         )
     left = rate / f.decimation / 2
-    if left < float(f.cutoff_hz) and f.source != "published":  # who published one has tried it: EMPS cuts lower so
+    if (
+        left < float(f.cutoff_hz) and f.source != "published"
+    ):  # a published filter was tried by its authors, as that of EMPS
         yield (
             f"filter.decimation: one row in {f.decimation} at {rate:g} Hz shows motion up to {left:g} Hz, below"
             f" filter.cutoff_hz {float(f.cutoff_hz):g}: at most {int(rate / 2 / float(f.cutoff_hz))} keeps all of it"
@@ -304,7 +308,7 @@ def _effects(model: Model) -> Iterator[str]:
 
 
 def _turning(model: Model) -> Iterator[str]:
-    """Chassis that turn about the vertical as if their mass were in one point."""
+    """Find chassis that turn about the vertical without inertia."""
     poses = mechanics.body_poses(model.machine, {})
     for b in model.machine.body:
         i = b.inertia
@@ -325,7 +329,7 @@ def _noise(model: Model) -> Iterator[str]:
 
 
 def _scales(model: Model) -> Iterator[str]:
-    """Scales that reach no base parameter, and base parameters so near zero that their relative error means nothing."""
+    """Find scales without a base parameter, and base parameters near zero without a scale."""
     base, groups = model.base, {s: n for n in model.base.names for s in model.base.grouping(n)}
     for name in model.machine.scale:
         if name not in base.names and groups.get(name) not in (None, name):
@@ -345,11 +349,11 @@ DOUBTS: tuple[Callable[[Model], Iterator[str]], ...] = (
 )
 
 
-# ------------------------------------------------------------------------------------------------ unseen
+# ------------------------------------------------------------------------------------------------ invisible
 
 
 def describe_invisible(model: Model) -> Iterator[str]:
-    """Standard parameters other than zero that no drive reveals, and why; bodies that are only seen within others."""
+    """Yield the standard parameters, other than zero, that no drive shows, with the reason."""
     machine = model.machine
     table = dict(zip(model.base.standard, _standard(model), strict=True))
     left = [n for n in model.base.invisible if table[n]]
@@ -373,20 +377,22 @@ def _standard(model: Model) -> list[float]:
 
 
 def _random_drive_sigma(model: Model) -> dict[str, float]:
-    """One standard deviation [%] of every parameter after the best of some random drives; {} where there is none.
+    """Return the standard deviation [%] of every parameter after the best of some random drives, {} without a drive.
 
-    Of the nominal value or the scale, whichever is larger: per cent of what is nearly zero mean little.
+    In per cent of the nominal value or the scale, whichever is larger.
     """
     best: dict[str, float] = {}
     size = np.maximum(np.abs(model.nominal), model.scale)
-    for seed in TRIED:
+    for seed in TRIAL_SEEDS:
         wish = trajectories.multisine(model, TRIAL, seed, top=0.4)
         for share in 0.75 ** np.arange(14):
             try:
-                motion = simulate(model, trajectories.scaled(wish, share).sample(float(model.machine.sampling_hz)))
+                motion = simulate(
+                    model, trajectories.scale_torques(wish, share).sample(float(model.machine.sampling_hz))
+                )
             except SimulationError:
                 continue
-            if trajectories.kept_between(trajectories.check_limits(model, TRIAL, motion)):
+            if trajectories.keeps_motion_limits(trajectories.check_limits(model, TRIAL, motion)):
                 break
         else:
             continue
@@ -399,11 +405,11 @@ def _random_drive_sigma(model: Model) -> dict[str, float]:
     return best
 
 
-# ------------------------------------------------------------------------------------------------ the commands' work
+# ------------------------------------------------------------------------------------------------ the command
 
 
 def check_machine(place: Path, path: Path, versions: dict[str, str]) -> dict[str, Any]:
-    """What there is to say of a machine file, with its picture and report in a folder. Raises MachineError."""
+    """Check a machine file into a folder with figure and report; return the summary. Raises MachineError."""
     found = check_file(path)
     model = found.model
     summary: dict[str, Any] = {

@@ -40,7 +40,7 @@ def motion_of(model: Model, speed: np.ndarray, angle: np.ndarray) -> Motion:
 def test_phases_of_a_drive_made_of_phases_are_these(va12: Model) -> None:
     t = np.arange(2701) / 100
     motion = motion_of(va12, np.interp(t, KNOTS, SPEED), np.interp(t, KNOTS, ANGLE[:, 0]))
-    trace = ground.phases(va12, motion, most=9)
+    trace = ground.trace_from_motion(va12, motion, most=9)
     assert trace.times == pytest.approx(KNOTS)
     assert trace.speed == pytest.approx(SPEED, abs=1e-9)
     assert trace.angle == pytest.approx(ANGLE, abs=1e-9)
@@ -50,7 +50,7 @@ def test_phases_of_a_drive_made_of_phases_are_these(va12: Model) -> None:
 def test_phases_are_few_and_long_enough_and_within_the_machine(
     va12: Model, va12_motion: Motion, most: int, shortest: float
 ) -> None:
-    trace = ground.phases(va12, va12_motion, shortest, most)
+    trace = ground.trace_from_motion(va12, va12_motion, shortest, most)
     assert 2 <= len(trace) <= most
     assert np.diff(trace.times).min() >= shortest - 1e-9
     assert trace.times[-1] == va12_motion.t[-1]
@@ -62,7 +62,7 @@ def test_phases_are_few_and_long_enough_and_within_the_machine(
 
 def test_more_phases_are_nearer_to_the_design(va12: Model, va12_motion: Motion) -> None:
     def misfit(most: int) -> float:
-        speed, _ = ground.phases(va12, va12_motion, most=most).at(va12_motion.t)
+        speed, _ = ground.trace_from_motion(va12, va12_motion, most=most).at(va12_motion.t)
         return float(np.mean((speed - va12_motion.nu[:, 0]) ** 2))
 
     assert misfit(4) > misfit(8) > misfit(16)
@@ -76,12 +76,12 @@ def test_what_makes_no_phases_is_refused(
     va12: Model, va12_motion: Motion, most: int, shortest: float, words: str
 ) -> None:
     with pytest.raises(UndrivableError, match=words):
-        ground.phases(va12, va12_motion, shortest, most)
+        ground.trace_from_motion(va12, va12_motion, shortest, most)
 
 
 def test_a_machine_without_wheels_has_no_driver(emps: Model) -> None:
     with pytest.raises(UndrivableError, match="emps"):
-        ground.levers(emps)
+        ground.find_levers(emps)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_steered_joints_have_the_machines_names(name: str, joints: list[str]) ->
     """A machine without any is asked for none."""
     model = build(load_machine(name))
     angle = np.outer([0.0, 0.1, 0], np.ones(len(joints)))
-    trace = Trace(np.array([0.0, 4, 8]), np.array([0.0, 1, 0]), angle, ground.levers(model))
+    trace = Trace(np.array([0.0, 4, 8]), np.array([0.0, 1, 0]), angle, ground.find_levers(model))
     assert [lever["name"] for lever in page.driver_data(model, trace, name)["levers"]] == joints
     text = page.driver_page(model, trace, name)
     assert [f'<div class="name">{joint}</div>' in text for joint in joints] == [True] * len(joints)
@@ -106,10 +106,10 @@ def test_steered_joints_have_the_machines_names(name: str, joints: list[str]) ->
 
 
 def test_words_say_what_to_do(va12: Model) -> None:
-    (lever,) = ground.levers(va12)
+    (lever,) = ground.find_levers(va12)
     assert lever.left == -1
     trace = Trace(KNOTS, SPEED, -ANGLE, (lever,))
-    assert [ground.words(trace, k) for k in range(len(trace))] == [
+    assert [ground.phase_words(trace, k) for k in range(len(trace))] == [
         "accelerate to 1.5 m/s in 4 s, straight",
         "hold 1.5 m/s for 5 s, steer to 20° left",
         "brake to a stop in 3 s, keep 20° left",
@@ -119,13 +119,13 @@ def test_words_say_what_to_do(va12: Model) -> None:
         "brake to a stop in 4 s, straighten up",
     ]
     slower = Trace(np.array([0.0, 3, 6, 9]), np.array([0.0, -1.5, -0.5, 0]), np.zeros((4, 0)), ())
-    assert ground.words(slower, 1) == "slow down to 0.5 m/s backward in 3 s"
+    assert ground.phase_words(slower, 1) == "slow down to 0.5 m/s backward in 3 s"
     through = Trace(np.array([0.0, 2, 5, 7]), np.array([0.0, 1, -0.5, 0]), np.zeros((4, 0)), ())
-    assert ground.words(through, 1) == "through a stop at 0:04 to 0.5 m/s backward in 3 s"
-    assert ground.words(through, 1, letters=True).startswith("through a stop A at 0:04")
-    assert ground.reversals(through) == pytest.approx([4.0], abs=0.2)
-    assert ground.reversals(trace) == pytest.approx([15.0], abs=0.2)
-    named = [ground.words(trace, k, letters=True) for k in range(len(trace))]
+    assert ground.phase_words(through, 1) == "through a stop at 0:04 to 0.5 m/s backward in 3 s"
+    assert ground.phase_words(through, 1, letters=True).startswith("through a stop A at 0:04")
+    assert ground.reversal_times(through) == pytest.approx([4.0], abs=0.2)
+    assert ground.reversal_times(trace) == pytest.approx([15.0], abs=0.2)
+    named = [ground.phase_words(trace, k, letters=True) for k in range(len(trace))]
     assert [words for words in named if "stop A" in words] == ["brake to a stop A in 3 s, keep 20° left"]
 
 
@@ -134,11 +134,13 @@ def test_every_change_of_direction_on_the_map_is_in_the_table(va12: Model, seed:
     """Through a stop or with a rest between, each letter stands in one row, in order."""
     rng = np.random.default_rng(seed)
     speed = np.array([0.0, *rng.choice([-1.2, -0.1, 0, 0.1, 1.5], 25), 0])
-    trace = Trace(3.0 * np.arange(len(speed)), speed, np.zeros((len(speed), 1)), ground.levers(va12))
-    turns = ground.reversals(trace)
-    rows = [ground.words(trace, k, letters=True) for k in range(len(trace))]
+    trace = Trace(3.0 * np.arange(len(speed)), speed, np.zeros((len(speed), 1)), ground.find_levers(va12))
+    turns = ground.reversal_times(trace)
+    rows = [ground.phase_words(trace, k, letters=True) for k in range(len(trace))]
     found = [row.partition(" stop ")[2].split()[0] for row in rows if " stop " in row]
-    assert [name for name in found if name not in ("at", "in")] == [ground.letter(k) for k in range(len(turns))]
+    assert [name for name in found if name not in ("at", "in")] == [
+        ground.reversal_letter(k) for k in range(len(turns))
+    ]
 
 
 @pytest.mark.parametrize(
@@ -154,7 +156,7 @@ def test_every_change_of_direction_on_the_map_is_in_the_table(va12: Model, seed:
 def test_where_to_start_is_said(va12: Model, x: float, y: float, degrees: float, words: str) -> None:
     motion = motion_of(va12, np.zeros(2), np.zeros(2))
     motion.q[:, :3] = [x, y, np.deg2rad(degrees)]
-    trace = Trace(KNOTS, SPEED, ANGLE, ground.levers(va12))
+    trace = Trace(KNOTS, SPEED, ANGLE, ground.find_levers(va12))
     said = ground.start_words(va12, motion, trace)
     assert said.startswith(f"Start, seen along the lane: the middle of the front roll {words}")
 
@@ -165,11 +167,11 @@ def test_a_lane_that_can_only_be_followed_needs_no_place(straight: Model) -> Non
 
 
 def test_words_name_each_of_several_joints() -> None:
-    front, rear = ground.levers(build(load_machine("tandem")))
+    front, rear = ground.find_levers(build(load_machine("tandem")))
     degrees = np.array([[0.0, 0], [20, 0], [20, -10], [20, -10], [0, -10], [0, 0]])
     times, speed = np.arange(0, 18, 3.0), np.array([0.0, 1, 1, 1, 1, 0])
     trace = Trace(times, speed, np.deg2rad(degrees) * [front.left, rear.left], (front, rear))
-    assert [ground.trace_parts(trace, k)[1] for k in range(len(trace))] == [
+    assert [ground.phase_parts(trace, k)[1] for k in range(len(trace))] == [
         "front steering to 20° left, rear steering straight",
         "keep front steering 20° left, rear steering to 10° right",
         "keep front steering 20° left, keep rear steering 10° right",
@@ -178,7 +180,7 @@ def test_words_name_each_of_several_joints() -> None:
     ]
     rows = ground.trace_table(trace)
     assert rows[1]["rear_steering_rad"] == pytest.approx([0, -rear.left * np.deg2rad(10)])
-    again = ground.from_table(build(load_machine("tandem")), rows)
+    again = ground.trace_from_table(build(load_machine("tandem")), rows)
     assert again.angle == pytest.approx(trace.angle)
 
 
@@ -190,10 +192,10 @@ def test_words_name_each_of_several_joints() -> None:
     ],
 )
 def test_phases_that_cannot_be_read_are_refused(va12: Model, change: dict[str, str], why: str) -> None:
-    trace = Trace(KNOTS, SPEED, ANGLE, ground.levers(va12))
+    trace = Trace(KNOTS, SPEED, ANGLE, ground.find_levers(va12))
     rows = [{change.get(name, name): value for name, value in row.items()} for row in ground.trace_table(trace)]
     with pytest.raises(UndrivableError, match=why):
-        ground.from_table(va12, rows)
+        ground.trace_from_table(va12, rows)
 
 
 @pytest.mark.parametrize("name", ["va12", "tandem", "double_loader"])
@@ -201,12 +203,12 @@ def test_left_is_where_the_machine_goes(name: str) -> None:
     """The sign from pure rolling is what simulation does: forward, each joint alone to its left, the machine turns
     left; all of them to the left it turns more, to different sides less than with the first alone."""
     model = build(load_machine(name))
-    levers = ground.levers(model)
+    levers = ground.find_levers(model)
 
     def heading(*sides: int) -> float:
         angle = np.outer([0.0, 1, 1], 0.2 * np.multiply(sides, [lever.left for lever in levers]))
         trace = Trace(np.array([0.0, 4, 10]), np.array([0.0, 1, 1]), angle, levers)
-        return float(ground.driven(model, trace, STEADY_DRIVER, 0).q[-1, model.coordinates.index("theta0")])
+        return float(ground.follow_trace(model, trace, STEADY_DRIVER, 0).q[-1, model.coordinates.index("theta0")])
 
     alone = [heading(*row) for row in np.eye(len(levers), dtype=int)]
     assert min(alone) > 0.1
@@ -216,7 +218,7 @@ def test_left_is_where_the_machine_goes(name: str) -> None:
 
 
 def test_a_straight_lane_has_nothing_to_steer(straight: Model) -> None:
-    assert ground.levers(straight) == ()
+    assert ground.find_levers(straight) == ()
 
 
 @pytest.mark.parametrize("name", ["tandem", "double_loader"])
@@ -227,16 +229,16 @@ def test_several_joints_are_followed_by_one_person(name: str) -> None:
     drawn = json.loads((RESULTS / "machines" / name / "drive.json").read_text())
     torque = Manoeuvre(np.array(drawn["times_s"]), np.array(drawn["torque"])).sample(100.0)
     motion = simulate(model, torque, q0=np.array(drawn["start"]))
-    trace = ground.phases(model, motion)
+    trace = ground.trace_from_motion(model, motion)
     assert np.ptp(trace.angle, axis=0).min() > 3 * ground.ANGLE_STEP
-    _, widest, swing = ground.bounds(model)
+    _, widest, swing = ground.trace_bounds(model)
     assert (np.abs(trace.angle).max(axis=0) <= widest).all()
     assert (np.abs(np.diff(trace.angle, axis=0)) <= np.outer(np.diff(trace.times), swing) + 1e-9).all()
-    person = ground.driven(model, trace, None, 1, motion.q[0])
+    person = ground.follow_trace(model, trace, None, 1, motion.q[0])
     wanted = trace.at(person.t)[1]
     rows = [model.coordinates.index(lever.body.coordinates[0]) for lever in trace.levers]
     for got, reference in zip(person.q[:, rows].T, wanted.T, strict=True):
-        low, high = ground.band(person.t, reference, ground.BAND_ANGLE)
+        low, high = ground.tolerance_band(person.t, reference, ground.BAND_ANGLE)
         assert np.mean((got >= low) & (got <= high)) > 0.9
 
 
@@ -258,7 +260,7 @@ def test_room_of_a_straight_pass_is_its_length_and_the_rolls_width(straight: Mod
     """10 m forward: the axles are 3.2 m apart, the rolls 2.1 m wide."""
     motion = motion_of(straight, np.zeros(101), np.zeros(101))
     motion.q[:, 0] = np.linspace(0, 10, 101)
-    room = ground.room(straight, [motion])
+    room = ground.touched_ground(straight, [motion])
     assert room.length == pytest.approx(10 + 1.45 + 1.75)
     assert room.width == pytest.approx(2.1)
     assert room.corner == pytest.approx((-3.2, -1.05))
@@ -266,7 +268,7 @@ def test_room_of_a_straight_pass_is_its_length_and_the_rolls_width(straight: Mod
 
 def test_edges_turn_with_the_articulation(va12: Model) -> None:
     motion = motion_of(va12, np.zeros(2), np.full(2, 0.5))
-    front, rear = ground.edges(va12, motion)[:, :, 0]
+    front, rear = ground.contact_edges(va12, motion)[:, :, 0]
     assert front[1] - front[0] == pytest.approx([0, 2.1])
     assert rear[1] - rear[0] == pytest.approx([-2.1 * np.sin(0.5), 2.1 * np.cos(0.5)])
     assert rear.mean(axis=0) == pytest.approx([-1.45 - 1.75 * np.cos(0.5), -1.75 * np.sin(0.5)])
@@ -277,17 +279,17 @@ def test_moved_motion_is_the_same_motion_elsewhere(va12: Model, va12_motion: Mot
     start = va12_motion.q[0].copy()
     start[:3] = [3.0, -2.0, 0.7]
     short = simulate(va12, va12_motion.u[:801], q0=start)
-    assert ground.moved(va12, va12_motion, start).q[:801] == pytest.approx(short.q, abs=1e-6)
+    assert ground.move_motion(va12, va12_motion, start).q[:801] == pytest.approx(short.q, abs=1e-6)
 
 
 def first_page(model: Model, lane: tuple[float, float], speed: float = 1.5) -> Figure:
     """The sheet of a drive forward and back, some metres long."""
-    levers = ground.levers(model)
+    levers = ground.find_levers(model)
     t = np.array([0.0, 2, 6, 8, 10, 12, 14, 16])
     v = np.array([0.0, speed, speed, 0, 0, -0.5, -0.5, 0])
     trace = Trace(t, v, -np.deg2rad([[0.0], [0], [0], [-14], [-14], [0], [0], [0]])[:, : len(levers)], levers)
-    motions = (ground.driven(model, trace, STEADY_DRIVER, 0),)
-    made = sheet.Sheet("A drive", model, trace, motions, ground.room(model, motions), lane, (), (), "Good.")
+    motions = (ground.follow_trace(model, trace, STEADY_DRIVER, 0),)
+    made = sheet.Sheet("A drive", model, trace, motions, ground.touched_ground(model, motions), lane, (), (), "Good.")
     figure = sheet._first(made)
     figure.draw_without_rendering()
     return figure
@@ -337,7 +339,7 @@ def test_stops_at_one_place_are_one_mark() -> None:
 def test_names_on_the_map_do_not_hide_each_other() -> None:
     """Eight changes of direction within two metres, a metre on 11 points of paper: no name on another or on a mark."""
     rng = np.random.default_rng(1)
-    marks = [("D", ground.letter(k), rng.uniform(0, 2, 2) * [3, 1]) for k in range(8)]
+    marks = [("D", ground.reversal_letter(k), rng.uniform(0, 2, 2) * [3, 1]) for k in range(8)]
     figure = Figure(figsize=(5, 5))
     ax = figure.subplots()
     ax.set_position((0, 0, 1, 1))
@@ -357,12 +359,12 @@ def test_names_on_the_map_do_not_hide_each_other() -> None:
 def test_texts_on_the_second_page_do_not_overlap(names: tuple[str, ...], n: int) -> None:
     """The longest words that a phase can have, with no joint to steer, one, two or four."""
     models = [build(load_machine(name)) for name in names]
-    levers = tuple(lever for model in models for lever in ground.levers(model))
+    levers = tuple(lever for model in models for lever in ground.find_levers(model))
     speed = np.where(np.arange(n + 1) % 2, 1.1, -1.1)
     speed[[0, -1]] = 0
     angle = np.outer(np.where(np.arange(n + 1) % 3, -0.3, 0.35), np.ones(len(levers)))
     trace = Trace(4.05 * np.arange(n + 1), speed, angle, levers)
-    room = ground.Room(20, 10, (0, 0))
+    room = ground.TouchedGround(20, 10, (0, 0))
     figure = sheet._second(
         sheet.Sheet("A drive", models[0], trace, (), room, (60, 10), ("Mind the gap.",), (), "Good.")
     )
@@ -376,15 +378,15 @@ def test_texts_on_the_second_page_do_not_overlap(names: tuple[str, ...], n: int)
 def test_band_is_the_reference_a_second_around() -> None:
     t = np.arange(0, 10, 0.1)
     step = np.where(t < 5, 0.0, 1.0)
-    low, high = ground.band(t, step, 0.1)
+    low, high = ground.tolerance_band(t, step, 0.1)
     assert high[t < 3.9] == pytest.approx(0.1)
     assert high[t > 4.05] == pytest.approx(1.1)
     assert low[t < 5.9] == pytest.approx(-0.1)
     assert low[t > 6.05] == pytest.approx(0.9)
 
 
-PLAYED = ground.Score(100, 1.0, "M", 0.2)
-LOST = ground.Score(100, 3.0, "M", 0.2)
+PLAYED = ground.DriveQuality(100, 1.0, "M", 0.2)
+LOST = ground.DriveQuality(100, 3.0, "M", 0.2)
 
 
 @pytest.mark.parametrize("objective", ["accuracy", "cond"])
@@ -421,24 +423,24 @@ def test_limits_that_a_person_exceeds_stand_with_the_verdict() -> None:
     ],
 )
 def test_errors_that_are_the_same_are_said_to_be_so(median: float, worst: float, words: str) -> None:
-    assert words in driving_aids.verdict(PLAYED, ground.Score(100, worst, "M", 0.2 * median))
+    assert words in driving_aids.verdict(PLAYED, ground.DriveQuality(100, worst, "M", 0.2 * median))
 
 
 def test_speeds_that_keep_the_limits_are_found(va12: Model) -> None:
     """A start that needs too much power: on speeds a tenth lower people keep it, on a twentieth they don't."""
     problem = va12.machine.problems["R60"]
-    trace = Trace(np.array([0.0, 1.6, 8, 12]), np.array([0.0, 1.6, 1.6, 0]), np.zeros((4, 1)), ground.levers(va12))
+    trace = Trace(np.array([0.0, 1.6, 8, 12]), np.array([0.0, 1.6, 1.6, 0]), np.zeros((4, 1)), ground.find_levers(va12))
 
     def exceeded(share: float) -> set[str]:
         slow = replace(trace, speed=share * trace.speed)
         return set(
-            driving_aids._exceeded(
-                va12, problem, tuple(ground.driven(va12, slow, None, k) for k in range(driving_aids.PEOPLE))
+            driving_aids._exceeded_limits(
+                va12, problem, tuple(ground.follow_trace(va12, slow, None, k) for k in range(driving_aids.PEOPLE))
             )
         )
 
     assert exceeded(1) == {"power"}
-    assert driving_aids._slower(va12, problem, trace, np.zeros(len(va12.coordinates)), 0) == 0.9
+    assert driving_aids._slower_share(va12, problem, trace, np.zeros(len(va12.coordinates)), 0) == 0.9
     assert [exceeded(0.95), exceeded(0.9)] == [{"power"}, set()]
 
 
@@ -448,7 +450,7 @@ def test_what_a_person_keeps_of_the_accurate_drive() -> None:
     design = saved_design.read_design(RESULTS / "R60_accuracy" / "design")
     made = driving_aids.prepare(design)
     scores = dict(made.scores)
-    played, person = scores[driving_aids.PLAYED], scores[driving_aids.PHASED]
+    played, person = scores[driving_aids.PLAYED_BACK], scores[driving_aids.PHASED]
     assert played.worst_percent == pytest.approx(max(design.summary["sigma_percent"].values()), rel=0.02)
     assert len(made.trace) <= 20
     assert played.median_percent < person.median_percent < 2 * played.median_percent
@@ -456,9 +458,9 @@ def test_what_a_person_keeps_of_the_accurate_drive() -> None:
     assert "good enough" in made.verdict
     ways = np.sign(made.trace.speed[np.abs(made.trace.speed) > 0.02])
     assert any(f"direction {np.count_nonzero(np.diff(ways))} times" in line for line in made.warnings)
-    lost = ground.Score(1, 3 * played.worst_percent, "M", played.median_percent)
+    lost = ground.DriveQuality(1, 3 * played.worst_percent, "M", played.median_percent)
     assert "too much is lost" in driving_aids.verdict(played, lost)
-    lines = sheet.set_up(design.model.machine)
+    lines = sheet.set_up_lines(design.model.machine)
     assert all(any(line.startswith(f"{s.column} [") for line in lines) for s in design.model.machine.sensor)
 
 

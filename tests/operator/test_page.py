@@ -36,7 +36,7 @@ TRACE = Trace(
     np.array([0.0, 3, 6, 8.5, 11, 14]),
     np.array([0.0, 1.2, 1.2, 0, -0.8, 0]),
     -np.array([[0.0], [0], [0.3], [0.3], [0], [0]]),
-    ground.levers(build(load_machine("va12"))),
+    ground.find_levers(build(load_machine("va12"))),
 )
 STARTS = [0.0, 3, 6, 8.5, 11]
 
@@ -47,7 +47,7 @@ def html(va12: Model) -> str:
 
 
 TANDEM = build(load_machine("tandem"))
-FRONT, REAR = ground.levers(TANDEM)
+FRONT, REAR = ground.find_levers(TANDEM)
 TWO = Trace(
     TRACE.times,
     TRACE.speed,
@@ -156,7 +156,7 @@ def test_what_the_driver_reads(open_page: Callable[..., Tab]) -> None:
 def test_the_driver_reads_every_joint(open_page: Callable[..., Tab], two_html: str, tmp_path: Path) -> None:
     """Targets, words, what a log of the machine's own columns shows, and the score, joint by joint."""
     tab = open_page(text=two_html)
-    table = sensors.measure(TANDEM, ground.driven(TANDEM, TWO, None, 4), seed=1)
+    table = sensors.measure(TANDEM, ground.follow_trace(TANDEM, TWO, None, 4), seed=1)
     table.to_csv(tmp_path / "log.csv", index=False)
     tab.page.set_input_files("#log", tmp_path / "log.csv")
     tab.shows("#note", "begins")
@@ -174,7 +174,7 @@ def test_the_driver_reads_every_joint(open_page: Callable[..., Tab], two_html: s
     t = table["t_s"].to_numpy()
     for k, lever in enumerate((FRONT, REAR)):
         got, wanted = table[lever.column], TWO.at(t)[1][:, k]
-        low, high = ground.band(t, wanted, ground.BAND_ANGLE)
+        low, high = ground.tolerance_band(t, wanted, ground.BAND_ANGLE)
         assert score["angle_percent"][k] == pytest.approx(100 * np.mean((got >= low) & (got <= high)), abs=0.3)
         off = np.rad2deg(np.sqrt(np.mean((got - wanted) ** 2)))
         assert score["angle_rms_deg"][k] == pytest.approx(off, rel=0.01)
@@ -271,7 +271,7 @@ def test_where_to_start_is_shown_until_the_drive_begins(
     model = {"va12": va12, "tandem": TANDEM}[name]
     q = np.zeros((2, len(model.coordinates)))
     q[:, :3] = [-13.1, -14.1, np.deg2rad(-142)]
-    motion = replace(ground.driven(model, trace, None, 0), t=np.arange(2) / 100, q=q, nu=np.zeros_like(q))
+    motion = replace(ground.follow_trace(model, trace, None, 0), t=np.arange(2) / 100, q=q, nu=np.zeros_like(q))
     start = ground.start_words(model, motion, trace)
     tab = open_page(size=size, text=page.driver_page(model, trace, "A drive", start))
     tab.page.clock.run_for(100)
@@ -286,7 +286,7 @@ def test_where_to_start_is_shown_until_the_drive_begins(
 
 @pytest.fixture(scope="module")
 def followed(va12: Model) -> pd.DataFrame:
-    return sensors.measure(va12, ground.driven(va12, TRACE, None, 4), seed=1)
+    return sensors.measure(va12, ground.follow_trace(va12, TRACE, None, 4), seed=1)
 
 
 def test_a_log_is_replayed_and_scored(
@@ -304,7 +304,7 @@ def test_a_log_is_replayed_and_scored(
     for value, reference, tolerance in zip(
         (speed, angle), (wanted[0], wanted[1][:, 0]), (ground.BAND_SPEED, ground.BAND_ANGLE), strict=True
     ):
-        low, high = ground.band(t, reference, tolerance)
+        low, high = ground.tolerance_band(t, reference, tolerance)
         inside.append((value >= low) & (value <= high))
     tab = open_page()
     tab.page.set_input_files("#log", tmp_path / "log.csv")
@@ -356,7 +356,7 @@ def running(html: str, host: str = serve.HOST) -> Iterator[tuple[str, Callable[[
 
     async def work() -> None:
         found["end"] = asyncio.Event()
-        async with serve.serving(html, ("articulation_rad",), host=host) as (server, send):
+        async with serve.running_server(html, ("articulation_rad",), host=host) as (server, send):
             found["address"] = f"127.0.0.1:{server.sockets[0].getsockname()[1]}"
             found["send"] = send
             ready.set()
@@ -424,20 +424,20 @@ def test_a_phone_on_the_network_gets_live_values(browser: Any, html: str) -> Non
 
 
 def test_addresses_to_open_are_numbers_of_this_machine() -> None:
-    assert serve.reached(serve.HOST) == ["127.0.0.1"]
-    assert serve.reached("192.168.1.7") == ["192.168.1.7"]
-    assert serve.reached("::1") == ["[::1]"]
-    *others, last = serve.reached("0.0.0.0")
+    assert serve.reachable_addresses(serve.HOST) == ["127.0.0.1"]
+    assert serve.reachable_addresses("192.168.1.7") == ["192.168.1.7"]
+    assert serve.reachable_addresses("::1") == ["[::1]"]
+    *others, last = serve.reachable_addresses("0.0.0.0")
     assert last == "127.0.0.1"
     for other in others:
         with socket.socket() as listener:
             listener.bind((other, 0))  # raises where it is another machine's
-    assert serve.reached("::")[-1] == "[::1]"
+    assert serve.reachable_addresses("::")[-1] == "[::1]"
 
 
 def test_an_address_that_is_not_this_machines_is_refused(html: str, excite: Excite) -> None:
     async def listen() -> None:
-        async with serve.serving(html, (), host="192.0.2.1"):
+        async with serve.running_server(html, (), host="192.0.2.1"):
             pass
 
     # in a thread of its own, for the browser's loop runs in this one
@@ -452,7 +452,7 @@ def test_an_address_that_is_not_this_machines_is_refused(html: str, excite: Exci
         assert f"--host {host}: is no address, give one such as" in said
     code, _, said = excite("drive", "nowhere", "--host", "0.0.0.0")
     assert code == 2
-    assert "for --serve, give that too" in said
+    assert "need --serve as well" in said
 
 
 def test_only_this_machine_reaches_the_server(html: str) -> None:
@@ -486,9 +486,9 @@ def test_a_message_may_be_as_long_as_is_said_and_no_longer(html: str) -> None:
     good = '{"v_m_s": 1}'
     with running(html) as (address, _), connect(f"ws://{address}/live") as listener:
         with connect(f"ws://{address}/live") as logger:
-            logger.send(good.ljust(serve.MESSAGE))
+            logger.send(good.ljust(serve.MAX_MESSAGE))
             assert json.loads(listener.recv(timeout=5)) == {"v_m_s": 1.0}
-            logger.send(good.ljust(serve.MESSAGE + 1))
+            logger.send(good.ljust(serve.MAX_MESSAGE + 1))
             ends(logger, 1009)
         with connect(f"ws://{address}/live") as logger:
             with suppress(ConnectionClosed):
@@ -508,7 +508,7 @@ def ends(logger: Any, code: int) -> None:
 
 def test_more_pages_than_are_allowed_are_refused(html: str) -> None:
     with running(html) as (address, _), ExitStack() as stack:
-        for _ in range(serve.CLIENTS):
+        for _ in range(serve.MAX_CLIENTS):
             stack.enter_context(connect(f"ws://{address}/live"))
         with pytest.raises(InvalidStatus, match="503"):
             connect(f"ws://{address}/live")
@@ -538,7 +538,7 @@ def test_bad_messages_end_the_connection(html: str, message: str, code: int) -> 
 def test_growing_log_becomes_values(va12: Model, followed: pd.DataFrame, tmp_path: Path) -> None:
     """Written in pieces that end anywhere, even within a number: every row counts once, nothing is misread."""
     path = tmp_path / "log.csv"
-    tail = serve.Tail(path, va12.machine, TRACE.levers)
+    tail = serve.GrowingLog(path, va12.machine, TRACE.levers)
     assert tail.new() == []
     text = followed.to_csv(index=False)
     said = []
@@ -565,14 +565,14 @@ def test_a_steered_joint_measured_as_a_rate_is_summed_up(va12: Model, tmp_path: 
     path = tmp_path / "log.csv"
     rows = "".join(f"{0.1 * k:g},0,0,{9 if k < 11 else 0}\n" for k in range(21))
     path.write_text("\ufefft_s,theta1_rad,theta4_rad,theta2_rad\n" + rows, encoding="utf-8")
-    said = serve.Tail(path, machine, TRACE.levers).new()
+    said = serve.GrowingLog(path, machine, TRACE.levers).new()
     assert len(said) == 20
     assert said[-1]["articulation_rad"] == pytest.approx(np.deg2rad(9.0))
 
 
 def test_an_angle_that_is_missing_silences_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
-    tail = serve.Tail(path, TANDEM.machine, (FRONT, REAR))
+    tail = serve.GrowingLog(path, TANDEM.machine, (FRONT, REAR))
     rims, columns = [s.column for _, s in tail.rims], [s.column for _, s in tail.angles]
     with path.open("w") as file:
         file.write(",".join(["t_s", *rims, columns[0]]) + "\n")
@@ -610,7 +610,7 @@ def test_serve_command_shows_the_page_until_it_is_stopped(tmp_path: Path) -> Non
         with pytest.raises(InvalidStatus, match="403"):
             connect(f"ws://127.0.0.1:{port}/live", origin=Origin("https://evil.example"))
         with connect(f"ws://127.0.0.1:{port}/live") as logger:
-            logger.send('{"v_m_s": 1}'.ljust(serve.MESSAGE + 1))
+            logger.send('{"v_m_s": 1}'.ljust(serve.MAX_MESSAGE + 1))
             ends(logger, 1009)
         run.terminate()
         assert run.wait(20) == 0

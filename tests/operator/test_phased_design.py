@@ -16,7 +16,7 @@ from excite.errors import UndrivableError
 from excite.model import Model, build
 from excite.model.machine import load_machine
 from excite.operator import Trace, ground, phased_design
-from excite.operator.ground import ANGLE_STEP, GRID, SPEED_STEP
+from excite.operator.ground import ANGLE_STEP, GRID_S, SPEED_STEP
 from excite.simulation import STEADY_DRIVER, Motion
 from excite.trajectories import composite_objective, limits, saved_design
 
@@ -26,14 +26,19 @@ def model_of(name: str) -> Model:
     return build(load_machine(name))
 
 
-def task_of(model: Model, duration: float, shortest: float) -> phased_design.Task:
+def task_of(model: Model, duration: float, shortest: float) -> phased_design.PhaseSearch:
     problem = next(iter(model.machine.problems.values()))
-    return phased_design.Task(
-        model, problem, composite_objective.aim(model, "cond"), duration, shortest, *ground.bounds(model)
+    return phased_design.PhaseSearch(
+        model,
+        problem,
+        composite_objective.compose_objective(model, "cond"),
+        duration,
+        shortest,
+        *ground.trace_bounds(model),
     )
 
 
-def fits(task: phased_design.Task, trace: Trace) -> bool:
+def fits(task: phased_design.PhaseSearch, trace: Trace) -> bool:
     """Whether a trace is one that was asked for."""
     turn = np.abs(np.diff(trace.angle, axis=0)) / np.diff(trace.times)[:, None]
     return bool(
@@ -59,22 +64,22 @@ def test_random_drives_and_their_rounding_are_what_was_asked_for(
     name: str, seed: int, shortest: float, duration: float
 ) -> None:
     model = model_of(name)
-    task, levers = task_of(model, duration, shortest), ground.levers(model)
+    task, levers = task_of(model, duration, shortest), ground.find_levers(model)
     like = Trace(np.array([0.0, duration]), np.zeros(2), np.zeros((2, len(levers))), levers)
-    for trace in phased_design.guesses(task, like, seed)[:2]:
+    for trace in phased_design.random_traces(task, like, seed)[:2]:
         assert fits(task, trace)
-        dial = phased_design.readable(task, trace)
+        dial = phased_design.snap_levels(task, trace)
         assert fits(task, dial)
-        assert dial.times / GRID == pytest.approx(np.round(dial.times / GRID))
+        assert dial.times / GRID_S == pytest.approx(np.round(dial.times / GRID_S))
         moved = phased_design._trace(trace, phased_design._vector(trace))
         assert (moved.angle == trace.angle).all()
-        assert len(phased_design._each(trace, (1, 2, 3))) == len(phased_design._vector(trace))
+        assert len(phased_design._per_entry(trace, (1, 2, 3))) == len(phased_design._vector(trace))
         assert dial.speed / SPEED_STEP == pytest.approx(np.round(dial.speed / SPEED_STEP), abs=1e-9)
 
 
 def test_a_design_as_phases_stands_still_at_its_end(va12: Model, va12_motion: Motion) -> None:
     task = task_of(va12, float(va12_motion.t[-1]), 3.0)
-    trace = phased_design.standing(task, va12_motion)
+    trace = phased_design.initial_trace(task, va12_motion)
     assert fits(task, trace)
     assert trace.times[-1] - trace.times[-2] >= 3.0
     speed, angle = trace.at(va12_motion.t)
@@ -86,12 +91,12 @@ def test_a_design_as_phases_stands_still_at_its_end(va12: Model, va12_motion: Mo
 @pytest.mark.parametrize("shortest", [0.0, 0.4, 16.0, float("nan")])
 def test_phases_that_do_not_fit_are_refused(va12: Model, shortest: float) -> None:
     with pytest.raises(UndrivableError, match=r"--phase-min.: must be between 0.5 and 15 s"):
-        phased_design.check(va12, va12.machine.problems["R60"], shortest)
+        phased_design.check_phase_length(va12, va12.machine.problems["R60"], shortest)
 
 
 def test_a_machine_without_wheels_has_nobody_to_drive_it(emps: Model, va12: Model) -> None:
     with pytest.raises(UndrivableError, match="emps"):
-        phased_design.check(emps, va12.machine.problems["R60"], 3.0)
+        phased_design.check_phase_length(emps, va12.machine.problems["R60"], 3.0)
 
 
 def test_the_command_designs_for_people_and_says_what_they_keep(
@@ -99,7 +104,7 @@ def test_the_command_designs_for_people_and_says_what_they_keep(
 ) -> None:
     """A short drive on a straight lane, the search cut short: both scores in summary and report, every limit kept or
     named, the driver's sheet of these phases; driven afresh it is what was said."""
-    for name, few in {"GUESSES": 4, "ROUNDS": 2, "LEVELS": 1, "POLISHES": 1}.items():
+    for name, few in {"N_RANDOM": 4, "ROUNDS": 2, "LEVELS": 1, "POLISHES": 1}.items():
         monkeypatch.setattr(phased_design, name, few)
     out = tmp_path / "d"
     asked = "design va12_straight --driver --phase-min 1.5 --duration 12 --starts 1 --seed 3 --json --out"
@@ -114,16 +119,16 @@ def test_the_command_designs_for_people_and_says_what_they_keep(
     assert ("every limit is kept" in report) == (not by_hand["limits_broken"])
 
     found = saved_design.read_design(out)
-    trace = ground.from_table(found.model, by_hand["phases"])
+    trace = ground.trace_from_table(found.model, by_hand["phases"])
     assert np.diff(trace.times).min() >= 1.5
     assert (trace.speed[-2:] == 0).all()
     assert found.problem is not None
-    ways = [ground.driven(found.model, trace, None, 3 + k) for k in range(by_hand["people"])]
-    assert ground.middle([ground.score(found.model, m) for m in ways]).cond_phi == pytest.approx(
+    ways = [ground.follow_trace(found.model, trace, None, 3 + k) for k in range(by_hand["people"])]
+    assert ground.middle_quality([ground.rate_motion(found.model, m) for m in ways]).cond_phi == pytest.approx(
         by_hand["by_hand"]["cond_phi"], rel=1e-6
     )
-    steady = ground.driven(found.model, trace, STEADY_DRIVER, 0)
-    for m in ground.placed(found.model, found.problem, (steady, *ways)):
+    steady = ground.follow_trace(found.model, trace, STEADY_DRIVER, 0)
+    for m in ground.place_in_lane(found.model, found.problem, (steady, *ways)):
         over = limits.check_limits(found.model, found.problem, m)
         assert {n for n, x in over.items() if x > 1e-3} <= set(by_hand["limits_broken"])
     assert found.motion.nu == pytest.approx(steady.nu, abs=1e-6)  # the profile is what a steady person does
@@ -138,7 +143,7 @@ def test_the_command_designs_for_people_and_says_what_they_keep(
 def test_a_damaged_table_of_phases_is_one_clear_line(straight: Model) -> None:
     for rows in ([{"end_s": 3.0}], [], [{"end_s": -1, "speed_m_s": [0, 1]}]):
         with pytest.raises(UndrivableError, match="design again"):
-            ground.from_table(straight, rows)
+            ground.trace_from_table(straight, rows)
 
 
 def test_one_step_improves_a_poor_drive(straight: Model) -> None:
@@ -149,11 +154,11 @@ def test_one_step_improves_a_poor_drive(straight: Model) -> None:
     times = np.array([0.0, 3, 6, 9, 12, 16])
     poor = Trace(times, np.array([0.0, 0.5, 0.5, 0.5, 0, 0]), np.zeros((6, 0)), ())
     run = joblib.Parallel(n_jobs=1)
-    first = phased_design.trials(task, [poor], run)[0]
+    first = phased_design.try_traces(task, [poor], run)[0]
     assert first is not None
-    room = np.full(len(first.over), phased_design.ROOM)
-    best, reach = phased_design.improved(task, first, room, 1.0, 20.0, True, run)
+    room = np.full(len(first.over), phased_design.MIN_MARGIN)
+    best, reach = phased_design.improve_by_program(task, first, room, 1.0, 20.0, True, run)
     assert phased_design.merit(task, best, room) < phased_design.merit(task, first, room) - 0.1
     assert reach > 0.1
-    assert fits(task, phased_design.on_grid(task, best.trace))
+    assert fits(task, phased_design.snap_times(task, best.trace))
     assert phased_design.merit(task, replace(best, over=best.over + 1.0), room) > phased_design.merit(task, best, room)

@@ -52,7 +52,7 @@ def test_the_file_to_start_from_is_beyond_doubt(tmp_path: Path) -> None:
     assert (found.faults, found.doubts) == ((), ())
     assert found.model is not None
     assert set(found.sigma_percent) == set(found.model.base.names)
-    assert 0 < max(found.sigma_percent.values()) < machine_check.HARDLY
+    assert 0 < max(found.sigma_percent.values()) < machine_check.POORLY_IDENTIFIABLE
 
 
 @pytest.mark.parametrize("name", ["", "2wd", "my machine", "va12", "../x", "röller"])
@@ -261,7 +261,7 @@ def test_new_then_check(tmp_path: Path, excite: Excite) -> None:
     assert {p.name for p in out.iterdir()} == {"machine.png", "report.html", "summary.json"}
     code, _, stderr = excite("machine", "new", "my_loader", "--out", path)
     assert code == 2
-    assert "is there already" in stderr
+    assert "exists already" in stderr
 
 
 def test_a_faulty_file_ends_with_1_and_a_missing_one_with_2(tmp_path: Path, excite: Excite) -> None:
