@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from excite.reports import Table
 
 MAX_ROWS = 40  # of a table on the terminal; chosen
+MIN_WORD_WIDTH = 4  # of a column of words on a narrow terminal; chosen
 PIPE_WIDTH = 200  # columns of a line in a pipe or file, which has no width; chosen
 LINE_INTERVAL_S = 30.0  # between lines of progress where there is no terminal; chosen
 INTERRUPTED = 130  # exit code of Ctrl-C, as shells have it
@@ -75,27 +76,36 @@ def table(*names: str, words: tuple[int, ...] = (0,)) -> Any:
 
     made = Table(box=box.SIMPLE_HEAD)
     for k, name in enumerate(names):
-        made.add_column(name, justify="left" if k in words else "right", no_wrap=k not in words)
+        made.add_column(
+            name,
+            justify="left" if k in words else "right",
+            no_wrap=k not in words,
+            min_width=MIN_WORD_WIDTH if k in words else None,
+        )
     return made
 
 
 def _fitted_table(described: Table) -> Any:
-    """Return a described table as the terminal shows it, without its optional columns if it is too wide for it."""
+    """Return a table for the terminal; a narrow one gets stacked headings and no optional columns."""
     from rich.console import Console
 
-    every = tuple(range(len(described.columns)))
-    whole = _rich_table(described, every)
     console = Console()
-    if not described.optional or not console.is_terminal:
-        return whole
-    if console.measure(whole, options=console.options.update(max_width=10_000)).maximum <= console.width:
-        return whole
-    return _rich_table(described, tuple(k for k in every if k not in described.optional))
+    every = tuple(range(len(described.columns)))
+    needed = tuple(k for k in every if k not in described.optional)
+    made = _rich_table(described, every, stacked=False)
+    if not console.is_terminal:
+        return made
+    for columns, stacked in ((every, False), (every, True), (needed, False), (needed, True)):
+        made = _rich_table(described, columns, stacked)
+        if console.measure(made, options=console.options.update(max_width=PIPE_WIDTH)).maximum <= console.width:
+            break
+    return made
 
 
-def _rich_table(described: Table, columns: tuple[int, ...]) -> Any:
+def _rich_table(described: Table, columns: tuple[int, ...], stacked: bool) -> Any:
     words = tuple(place for place, k in enumerate(columns) if k in described.text_columns)
-    made = table(*(described.columns[k] for k in columns), words=words)
+    names = [described.columns[k].replace(" ", "\n") if stacked else described.columns[k] for k in columns]
+    made = table(*names, words=words)
     for k, row in enumerate(described.rows[:MAX_ROWS]):
         made.add_row(*(row[i] for i in columns), style="bold" if k in described.marked else None)
     return made

@@ -101,7 +101,11 @@ def test_what_no_run_finds_is_left_out_of_the_answer(straight: Model, straight_m
     one = verify(straight, straight_motion, "ols", "paper", runs=1, seed=7, jobs=1)
     lost = one.value.copy()
     lost[:, 0] = np.nan
-    for v, words in ((one, "worst"), (replace(one, value=lost), "worst"), (replace(one, value=lost * np.nan), "none")):
+    for v, words in (
+        (one, "worst"),
+        (replace(one, value=lost), "worst"),
+        (replace(one, value=lost * np.nan), "No parameter"),
+    ):
         made = {"machine": "x", "runs": 1, "failed": 0, "biased": [], "meanings": {}, "parameters": summarise_runs(v)}
         answer = describe("verify", made).headline
         assert words in answer

@@ -12,6 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 from support.commands import Excite
 
+from excite.cli import terminal
 from excite.logs import profile as profiles
 from excite.model import Model
 from excite.reports import Picture, Table, describe, figures, html, pages
@@ -85,6 +86,24 @@ def test_verify_answers_with_error_against_the_truth() -> None:
     assert "held it in 90 % of cases" in answer
     assert described.remarks == ("Biased, the intervals do not hold: a.",)
     assert table.marked == (0,)
+
+
+def test_a_narrow_terminal_shows_every_name_and_number(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It leaves out explanations and stacks headings rather than cut a cell."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    summary = json.loads((RESULTS / "R60_accuracy" / "verify" / "summary.json").read_text())
+    shown = {}
+    for width in (80, 200):
+        monkeypatch.setenv("COLUMNS", str(width))
+        terminal.show("verify", summary)
+        shown[width] = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+        assert max(map(len, shown[width].splitlines())) <= width
+        for name, row in summary["parameters"].items():
+            assert re.search(rf"^ +{name} .* {row['mean']:.6g} ", shown[width], re.M)
+    assert "mass, whole machine" in shown[200]
+    assert "mass, whole machine" not in shown[80]
 
 
 def test_design_answers_with_what_can_be_known() -> None:
