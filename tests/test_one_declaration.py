@@ -33,10 +33,10 @@ from excite.model import Model, build
 from excite.model.effects import CATALOGUE, Effect, placing
 from excite.model.machine import Filter, Problem, machine
 from excite.simulation import simulate
-from excite.trajectories import Manoeuvre, aim, baselines, collocation, limits, objective
-from excite.trajectories.continuation import PLAN, depart, search
-from excite.trajectories.excitation import knots
-from excite.trajectories.limits import Kind, Symbols
+from excite.trajectories import Manoeuvre, baselines, collocation, compose_objective, limits, objective
+from excite.trajectories.continuation import STAGES, run_stages, start_from_multisine
+from excite.trajectories.excitation import knot_times
+from excite.trajectories.limits import LimitKind, SampleSymbols
 from excite.trajectories.objective import Objective
 from excite.workflows import Study, machine_check, requests, study_plan
 
@@ -58,7 +58,7 @@ def spread(variances: ca.SX, sharp: ca.SX) -> ca.SX:
     return ca.logsumexp(ca.log(variances) / 2)
 
 
-def wheelspin(model: Model, problem: Problem, s: Symbols) -> Iterator[limits.Bounded]:
+def wheelspin(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[limits.BoundedExpression]:
     """How much faster the front roll turns than the rear one."""
     front, rear = (s.nu[model.coordinates.index(c)] for c in ("theta1", "theta4"))
     yield "wheelspin", front - rear, -0.02, 0.02, "rad/s"
@@ -72,7 +72,7 @@ def halves(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
 
 def stamp(model: Model, problem: Problem, seed: int, seconds: float) -> Manoeuvre:
     """Forward and back, once."""
-    t = knots(problem)
+    t = knot_times(problem)
     wave = np.sin(2 * np.pi * t / t[-1])
     return Manoeuvre(t, np.outer(wave, [2000.0] * len(model.inputs)))
 
@@ -222,20 +222,20 @@ def test_a_new_objective_is_one_function(
     monkeypatch: pytest.MonkeyPatch, excite: Excite, straight: Model, problem: Problem, tmp_path: Path
 ) -> None:
     monkeypatch.setitem(objective.OBJECTIVES, "spread", Objective(spread, "variances", True))
-    goal = aim(straight, "spread")
-    begun = depart(straight, problem, goal, 0, 1)
-    found = search(straight, problem, goal, begun, PLAN[:1], lambda: False)
+    goal = compose_objective(straight, "spread")
+    begun = start_from_multisine(straight, problem, goal, 0, 1)
+    found = run_stages(straight, problem, goal, begun, STAGES[:1], lambda: False)
     assert found.latest.score < begun.latest.score
     slope_and_curvature()
     offered(excite, "design", "objective", "spread")
     assert "| spread | log of the mean relative standard deviation. | variances | yes |" in reference.choices_page()
     assert study_plan.plan_study(study(objective=["cond", "spread"])).total == 2
-    assert objective.titled("spread", objective.reported("spread", 1.5)) == "objective spread 1.5"
+    assert objective.describe_value("spread", objective.reported_value("spread", 1.5)) == "objective spread 1.5"
 
 
 def test_a_new_limit_is_one_function(monkeypatch: pytest.MonkeyPatch, straight: Model, problem: Problem) -> None:
     """In the program that designs, in the check of what was designed, in studies where the machine file states it."""
-    monkeypatch.setitem(limits.KINDS, "wheelspin", Kind(wheelspin, ("body.limit.rim_speed",)))
+    monkeypatch.setitem(limits.LIMITS, "wheelspin", LimitKind(wheelspin, ("body.limit.rim_speed",)))
     torque = drive(straight, 6, 1, {"u1": 3000, "u4": -3000})
     assert limits.check_limits(straight, problem, simulate(straight, torque))["wheelspin"] > 0.01
     still = simulate(straight, 0 * torque)
@@ -272,9 +272,9 @@ def test_a_new_method_is_one_function(
 def test_a_new_usual_drive_is_one_function(
     monkeypatch: pytest.MonkeyPatch, excite: Excite, straight: Model, problem: Problem
 ) -> None:
-    monkeypatch.setitem(baselines.USUAL, "stamp", baselines.Usual(stamp))
-    made = baselines.USUAL["stamp"].make(straight, problem, 0, 1.0)
-    found, _ = baselines.judge(straight, problem, baselines.shrunk(straight, problem, made))
+    monkeypatch.setitem(baselines.BASELINES, "stamp", baselines.Baseline(stamp))
+    made = baselines.BASELINES["stamp"].make(straight, problem, 0, 1.0)
+    found, _ = baselines.score_drive(straight, problem, baselines.scale_into_limits(straight, problem, made))
     assert all(v == 0 for name, v in found.violations.items() if not name.startswith(("rest", "lane")))
     offered(excite, "compare", "against", "stamp")
     assert "| stamp | Forward and back, once. | no |" in reference.choices_page()
@@ -304,21 +304,21 @@ OBJECTIVES["spread"] = Objective(spread, "variances", True)
 """,
     "excite/trajectories/limits.py": """
 
-def _wheelspin(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+def _wheelspin(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
     a, b = (s.nu[model.coordinates.index(c)] for c in ("theta1", "theta4"))
     yield "wheelspin", a - b, -0.02, 0.02, "rad/s"
 
 
-KINDS["wheelspin"] = Kind(_wheelspin)
+LIMITS["wheelspin"] = LimitKind(_wheelspin)
 """,
     "excite/trajectories/baselines.py": """
 
 def stamp(model: Model, problem: Problem, seed: int, seconds: float) -> Manoeuvre:
-    t = excitation.knots(problem)
+    t = excitation.knot_times(problem)
     return Manoeuvre(t, np.outer(np.sin(2 * np.pi * t / t[-1]), [2000.0] * len(model.inputs)))
 
 
-USUAL["stamp"] = Usual(stamp)
+BASELINES["stamp"] = Baseline(stamp)
 """,
     "excite/identification/methods.py": """
 

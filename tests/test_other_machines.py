@@ -248,7 +248,9 @@ def _of_soil(model: Model, index: int, q: np.ndarray, nu: np.ndarray) -> np.ndar
 # --------------------------------------------------------------------------------- design, simulation, estimate
 def test_a_log_gives_the_true_parameters_back(name: str, model: Model) -> None:
     """A random drive of twelve seconds with every sensor's flaws: no parameter four of its own deviations off."""
-    drive = excitation.scaled(excitation.multisine(model, short(model.machine, 12.0), 1, top=0.4), CASES[name].share)
+    drive = excitation.scale_torques(
+        excitation.multisine(model, short(model.machine, 12.0), 1, top=0.4), CASES[name].share
+    )
     motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
     table = sensors.measure(model, motion, kit="full", seed=1)
     estimate = methods.identify(model, [log.from_table(table, model.machine)], methods.recommend_method(model))
@@ -268,7 +270,7 @@ def test_a_drum_that_nothing_drives_is_found_as_well() -> None:
     model = build(pulled.model_copy(update={"body": body, "sensor": sensor}))
     assert model.inputs == ("u1", "u2", "u3")
     assert "u50" in model.base.invisible
-    drive = excitation.scaled(excitation.multisine(model, short(model.machine, 12.0), 1, top=0.4), 0.5)
+    drive = excitation.scale_torques(excitation.multisine(model, short(model.machine, 12.0), 1, top=0.4), 0.5)
     motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
     measured = make_log(model, motion, seed=1)
     estimate = methods.identify(model, [measured], "joint")
@@ -399,7 +401,7 @@ def test_what_is_advised_has_the_machines_names(own: str) -> None:
     model = model_of(own)
     texts = [c.text for c in identifiability.list_manoeuvres(model, np.zeros(len(model.coordinates), bool))]
     texts += [separating_run._said(run, model.machine) for run in separating_run.RUNS]
-    texts += sheet.set_up(model.machine)
+    texts += sheet.set_up_lines(model.machine)
     contacts = [b.where.replace("_", " ") for b in model.machine.contacts]
     assert any(f"drive {contacts[0]}" in text and contacts[-1] in text for text in texts)
     assert [text for text in texts if FOREIGN.search(text)] == []
@@ -488,4 +490,4 @@ def test_footprints_stand_where_the_wheels_do() -> None:
     """The robot turned by a quarter and moved: its front left wheel is now ahead on the left of where it stood."""
     shapes = top_view.footprints(load_machine("skid_robot"), {"x0": 5.0, "y0": 1.0, "theta0": np.pi / 2})
     assert shapes[0].mean(axis=0) == pytest.approx([5 - 0.29153, 1 + 0.249])
-    assert np.ptp(shapes[0], axis=0) == pytest.approx([top_view.NARROW * 0.16459, 2 * 0.16459])
+    assert np.ptp(shapes[0], axis=0) == pytest.approx([top_view.POINT_WIDTH * 0.16459, 2 * 0.16459])

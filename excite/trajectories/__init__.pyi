@@ -1,40 +1,50 @@
-from .baselines import OURS as OURS, USUAL as USUAL, Comparison as Comparison, Row as Row, compare as compare
-from .composite_objective import (
-    Aim as Aim,
-    aim as aim,
-    calibrated as calibrated,
-    information as information,
-    judge as judge,
-    local as local,
-    optimism as optimism,
-    sigma_percent as sigma_percent,
-    value as value,
+from .baselines import (
+    BASELINES as BASELINES,
+    DESIGNED as DESIGNED,
+    Comparison as Comparison,
+    ComparisonRow as ComparisonRow,
+    compare as compare,
 )
-from .excitation import Manoeuvre as Manoeuvre, multisine as multisine, scaled as scaled
+from .composite_objective import (
+    CompositeObjective as CompositeObjective,
+    calibrate_surrogates as calibrate_surrogates,
+    compose_objective as compose_objective,
+    information_matrices as information_matrices,
+    local_model as local_model,
+    score_matrices as score_matrices,
+    score_motions as score_motions,
+    sigma_percent as sigma_percent,
+    surrogate_ratio as surrogate_ratio,
+)
+from .excitation import Manoeuvre as Manoeuvre, multisine as multisine, scale_torques as scale_torques
 from .limits import (
-    KINDS as KINDS,
+    LIMITS as LIMITS,
+    MOTION_LIMITS as MOTION_LIMITS,
     REST_POSITION as REST_POSITION,
-    REVERSALS as REVERSALS,
+    REVERSALS_LIMIT as REVERSALS_LIMIT,
     TOLERANCE as TOLERANCE,
-    WHOLE as WHOLE,
     check_limits as check_limits,
-    kept_between as kept_between,
+    is_rest_limit as is_rest_limit,
+    keeps_motion_limits as keeps_motion_limits,
     lane_excess as lane_excess,
     machine_limits as machine_limits,
-    of_rest as of_rest,
-    placed as placed,
+    place_on_lane as place_on_lane,
     rest_tolerances as rest_tolerances,
-    resting as resting,
-    stacked as stacked,
+    resting_coordinates as resting_coordinates,
+    stack_limits as stack_limits,
 )
-from .multistart import Design as Design, design as design, processes as processes
+from .multistart import Design as Design, design as design, process_count as process_count
 from .objective import (
     OBJECTIVES as OBJECTIVES,
     cond_phi as cond_phi,
     cond_w as cond_w,
-    conditions as conditions,
-    percent as percent,
-    reported as reported,
-    titled as titled,
+    describe_value as describe_value,
+    is_condition_number as is_condition_number,
+    relative_std_percent as relative_std_percent,
+    reported_value as reported_value,
 )
-from .saved_design import Stored as Stored, read_design as read_design, read_design_summary as read_design_summary
+from .saved_design import (
+    SavedDesign as SavedDesign,
+    read_design as read_design,
+    read_design_summary as read_design_summary,
+)

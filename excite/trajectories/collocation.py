@@ -1,8 +1,8 @@
-"""A drive as numbers: piecewise linear torques, states at collocation points, and all their derivatives.
+"""Direct collocation of a drive: piecewise linear torques and states at collocation points, with exact derivatives.
 
-Radau IIA collocation (degree 3) on every interval between two torque knots: stiffly accurate, made for the contact's
-1500 1/s near standstill. Physics, limits and information are CasADi expressions of one sample, mapped over all nodes;
-their exact first and second derivatives come out as plain arrays. Every variable is scaled to O(1).
+Every torque interval has Radau IIA nodes of degree 3, which are stiffly accurate: contacts are as fast as 1500 1/s near
+standstill. Physics, limits and information are CasADi expressions of one sample, mapped over all nodes. Variables are
+scaled to about one.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from excite.simulation import Motion
 from excite.trajectories.limits import (
     REST_POSITION,
     Limit,
-    Symbols,
+    SampleSymbols,
+    is_lane_limit,
     machine_limits,
-    of_lane,
     rest_tolerances,
-    resting,
-    symbols,
+    resting_coordinates,
+    sample_symbols,
 )
 
-DEGREE = 3
-STILL = 0.25  # of the tolerance for rest at the end is used
-SETTLED = 1e-7  # residual of the equations of motion, scaled
-FAR = 1e3  # stands for no bound, in half ranges
+DEGREE = 3  # of the state polynomials: Radau IIA of order 5
+REST_SHARE = 0.25  # share of the tolerance for rest that the program uses, as the simulation differs; chosen
+MAX_RESIDUAL = 1e-7  # accepted residual of the equations of motion, scaled; chosen
+NO_BOUND = 1e3  # half ranges, in place of an infinite bound; chosen
 
 
 def _view(array: Any) -> memoryview:
     return memoryview(array)
 
 
-class Mapped:
-    """A CasADi function of one sample, evaluated over N samples: arrays (N, n) in, (N, rows...) out."""
+class MappedFunction:
+    """CasADi function of one sample, evaluated over N samples: arrays (N, n) to (N, rows...)."""
 
     def __init__(self, function: ca.Function, samples: int, shapes: Sequence[tuple[int, ...]]) -> None:
         self._function = function.map(samples)
@@ -52,7 +52,7 @@ class Mapped:
     def __call__(self, *arguments: np.ndarray) -> list[np.ndarray]:
         held = [np.ascontiguousarray(a, float) for a in arguments]
         for k, a in enumerate(held):
-            if a.size:  # memory that isn't there may seem to lie in CasADi's own
+            if a.size:  # CasADi may mistake an empty array for its own memory
                 self._buffer.set_arg(k, _view(a))
         self._run()
         return [r.copy() for r in self._results]
@@ -60,42 +60,49 @@ class Mapped:
 
 @dataclass(frozen=True)
 class Transcription:
-    """The nonlinear program's data. K intervals, J nodes in each, states z (n_z,), torques u (n_u,).
+    """Data of the nonlinear program: K intervals with J nodes each, states z (n_z,), torques u (n_u,).
 
-    A node's sample is s = (z, dz/dt, u), all scaled; `spread` (J, n_s, n_z + J n_z + 2 n_u) makes it from an interval's
-    left state, node states, left and right torque. over (K J, n_over): what a map of the ground tells at the nodes,
-    which is taken as known. Functions of a sample and of that: residual (n_z,) of the equations of motion,
-    limits (n_g,) scaled to -1..1, entries (n_a,) of the information matrices on and above their diagonals, one matrix
-    after the other; `weight` (K J,) sums them as if over every sample of a motion.
+    The sample of a node is s = (z, dz/dt, u), scaled.
+
+    interval_s [s]; state_scale (n_z,), torque_scale (n_u,): units of the scaled variables.
+    derivative (J, J + 1), node_position (J,) in 0..1, weight (K J,): the collocation scheme. `weight` sums over nodes
+        as over the samples of a motion.
+    lower_bound (n_g,): of the scaled limits. torque_rows (n_c, 2 n_u), torque_centre (n_c,): limits on torques alone.
+    rows, columns: non-zero entries of an information matrix on and above its diagonal; `blocks` matrices.
+    rest_states, rest_band: states that are zero at the end, and their tolerance. free_states: states free at the start.
+    sample_map (J, n_s, n_z + J n_z + 2 n_u): samples from an interval's left state, node states, left and right torque.
+    map_values (K J, n_over): values of a map of the ground at the nodes, taken as known.
+    values: (s, map values) to the residual (n_z,) of the equations of motion, limits (n_g,) scaled to -1..1 and entries
+        (n_a,) of the information matrices. first_derivatives, lagrangian_hessian, residual_slope: their derivatives.
     """
 
     intervals: int
     nodes: int
-    knot: float
+    interval_s: float
     state_names: tuple[str, ...]
     state_scale: np.ndarray
     torque_scale: np.ndarray
     derivative: np.ndarray
-    place: np.ndarray
+    node_position: np.ndarray
     weight: np.ndarray
     limit_names: tuple[str, ...]
-    floor: np.ndarray
-    control_names: tuple[str, ...]
-    control: np.ndarray
-    control_centre: np.ndarray
+    lower_bound: np.ndarray
+    torque_limit_names: tuple[str, ...]
+    torque_rows: np.ndarray
+    torque_centre: np.ndarray
     rows: np.ndarray
     columns: np.ndarray
-    size: int
+    matrix_size: int
     blocks: int
-    at_rest: np.ndarray
-    band: np.ndarray
-    loose: np.ndarray
-    spread: np.ndarray
-    over: np.ndarray
-    values: Mapped = field(repr=False)
-    first: Mapped = field(repr=False)
-    second: Mapped = field(repr=False)
-    step: Mapped = field(repr=False)
+    rest_states: np.ndarray
+    rest_band: np.ndarray
+    free_states: np.ndarray
+    sample_map: np.ndarray
+    map_values: np.ndarray
+    values: MappedFunction = field(repr=False)
+    first_derivatives: MappedFunction = field(repr=False)
+    lagrangian_hessian: MappedFunction = field(repr=False)
+    residual_slope: MappedFunction = field(repr=False)
 
     @property
     def n_z(self) -> int:
@@ -110,11 +117,14 @@ class Transcription:
         return 2 * self.n_z + self.n_u
 
     def samples(self, start: np.ndarray, Z: np.ndarray, U: np.ndarray) -> np.ndarray:
-        """(K J, n_s): what every node sees of states Z (K, J, n_z), torques U (K + 1, n_u) and the start (n_z,)."""
+        """Return the samples (K J, n_s) of all nodes.
+
+        start (n_z,); Z (K, J, n_z): node states; U (K + 1, n_u): torques.
+        """
         left = np.concatenate([start[None], Z[:-1, -1]])[:, None]
         along = np.concatenate([left, Z], axis=1)
         rate = np.einsum("ji,kin->kjn", self.derivative, along)
-        u = U[:-1, None] * (1 - self.place)[:, None] + U[1:, None] * self.place[:, None]
+        u = U[:-1, None] * (1 - self.node_position)[:, None] + U[1:, None] * self.node_position[:, None]
         return np.concatenate([Z, rate, u], axis=2).reshape(-1, self.n_s)
 
     @property
@@ -122,52 +132,52 @@ class Transcription:
         return len(self.rows) * self.blocks
 
     def matrices(self, entries: np.ndarray) -> np.ndarray:
-        """The information matrices (n_blocks, n, n) of their entries (n_a,)."""
-        A = np.zeros((self.blocks, self.size, self.size))
+        """Return the information matrices (n_blocks, n, n) from their entries (n_a,)."""
+        A = np.zeros((self.blocks, self.matrix_size, self.matrix_size))
         each = entries.reshape(self.blocks, -1)
         A[:, self.rows, self.columns] = each
         A[:, self.columns, self.rows] = each
         return A
 
 
-def _spread(place: np.ndarray, derivative: np.ndarray, n_z: int, n_u: int) -> np.ndarray:
-    """(J, n_s, n_z + J n_z + 2 n_u): samples of the nodes from (left state, node states, left and right torque)."""
-    J = len(place)
+def _sample_map(node_position: np.ndarray, derivative: np.ndarray, n_z: int, n_u: int) -> np.ndarray:
+    """Build the map (J, n_s, n_z + J n_z + 2 n_u) to node samples; see `Transcription`."""
+    J = len(node_position)
     L = np.zeros((J, 2 * n_z + n_u, n_z + J * n_z + 2 * n_u))
     for j in range(J):
         L[j, :n_z, n_z * (j + 1) : n_z * (j + 2)] = np.eye(n_z)
         L[j, n_z : 2 * n_z, : n_z * (J + 1)] = np.kron(derivative[j], np.eye(n_z))
-        L[j, 2 * n_z :, n_z * (J + 1) :] = np.kron([1 - place[j], place[j]], np.eye(n_u))
+        L[j, 2 * n_z :, n_z * (J + 1) :] = np.kron([1 - node_position[j], node_position[j]], np.eye(n_u))
     return L
 
 
-def settle(tr: Transcription, start: np.ndarray, U: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Node states (K, J, n_z) that the torques U (K + 1, n_u) lead to: Newton's method interval by interval.
+def solve_states(tr: Transcription, start: np.ndarray, U: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """Solve the equations of motion for the node states (K, J, n_z) under torques U (K + 1, n_u), interval by interval.
 
-    Raises UnsettledError where it fails from the guess and from rest on the left state.
+    Raises CollocationError if Newton's method fails both from the guess and from a constant state.
     """
     Z = np.empty_like(guess)
     left = start
     for k in range(tr.intervals):
-        u, over = U[k : k + 2].ravel(), tr.over[k * tr.nodes : (k + 1) * tr.nodes]
-        x, size = _follow(tr, left, guess[k].ravel(), u, over)
-        if size > SETTLED:
-            x, size = _follow(tr, left, np.tile(left, tr.nodes), u, over)
-        if size > SETTLED:
+        u, map_values = U[k : k + 2].ravel(), tr.map_values[k * tr.nodes : (k + 1) * tr.nodes]
+        x, size = _solve_interval(tr, left, guess[k].ravel(), u, map_values)
+        if size > MAX_RESIDUAL:
+            x, size = _solve_interval(tr, left, np.tile(left, tr.nodes), u, map_values)
+        if size > MAX_RESIDUAL:
             raise CollocationError(f"no motion follows these torques in interval {k} (residual {size:.1e})")
         Z[k] = x.reshape(tr.nodes, tr.n_z)
         left = Z[k, -1]
     return Z
 
 
-def _follow(
-    tr: Transcription, left: np.ndarray, x: np.ndarray, u: np.ndarray, over: np.ndarray
+def _solve_interval(
+    tr: Transcription, left: np.ndarray, x: np.ndarray, u: np.ndarray, map_values: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Node states (J n_z,) of one interval and the largest residual, by Newton's method with step halving."""
+    """Solve one interval by Newton's method with step halving: node states (J n_z,), largest residual."""
     n_z, J = tr.n_z, tr.nodes
-    L, inner = tr.spread, tr.spread[:, :, n_z : n_z * (J + 1)]
+    L, inner = tr.sample_map, tr.sample_map[:, :, n_z : n_z * (J + 1)]
     known = L @ np.concatenate([left, np.zeros(J * n_z), u])
-    c, slope = tr.step(known + inner @ x, over)
+    c, slope = tr.residual_slope(known + inner @ x, map_values)
     size = float(np.abs(c).max())
     for _ in range(25):
         if size < 1e-9:
@@ -175,7 +185,7 @@ def _follow(
         dx = np.linalg.solve(np.matmul(slope, inner).reshape(J * n_z, -1), -c.ravel())
         share = 1.0
         for _ in range(8):
-            c, slope = tr.step(known + inner @ (x + share * dx), over)
+            c, slope = tr.residual_slope(known + inner @ (x + share * dx), map_values)
             trial = float(np.abs(c).max())
             if trial < size:
                 break
@@ -186,8 +196,11 @@ def _follow(
     return x, size
 
 
-def radau(elements: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes (J,) in 0..1, differentiation matrix (J, J + 1) on (left end, nodes) and weights (J,), J = 3 elements."""
+def radau_scheme(elements: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the Radau IIA scheme of `elements` elements on 0..1, J = 3 elements.
+
+    Nodes (J,), differentiation matrix (J, J + 1) on (left end, nodes), quadrature weights (J,).
+    """
     tau = np.array([0.0, *ca.collocation_points(DEGREE, "radau")])
     polynomials = [
         np.poly1d(np.poly(np.delete(tau, i)) / np.prod(tau[i] - np.delete(tau, i))) for i in range(DEGREE + 1)
@@ -199,8 +212,8 @@ def radau(elements: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     derivative = np.zeros((J, J + 1))
     for e in range(elements):
         derivative[e * DEGREE : (e + 1) * DEGREE, e * DEGREE : (e + 1) * DEGREE + 1] = D * elements
-    place = np.concatenate([(e + tau[1:]) / elements for e in range(elements)])
-    return place, derivative, np.tile(b / elements, elements)
+    node_position = np.concatenate([(e + tau[1:]) / elements for e in range(elements)])
+    return node_position, derivative, np.tile(b / elements, elements)
 
 
 def transcribe(
@@ -211,35 +224,37 @@ def transcribe(
     motion: Motion,
     elements: int = 1,
     with_pose: bool = False,
-    rest: float = 1.0,
+    rest_factor: float = 1.0,
     weights: np.ndarray | None = None,
 ) -> Transcription:
-    """The nonlinear program of a problem on `intervals` equal intervals, each of `elements` collocation elements.
+    """Build the nonlinear program of a problem.
 
-    state_size: the typical size of every coordinate and velocity (named c and c') and of what effects remember. motion:
-    one nearby, from which what a map of the ground tells is taken. The pose is a state only where `with_pose`: nothing
-    but the lane depends on it. weights (n_blocks, n_rows): of the regressor's rows [1/SI], one information matrix for
-    each; all 1 by default, none for a program without an aim.
+    state_size: typical size by name, of coordinates c, velocities c' and memory states of effects.
+    intervals: number of equal intervals, each of `elements` collocation elements.
+    motion: a nearby motion, from which values of a map of the ground are taken.
+    with_pose: make the pose a state; only limits of the lane depend on it.
+    rest_factor: factor on the tolerance of rest at the end.
+    weights (n_blocks, n_rows) [1/SI]: factors of the regressor's rows, one information matrix each; ones by default.
     """
     every = machine_limits(model, problem)
-    s = symbols(model)
-    moved = _depends(every, s, ca.vertcat(s.q, s.nu))
-    deferred = set() if with_pose else {g.name for g in every if of_lane(g.name)}
+    s = sample_symbols(model)
+    moved = _limits_depending_on(every, s, ca.vertcat(s.q, s.nu))
+    deferred = set() if with_pose else {g.name for g in every if is_lane_limit(g.name)}
     staged = [g for g in every if g.name in moved and g.name not in deferred]
     steered = [g for g in every if g.name not in moved and g.name not in deferred]
     pose = model.machine.body[0].coordinates if with_pose else ()
-    needed = {*pose, *model.active_coordinates, *(model.coordinates[k] for k in resting(model))}
+    needed = {*pose, *model.active_coordinates, *(model.coordinates[k] for k in resting_coordinates(model))}
     used = [c for c in model.coordinates if c in needed]
     names = (*used, *[c + "'" for c in model.coordinates], *model.memory[: model.n_dynamic_memory])
     z_size = np.array([state_size[c] for c in names])
     u_size = np.array([float(b.limit.torque) if b.limit.torque is not None else 1.0 for b in model.machine.actuated])
-    knot = float(problem.duration_s) / intervals
-    place, derivative, weight = radau(elements)
+    interval_s = float(problem.duration_s) / intervals
+    node_position, derivative, weight = radau_scheme(elements)
 
     n_z, n_q, n_u = len(names), len(model.coordinates), len(u_size)
     sample = ca.SX.sym("s", 2 * n_z + n_u)
     z = sample[:n_z] * ca.DM(z_size)
-    rate = sample[n_z : 2 * n_z] * ca.DM(z_size) / knot
+    rate = sample[n_z : 2 * n_z] * ca.DM(z_size) / interval_s
     u = sample[2 * n_z :] * ca.DM(u_size)
     q = ca.SX(n_q, 1)
     for k, c in enumerate(used):
@@ -247,16 +262,16 @@ def transcribe(
     memory = len(used) + n_q
     nu, a = (ca.vertcat(*ca.vertsplit(x)[len(used) : memory]) for x in (z, rate))
     kept, kept_rate = (ca.vertcat(*ca.vertsplit(x)[memory:], ca.SX(0, 1)) for x in (z, rate))
-    over = ca.SX.sym("over", len(model.map_inputs))
-    beside = () if model.plain else (u, ca.vertcat(kept, over))
+    map_values = ca.SX.sym("over", len(model.map_inputs))
+    beside = () if model.plain else (u, ca.vertcat(kept, map_values))
     p = model.expand @ model.nominal
     drive = ca.SX(n_q, 1)
     for k, row in enumerate(model.actuated):
         drive[row] = u[k]
     dq = model.kinematics(q, nu)[0]
-    turns = [(rate[k] - dq[model.coordinates.index(c)]) * knot / z_size[k] for k, c in enumerate(used)]
-    flow = model.flow(q, nu, u, ca.vertcat(kept, over), model.nominal)[: len(names) - memory]
-    going = (kept_rate - flow) * knot / ca.DM(z_size[memory:])
+    turns = [(rate[k] - dq[model.coordinates.index(c)]) * interval_s / z_size[k] for k, c in enumerate(used)]
+    flow = model.flow(q, nu, u, ca.vertcat(kept, map_values), model.nominal)[: len(names) - memory]
+    going = (kept_rate - flow) * interval_s / ca.DM(z_size[memory:])
     balance = (model.balance(q, nu, a, p, *beside) - drive) / float(u_size.max())
     residual = ca.vertcat(*turns, balance, going)
     g = ca.vertcat(*[(g.expression(q, nu, u, 0) - g.centre) * (2 / g.range) for g in staged], ca.SX(0, 1))
@@ -271,67 +286,73 @@ def transcribe(
     multipliers = ca.SX.sym("m", n_z + n_g + n_a)
     lagrangian = ca.dot(multipliers, ca.vertcat(residual, g, entries))
     H, _ = ca.hessian(lagrangian, sample)
-    N = intervals * len(place)
+    N = intervals * len(node_position)
     samples = float(problem.duration_s) * float(model.machine.sampling_hz)
     options = {"cse": True}
-    values = ca.Function("values", [sample, over], [residual, g, entries], options)
+    values = ca.Function("values", [sample, map_values], [residual, g, entries], options)
     slopes = [ca.densify(ca.jacobian(x, sample).T) for x in (residual, g, entries)]
-    first = ca.Function("first", [sample, over], [residual, g, entries, *slopes], options)
-    second = ca.Function("second", [sample, over, multipliers], [ca.densify(H)], options)
+    first_derivatives = ca.Function("first", [sample, map_values], [residual, g, entries, *slopes], options)
+    lagrangian_hessian = ca.Function("second", [sample, map_values, multipliers], [ca.densify(H)], options)
 
-    nodes = ((np.arange(intervals)[:, None] + place) * knot).ravel()
+    nodes = ((np.arange(intervals)[:, None] + node_position) * interval_s).ravel()
     told = motion.memory[:, model.n_dynamic_memory :]
-    control, centre = _control(steered, s, u_size, knot)
-    resting_states = [names.index(model.coordinates[k]) for k in resting(model)] + [
+    torque_rows, torque_centre = _torque_limit_rows(steered, s, u_size, interval_s)
+    resting_states = [names.index(model.coordinates[k]) for k in resting_coordinates(model)] + [
         names.index(c + "'") for c in model.coordinates
     ]
-    still = np.concatenate([np.full(len(resting(model)), REST_POSITION), rest_tolerances(model)])
-    at_rest = np.array(resting_states if problem.rest else [], int)
-    band = (rest * STILL * still / z_size[resting_states])[: len(at_rest)]
+    still = np.concatenate([np.full(len(resting_coordinates(model)), REST_POSITION), rest_tolerances(model)])
+    rest_states = np.array(resting_states if problem.rest else [], int)
+    rest_band = (rest_factor * REST_SHARE * still / z_size[resting_states])[: len(rest_states)]
     return Transcription(
         intervals,
-        len(place),
-        knot,
+        len(node_position),
+        interval_s,
         names,
         z_size,
         u_size,
         derivative,
-        place,
+        node_position,
         np.tile(weight, intervals) / intervals * samples,
         tuple(x.name for x in staged),
-        np.array([-1.0 if np.isfinite(x.low) else -FAR for x in staged]),
+        np.array([-1.0 if np.isfinite(x.low) else -NO_BOUND for x in staged]),
         tuple(x.name for x in steered),
-        control,
-        centre,
+        torque_rows,
+        torque_centre,
         rows,
         columns,
         len(model.scale),
         len(blocks),
-        at_rest,
-        band,
+        rest_states,
+        rest_band,
         np.array([k for k, c in enumerate(names) if c in pose and k not in resting_states], int),
-        _spread(place, derivative, n_z, n_u),
+        _sample_map(node_position, derivative, n_z, n_u),
         np.array([np.interp(nodes, motion.t, x) for x in told.T]).T.reshape(N, -1),
-        Mapped(values, N, [(n_z,), (n_g,), (n_a,)]),
-        Mapped(first, N, [(n_z,), (n_g,), (n_a,), (n_z, n_s), (n_g, n_s), (n_a, n_s)]),
-        Mapped(second, N, [(n_s, n_s)]),
-        Mapped(ca.Function("step", [sample, over], [residual, slopes[0]], options), len(place), [(n_z,), (n_z, n_s)]),
+        MappedFunction(values, N, [(n_z,), (n_g,), (n_a,)]),
+        MappedFunction(first_derivatives, N, [(n_z,), (n_g,), (n_a,), (n_z, n_s), (n_g, n_s), (n_a, n_s)]),
+        MappedFunction(lagrangian_hessian, N, [(n_s, n_s)]),
+        MappedFunction(
+            ca.Function("step", [sample, map_values], [residual, slopes[0]], options),
+            len(node_position),
+            [(n_z,), (n_z, n_s)],
+        ),
     )
 
 
-def _depends(every: Sequence[Limit], s: Symbols, on: ca.SX) -> set[str]:
-    """Names of the limits whose expression depends on any of these symbols."""
+def _limits_depending_on(every: Sequence[Limit], s: SampleSymbols, on: ca.SX) -> set[str]:
+    """Return the names of the limits whose expression depends on any of these symbols."""
     return {g.name for g in every if any(ca.which_depends(g.expression(s.q, s.nu, s.u, s.du), on, 1, True))}
 
 
-def _control(steered: Sequence[Limit], s: Symbols, u_size: np.ndarray, knot: float) -> tuple[np.ndarray, np.ndarray]:
-    """Limits on torques alone as rows (n_c, 2 n_u) on the scaled torques of both ends, scaled to -1..1."""
+def _torque_limit_rows(
+    steered: Sequence[Limit], s: SampleSymbols, u_size: np.ndarray, interval_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return limits on torques alone as rows (n_c, 2 n_u) on the scaled end torques, scaled to -1..1."""
     n_u = len(u_size)
     rows, centres = [], []
     for g in steered:
         e = g.expression(s.q, s.nu, s.u, s.du)
         slope = ca.Function("slope", [s.u, s.du], [ca.jacobian(e, s.u), ca.jacobian(e, s.du)])
         by_u, by_du = (x.full().ravel() for x in slope(0, 0))
-        rows.append(np.concatenate([-by_du / knot, by_u + by_du / knot]) * np.tile(u_size, 2) * 2 / g.range)
+        rows.append(np.concatenate([-by_du / interval_s, by_u + by_du / interval_s]) * np.tile(u_size, 2) * 2 / g.range)
         centres.append(-2 * g.centre / g.range)
     return np.array(rows).reshape(-1, 2 * n_u), np.array(centres)

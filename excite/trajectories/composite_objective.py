@@ -1,13 +1,11 @@
-"""What a design is after: terms of objectives put together, on the information that there will be after the drive.
+"""Objective of one design: a weighted sum of terms from OBJECTIVES, on the information after the drive.
 
-An aim is a weighted sum of terms. A term is an objective of J = D (A + prior) D: A the information of the drive, rows
-of the regressor weighted by their noise; prior what is known already (the inverse covariance of an earlier estimate);
-D the units that parameters count in. All of it is in the model's scale, so that the numbers have no unit. One term is
-the plain objective. A prior on each makes it sequential, one term for every machine that it could be makes it robust,
-and a term that only counts above a ceiling keeps an accuracy.
+A term scores J = D (A + prior) D in the model's scale, without units. A is the information of the drive with rows
+weighted by their noise, `prior` the information from earlier logs, D the reference values of the parameters. A prior
+makes a design sequential, one term per possible machine makes it robust, and a ceiling bounds the inaccuracy.
 
-Objectives of relative variances are judged by the Cramer-Rao bound of all sensors together (`smoothing.cramer_rao`).
-The weighted regressor is its smooth surrogate; `calibrated` makes the two agree, parameter by parameter, at a drive.
+Objectives of variances are reported by the Cramer-Rao bound of all sensors (`smoothing.cramer_rao`). The weighted
+regressor is a smooth surrogate of it; `calibrate_surrogates` makes both agree at one drive.
 """
 
 from __future__ import annotations
@@ -21,22 +19,29 @@ from excite import smoothing
 from excite.model import Model
 from excite.simulation import Motion, effect_inputs
 from excite.trajectories import objective as objectives
-from excite.trajectories.objective import EXACT, OBJECTIVES, Local, percent, relative
+from excite.trajectories.objective import (
+    EXACT_SHARPNESS,
+    OBJECTIVES,
+    LocalModel,
+    reference_values,
+    relative_std_percent,
+)
 
-# A ceiling is a smooth hinge: PRICE for what is above it, per unit of the logarithm of a variance, from WIDTH on.
-PRICE, WIDTH = 30.0, 0.01
-SIGMA_MAX = "sigma-max"
+CEILING_PRICE = 30.0  # price of a log variance above a ceiling, per unit; chosen
+CEILING_WIDTH = 0.01  # log variance over which that hinge is rounded; chosen
+SIGMA_MAX = "sigma-max"  # name of the ceiling among the violations of a drive
 
 
 @dataclass(frozen=True)
 class Term:
-    """weight * objective(D (A + prior) D); D = diag(columns), columns (n_base,), prior (n_base, n_base), in the scale.
+    """weight * objective(D (A + prior) D) with D = diag(column_scale), in the model's scale.
 
-    block: the row of `Aim.rows` that weights the regressor. ceiling: where given, only what is above it counts.
+    column_scale (n_base,). block: row of `CompositeObjective.row_weights`. prior (n_base, n_base). ceiling: if given,
+    only the excess over it counts.
     """
 
     objective: str
-    columns: np.ndarray
+    column_scale: np.ndarray
     block: int
     weight: float = 1.0
     prior: np.ndarray | None = None
@@ -48,34 +53,38 @@ class Term:
 
 
 @dataclass(frozen=True)
-class Aim:
-    """Terms, with the weights (n_blocks, n_rows) of the regressor's rows [1/SI] they look at; scale (n_base,) [SI].
+class CompositeObjective:
+    """Terms and the data they share.
 
-    sigma_max [%]: what the Cramer-Rao bound of the worst parameter may be. prior (n_base, n_base) in the scale.
-    machines: that the drive is for, each with a term in that order; none where it is for the nominal one alone.
+    row_weights (n_blocks, n_rows) [1/SI]: factors of the regressor's rows. scale (n_base,) [SI]. sigma_max [%]: bound
+    on the Cramer-Rao standard deviation of the least accurate parameter. prior (n_base, n_base), in the scale.
+    machines: machines that the drive is for, one term each; empty for the nominal machine alone.
     """
 
     name: str
     terms: tuple[Term, ...]
-    rows: np.ndarray
+    row_weights: np.ndarray
     scale: np.ndarray
     sigma_max: float | None = None
     prior: np.ndarray | None = None
     machines: tuple[Model, ...] = ()
 
 
-def aim(
+def compose_objective(
     model: Model,
     objective: str,
     sigma_max: float | None = None,
     prior: np.ndarray | None = None,
     machines: Sequence[Model] = (),
-) -> Aim:
-    """An objective by name, put together with what else is asked for.
+) -> CompositeObjective:
+    """Build the objective of a design from a name and the requirements beside it.
 
-    sigma_max [%]: a ceiling on the worst parameter's relative standard deviation. prior (n_base, n_base): information
-    that is there already [1/SI^2]. machines: the scenarios, whose scores are averaged; the model alone by default.
-    Raises KeyError for an unknown objective and ValueError for a bad prior or ceiling.
+    objective: a name in OBJECTIVES.
+    sigma_max [%]: bound on the largest relative standard deviation.
+    prior (n_base, n_base) [1/SI^2]: information from earlier logs.
+    machines: possible machines, whose scores are averaged; the model alone by default.
+
+    Raises KeyError for an unknown objective and ValueError for a bad prior or sigma_max.
     """
     if objective not in OBJECTIVES:
         raise KeyError(f"no objective {objective}, allowed: {', '.join(OBJECTIVES)}")
@@ -85,7 +94,7 @@ def aim(
     if prior is not None and (prior.shape != (n, n) or not np.isfinite(prior).all()):
         raise ValueError(f"prior: needs finite numbers of shape ({n}, {n}), got {prior.shape}")
     noise = objectives.row_noise(model)
-    # rows that count alike have one noise, so that a prior weighs as much as it tells
+    # Row 0: one noise for all rows, in units in which a prior adds up. Row 1: each row by its own noise.
     rows = np.stack([np.full(len(noise), 1 / np.sqrt(np.mean(noise**2))), 1 / noise])
     chosen = OBJECTIVES[objective]
     every = tuple(machines) or (model,)
@@ -93,7 +102,7 @@ def aim(
     terms = [
         Term(
             objective,
-            (m.scale if chosen.of == "eigenvalues" else relative(m)) / model.scale,
+            (m.scale if chosen.of == "eigenvalues" else reference_values(m)) / model.scale,
             int(chosen.weighted),
             1 / len(every),
             known,
@@ -102,38 +111,49 @@ def aim(
     ]
     if sigma_max is not None:
         ceiling = 2 * float(np.log(sigma_max / 100))
-        terms += [Term("worst", relative(m) / model.scale, 1, PRICE / len(every), known, ceiling) for m in every]
+        terms += [
+            Term("worst", reference_values(m) / model.scale, 1, CEILING_PRICE / len(every), known, ceiling)
+            for m in every
+        ]
     used = sorted({t.block for t in terms})
     terms = [replace(t, block=used.index(t.block)) for t in terms]
-    return Aim(objective, tuple(terms), rows[used], model.scale, sigma_max, known, tuple(machines))
+    return CompositeObjective(objective, tuple(terms), rows[used], model.scale, sigma_max, known, tuple(machines))
 
 
-# ------------------------------------------------------------------------------------------------ for the program
+# ------------------------------------------------------------------------------------------------ of matrices
 
 
-def value(aim: Aim, A: Sequence[np.ndarray] | np.ndarray, sharp: float = EXACT) -> float:
-    """The aim of information matrices (n_base, n_base), one for each of `aim.rows`; inf where one is singular."""
+def score_matrices(
+    objective: CompositeObjective, A: Sequence[np.ndarray] | np.ndarray, sharpness: float = EXACT_SHARPNESS
+) -> float:
+    """Score information matrices (n_base, n_base), one per row of `row_weights`; inf if one is singular."""
     total = 0.0
-    for term in aim.terms:
-        x = objectives.value(term.objective, _seen(term, A[term.block]), sharp)
+    for term in objective.terms:
+        x = objectives.score_matrix(term.objective, _accumulated(term, A[term.block]), sharpness)
         if not np.isfinite(x):
             return float("inf")
-        total += term.weight * (x if term.ceiling is None else _hinge(x - term.ceiling)[0])
+        total += term.weight * (x if term.ceiling is None else _smooth_hinge(x - term.ceiling)[0])
     return total
 
 
-def local(aim: Aim, A: Sequence[np.ndarray] | np.ndarray, rows: np.ndarray, columns: np.ndarray, sharp: float) -> Local:
-    """Value, slope and convex curvature by the entries A_b[rows, columns] of all information matrices in turn."""
+def local_model(
+    objective: CompositeObjective,
+    A: Sequence[np.ndarray] | np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    sharpness: float,
+) -> LocalModel:
+    """Expand the objective in the entries A_b[rows, columns] of all information matrices, block after block."""
     n_a = len(rows)
     total, slope = 0.0, np.zeros(len(A) * n_a)
     factors: list[np.ndarray] = []
-    for term in aim.terms:
-        near = objectives.local(term.objective, _seen(term, A[term.block]), rows, columns, sharp)
+    for term in objective.terms:
+        near = objectives.local_model(term.objective, _accumulated(term, A[term.block]), rows, columns, sharpness)
         own = slice(term.block * n_a, (term.block + 1) * n_a)
-        by = term.columns[rows] * term.columns[columns]
+        by = term.column_scale[rows] * term.column_scale[columns]
         x, push, bend = near.value, 1.0, 0.0
         if term.ceiling is not None:
-            x, push, bend = _hinge(x - term.ceiling)
+            x, push, bend = _smooth_hinge(x - term.ceiling)
         total += term.weight * x
         slope[own] += term.weight * push * by * near.slope
         columns_of = [np.sqrt(term.weight * push) * by[:, None] * near.factor]
@@ -144,103 +164,111 @@ def local(aim: Aim, A: Sequence[np.ndarray] | np.ndarray, rows: np.ndarray, colu
         factors.append(factor)
     factor = np.hstack(factors)
     if factor.shape[1] > len(slope):
-        factor = objectives.factored(factor @ factor.T)
-    return Local(total, slope, factor)
+        factor = objectives.factor_positive_part(factor @ factor.T)
+    return LocalModel(total, slope, factor)
 
 
-def _seen(term: Term, A: np.ndarray) -> np.ndarray:
-    """J = D (A + prior) D."""
+def _accumulated(term: Term, A: np.ndarray) -> np.ndarray:
+    """Return J = D (A + prior) D."""
     J = A if term.prior is None else A + term.prior
-    return np.asarray(J * term.columns * term.columns[:, None])
+    return np.asarray(J * term.column_scale * term.column_scale[:, None])
 
 
-def _hinge(x: float) -> tuple[float, float, float]:
-    """A smooth max(x, 0), its slope and its curvature."""
-    z = x / WIDTH
+def _smooth_hinge(x: float) -> tuple[float, float, float]:
+    """Return a smooth max(x, 0), its slope and its curvature."""
+    z = x / CEILING_WIDTH
     share = 1 / (1 + np.exp(-np.clip(z, -500, 500)))
-    return WIDTH * float(np.logaddexp(0, z)), float(share), float(share * (1 - share)) / WIDTH
+    return CEILING_WIDTH * float(np.logaddexp(0, z)), float(share), float(share * (1 - share)) / CEILING_WIDTH
 
 
 # ------------------------------------------------------------------------------------------------ of a motion
 
 
-def information(aim: Aim, model: Model, motion: Motion) -> list[np.ndarray]:
-    """The matrices (n_base, n_base) of a motion in the scale, every sample counted, one for each of `aim.rows`."""
+def information_matrices(objective: CompositeObjective, model: Model, motion: Motion) -> list[np.ndarray]:
+    """Return a motion's information matrices (n_base, n_base) in the scale, one per row of `row_weights`."""
     W = model.stacked_regressor(motion.q.T, motion.nu.T, motion.a.T, *effect_inputs(model, motion))
     found: list[np.ndarray] = []
-    for weights in aim.rows:
-        # by QR: squaring W would cost half of the digits
-        R = np.asarray(np.linalg.qr((W * weights[:, None] * aim.scale).reshape(-1, W.shape[2]), mode="r"))
+    for weights in objective.row_weights:
+        # QR, since W' W would lose half of the digits
+        R = np.asarray(np.linalg.qr((W * weights[:, None] * objective.scale).reshape(-1, W.shape[2]), mode="r"))
         found.append(R.T @ R)
     return found
 
 
-def covariance(aim: Aim, model: Model, motion: Motion) -> np.ndarray:
-    """(n_base, n_base) the Cramer-Rao bound [SI^2] after the drive, with what is known before."""
+def _term_information(objective: CompositeObjective, term: Term, model: Model, motion: Motion) -> np.ndarray:
+    return information_matrices(replace(objective, row_weights=objective.row_weights[[term.block]]), model, motion)[0]
+
+
+def covariance_bound(objective: CompositeObjective, model: Model, motion: Motion) -> np.ndarray:
+    """Return the Cramer-Rao bound (n_base, n_base) [SI^2] after the drive, with the prior information."""
     C = smoothing.cramer_rao(model, motion, "full")
-    if aim.prior is None:
+    if objective.prior is None:
         return C
-    by = np.outer(aim.scale, aim.scale)
-    return np.asarray(np.linalg.inv(np.linalg.inv(C / by) + aim.prior) * by)
+    by = np.outer(objective.scale, objective.scale)
+    return np.asarray(np.linalg.inv(np.linalg.inv(C / by) + objective.prior) * by)
 
 
-def sigma_percent(aim: Aim, model: Model, motion: Motion) -> np.ndarray:
-    """(n_base,) attainable relative standard deviations [%] after the drive."""
-    return percent(model, covariance(aim, model, motion))
+def sigma_percent(objective: CompositeObjective, model: Model, motion: Motion) -> np.ndarray:
+    """Return the attainable relative standard deviations (n_base,) [%] after the drive."""
+    return relative_std_percent(model, covariance_bound(objective, model, motion))
 
 
 @dataclass(frozen=True)
-class Judged:
-    """What a drive is worth: the aim's score (lower is better), and the worst parameter's deviation [%] where asked."""
+class DriveScore:
+    """Score of a drive, lower is better, and the largest relative standard deviation [%], 0 if not computed."""
 
     score: float
     worst_percent: float
 
 
-def judge(aim: Aim, motions: Sequence[tuple[Model, Motion]]) -> Judged:
-    """The score over the machines that a drive is for, each with its own motion, and the worst deviation [%] of all.
+def score_motions(objective: CompositeObjective, motions: Sequence[tuple[Model, Motion]]) -> DriveScore:
+    """Score a drive over the machines that it is for, given the motion of each.
 
-    Objectives of variances are judged by the Cramer-Rao bound; without those and without a `sigma_max` the deviation is
-    not looked at, and 0.
+    The Cramer-Rao bound is computed for objectives of variances or if `sigma_max` is set.
     """
-    primary = [t for t in aim.terms if t.ceiling is None]
+    primary = [t for t in objective.terms if t.ceiling is None]
     total, worst = 0.0, 0.0
     for term, (model, motion) in zip(primary, motions, strict=True):
-        spread = sigma_percent(aim, model, motion) if term.of_variances or aim.sigma_max is not None else None
-        if spread is not None:
-            worst = max(worst, float(spread.max()))
+        sigma = (
+            sigma_percent(objective, model, motion) if term.of_variances or objective.sigma_max is not None else None
+        )
+        if sigma is not None:
+            worst = max(worst, float(sigma.max()))
         if term.of_variances:
-            assert spread is not None
-            total += term.weight * objectives.of_values(term.objective, (spread / 100) ** 2)
+            assert sigma is not None
+            total += term.weight * objectives.score_values(term.objective, (sigma / 100) ** 2)
         else:
-            A = information(replace(aim, rows=aim.rows[[term.block]]), model, motion)[0]
-            total += term.weight * objectives.value(term.objective, _seen(term, A))
-    return Judged(total, worst)
+            A = _term_information(objective, term, model, motion)
+            total += term.weight * objectives.score_matrix(term.objective, _accumulated(term, A))
+    return DriveScore(total, worst)
 
 
-def optimism(aim: Aim, model: Model, motion: Motion) -> np.ndarray | None:
-    """(n_base,) the Cramer-Rao bound's variances over the surrogate's along a motion of the nominal machine.
+def surrogate_ratio(objective: CompositeObjective, model: Model, motion: Motion) -> np.ndarray | None:
+    """Return the Cramer-Rao variances over the surrogate's (n_base,) along a motion of the nominal machine.
 
-    None where the aim has no objective of variances.
+    None if no term is an objective of variances.
     """
-    for term in aim.terms:
+    for term in objective.terms:
         if term.of_variances:
-            A = information(replace(aim, rows=aim.rows[[term.block]]), model, motion)[0]
-            J = _seen(term, A)
-            thought = np.diag(np.linalg.inv(J)) * term.columns**2
-            return np.asarray(np.diag(covariance(aim, model, motion)) / aim.scale**2 / thought)
+            A = _term_information(objective, term, model, motion)
+            J = _accumulated(term, A)
+            thought = np.diag(np.linalg.inv(J)) * term.column_scale**2
+            return np.asarray(np.diag(covariance_bound(objective, model, motion)) / objective.scale**2 / thought)
     return None
 
 
-def calibrated(aim: Aim, optimism: np.ndarray) -> Aim:
-    """The aim with surrogates of variances that much larger: they give the bound where the optimism is that of."""
-    terms = tuple(replace(t, columns=t.columns / np.sqrt(optimism)) if t.of_variances else t for t in aim.terms)
-    return replace(aim, terms=terms)
+def calibrate_surrogates(objective: CompositeObjective, optimism: np.ndarray) -> CompositeObjective:
+    """Scale the surrogates of variances by this ratio (n_base,), so that they match the Cramer-Rao bound."""
+    terms = tuple(
+        replace(t, column_scale=t.column_scale / np.sqrt(optimism)) if t.of_variances else t for t in objective.terms
+    )
+    return replace(objective, terms=terms)
 
 
-def lowered(aim: Aim, share: float) -> Aim:
-    """The aim with its ceilings lower by this share of the deviation."""
+def lower_ceilings(objective: CompositeObjective, share: float) -> CompositeObjective:
+    """Lower every ceiling by this share of the standard deviation."""
     down = 2 * float(np.log1p(share))
     return replace(
-        aim, terms=tuple(t if t.ceiling is None else replace(t, ceiling=t.ceiling - down) for t in aim.terms)
+        objective,
+        terms=tuple(t if t.ceiling is None else replace(t, ceiling=t.ceiling - down) for t in objective.terms),
     )

@@ -1,8 +1,8 @@
-"""The continuation of a design: a drive carried from a smooth, coarse problem to the machine as it is.
+"""Continuation of a design: from a smooth, coarse problem to the machine as it is.
 
-Wide friction and slip transitions and far-apart torque knots first, where the problem is smooth, then ever closer to
-the machine as it is. Every stage's answer is simulated afresh by the accurate integrator at the machine's sampling
-rate; its score and its limits are those of that motion, never the optimiser's own.
+The first stages have wide transitions of friction and slip and torque knots far apart; later ones approach the real
+machine. Every stage's result is simulated afresh by the accurate integrator at the machine's sampling rate. Scores and
+limits are those of that simulation.
 """
 
 from __future__ import annotations
@@ -16,79 +16,80 @@ from excite.errors import CollocationError, SimulationError
 from excite.model import Model
 from excite.model.machine import Machine, Problem
 from excite.simulation import Motion, simulate, track_motion
-from excite.trajectories import composite_objective as aims, interior_point, objective as _objective
-from excite.trajectories.collocation import Transcription, settle, transcribe
-from excite.trajectories.composite_objective import SIGMA_MAX, Aim
-from excite.trajectories.excitation import Manoeuvre, knots, multisine, scaled
+from excite.trajectories import composite_objective, interior_point, objective as objectives
+from excite.trajectories.collocation import Transcription, solve_states, transcribe
+from excite.trajectories.composite_objective import SIGMA_MAX, CompositeObjective
+from excite.trajectories.excitation import Manoeuvre, knot_times, multisine, scale_torques
 from excite.trajectories.limits import (
     REST_POSITION,
     REST_SPEED,
     TOLERANCE,
-    TRAVEL,
+    TRAVEL_LIMIT,
     check_limits,
-    directions,
-    free,
-    kept_between,
+    is_free_limit,
+    is_lane_limit,
+    is_rest_limit,
+    keeps_motion_limits,
     lane_excess,
     machine_limits,
-    of_lane,
-    of_rest,
-    placed,
+    place_on_lane,
     rest_tolerances,
-    resting,
+    resting_coordinates,
+    travel_directions,
 )
 
-STUCK = 20.0  # half ranges in all that a program still exceeds: it is not going to keep its limits
-MARGIN = 2e-3  # of half a range: what the program keeps from every limit
+MAX_INFEASIBILITY = 20.0  # half ranges in sum; a program that ends above it is started again; chosen
+LIMIT_MARGIN = 2e-3  # half ranges, distance that the program keeps from limits on the motion; chosen
 
 
 @dataclass(frozen=True)
-class Stage:
-    """One solve of the continuation: transitions and knots wider by these factors, and the levels that follow.
+class ContinuationStage:
+    """One stage: transitions of friction and slip and the knot spacing are wider by these factors.
 
-    Level i follows the objective with sharpness sharp 2^i at barrier / 3^i, and ends when the decrease that a Newton
-    step promises is below `patience` / sharpness.
+    Level i has sharpness `sharpness` 2^i and barrier `barrier` / 3^i. It ends when the decrease that a Newton step
+    expects is below `patience` / sharpness. elements: collocation elements per interval.
     """
 
     friction: float
     slip: float
     coarse: int
-    sharp: float
+    sharpness: float
     barrier: float
     levels: int
     iterations: int
     patience: float
     elements: int = 1
 
-    def apart(self) -> list[Stage]:
-        """Its levels as stages of their own: surrogates of variances are then calibrated before each."""
+    def split_levels(self) -> list[ContinuationStage]:
+        """Split the levels into stages, so that surrogates of variances are calibrated before each."""
         return [
-            replace(self, sharp=self.sharp * 2**i, barrier=self.barrier / 3**i, levels=1) for i in range(self.levels)
+            replace(self, sharpness=self.sharpness * 2**i, barrier=self.barrier / 3**i, levels=1)
+            for i in range(self.levels)
         ]
 
 
-PLAN = (
-    Stage(10, 3, 4, 8, 1e-3, 2, 40, 1.0),
-    Stage(4, 1.7, 2, 16, 1e-4, 2, 30, 1.0),
-    Stage(2, 1.2, 2, 40, 3e-5, 1, 30, 1.0),
-    Stage(1, 1, 2, 60, 1e-5, 1, 30, 1.0),
-    Stage(1, 1, 1, 100, 1e-5, 4, 30, 0.1),
+# friction, slip, coarse, sharpness, barrier, levels, iterations, patience; all chosen
+STAGES = (
+    ContinuationStage(10, 3, 4, 8, 1e-3, 2, 40, 1.0),
+    ContinuationStage(4, 1.7, 2, 16, 1e-4, 2, 30, 1.0),
+    ContinuationStage(2, 1.2, 2, 40, 3e-5, 1, 30, 1.0),
+    ContinuationStage(1, 1, 2, 60, 1e-5, 1, 30, 1.0),
+    ContinuationStage(1, 1, 1, 100, 1e-5, 4, 30, 0.1),
 )
-SCOUTS = 3  # stages that every start goes through; the best third of the starts go on to the end
-REPAIR = Stage(1, 1, 1, 800, 1e-6, 1, 30, 0.1, elements=3)
-REFINE = Stage(1, 1, 1, 800, 1e-6, 1, 30, 0.1)
-REPAIRS = 3  # of a drive whose fresh simulation exceeds a limit, at most, and one more for every machine it is for
-MUCH = 0.05  # of a limit's range: exceeded by more, its ratio counts
-REFINES = 5  # of an aim with a ceiling, at most
-GAINED = 2e-3  # of the score by which another one is worth its time
+SCREENING_STAGES = 3  # stages that every start goes through; the best third goes on; chosen
+REPAIR_STAGE = ContinuationStage(1, 1, 1, 800, 1e-6, 1, 30, 0.1, elements=3)
+REFINE_STAGE = ContinuationStage(1, 1, 1, 800, 1e-6, 1, 30, 0.1)
+MAX_REPAIRS = 3  # repairs of a drive that exceeds a limit, and one more for every machine; chosen
+LARGE_EXCESS = 0.05  # share of a limit's range, above which margins grow by a ratio; chosen
+MAX_REFINES = 5  # re-optimisations of an objective with a ceiling; chosen
+MIN_SCORE_GAIN = 2e-3  # gain of the score that justifies another re-optimisation; chosen
 
-
-Tell = Callable[["Track"], None]
+StateReport = Callable[["SearchState"], None]
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A drive and the fresh simulation's verdict: torques at the knots, start coordinates (n_q,), score, violations."""
+class ScoredDrive:
+    """A drive after fresh simulation: torques, start coordinates (n_q,), score, excess by limit."""
 
     manoeuvre: Manoeuvre
     start: np.ndarray
@@ -105,69 +106,99 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Track:
-    """How far one start has come, ready to be carried on.
+class SearchState:
+    """Progress of one start.
 
-    times (N,) [s] and states (N, n_z), scaled by `sizes`, are the last program's nodes, or the guess's samples and
-    none yet. pose (n_q,): the start coordinates once the lane matters. best: the best candidate on the way.
-    going (N,): the direction of travel at the machine's samples, +-1, where reversals are counted. optimism (n_base,):
-    of the surrogates of variances, as the next stage corrects them.
+    state_sizes: typical sizes by state name. latest, best: drives found. motion: of `latest`.
+    times (N,) [s], node_states (N, n_z): nodes of the last program, scaled; at first the samples of `motion` and None.
+    start_pose (n_q,): start coordinates, once limits of the lane matter.
+    travel_direction (N,): +-1 at the machine's samples, if reversals are limited.
+    surrogate_ratio (n_base,): correction of the surrogates of variances in the last stage.
+    complete: False if the search was cut short.
     """
 
     number: int
-    guess: float
-    sizes: Mapping[str, float]
-    latest: Candidate
-    best: Candidate
+    start_cond_phi: float
+    state_sizes: Mapping[str, float]
+    latest: ScoredDrive
+    best: ScoredDrive
     motion: Motion
     times: np.ndarray
-    states: np.ndarray | None = None
-    pose: np.ndarray | None = None
-    going: np.ndarray | None = None
-    optimism: np.ndarray | None = None
+    node_states: np.ndarray | None = None
+    start_pose: np.ndarray | None = None
+    travel_direction: np.ndarray | None = None
+    surrogate_ratio: np.ndarray | None = None
     complete: bool = False
 
 
-def rank(c: Candidate) -> tuple[float, float]:
-    """Feasible before infeasible, then by score, or by excess."""
+def rank(c: ScoredDrive) -> tuple[float, float]:
+    """Order feasible drives before infeasible ones, then by score or by excess."""
     return (0.0, c.score) if c.feasible else (1.0, c.excess)
 
 
-def promise(c: Candidate) -> float:
-    """What a start may come to: its score, dearer by what it exceeds."""
+def selection_score(c: ScoredDrive) -> float:
+    """Score a screened start: its score plus its excess, at most 1."""
     return c.score + min(1.0, c.excess)
 
 
-def depart(model: Model, problem: Problem, aim: Aim, number: int, seed: int) -> Track:
-    """A start: a random multisine, as large as the limits on the motion allow."""
-    wish = multisine(model, problem, seed, top=0.5)
+def start_from_multisine(
+    model: Model, problem: Problem, objective: CompositeObjective, number: int, seed: int
+) -> SearchState:
+    """Start from a random multisine, as large as the limits on the motion allow."""
+    largest = multisine(model, problem, seed, top=0.5)
     for factor in 0.85 ** np.arange(60):
-        drive = scaled(wish, float(factor))
+        drive = scale_torques(largest, float(factor))
         try:
             motion = simulate(model, drive.sample(float(model.machine.sampling_hz)))
         except SimulationError:
             continue
-        if kept_between(check_limits(model, problem, motion)):
+        if keeps_motion_limits(check_limits(model, problem, motion)):
             break
-    found, motion = verdict(model, problem, aim, drive)
-    sizes = typical_sizes(model, problem, motion)
-    going = None if problem.reversals is None else directions(motion, problem.reversals)
-    return Track(number, _objective.cond_phi(model, motion), sizes, found, found, motion, motion.t, going=going)
+    found, motion = evaluate_drive(model, problem, objective, drive)
+    state_sizes = typical_sizes(model, problem, motion)
+    travel_direction = None if problem.reversals is None else travel_directions(motion, problem.reversals)
+    return SearchState(
+        number,
+        objectives.cond_phi(model, motion),
+        state_sizes,
+        found,
+        found,
+        motion,
+        motion.t,
+        travel_direction=travel_direction,
+    )
 
 
-def resume(model: Model, problem: Problem, aim: Aim, number: int, drive: Manoeuvre) -> Track:
-    """A start from a drive that is there already, for the last stages. Raises SimulationError."""
-    found, motion = verdict(model, problem, aim, drive)
-    sizes = typical_sizes(model, problem, motion)
-    going = None if problem.reversals is None else directions(motion, problem.reversals)
-    pose = found.start if model.machine.planar and problem.lane_points else None
-    score = _objective.cond_phi(model, motion)
-    return Track(number, score, sizes, found, found, motion, motion.t, pose=pose, going=going)
+def start_from_drive(
+    model: Model, problem: Problem, objective: CompositeObjective, number: int, drive: Manoeuvre
+) -> SearchState:
+    """Start the last stages from a given drive.
+
+    Raises SimulationError.
+    """
+    found, motion = evaluate_drive(model, problem, objective, drive)
+    state_sizes = typical_sizes(model, problem, motion)
+    travel_direction = None if problem.reversals is None else travel_directions(motion, problem.reversals)
+    start_pose = found.start if model.machine.planar and problem.lane_points else None
+    score = objectives.cond_phi(model, motion)
+    return SearchState(
+        number,
+        score,
+        state_sizes,
+        found,
+        found,
+        motion,
+        motion.t,
+        start_pose=start_pose,
+        travel_direction=travel_direction,
+    )
 
 
 def typical_sizes(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
-    """Typical size of every coordinate and velocity (c and c') in a motion, and of what effects remember; of the pose,
-    half the lane."""
+    """Return twice the root mean square of every coordinate c, velocity c' and memory state in a motion.
+
+    Half the lane for the position, 1 for the heading.
+    """
     sizes = {}
     for k, c in enumerate(model.coordinates):
         sizes[c] = max(1e-3, 2 * float(np.sqrt((motion.q[:, k] ** 2).mean())))
@@ -180,82 +211,92 @@ def typical_sizes(model: Model, problem: Problem, motion: Motion) -> dict[str, f
     return sizes
 
 
-def search(
+def run_stages(
     model: Model,
     problem: Problem,
-    aim: Aim,
-    track: Track,
-    plan: Sequence[Stage],
-    over: Callable[[], bool],
-    tell: Tell = lambda track: None,
-) -> Track:
-    """A track carried through the stages of a plan, until `over`; `tell` sees it after each."""
-    if aim.sigma_max is not None:
-        plan = [one for stage in plan for one in (stage.apart() if stage.friction == 1 else [stage])]
+    objective: CompositeObjective,
+    state: SearchState,
+    plan: Sequence[ContinuationStage],
+    should_stop: Callable[[], bool],
+    report: StateReport = lambda state: None,
+) -> SearchState:
+    """Take a start through stages until `should_stop`; `report` is called after each."""
+    if objective.sigma_max is not None:
+        plan = [one for stage in plan for one in (stage.split_levels() if stage.friction == 1 else [stage])]
     for stage in plan:
-        if over():
+        if should_stop():
             break
-        moved = _advance(model, problem, aim, track, stage, {}, over)
+        moved = _run_stage(model, problem, objective, state, stage, {}, should_stop)
         if moved is None:
             break
-        track = moved
-        if track.pose is not None or (stage.friction <= 4 and lane_excess(track.latest.violations) > 0):
-            track = replace(track, pose=track.latest.start)
-        tell(track)
-    return track
+        state = moved
+        if state.start_pose is not None or (stage.friction <= 4 and lane_excess(state.latest.violations) > 0):
+            state = replace(state, start_pose=state.latest.start)
+        report(state)
+    return state
 
 
 def refine(
-    model: Model, problem: Problem, aim: Aim, track: Track, over: Callable[[], bool], tell: Tell = lambda track: None
-) -> Track:
-    """The same drive with its ceiling calibrated anew to the Cramer-Rao bound, as long as that helps."""
-    if aim.sigma_max is None:
-        return track
-    for _ in range(REFINES):
-        before = track.best
-        if over():
+    model: Model,
+    problem: Problem,
+    objective: CompositeObjective,
+    state: SearchState,
+    should_stop: Callable[[], bool],
+    report: StateReport = lambda state: None,
+) -> SearchState:
+    """Calibrate the accuracy ceiling to the Cramer-Rao bound again and re-optimise, as long as the score improves."""
+    if objective.sigma_max is None:
+        return state
+    for _ in range(MAX_REFINES):
+        before = state.best
+        if should_stop():
             break
-        track = _advance(model, problem, aim, track, REFINE, {}, over) or track
-        tell(track)
-        if before.feasible and track.latest.feasible and before.score - track.best.score < GAINED:
+        state = _run_stage(model, problem, objective, state, REFINE_STAGE, {}, should_stop) or state
+        report(state)
+        if before.feasible and state.latest.feasible and before.score - state.best.score < MIN_SCORE_GAIN:
             break
-    return track
+    return state
 
 
-def repair(model: Model, problem: Problem, aim: Aim, track: Track, over: Callable[[], bool]) -> Track:
-    """The same drive with what the fresh simulation exceeds moved in, a few times at most.
+def repair(
+    model: Model, problem: Problem, objective: CompositeObjective, state: SearchState, should_stop: Callable[[], bool]
+) -> SearchState:
+    """Move exceeded limits in and re-optimise, a few times at most.
 
-    By what is exceeded; by its ratio where that is much, as for other machines, which need more torque and power for
-    the same motion: a range can't be narrowed by more than itself.
+    A margin grows by the excess. For a large excess it grows by its ratio, since a range can't shrink below zero; other
+    machines may need much more torque and power for the same motion.
     """
     margins: dict[str, float] = {}
-    track = land(model, problem, aim, track, over)
-    for _ in range(REPAIRS + len(aim.machines)):
-        if track.latest.feasible or over():
+    state = bring_to_rest(model, problem, objective, state, should_stop)
+    for _ in range(MAX_REPAIRS + len(objective.machines)):
+        if state.latest.feasible or should_stop():
             break
-        for name, excess in track.latest.violations.items():
+        for name, excess in state.latest.violations.items():
             if excess > 0.3 * TOLERANCE:
                 old, more = margins.get(name, 0.0), min(3 * excess, excess + 0.01)
-                margins[name] = old + more if more < MUCH else 0.5 - (0.5 - old) / (1 + 2 * more)
-        track = replace(track, pose=track.latest.start) if track.pose is not None else track
-        track = _advance(model, problem, aim, track, REPAIR, margins, over) or track
-        track = land(model, problem, aim, track, over)
-    return track
+                margins[name] = old + more if more < LARGE_EXCESS else 0.5 - (0.5 - old) / (1 + 2 * more)
+        state = replace(state, start_pose=state.latest.start) if state.start_pose is not None else state
+        state = _run_stage(model, problem, objective, state, REPAIR_STAGE, margins, should_stop) or state
+        state = bring_to_rest(model, problem, objective, state, should_stop)
+    return state
 
 
-def land(model: Model, problem: Problem, aim: Aim, track: Track, over: Callable[[], bool]) -> Track:
-    """The same drive with small smooth torques added that bring the fresh simulation to rest where it should end.
+def bring_to_rest(
+    model: Model, problem: Problem, objective: CompositeObjective, state: SearchState, should_stop: Callable[[], bool]
+) -> SearchState:
+    """Add small smooth torques that bring the fresh simulation to rest at the end.
 
-    What the forces integrate, a steered joint say, drifts in open loop by what the collocation neglects; Newton's
-    method on the end of the motion, least in the share of the torque limits, takes that out. Kept where it helps.
+    States that integrate forces, such as a steered joint, drift in open loop by the collocation error. Newton's method
+    on the end of the motion removes the drift with the least torque, as a share of the limits. Kept if the drive
+    improves.
     """
     rate = float(model.machine.sampling_hz)
     scale = np.array([float(b.limit.torque) if b.limit.torque is not None else 1.0 for b in model.machine.actuated])
     for _ in range(4):
-        late = [name for name, v in track.latest.violations.items() if v > 0 and of_rest(name)]
-        if not late or over():
+        late = [name for name, v in state.latest.violations.items() if v > 0 and is_rest_limit(name)]
+        if not late or should_stop():
             break
-        drive, x0 = track.latest.manoeuvre, _end(model, track.motion)
+        drive, x0 = state.latest.manoeuvre, _rest_errors(model, state.motion)
         shapes = [
             shape[:, None] * scale * np.eye(len(scale))[k]
             for shape in _bumps(drive.times / drive.duration)
@@ -264,181 +305,202 @@ def land(model: Model, problem: Problem, aim: Aim, track: Track, over: Callable[
         step = 1e-3
         try:
             moved = [
-                simulate(model, Manoeuvre(drive.times, drive.torque + step * s).sample(rate), q0=track.motion.q[0])
+                simulate(model, Manoeuvre(drive.times, drive.torque + step * s).sample(rate), q0=state.motion.q[0])
                 for s in shapes
             ]
-            J = np.column_stack([(_end(model, m) - x0) / step for m in moved])
-            off = np.abs(x0) > 0.5  # what is at rest already needs no torque
+            J = np.column_stack([(_rest_errors(model, m) - x0) / step for m in moved])
+            off = np.abs(x0) > 0.5  # in tolerances
             sizes = np.linalg.lstsq(J[off], -x0[off], rcond=1e-3)[0]
             added = sum((size * s for size, s in zip(sizes, shapes, strict=True)), np.zeros_like(drive.torque))
-            found, motion = verdict(model, problem, aim, Manoeuvre(drive.times, drive.torque + added))
+            found, motion = evaluate_drive(model, problem, objective, Manoeuvre(drive.times, drive.torque + added))
         except SimulationError:
             break
-        if rank(found) >= rank(track.latest):
+        if rank(found) >= rank(state.latest):
             break
-        track = replace(track, latest=found, best=min(track.best, found, key=rank), motion=motion)
-    return track
+        state = replace(state, latest=found, best=min(state.best, found, key=rank), motion=motion)
+    return state
 
 
 def _bumps(share: np.ndarray) -> list[np.ndarray]:
-    """Smooth bumps (K,) in the second half of a drive, share (K,) of its duration."""
+    """Return smooth bumps (K,) in the second half of a drive; share (K,): time over duration."""
     return [
         np.where(np.abs(share - middle) < 0.1, np.cos(5 * np.pi * (share - middle)) ** 2, 0.0)
         for middle in (0.6, 0.75, 0.88)
     ]
 
 
-def _end(model: Model, motion: Motion) -> np.ndarray:
-    """What must be zero at the end of a motion, in its tolerances: coordinates that rest and velocities."""
-    still = motion.q[-1, list(resting(model))] / REST_POSITION
+def _rest_errors(model: Model, motion: Motion) -> np.ndarray:
+    """Return resting coordinates and velocities at the end of a motion, in tolerances."""
+    still = motion.q[-1, list(resting_coordinates(model))] / REST_POSITION
     return np.concatenate([still, motion.nu[-1] / rest_tolerances(model)])
 
 
-def _advance(
+def _run_stage(
     model: Model,
     problem: Problem,
-    aim: Aim,
-    track: Track,
-    stage: Stage,
+    objective: CompositeObjective,
+    state: SearchState,
+    stage: ContinuationStage,
     margins: Mapping[str, float],
-    over: Callable[[], bool],
-) -> Track | None:
-    """One stage from where the track stands. None where no motion follows its torques."""
-    wanted = aim
+    should_stop: Callable[[], bool],
+) -> SearchState | None:
+    """Run one stage; None if no motion follows the torques or the information is singular."""
+    wanted = objective
     if stage.friction == 1:
-        seen = aims.optimism(aim, model, track.motion)
-        if seen is not None:
-            careful = _careful(seen, track.optimism)
-            track, wanted = replace(track, optimism=careful), aims.calibrated(aim, careful)
-    wanted = aims.lowered(wanted, margins.get(SIGMA_MAX, 0.0))
-    times = knots(problem, stage.coarse)
+        ratio = composite_objective.surrogate_ratio(objective, model, state.motion)
+        if ratio is not None:
+            careful = _damped_ratio(ratio, state.surrogate_ratio)
+            state, wanted = (
+                replace(state, surrogate_ratio=careful),
+                composite_objective.calibrate_surrogates(objective, careful),
+            )
+    wanted = composite_objective.lower_ceilings(wanted, margins.get(SIGMA_MAX, 0.0))
+    times = knot_times(problem, stage.coarse)
     intervals = len(times) - 1
-    softer = soften(model, stage.friction, stage.slip)
+    softer = widen_transitions(model, stage.friction, stage.slip)
     tr = transcribe(
         softer,
         problem,
-        track.sizes,
+        state.state_sizes,
         intervals,
-        track.motion,
+        state.motion,
         elements=stage.elements,
-        with_pose=track.pose is not None,
-        rest=rest_band(stage.friction),
-        weights=aim.rows,
+        with_pose=state.start_pose is not None,
+        rest_factor=rest_band_factor(stage.friction),
+        weights=objective.row_weights,
     )
-    nodes = (np.arange(intervals)[:, None] + tr.place) * tr.knot
-    U = track.latest.manoeuvre.at(times) / tr.torque_scale
+    nodes = (np.arange(intervals)[:, None] + tr.node_position) * tr.interval_s
+    U = state.latest.manoeuvre.at(times) / tr.torque_scale
     U[0] = U[-1] = 0.0
     start = np.zeros(tr.n_z)
-    if track.pose is not None:
+    if state.start_pose is not None:
         for k, c in enumerate(tr.state_names):
-            start[k] = track.pose[model.coordinates.index(c)] / tr.state_scale[k] if c in model.coordinates else 0.0
-    fresh = track.states is None
-    if track.states is None or track.states.shape[1] != tr.n_z:
+            start[k] = (
+                state.start_pose[model.coordinates.index(c)] / tr.state_scale[k] if c in model.coordinates else 0.0
+            )
+    fresh = state.node_states is None
+    if state.node_states is None or state.node_states.shape[1] != tr.n_z:
         names = [*model.coordinates, *[c + "'" for c in model.coordinates], *model.memory]
-        every = np.hstack([track.motion.q, track.motion.nu, track.motion.memory])
+        every = np.hstack([state.motion.q, state.motion.nu, state.motion.memory])
         columns = [every[:, names.index(c)] / size for c, size in zip(tr.state_names, tr.state_scale, strict=True)]
-        Z = np.stack([np.interp(nodes, track.motion.t, x) for x in columns], axis=-1)
+        Z = np.stack([np.interp(nodes, state.motion.t, x) for x in columns], axis=-1)
     else:
-        Z = np.stack([np.interp(nodes, track.times, x) for x in track.states.T], axis=-1)
-    moved_in = np.array([MARGIN + 2 * margins.get(name, 0.0) for name in tr.limit_names])
-    task = interior_point.Task(
+        Z = np.stack([np.interp(nodes, state.times, x) for x in state.node_states.T], axis=-1)
+    moved_in = np.array([LIMIT_MARGIN + 2 * margins.get(name, 0.0) for name in tr.limit_names])
+    task = interior_point.Subproblem(
         wanted,
         np.tile(moved_in, (intervals, tr.nodes, 1)),
-        np.tile([1e-4 + 2 * margins.get(name, 0.0) for name in tr.control_names], (intervals, 1)),
-        np.array([of_lane(name) for name in tr.limit_names], bool),
+        np.tile([1e-4 + 2 * margins.get(name, 0.0) for name in tr.torque_limit_names], (intervals, 1)),
+        np.array([is_lane_limit(name) for name in tr.limit_names], bool),
     )
-    if track.going is not None and TRAVEL in tr.limit_names:
-        above, below = _one_way(tr, nodes, model, problem, track.going)
+    if state.travel_direction is not None and TRAVEL_LIMIT in tr.limit_names:
+        above, below = _direction_margins(tr, nodes, model, problem, state.travel_direction)
         task = replace(task, above=above, below=below)
 
     try:
-        Z = settle(tr, start, U, Z)
+        Z = solve_states(tr, start, U, Z)
     except CollocationError:
         return None
-    sharp = [stage.sharp * 2**i for i in range(stage.levels)]
+    sharpness = [stage.sharpness * 2**i for i in range(stage.levels)]
     levels = tuple(
-        interior_point.Level(p, stage.barrier / 3**i, stage.patience / p, stage.iterations) for i, p in enumerate(sharp)
+        interior_point.BarrierLevel(p, stage.barrier / 3**i, stage.patience / p, stage.iterations)
+        for i, p in enumerate(sharpness)
     )
     kept = not fresh
     try:
         if kept:
-            point = interior_point.begin(tr, task, start, Z, U, stage.barrier, 1e-3)
-            point, state = interior_point.minimise(tr, task, point, levels, over)
-            kept = interior_point.infeasibility(state, point) < STUCK
-        if not kept:  # by way of the nearest torques that keep every limit and come to rest
-            near = replace(task, aim=None, pull=1.0, goal=U)
-            point = interior_point.begin(tr, near, start, Z, U, 1e-3, 0.05)
-            point, _ = interior_point.minimise(tr, near, point, (interior_point.Level(1.0, 1e-3, 1e-3, 40),), over)
-            point = interior_point.begin(tr, task, point.start, point.Z, point.U, max(stage.barrier, 1e-4), 0.05)
-            point, _ = interior_point.minimise(tr, task, point, levels, over)
-    except np.linalg.LinAlgError:  # the information is singular: the machine hardly moves
+            point = interior_point.initial_iterate(tr, task, start, Z, U, stage.barrier, 1e-3)
+            point, values = interior_point.minimise(tr, task, point, levels, should_stop)
+            kept = interior_point.infeasibility(values, point) < MAX_INFEASIBILITY
+        if not kept:  # first find the nearest torques that keep every limit and end at rest
+            near = replace(task, objective=None, goal_weight=1.0, goal=U)
+            point = interior_point.initial_iterate(tr, near, start, Z, U, 1e-3, 0.05)
+            point, _ = interior_point.minimise(
+                tr, near, point, (interior_point.BarrierLevel(1.0, 1e-3, 1e-3, 40),), should_stop
+            )
+            point = interior_point.initial_iterate(
+                tr, task, point.start, point.Z, point.U, max(stage.barrier, 1e-4), 0.05
+            )
+            point, _ = interior_point.minimise(tr, task, point, levels, should_stop)
+    except np.linalg.LinAlgError:  # singular information: the machine hardly moves
         return None
     try:
-        found, motion = verdict(model, problem, aim, Manoeuvre(times, point.U * tr.torque_scale))
+        found, motion = evaluate_drive(model, problem, objective, Manoeuvre(times, point.U * tr.torque_scale))
     except SimulationError:
         return None
     return replace(
-        track,
+        state,
         latest=found,
-        best=min(track.best, found, key=rank),
+        best=min(state.best, found, key=rank),
         motion=motion,
         times=nodes.ravel(),
-        states=point.Z.reshape(-1, tr.n_z),
+        node_states=point.Z.reshape(-1, tr.n_z),
     )
 
 
-def _careful(seen: np.ndarray, before: np.ndarray | None) -> np.ndarray:
-    """The optimism to correct for, where `before` was corrected for and this is seen: half of a growth is expected
-    again, half of a decline is believed. Drives would go back and forth otherwise."""
+def _damped_ratio(ratio: np.ndarray, before: np.ndarray | None) -> np.ndarray:
+    """Extrapolate half of a growth of the surrogate ratio and take half of a decline, in logarithms.
+
+    This keeps successive designs from alternating.
+    """
     if before is None:
-        return seen
-    return np.asarray(np.where(seen > before, seen * np.sqrt(seen / before), np.sqrt(seen * before)))
+        return ratio
+    return np.asarray(np.where(ratio > before, ratio * np.sqrt(ratio / before), np.sqrt(ratio * before)))
 
 
-def _one_way(
-    tr: Transcription, nodes: np.ndarray, model: Model, problem: Problem, going: np.ndarray
+def _direction_margins(
+    tr: Transcription, nodes: np.ndarray, model: Model, problem: Problem, travel_direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What moves the upper and the lower bound of the forward speed in (K, J, n_g), so that it keeps its direction."""
-    k = tr.limit_names.index(TRAVEL)
-    (travel,) = (g for g in machine_limits(model, problem) if g.name == TRAVEL)
-    shut = 1 - REST_SPEED / travel.high  # what counts as at rest may go either way
+    """Return margins (K, J, n_g) above and below that keep the direction of travel at every node."""
+    k = tr.limit_names.index(TRAVEL_LIMIT)
+    (travel,) = (g for g in machine_limits(model, problem) if g.name == TRAVEL_LIMIT)
+    shut = 1 - REST_SPEED / travel.high  # speeds that count as rest may have either sign
     above, below = np.zeros((2, *nodes.shape, len(tr.limit_names)))
-    ahead = going[np.clip(np.rint(nodes * float(model.machine.sampling_hz)).astype(int), 0, len(going) - 1)] > 0
+    ahead = (
+        travel_direction[
+            np.clip(np.rint(nodes * float(model.machine.sampling_hz)).astype(int), 0, len(travel_direction) - 1)
+        ]
+        > 0
+    )
     above[..., k], below[..., k] = np.where(ahead, 0, shut), np.where(ahead, shut, 0)
     return above, below
 
 
-def verdict(model: Model, problem: Problem, aim: Aim, drive: Manoeuvre) -> tuple[Candidate, Motion]:
-    """The fresh simulation of a drive, placed on the lane as well as can be; other machines that the aim is for follow
-    its motion, and their limits count too."""
+def evaluate_drive(
+    model: Model, problem: Problem, objective: CompositeObjective, drive: Manoeuvre
+) -> tuple[ScoredDrive, Motion]:
+    """Simulate a drive afresh, place it on the lane and score it.
+
+    Other machines of the objective follow its motion, and their limits count too, except lane and rest.
+    """
     torque = drive.sample(float(model.machine.sampling_hz))
     motion = simulate(model, torque)
-    start = placed(model, problem, motion)
+    start = place_on_lane(model, problem, motion)
     if not np.array_equal(start, motion.q[0]):
         motion = simulate(model, torque, q0=start)
     violations = check_limits(model, problem, motion)
-    motions = [(model, motion), *((m, track_motion(m, model, motion)) for m in aim.machines[1:])]
-    for m, other in motions[1:]:  # what people see to themselves, where the machine goes, is left out
+    motions = [(model, motion), *((m, track_motion(m, model, motion)) for m in objective.machines[1:])]
+    for m, other in motions[1:]:  # lane and rest are left to the driver
         for name, excess in check_limits(m, problem, other).items():
-            if not free(name):
+            if not is_free_limit(name):
                 violations[name] = max(violations[name], excess)
-    judged = aims.judge(aim, motions)
-    if aim.sigma_max is not None:
-        violations[SIGMA_MAX] = max(0.0, judged.worst_percent / aim.sigma_max - 1)
-    return Candidate(drive, start, judged.score, violations), motion
+    judged = composite_objective.score_motions(objective, motions)
+    if objective.sigma_max is not None:
+        violations[SIGMA_MAX] = max(0.0, judged.worst_percent / objective.sigma_max - 1)
+    return ScoredDrive(drive, start, judged.score, violations), motion
 
 
-def rest_band(friction: float) -> float:
-    """How many times wider than usual the band is that counts as rest, for a machine of that friction.
+def rest_band_factor(friction: float) -> float:
+    """Return the factor on the tolerance of rest for wider friction transitions.
 
-    Near standstill a soft machine's friction only damps, so what it is left with when the torques end grows with the
-    width of the transition. No verdict is spoken on it, so it need not leave that much of the tolerance unused: 2.
+    Near standstill, softened friction only damps, and the speed that remains at the end grows with the transition's
+    width.
     """
     return 2 * friction if friction > 1 else 1.0
 
 
-def soften(model: Model, friction: float, slip: float) -> Model:
-    """The same model with transitions of friction and slip at standstill wider by these factors."""
+def widen_transitions(model: Model, friction: float, slip: float) -> Model:
+    """Return the model with wider transitions of friction and slip at standstill."""
     if friction == 1 and slip == 1:
         return model
     bodies = []

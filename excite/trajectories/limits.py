@@ -1,8 +1,7 @@
-"""What the machine and the lane allow: every limit is a named expression between two bounds.
+"""Limits of the machine and the lane: every limit is a named expression between two bounds.
 
-One plain function per kind of limit, in the table KINDS; each yields the limits of its kind that the machine file and
-the problem state, or has bounds of its own. Their scale comes from their bounds: an excess is a fraction of the range,
-high - low. A design, its check, comparisons and reports take every limit of the table.
+LIMITS holds one pure function per kind. Each yields the limits of its kind that the machine file and the problem state.
+MOTION_LIMITS holds limits on a whole motion. An excess is a fraction of the limit's range, high - low.
 """
 
 from __future__ import annotations
@@ -18,18 +17,23 @@ from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion
 
-# What counts as at rest at the ends (contract, R60): speeds [m/s], rates [rad/s] and positions [rad, m].
-REST_SPEED, REST_RATE, REST_POSITION = 0.02, 0.01, 0.01
-TOLERANCE = 1e-3  # of a limit's range: what the fresh simulation may exceed
-TRAVEL, REVERSALS = "travel", "reversals"
-TURNS = 361  # headings at which a drive is tried on the lane
+REST_SPEED = 0.02  # m/s, speed that counts as rest at the ends; problem R60
+REST_RATE = 0.01  # rad/s, the same for rates of rotation; problem R60
+REST_POSITION = 0.01  # rad or m, position that counts as centred at the ends; problem R60
+TOLERANCE = 1e-3  # share of a limit's range that the fresh simulation may exceed; problem R60
+TRAVEL_LIMIT = "travel"
+REVERSALS_LIMIT = "reversals"
+HEADINGS = 361  # headings tried on the lane, half a degree apart in a box; chosen
+TOP_SPEED_FACTOR = 1.2  # top speed over rim speed, with slip; chosen
+DEFAULT_TOP_SPEED = 10.0  # m/s, without a limit on rim speed; chosen
+POWER_SMOOTHING = 1e-3  # of the power limit: rounding of |u q'|; chosen
 
 
 @dataclass(frozen=True)
 class Limit:
-    """low <= expression(q, nu, u, du) <= high, one number per sample; low may be -inf.
+    """low <= expression(q, nu, u, du) <= high at every sample; low may be -inf.
 
-    q, nu (n_q,) coordinates and velocities, u, du (n_u,) torques [N m] and their rates [N m/s]. kind: its key in KINDS.
+    q, nu (n_q,): coordinates and velocities. u, du (n_u,): torques [N m] and their rates [N m/s]. kind: key in LIMITS.
     """
 
     name: str
@@ -41,18 +45,18 @@ class Limit:
 
     @property
     def range(self) -> float:
-        """high - low; of a limit that has no lower bound, high."""
+        """high - low, or |high| without a lower bound."""
         return self.high - self.low if np.isfinite(self.low) else abs(self.high)
 
     @property
     def centre(self) -> float:
-        """The middle of the range."""
+        """Middle of the range."""
         return self.high - self.range / 2
 
 
 @dataclass(frozen=True)
-class Symbols:
-    """One sample: q, nu (n_q,), u, du (n_u,)."""
+class SampleSymbols:
+    """CasADi symbols of one sample: q, nu (n_q,), u, du (n_u,)."""
 
     q: ca.SX
     nu: ca.SX
@@ -60,34 +64,34 @@ class Symbols:
     du: ca.SX
 
 
-Bounded = tuple[str, ca.SX, float, float, str]
+BoundedExpression = tuple[str, ca.SX, float, float, str]
 
 
 @dataclass(frozen=True)
-class Kind:
-    """bounds(model, problem, symbols): the limits of a kind; `stated`: the places of a machine file that state them."""
+class LimitKind:
+    """bounds(model, problem, symbols) yields the limits of a kind; stated: where a machine file states them."""
 
-    bounds: Callable[[Model, Problem, Symbols], Iterator[Bounded]]
+    bounds: Callable[[Model, Problem, SampleSymbols], Iterator[BoundedExpression]]
     stated: tuple[str, ...] = ()
 
 
-def _torque(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
-    """What a motor or cylinder delivers, `torque` of a joint."""
+def _torque(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
+    """Torque or force of a motor or cylinder, `torque` of a joint."""
     for k, body in enumerate(model.machine.actuated):
         if body.limit.torque is not None:
             high = float(body.limit.torque)
             yield f"torque {model.inputs[k]}", s.u[k], -high, high, "N m" if body.joint == "revolute" else "N"
 
 
-def _torque_rate(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
-    """How fast that changes, `torque_rate` of a joint."""
+def _torque_rate(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
+    """Rate of that torque or force, `torque_rate` of a joint."""
     for k, body in enumerate(model.machine.actuated):
         if body.limit.torque_rate is not None:
             high = float(body.limit.torque_rate)
             yield f"torque rate {model.inputs[k]}", s.du[k], -high, high, "N m/s" if body.joint == "revolute" else "N/s"
 
 
-def _position(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+def _position(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
     """A joint's angle or stroke from its zero, `position` of a joint."""
     for body in model.machine.body:
         if body.limit.position is not None and body.coordinates[0] in model.coordinates:
@@ -96,7 +100,7 @@ def _position(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
             yield f"position {body.where}", s.q[k], -high, high, "rad" if body.joint == "revolute" else "m"
 
 
-def _rate(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+def _rate(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
     """A joint's speed, `rate` of a joint."""
     for body in model.machine.body:
         if body.limit.rate is not None and body.coordinates[0] in model.coordinates:
@@ -105,7 +109,7 @@ def _rate(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
             yield f"rate {body.where}", s.nu[k], -high, high, "rad/s" if body.joint == "revolute" else "m/s"
 
 
-def _rim_speed(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+def _rim_speed(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
     """Radius times spin of a roll or wheel, `rim_speed` of its joint."""
     for body in model.machine.contacts:
         if body.limit.rim_speed is not None and body.contact is not None:
@@ -114,8 +118,8 @@ def _rim_speed(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
             yield f"rim speed {body.where}", float(body.contact.radius) * s.nu[k], -high, high, "m/s"
 
 
-def _slip(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
-    """Both slips of a contact, `slip_limit`: beyond it the soil law is no longer linear."""
+def _slip(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
+    """Both slips of a contact, `slip_limit`: the range in which the soil law is linear."""
     slips = model.kinematics(s.q, s.nu)[1]
     bodies = {str(b.index): b for b in model.machine.contacts}
     for k, name in enumerate(model.slips):
@@ -125,18 +129,19 @@ def _slip(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
             yield f"slip {name[:2]} {body.where}", slips[k], -high, high, "-"
 
 
-def _power(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
-    """The hydraulics' power, sum of |u_i q_i'|, `power_limit` of the machine.
+def _power(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
+    """Hydraulic power, sum of |u_i q_i'|, `power_limit` of the machine.
 
-    |x| as sqrt(x^2 + e^2), e = 1/1000 of the limit: never less, and at the limit no more.
+    |x| is replaced by sqrt(x^2 + e^2) with e = limit / 1000, which is never smaller.
     """
     if model.machine.power_limit is not None:
         high = float(model.machine.power_limit)
-        parts = [ca.sqrt((s.u[k] * s.nu[row]) ** 2 + (1e-3 * high) ** 2) for k, row in enumerate(model.actuated)]
+        rounding = (POWER_SMOOTHING * high) ** 2
+        parts = [ca.sqrt((s.u[k] * s.nu[row]) ** 2 + rounding) for k, row in enumerate(model.actuated)]
         yield "power", sum(parts, ca.SX(0)), -np.inf, high, "W"
 
 
-def _lane(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
+def _lane(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
     """Points of the machine that stay inside the lane's length and width, `lane_m` of the problem."""
     if not model.machine.planar:
         return
@@ -150,32 +155,35 @@ def _lane(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
                 yield f"lane {letter} {model.machine.find(index).where}", point[axis], -high, high, "m"
 
 
-def _polygon(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
-    """The same points inside a convex area, `lane_polygon_m` of the problem.
+def _polygon(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
+    """Points of the machine that stay inside a convex area, `lane_polygon_m` of the problem.
 
-    Every edge: the distance across the area, from the corner that is farthest to the edge itself.
+    One limit per edge: the distance along its normal, from the farthest corner to the edge.
     """
     if not model.machine.planar:
         return
     places = model.kinematics(s.q, s.nu)[3]
     bodies = [b.index for b in model.machine.body]
-    for k, (outward, low, high) in enumerate(edges(problem.lane_polygon_m), 1):
+    for k, (outward, low, high) in enumerate(polygon_edges(problem.lane_polygon_m), 1):
         for index in problem.lane_points:
             point = places[:, bodies.index(index)]
             across = outward[0] * point[0] + outward[1] * point[1]
             yield f"lane edge {k} {model.machine.find(index).where}", across, low, high, "m"
 
 
-def _travel(model: Model, problem: Problem, s: Symbols) -> Iterator[Bounded]:
-    """The forward speed of a problem that counts reversals; the program narrows it to one direction at a time."""
+def _travel(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
+    """The forward speed of a problem that counts reversals; the program restricts it to one direction at a time."""
     if problem.reversals is not None and model.machine.planar:
         fast = [float(b.limit.rim_speed) for b in model.machine.contacts if b.limit.rim_speed is not None]
-        high = 1.2 * max(fast, default=10.0)  # slip included
-        yield TRAVEL, s.nu[0], -high, high, "m/s"
+        high = TOP_SPEED_FACTOR * max(fast, default=DEFAULT_TOP_SPEED)
+        yield TRAVEL_LIMIT, s.nu[0], -high, high, "m/s"
 
 
-def edges(corners: Sequence[tuple[float, float]]) -> list[tuple[np.ndarray, float, float]]:
-    """Outward normal (2,), and distance of the farthest corner and of the edge along it [m], of a convex area."""
+def polygon_edges(corners: Sequence[tuple[float, float]]) -> list[tuple[np.ndarray, float, float]]:
+    """Return the edges of a convex area as (outward normal (2,), low, high).
+
+    low, high [m]: distances of the farthest corner and of the edge along the normal.
+    """
     P = np.array(corners, float).reshape(-1, 2)
     found = []
     for a, b in zip(P, np.roll(P, -1, axis=0), strict=True):
@@ -186,71 +194,71 @@ def edges(corners: Sequence[tuple[float, float]]) -> list[tuple[np.ndarray, floa
     return found
 
 
-KINDS: dict[str, Kind] = {
-    "torque": Kind(_torque, ("body.limit.torque",)),
-    "torque_rate": Kind(_torque_rate, ("body.limit.torque_rate",)),
-    "position": Kind(_position, ("body.limit.position",)),
-    "rate": Kind(_rate, ("body.limit.rate",)),
-    "rim_speed": Kind(_rim_speed, ("body.limit.rim_speed",)),
-    "slip": Kind(_slip, ("body.contact.slip_limit",)),
-    "power": Kind(_power, ("power_limit",)),
-    "lane": Kind(_lane, ("problems.lane_m", "problems.lane_polygon_m")),
-    "polygon": Kind(_polygon),
-    "travel": Kind(_travel),
+LIMITS: dict[str, LimitKind] = {
+    "torque": LimitKind(_torque, ("body.limit.torque",)),
+    "torque_rate": LimitKind(_torque_rate, ("body.limit.torque_rate",)),
+    "position": LimitKind(_position, ("body.limit.position",)),
+    "rate": LimitKind(_rate, ("body.limit.rate",)),
+    "rim_speed": LimitKind(_rim_speed, ("body.limit.rim_speed",)),
+    "slip": LimitKind(_slip, ("body.contact.slip_limit",)),
+    "power": LimitKind(_power, ("power_limit",)),
+    "lane": LimitKind(_lane, ("problems.lane_m", "problems.lane_polygon_m")),
+    "polygon": LimitKind(_polygon),
+    "travel": LimitKind(_travel),
 }
 
 
-def symbols(model: Model) -> Symbols:
+def sample_symbols(model: Model) -> SampleSymbols:
+    """Create the CasADi symbols of one sample."""
     n_q, n_u = len(model.coordinates), len(model.inputs)
-    return Symbols(ca.SX.sym("q", n_q), ca.SX.sym("nu", n_q), ca.SX.sym("u", n_u), ca.SX.sym("du", n_u))
+    return SampleSymbols(ca.SX.sym("q", n_q), ca.SX.sym("nu", n_q), ca.SX.sym("u", n_u), ca.SX.sym("du", n_u))
 
 
 def machine_limits(model: Model, problem: Problem) -> tuple[Limit, ...]:
-    """Every limit that the machine and the problem state, in the order of KINDS."""
-    s = symbols(model)
+    """Return every limit that the machine and the problem state, in the order of LIMITS."""
+    s = sample_symbols(model)
     sample, names = [s.q, s.nu, s.u, s.du], ["q", "nu", "u", "du"]
     return tuple(
         Limit(name, ca.Function("limit", sample, [e], names, ["g"]), low, high, unit, kind)
-        for kind, stated in KINDS.items()
+        for kind, stated in LIMITS.items()
         for name, e, low, high, unit in stated.bounds(model, problem, s)
     )
 
 
-def stacked(model: Model, every: Sequence[Limit]) -> ca.Function:
-    """(q, nu, u, du) -> the values of several limits, one under the other."""
-    s = symbols(model)
+def stack_limits(model: Model, limits: Sequence[Limit]) -> ca.Function:
+    """Return the function (q, nu, u, du) -> values (n_limits,)."""
+    s = sample_symbols(model)
     sample = [s.q, s.nu, s.u, s.du]
-    return ca.Function("limits", sample, [ca.vertcat(*[g.expression(*sample) for g in every])])
+    return ca.Function("limits", sample, [ca.vertcat(*[g.expression(*sample) for g in limits])])
 
 
-def of_lane(name: str) -> bool:
-    """Whether a limit of that name depends on where the machine stands on the ground: its name begins with `lane`."""
+def is_lane_limit(name: str) -> bool:
+    """Return True for limits that depend on the position on the ground: names that begin with `lane`."""
     return name.startswith("lane")
 
 
-def of_rest(name: str) -> bool:
-    """Whether a limit of that name is about rest at both ends."""
+def is_rest_limit(name: str) -> bool:
+    """Return True for limits on rest at both ends: names that begin with `rest`."""
     return name.startswith("rest")
 
 
-def free(name: str) -> bool:
-    """Whether a limit of that name leaves the motion between free: the lane, on which a drive can still be placed, and
-    rest at its ends."""
-    return of_lane(name) or of_rest(name)
+def is_free_limit(name: str) -> bool:
+    """Return True for limits of lane and rest, which shifting the drive or small end torques can still meet."""
+    return is_lane_limit(name) or is_rest_limit(name)
 
 
-def kept_between(excess: Mapping[str, float]) -> bool:
-    """Whether every limit but the free ones is kept, by name the excess that `check` finds."""
-    return all(v == 0 for name, v in excess.items() if not free(name))
+def keeps_motion_limits(excess: Mapping[str, float]) -> bool:
+    """Return True if every limit but lane and rest is kept; excess as from `check_limits`."""
+    return all(v == 0 for name, v in excess.items() if not is_free_limit(name))
 
 
 def lane_excess(excess: Mapping[str, float]) -> float:
-    """The largest excess over any limit of the lane, 0 where there is none."""
-    return max((v for name, v in excess.items() if of_lane(name)), default=0.0)
+    """Return the largest excess over a limit of the lane, 0 without one."""
+    return max((v for name, v in excess.items() if is_lane_limit(name)), default=0.0)
 
 
-def resting(model: Model) -> tuple[int, ...]:
-    """Coordinates that are zero at both ends: those with a position limit or whose value the forces depend on."""
+def resting_coordinates(model: Model) -> tuple[int, ...]:
+    """Return the coordinates that are zero at both ends: those with a position limit or that forces depend on."""
     limited = {
         body.coordinates[0]
         for body in model.machine.body
@@ -260,7 +268,7 @@ def resting(model: Model) -> tuple[int, ...]:
 
 
 def rest_tolerances(model: Model) -> np.ndarray:
-    """(n_q,) what counts as standing still: 0.02 m/s (of a contact, at its rim), 0.01 rad/s."""
+    """Return the speeds (n_q,) that count as rest: 0.02 m/s (at the rim of a contact), 0.01 rad/s."""
     tolerance = np.empty(len(model.coordinates))
     for body in model.machine.body:
         for c in body.coordinates:
@@ -275,25 +283,25 @@ def rest_tolerances(model: Model) -> np.ndarray:
 
 
 def check_limits(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
-    """By name, the largest excess of every limit over the motion's samples, as a fraction of the limit's range.
+    """Return the largest excess over every limit by name, as a fraction of its range; 0 where it is kept.
 
-    0 where it is kept. Rest at the ends counts as a limit whose range is its tolerance.
+    Rest at the ends is a limit whose range is its tolerance.
     """
-    every = machine_limits(model, problem)
+    limits = machine_limits(model, problem)
     du = np.diff(motion.u, axis=0) / np.diff(motion.t)[:, None]
     du = np.vstack([du, du[-1:]])
-    values = stacked(model, every)(motion.q.T, motion.nu.T, motion.u.T, du.T).full()
+    values = stack_limits(model, limits)(motion.q.T, motion.nu.T, motion.u.T, du.T).full()
     excess = {
         g.name: max(0.0, float(v.max() - g.high), float(g.low - v.min())) / g.range
-        for g, v in zip(every, values, strict=True)
+        for g, v in zip(limits, values, strict=True)
     }
-    for whole in WHOLE.values():
+    for whole in MOTION_LIMITS.values():
         excess |= whole(model, problem, motion)
     return excess
 
 
 def _rest(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
-    """At both ends the machine stands still and what steers is centred, `rest` of the problem."""
+    """At both ends the machine stands still and its steering is centred, `rest` of the problem."""
     if not problem.rest:
         return {}
     tolerance = rest_tolerances(model)
@@ -303,38 +311,41 @@ def _rest(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
     }
     centred = {
         f"rest {model.coordinates[k]}": max(0.0, float(np.abs(motion.q[[0, -1], k]).max() / REST_POSITION) - 1)
-        for k in resting(model)
+        for k in resting_coordinates(model)
     }
     return still | centred
 
 
 def _reversals(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
-    """At most so many changes of the direction of travel, `reversals` of the problem."""
+    """Number of changes of the direction of travel, `reversals` of the problem."""
     if problem.reversals is None or not model.machine.planar:
         return {}
-    return {REVERSALS: max(0.0, (reversals(motion) - problem.reversals) / max(1, problem.reversals))}
+    return {REVERSALS_LIMIT: max(0.0, (count_reversals(motion) - problem.reversals) / max(1, problem.reversals))}
 
 
-def reversals(motion: Motion) -> int:
-    """How often a machine changes its direction of travel; what counts as at rest is no direction."""
+def count_reversals(motion: Motion) -> int:
+    """Count the changes of the direction of travel; speeds that count as rest have no direction."""
     going = np.sign(motion.nu[np.abs(motion.nu[:, 0]) > REST_SPEED, 0])
     return int((np.diff(going) != 0).sum())
 
 
-# Limits on a motion as a whole: excess by name, of the model, the problem and the motion.
-WHOLE: dict[str, Callable[[Model, Problem, Motion], dict[str, float]]] = {"rest": _rest, "reversals": _reversals}
+# Limits on a whole motion: function(model, problem, motion) returns the excess by name.
+MOTION_LIMITS: dict[str, Callable[[Model, Problem, Motion], dict[str, float]]] = {
+    "rest": _rest,
+    "reversals": _reversals,
+}
 
 
-def directions(motion: Motion, most: int) -> np.ndarray:
-    """(N,) +-1: the direction of travel at every sample, with at most so many reversals, that fits a motion best.
+def travel_directions(motion: Motion, most: int) -> np.ndarray:
+    """Return the direction of travel (N,), +-1, with at most `most` reversals, that fits a motion best.
 
-    Best: the least distance is driven the other way. By dynamic programming over the runs of one direction.
+    The fit minimises the distance driven against it, by dynamic programming over stretches of one direction.
     """
     v = motion.nu[:, 0]
     cuts = np.concatenate([[0], np.flatnonzero(np.diff(np.sign(v)) != 0) + 1, [len(v)]])
     driven = np.add.reduceat(v, cuts[:-1])
     gain = np.full((len(driven), most + 1, 2), -np.inf)
-    came = np.zeros((len(driven), most + 1, 2), int)  # direction of the run before
+    came = np.zeros((len(driven), most + 1, 2), int)  # direction of the stretch before
     signs = np.array([1.0, -1.0])
     gain[0, 0] = signs * driven[0]
     for k in range(1, len(driven)):
@@ -353,8 +364,8 @@ def directions(motion: Motion, most: int) -> np.ndarray:
     return found
 
 
-def placed(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
-    """Start coordinates (n_q,) that put the drive into the lane area as well as turning and shifting it can."""
+def place_on_lane(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
+    """Return start coordinates (n_q,) that turn and shift the drive into the lane as well as possible."""
     start = motion.q[0].copy()
     if not model.machine.planar or not problem.lane_points:
         return start
@@ -365,8 +376,8 @@ def placed(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
     path = places[:2][:, :, [bodies.index(i) for i in problem.lane_points]].reshape(2, -1)
     fit = _fit_polygon if problem.lane_polygon_m else _fit_box
     best, chosen = np.inf, (0.0, np.zeros(2))
-    whole = 2 * np.pi if problem.lane_polygon_m else np.pi  # a box is the same upside down
-    for turn in np.linspace(0, whole, TURNS)[:-1] if heading in axes else (0.0,):
+    whole = 2 * np.pi if problem.lane_polygon_m else np.pi  # a box is symmetric under half a turn
+    for turn in np.linspace(0, whole, HEADINGS)[:-1] if heading in axes else (0.0,):
         c, s = np.cos(turn), np.sin(turn)
         used, shift = fit(problem, np.array([[c, -s], [s, c]]) @ path)
         if used < best - 1e-9:
@@ -384,16 +395,16 @@ def placed(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
 
 
 def _fit_box(problem: Problem, path: np.ndarray) -> tuple[float, np.ndarray]:
-    """The share of the lane's length or width that a path (2, K) needs, and the shift that centres it."""
+    """Return the share of the lane that a path (2, K) needs, and the shift (2,) [m] that centres it."""
     low, high = path.min(axis=1), path.max(axis=1)
     return float(((high - low) / np.array(problem.lane_m)).max()), -(low + high) / 2
 
 
 def _fit_polygon(problem: Problem, path: np.ndarray) -> tuple[float, np.ndarray]:
-    """The same for the edges of box and polygon: the shift that leaves the largest excess least, a linear program."""
+    """Return the largest excess over box and polygon and the shift (2,) [m] that minimises it (linear program)."""
     length, width = problem.lane_m
     box = [(length / 2, width / 2), (-length / 2, width / 2), (-length / 2, -width / 2), (length / 2, -width / 2)]
-    sides = edges(box) + edges(problem.lane_polygon_m)
+    sides = polygon_edges(box) + polygon_edges(problem.lane_polygon_m)
     rows = [[*outward / (high - low), -1.0] for outward, low, high in sides]
     most = [(high - float((outward @ path).max())) / (high - low) for outward, low, high in sides]
     found = scipy.optimize.linprog([0, 0, 1], A_ub=rows, b_ub=most, bounds=[(None, None)] * 3)

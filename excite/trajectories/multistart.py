@@ -1,7 +1,6 @@
-"""The search for a test drive: torques that make every parameter speak, under every limit.
+"""Search for an excitation trajectory from several random starts in parallel processes.
 
-Many starts, each carried through the continuation (`continuation`) in a process of its own: all of them through the
-first stages, the most promising to the end.
+Every start goes through the first stages of `continuation`, the best of them through the others.
 """
 
 from __future__ import annotations
@@ -27,35 +26,34 @@ from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion, simulate
 from excite.text import format_percent
-from excite.trajectories import composite_objective as aims, objective as objectives
-from excite.trajectories.composite_objective import SIGMA_MAX, Aim
+from excite.trajectories import composite_objective, objective as objectives
+from excite.trajectories.composite_objective import SIGMA_MAX, CompositeObjective
 from excite.trajectories.continuation import (
-    PLAN,
-    SCOUTS,
-    Candidate,
-    Track,
-    depart,
-    promise,
+    SCREENING_STAGES,
+    STAGES,
+    ScoredDrive,
+    SearchState,
     rank,
     refine,
     repair,
-    resume,
-    search,
+    run_stages,
+    selection_score,
+    start_from_drive,
+    start_from_multisine,
 )
 from excite.trajectories.excitation import Manoeuvre
 
 Report = Callable[[int, int, float], None]
-LATER = len(PLAN) - SCOUTS + 1  # pieces of work of a start that is chosen, at least
+MIN_LATER_STEPS = len(STAGES) - SCREENING_STAGES + 1  # progress reports of a selected start, at least
 
 
 @dataclass(frozen=True)
 class Design:
-    """A test drive and what the fresh simulation says of it.
+    """An excitation trajectory and the results of its fresh simulation.
 
-    cond_phi, cond_w: condition numbers over every sample of `motion`; cond_phi_start: the best starting guess's.
-    violations: by limit, the excess as a fraction of its range, 0 where kept. scores: the objective of every start as
-    it is reported (cond: of Phi), inf where it ended infeasible. complete: False where it was interrupted or cut short
-    by its budget.
+    cond_phi, cond_w: condition numbers over every sample of `motion`. cond_phi_start: of the best random start.
+    violations: excess by limit, as a fraction of its range, 0 where kept. scores: the objective of every start as
+    reported, inf for an infeasible one. complete: False if interrupted or cut short by the budget.
     """
 
     objective: str
@@ -73,25 +71,27 @@ class Design:
 def design(
     model: Model,
     problem: Problem,
-    objective: str | Aim = "cond",
+    objective: str | CompositeObjective = "cond",
     starts: int = 2,
     seed: int = 0,
     budget_s: float | None = None,
     progress: Report | None = None,
     warm: Sequence[Manoeuvre] = (),
 ) -> Design:
-    """The best drive of several starts, each from its own random multisine, in parallel processes.
+    """Design an excitation trajectory: the best of several random starts.
 
-    Every start goes through the first stages, the most promising third (two at least) to the end. objective: a name, or
-    an `aim` that puts it together with an accuracy to keep, what is known before, or other machines. warm: drives to
-    start from as well, which go straight to the last stages; starts may be 0 then.
-    progress(done, total, best score so far) is called as stages finish. budget_s [s], half of it for the
-    first stages, ends the search early with the best feasible drive so far, and so does Ctrl-C (KeyboardInterrupt
-    where there is none yet). The same seed gives the same design where neither cuts in.
+    objective: a name in OBJECTIVES or the result of `compose_objective`.
+    starts: random multisines to start from; the best third (two at least) goes through all stages.
+    budget_s [s]: ends the search with the best feasible drive so far; half of it is for the first stages. Ctrl-C does
+        so too, and raises KeyboardInterrupt if there is no such drive yet.
+    progress(done, total, best score): called as stages finish.
+    warm: drives that start at the last stages; `starts` may then be 0.
 
-    Raises InfeasibleError with the limit that can't be met and by how much, KeyError for an unknown objective.
+    The same seed gives the same design unless the search is cut short.
+
+    Raises InfeasibleError with the limit and its excess, KeyError for an unknown objective.
     """
-    aim = aims.aim(model, objective) if isinstance(objective, str) else objective
+    composite = composite_objective.compose_objective(model, objective) if isinstance(objective, str) else objective
     if starts < (0 if warm else 1):
         raise ValueError(f"starts must be at least 1, got {starts}")
     now = time.time()
@@ -99,54 +99,54 @@ def design(
     seeds = np.random.SeedSequence(seed).generate_state(starts)
     kept = min(starts, max(2, -(-starts // 3))) + len(warm)
     guesses: list[int | Manoeuvre] = [*(int(s) for s in seeds), *warm]
-    tracks: dict[int, Track] = {}
+    states: dict[int, SearchState] = {}
     with (
-        _interruptible() as stop,
-        _watching(stop.parent, progress, starts * SCOUTS + kept * LATER),
+        _stop_file() as stop,
+        _progress_reports(stop.parent, progress, starts * SCREENING_STAGES + kept * MIN_LATER_STEPS),
         joblib.parallel_config("loky", inner_max_num_threads=1),
     ):
-        # loky even for one start: only there can the number of threads of the linear algebra be set
-        run = joblib.Parallel(n_jobs=processes(), return_as="generator_unordered")
-        call = joblib.delayed(_carry)
+        # loky even for one start: only its workers can limit the threads of the linear algebra
+        run = joblib.Parallel(n_jobs=process_count(), return_as="generator_unordered")
+        call = joblib.delayed(_run_start)
 
         def gather(calls: Iterator[Any]) -> None:
-            with _broken_off(stop):
-                for track in run(calls):
-                    if track is not None:
-                        tracks[track.number] = track
+            with _ignore_killed_workers(stop):
+                for state in run(calls):
+                    if state is not None:
+                        states[state.number] = state
 
-        gather(call(model, problem, aim, k, g, None, half, stop) for k, g in enumerate(guesses))
-        ranked = sorted(tracks.values(), key=lambda t: (t.number < starts, promise(t.latest), t.number))
+        gather(call(model, problem, composite, k, g, None, half, stop) for k, g in enumerate(guesses))
+        ranked = sorted(states.values(), key=lambda t: (t.number < starts, selection_score(t.latest), t.number))
         chosen = ranked[:kept]
-        gather(call(model, problem, aim, t.number, 0, t, deadline, stop) for t in chosen)
+        gather(call(model, problem, composite, t.number, 0, t, deadline, stop) for t in chosen)
         interrupted = stop.exists()
-    if not tracks:
+    if not states:
         raise KeyboardInterrupt
-    best = min(tracks.values(), key=lambda t: (*rank(t.best), t.number))
-    complete = len(tracks) == len(guesses) and all(tracks[t.number].complete for t in chosen)
+    best = min(states.values(), key=lambda t: (*rank(t.best), t.number))
+    complete = len(states) == len(guesses) and all(states[t.number].complete for t in chosen)
     if not best.best.feasible:
         if interrupted:
             raise KeyboardInterrupt
-        raise _infeasible(aim, best.best, complete)
+        raise _infeasible(composite, best.best, complete)
     drive = best.best
     motion = simulate(model, drive.manoeuvre.sample(float(model.machine.sampling_hz)), q0=drive.start)
     return Design(
-        aim.name,
+        composite.name,
         drive.manoeuvre,
         motion,
         objectives.cond_phi(model, motion),
         objectives.cond_w(model, motion),
-        min(t.guess for t in tracks.values()),
+        min(t.start_cond_phi for t in states.values()),
         dict(drive.violations),
         drive.excess,
-        tuple(_score(aim, tracks[k].best) if k in tracks else float("inf") for k in range(len(guesses))),
+        tuple(_score(composite, states[k].best) if k in states else float("inf") for k in range(len(guesses))),
         complete,
     )
 
 
 @contextmanager
-def _broken_off(stop: Path) -> Iterator[None]:
-    """Workers that Ctrl-C kills before they listen to it are no error."""
+def _ignore_killed_workers(stop: Path) -> Iterator[None]:
+    """Ignore workers that Ctrl-C kills before they handle it."""
     try:
         yield
     except BrokenProcessPool:
@@ -154,21 +154,21 @@ def _broken_off(stop: Path) -> Iterator[None]:
             raise
 
 
-def processes() -> int:
-    """In how many processes drives are sought: one on every core, two at least."""
+def process_count() -> int:
+    """Return the number of parallel processes: one per core, two at least."""
     return max(2, os.cpu_count() or 1)
 
 
-def _infeasible(aim: Aim, best: Candidate, complete: bool) -> InfeasibleError:
-    """What to say where no start ended inside the limits: which one can't be met, and by how much."""
+def _infeasible(objective: CompositeObjective, best: ScoredDrive, complete: bool) -> InfeasibleError:
+    """Build the error that names the limit with the largest excess."""
     name = max(best.violations, key=lambda limit: best.violations[limit])
     excess = best.excess
     cut = "the search was cut short, give more time"
-    if name == SIGMA_MAX and aim.sigma_max is not None:
+    if name == SIGMA_MAX and objective.sigma_max is not None:
         return InfeasibleError(
-            f"no drive found that is accurate enough: {name} {aim.sigma_max:g} % is exceeded by"
+            f"no drive found that is accurate enough: {name} {objective.sigma_max:g} % is exceeded by"
             f" {format_percent(100 * excess)}, the worst parameter comes out at"
-            f" {format_percent(aim.sigma_max * (1 + excess), 3)} in the best attempt;"
+            f" {format_percent(objective.sigma_max * (1 + excess), 3)} in the best attempt;"
             f" {'allow more, or give a longer duration or more starts' if complete else cut}",
             name,
             excess,
@@ -181,13 +181,13 @@ def _infeasible(aim: Aim, best: Candidate, complete: bool) -> InfeasibleError:
     )
 
 
-def _score(aim: Aim, c: Candidate) -> float:
-    return objectives.reported(aim.name, c.score) if c.feasible else float("inf")
+def _score(objective: CompositeObjective, c: ScoredDrive) -> float:
+    return objectives.reported_value(objective.name, c.score) if c.feasible else float("inf")
 
 
 @contextmanager
-def _interruptible() -> Iterator[Path]:
-    """A file that appears when Ctrl-C is pressed; the searches look for it and end with what they have."""
+def _stop_file() -> Iterator[Path]:
+    """Yield the path of a file that appears on Ctrl-C; searches look for it and stop."""
     with tempfile.TemporaryDirectory(prefix="excite-") as folder:
         stop = Path(folder) / "stop"
         if threading.current_thread() is not threading.main_thread():
@@ -201,8 +201,8 @@ def _interruptible() -> Iterator[Path]:
 
 
 @contextmanager
-def _watching(folder: Path, progress: Report | None, total: int) -> Iterator[None]:
-    """Reports as the searches leave word of a stage that is done: a file START-STAGE with the best score so far."""
+def _progress_reports(folder: Path, progress: Report | None, total: int) -> Iterator[None]:
+    """Call `progress` as workers write files START-STAGE with their best score."""
     if progress is None:
         yield
         return
@@ -229,42 +229,50 @@ def _watching(folder: Path, progress: Report | None, total: int) -> Iterator[Non
         look()
 
 
-def _carry(
+def _run_start(
     model: Model,
     problem: Problem,
-    aim: Aim,
+    objective: CompositeObjective,
     number: int,
     guess: int | Manoeuvre,
-    track: Track | None,
+    state: SearchState | None,
     deadline: float | None,
     stop: Path,
-) -> Track | None:
-    """In a worker: a start (a seed or a drive) through the first stages, or one that was chosen through the others.
+) -> SearchState | None:
+    """Run the first stages from a seed or a drive, or the later ones from `state`, in a worker process.
 
-    None for a start that comes too late; the first one never does.
+    Returns None if time is up before the start begins; start 0 always runs.
     """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, lambda *_: stop.touch() if stop.parent.exists() else None)
-    stages = itertools.count(0 if track is None else SCOUTS)
+    stages = itertools.count(0 if state is None else SCREENING_STAGES)
 
-    def over() -> bool:
+    def should_stop() -> bool:
         return stop.exists() or (deadline is not None and time.time() > deadline)
 
-    def tell(track: Track) -> None:
+    def report_stage(state: SearchState) -> None:
         fresh = stop.parent / f".{number}"
-        fresh.write_text(repr(_score(aim, track.best)), encoding="ascii")
+        fresh.write_text(repr(_score(objective, state.best)), encoding="ascii")
         fresh.replace(stop.parent / f"{number}-{next(stages)}")
 
-    if track is None:
-        if number > 0 and over():
+    if state is None:
+        if number > 0 and should_stop():
             return None
         if isinstance(guess, Manoeuvre):
-            return resume(model, problem, aim, number, guess)
-        return search(model, problem, aim, depart(model, problem, aim, number, guess), PLAN[:SCOUTS], over, tell)
-    track = search(model, problem, aim, track, PLAN[SCOUTS:], over, tell)
-    if not over():
-        track = refine(model, problem, aim, track, over, tell)
-    if not over():
-        track = replace(repair(model, problem, aim, track, over), complete=not over())
-    tell(track)
-    return track
+            return start_from_drive(model, problem, objective, number, guess)
+        return run_stages(
+            model,
+            problem,
+            objective,
+            start_from_multisine(model, problem, objective, number, guess),
+            STAGES[:SCREENING_STAGES],
+            should_stop,
+            report_stage,
+        )
+    state = run_stages(model, problem, objective, state, STAGES[SCREENING_STAGES:], should_stop, report_stage)
+    if not should_stop():
+        state = refine(model, problem, objective, state, should_stop, report_stage)
+    if not should_stop():
+        state = replace(repair(model, problem, objective, state, should_stop), complete=not should_stop())
+    report_stage(state)
+    return state

@@ -1,4 +1,4 @@
-"""A design folder read back: what `excite design` wrote, as a model and a motion again."""
+"""Read a design folder back as a model and a motion."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from excite.simulation import Motion, simulate
 
 
 @dataclass(frozen=True)
-class Stored:
-    """A design: its summary, model and problem, and the motion that its torques make."""
+class SavedDesign:
+    """A design folder: its summary, model and problem, and the motion under its torques."""
 
     summary: dict[str, Any]
     model: Model
@@ -31,7 +31,10 @@ class Stored:
 
 
 def read_design_summary(design_dir: Path) -> dict[str, Any]:
-    """The summary of a design folder. Raises StoredError."""
+    """Read the summary of a design folder.
+
+    Raises DesignFolderError.
+    """
     path = design_dir / output.SUMMARY
     if not path.is_file():
         raise DesignFolderError(
@@ -47,8 +50,11 @@ def read_design_summary(design_dir: Path) -> dict[str, Any]:
     return dict(found)
 
 
-def read_design(design_dir: Path) -> Stored:
-    """A design folder, its profile driven afresh. Raises StoredError, LogError, SimulationError."""
+def read_design(design_dir: Path) -> SavedDesign:
+    """Read a design folder and simulate its profile.
+
+    Raises DesignFolderError, LogError, SimulationError.
+    """
     before = read_design_summary(design_dir)
     path = design_dir / "machine.json"
     try:
@@ -57,7 +63,7 @@ def read_design(design_dir: Path) -> Stored:
         raise DesignFolderError(f"{path}: missing or damaged, design again") from None
     nominal = dict(zip(model.base.names, model.nominal.tolist(), strict=True))
     try:
-        # Designed for what logs told of the machine, if it was; what sits in a sensor alone is no part of a design.
+        # The design may be for values identified from logs. Those of sensors alone are not in the summary.
         nominal |= {n: float(x) for n, x in before.get("nominal", {}).items()}
         seconds = float(before["duration_s"])
     except (AttributeError, TypeError, ValueError):
@@ -69,4 +75,4 @@ def read_design(design_dir: Path) -> Stored:
             f"{design_dir / 'profile.csv'}: {len(torque)} rows do not make {seconds:g} s, design again"
         )
     problem = model.machine.problems.get(str(before.get("problem")))
-    return Stored(before, model, problem, simulate(model, torque, q0=q0, nu0=nu0))
+    return SavedDesign(before, model, problem, simulate(model, torque, q0=q0, nu0=nu0))

@@ -82,7 +82,7 @@ def compare(
 ) -> dict[str, Any]:
     """Compare the designed drive with usual ones into a folder; return the summary.
 
-    samples: drives of each random kind. against: names of `USUAL`, all of them if empty. budget [s].
+    samples: drives of each random kind. against: names of `BASELINES`, all of them if empty. budget [s].
     Raises UsageError, MachineError.
     """
     model = requests.build_model(machine, fit_sensor_effects=False)
@@ -90,7 +90,7 @@ def compare(
     design_request.require_noise_figures(model)
     requests.require_positive("--budget", budget, "s")
     for usual in against:
-        requests.require_known("--against", usual, tuple(trajectories.USUAL))
+        requests.require_known("--against", usual, tuple(trajectories.BASELINES))
     with bar("comparing") as advance:
         result = trajectories.compare(model, chosen, samples, seed, budget, advance, against)
     columns = ["t_s", *(torque_column(model, u) for u in model.inputs)]

@@ -67,7 +67,7 @@ def choose_method(name: str | None, model: Model, kit: str | None = None) -> str
 CHOICES = {
     "objective": ("excite.trajectories", "OBJECTIVES"),
     "method": ("excite.identification", "METHODS"),
-    "against": ("excite.trajectories", "USUAL"),
+    "against": ("excite.trajectories", "BASELINES"),
     "kit": ("excite.simulation", "KITS"),
     "effect": ("excite.model.effects", "CATALOGUE"),
 }

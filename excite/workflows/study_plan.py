@@ -53,7 +53,7 @@ from excite.model.machine import (
     read_toml,
     shipped_machines,
 )
-from excite.trajectories import KINDS
+from excite.trajectories import LIMITS
 from excite.workflows import requests
 
 STEPS = ("design", "simulate", "identify", "diagnose", "verify")
@@ -108,7 +108,7 @@ Starts = Annotated[int, Field(strict=True, ge=1, le=1000)]
 
 def _limits(value: Any) -> Any:
     """Raise ValidationError for a limit that no machine file has."""
-    allowed = [known for known, kind in KINDS.items() if kind.stated]
+    allowed = [known for known, kind in LIMITS.items() if kind.stated]
     for name in value if isinstance(value, dict) else ():
         if name not in allowed:
             error = PydanticCustomError(
@@ -452,7 +452,7 @@ def scale_limits(machine: Machine, factors: dict[str, float]) -> Machine:
                 " (got"
                 f" {factor:g}); 0.5 is half of it"
             )
-        stated = [_multiply(raw, path, factor) for path in KINDS[name].stated]
+        stated = [_multiply(raw, path, factor) for path in LIMITS[name].stated]
         if not any(stated):
             raise StudyError(f"limits: {machine.name} has no limit {name}")
     return Machine.model_validate_json(json.dumps(raw))

@@ -606,8 +606,8 @@ def test_what_a_map_tells_is_identified_and_designed_with(straight: Model) -> No
     tr = transcribe(model, problem, sizes, 48, motion)
     assert not set(tr.state_names) & set(model.map_inputs)
     told = motion.memory[:, model.n_dynamic_memory :]
-    assert tr.over[2:-1:3] == pytest.approx(told[50::50], abs=0.1)
-    entries = tr.values(np.full((48 * tr.nodes, tr.n_s), 0.3), tr.over)[2]
+    assert tr.map_values[2:-1:3] == pytest.approx(told[50::50], abs=0.1)
+    entries = tr.values(np.full((48 * tr.nodes, tr.n_s), 0.3), tr.map_values)[2]
     amount = np.array([len(model.scale) - 1 in (a, b) for a, b in zip(tr.rows, tr.columns, strict=True)])
     assert np.abs(entries[-3:, amount]).max() > 100 * np.abs(entries[:3, amount]).max()
 

@@ -16,18 +16,26 @@ from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import simulate
 from excite.trajectories import (
-    OURS,
+    BASELINES,
+    DESIGNED,
     TOLERANCE,
-    USUAL,
     Manoeuvre,
     check_limits,
     compare,
     multisine,
     objective,
-    processes,
+    process_count,
 )
-from excite.trajectories.baselines import WAY, Comparison, _equal, _Sample, judge, shrunk, within
-from excite.trajectories.collocation import Transcription, settle
+from excite.trajectories.baselines import (
+    CONTINUATION,
+    Comparison,
+    _BaselineDrive,
+    _time_to_equal_score,
+    bring_within_limits,
+    scale_into_limits,
+    score_drive,
+)
+from excite.trajectories.collocation import Transcription, solve_states
 
 KINDS = ("multisine", "hand-made", "Fourier SLSQP")
 
@@ -40,12 +48,12 @@ def problem(straight: Model) -> Problem:
 
 @pytest.fixture(scope="module")
 def result(straight: Model, problem: Problem) -> Comparison:
-    return compare(straight, problem, samples=3, seed=1, budget_s=60.0, usual=KINDS)
+    return compare(straight, problem, samples=3, seed=1, budget_s=60.0, baselines=KINDS)
 
 
 def test_every_kind_has_its_rows(result: Comparison) -> None:
     assert [r.name for r in result.rows] == [
-        OURS,
+        DESIGNED,
         "multisine, best of 3",
         "multisine, median of 3",
         "hand-made",
@@ -75,19 +83,21 @@ def test_time_to_an_equal_score(result: Comparison, straight: Model, problem: Pr
     ours, *others = result.rows
     assert ours.equal_s == ours.wall_s
     assert all(r.equal_s is None for r in others)
-    found, _ = judge(straight, problem, shrunk(straight, problem, multisine(straight, problem, 0)))
+    found, _ = score_drive(straight, problem, scale_into_limits(straight, problem, multisine(straight, problem, 0)))
     kept = replace(found, violations={}, score=2 * np.log(100.0))
-    samples = [_Sample("x", k, c, 10.0) for k, c in enumerate([replace(kept, violations={"power": 1.0}), kept, kept])]
-    shared = min(processes(), 3)
-    assert _equal(samples, 101.0) == pytest.approx(20.0 / shared)
-    assert _equal(samples, 99.0) is None
+    samples = [
+        _BaselineDrive("x", k, c, 10.0) for k, c in enumerate([replace(kept, violations={"power": 1.0}), kept, kept])
+    ]
+    shared = min(process_count(), 3)
+    assert _time_to_equal_score(samples, 101.0) == pytest.approx(20.0 / shared)
+    assert _time_to_equal_score(samples, 99.0) is None
 
 
 def test_what_cannot_be_brought_inside_says_what_it_breaks(straight: Model, problem: Problem) -> None:
     shorter = problem.duration_s.model_copy(update={"value": 8.0})
     lane = (3.0, 20.0)  # the rolls alone are 3.2 m apart
     short = problem.model_copy(update={"lane_m": lane, "duration_s": shorter})
-    found = within(straight, short, multisine(straight, short, 0))
+    found = bring_within_limits(straight, short, multisine(straight, short, 0))
     assert not found.feasible
     assert max(found.violations, key=lambda name: found.violations[name]).startswith("lane x")
 
@@ -95,10 +105,10 @@ def test_what_cannot_be_brought_inside_says_what_it_breaks(straight: Model, prob
 def test_a_drive_that_ends_far_from_rest_is_brought_inside(va12: Model) -> None:
     whole = va12.machine.problems["R60"]
     wish = multisine(va12, whole, 2)
-    small = shrunk(va12, whole, wish)
-    before, _ = judge(va12, whole, small)
+    small = scale_into_limits(va12, whole, wish)
+    before, _ = score_drive(va12, whole, small)
     assert before.excess > 20
-    found = within(va12, whole, wish)
+    found = bring_within_limits(va12, whole, wish)
     assert found.feasible
     full = [float(b.limit.torque or 1.0) for b in va12.machine.actuated]
     moved = (found.manoeuvre.torque - small.torque) / full
@@ -112,38 +122,38 @@ def test_soft_machines_that_do_not_follow_leave_it_to_the_sharp_one(
         asked.append(tr.intervals)
         if len(asked) <= refused:
             raise CollocationError("no motion follows")
-        return settle(tr, *args)
+        return solve_states(tr, *args)
 
     wish = multisine(straight, problem, 2)
-    before, _ = judge(straight, problem, shrunk(straight, problem, wish))
+    before, _ = score_drive(straight, problem, scale_into_limits(straight, problem, wish))
     assert not before.feasible
     asked: list[int] = []
-    monkeypatch.setattr("excite.trajectories.baselines.settle", settled)
-    refused = len(WAY) - 1
-    assert within(straight, problem, wish).feasible
+    monkeypatch.setattr("excite.trajectories.baselines.solve_states", settled)
+    refused = len(CONTINUATION) - 1
+    assert bring_within_limits(straight, problem, wish).feasible
     asked.clear()
-    refused = len(WAY)
-    assert within(straight, problem, wish).violations == before.violations
-    assert len(asked) == len(WAY)
+    refused = len(CONTINUATION)
+    assert bring_within_limits(straight, problem, wish).violations == before.violations
+    assert len(asked) == len(CONTINUATION)
 
 
 def test_scaling_down_keeps_shape_and_limits(straight: Model, problem: Problem) -> None:
     wish = multisine(straight, problem, 2)
-    small = shrunk(straight, problem, wish)
+    small = scale_into_limits(straight, problem, wish)
     ratio = small.torque[5:-5] / wish.torque[5:-5]
     assert np.ptp(ratio) < 1e-9
-    found, _ = judge(straight, problem, small)
+    found, _ = score_drive(straight, problem, small)
     assert all(v == 0 for name, v in found.violations.items() if not name.startswith(("rest", "lane")))
 
 
-@pytest.mark.parametrize("kind", USUAL)
+@pytest.mark.parametrize("kind", BASELINES)
 def test_every_kind_makes_a_drive_for_every_machine(emps: Model, straight: Model, va12: Model, kind: str) -> None:
     for model in (emps, straight, va12):
         problem = next(iter(model.machine.problems.values()), None)
         if problem is None:
             continue
         problem = problem.model_copy(update={"duration_s": problem.duration_s.model_copy(update={"value": 12.0})})
-        drive = USUAL[kind].make(model, problem, 0, 0.0)
+        drive = BASELINES[kind].make(model, problem, 0, 0.0)
         assert drive.duration == pytest.approx(float(problem.duration_s))
         assert np.isfinite(drive.torque).all()
         assert np.abs(drive.torque[[0, -1]]).max() < 1e-9
@@ -152,7 +162,7 @@ def test_every_kind_makes_a_drive_for_every_machine(emps: Model, straight: Model
 
 def test_an_unknown_kind_is_refused(straight: Model, problem: Problem) -> None:
     with pytest.raises(KeyError, match="no usual drive waltz"):
-        compare(straight, problem, usual=("waltz",))
+        compare(straight, problem, baselines=("waltz",))
 
 
 def test_the_command_writes_drives_that_score_what_it_says(tmp_path: Path, excite: Excite, straight: Model) -> None:

@@ -11,8 +11,8 @@ from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion, simulate
 from excite.trajectories import multisine, objective
-from excite.trajectories.baselines import shrunk
-from excite.trajectories.bound import Bound, _mixture, bound
+from excite.trajectories.baselines import scale_into_limits
+from excite.trajectories.bound import Bound, _best_mixture, bound
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def problem(straight: Model) -> Problem:
 
 @pytest.fixture(scope="module")
 def drives(straight: Model, problem: Problem) -> list[Motion]:
-    made = [shrunk(straight, problem, multisine(straight, problem, k)) for k in range(3)]
+    made = [scale_into_limits(straight, problem, multisine(straight, problem, k)) for k in range(3)]
     return [simulate(straight, m.sample(100.0)) for m in made]
 
 
@@ -49,8 +49,8 @@ def test_no_sample_of_a_drive_violates_the_certificate_by_more_than_it_says(
     straight: Model, problem: Problem, drives: list[Motion], loose: Bound
 ) -> None:
     assert loose.certificate is not None
-    assert loose.along(straight, problem, drives[0]) <= loose.violation * (1 + 1e-9)
-    assert loose.certified == pytest.approx(np.sqrt(loose.certificate.proves(loose.violation)))
+    assert loose.largest_violation(straight, problem, drives[0]) <= loose.violation * (1 + 1e-9)
+    assert loose.certified == pytest.approx(np.sqrt(loose.certificate.proven_bound(loose.violation)))
 
 
 def test_the_same_seed_gives_the_same_bound(straight: Model, problem: Problem, drives: list[Motion]) -> None:
@@ -63,7 +63,7 @@ def test_mixture_and_certificate_agree() -> None:
     rows = rng.standard_normal((40, 2, 4)) * [1.0, 2.0, 3.0, 10.0]
     A = np.einsum("kri,krj->kij", rows, rows)
     c = rng.standard_normal((40, 2))
-    t, w, x = _mixture(A, c)
+    t, w, x = _best_mixture(A, c)
     mixed = np.einsum("k,kij->ij", w, A)
     assert np.linalg.cond(mixed) == pytest.approx(t, rel=1e-4)
     assert np.abs(w @ c).max() < 1e-4 * w.sum()
@@ -72,7 +72,7 @@ def test_mixture_and_certificate_agree() -> None:
     gain = np.einsum("kij,ij->k", A, x.U - x.V) - c @ x.m
     assert gain.max() < 1e-4 * t
     e = float((gain / np.einsum("kij,ij->k", A, x.gauge)).max())
-    assert x.proves(max(e, 0.0)) <= t * (1 + 1e-6)
+    assert x.proven_bound(max(e, 0.0)) <= t * (1 + 1e-6)
 
 
 def test_a_violated_certificate_still_proves_something() -> None:
@@ -81,11 +81,11 @@ def test_a_violated_certificate_still_proves_something() -> None:
     rows = rng.standard_normal((60, 2, 3)) * [1.0, 2.0, 5.0]
     A = np.einsum("kri,krj->kij", rows, rows)
     none = np.zeros((60, 0))
-    t, _, _ = _mixture(A, none)
-    few, _, x = _mixture(A[:12], none[:12])
+    t, _, _ = _best_mixture(A, none)
+    few, _, x = _best_mixture(A[:12], none[:12])
     e = float((np.einsum("kij,ij->k", A, x.U - x.V) / np.einsum("kij,ij->k", A, x.gauge)).max())
     assert e > 0
-    assert x.proves(e) <= t <= few
+    assert x.proven_bound(e) <= t <= few
 
 
 def test_a_drive_outside_the_limits_is_refused(straight: Model, problem: Problem, drives: list[Motion]) -> None:

@@ -15,8 +15,8 @@ from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion, scenarios, sensors, simulate
 from excite.smoothing import cramer_rao
-from excite.trajectories import composite_objective as aims, design, multisine, objective, scaled
-from excite.trajectories.continuation import verdict
+from excite.trajectories import composite_objective as aims, design, multisine, objective, scale_torques
+from excite.trajectories.continuation import evaluate_drive
 
 
 def shorter(model: Model, seconds: float) -> Problem:
@@ -26,66 +26,71 @@ def shorter(model: Model, seconds: float) -> Problem:
 
 @pytest.fixture(scope="module")
 def motion(straight: Model) -> Motion:
-    wish = scaled(multisine(straight, shorter(straight, 20.0), 2), 0.3)
+    wish = scale_torques(multisine(straight, shorter(straight, 20.0), 2), 0.3)
     return simulate(straight, wish.sample(100.0))
 
 
 def test_one_term_is_the_plain_objective(straight: Model, motion: Motion) -> None:
     for name in ("cond", "D", "A", "E", "weighted-cond"):
-        aim = aims.aim(straight, name)
+        aim = aims.compose_objective(straight, name)
         P = objective.phi(straight, motion, name)
-        (A,) = aims.information(aim, straight, motion)
-        assert aims.value(aim, [A]) == pytest.approx(objective.value(name, P.T @ P), rel=1e-6, abs=1e-6)
-    assert aims.judge(aims.aim(straight, "cond"), [(straight, motion)]).score == pytest.approx(
+        (A,) = aims.information_matrices(aim, straight, motion)
+        assert aims.score_matrices(aim, [A]) == pytest.approx(objective.score_matrix(name, P.T @ P), rel=1e-6, abs=1e-6)
+    assert aims.score_motions(aims.compose_objective(straight, "cond"), [(straight, motion)]).score == pytest.approx(
         2 * np.log(objective.cond_phi(straight, motion)), rel=1e-6
     )
 
 
 def test_accuracy_is_judged_by_the_bound(straight: Model, motion: Motion) -> None:
     spread = np.sqrt(np.diag(cramer_rao(straight, motion))) / np.abs(straight.nominal)
-    judged = aims.judge(aims.aim(straight, "worst"), [(straight, motion)])
-    assert objective.reported("worst", judged.score) == pytest.approx(100 * spread.max(), rel=1e-6)
+    judged = aims.score_motions(aims.compose_objective(straight, "worst"), [(straight, motion)])
+    assert objective.reported_value("worst", judged.score) == pytest.approx(100 * spread.max(), rel=1e-6)
     assert judged.worst_percent == pytest.approx(100 * spread.max())
 
 
 def test_calibrated_surrogates_give_the_bound(straight: Model, motion: Motion) -> None:
-    aim = aims.aim(straight, "worst")
-    optimism = aims.optimism(aim, straight, motion)
+    aim = aims.compose_objective(straight, "worst")
+    optimism = aims.surrogate_ratio(aim, straight, motion)
     assert optimism is not None
-    off, on = (aims.value(a, aims.information(a, straight, motion)) for a in (aim, aims.calibrated(aim, optimism)))
-    true = aims.judge(aim, [(straight, motion)]).score
+    off, on = (
+        aims.score_matrices(a, aims.information_matrices(a, straight, motion))
+        for a in (aim, aims.calibrate_surrogates(aim, optimism))
+    )
+    true = aims.score_motions(aim, [(straight, motion)]).score
     assert on == pytest.approx(true, abs=1e-6)
     assert abs(off - true) > 0.01
 
 
 def test_prior_information_adds(straight: Model, motion: Motion) -> None:
     """The same drive again halves every variance; D-optimality then falls by log 2."""
-    plain = aims.aim(straight, "D")
-    (A,) = aims.information(plain, straight, motion)
+    plain = aims.compose_objective(straight, "D")
+    (A,) = aims.information_matrices(plain, straight, motion)
     prior = A / np.outer(straight.scale, straight.scale)
-    after = aims.aim(straight, "D", prior=prior)
-    assert aims.value(after, [A]) == pytest.approx(aims.value(plain, [A]) - np.log(2), rel=1e-9)
+    after = aims.compose_objective(straight, "D", prior=prior)
+    assert aims.score_matrices(after, [A]) == pytest.approx(aims.score_matrices(plain, [A]) - np.log(2), rel=1e-9)
     C = cramer_rao(straight, motion)
-    twice = aims.aim(straight, "accuracy", prior=np.linalg.inv(C))
-    assert np.allclose(aims.covariance(twice, straight, motion), C / 2, rtol=1e-5)
+    twice = aims.compose_objective(straight, "accuracy", prior=np.linalg.inv(C))
+    assert np.allclose(aims.covariance_bound(twice, straight, motion), C / 2, rtol=1e-5)
 
 
 @pytest.mark.parametrize("what", ["plain", "ceiling", "prior", "machines"])
 def test_slope_and_curvature(straight: Model, motion: Motion, what: str) -> None:
     rng = np.random.default_rng(0)
-    (A,) = aims.information(aims.aim(straight, "D"), straight, motion)
+    (A,) = aims.information_matrices(aims.compose_objective(straight, "D"), straight, motion)
     prior = np.diag(1 / straight.scale**2) if what == "prior" else None
     machines = scenarios.perturbed_machines(straight, 3) if what == "machines" else ()
     level = None
     if what == "ceiling":  # half way up its hinge
-        worst = aims.value(
-            aims.aim(straight, "worst"), aims.information(aims.aim(straight, "worst"), straight, motion), 6
+        worst = aims.score_matrices(
+            aims.compose_objective(straight, "worst"),
+            aims.information_matrices(aims.compose_objective(straight, "worst"), straight, motion),
+            6,
         )
         level = 100 * float(np.exp(worst / 2))
-    aim = aims.aim(straight, "cond", level, prior, machines)
-    blocks = np.stack(aims.information(aim, straight, motion))
+    aim = aims.compose_objective(straight, "cond", level, prior, machines)
+    blocks = np.stack(aims.information_matrices(aim, straight, motion))
     rows, columns = np.triu_indices(len(A))
-    here = aims.local(aim, blocks, rows, columns, 6.0)
+    here = aims.local_model(aim, blocks, rows, columns, 6.0)
     steps = (
         1e-6
         * rng.standard_normal((len(blocks), len(rows)))
@@ -96,7 +101,7 @@ def test_slope_and_curvature(straight: Model, motion: Motion, what: str) -> None
         moved = blocks.copy()
         moved[:, rows, columns] += share * steps
         moved[:, columns, rows] = moved[:, rows, columns]
-        return aims.value(aim, moved, 6.0)
+        return aims.score_matrices(aim, moved, 6.0)
 
     slope = (at(1.0) - at(-1.0)) / 2
     assert slope == pytest.approx(float(here.slope @ steps.ravel()), rel=1e-3)
@@ -109,15 +114,15 @@ def test_a_ceiling_is_kept_or_named(straight: Model) -> None:
     """An accuracy between what cond gives and what can be had is kept, at a higher cond; an impossible one is named."""
     problem = shorter(straight, 12.0)
     free = design(straight, problem, "cond", starts=1, seed=3)
-    reached = aims.sigma_percent(aims.aim(straight, "cond"), straight, free.motion).max()
+    reached = aims.sigma_percent(aims.compose_objective(straight, "cond"), straight, free.motion).max()
     asked = 0.6 * float(reached)
-    kept = design(straight, problem, aims.aim(straight, "cond", sigma_max=asked), starts=1, seed=3)
+    kept = design(straight, problem, aims.compose_objective(straight, "cond", sigma_max=asked), starts=1, seed=3)
     spread = np.sqrt(np.diag(cramer_rao(straight, kept.motion))) / np.abs(straight.nominal)
     assert 100 * spread.max() <= asked * 1.001
     assert free.cond_phi < kept.cond_phi
     assert kept.max_violation <= 1e-3
     with pytest.raises(InfeasibleError, match=r"sigma-max 0\.01 % is exceeded by") as caught:
-        design(straight, problem, aims.aim(straight, "cond", sigma_max=0.01), starts=1, seed=3)
+        design(straight, problem, aims.compose_objective(straight, "cond", sigma_max=0.01), starts=1, seed=3)
     assert caught.value.limit == "sigma-max"
     assert caught.value.excess > 1
 
@@ -153,9 +158,9 @@ def test_another_machine_follows_the_nominal_motion(va12: Model) -> None:
 
 def test_limits_hold_for_every_machine_of_a_robust_design(straight: Model) -> None:
     problem = shorter(straight, 12.0)
-    aim = aims.aim(straight, "cond", machines=scenarios.perturbed_machines(straight, 3, 0.2))
+    aim = aims.compose_objective(straight, "cond", machines=scenarios.perturbed_machines(straight, 3, 0.2))
     d = design(straight, problem, aim, starts=1, seed=3)
-    found, motion = verdict(straight, problem, aim, d.manoeuvre)
+    found, motion = evaluate_drive(straight, problem, aim, d.manoeuvre)
     assert found.feasible
     for m in aim.machines[1:]:
         driven = scenarios.track_motion(m, straight, motion)

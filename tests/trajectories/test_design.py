@@ -24,20 +24,20 @@ from excite.trajectories import (
     TOLERANCE,
     Design,
     Manoeuvre,
-    aim,
     check_limits,
     collocation,
+    compose_objective,
     design,
     interior_point,
     machine_limits,
     multisine,
     objective,
-    placed,
-    scaled,
+    place_on_lane,
+    scale_torques,
 )
-from excite.trajectories.continuation import PLAN, depart, repair, search, soften
+from excite.trajectories.continuation import STAGES, repair, run_stages, start_from_multisine, widen_transitions
 from excite.trajectories.excitation import chirp, steps
-from excite.trajectories.limits import directions, reversals
+from excite.trajectories.limits import count_reversals, travel_directions
 
 
 @pytest.fixture(scope="module")
@@ -163,7 +163,7 @@ def test_other_objectives(straight: Model, quick: Design, name: str) -> None:
     problem = shorter(straight, 12.0)
     d = design(straight, problem, objective=name, starts=1, seed=3)
     P, Q = objective.phi(straight, d.motion), objective.phi(straight, quick.motion)
-    assert objective.value(name, P.T @ P) < objective.value(name, Q.T @ Q)
+    assert objective.score_matrix(name, P.T @ P) < objective.score_matrix(name, Q.T @ Q)
     assert d.max_violation <= TOLERANCE
 
 
@@ -194,8 +194,10 @@ def test_without_a_budget_left_nothing_is_made_up(straight: Model) -> None:
 def test_what_the_fresh_simulation_exceeds_is_repaired(straight: Model) -> None:
     """The first stage ends far from rest, with transitions ten times wider than the machine's."""
     problem = shorter(straight, 12.0)
-    cond = aim(straight, "cond")
-    track = search(straight, problem, cond, depart(straight, problem, cond, 0, 1), PLAN[:1], lambda: False)
+    cond = compose_objective(straight, "cond")
+    track = run_stages(
+        straight, problem, cond, start_from_multisine(straight, problem, cond, 0, 1), STAGES[:1], lambda: False
+    )
     off = replace(track.latest, violations=track.latest.violations | {"rim speed front_roll": 0.01})
     mended = repair(straight, problem, cond, replace(track, latest=off, best=off), lambda: False)
     assert mended.best.feasible
@@ -247,7 +249,7 @@ def test_placed_fits_a_diagonal_path_into_the_lane(roller: Model) -> None:
     q0 = np.array([30.0, -12.0, 0.8, 0, 0, 0])
     motion = simulate(roller, u, q0=q0)
     assert max(v for k, v in check_limits(roller, problem, motion).items() if k.startswith("lane")) > 0.1
-    again = simulate(roller, u, q0=placed(roller, problem, motion))
+    again = simulate(roller, u, q0=place_on_lane(roller, problem, motion))
     assert max(v for k, v in check_limits(roller, problem, again).items() if k.startswith("lane")) == 0
 
 
@@ -299,7 +301,7 @@ def test_newton_step_is_the_dense_one() -> None:
         dense[1:, 1:] += (regular - max(regular, 1e-8)) * np.eye(n - 1)
         positive = bool((np.linalg.eigvalsh(dense) > 0).all())
         seen.add(positive)
-        step = interior_point.newton(Q, h, A, border, F, last, loose, regular)
+        step = interior_point.solve_newton_system(Q, h, A, border, F, last, loose, regular)
         assert (step is not None) == positive
         if step is not None:
             expected = np.einsum("krn,n->kr", D, -np.linalg.solve(dense, g))
@@ -313,8 +315,8 @@ def test_settled_states_follow_the_accurate_simulation(roller: Model) -> None:
     motion = simulate(roller, drive.torque[:1] * 0 + drive.sample(100) * 0.3)
     sizes = dict.fromkeys(roller.coordinates, 1.0) | {c + "'": 1.0 for c in roller.coordinates}
     tr = collocation.transcribe(roller, problem, sizes, 30, motion, elements=4)
-    at = (np.arange(30)[:, None] + tr.place) * tr.knot
-    Z = collocation.settle(tr, np.zeros(tr.n_z), 0.3 * drive.torque / tr.torque_scale, np.zeros((30, 12, tr.n_z)))
+    at = (np.arange(30)[:, None] + tr.node_position) * tr.interval_s
+    Z = collocation.solve_states(tr, np.zeros(tr.n_z), 0.3 * drive.torque / tr.torque_scale, np.zeros((30, 12, tr.n_z)))
     for k, name in enumerate(tr.state_names):
         if name.endswith("'"):
             true = motion.nu[:, roller.coordinates.index(name[:-1])]
@@ -322,7 +324,7 @@ def test_settled_states_follow_the_accurate_simulation(roller: Model) -> None:
 
 
 def test_softening_changes_nothing_but_standstill(roller: Model) -> None:
-    softer = soften(roller, 10, 3)
+    softer = widen_transitions(roller, 10, 3)
     assert np.array_equal(softer.nominal, roller.nominal)
     q, u = np.zeros(6), np.array([500.0, 2000.0, 300.0])
     nu = np.array([1.0, 0.0, 0.0, 1.55, 0.3, 1.55])
@@ -336,15 +338,15 @@ def test_objective_slope_and_curvature() -> None:
     A = B.T @ B
     rows, columns = np.triu_indices(5)
     for name in objective.OBJECTIVES:
-        here = objective.local(name, A, rows, columns, 6.0)
+        here = objective.local_model(name, A, rows, columns, 6.0)
         d = rng.normal(size=len(rows)) * 1e-4
         step = np.zeros((5, 5))
         step[rows, columns] = d
         step = step + step.T - np.diag(np.diag(step))
-        up, down = (objective.value(name, A + s * step, 6.0) for s in (1, -1))
+        up, down = (objective.score_matrix(name, A + s * step, 6.0) for s in (1, -1))
         assert (up - down) / 2 == pytest.approx(here.slope @ d, rel=1e-5)
         assert ((here.factor.T @ d) ** 2).sum() >= 0.99 * (up + down - 2 * here.value)
-    assert objective.value("cond", A) == pytest.approx(2 * np.log(np.linalg.cond(B)), rel=1e-5)
+    assert objective.score_matrix("cond", A) == pytest.approx(2 * np.log(np.linalg.cond(B)), rel=1e-5)
 
 
 @pytest.mark.parametrize("shape", ["triangle", "leaning"])
@@ -352,7 +354,7 @@ def test_a_polygon_is_kept(straight: Model, shape: str) -> None:
     """Corners of a convex area, in either order; the straight line has to lie along its long side."""
     corners = {"triangle": ((0, 0), (14, 0), (0, 9)), "leaning": ((0, 0), (3, 9), (6, 9), (3, 0))}[shape]
     problem = shorter(straight, 12.0, lane_polygon_m=corners)
-    drive = scaled(multisine(straight, problem, 3), 0.2)
+    drive = scale_torques(multisine(straight, problem, 3), 0.2)
     motion = simulate(straight, drive.sample(100.0))
     excess = {k: v for k, v in check_limits(straight, problem, motion).items() if k.startswith("lane edge")}
     x, y = motion.q[:, 0], np.zeros(len(motion.t))
@@ -367,7 +369,7 @@ def test_placed_fits_a_path_into_a_polygon(roller: Model) -> None:
     u[20:900, [0, 2]] = 450.0
     motion = simulate(roller, u, q0=np.array([5.0, 5.0, 2.0, 0, 0, 0]))
     assert max(v for k, v in check_limits(roller, problem, motion).items() if k.startswith("lane")) > 0.1
-    again = simulate(roller, u, q0=placed(roller, problem, motion))
+    again = simulate(roller, u, q0=place_on_lane(roller, problem, motion))
     assert max(v for k, v in check_limits(roller, problem, again).items() if k.startswith("lane")) == 0
 
 
@@ -377,7 +379,7 @@ def test_directions_fit_a_motion_best(straight: Model) -> None:
     speed = np.sin(t) + 0.3 * np.sin(5 * t)
     motion = replace(still, nu=np.column_stack([speed, speed, speed]))
     for most in (0, 1, 2, 3):
-        found = directions(motion, most)
+        found = travel_directions(motion, most)
         assert set(np.unique(found)) <= {-1.0, 1.0}
         turns = int((np.diff(found) != 0).sum())
         assert turns <= most
@@ -393,7 +395,7 @@ def test_reversals_are_counted_where_it_moves(straight: Model) -> None:
     still = simulate(straight, np.zeros((1001, 2)))
     wave = np.where(t < 5, 0.5 * np.sin(t), 0.01 * np.sin(20 * t))
     motion = replace(still, nu=np.column_stack([wave] * 3))
-    assert reversals(motion) == 1
+    assert count_reversals(motion) == 1
     over = check_limits(straight, shorter(straight, 10.0, reversals=0), motion)
     assert over["reversals"] == 1
     assert "reversals" not in check_limits(straight, shorter(straight, 10.0), motion)
@@ -403,7 +405,7 @@ def test_reversals_are_counted_where_it_moves(straight: Model) -> None:
 def test_few_reversals_are_kept(straight: Model, most: int) -> None:
     problem = shorter(straight, 12.0, reversals=most)
     d = design(straight, problem, starts=1, seed=3)
-    assert reversals(d.motion) <= most
+    assert count_reversals(d.motion) <= most
     assert d.max_violation <= TOLERANCE
     assert d.violations["reversals"] == 0
 
@@ -414,7 +416,7 @@ def test_r60_within_a_triangle_and_with_two_reversals(roller: Model) -> None:
     problem = roller.machine.problems["R60"].model_copy(update={"lane_polygon_m": corners, "reversals": 2})
     d = design(roller, problem, starts=2, seed=0)
     assert d.max_violation <= TOLERANCE
-    assert reversals(d.motion) <= 2
+    assert count_reversals(d.motion) <= 2
     places = roller.kinematics(d.motion.q.T, d.motion.nu.T)[3].full().reshape(3, len(d.motion.t), -1)
     bodies = [b.index for b in roller.machine.body]
     area = MplPath(np.array(corners))

@@ -20,7 +20,7 @@ def matrix(n: int, seed: int) -> np.ndarray:
 
 def along(name: str, A: np.ndarray, H: np.ndarray, sharp: float, h: float) -> tuple[float, float]:
     """First and second derivative of an objective at A along H, by differences."""
-    low, middle, high = (objective.value(name, A + s * h * H, sharp) for s in (-1, 0, 1))
+    low, middle, high = (objective.score_matrix(name, A + s * h * H, sharp) for s in (-1, 0, 1))
     return (high - low) / (2 * h), (high - 2 * middle + low) / h**2
 
 
@@ -29,8 +29,8 @@ def along(name: str, A: np.ndarray, H: np.ndarray, sharp: float, h: float) -> tu
 def test_slope_is_the_derivative(name: str, sharp: float) -> None:
     A = matrix(5, 1)
     rows, columns = np.triu_indices(5)
-    found = objective.local(name, A, rows, columns, sharp)
-    assert found.value == pytest.approx(objective.value(name, A, sharp))
+    found = objective.local_model(name, A, rows, columns, sharp)
+    assert found.value == pytest.approx(objective.score_matrix(name, A, sharp))
     for k, (i, j) in enumerate(zip(rows, columns, strict=True)):
         H = np.zeros_like(A)
         H[i, j] = H[j, i] = 1.0
@@ -41,7 +41,7 @@ def test_slope_is_the_derivative(name: str, sharp: float) -> None:
 def test_curvature_is_exact_where_the_objective_is_convex(name: str) -> None:
     A = matrix(5, 2)
     rows, columns = np.triu_indices(5)
-    found = objective.local(name, A, rows, columns, 4.0)
+    found = objective.local_model(name, A, rows, columns, 4.0)
     rng = np.random.default_rng(0)
     for _ in range(5):
         d = rng.normal(size=len(rows))
@@ -53,13 +53,13 @@ def test_curvature_is_exact_where_the_objective_is_convex(name: str) -> None:
 def test_scores_are_what_they_are_called() -> None:
     A = matrix(6, 3)
     eigenvalues, variances = np.linalg.eigvalsh(A), np.diag(np.linalg.inv(A))
-    assert objective.reported("cond", objective.value("cond", A)) == pytest.approx(
+    assert objective.reported_value("cond", objective.score_matrix("cond", A)) == pytest.approx(
         np.sqrt(eigenvalues[-1] / eigenvalues[0]), rel=1e-5
     )
-    assert objective.value("D", A) == pytest.approx(-np.linalg.slogdet(A)[1] / 6)
-    assert objective.value("A", A) == pytest.approx(np.log(variances.sum()))
-    assert objective.value("E", A) == pytest.approx(-np.log(eigenvalues[0]), rel=1e-5)
-    assert objective.reported("worst", objective.value("worst", A)) == pytest.approx(
+    assert objective.score_matrix("D", A) == pytest.approx(-np.linalg.slogdet(A)[1] / 6)
+    assert objective.score_matrix("A", A) == pytest.approx(np.log(variances.sum()))
+    assert objective.score_matrix("E", A) == pytest.approx(-np.log(eigenvalues[0]), rel=1e-5)
+    assert objective.reported_value("worst", objective.score_matrix("worst", A)) == pytest.approx(
         100 * np.sqrt(variances.max()), rel=1e-5
     )
 
@@ -68,12 +68,12 @@ def test_singular_information_is_infinitely_bad() -> None:
     A = matrix(4, 4)
     A[:, 3] = A[3] = 0
     for name in objective.OBJECTIVES:
-        assert objective.value(name, A) == np.inf
+        assert objective.score_matrix(name, A) == np.inf
 
 
 def test_unknown_objective_is_refused() -> None:
     with pytest.raises(KeyError):
-        objective.value("beauty", matrix(3, 0))
+        objective.score_matrix("beauty", matrix(3, 0))
 
 
 def test_rows_count_by_what_disturbs_them(va12: Model) -> None:
@@ -96,7 +96,7 @@ def test_accuracy_ranks_drives_as_the_bound_of_all_sensors_does(va12: Model) -> 
         std = np.sqrt(np.diag(smoothing.cramer_rao(va12, motion, "full"))) / np.abs(va12.nominal)
         P = objective.phi(va12, motion, "worst")
         bound.append(std.max())
-        score.append(objective.value("worst", P.T @ P))
+        score.append(objective.score_matrix("worst", P.T @ P))
         cond.append(objective.cond_phi(va12, motion))
     assert spearmanr(bound, score)[0] > 0.8
     assert spearmanr(bound, score)[0] > spearmanr(bound, cond)[0]
