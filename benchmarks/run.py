@@ -1,13 +1,13 @@
-"""How long the parts of the program take, as ratios that can be kept over time.
+"""Measure the time of the program's parts as ratios that are comparable over time and machines.
 
-    python benchmarks/run.py                  measures all, compares with what is kept, adds a line to history.jsonl
-    python benchmarks/run.py --only joint     one of them;  --profile: where its time goes
-    python benchmarks/run.py --check 1.5      ends with 1 where a ratio is more than 1.5 times the median kept
-    python benchmarks/run.py --scaling        what a study costs per run at 10, 100, 1000 and 10 000 runs, in one
-                                              process and in two, and its memory
+    python benchmarks/run.py                  measure all parts, compare with history.jsonl, add a line to it
+    python benchmarks/run.py --only joint     measure one part;  --profile: profile it
+    python benchmarks/run.py --check 1.5      exit with 1 if a ratio exceeds 1.5 times the stored median
+    python benchmarks/run.py --scaling        cost of a study per run at 10, 100, 1000 and 10 000 runs, in one process
+                                              and in two, and its memory
 
-A ratio is CPU time over that of a fixed reference computation, measured in turn on the same machine: it depends little
-on what else the machine does and on how fast it is.
+A ratio is the CPU time of a part over that of a fixed reference computation, measured alternately on the same machine.
+It depends little on the load and the speed of the machine.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ from excite.workflows import design_request, requests, study_plan, study_runner,
 
 HERE = Path(__file__).parent
 HISTORY = HERE / "history.jsonl"
-ROUNDS = 3  # of the reference and a part
-SHORT = 0.3  # s that a part is repeated for in a round
+ROUNDS = 3  # rounds of reference and part; the minimum counts; chosen
+ROUND_DURATION = 0.3  # s: a part is repeated for this long in a round; chosen
 STUDY = """
 name = "overhead"
 runs = {runs}
@@ -58,14 +58,14 @@ profile = "drive.csv"
 """
 
 
-def cpu() -> float:
-    """CPU time [s] of this process and of those that it waited for."""
+def cpu_time() -> float:
+    """CPU time [s] of this process and of the finished child processes."""
     own, children = (resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime
 
 
 def reference() -> None:
-    """Much what the program does: small linear algebra, Python, and memory that is moved about."""
+    """Run a fixed mix of small linear algebra, Python loops and memory traffic, as in the program."""
     rng = np.random.default_rng(0)
     A = rng.standard_normal((40, 40))
     for _ in range(300):
@@ -79,7 +79,7 @@ def reference() -> None:
 
 
 @lru_cache
-def straight() -> Model:
+def straight_model() -> Model:
     return prediction.build(machine.load_machine("va12_straight"))
 
 
@@ -88,105 +88,107 @@ def drive(seconds: float) -> Motion:
     t = np.arange(round(seconds * 100) + 1) / 100
     slow = np.minimum(1, np.minimum(t, seconds - t) / 2)
     torque = np.column_stack([1500 * np.sin(0.7 * t) * slow, 1200 * np.sin(1.1 * t) * slow])
-    return simulate(straight(), torque)
+    return simulate(straight_model(), torque)
 
 
 @lru_cache
-def measured(seconds: float) -> log.Log:
-    return log.from_table(sensors.measure(straight(), drive(seconds), seed=1), straight().machine)
+def measured_log(seconds: float) -> log.Log:
+    return log.from_table(sensors.measure(straight_model(), drive(seconds), seed=1), straight_model().machine)
 
 
-def started(*words: str) -> None:
+def run_command(*words: str) -> None:
     subprocess.run([sys.executable, "-m", "excite", *words], check=True, capture_output=True)
 
 
-def worker() -> None:
-    """What a process of a study or a design loads before it computes."""
-    subprocess.run([sys.executable, "-c", "import excite.cell"], check=True)
+def import_worker() -> None:
+    """Import what a worker process of a study loads before it computes."""
+    subprocess.run([sys.executable, "-c", "import excite.workflows.study_runs"], check=True)
 
 
-def simulated() -> None:
-    """A short command that computes: 2.5 s of driving, a log of 250 rows."""
+def run_simulation() -> None:
+    """Run a short simulation by command: 2.5 s of driving, a log of 250 rows."""
     with tempfile.TemporaryDirectory() as folder:
-        profile.profile_of(straight(), drive(2.5)).to_csv(f"{folder}/drive.csv", index=False)
-        started("simulate", "va12_straight", f"{folder}/drive.csv", "--out", f"{folder}/log.csv")
+        profile.profile_of(straight_model(), drive(2.5)).to_csv(f"{folder}/drive.csv", index=False)
+        run_command("simulate", "va12_straight", f"{folder}/drive.csv", "--out", f"{folder}/log.csv")
 
 
-def designed() -> None:
-    _, problem = requests.choose_problem(straight().machine, None, 8.0)
-    design_request.design_from(straight(), problem, design_request.DesignRequest("cond", starts=1))
-    get_reusable_executor().shutdown(wait=True)  # CPU time of a process counts when it has ended
+def run_design() -> None:
+    _, problem = requests.choose_problem(straight_model().machine, None, 8.0)
+    design_request.design_from(straight_model(), problem, design_request.DesignRequest("cond", starts=1))
+    get_reusable_executor().shutdown(wait=True)  # CPU time of a child counts after it has ended
 
 
-def diagnosed() -> None:
-    diagnosis.diagnose(straight(), [measured(20.0)], straight().machine.filter)
+def run_diagnosis() -> None:
+    diagnosis.diagnose(straight_model(), [measured_log(20.0)], straight_model().machine.filter)
 
 
-def studied(runs: int, jobs: int = 1) -> None:
+def run_study(runs: int, jobs: int = 1) -> None:
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        profile.profile_of(straight(), drive(2.5)).to_csv(place / "drive.csv", index=False)
+        profile.profile_of(straight_model(), drive(2.5)).to_csv(place / "drive.csv", index=False)
         (place / "study.toml").write_text(STUDY.format(runs=runs))
         study_runner.run_study(study_plan.read_study(place / "study.toml"), place / "out", jobs=jobs)
 
 
-def bare(runs: int) -> None:
-    """The runs of `studied` without a study around them."""
+def run_without_study(runs: int) -> None:
+    """Simulate and hash the runs of `run_study` without a study around them."""
     for seed in range(runs):
-        table = sensors.measure(straight(), drive(2.5), seed=seed)
+        table = sensors.measure(straight_model(), drive(2.5), seed=seed)
         hashlib.sha256(table.to_numpy(float).tobytes()).hexdigest()
 
 
 PARTS: dict[str, Callable[[], object]] = {
-    "start-up: --help": lambda: started("--help"),
-    "start-up: machines": lambda: started("machines", "--json"),
-    "start-up: a worker": worker,
-    "start-up: simulate": simulated,
+    "start-up: --help": lambda: run_command("--help"),
+    "start-up: machines": lambda: run_command("machines", "--json"),
+    "start-up: a worker": import_worker,
+    "start-up: simulate": run_simulation,
     "model of va12": lambda: prediction.build(machine.load_machine("va12")),
-    "simulation, 40 s": lambda: simulate(straight(), drive(40.0).u),
-    "sensors, 40 s": lambda: sensors.measure(straight(), drive(40.0), seed=1),
-    "identification ols, 40 s": lambda: methods.identify(straight(), [measured(40.0)], "ols"),
-    "identification joint, 40 s": lambda: methods.identify(straight(), [measured(40.0)], "joint"),
-    "diagnosis, 20 s": diagnosed,
-    "design, 8 s, one start": designed,
-    "study of 200 runs": lambda: studied(200),
-    "the same 200 runs bare": lambda: bare(200),
+    "simulation, 40 s": lambda: simulate(straight_model(), drive(40.0).u),
+    "sensors, 40 s": lambda: sensors.measure(straight_model(), drive(40.0), seed=1),
+    "identification ols, 40 s": lambda: methods.identify(straight_model(), [measured_log(40.0)], "ols"),
+    "identification joint, 40 s": lambda: methods.identify(straight_model(), [measured_log(40.0)], "joint"),
+    "diagnosis, 20 s": run_diagnosis,
+    "design, 8 s, one start": run_design,
+    "study of 200 runs": lambda: run_study(200),
+    "the same 200 runs bare": lambda: run_without_study(200),
 }
 
 
-def timed(work: Callable[[], object]) -> float:
-    begin = cpu()
+def cpu_time_of(work: Callable[[], object]) -> float:
+    begin = cpu_time()
     work()
-    return cpu() - begin
+    return cpu_time() - begin
 
 
-def paired(work: Callable[[], object]) -> tuple[float, float]:
-    """The least CPU time [s] of a piece of work and of the reference, measured in turn: everything disturbs in one
-    direction, and a machine that is slow for a while is so for both."""
+def measure_with_reference(work: Callable[[], object]) -> tuple[float, float]:
+    """Least CPU time [s] of a function and of the reference, measured alternately.
+
+    Disturbances only add time, and a slow phase of the machine affects both.
+    """
     own: list[float] = []
     base: list[float] = []
     for _ in range(ROUNDS):
-        base.append(timed(reference))
+        base.append(cpu_time_of(reference))
         begin = len(own)
-        while len(own) == begin or sum(own[begin:]) < SHORT:
-            own.append(timed(work))
+        while len(own) == begin or sum(own[begin:]) < ROUND_DURATION:
+            own.append(cpu_time_of(work))
     return min(own), min(base)
 
 
 def measure(only: str | None) -> dict[str, dict[str, float]]:
-    """Part -> CPU seconds and ratio to the reference."""
+    """Measure parts: CPU time [s] and ratio to the reference, by name."""
     rows: dict[str, dict[str, float]] = {}
-    straight(), drive(40.0), drive(20.0), drive(2.5), measured(40.0), measured(20.0)
+    straight_model(), drive(40.0), drive(20.0), drive(2.5), measured_log(40.0), measured_log(20.0)
     for name, work in PARTS.items():
         if only is not None and only not in name:
             continue
-        own, base = paired(work)
+        own, base = measure_with_reference(work)
         rows[name] = {"cpu_s": round(own, 5), "ratio": round(own / base, 4)}
         print(f"{name:32} {own:8.3f} s CPU {own / base:8.2f} of the reference", flush=True)
     return rows
 
 
-def kept() -> list[dict[str, dict[str, float]]]:
+def stored_history() -> list[dict[str, dict[str, float]]]:
     if not HISTORY.is_file():
         return []
     return [json.loads(line)["parts"] for line in HISTORY.read_text().splitlines()]
@@ -197,9 +199,9 @@ def commit() -> str:
     return done.stdout.strip() or "unknown"
 
 
-def compared(rows: dict[str, dict[str, float]], limit: float | None) -> int:
-    """Shows each ratio beside the median of those kept; how many are above `limit` times that."""
-    before, worse = kept(), 0
+def compare_with_history(rows: dict[str, dict[str, float]], limit: float | None) -> int:
+    """Print each ratio relative to the stored median; return how many exceed `limit` times the median."""
+    before, worse = stored_history(), 0
     for name, row in rows.items():
         old = [h[name]["ratio"] for h in before if name in h]
         if not old:
@@ -207,12 +209,12 @@ def compared(rows: dict[str, dict[str, float]], limit: float | None) -> int:
         change = row["ratio"] / statistics.median(old)
         bad = limit is not None and change > limit
         worse += bad
-        print(f"{name:32} {change:6.2f} times the median of {len(old)} kept{'  TOO SLOW' if bad else ''}")
+        print(f"{name:32} {change:6.2f} times the median of {len(old)} stored{'  TOO SLOW' if bad else ''}")
     return worse
 
 
 def scaling(sizes: list[int]) -> None:
-    """Cost of studies of growing size, each in a process of its own; the same runs without a study first."""
+    """Print the cost of studies of growing size, each in its own process, first without a study."""
     print(
         "| runs | processes | wall [s] | wall per run [ms] | CPU per run [ms] | speed-up | driver [MB] | worker [MB]"
         " | table [kB] |\n|---|---|---|---|---|---|---|---|---|"
@@ -220,58 +222,65 @@ def scaling(sizes: list[int]) -> None:
     for runs in sizes:
         alone = 0.0
         for jobs in (0, 1, 2):
-            code = f"import run; run.one({runs}, {jobs}, {alone})"
+            code = f"import run; run.print_scaling_row({runs}, {jobs}, {alone})"
             done = subprocess.run([sys.executable, "-c", code], cwd=HERE, check=True, stdout=subprocess.PIPE, text=True)
             print(done.stdout, end="", flush=True)
             if jobs == 1:
                 alone = float(done.stdout.split("|")[3])
 
 
-def most(pid: int | str = "self") -> float:
-    """The most memory [MB] that a process had: not ru_maxrss, which a child takes over from the one that started it."""
+def peak_memory(pid: int | str = "self") -> float:
+    """Peak memory [MB] of a process. ru_maxrss would not do: a child inherits it from its parent."""
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    except OSError:  # it has ended
+    except OSError:  # the process has ended
         return 0.0
     return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")), 0.0)
 
 
-def one(runs: int, jobs: int, alone: float) -> None:
-    """A line of the scaling table. jobs 0: the runs without a study; alone: wall time [s] in one process."""
-    straight(), drive(2.5)
-    bare(1)
+def print_scaling_row(runs: int, jobs: int, alone: float) -> None:
+    """Print a row of the scaling table. jobs 0: runs without a study; alone: wall time [s] in one process."""
+    straight_model(), drive(2.5)
+    run_without_study(1)
     with tempfile.TemporaryDirectory() as folder:
         place, workers, looked, size = Path(folder), 0.0, 0.0, "-"
-        profile.profile_of(straight(), drive(2.5)).to_csv(place / "drive.csv", index=False)
+        profile.profile_of(straight_model(), drive(2.5)).to_csv(place / "drive.csv", index=False)
         (place / "study.toml").write_text(STUDY.format(runs=runs))
 
-        def look(*_: object) -> None:
+        def watch_workers(*_: object) -> None:
             nonlocal workers, looked
             if time.perf_counter() - looked > 0.2:
                 children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
-                workers, looked = max([workers, *map(most, children)]), time.perf_counter()
+                workers, looked = max([workers, *map(peak_memory, children)]), time.perf_counter()
 
-        begin, spent = time.perf_counter(), cpu()
+        begin, spent = time.perf_counter(), cpu_time()
         if jobs:
-            study_runner.run_study(study_plan.read_study(place / "study.toml"), place / "out", jobs=jobs, progress=look)
+            study_runner.run_study(
+                study_plan.read_study(place / "study.toml"), place / "out", jobs=jobs, progress=watch_workers
+            )
             size = f"{(place / 'out' / 'runs.parquet').stat().st_size / 1e3:.0f}"
         else:
-            bare(runs)
-        wall, busy = time.perf_counter() - begin, cpu() - spent
+            run_without_study(runs)
+        wall, busy = time.perf_counter() - begin, cpu_time() - spent
     faster = f"{alone / wall:.2f}" if jobs > 1 else "-"
     print(
         f"| {runs} | {jobs or 'no study'} | {wall:.2f} | {1e3 * wall / runs:.2f} | {1e3 * busy / runs:.2f} | {faster}"
-        f" | {most():.0f} | {f'{workers:.0f}' if workers else '-'} | {size} |"
+        f" | {peak_memory():.0f} | {f'{workers:.0f}' if workers else '-'} | {size} |"
     )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", help="parts whose name has this in it")
-    parser.add_argument("--profile", action="store_true", help="where the time goes")
-    parser.add_argument("--check", type=float, metavar="FACTOR", help="fail above so many times the median kept")
-    parser.add_argument("--dry", action="store_true", help="keep nothing")
-    parser.add_argument("--scaling", type=int, nargs="*", metavar="RUNS", help="sizes of studies [10 100 1000 10000]")
+    parser.add_argument("--only", help="parts whose name contains this")
+    parser.add_argument("--profile", action="store_true", help="profile the parts")
+    parser.add_argument(
+        "--check",
+        type=float,
+        metavar="FACTOR",
+        help="exit with 1 if a ratio exceeds this factor times the stored median",
+    )
+    parser.add_argument("--dry", action="store_true", help="do not add a line to history.jsonl")
+    parser.add_argument("--scaling", type=int, nargs="*", metavar="RUNS", help="numbers of runs [10 100 1000 10000]")
     asked = parser.parse_args()
     if asked.scaling is not None:
         scaling(asked.scaling or [10, 100, 1000, 10_000])
@@ -286,7 +295,7 @@ def main() -> None:
                 pstats.Stats(profiler).sort_stats("tottime").print_stats(12)
         return
     rows = measure(asked.only)
-    worse = compared(rows, asked.check)
+    worse = compare_with_history(rows, asked.check)
     if not asked.dry and asked.only is None:
         about = {
             "commit": commit(),
