@@ -1,4 +1,4 @@
-"""Why the first identification failed (1999): simulate the roller, identify as then, find when that table arises.
+"""Find the conditions under which least squares gives the table printed in 1999: simulate and identify as then.
 
 python results/1999/study.py [--jobs 2] rebuilds summary.json, tables.md and the figures beside this file.
 """
@@ -30,13 +30,13 @@ from excite.model.machine import Filter, Machine, machine as machines
 from excite.reports import COLOURS, save
 from excite.simulation import Motion, follow, sensors, simulate
 from excite.smoothing import cramer_rao
-from excite.trajectories import Manoeuvre, design, percent
+from excite.trajectories import Manoeuvre, design, relative_std_percent
 
 HERE = Path(__file__).parent
 FORK = "multiprocessing"  # workers keep the models that this file has built
-SEEDS = 4  # of the grid
-MANY = 6  # of the table of single causes
-RUNS = 50  # of the comparison with the recommended method
+SEEDS = 4  # seeds of each cell of the grid; chosen
+MANY = 6  # seeds of the table of single changes; chosen
+RUNS = 50  # runs of the comparison with the recommended method; chosen
 RADIUS = 0.65  # R_c [m]
 SCALE = 4.79  # (ZZ1 + ZZ4 + M R_c^2 of the reference machine) / (ZZ1 + ZZ4 as printed)
 PAPER = {
@@ -51,8 +51,9 @@ PAPER = {
     "Kx4": -310.0,
     "u40": -181.94,
 }
-PAPER_STD = {"inertias": 0.3, "friction and offsets": 3.0, "contact": (17.0, 27.0)}  # per cent
-FRICTION, OFFSETS = ("Fv1", "Fs1", "Fv4", "Fs4"), ("u10", "u40")
+PAPER_STD = {"inertias": 0.3, "friction and offsets": 3.0, "contact": (17.0, 27.0)}  # [%]
+FRICTION = ("Fv1", "Fs1", "Fv4", "Fs4")
+OFFSETS = ("u10", "u40")
 
 
 # ------------------------------------------------------------------------------------------------ machine and drive
@@ -60,9 +61,12 @@ FRICTION, OFFSETS = ("Fv1", "Fs1", "Fv4", "Fs4"), ("u10", "u40")
 
 @dataclass(frozen=True)
 class Plant:
-    """What is driven and measured. soil: factor on Kx; counts: factor on the encoders' counts per turn, inf for exact
-    signals without any noise; wheel: measuring wheels larger by this share; scale: torques read too small by it, with
-    friction, offsets and noise as large as it takes to read as the reference's do."""
+    """Simulated machine and sensors.
+
+    soil: factor on Kx. counts: factor on the encoders' counts per turn, inf for exact signals without noise. wheel:
+    relative excess of the measuring wheels' radius. scale: torques read too small by this factor; friction, offsets and
+    noise are scaled up so that their readings equal the reference.
+    """
 
     drive: str = "gentle"
     soil: float = 1.0
@@ -73,7 +77,7 @@ class Plant:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How the log is identified. law: slip over v_n or over R_c w; cutoff [Hz]; rows: see ROWS."""
+    """Options of least squares. law: slip over v_n or over R_c w; cutoff [Hz]; rows: see ROWS."""
 
     law: str = "v_n"
     cutoff: float = 3.0
@@ -82,7 +86,7 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Fit:
-    """Estimates by name [SI], deviations by (33), cond(W diag X), residual [%]."""
+    """Estimates by name [SI], standard deviations by (33), cond(W diag X), residual [%]."""
 
     value: dict[str, float]
     std: dict[str, float]
@@ -100,7 +104,7 @@ def reference() -> Model:
 
 @lru_cache(maxsize=64)
 def true_model(plant: Plant) -> Model:
-    """The machine that is really there: what a plant changes of the reference."""
+    """Build the true machine: the reference with the changes of a plant."""
     d = reference().machine.model_dump()
     for body in d["body"]:
         if body["contact"]:
@@ -117,7 +121,7 @@ def true_model(plant: Plant) -> Model:
 
 
 def trapezoids(duration: float, signs: Sequence[int], speed: float, ramp: float) -> np.ndarray:
-    """Wanted speed (N,) [m/s] at 100 Hz: one trapezoid per sign, ramps of `ramp` [s], at rest in between."""
+    """Reference speed (N,) [m/s] at 100 Hz: one trapezoid per sign, ramps of `ramp` [s], at rest in between."""
     t = np.arange(round(duration * 100) + 1) / 100
     v, leg = np.zeros_like(t), duration / len(signs)
     for k, sign in enumerate(signs):
@@ -126,14 +130,14 @@ def trapezoids(duration: float, signs: Sequence[int], speed: float, ramp: float)
     return v
 
 
-DRIVES = {  # by a human driver: wanted speeds
+DRIVES = {  # reference speeds for the driver model
     "gentle": trapezoids(120, (1, -1, 1, -1), 1.0, 6.0),
     "slow": trapezoids(60, (1, -1, 1, -1), 1.0, 3.0),
     "forward only": trapezoids(60, (1, 1, 1, 1), 1.0, 3.0),
     "forward long": trapezoids(120, (1, 1, 1, 1), 1.0, 6.0),
     "brisk": trapezoids(60, (1, -1) * 4, 1.8, 1.0),
 }
-ROLLS_UP = 1e-9  # factor on Kx: rolls that touch nothing
+ROLLS_UP = 1e-9  # factor on Kx: rolls off the ground
 
 
 @lru_cache(maxsize=2)
@@ -144,7 +148,7 @@ def s40(objective: str) -> Manoeuvre:
 
 
 def motion(plant: Plant, seed: int, designed: Manoeuvre | None = None) -> Motion:
-    """What the machine does; larger measuring wheels turn less and change nothing else."""
+    """Simulate a plant's drive; larger measuring wheels turn less and change nothing else."""
     if plant.drive == "S40":
         assert designed is not None
         moved = simulate(true_model(plant), designed.sample(100.0))
@@ -160,7 +164,7 @@ def _motion(drive: str, soil: float, scale: float, seed: int) -> Motion:
 
 
 def measured(plant: Plant, moved: Motion, seed: int) -> log.Log:
-    """The log of the paper's sensors."""
+    """Simulate the log of the paper's sensors."""
     table = sensors.measure(true_model(plant), moved, kit="paper", seed=seed, noise=bool(np.isfinite(plant.counts)))
     for column in ("u1_Nm", "u4_Nm"):
         table[column] = table[column] / plant.scale
@@ -174,7 +178,7 @@ LAWS = ("v_n", "R_c w")
 
 
 def equations(measurement: log.Log, cutoff: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """W (3, n, 11) and Y (3, n) as `ols` makes them with a cut-off [Hz], by slip law."""
+    """Build W (3, n, 11) and Y (3, n) as `ols` does with a cut-off [Hz], by slip law."""
     model = reference()
     default = model.machine.filter
     f = Filter.model_validate(default.model_dump() | {"cutoff_hz": {"value": cutoff, "source": "assumed"}})
@@ -186,7 +190,7 @@ def equations(measurement: log.Log, cutoff: float) -> dict[str, tuple[np.ndarray
     printed = own.copy()
     for body in model.machine.contacts:
         rim = RADIUS * s.nu[model.coordinates.index(f"theta{body.index}")]
-        # Nobody divides by zero: below 0.02 m/s the slip counts as none.
+        # Below 0.02 m/s the slip is set to zero, to avoid division by zero.
         moving = np.abs(rim) > 0.02
         factor = np.where(moving, np.hypot(rim, 0.05) / np.where(moving, rim, 1.0), 0.0)
         k = model.base.names.index(f"Kx{body.index}")
@@ -205,7 +209,7 @@ ROWS: dict[str, tuple[float, bool]] = {  # weight of the homogeneous row 0 = M a
 
 
 def solve(W: np.ndarray, Y: np.ndarray, rows: str) -> Fit:
-    """Ordinary least squares with deviations (33), one variance for all rows."""
+    """Solve ordinary least squares with standard deviations (33), one variance for all rows."""
     names = reference().base.names
     weight, with_M = ROWS[rows]
     Y = Y.copy()
@@ -262,7 +266,7 @@ def marks(fit: Fit, plant: Plant) -> np.ndarray:
 
 
 def fits(plant: Plant, seed: int, recipes: Sequence[Recipe], designed: Manoeuvre | None) -> list[Fit]:
-    """One log, identified by every recipe."""
+    """Identify one log by every recipe."""
     measurement = measured(plant, motion(plant, seed, designed), seed + 1)
     made = {c: equations(measurement, c) for c in sorted({r.cutoff for r in recipes})}
     return [solve(*made[r.cutoff][r.law], r.rows) for r in recipes]
@@ -311,7 +315,7 @@ SINGLE: dict[str, tuple[Plant, Recipe]] = {
 
 
 def _median(found: Sequence[Fit]) -> dict[str, float]:
-    """Medians over seeds of values, deviations [%], cond and error; and of the conserved sum."""
+    """Medians over seeds of values, standard deviations [%], cond, error and conserved sum."""
     names = found[0].value
     out = {n: float(np.median([f.value[n] for f in found])) for n in names}
     out |= {f"{n} std_percent": float(np.median([f.percent(n) for f in found])) for n in names}
@@ -322,12 +326,12 @@ def _median(found: Sequence[Fit]) -> dict[str, float]:
 
 
 def conserved(fit: Fit) -> float:
-    """ZZ1 + ZZ4 + R_c^2 M [kg m2]: what the torques of a rolling machine fix, however they are shared out."""
+    """Sum ZZ1 + ZZ4 + R_c^2 M [kg m2], which the torques of a rolling machine determine."""
     return fit.value["ZZ1"] + fit.value["ZZ4"] + RADIUS**2 * fit.value.get("M", 0.0)
 
 
 def _single(seed: int) -> dict[str, Fit]:
-    """Every single cause on one seed."""
+    """Identify every single change on one seed."""
     return {name: fits(plant, seed, [recipe], None)[0] for name, (plant, recipe) in SINGLE.items()}
 
 
@@ -356,7 +360,7 @@ RECIPES = [Recipe(*r) for r in itertools.product(FACTORS["law"], FACTORS["cutoff
 
 
 def plants() -> Iterator[Plant]:
-    """Every combination; and torques read too small, with encoders as they are and coarser."""
+    """List every combination, and plants with torques read too small."""
     for drive, soil, counts, wheel in itertools.product(*(FACTORS[k] for k in ("drive", "soil", "counts", "wheel"))):
         yield Plant(drive, soil, counts, wheel)
     for drive, counts in itertools.product(("gentle", "forward long", "brisk"), (0.35, 0.5, 1.0)):
@@ -433,21 +437,21 @@ def grid(jobs: int, designed: Manoeuvre) -> dict[str, object]:
 
 
 def _distance(median: dict[str, float]) -> float:
-    """Mean factor between stated deviations and cond of a cell and the printed ones, as a logarithm."""
+    """Mean absolute log ratio of stated standard deviations and cond of a cell to the printed ones."""
     printed = {"ZZ": 0.3, "Kx": 21.4}
     off = [np.log(median[f"{n} std_percent"] / printed.get(n[:2], 3.0)) for n in PAPER]
     return float(np.mean(np.abs([*off, np.log(median["cond_phi"] / 87)])))
 
 
 def _apart(median: dict[str, float]) -> float:
-    """Mean factor between a cell's values and the printed ones, as a logarithm; a wrong sign counts as a factor 20."""
+    """Mean absolute log ratio of a cell's values to the printed ones; a wrong sign counts as a factor of 20."""
     return float(np.mean([abs(np.log(median[n] / x)) if median[n] * x > 0 else 3.0 for n, x in PAPER.items()]))
 
 
 def _count(
     cells: list[tuple[dict[str, object], dict[str, float]]], hit: np.ndarray, among: np.ndarray
 ) -> dict[str, int]:
-    """Fits with the printed inertias, by what made the slips good enough for that."""
+    """Count fits with the printed inertias by soil, encoder and drive."""
     out: dict[str, int] = {}
     for (cell, _), own, yes in zip(cells, hit, among, strict=True):
         if yes and own.any():
@@ -467,7 +471,7 @@ def _resolution(counts: float, seed: int, designed: Manoeuvre | None) -> Fit:
 
 
 def mechanism(jobs: int, designed: Manoeuvre) -> dict[str, dict[str, list[dict[str, float]]]]:
-    """OLS against encoder resolution, gentle drive and designed drive; cut-off 10 Hz, so that filters do not count."""
+    """Identify by OLS over encoder resolution, gentle and designed drive; cut-off 10 Hz makes filters negligible."""
     out = {}
     for name, d in (("gentle", None), ("S40", designed)):
         todo = [(c, s) for c in FINER for s in range(SEEDS)]
@@ -479,11 +483,11 @@ def mechanism(jobs: int, designed: Manoeuvre) -> dict[str, dict[str, list[dict[s
     return out
 
 
-# ------------------------------------------------------------------------------------------------ part 4: instead
+# -------------------------------------------------------------------------------- part 4: the recommended method
 
 
 def wrong_start(seed: int) -> Model:
-    """A machine file whose masses, inertias, friction and soil are off by up to 20 % each: what one knows before."""
+    """Build a machine with masses, inertias, friction and soil up to 20 % off, as a starting point."""
     rng = np.random.default_rng(seed)
     d = reference().machine.model_dump()
     for body in d["body"]:
@@ -504,16 +508,16 @@ def instead(jobs: int, designs: dict[str, Manoeuvre]) -> dict[str, object]:
             print(f"  {method} on {name}", flush=True)
             v = verify(model, moved, method, kit="paper", runs=RUNS, seed=5, start=known, jobs=jobs)
             out[f"{method}, {name}"] = {"failures": len(v.failures), "parameters": verified(v)}
-        bound = percent(model, cramer_rao(model, moved, "paper"))
+        bound = relative_std_percent(model, cramer_rao(model, moved, "paper"))
         out[f"bound, {name}"] = dict(zip(model.base.names, map(float, bound), strict=True))
     return out
 
 
-# ------------------------------------------------------------------------------------------------ physics on paper
+# -------------------------------------------------------------------------------- physics of the printed numbers
 
 
 def physics() -> dict[str, float]:
-    """What the printed numbers would mean for the machine."""
+    """Compute the physical consequences of the printed numbers."""
     names = dict(zip(reference().base.names, reference().nominal, strict=True))
     M = names["M"]
     K = -(PAPER["Kx1"] + PAPER["Kx4"])
@@ -678,7 +682,7 @@ def _instead_figure(r: dict[str, dict[str, dict[str, dict[str, float]]]]) -> Non
 
 
 def tables(result: dict[str, object]) -> str:
-    """Markdown tables for the README."""
+    """Write the Markdown tables of tables.md."""
     head = (
         "change|M [kg]|ZZ1 [kg m2]|ZZ4 [kg m2]|friction / offsets, median std %|Kx1 [N]|Kx4 [N]|cond(Phi)"
         "|ZZ1 + ZZ4 + R_c² M|marks of 7"
@@ -699,7 +703,7 @@ def tables(result: dict[str, object]) -> str:
         if case.startswith("bound"):
             continue
         lines += ["", f"**{case}**, failures {own['failures']}", ""]
-        lines += ["| parameter | true | mean | bias % | spread % | predicted % | coverage |", "|---" * 7 + "|"]
+        lines += ["| parameter | true | mean | bias % | dispersion % | predicted % | coverage |", "|---" * 7 + "|"]
         lines += [
             f"| {n} | {p['true']:.6g} | {p['mean']:.5g} | {p['bias_percent']:.2f} | {p['std_percent']:.2f} |"
             f" {p['predicted_std_percent']:.2f} | {100 * p['coverage95']:.0f} % |"
@@ -709,7 +713,7 @@ def tables(result: dict[str, object]) -> str:
 
 
 def _plain(x: object) -> object:
-    """Numbers of four or five digits: files that can be compared."""
+    """Round numbers to five digits, so that files can be compared."""
     if isinstance(x, dict):
         return {str(k): _plain(v) for k, v in x.items()}
     if isinstance(x, list | tuple):
@@ -721,7 +725,7 @@ def _plain(x: object) -> object:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--jobs", type=int, default=2, help="processes side by side")
+    parser.add_argument("--jobs", type=int, default=2, help="parallel processes")
     jobs = parser.parse_args().jobs
     print("designing S40", flush=True)
     designs = {"cond": s40("cond"), "D": s40("D")}

@@ -1,4 +1,4 @@
-"""How low cond(Phi) of R60 could be: the bound of `excite.bound`, from the states of the designed drives.
+"""Compute a lower bound on cond(Phi) of R60 (`excite.trajectories.bound`), from the states of the designed drives.
 
 python results/bound_R60/study.py [--rounds 80] [--minutes 45] rebuilds summary.json and bound.png beside this file.
 """
@@ -25,7 +25,7 @@ from excite.model import Model, prediction
 from excite.model.machine import machine
 from excite.reports import COLOURS, save
 from excite.simulation import Motion, simulate
-from excite.trajectories import Manoeuvre, objective, placed
+from excite.trajectories import Manoeuvre, objective, place_on_lane
 from excite.trajectories.bound import Bound, bound
 
 HERE = Path(__file__).parent
@@ -34,17 +34,17 @@ DESIGNS = HERE.parent / "R60" / "design", HERE.parent / "R60_accuracy" / "design
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=80, help="of column generation, at most")
-    parser.add_argument("--minutes", type=float, default=45, help="after which no new round begins")
-    parser.add_argument("--degree", type=int, default=2, help="of the polynomials")
-    parser.add_argument("--polished", type=int, default=12, help="states that are made worse locally in a round")
+    parser.add_argument("--rounds", type=int, default=80, help="largest number of rounds of column generation")
+    parser.add_argument("--minutes", type=float, default=45, help="no new round begins after this time")
+    parser.add_argument("--degree", type=int, default=2, help="degree of the polynomials")
+    parser.add_argument("--polished", type=int, default=12, help="states refined by local search in each round")
     options = parser.parse_args()
     model = prediction.build(machine.load_machine("va12"))
     motions = drives(model)
     path: list[Bound] = []
     begin = time.monotonic()
 
-    def seen(found: Bound) -> bool:
+    def record_round(found: Bound) -> bool:
         path.append(found)
         spent = (time.monotonic() - begin) / 60
         print(
@@ -60,7 +60,7 @@ def main() -> None:
         options.degree,
         options.rounds,
         polished=options.polished,
-        progress=seen,
+        progress=record_round,
     )
     best = min(objective.cond_phi(model, m) for m in motions)
     summary = {
@@ -76,19 +76,19 @@ def main() -> None:
     save(figure(path, found, best), HERE / "bound.png")
     certificate = found.certificate
     assert certificate is not None
-    told = {k: getattr(certificate, k) for k in ("U", "V", "m", "a", "b")}
+    matrices = {k: getattr(certificate, k) for k in ("U", "V", "m", "a", "b")}
     with output.new_file(HERE / "certificate.json") as place:
-        place.write_text(json.dumps(told, default=lambda x: np.asarray(x).tolist()) + "\n", encoding="utf-8")
+        place.write_text(json.dumps(matrices, default=lambda x: np.asarray(x).tolist()) + "\n", encoding="utf-8")
     with output.new_file(HERE / "summary.json") as place:
         place.write_text(output.to_json(summary), encoding="utf-8")
 
 
 def drives(model: Model) -> list[Motion]:
-    """The designs of the studies R60 and R60_accuracy, and the best drive that a long search found (drive.csv)."""
+    """Simulate the designs of R60 and R60_accuracy, and the best drive of a long search (drive.csv)."""
     rate = float(model.machine.sampling_hz)
     knots = np.loadtxt(HERE / "drive.csv", delimiter=",", skiprows=1)
     torque = Manoeuvre(knots[:, 0], knots[:, 1:]).sample(rate)
-    start = placed(model, model.machine.problems["R60"], simulate(model, torque))
+    start = place_on_lane(model, model.machine.problems["R60"], simulate(model, torque))
     found = [simulate(model, torque, q0=start)]
     for place in DESIGNS:
         torque, q0, nu0 = profile.read_profile(place / "profile.csv", model)
@@ -97,7 +97,7 @@ def drives(model: Model) -> list[Motion]:
 
 
 def figure(path: list[Bound], found: Bound, best: float) -> Figure:
-    """Mixture and certificate, round by round, against the best drive."""
+    """Plot mixture and certified bound of every round against the best drive."""
     fig = Figure(figsize=(8, 4.5), layout="constrained")
     ax = fig.subplots()
     rounds = [f.rounds for f in path]

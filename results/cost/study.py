@@ -1,7 +1,7 @@
-"""What a design costs: time and memory against duration, grid and number of parameters, and where the time goes.
+"""Measure time and memory of a design against duration, knot interval and number of parameters.
 
 python results/cost/study.py [--seconds 20 40 60 120] rebuilds summary.json, table.md and cost.png beside this file.
-Every case is one start, all stages, in a process of its own, one after the other; what the profiler costs is left in.
+Each case is one start with all stages, in a process of its own. Times include the profiler.
 """
 
 from __future__ import annotations
@@ -30,18 +30,16 @@ from excite.model import prediction
 from excite.model.machine import machine
 from excite.reports import COLOURS, save
 from excite.reports.figures import STYLES
-from excite.trajectories import composite_objective as aims
-from excite.trajectories.continuation import PLAN, depart, repair, search
+from excite.trajectories import collocation, composite_objective, continuation, interior_point
 
 HERE = Path(__file__).parent
-# Functions whose time is told apart: (file, name) to what they do. None of them calls another.
-PARTS = {
-    ("collocation.py", "transcribe"): "derivatives built",
-    ("interior.py", "_linearise"): "derivatives evaluated",
-    ("interior.py", "_descend"): "Newton step",
-    ("collocation.py", "settle"): "states settled",
-    ("interior.py", "_evaluate"): "line search",
-    ("continuation.py", "verdict"): "fresh simulation",
+PARTS = {  # function: its part of the time; none of them calls another
+    collocation.transcribe: "derivatives built",
+    interior_point._linearise: "derivatives evaluated",
+    interior_point._descent_step: "Newton step",
+    collocation.solve_states: "states settled",
+    interior_point._evaluate: "line search",
+    continuation.evaluate_drive: "fresh simulation",
 }
 
 
@@ -72,7 +70,7 @@ def main() -> None:
 
 
 def case(name: str, seconds: float, knot: float) -> dict[str, object]:
-    """One start of a design: wall and processor time [s], peak memory [MB], where the time went."""
+    """Run one start of a design: wall and CPU time [s], peak memory [MB], share of the time by part."""
     model = prediction.build(machine.load_machine(name))
     before = model.machine.problems[model.machine.problem or ""]
     problem = before.model_copy(
@@ -81,17 +79,19 @@ def case(name: str, seconds: float, knot: float) -> dict[str, object]:
             "knot_s": before.knot_s.model_copy(update={"value": knot}),
         }
     )
-    aim = aims.aim(model, "cond")
+    aim = composite_objective.compose_objective(model, "cond")
     profile = cProfile.Profile(time.process_time)
     wall, cpu = time.perf_counter(), time.process_time()
     profile.enable()
-    track = search(model, problem, aim, depart(model, problem, aim, 0, 1), PLAN, lambda: False)
-    track = repair(model, problem, aim, track, lambda: False)
+    start = continuation.start_from_multisine(model, problem, aim, 0, 1)
+    track = continuation.run_stages(model, problem, aim, start, continuation.STAGES, lambda: False)
+    track = continuation.repair(model, problem, aim, track, lambda: False)
     profile.disable()
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     spent = dict.fromkeys(PARTS.values(), 0.0)
+    parts = {(f.__code__.co_filename, f.__code__.co_name): part for f, part in PARTS.items()}
     for (file, _, function), (_, _, _, cumulative, _) in pstats.Stats(profile).stats.items():  # type: ignore[attr-defined]
-        part = PARTS.get((Path(file).name, function))
+        part = parts.get((file, function))
         if part is not None:
             spent[part] += cumulative
     return {

@@ -1,10 +1,9 @@
-"""Does the diagnosis name what was hidden? Blind logs of a second roller that shares no code with the program.
+"""Diagnose blind logs of a second roller that shares no code with the program, and score the answers.
 
 python results/diagnosis/study.py [--per-cause 6] [--nothing 200] [--per-surprise 2] [--pairs 12] [--jobs 2]
-rebuilds summary.json, cases.csv, confusion.png and README.md beside this file, of cases that nobody had looked at while
-the diagnosis was written; `--seen` goes through those instead that it was mended by. Each case is kept in
-results/.diagnosis/ as soon as it is done, so an interrupted study goes on where it stopped; cases of other versions of
-the program are not used again. `--jobs 0` reports what there is.
+rebuilds summary.json, cases.csv, confusion.png and README.md beside this file from held-out cases. `--seen` runs the
+cases that the diagnosis was developed on instead. Each case is stored in results/.diagnosis/ when done, so an
+interrupted study resumes; cases of other versions of the program are not reused. `--jobs 0` reports the stored cases.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import argparse
 import hashlib
 import json
 import os
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -44,16 +42,21 @@ from support.visibility import VISIBLE, visibility
 from excite.output import new_file
 
 Row = dict[str, Any]
-FRESH = {"nothing": 3030, "cause": 41, "surprise": 20, "pair": 106}  # numbers below were looked at when mending
-GOOD = ("right", "tied")  # a tie that holds the cause sends nobody to repair the wrong thing
-LOADED = """import sys, excite.diagnosis.findings, excite.logs.repair
-print(*(m.__file__ for n, m in sys.modules.items() if n.partition(".")[0] == "excite" and m.__file__), sep="\\n")"""
+# First case number of each kind that is held out; lower ones were used in development.
+FRESH = {
+    "nothing": 3030,
+    "cause": 41,
+    "surprise": 20,
+    "pair": 106,
+}
+GOOD = ("right", "tied")  # a tie that holds the cause counts as right
+PACKAGES = ("model", "simulation", "logs", "smoothing", "identification", "trajectories", "diagnosis")
 ROLLER = [
     ROOT / "tests" / "support" / n for n in ("plant.py", "causes.py", "surprises.py", "blind.py", "visibility.py")
 ]
 
 
-def _digits(files: Sequence[Path]) -> str:
+def file_hash(files: Sequence[Path]) -> str:
     seen = hashlib.sha1()
     for file in dict.fromkeys(files):
         seen.update(file.read_bytes())
@@ -61,15 +64,17 @@ def _digits(files: Sequence[Path]) -> str:
 
 
 def version() -> str:
-    """Eight digits that change when the program, as far as a diagnosis loads it, or the second roller does."""
-    done = subprocess.run([sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True, check=True)
-    files = sorted([*map(Path, done.stdout.splitlines()), *(ROOT / "model").rglob("*.toml")])
-    return _digits([*files, *ROLLER])
+    """Hash the packages that a diagnosis uses, the machine files and the second roller: eight digits."""
+    files = [f for p in PACKAGES for f in sorted((ROOT / "excite" / p).resolve().rglob("*.py"))]
+    files += sorted((ROOT / "model").rglob("*.toml"))
+    return file_hash([*files, *ROLLER])
 
 
 def cases(wanted: Mapping[str, int], first: Mapping[str, int]) -> list[Case]:
-    """So many of every kind (causes and surprises: of every name) from the first number on, in an order in which a
-    study that is cut short has seen some of everything."""
+    """List the wanted number of cases of each kind (causes and surprises: of each name), from number `first` on.
+
+    Kinds and names alternate, so an interrupted study has cases of each.
+    """
     names = {"nothing": [""], "cause": list(CAUSES), "surprise": list(SURPRISES), "pair": [""]}
     every = [
         (k / count, case(kind, name, first[kind] + k))
@@ -80,30 +85,30 @@ def cases(wanted: Mapping[str, int], first: Mapping[str, int]) -> list[Case]:
     return [c for _, c in sorted(every, key=lambda both: both[0])]
 
 
-def _kept(file: Path, row: Row) -> None:
+def store(file: Path, row: Row) -> None:
     with new_file(file) as part:
         part.write_text(json.dumps(row, default=float))
 
 
-def driven(one: Case) -> tuple[pd.DataFrame, float]:
-    """The log of a case and how visible its cause is: kept too, as the program has no part in it."""
-    kept = KEPT / f"driven-{_digits(ROLLER)}"
+def simulate_case(one: Case) -> tuple[pd.DataFrame, float]:
+    """Simulate the log of a case and its visibility (chi-squared), or read the stored ones."""
+    kept = KEPT / f"driven-{file_hash(ROLLER)}"
     kept.mkdir(parents=True, exist_ok=True)
     log, file = kept / f"{one.key}.parquet", kept / f"{one.key}.json"
     if not file.exists():
         drive = blind(one)
         with new_file(log) as part:
             drive.log.to_parquet(part)
-        _kept(file, {"visibility": visibility(drive)})  # last: a log without it is driven again
+        store(file, {"visibility": visibility(drive)})  # written last: a log without it is simulated again
     return pd.read_parquet(log), float(json.loads(file.read_text())["visibility"])
 
 
-def judged(one: Case, kept: Path) -> None:
-    """Drives a case, has it diagnosed, judges it and keeps the row."""
+def run_case(one: Case, kept: Path) -> None:
+    """Simulate, diagnose and score a case, and store the row."""
     file = kept / f"{one.key}.json"
     if file.exists():
         return
-    log, seen = driven(one)
+    log, seen = simulate_case(one)
     row: Row = {
         "key": one.key,
         "program": kept.name,
@@ -124,12 +129,12 @@ def judged(one: Case, kept: Path) -> None:
     except RuntimeError as err:
         row |= {"error": str(err), "verdict": None, "findings": [], "outcome": "failed", "named": "failed"}
     row["wall_s"] = time.perf_counter() - begin
-    _kept(file, row)
+    store(file, row)
 
 
 # ------------------------------------------------------------------------------------------------------ figures
 def rate(rows: Sequence[Row], is_so: Callable[[Row], bool]) -> dict[str, Any]:
-    """How often, with the 95 % interval of Wilson."""
+    """Count rows that meet a condition: rate with 95 % Wilson interval."""
     k, n = sum(map(is_so, rows)), len(rows)
     if n == 0:
         return {"count": 0, "of": 0, "rate": None, "ci95": None}
@@ -138,14 +143,14 @@ def rate(rows: Sequence[Row], is_so: Callable[[Row], bool]) -> dict[str, Any]:
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """All rates, and the table by cause."""
+    """Compute all rates, and the outcomes by cause."""
     of = {kind: [r for r in rows if r["kind"] == kind] for kind in ("nothing", "cause", "surprise", "pair")}
     seen = [r for r in of["cause"] if r["visibility"] >= VISIBLE]
     unseen = [r for r in of["cause"] if r["visibility"] < VISIBLE]
     strange = [r for r in of["surprise"] if r["visibility"] >= VISIBLE]
     named = [r for r in of["cause"] if r.get("amount_in") is not None]
 
-    def told(group: Sequence[Row]) -> dict[str, Any]:
+    def outcome_rates(group: Sequence[Row]) -> dict[str, Any]:
         return {
             "named_or_tied": rate(group, lambda r: r["outcome"] in GOOD),
             "named_alone": rate(group, lambda r: r["outcome"] == "right"),
@@ -163,11 +168,11 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "cases": len(rows),
         "visible_chi2": VISIBLE,
         "false_alarms": rate(of["nothing"], lambda r: r["outcome"] != "clean"),
-        "visible_causes": told(seen),
-        "hardly_visible_causes": told(unseen),
-        "by_kit": {k: told([r for r in seen if r["kit"] == k]) for k in ("full", "paper")},
+        "visible_causes": outcome_rates(seen),
+        "hardly_visible_causes": outcome_rates(unseen),
+        "by_kit": {k: outcome_rates([r for r in seen if r["kit"] == k]) for k in ("full", "paper")},
         "by_manoeuvre": {
-            m: told([r for r in seen if r["manoeuvre"] == m]) for m in sorted({r["manoeuvre"] for r in rows})
+            m: outcome_rates([r for r in seen if r["manoeuvre"] == m]) for m in sorted({r["manoeuvre"] for r in rows})
         },
         "visible_surprises_unexplained": rate(strange, lambda r: r["outcome"] == "unexplained"),
         "visible_surprises_named": rate(strange, lambda r: r["outcome"] == "wrong"),
@@ -185,7 +190,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def confusion(rows: Sequence[Row]) -> Figure:
-    """Hidden against named, visible cases only; a tie that holds the truth counts for the truth."""
+    """Plot hidden against named effects of the visible cases; a tie that holds the true one counts as right."""
     across = [*CAUSES, "other names", "wrong place", "unexplained", "clean", "failed"]
     down = ["nothing", *CAUSES, *SURPRISES]
     table = np.zeros((len(down), len(across)), int)
@@ -211,8 +216,8 @@ def confusion(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def told(s: dict[str, Any], planned: int, options: Sequence[str]) -> str:
-    """The README: what was done with these options and what came out, of so many cases planned."""
+def readme(s: dict[str, Any], planned: int, options: Sequence[str]) -> str:
+    """Write the README from the summary, the number of planned cases and the options."""
 
     def line(what: str, r: dict[str, Any], aim: str = "") -> str:
         if not r["of"]:
@@ -222,20 +227,20 @@ def told(s: dict[str, Any], planned: int, options: Sequence[str]) -> str:
 
     v = s["visible_causes"]
     rows = [
-        line("nothing hidden, something found (false alarms)", s["false_alarms"], "at most 5 %"),
-        line("visible cause named, alone or in a tie that holds it", v["named_or_tied"], "at least 90 %"),
+        line("false alarms: nothing hidden, something found", s["false_alarms"], "at most 5 %"),
+        line("visible cause named, alone or in a tie", v["named_or_tied"], "at least 90 %"),
         line("- named alone", v["named_alone"]),
         line("visible cause: wrong name or place", v["wrong"], "at most 2 %"),
-        line("visible cause: right name and wrong ones besides", v["with_wrong_ones_besides"]),
+        line("visible cause: right name plus wrong ones", v["with_wrong_ones_besides"]),
         line("visible cause: unexplained", v["unexplained"]),
         line("visible cause: nothing found", v["nothing_found"]),
         line("visible surprise: left unexplained", s["visible_surprises_unexplained"]),
         line("visible surprise: given a name", s["visible_surprises_named"]),
         line("two causes: both named, no other", s["pairs"]["right"]),
-        line("two causes: one named, nothing wrong", s["pairs"]["part"]),
-        line("named causes: true amount within the 95 % interval", s["amount_within_interval"], "95 %"),
-        line("named causes: gain on data not fitted on above zero", s["gain_positive"]),
-        line("- surely (interval above zero)", s["gain_surely_positive"]),
+        line("two causes: one named, none wrong", s["pairs"]["part"]),
+        line("named causes: true magnitude in the 95 % interval", s["amount_within_interval"], "95 %"),
+        line("named causes: positive gain on held-out data", s["gain_positive"]),
+        line("- 95 % interval of the gain above zero", s["gain_surely_positive"]),
     ]
     table = "\n".join(rows)
     causes = "\n".join(
@@ -247,36 +252,40 @@ def told(s: dict[str, Any], planned: int, options: Sequence[str]) -> str:
         for name, c in s["surprises"].items()
     )
     walls = s["wall_s"]
-    part = f" These are {s['cases']} of {planned} cases, as far as the time went." if s["cases"] < planned else ""
+    part = f" These are {s['cases']} of {planned} planned cases." if s["cases"] < planned else ""
     command = " ".join(["python results/diagnosis/study.py", *options])
     programs = " and ".join(f"{name} ({count} cases)" for name, count in s["program"].items())
-    programs += ", put together by hand" if len(s["program"]) > 1 else ""
-    return f"""# Does the diagnosis name what was hidden?
+    programs += ", merged" if len(s["program"]) > 1 else ""
+    named, alarms = s["visible_causes"]["named_or_tied"], s["false_alarms"]
+    return f"""# Blind test of the diagnosis
+
+**Result.** {named["count"]} of {named["of"]} visible causes were named, alone or in a tie that holds the true one.
+{alarms["count"]} of {alarms["of"]} clean logs gave a false alarm.
 
 `{command}`
-makes this page, of program {programs} (`version` in study.py); [summary.json](summary.json) has every rate,
-[cases.csv](cases.csv) every case.{part} Nobody had looked at any of them while the diagnosis was written: their numbers
-begin where those end that it was mended by, which `--seen` runs instead, so that every round has others.
+rebuilds this page; program version {programs}, see `version` in study.py. All rates are in
+[summary.json](summary.json), all cases in [cases.csv](cases.csv).{part}
 
-A second roller (`tests/plant.py`) shares no code with the program: Lagrange's equations in ground coordinates by
-automatic differentiation, half-millisecond Runge-Kutta steps, a person with delay, slow hand and hydraulics at the
-levers, counting encoders and noise. Bodies, soil and friction of each machine differ by up to 20 % from the nominal
-one; five manoeuvres of 60 or 120 s; kits `full` and `paper`. The effects (`tests/causes.py`) are written from their
-physics and not in the catalogue's formulas: two masses with a dead zone for backlash, shear integrated over the patch,
-a volume of oil behind a valve; passes are counted on a map of the lane, as the catalogue does since, on another one.
-Surprises (`tests/surprises.py`) are in no catalogue.
+- **Held-out cases.** The diagnosis was developed on lower case numbers (`--seen` runs those). Each round uses new ones.
+- **Second roller** (`tests/support/plant.py`). It shares no code with the program: Lagrange's equations in ground
+  coordinates by automatic differentiation, Runge-Kutta steps of 0.5 ms, a driver model with delay, slow hand and
+  hydraulics, encoder counts and noise.
+- **Variation.** Bodies, soil and friction differ by up to 20 % from the nominal machine; five manoeuvres of 60 or
+  120 s; kits `full` and `paper`.
+- **Causes** (`tests/support/causes.py`) follow their physics, not the catalogue's formulas: two masses with a dead zone
+  for backlash, shear integrated over the patch, an oil volume behind a valve, passes counted on another map of the
+  lane.
+- **Surprises** (`tests/support/surprises.py`) are in no catalogue. The right answer is `unexplained`.
+- **Visible**: a fit of the roller without the cause (27 parameters and true torques) leaves a chi-squared of at least
+  {s["visible_chi2"]:g} in the noise-free signals, in units of sensor noise (`tests/support/visibility.py`, a
+  linearised Kalman filter of the second roller). A visible cause may still be indistinguishable from others.
 
-**Visible** means: the roller without the cause, its 27 parameters and true torques fitted, keeps a chi-squared of at
-least {s["visible_chi2"]:g} in the noise-free signals, in units of the sensors' noise (`tests/visibility.py`, a
-linearised Kalman filter of the second roller; no part of the diagnosis). That says that something is seen, not that it
-can be told from everything else.
-
-| {s["cases"]} cases | rate | count | 95 % interval | aim |
+| {s["cases"]} cases | rate | count | 95 % interval | target |
 |---|---|---|---|---|
 {table}
 
-A diagnosis took {walls["median"]:.1f} s (median), {walls["p95"]:.1f} s (95 %), {walls["max"]:.1f} s (longest),
-the start of the program included, with another case at work beside it (`--jobs`).
+Time of a diagnosis, start of the program included, two cases in parallel: {walls["median"]:.1f} s (median),
+{walls["p95"]:.1f} s (95 %), {walls["max"]:.1f} s (longest).
 
 ![hidden against named](confusion.png)
 
@@ -284,7 +293,7 @@ the start of the program included, with another case at work beside it (`--jobs`
 |---|---|---|
 {causes}
 
-| surprise | visible cases | said |
+| surprise | visible cases | verdict |
 |---|---|---|
 {surprises}
 """
@@ -297,9 +306,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--per-surprise", type=int, default=2)
     parser.add_argument("--pairs", type=int, default=12)
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--seen", action="store_true", help="cases from number 0, by which the diagnosis was mended")
-    parser.add_argument("--drive", action="store_true", help="drive the second roller only, nothing is diagnosed yet")
-    parser.add_argument("--only", default="", help="cases whose key begins like this, nothing else is written")
+    parser.add_argument(
+        "--seen", action="store_true", help="run the cases that the diagnosis was developed on (from number 0)"
+    )
+    parser.add_argument("--drive", action="store_true", help="simulate the logs only")
+    parser.add_argument("--only", default="", help="run cases whose key begins with this, and print them")
     parser.add_argument("--out", type=Path, default=HERE)
     given = parser.parse_args(argv)
     kept = KEPT / version()
@@ -308,10 +319,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     every = cases(many, dict.fromkeys(FRESH, 0) if given.seen else FRESH)
     wanted = [c for c in every if c.key.startswith(given.only)]
     if given.drive:
-        joblib.Parallel(n_jobs=given.jobs or 1, verbose=5)(joblib.delayed(driven)(c) for c in wanted)
+        joblib.Parallel(n_jobs=given.jobs or 1, verbose=5)(joblib.delayed(simulate_case)(c) for c in wanted)
         return
     if given.jobs:
-        joblib.Parallel(n_jobs=given.jobs, verbose=5)(joblib.delayed(judged)(c, kept) for c in wanted)
+        joblib.Parallel(n_jobs=given.jobs, verbose=5)(joblib.delayed(run_case)(c, kept) for c in wanted)
     files = [kept / f"{c.key}.json" for c in wanted]
     rows = [{"program": kept.name} | json.loads(file.read_text()) for file in files if file.is_file()]
     if given.only:
@@ -328,7 +339,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     (given.out / "summary.json").write_text(json.dumps(s, indent=1) + "\n")
     names = ("nothing", "per_cause", "per_surprise", "pairs")
     options = [f"--{name.replace('_', '-')} {getattr(given, name)}" for name in names]
-    (given.out / "README.md").write_text(told(s, len(wanted), [*options, *(["--seen"] if given.seen else [])]))
+    (given.out / "README.md").write_text(readme(s, len(wanted), [*options, *(["--seen"] if given.seen else [])]))
 
 
 if __name__ == "__main__":

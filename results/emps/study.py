@@ -1,4 +1,4 @@
-"""EMPS by every method, and the rig simulated with what each found, in the rig's own closed loop.
+"""Identify EMPS by every method, and simulate the rig with each estimate in its own closed loop.
 
 python results/emps/study.py [DATA_EMPS.mat] rebuilds methods.json and README.md beside this file.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import textwrap
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,9 @@ from excite.simulation import Motion, respond
 HERE = Path(__file__).parent
 DATA = HERE.parents[1] / ".." / "shared" / "data" / "emps" / "DATA_EMPS.mat"
 Control = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
-KP, KV, TOP = 160.18, 243.45, 10.0  # 1/s, V/(m/s), V: the rig's controller, from its authors
+KP = 160.18  # 1/s: position gain of the rig's controller; its authors
+KV = 243.45  # V/(m/s): speed gain; its authors
+MAX_VOLTAGE = 10.0  # V: saturation of the controller; its authors
 PUBLISHED = {
     "value": {"M": 95.1089, "Fv": 203.5034, "Fc": 20.3935, "offset": -3.1648},
     "std": {"M": 0.1085, "Fv": 1.1460, "Fc": 0.1012, "offset": 0.0444},
@@ -38,11 +41,12 @@ def relative(measured: np.ndarray, simulated: np.ndarray) -> float:
     return float(100 * np.linalg.norm(measured - simulated) / np.linalg.norm(measured))
 
 
-def controlled(model: Model, X: np.ndarray, samples: int, control: Control, q0: np.ndarray) -> Motion:
-    """The machine X (n_base,) under its own controller: control(k, q, nu) commands the torques (n_u,) at sample k
-    from coordinates and velocities (n_q,) there. What is delivered is the command less the channel's offset.
+def simulate_controlled(model: Model, X: np.ndarray, samples: int, control: Control, q0: np.ndarray) -> Motion:
+    """Simulate a machine with base parameters X (n_base,) under its own controller.
 
-    Commands are joined by straight lines, and the state at k is the one before, carried on at its speed.
+    control(k, q, nu) commands the torques (n_u,) at sample k from coordinates and velocities (n_q,). The delivered
+    torque is the command less the channel's offset. Commands are interpolated linearly; the state at k is extrapolated
+    from k - 1 at constant speed.
     """
     n_q, h = len(model.coordinates), 1 / float(model.machine.sampling_hz)
     offset = model.offsets @ X
@@ -55,10 +59,12 @@ def controlled(model: Model, X: np.ndarray, samples: int, control: Control, q0: 
 
 
 def cascade(reference: np.ndarray, gain: float, rate: float) -> Control:
-    """A position loop around a speed loop: gain (KP KV (reference - q) - KV dq), the bracket held within TOP; dq is the
-    backward difference of the mean of the last two positions.
+    """Build the rig's controller, a position loop around a speed loop.
 
-    reference (N,) [m]; gain [N/V], rate [Hz]. A controller remembers: make a new one for every run.
+    Its command is gain (KP KV (reference - q) - KV dq), the bracket held within MAX_VOLTAGE; dq is the backward
+    difference of the mean of the last two positions.
+
+    reference (N,) [m]; gain [N/V], rate [Hz]. The controller has memory: make a new one for every run.
     """
     last: list[float] = []
 
@@ -68,17 +74,20 @@ def cascade(reference: np.ndarray, gain: float, rate: float) -> Control:
         earlier = last[-2] if len(last) > 1 else before
         last.append(now)
         speed = (now - earlier) / 2 * rate
-        return np.array([gain * float(np.clip(KP * KV * (reference[k] - now) - KV * speed, -TOP, TOP))])
+        return np.array([gain * float(np.clip(KP * KV * (reference[k] - now) - KV * speed, -MAX_VOLTAGE, MAX_VOLTAGE))])
 
     return control
 
 
 def closed_loop(model: Model, raw: dict[str, np.ndarray], X: np.ndarray, late: bool = False) -> dict[str, float]:
-    """Simulation errors [%] from the reference alone. Speed and acceleration are compared with those of the filtered
-    position, from where the filter has settled. `late`: the controller acts one sample later."""
+    """Compute simulation errors [%] from the reference alone.
+
+    Speed and acceleration are compared with those of the filtered position, after the filter has settled.
+    late: the controller acts one sample later.
+    """
     gain, rate, filter = float(raw["gtau"][0]), float(model.machine.sampling_hz), model.machine.filter
     control = cascade(raw["qg"], gain, rate)
-    motion = controlled(model, X, len(raw["qm"]), delayed(control) if late else control, raw["qm"][:1])
+    motion = simulate_controlled(model, X, len(raw["qm"]), delayed(control) if late else control, raw["qm"][:1])
     settled = slice(filter.drop[0], None)
     speed = derivative(lowpass(raw["qm"], rate, filter), rate)
     return {
@@ -100,7 +109,7 @@ def delayed(control: Control) -> Control:
 
 
 def loop(raw: dict[str, np.ndarray]) -> dict[str, float]:
-    """What the controller's stiffness makes of the published force error, and what the published position error is."""
+    """Compare the published position error with the one that the published force error causes in the loop."""
     rms = {k: float(np.sqrt(np.mean(v**2))) for k, v in raw.items()}
     published = PUBLISHED["closed_loop_percent"]
     assert isinstance(published, dict)
@@ -122,9 +131,13 @@ def readme(found: dict[str, dict[str, object]], own: dict[str, float], late: dic
         "# EMPS by every method",
         "",
         "Real measurements of an electro-mechanical positioning system (Janot, Gautier, Brunot, 2019).",
-        "[identify](identify) is what `excite identify` gives; `python results/emps/study.py` rebuilds this page and",
-        "`methods.json`. Value and standard deviation; residual: 100 |Y - W X| / |Y|; closed loop: the rig simulated",
-        "from its reference alone with its own controller, 100 |measured - simulated| / |measured|.",
+        "",
+        "**Result.** The methods agree within 2 %, and least squares reproduces the published estimates. The standard",
+        "deviations published with them are 3.8 to 5.2 times too small: filtered residuals are autocorrelated.",
+        "",
+        "`python results/emps/study.py` rebuilds this page and `methods.json`; [identify](identify) is the output of",
+        "`excite identify`. Cells: value (standard deviation). Residual: 100 |Y - W X| / |Y|. Last four columns:",
+        "errors of the rig simulated in closed loop from its reference alone, 100 |measured - simulated| / |measured|.",
         "",
         "| method | " + " | ".join(names) + " | residual | position | velocity | acceleration | force |",
         "|---" * (len(names) + 6) + "|",
@@ -137,34 +150,36 @@ def readme(found: dict[str, dict[str, object]], own: dict[str, float], late: dic
         lines.append(f"| {method} | " + " | ".join([*cells, f"{r['relative_error_percent']:.2f} %", *loop]) + " |")
     lines += [
         "",
-        _line(f"""
-        The published position error, {1e6 * own["published_position_error_m"]:.0f} um, is nine times what the
-        published force error of {own["force_error_N"]:.1f} N can do against the controller's stiffness of
-        {own["stiffness_N_m"] / 1e6:.2f} MN/m ({1e6 * own["position_of_force_error_m"]:.1f} um, about ours): it is no
-        misfit of forces, but as much as {1e3 * own["as_a_delay_s"]:.2f} ms between the simulated and the measured
-        signal make. The authors' simulator isn't published, so where that comes from stays open. With a controller that
-        acts one sample later, ours gives {late["position"]:.2g} %, {late["velocity"]:.2g} %,
-        {late["acceleration"]:.2g} % and {late["force"]:.2g} %: the loop's timing counts for more than the method."""),
-        "",
-        _line(f"""
-        The methods agree within {_apart(found, "M"):.1f} % in M, {_apart(found, "Fv"):.1f} % in Fv,
-        {_apart(found, "Fc"):.1f} % in Fc. Filtered residuals are autocorrelated, so that `ols`
-        as its authors use it states deviations that are 3.8 to 5.2 times too small; `wls`, `iv` and `tls` allow for it.
-        `joint` finds that the rig does something that the model doesn't know (friction of the screw differs by
-        direction, its authors say), allows for disturbing forces and says that its intervals do not hold.
-        `+consistent` changes nothing: every answer is a possible machine."""),
+        _bullet(f"""
+        The methods agree within {_range_percent(found, "M"):.1f} % in M, {_range_percent(found, "Fv"):.1f} % in Fv,
+        {_range_percent(found, "Fc"):.1f} % in Fc."""),
+        _bullet("""
+        `ols`, as its authors use it, assumes independent residuals. `wls`, `iv`, `tls` allow for autocorrelation."""),
+        _bullet("""
+        `joint` finds an effect outside the model (the authors report screw friction that depends on direction), adds
+        process noise, and states that its intervals do not hold."""),
+        _bullet("`+consistent` changes nothing: every estimate is a physically possible machine."),
+        _bullet(f"""
+        The published position error, {1e6 * own["published_position_error_m"]:.0f} um, is nine times larger than the
+        published force error of {own["force_error_N"]:.1f} N can cause against the controller's stiffness of
+        {own["stiffness_N_m"] / 1e6:.2f} MN/m ({1e6 * own["position_of_force_error_m"]:.1f} um, close to ours). It
+        corresponds to a delay of {1e3 * own["as_a_delay_s"]:.2f} ms between simulated and measured signal. The authors'
+        simulator is not published, so its cause is unknown."""),
+        _bullet(f"""
+        With a controller that acts one sample later, our errors are {late["position"]:.2g} %, {late["velocity"]:.2g} %,
+        {late["acceleration"]:.2g} % and {late["force"]:.2g} %: loop timing matters more than the method."""),
     ]
     return "\n".join(lines) + "\n"
 
 
-def _apart(found: Mapping[str, Mapping[str, Any]], name: str) -> float:
-    """By how much the methods' values of a parameter differ [%]."""
+def _range_percent(found: Mapping[str, Mapping[str, Any]], name: str) -> float:
+    """Range of the methods' values of a parameter [%]."""
     values = [float(x["value"][name]) for x in found.values()]
     return 100 * (max(values) - min(values)) / abs(sum(values) / len(values))
 
 
-def _line(text: str) -> str:
-    return " ".join(text.split())
+def _bullet(text: str) -> str:
+    return textwrap.fill("- " + " ".join(text.split()), 120, subsequent_indent="  ")
 
 
 def main() -> None:

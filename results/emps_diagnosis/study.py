@@ -1,8 +1,8 @@
-"""EMPS, diagnosed: what its authors' symmetric friction leaves, on a stretch that nothing was fitted on.
+"""Measure the gain of friction effects on EMPS on data withheld from the fit.
 
-python results/emps_diagnosis/study.py [DATA_EMPS.mat] rebuilds heldout.json beside this file: the published processing,
-each model fitted by least squares to one half of the log and asked for the force of the other, both ways round, with an
-interval from stretches of a second drawn anew. `excite diagnose emps DATA_EMPS.mat` names the effects without them.
+python results/emps_diagnosis/study.py [DATA_EMPS.mat] rebuilds heldout.json beside this file. With the published
+processing, each model is fitted by least squares to one half of the log and predicts the force of the other half, both
+ways round. Intervals come from a bootstrap over stretches of one second.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ MODELS = {
     "asymmetric_viscous + asymmetric_coulomb": ("asymmetric_viscous=-30", "asymmetric_coulomb=0.5"),
     "asymmetric_viscous + quadratic_drag": ("asymmetric_viscous=-30", "quadratic_drag=-100"),
 }
-SECOND, DRAWS = 100, 2000  # rows of a second; intervals from so many draws
+SECOND = 100  # rows of one second after decimation
+DRAWS = 2000  # bootstrap draws; chosen
 
 
 def main(path: Path) -> None:

@@ -1,10 +1,10 @@
-"""What finding an effect does to the parameters, and to the drive that is designed next.
+"""Measure how much an identified effect improves the parameters and the next drive.
 
 python results/extended/study.py [--runs 20] [--jobs 2] rebuilds summary.json, figure.png and README.md beside this
-file; every effect is kept in results/.extended as it is done, and a study that was stopped goes on from there. The
-roller does something that its file doesn't know. One log of the drive R60_accuracy is diagnosed, and a drive is
-designed for the machine file that comes out. Then both drives are driven many times by the machine that has the effect,
-and identified with the old file and with the new one. Of a tie the new file has the first name.
+file. Finished effects are stored in results/.extended, so an interrupted study resumes. The true roller has an effect
+that its machine file lacks. One log of the drive R60_accuracy is diagnosed, and a drive is designed for the resulting
+machine file. The true machine drives both drives many times, and the logs are identified with the old and the new file.
+Of a tie the new file has the first effect.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import textwrap
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,8 +50,8 @@ HIDDEN = (
     "shear_saturation@rear_roll=0.1",
     "asymmetric_coulomb@front_roll=100",
 )
-KEPT = 1e-3  # of a limit's range: what a drive leaves it by and still keeps it
-WAYS = {  # of identifying: which file, which drive
+TOLERANCE = 1e-3  # share of a limit's range that still counts as kept; from the contract
+WAYS = {  # label: machine file, drive
     "old file, old drive": ("old", "old"),
     "new file, old drive": ("new", "old"),
     "new file, new drive": ("new", "new"),
@@ -61,7 +62,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--kept", type=Path, default=HERE.parent / ".extended", help="folder of what is done already")
+    parser.add_argument("--kept", type=Path, default=HERE.parent / ".extended", help="folder of finished effects")
     options = parser.parse_args()
     options.kept.mkdir(exist_ok=True)
     rows = []
@@ -69,7 +70,7 @@ def main() -> None:
         path = options.kept / f"{hidden}-{options.runs}.json"
         if not path.is_file():
             with output.new_file(path) as place:
-                place.write_text(output.to_json(one(hidden, options.runs, options.jobs)), encoding="utf-8")
+                place.write_text(output.to_json(study_effect(hidden, options.runs, options.jobs)), encoding="utf-8")
         rows.append(json.loads(path.read_text(encoding="utf-8")))
         print(f"{hidden}: done", flush=True)
     save(figure(rows), HERE / "figure.png")
@@ -79,8 +80,8 @@ def main() -> None:
         place.write_text(readme(rows, options.runs), encoding="utf-8")
 
 
-def one(hidden: str, runs: int, jobs: int) -> dict[str, Any]:
-    """One effect: what the diagnosis of one log makes of it, and what old and new file tell on old and new drive."""
+def study_effect(hidden: str, runs: int, jobs: int) -> dict[str, Any]:
+    """Diagnose one log with a hidden effect, then compare old and new machine file on the old and the new drive."""
     old = machine.load_machine("va12")
     true = prediction.build(placing.with_effects(old, placing.parse_effect(hidden, old, 60.0)))
     torque, start, _ = profile.read_profile(DRIVE, true)
@@ -88,29 +89,31 @@ def one(hidden: str, runs: int, jobs: int) -> dict[str, Any]:
     found = diagnosed(old, measured(prediction.build(old), true, motions["old"], 1000))
     row: dict[str, Any] = {"hidden": hidden, "verdict": found.verdict, "found": [], "ways": {}}
     for f in found.findings:
-        told_with = {"amount": f.amount, "std": f.amount_std, "unit": f.unit, "tied_with": f.tied_with}
-        row["found"].append({"name": f.name, **told_with})
+        magnitude = {"amount": f.amount, "std": f.amount_std, "unit": f.unit, "tied_with": f.tied_with}
+        row["found"].append({"name": f.name, **magnitude})
     files = {"old": prediction.build(old)}
     if found.findings and found.verdict != "unexplained":
         files["new"] = prediction.build(placing.with_effects(old, *(f.entry for f in found.findings)))
         problem = old.problems["R60"]
         planned = prediction.build(files["new"].machine, fit_sensor_effects=False)
         try:
-            made = multistart.design(planned, problem, composite_objective.aim(planned, "accuracy"), starts=2, seed=0)
+            made = multistart.design(
+                planned, problem, composite_objective.compose_objective(planned, "accuracy"), starts=2, seed=0
+            )
             row["cond_phi"] = made.cond_phi
             motions["new"] = simulate(true, made.manoeuvre.sample(float(old.sampling_hz)), q0=made.motion.q[0])
         except (InfeasibleError, SimulationError) as failed:
             row["failed"] = str(failed)
-        row["violation"] = {n: between(limits.check_limits(true, problem, m)) for n, m in motions.items()}
+        row["violation"] = {n: motion_limits(limits.check_limits(true, problem, m)) for n, m in motions.items()}
     for way, (file, driven) in WAYS.items():
         if file in files and driven in motions:
-            row["ways"][way] = told(files[file], true, motions[driven], runs, jobs)
+            row["ways"][way] = run_statistics(files[file], true, motions[driven], runs, jobs)
     return row
 
 
-def between(excess: dict[str, float]) -> dict[str, float]:
-    """Excesses of the limits on the motion itself, not of the lane and of rest at its ends."""
-    return {n: x for n, x in excess.items() if not limits.free(n)}
+def motion_limits(excess: dict[str, float]) -> dict[str, float]:
+    """Select the excesses of limits on the motion; lane and rest at the ends are left out."""
+    return {n: x for n, x in excess.items() if not limits.is_free_limit(n)}
 
 
 def diagnosed(old: Machine, one: Log) -> diagnosis.Diagnosis:
@@ -119,15 +122,14 @@ def diagnosed(old: Machine, one: Log) -> diagnosis.Diagnosis:
 
 
 def measured(known: Model, true: Model, motion: Motion, seed: int) -> Log:
-    """What the sensors write of a true machine's motion, read as a file says."""
+    """Simulate a log of the true machine's motion and read it with the columns of a known machine."""
     table = sensors.measure(true, motion, kit="full", seed=seed)
     return log.from_table(table, known.machine, methods.needed_sensors(known, "joint"))
 
 
-def told(known: Model, true: Model, motion: Motion, runs: int, jobs: int) -> dict[str, Any]:
-    """Errors of the parameters that the file knows in per cent of the truth, over many runs of one motion; how often
-    their 95 % intervals hold it; what is attainable there."""
-    work = (joblib.delayed(partial(estimated, known.machine, true.machine, motion))(k) for k in range(runs))
+def run_statistics(known: Model, true: Model, motion: Motion, runs: int, jobs: int) -> dict[str, Any]:
+    """Identify many runs of one motion: error [%], coverage and attainable accuracy of each parameter in the file."""
+    work = (joblib.delayed(partial(identify_run, known.machine, true.machine, motion))(k) for k in range(runs))
     answers = [x for x in joblib.Parallel(n_jobs=jobs)(work) if x is not None]
     found: dict[str, Any] = {"runs": runs, "failed": runs - len(answers), "parameters": {}}
     if not answers:
@@ -139,14 +141,14 @@ def told(known: Model, true: Model, motion: Motion, runs: int, jobs: int) -> dic
     units = tuple(true.base.units[k] for k in there)
     truth, scale = true.nominal[there], true.scale[there]
     of = monte_carlo.Verification("joint", "full", names, units, truth, scale, value, std, interval, {})
-    bound = objective.percent(true, smoothing.cramer_rao(true, motion))[there]
+    bound = objective.relative_std_percent(true, smoothing.cramer_rao(true, motion))[there]
     for (name, row), least in zip(monte_carlo.summarise_runs(of).items(), bound, strict=True):
-        told = {key: row[key] for key in ("bias_percent", "rms_percent", "coverage95")}
-        found["parameters"][name] = {**told, "attainable_percent": float(least)}
+        statistics = {key: row[key] for key in ("bias_percent", "rms_percent", "coverage95")}
+        found["parameters"][name] = {**statistics, "attainable_percent": float(least)}
     return found
 
 
-def estimated(known: Machine, true: Machine, motion: Motion, seed: int) -> tuple[np.ndarray, ...] | None:
+def identify_run(known: Machine, true: Machine, motion: Motion, seed: int) -> tuple[np.ndarray, ...] | None:
     model = prediction.build(known)
     try:
         estimate = methods.identify(model, [measured(model, prediction.build(true), motion, seed)], "joint")
@@ -155,16 +157,16 @@ def estimated(known: Machine, true: Machine, motion: Motion, seed: int) -> tuple
     return estimate.value, estimate.std, estimate.interval95
 
 
-# ------------------------------------------------------------------------------------------------ the page
+# ------------------------------------------------------------------------------------------------ figure and page
 
 
 def own(way: dict[str, Any], key: str) -> np.ndarray:
-    """What there is of a key for the parameters that the machine has without the effect."""
+    """Values of a key for the parameters that the machine has without the effect."""
     return np.array([p[key] for n, p in way["parameters"].items() if "@" not in n], float)
 
 
 def figure(rows: list[dict[str, Any]]) -> Figure:
-    """Errors of every parameter, effect by effect, for each way of identifying."""
+    """Plot the errors of every parameter by effect, for each file and drive."""
     fig = Figure(figsize=(10, 4.2), layout="constrained")
     ax = fig.subplots()
     labelled: set[str] = set()
@@ -196,18 +198,24 @@ def figure(rows: list[dict[str, Any]]) -> Figure:
 
 def readme(rows: list[dict[str, Any]], runs: int) -> str:
     lines = [
-        "# What finding an effect does to the parameters, and to the next drive",
+        "# Gain from a diagnosed effect: parameters and the next drive",
+        "",
+        "**Result.** Error of the worst parameter, by effect:",
+        "",
+        *(f"- {way}: {_worst(rows, way)}" for way in WAYS),
+        "",
+        "With the old file, identification can also fail altogether.",
         "",
         "`python results/extended/study.py` rebuilds this page; [summary.json](summary.json) has every parameter.",
         "",
-        "The roller does something that its file doesn't know. One log of the drive"
-        " [R60_accuracy](../R60_accuracy) is diagnosed (old file, va12's), the machine file that comes out is the new"
-        " one, and `accuracy` on R60 is designed for it (new drive). The machine that has the effect drives each"
-        f" {runs} times, with new sensor noise, and joint smoothing identifies. Errors are of the 22 parameters that"
-        " the machine has without the effect, rms over the runs, in per cent of the truth; all other values in both"
-        " files are the true ones.",
+        "- **Old file, old drive**: `va12` and the drive [R60_accuracy](../R60_accuracy).",
+        "- **New file**: the machine file that `excite diagnose` makes from one log. **New drive**: `accuracy` on R60,",
+        "  designed for the new file.",
+        f"- The true machine drives each {runs} times with new sensor noise. Joint smoothing identifies.",
+        "- Errors: rms over runs in per cent of the true value, for the 22 parameters that the machine has without the",
+        "  effect. All other values in both files are true.",
         "",
-        "| hidden | diagnosed | identified with | median error | worst | in 95 % intervals | the effect's amount |",
+        "| hidden effect | diagnosed | file, drive | median error | worst | coverage | error of the magnitude |",
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
@@ -229,6 +237,12 @@ def readme(rows: list[dict[str, Any]], runs: int) -> str:
     ]
     lines += ["", *_limits(rows)]
     return "\n".join(lines) + "\n"
+
+
+def _worst(rows: list[dict[str, Any]], way: str) -> str:
+    """Smallest and largest error of the worst parameter over the effects [%]."""
+    worst = [np.nanmax(own(r["ways"][way], "rms_percent")) for r in rows if r["ways"].get(way, {}).get("parameters")]
+    return f"{percent(min(worst))} to {percent(max(worst))}" if worst else "-"
 
 
 def percent(x: float) -> str:
@@ -255,17 +269,18 @@ def _cells(way: dict[str, Any]) -> list[str]:
 
 
 def _limits(rows: list[dict[str, Any]]) -> list[str]:
-    """By how much the drives leave the limits on the machine that has the effect."""
+    """List the largest violation of a limit by each drive on the true machine."""
     lines = []
     for row in rows:
         said = []
         for n, excess in row.get("violation", {}).items():
             name, most = max(excess.items(), key=lambda x: x[1])
-            kept = f"leaves the limit of {name} by {percent(100 * most)} of its range"
-            said.append(f"the {n} drive " + (kept if most > KEPT else "keeps every limit"))
+            kept = f"exceeds the limit of {name} by {percent(100 * most)} of its range"
+            said.append(f"the {n} drive " + (kept if most > TOLERANCE else "keeps every limit"))
         if said:
-            lines.append(f"- {row['hidden']}: {', '.join(said)}.")
-    return ["On the machine that has the effect:", "", *lines] if lines else []
+            text = f"- {row['hidden']}: {', '.join(said)}."
+            lines.append(textwrap.fill(text, 120, subsequent_indent="  "))
+    return ["Limits on the true machine:", "", *lines] if lines else []
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""The front between condition number and accuracy on R60: the lowest cond(Phi) for what the worst parameter may be.
+"""Trace the front between condition number and accuracy on R60: lowest cond(Phi) for a bound on the worst parameter.
 
 python results/front_R60/study.py [--sigma-max 1 1.5 2 3 5] rebuilds summary.json, front.png and the designs' knots
-beside this file, from the designs of the studies R60 and R60_accuracy. A design that is in `drives/` is not made again.
+beside this file, from the designs of the studies R60 and R60_accuracy. Designs in `drives/` are
+not repeated.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from excite.logs import profile
 from excite.model import Model, prediction
 from excite.model.machine import Problem, machine
 from excite.reports import COLOURS, save
-from excite.trajectories import Manoeuvre, composite_objective as aims, design, objective
-from excite.trajectories.continuation import verdict
-from excite.trajectories.excitation import knots
+from excite.trajectories import Manoeuvre, composite_objective, design, objective
+from excite.trajectories.continuation import evaluate_drive
+from excite.trajectories.excitation import knot_times
 
 HERE = Path(__file__).parent
 ENDS = {"cond": HERE.parent / "R60" / "design", "accuracy": HERE.parent / "R60_accuracy" / "design"}
@@ -34,20 +35,32 @@ ENDS = {"cond": HERE.parent / "R60" / "design", "accuracy": HERE.parent / "R60_a
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sigma-max", type=float, nargs="*", default=[1.0, 1.5, 2.0, 3.0, 5.0], help="per cent")
+    parser.add_argument(
+        "--sigma-max",
+        type=float,
+        nargs="*",
+        default=[1.0, 1.5, 2.0, 3.0, 5.0],
+        help="bounds on the worst parameter's standard deviation [%%]",
+    )
     options = parser.parse_args()
     (HERE / "drives").mkdir(exist_ok=True)
     model = prediction.build(machine.load_machine("va12"))
     problem = model.machine.problems["R60"]
-    ends = {name: stored(model, problem, place) for name, place in ENDS.items()}
-    points = [point(model, problem, name, None, drive, 0.0) for name, drive in ends.items()]
+    ends = {name: read_design(model, problem, place) for name, place in ENDS.items()}
+    points = [score_design(model, problem, name, None, drive, 0.0) for name, drive in ends.items()]
     before = ends["accuracy"]
     for level in sorted(options.sigma_max):
         path, wall = HERE / "drives" / f"{level:g}.csv", 0.0
         if not path.is_file():
             begin = time.monotonic()
             try:
-                found = design(model, problem, aims.aim(model, "cond", level), 0, warm=[before, ends["cond"]])
+                found = design(
+                    model,
+                    problem,
+                    composite_objective.compose_objective(model, "cond", level),
+                    0,
+                    warm=[before, ends["cond"]],
+                )
             except InfeasibleError as err:
                 print(err, flush=True)
                 continue
@@ -57,7 +70,7 @@ def main() -> None:
                 np.savetxt(place, rows, "%.12g", ",", header="t_s,u1_Nm,u2_Nm,u4_Nm", comments="")
         rows = np.loadtxt(path, delimiter=",", skiprows=1)
         before = Manoeuvre(rows[:, 0], rows[:, 1:])
-        points.append(point(model, problem, "cond", level, before, wall))
+        points.append(score_design(model, problem, "cond", level, before, wall))
         print(points[-1], flush=True)
     points.sort(key=lambda p: float(p["worst_percent"]))
     summary = {"machine": "va12", "problem": "R60", "designs": points}
@@ -66,20 +79,20 @@ def main() -> None:
         place.write_text(output.to_json(summary), encoding="utf-8")
 
 
-def stored(model: Model, problem: Problem, place: Path) -> Manoeuvre:
-    """The knots of a design folder."""
+def read_design(model: Model, problem: Problem, place: Path) -> Manoeuvre:
+    """Read the torques at the knots from a design folder."""
     torque, _, _ = profile.read_profile(place / "profile.csv", model)
-    times = knots(problem)
+    times = knot_times(problem)
     return Manoeuvre(times, torque[np.rint(times * float(model.machine.sampling_hz)).astype(int)])
 
 
-def point(
+def score_design(
     model: Model, problem: Problem, name: str, level: float | None, drive: Manoeuvre, wall_s: float
 ) -> dict[str, object]:
-    """One design, judged afresh."""
-    aim = aims.aim(model, "cond", level)
-    found, motion = verdict(model, problem, aim, drive)
-    sigma = aims.sigma_percent(aim, model, motion)
+    """Simulate and score one design afresh."""
+    aim = composite_objective.compose_objective(model, "cond", level)
+    found, motion = evaluate_drive(model, problem, aim, drive)
+    sigma = composite_objective.sigma_percent(aim, model, motion)
     return {
         "objective": name,
         "sigma_max": level,
@@ -93,7 +106,7 @@ def point(
 
 
 def figure(points: list[dict[str, object]]) -> Figure:
-    """cond(Phi) against the worst and the median parameter."""
+    """Plot cond(Phi) against the worst and the median parameter."""
     fig = Figure(figsize=(7.5, 4.8), layout="constrained")
     ax = fig.subplots()
     for k, (key, label) in enumerate((("worst_percent", "worst parameter"), ("median_percent", "median parameter"))):

@@ -1,10 +1,10 @@
-"""Other machines by another table: of each, a designed drive, its verification, and random multisines beside it.
+"""Design and verify a drive for each of the other machines, with random multisines for comparison.
 
-python results/machines/study.py [NAME...] makes, in a folder of each machine's name beside this file, drive.json (the
-designed drive at its knots), verify.json (100 simulated runs), quiet.json (50 with a tenth of all noise: whether
-intervals that are too narrow are so because the noise is large), multisines.json (10), and of them README.md and
-figure.png. What is there already is not made again, so an interrupted study goes on; with --as-is pages are made of as
-many multisines as there are. A machine is its file in model/machines and a line of STUDIES.
+python results/machines/study.py [NAME...] writes a folder for each machine beside this file: drive.json (designed drive
+at its knots), verify.json (100 simulated runs), quiet.json (50 runs with a tenth of the noise, to tell whether narrow
+intervals come from large noise), multisines.json (10), README.md and figure.png. Existing files are not repeated, so an
+interrupted study resumes; --as-is writes the pages with the multisines there are. A machine is its file in
+model/machines and a line of STUDIES.
 """
 
 from __future__ import annotations
@@ -38,26 +38,29 @@ from excite.text import format_number
 from excite.trajectories import Manoeuvre, baselines, excitation, multistart, objective
 
 HERE = Path(__file__).parent
-SECONDS, BUDGET = 20.0, 240.0  # of every drive, and for its design [s]; quiet cores need less than 60
-RUNS, QUIET, RANDOM = 100, 50, 10
-SHARE = 0.1  # of the noise, in the quiet runs
-RARE = 0.01  # how often chance alone may make intervals look too narrow
+SECONDS = 20.0  # duration of every drive [s]; chosen
+BUDGET = 240.0  # time for its design [s]; idle cores need less than 60
+RUNS = 100  # simulated runs of the designed drive
+QUIET = 50  # runs with less noise
+RANDOM = 10  # random multisines
+QUIET_NOISE = 0.1  # share of the noise in the quiet runs; chosen
+SIGNIFICANCE = 0.01  # chance of calling correct intervals too narrow, over all parameters; chosen
 
-# What there is to say of each machine, beyond what its numbers say.
+# Remarks on each machine for its page.
 STUDIES = {
-    "single_drum": "Two driven wheels stand on one axle, beside the drum: MY0R holds what sets the two apart, and the"
-    " wheels' own Ky differ only by what their rims' speeds differ in a turn.",
-    "tandem": "No articulation but two steering joints at the ends of one frame. The yokes are balanced about their"
-    " pivots, so of yoke and drum only the moment of inertia about the pivot is seen (ZZ1R, ZZ3R).",
-    "double_loader": "A chain of two vertical joints: the articulation, and the pivot of the rear axle behind it. What"
-    " is behind a joint is felt by it as one body, so mass and moments travel forward through both.",
-    "pendulum_loader": "The pendulum joint is in the table, about the longitudinal axis, and held at zero by"
+    "single_drum": "Two driven wheels share one axle behind the drum. MY0R holds the difference between the two; their"
+    " Ky are separable only because the rim speeds differ in a turn.",
+    "tandem": "No articulation; two steering joints at the ends of one frame. The yokes are balanced about their"
+    " pivots, so only the moment of inertia of yoke and drum about the pivot is identifiable (ZZ1R, ZZ3R).",
+    "double_loader": "A chain of two vertical joints: the articulation, and the pivot of the rear axle behind it. A"
+    " joint feels everything behind it as one body, so mass and moments are grouped forward through both.",
+    "pendulum_loader": "The pendulum joint is in the table, about the longitudinal axis, and locked at zero by"
     ' `locked = ["theta3"]`. Its friction and offset (Fv3, Fs3, u30) and the rear frame\'s moments of inertia about'
-    " horizontal axes can't be seen on the plane; everything else is what an articulated loader without it has.",
-    "skid_robot": "No steering joint, four narrow wheels (contacts of width 0): it turns by driving its sides at"
-    " different speeds. The masses of the wheels hide in M, MX0R, MY0R and ZZ0R.",
-    "three_wheel": "The last one: added by its file and these lines alone. Its steered front roll is driven by nothing:"
-    " the row of its joint says that no torque acts on it, and there is no offset u40 to find.",
+    " horizontal axes are not identifiable on the plane; the other parameters are those of a loader without it.",
+    "skid_robot": "No steering joint, four narrow wheels (contacts of width 0): it turns by different speeds of its"
+    " sides. The wheels' masses are grouped into M, MX0R, MY0R and ZZ0R.",
+    "three_wheel": "Its steered front roll is undriven: the row of its joint states zero torque, and there is no"
+    " offset u40.",
 }
 
 
@@ -66,11 +69,11 @@ def main(names: list[str], as_is: bool) -> None:
         (HERE / name).mkdir(exist_ok=True)
         model = prediction.build(machine.load_machine(name))
         problem = short(model)
-        drive = kept(HERE / name / "drive.json", lambda m=model, p=problem: designed(m, p))
+        drive = read_or_make(HERE / name / "drive.json", lambda m=model, p=problem: designed(m, p))
         drawn = Manoeuvre(np.array(drive["times_s"]), np.array(drive["torque"]))
         motion = driven(model, drawn, np.array(drive["start"]))
-        runs = kept(HERE / name / "verify.json", lambda m=model, x=motion: verified(m, x, RUNS))
-        calm = kept(HERE / name / "quiet.json", lambda m=model, x=motion: verified(quiet(m), x, QUIET))
+        runs = read_or_make(HERE / name / "verify.json", lambda m=model, x=motion: verified(m, x, RUNS))
+        calm = read_or_make(HERE / name / "quiet.json", lambda m=model, x=motion: verified(quiet(m), x, QUIET))
         path = HERE / name / "multisines.json"
         others = read(path) if path.is_file() else []
         while len(others) < (0 if as_is else RANDOM):
@@ -81,8 +84,8 @@ def main(names: list[str], as_is: bool) -> None:
         print(f"{name}: written", flush=True)
 
 
-def kept(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What a file holds; made first where it isn't there."""
+def read_or_make(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Read a file; make it first if it does not exist."""
     if not path.is_file():
         write(path, make())
         print(f"{path.parent.name}: {path.stem}", flush=True)
@@ -111,7 +114,7 @@ def driven(model: Model, drive: Manoeuvre, start: np.ndarray) -> Motion:
 
 
 def designed(model: Model, problem: Problem) -> dict[str, Any]:
-    """The drive of lowest cond(Phi), as `excite design NAME --duration 20 --starts 1 --budget 240` finds it."""
+    """Design the drive of lowest cond(Phi), as `excite design NAME --duration 20 --starts 1 --budget 240` finds it."""
     found = multistart.design(model, problem, starts=1, seed=0, budget_s=BUDGET)
     return {
         "times_s": found.manoeuvre.times,
@@ -127,14 +130,16 @@ def designed(model: Model, problem: Problem) -> dict[str, Any]:
 
 
 def quiet(model: Model) -> Model:
-    """The same machine, its sensors so much finer."""
+    """Build the machine with less sensor noise and finer encoders."""
     finer = []
     for s in model.machine.sensor:
         update = {}
         if s.noise is not None:
-            update["noise"] = s.noise.model_copy(update={"value": SHARE * float(s.noise)})
+            update["noise"] = s.noise.model_copy(update={"value": QUIET_NOISE * float(s.noise)})
         if s.counts_per_turn is not None:
-            update["counts_per_turn"] = s.counts_per_turn.model_copy(update={"value": float(s.counts_per_turn) / SHARE})
+            update["counts_per_turn"] = s.counts_per_turn.model_copy(
+                update={"value": float(s.counts_per_turn) / QUIET_NOISE}
+            )
         finer.append(s.model_copy(update=update))
     return prediction.build(model.machine.model_copy(update={"sensor": tuple(finer)}))
 
@@ -151,11 +156,11 @@ def verified(model: Model, motion: Motion, runs: int) -> dict[str, Any]:
 
 
 def multisine(model: Model, problem: Problem, seed: int) -> dict[str, Any]:
-    """A random multisine brought inside the limits as `excite compare` does it."""
-    found = baselines.within(model, problem, excitation.multisine(model, problem, seed))
+    """Bring a random multisine inside the limits, as `excite compare` does, and score it."""
+    found = baselines.bring_within_limits(model, problem, excitation.multisine(model, problem, seed))
     error = sigma(model, driven(model, found.manoeuvre, found.start))
     return {
-        "cond_phi": objective.reported("cond", found.score),
+        "cond_phi": objective.reported_value("cond", found.score),
         "worst_std_percent": float(error.max()),
         "median_std_percent": float(np.median(error)),
         "kept": found.feasible,
@@ -164,22 +169,22 @@ def multisine(model: Model, problem: Problem, seed: int) -> dict[str, Any]:
 
 
 def sigma(model: Model, motion: Motion) -> np.ndarray:
-    """(n_base,) Cramer-Rao bound, one standard deviation [%] of the nominal value."""
-    return objective.percent(model, smoothing.cramer_rao(model, motion))
+    """Cramer-Rao bound (n_base,), standard deviation [%] of the nominal value."""
+    return objective.relative_std_percent(model, smoothing.cramer_rao(model, motion))
 
 
 # ------------------------------------------------------------------------------------------------ the page
 
 
 def figure(model: Model, drive: dict[str, Any], runs: dict[str, Any], others: list[dict[str, Any]]) -> Figure:
-    """The machine from above; the runs' errors against their predicted spread; the drive among random ones."""
+    """Plot the machine from above, errors against the predicted intervals, and the drive among random ones."""
     n = len(model.base.names)
     fig = Figure(figsize=(11.5, max(4.5, 1.2 + 0.21 * n)), layout="constrained")
     above, errors, among = fig.subplots(1, 3, width_ratios=(1.0, 1.2, 1.0))
     fig.suptitle(model.machine.title, fontsize=11)
     draw_machine(above, model.machine)
     _errors(errors, runs)
-    for good, face, label in ((True, COLOURS[0], "random multisine"), (False, "none", "the same, breaks a limit")):
+    for good, face, label in ((True, COLOURS[0], "random multisine"), (False, "none", "the same, violates a limit")):
         some = [r for r in others if r["kept"] == good]
         if some:
             x, y = ([r[k] for r in some] for k in ("cond_phi", "worst_std_percent"))
@@ -210,13 +215,13 @@ def _errors(ax: Axes, runs: dict[str, Any]) -> None:
     ax.set_xscale("symlog", linthresh=1.0)
     ax.xaxis.set_major_formatter("{x:g}")
     ax.set_yticks(range(len(names)), names[::-1], fontsize=7)
-    ax.set_xlabel("error of one run [%]; grey: 95 % as predicted")
+    ax.set_xlabel("error of one run [%]; grey: predicted 95 % interval")
     ax.grid(axis="x", alpha=0.3)
 
 
 def narrow(runs: dict[str, Any], count: int) -> dict[str, float]:
-    """Parameters whose 95 % intervals hold the truth less often than chance lets them, with how often [%]."""
-    least = binom.ppf(RARE / len(runs["parameters"]), count, 0.95)
+    """Find parameters whose coverage is significantly below 95 %, with their coverage [%]."""
+    least = binom.ppf(SIGNIFICANCE / len(runs["parameters"]), count, 0.95)
     cover = {n: r["coverage95"] for n, r in runs["parameters"].items()}
     return {n: 100 * c for n, c in cover.items() if round(c * count) < least}
 
@@ -242,46 +247,48 @@ def page(
     lines = [
         f"# {model.machine.title}",
         "",
-        f"`model/machines/{name}.toml`; made by `python results/machines/study.py {name}`. {STUDIES[name]}",
+        f"`model/machines/{name}.toml`. {STUDIES[name]}",
+        "",
+        f"Rebuilt by `python results/machines/study.py {name}`.",
         "",
         "![The machine from above; errors of the runs; the designed drive among random ones](figure.png)",
         "",
         f"- **Drive**: {SECONDS:g} s, designed for cond(Phi) within {drive['budget_s']:g} s"
-        + ("" if drive["complete"] else " (cut short by that)")
-        + f": {drive['cond_phi']:.3g}, its starting guess {drive['cond_phi_start']:.3g}; every limit kept within"
-        f" {100 * drive['max_violation']:.2g} % of its range. Attainable: worst {worst} {sizes[worst]:.2g} %, median"
-        f" {np.median(list(sizes.values())):.2g} %.",
-        f"- **Verification**: {RUNS} simulated runs with every sensor's flaws, method `{runs['method']}`,"
+        + ("" if drive["complete"] else " (stopped by the budget)")
+        + f": {drive['cond_phi']:.3g}, starting guess {drive['cond_phi_start']:.3g}; every limit kept within"
+        f" {100 * drive['max_violation']:.2g} % of its range. Attainable standard deviation: worst {worst}"
+        f" {sizes[worst]:.2g} %, median {np.median(list(sizes.values())):.2g} %.",
+        f"- **Verification**: {RUNS} simulated runs with noise and quantisation, method `{runs['method']}`,"
         f" {len(runs['failures'])} failed. True error: worst {hurt} {rows[hurt]['rms_percent']:.2g} %, median"
-        f" {median:.2g} %; the 95 % intervals hold the truth in {100 * inside:.0f} % of cases.",
+        f" {median:.2g} %; coverage of the 95 % intervals {100 * inside:.0f} %.",
         f"- **Random multisines**: {len(good)} of {len(others)}"
         + (f" (of {RANDOM} that the study makes)" if len(others) < RANDOM else "")
-        + " could be brought inside the limits; their"
-        f" cond(Phi) is {best}"
-        + (f", {conds[0] / drive['cond_phi']:.2g} times the designed one's at best" if conds else "")
-        + (f"; their worst parameter is attainable to {errors[0]:.2g} % at best." if errors else "."),
+        + " could be brought inside the limits; cond(Phi)"
+        f" {best}"
+        + (f", {conds[0] / drive['cond_phi']:.2g} times the designed one at best" if conds else "")
+        + (f"; worst parameter attainable to {errors[0]:.2g} % at best." if errors else "."),
     ]
     if few := narrow(runs, RUNS):
         worse, mean = narrow(calm, QUIET), np.mean([r["coverage95"] for r in calm["parameters"].values()])
         named = ", ".join(f"{n} ({percent:.0f} %)" for n, percent in few.items())
         lines.append(
-            f"- **Too narrow**: intervals that hold the truth in fewer runs than chance lets them: {named}. With a"
-            f" tenth of all noise ({QUIET} runs) "
+            f"- **Intervals too narrow** (coverage significantly below 95 %): {named}. With a tenth of the noise"
+            f" ({QUIET} runs) "
             + (
                 f"these are {', '.join(worse)}."
                 if worse
-                else f"there are none ({100 * mean:.0f} % on average): deviations are right to first order, and this"
-                " drive moves these parameters so little that the noise goes beyond it. A drive that shows them better"
-                " (`--objective accuracy`) mends that."
+                else f"there are none ({100 * mean:.0f} % on average): standard deviations are right to first"
+                " order, but this drive excites these parameters so little that the errors leave the linear range."
+                " `--objective accuracy` designs a drive that excites them."
             )
         )
     if worst_better := [r for r in good if r["worst_std_percent"] < sizes[worst]]:
         lines.append(
-            f"- A low cond(Phi) is not a small error: {len(worst_better)} of them would find the worst parameter"
-            " better; who wants accuracy designs for `--objective accuracy`."
+            f"- A low cond(Phi) is not a small error: {len(worst_better)} of the multisines identify the worst"
+            " parameter better. `--objective accuracy` designs for accuracy."
         )
     lines = [textwrap.fill(line, 120, subsequent_indent="  " if line[:1] in "- " else "") for line in lines]
-    lines += ["", "| base parameter | stands for | true value | attainable [%] | true error of runs [%] | in 95 % |"]
+    lines += ["", "| base parameter | grouping | true value | attainable [%] | true error of runs [%] | coverage |"]
     lines += ["|---|---|---|---|---|---|"]
     for n, row in rows.items():
         value = f"{format_number(row['true'])} {row['unit']}"
@@ -289,7 +296,7 @@ def page(
         lines.append(
             f"| {n} | {parts} | {value} | {sizes[n]:.2g} | {row['rms_percent']:.2g} | {100 * row['coverage95']:.0f} % |"
         )
-    lines += ["", textwrap.fill(f"Seen by no motion on the plane: {', '.join(base.invisible)}.", 120)]
+    lines += ["", textwrap.fill(f"Not identifiable by any motion on the plane: {', '.join(base.invisible)}.", 120)]
     return "\n".join(lines) + "\n"
 
 

@@ -1,8 +1,7 @@
-"""Which criterion predicts true errors: some twenty drives of R60, what each criterion says, what identification gives.
+"""Rank design criteria by how well they predict true errors of identification, over some twenty drives of R60.
 
 python results/objectives/study.py [--runs 12] [--jobs 2] rebuilds summary.json and objectives.png beside this file.
-Drives that are in `drives/` are not made again, and neither are runs that are in `runs/`. A drive that two
-objectives end at counts once.
+Drives in `drives/` and runs in `runs/` are not repeated. A drive that two objectives end at counts once.
 """
 
 from __future__ import annotations
@@ -30,21 +29,21 @@ from excite.model.machine import Problem, machine
 from excite.reports import COLOURS, save
 from excite.simulation import Motion, simulate
 from excite.smoothing import cramer_rao
-from excite.trajectories import Manoeuvre, baselines, composite_objective as aims, design, objective
-from excite.trajectories.excitation import knots
+from excite.trajectories import Manoeuvre, baselines, composite_objective, design, objective
+from excite.trajectories.excitation import knot_times
 
 HERE = Path(__file__).parent
 RANDOM = {"multisine": 5, "slow multisine": 3, "random steps": 3, "chirp": 2, "hand-made": 1}
 DESIGNED = ("D", "A", "E", "worst", "weighted-cond")
 STORED = {"cond": HERE.parent / "R60" / "design", "accuracy": HERE.parent / "R60_accuracy" / "design"}
-DRAWS = 2000  # of the bootstrap
+DRAWS = 2000  # bootstrap draws; chosen
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=12, help="simulated and identified logs of every drive")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--few", type=int, default=None, help="only so many drives, to try it out")
+    parser.add_argument("--few", type=int, default=None, help="number of drives, for a trial")
     options = parser.parse_args()
     for name in ("drives", "runs"):
         (HERE / name).mkdir(exist_ok=True)
@@ -52,11 +51,11 @@ def main() -> None:
     problem = model.machine.problems["R60"]
     rows: list[dict[str, Any]] = []
     for name, make in list(drives(model, problem).items())[: options.few]:
-        motion = driven(model, problem, name, make)
-        said = {c: f(model, motion) for c, f in CRITERIA.items()}
+        motion = simulate_drive(model, problem, name, make)
+        values = {c: f(model, motion) for c, f in CRITERIA.items()}
         error = errors(model, motion, name, options.runs, options.jobs)
-        rows.append({"drive": name, "criteria": said, "rms_percent": dict(zip(model.base.names, error, strict=True))})
-        print(f"{name}: cond(Phi) {said['cond(Phi)']:.0f}, worst {max(error):.2f} %", flush=True)
+        rows.append({"drive": name, "criteria": values, "rms_percent": dict(zip(model.base.names, error, strict=True))})
+        print(f"{name}: cond(Phi) {values['cond(Phi)']:.0f}, worst {max(error):.2f} %", flush=True)
     other = [r for k, r in enumerate(rows) if all(r["criteria"] != s["criteria"] for s in rows[:k])]
     worst = np.array([max(r["rms_percent"].values()) for r in other])
     median = np.array([np.median(list(r["rms_percent"].values())) for r in other])
@@ -79,17 +78,17 @@ def main() -> None:
 def _of(name: str) -> Callable[[Model, Motion], float]:
     def score(model: Model, motion: Motion) -> float:
         P = objective.phi(model, motion, name)
-        return objective.reported(name, objective.value(name, P.T @ P))
+        return objective.reported_value(name, objective.score_matrix(name, P.T @ P))
 
     return score
 
 
 def torque_noise(model: Model, motion: Motion) -> float:
-    """Worst relative standard deviation [%] if the torques' noise were all there is, on the rows that have a torque."""
+    """Worst relative standard deviation [%] if torques alone were noisy, from the rows that have a torque."""
     W = model.stacked_regressor(motion.q.T, motion.nu.T, motion.a.T)
     noise = objective.row_noise(model)
     W = np.concatenate([W[:, row] / noise[row] for row in range(W.shape[1]) if row in model.actuated]) * model.scale
-    # rows without a torque hold exactly: they count a thousand times as much
+    # Rows without a torque hold exactly: weight 1000.
     still = model.stacked_regressor(motion.q.T, motion.nu.T, motion.a.T)
     exact = [row for row in range(still.shape[1]) if row not in model.actuated]
     held = np.concatenate([1e3 * still[:, row] / noise[row] for row in exact]) * model.scale
@@ -99,7 +98,7 @@ def torque_noise(model: Model, motion: Motion) -> float:
 
 def bound(model: Model, motion: Motion) -> float:
     """Worst relative standard deviation [%] of the Cramer-Rao bound."""
-    return float(objective.percent(model, cramer_rao(model, motion)).max())
+    return float(objective.relative_std_percent(model, cramer_rao(model, motion)).max())
 
 
 CRITERIA: dict[str, Callable[[Model, Motion], float]] = {
@@ -122,34 +121,36 @@ Make = Callable[[], Manoeuvre]
 
 
 def drives(model: Model, problem: Problem) -> dict[str, Make]:
-    """How to come by every drive, by name."""
+    """Map each drive's name to the function that makes it."""
     found: dict[str, Make] = {}
     for kind, count in RANDOM.items():
         for k in range(count):
-            found[f"{kind} {k + 1}"] = lambda kind=kind, k=k: usual(model, problem, kind, k)  # type: ignore[misc]
+            found[f"{kind} {k + 1}"] = lambda kind=kind, k=k: make_baseline(model, problem, kind, k)  # type: ignore[misc]
     for name, place in STORED.items():
-        found[f"designed for {name}"] = lambda place=place: stored(model, problem, place)  # type: ignore[misc]
+        found[f"designed for {name}"] = lambda place=place: read_design(model, problem, place)  # type: ignore[misc]
     for name in DESIGNED:
-        found[f"designed for {name}"] = lambda name=name: made(model, problem, name)  # type: ignore[misc]
+        found[f"designed for {name}"] = lambda name=name: make_design(model, problem, name)  # type: ignore[misc]
     return found
 
 
-def usual(model: Model, problem: Problem, kind: str, seed: int) -> Manoeuvre:
-    return baselines.within(model, problem, baselines.USUAL[kind].make(model, problem, seed, 0.0)).manoeuvre
+def make_baseline(model: Model, problem: Problem, kind: str, seed: int) -> Manoeuvre:
+    return baselines.bring_within_limits(
+        model, problem, baselines.BASELINES[kind].make(model, problem, seed, 0.0)
+    ).manoeuvre
 
 
-def stored(model: Model, problem: Problem, place: Path) -> Manoeuvre:
+def read_design(model: Model, problem: Problem, place: Path) -> Manoeuvre:
     torque, _, _ = profile.read_profile(place / "profile.csv", model)
-    times = knots(problem)
+    times = knot_times(problem)
     return Manoeuvre(times, torque[np.rint(times * float(model.machine.sampling_hz)).astype(int)])
 
 
-def made(model: Model, problem: Problem, name: str) -> Manoeuvre:
-    warm = [stored(model, problem, place) for place in STORED.values()]
-    return design(model, problem, aims.aim(model, name), starts=0, warm=warm).manoeuvre
+def make_design(model: Model, problem: Problem, name: str) -> Manoeuvre:
+    warm = [read_design(model, problem, place) for place in STORED.values()]
+    return design(model, problem, composite_objective.compose_objective(model, name), starts=0, warm=warm).manoeuvre
 
 
-def driven(model: Model, problem: Problem, name: str, make: Make) -> Motion:
+def simulate_drive(model: Model, problem: Problem, name: str, make: Make) -> Motion:
     path = HERE / "drives" / f"{name.replace(' ', '-')}.csv"
     if not path.is_file():
         m = make()
@@ -187,7 +188,7 @@ def rank(criterion: np.ndarray, error: np.ndarray) -> dict[str, float]:
 
 
 def figure(rows: Sequence[Mapping], worst: np.ndarray, ranks: Mapping[str, Mapping]) -> Figure:
-    """Left: how well every criterion ranks. Right: cond(Phi) and the bound against the true error."""
+    """Plot rank correlations (left), and cond(Phi) and the bound against the true error (right)."""
     fig = Figure(figsize=(11.5, 4.6), layout="constrained")
     left, right = fig.subplots(1, 2, width_ratios=(1.2, 1))
     names = list(ranks)[::-1]

@@ -1,8 +1,8 @@
-"""Nominal, robust and sequential design on machines that nobody knows exactly, driven by people.
+"""Compare nominal, robust and sequential design on machines with uncertain parameters, driven by a driver model.
 
 python results/robust_sequential/study.py [--machines 100] [--sequential 100] [--identified 6] [--jobs 2] rebuilds
-summary.json, figure.png and README.md beside this file. Every machine is written to `runs/` as it is done; a study
-that was stopped goes on from there.
+summary.json, figure.png and README.md beside this file. Finished machines are stored in `runs/`, so an interrupted
+study resumes.
 """
 
 from __future__ import annotations
@@ -31,32 +31,36 @@ from excite.model.machine import Problem, machine
 from excite.reports import COLOURS, save
 from excite.simulation import Motion, follow, scenarios, sensors, simulate
 from excite.smoothing import cramer_rao
-from excite.trajectories import Manoeuvre, check_limits, composite_objective as aims, design, objective
-from excite.trajectories.limits import free
+from excite.trajectories import Manoeuvre, check_limits, composite_objective, design, objective
+from excite.trajectories.limits import is_free_limit
 
 HERE = Path(__file__).parent
-SECONDS = 30.0  # of each of two drives
-SPREAD, SCENARIOS = 0.2, 5
+SECONDS = 30.0  # duration of each of two drives [s]; chosen
+PARAMETER_RANGE = 0.2  # largest relative error of a parameter; chosen
+SCENARIOS = 5  # machines that the robust drive is designed for: nominal and four corners; chosen
 KINDS = ("nominal", "robust", "sequential")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--machines", type=int, default=100)
-    parser.add_argument(
-        "--sequential", type=int, default=100, help="of these, how many get a second drive of their own"
-    )
-    parser.add_argument(
-        "--identified", type=int, default=6, help="of these, how many logs are identified, not just bounded"
-    )
+    parser.add_argument("--sequential", type=int, default=100, help="number of these machines that get a second design")
+    parser.add_argument("--identified", type=int, default=6, help="number of these machines whose logs are identified")
     parser.add_argument("--objective", default="accuracy")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--runs", type=Path, default=HERE / "runs", help="folder of what is done already")
+    parser.add_argument("--runs", type=Path, default=HERE / "runs", help="folder of finished machines")
     options = parser.parse_args()
     options.runs.mkdir(exist_ok=True)
     designs = designed(options.objective, options.runs)
     work = (
-        joblib.delayed(one)(options.runs, k, designs, options.objective, k < options.sequential, k < options.identified)
+        joblib.delayed(run_machine)(
+            options.runs,
+            k,
+            designs,
+            options.objective,
+            k < options.sequential,
+            k < options.identified,
+        )
         for k in range(options.machines)
     )
     rows = []
@@ -67,7 +71,7 @@ def main() -> None:
     summary = {
         "objective": options.objective,
         "drives_s": [SECONDS, SECONDS],
-        "spread": SPREAD,
+        "spread": PARAMETER_RANGE,
         "scenarios": SCENARIOS,
         "machines": options.machines,
         "table": table(rows),
@@ -90,14 +94,21 @@ def roller() -> Model:
 
 
 def designed(objective: str, runs: Path) -> dict[str, Manoeuvre]:
-    """The nominal and the robust drive, from `runs` where they are there."""
+    """Design the nominal and the robust drive, or read them from `runs`."""
     model, found = roller(), {}
     for kind in ("nominal", "robust"):
         path = runs / f"{kind}-{objective}.json"
         if not path.is_file():
-            others = scenarios.perturbed_machines(model, SCENARIOS, SPREAD) if kind == "robust" else ()
+            others = scenarios.perturbed_machines(model, SCENARIOS, PARAMETER_RANGE) if kind == "robust" else ()
             warm = [found["nominal"]] if kind == "robust" else []
-            d = design(model, short(model), aims.aim(model, objective, machines=others), starts=2, seed=0, warm=warm)
+            d = design(
+                model,
+                short(model),
+                composite_objective.compose_objective(model, objective, machines=others),
+                starts=2,
+                seed=0,
+                warm=warm,
+            )
             with output.new_file(path) as place:
                 place.write_text(json.dumps({"t": d.manoeuvre.times.tolist(), "u": d.manoeuvre.torque.tolist()}))
             print(f"{kind}: cond(Phi) {d.cond_phi:.1f}", flush=True)
@@ -106,31 +117,33 @@ def designed(objective: str, runs: Path) -> dict[str, Manoeuvre]:
     return found
 
 
-def one(
+def run_machine(
     runs: Path, number: int, designs: dict[str, Manoeuvre], objective: str, third: bool, identified: bool
 ) -> dict[str, object]:
-    """One machine: two drives of every kind, what they tell at best, and what is identified from them."""
+    """Simulate two drives of each kind on a machine: attainable accuracy, limits, errors of identification."""
     path = runs / f"{objective}-{number:03d}-{int(third)}{int(identified)}.json"
     if path.is_file():
         return dict(json.loads(path.read_text()))
     nominal = roller()
-    true = prediction.build(scenarios.vary_machine(nominal.machine, SPREAD, np.random.default_rng([number, 7])))
+    true = prediction.build(
+        scenarios.vary_machine(nominal.machine, PARAMETER_RANGE, np.random.default_rng([number, 7]))
+    )
     row: dict[str, object] = {"machine": number}
     first: Motion | None = None
     for kind in KINDS[: 3 if third else 2]:
         try:
             if kind == "sequential":
                 assert first is not None
-                drive = second(nominal, true, first, designs["nominal"], objective, number)
-                motions = [first, driven(nominal, true, drive[1], drive[0], 2 * number + 1)]
+                drive = design_second_drive(nominal, true, first, designs["nominal"], objective, number)
+                motions = [first, follow_drive(nominal, true, drive[1], drive[0], 2 * number + 1)]
             else:
-                motions = [driven(nominal, true, designs[kind], nominal, 2 * number + i) for i in range(2)]
+                motions = [follow_drive(nominal, true, designs[kind], nominal, 2 * number + i) for i in range(2)]
         except (SimulationError, NoEstimateError, ValueError) as err:
             row[kind] = {"failed": str(err)}
             continue
         if kind == "nominal":
             first = motions[0]
-        row[kind] = told(true, motions)
+        row[kind] = attainable(true, motions)
         if identified:
             row[kind] |= {"error_percent": errors(nominal, true, motions, number)}  # type: ignore[operator]
     with output.new_file(path) as place:
@@ -138,18 +151,18 @@ def one(
     return row
 
 
-def driven(nominal: Model, true: Model, drive: Manoeuvre, planned: Model, seed: int) -> Motion:
-    """What the true machine does under a driver who follows the speed and articulation that were planned."""
+def follow_drive(nominal: Model, true: Model, drive: Manoeuvre, planned: Model, seed: int) -> Motion:
+    """Simulate the true machine under a driver model that follows the planned speed and articulation."""
     plan = simulate(planned, drive.sample(float(nominal.machine.sampling_hz)))
     return follow(true, plan.nu[:, 0], plan.q[:, [4]], seed=seed)
 
 
-def second(
+def design_second_drive(
     nominal: Model, true: Model, first: Motion, start: Manoeuvre, objective: str, number: int
 ) -> tuple[Model, Manoeuvre]:
-    """The machine as the first log tells it, and the drive for what that leaves."""
+    """Identify the machine from the first log and design the second drive for the remaining uncertainty."""
     known = prior.prior_from_logs(nominal, [measured(nominal, true, first, 1000 + number)])
-    aim = aims.aim(known.model, objective, prior=known.information)
+    aim = composite_objective.compose_objective(known.model, objective, prior=known.information)
     turned = Manoeuvre(start.times, start.torque * [1, -1, 1])
     found = design(known.model, short(nominal), aim, starts=0, warm=[start, turned])
     return known.model, found.manoeuvre
@@ -160,30 +173,30 @@ def measured(nominal: Model, true: Model, motion: Motion, seed: int) -> log.Log:
     return log.from_table(table, nominal.machine, methods.needed_sensors(nominal, "joint"))
 
 
-def told(true: Model, motions: Sequence[Motion]) -> dict[str, object]:
-    """Condition number of both drives together, Cramer-Rao bound, and the limit most exceeded, of the true machine."""
+def attainable(true: Model, motions: Sequence[Motion]) -> dict[str, object]:
+    """Compute cond(Phi) and Cramer-Rao bound of both drives, and the most exceeded limit, at the true machine."""
     W = np.concatenate([true.stacked_regressor(m.q.T, m.nu.T, m.a.T).reshape(-1, len(true.scale)) for m in motions])
     by = np.outer(true.scale, true.scale)
     information = sum(np.linalg.inv(cramer_rao(true, m) / by) for m in motions)
-    spread = objective.percent(true, np.linalg.inv(information) * by)
-    broken = [(v, n) for m in motions for n, v in check_limits(true, short(true), m).items() if not free(n)]
+    sigma = objective.relative_std_percent(true, np.linalg.inv(information) * by)
+    broken = [(v, n) for m in motions for n, v in check_limits(true, short(true), m).items() if not is_free_limit(n)]
     return {
         "limit": max(broken)[1],
         "excess": max(broken)[0],
         "cond_phi": float(np.linalg.cond(np.linalg.qr(W * true.scale, mode="r"))),
-        "sigma_percent": spread.tolist(),
+        "sigma_percent": sigma.tolist(),
     }
 
 
 def errors(nominal: Model, true: Model, motions: Sequence[Motion], number: int) -> list[float]:
-    """Errors [%] of what both logs together give."""
+    """Errors [%] of identification from both logs."""
     logs = [measured(nominal, true, m, 1000 * (i + 1) + number) for i, m in enumerate(motions)]
     found = methods.identify(nominal, logs, "joint")
     return (100 * (found.value - true.nominal) / np.abs(true.nominal)).tolist()
 
 
 def table(rows: Sequence[dict[str, object]]) -> dict[str, dict[str, object]]:
-    """Median and 90th percentile over the machines of cond, worst and median parameter."""
+    """Summarise cond, worst and median parameter over the machines: median, 90th percentile, maximum."""
     out: dict[str, dict[str, object]] = {}
     for kind in KINDS:
         got = [r[kind] for r in rows if kind in r and "failed" not in r[kind]]  # type: ignore[operator]
@@ -242,36 +255,41 @@ def readme(t: dict[str, dict[str, Any]], rows: Sequence[dict[str, Any]]) -> str:
     return README.format(rows="\n".join(lines), said=" and ".join(said.values()))
 
 
-README = """# Nominal, robust and sequential design on machines that nobody knows exactly
+README = """# Nominal, robust and sequential design under parameter uncertainty
 
 ![every machine](figure.png)
 
-| design | machines | cond(Phi), median (worst) | worst parameter, attainable [%] | median parameter [%] | every limit kept | most exceeded | errors of `joint` / bound |
+| design | machines | cond(Phi), median (worst) | worst parameter, attainable [%] | median parameter [%] | every limit kept | largest violation | error of `joint` / bound |
 |---|---|---|---|---|---|---|---|
 {rows}
 
-Against the nominal drive on the same machine the median parameter's attainable deviation is {said}. A drive designed for
-values that are up to 20 % off breaks limits when a person drives it on the true machine; the robust one pays for keeping
-them. A second drive designed for what the first log leaves is worth more than the first one driven twice, but keeps the
-limits no better: it is designed for the machine that the log told of, played back, not for people.
+**Result.** The median parameter's attainable standard deviation, compared with the nominal drive on the same machine, is
+{said}.
 
-`python results/robust_sequential/study.py` draws 100 machines whose bodies, friction and contacts are up to 20 % off
-(each value on its own, uniform), has each driven by the driver model, who follows the designed speed and articulation
-late, slowly and not quite, and compares at equal time, two drives of 30 s each, designed with `--objective accuracy`:
+- Nominal designs violate limits when a driver follows them on a machine whose parameters are up to 20 % off. The robust
+  design keeps the limits at some loss of accuracy.
+- A second drive designed after the first log is worth more than the first drive repeated. It violates limits as well,
+  because it is designed for the identified machine with torques played back, not for a driver.
 
-- nominal: the drive designed for the machine file's values, twice;
-- robust: the drive designed for five machines, the nominal one and four corners of the box (`--robust`), twice;
-- sequential: the nominal drive, then one designed for what its log leaves uncertain, at the machine that it told of (`--after`).
+## Method
 
-Told: cond(Phi) of both drives together and the Cramer-Rao bound, at the true machine; the limit that the true machine
-exceeds most (lane and rest, which people see to themselves, left out), kept up to 0.1 % of its range; and for six machines the
-errors of `--method joint` from both logs over the bound, rms over all parameters. Three quarters of an hour
-of two cores. Machines are written to `runs/` as they are done, and a study that was stopped goes on from there.
+`python results/robust_sequential/study.py` draws 100 machines with bodies, friction and contacts up to 20 % off
+(independent, uniform). The driver model follows the designed speed and articulation with delay, limited rate and error.
+All designs get equal time, two drives of 30 s, and `--objective accuracy`:
+
+- nominal: designed for the values of the machine file, driven twice;
+- robust: designed for five machines, the nominal one and four corners (`--robust`), driven twice;
+- sequential: the nominal drive, then one designed for the remaining uncertainty at the identified machine (`--after`).
+
+cond(Phi) and the Cramer-Rao bound are of both drives together, at the true machine. Limits exclude lane and rest, which a
+driver keeps by sight, and count as kept up to 0.1 % of their range. For six machines, the last column compares the error of
+`--method joint` from both logs with the bound, rms over all parameters. The study takes three quarters of an hour on two
+cores. Finished machines are stored in `runs/`, so an interrupted study resumes.
 """  # noqa: E501
 
 
 def figure(rows: Sequence[dict[str, object]]) -> Figure:
-    """Every machine: cond, worst and median parameter, by kind of design."""
+    """Plot cond, worst and median parameter of every machine by kind of design."""
     fig = Figure(figsize=(11, 3.6), layout="constrained")
     shown: tuple[tuple[str, Callable[[dict[str, Any]], float]], ...] = (
         ("cond(Phi) at the true machine", lambda g: g["cond_phi"]),

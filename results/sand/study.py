@@ -1,10 +1,10 @@
-"""A wheel on sand: what the linear slip law gets wrong, named by the catalogue's own declarations.
+"""Fit slip laws of the effects' catalogue to measurements of a wheel on sand.
 
 python results/sand/study.py [DATA.csv] rebuilds summary.json and sand.png beside this file, from the single-wheel
-measurements of Carnegie Mellon University (../shared/data/cmu_single_wheel). Straight driving only (slip angle 0).
+measurements of Carnegie Mellon University (../shared/data/cmu_single_wheel), straight driving only (slip angle 0).
 
-The table is static: each row is the mean of a steady stretch. Force against slip is taken through model/contact.py with
-the catalogue's effects, as the dynamics would take it; parameters by least squares, errors on slip levels left out.
+Each row of the data is the mean of a steady stretch. Traction follows from `excite.model.mechanics.contact` with the
+catalogue's effects. Parameters are fitted by least squares; errors are those on slip levels left out.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ from excite.reports.figures import STYLES
 HERE = Path(__file__).parent
 DATA = HERE.parents[2] / "shared" / "data" / "cmu_single_wheel" / "smooth_wheel.csv"
 NAMES = ("shear_saturation", "drive_brake_asymmetry", "rolling_resistance")
-LINEAR = 30.0  # K / xi_s from which saturation does nothing on this table
-RADIUS, WIDTH = 0.058, 0.050  # m, the authors'
+LARGEST_SATURATION_SLIP = 30.0  # K / xi_s [-]; above it saturation has no effect on these data
+RADIUS = 0.058  # m; the authors
+WIDTH = 0.050  # m; the authors
 
 
 def quantity(value: float) -> Quantity:
@@ -47,16 +48,16 @@ WHEEL = Contact(
     v_eps=quantity(1e-6),
 )
 ROLLER = load_machine("va12")
-USUAL = Site(ROLLER, ROLLER.contacts[0], DEFAULT_DURATION)  # shapes of effects are as in any other machine
+USUAL = Site(ROLLER, ROLLER.contacts[0], DEFAULT_DURATION)  # default shapes of effects, as in any other machine
 
 
 def force(names: Sequence[str]) -> tuple[ca.Function, list[str], np.ndarray]:
-    """(V_x, rim speed, parameters) -> traction [N] under some of the catalogue's effects; names and first values."""
+    """Build traction [N] from (V_x, rim speed, parameters) with some effects; also names and first values."""
     V, rim = ca.SX.sym("V"), ca.SX.sym("rim")
     labels, first = ["Kx"], [-30.0]
     rolling = ContactMotion(WHEEL, V, ca.SX(0), rim / RADIUS, ca.SX(0))
     p = ca.SX.sym("p", 1 + len(names))
-    # The authors' slip divides by the larger speed: the table goes down to a locked wheel, where the rim's is zero.
+    # The authors divide slip by the larger speed, as the data include a locked wheel with zero rim speed.
     larger = ca.fmax(V, rim)
     soil = Soil(contact.Slip((V - rim) / larger, ca.SX(0), larger), ca.SX(0), p[0], ca.SX(-1))
     none: dict[int, ca.SX] = {}
@@ -75,10 +76,10 @@ def force(names: Sequence[str]) -> tuple[ca.Function, list[str], np.ndarray]:
     return ca.Function("force", [V, rim, p], [soil.wrench(WHEEL).Sx + pushed]), labels, np.array(first)
 
 
-def fitted(
+def fit_law(
     names: Sequence[str], table: pd.DataFrame
 ) -> tuple[np.ndarray, np.ndarray, list[str], Callable[[np.ndarray, np.ndarray], np.ndarray]]:
-    """Parameters, deviations (of residuals that belong together by level), their names, and the fitted law."""
+    """Fit a law: parameters, standard deviations (residuals clustered by level), names, and the fitted function."""
     law, labels, first = force(names)
     V, rim, F = (table[c].to_numpy() for c in ("V", "rim", "F"))
 
@@ -86,13 +87,13 @@ def fitted(
         return np.asarray(law(V[None], rim[None], np.repeat(x[:, None], len(V), 1)).full()[0]) - F
 
     low = [-np.inf, *(1e-3 if CATALOGUE[n].positive else -np.inf for n in names)]
-    high = [np.inf, *(LINEAR if CATALOGUE[n].inverse else np.inf for n in names)]
+    high = [np.inf, *(LARGEST_SATURATION_SLIP if CATALOGUE[n].inverse else np.inf for n in names)]
     best = min(
         (least_squares(error, first * s, bounds=(low, high), x_scale=np.abs(first)) for s in (0.3, 1.0, 3.0)),
         key=lambda r: r.cost,
     )
     x, J, e = best.x, best.jac, best.fun
-    # Errors of one slip level belong together (the law's own error): sandwich by level.
+    # Residuals of one slip level are correlated (error of the law): sandwich estimator by level.
     bread = np.linalg.pinv(J.T @ J)
     meat = sum(
         np.outer(J[at].T @ e[at], J[at].T @ e[at]) for at in (table["level"] == k for k in table["level"].unique())
@@ -104,12 +105,12 @@ def fitted(
     return x, std, labels, lambda v, r: np.asarray(law(v[None], r[None], np.repeat(x[:, None], len(v), 1)).full()[0])
 
 
-def left_out(names: Sequence[str], table: pd.DataFrame) -> pd.Series:
-    """Errors [N] of every slip level's mean force, predicted by a fit to the other levels."""
+def left_out_errors(names: Sequence[str], table: pd.DataFrame) -> pd.Series:
+    """Predict each slip level from a fit to the other levels: errors of the mean force [N]."""
     errors = {}
     for level in sorted(table["level"].unique()):
         own = table["level"] == level
-        law = fitted(names, table[~own])[3]
+        law = fit_law(names, table[~own])[3]
         errors[level] = float(np.mean(law(table["V"][own].to_numpy(), table["rim"][own].to_numpy()) - table["F"][own]))
     return pd.Series(errors)
 
@@ -124,9 +125,9 @@ def main(path: Path) -> None:
     tried = [c for n in range(len(NAMES) + 1) for c in combinations(NAMES, n)]
     rows: list[dict[str, Any]] = []
     for names in tried:
-        x, std, labels, law = fitted(names, table)
+        x, std, labels, law = fit_law(names, table)
         inside = law(table["V"].to_numpy(), table["rim"].to_numpy()) - table["F"].to_numpy()
-        outside = left_out(names, table)
+        outside = left_out_errors(names, table)
         inner = outside.iloc[1:-1]
         rows.append(
             {
@@ -160,7 +161,7 @@ def main(path: Path) -> None:
 
 
 def figure(table: pd.DataFrame, mean: pd.DataFrame, rows: list[dict[str, Any]]) -> Figure:
-    """Force against slip, measured and by each law; errors on levels left out."""
+    """Plot traction against slip, measured and by each law, and errors on levels left out."""
     fig = Figure(figsize=(11, 4.6), layout="constrained")
     left, right = fig.subplots(1, 2, width_ratios=(1.4, 1))
     fig.suptitle("Wheel on sand: traction against slip, measured and by laws of the catalogue", fontsize=11)
@@ -171,7 +172,7 @@ def figure(table: pd.DataFrame, mean: pd.DataFrame, rows: list[dict[str, Any]]) 
     rim = np.concatenate([np.linspace(3e-4, 0.01, 200), np.linspace(0.01, 0.1, 200)])
     s = (rim - V) / np.maximum(rim, V)
     for k, row in enumerate(shown):
-        law = fitted(row["effects"], table)[3]
+        law = fit_law(row["effects"], table)[3]
         left.plot(s, law(V, rim), color=COLOURS[k % 6], linestyle=STYLES[k % 6], linewidth=1.3, label=_words(row))
     left.set_xlabel("slip, + driving, - braking [-]")
     left.set_ylabel("traction [N]")
