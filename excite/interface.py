@@ -1,8 +1,8 @@
-"""The functions that most people need, behind `import excite`.
+"""The functions of `import excite`.
 
-Each takes what is at hand: a machine as its name, its file or a model; a problem by name; a log as a path, a pandas
-DataFrame in the machine's columns, or a `Log`; a drive as a profile, a design folder, a `Design` or a `Motion`.
-Defaults are those of the command of the same name.
+A machine is given by its name, its file or a model; a problem by name; a log as a path, a pandas DataFrame in the
+machine's columns, or a `Log`; a drive as a profile, a design folder, a `Design` or a `Motion`. Defaults are those of
+the command of the same name.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import pandas as pd
 
 from excite import identification, logs as readers, model as models, simulation, trajectories, workflows
 from excite.diagnosis import Account
+from excite.errors import LogError
 from excite.identification import Estimate, Verification
 from excite.logs import Log
 from excite.model import Model
@@ -48,11 +49,10 @@ def read_log(machine: Machine, source: Source) -> Log:
     Raises LogError: what is wrong, where (row, column), what to do.
     """
     model = load(machine)
-    if isinstance(source, Log):
-        return source
-    if isinstance(source, pd.DataFrame):
-        return readers.from_table(source, model.machine)
-    return readers.read_log(source, model.machine)
+    found = readers.prepare(model, [source]).logs
+    if len(found) > 1:
+        raise LogError(f"{found[0].source}: has gaps or rests, which make it {len(found)} logs: give it as it is")
+    return found[0]
 
 
 def design(
@@ -70,19 +70,23 @@ def design(
 ) -> Design:
     """Design a test drive that makes the parameters of a machine identifiable.
 
-    problem: a design problem of the machine file, its default one if not given. objective: a name of
-    `excite.trajectories.OBJECTIVES`. duration [s]: another length of the drive. sigma_max [%]: bound on the worst
-    attainable standard deviation. robust: for machines up to 20 % off the nominal one. starts: starting guesses.
-    budget [s]: stop improving after so long. progress(done, total, best score) is called as the search goes on.
-    Raises InfeasibleError with the limit that can't be met, UsageError for an unknown name.
+    problem: a design problem of the machine file, its default one if not given.
+    objective: a name of `excite.trajectories.OBJECTIVES`.
+    duration [s]: length of the drive, if not the problem's.
+    sigma_max [%]: bound on the largest attainable standard deviation.
+    robust: design for machines up to 20 % off the nominal one.
+    starts, seed: starting guesses and their random seed.
+    budget [s]: time after which the search stops.
+    progress(done, total, best score): called during the search.
+    Raises InfeasibleError with the limit that can't be kept, UsageError for an unknown name.
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
     _, chosen = workflows.choose_problem(model.machine, problem, duration)
     workflows.require_objective(objective, model.machine)
     workflows.require_positive("sigma_max", sigma_max, "%")
     workflows.require_positive("budget", budget, "s")
-    brief = DesignRequest(objective, sigma_max, robust, (), starts, seed, budget)
-    return workflows.design_from(model, chosen, brief, progress).design
+    request = DesignRequest(objective, sigma_max, robust, (), starts, seed, budget)
+    return workflows.design_from(model, chosen, request, progress).design
 
 
 def simulate(
@@ -96,9 +100,11 @@ def simulate(
 ) -> pd.DataFrame:
     """Drive a machine in simulation and return the log that its sensors would write.
 
-    drive: a profile (.csv), a design folder, a design, a motion, or torques (N, n_u) [N m] from rest. noise: False for
-    exact signals. kit: a name of `excite.simulation.KITS`. effects: NAME[@WHERE]=MAGNITUDE each, what else the machine
-    does. Raises LogError for a profile, MachineError for an effect, SimulationError for a motion that can't be had.
+    drive: a profile (.csv), a design folder, a design, a motion, or torques (N, n_u) [N m] from rest.
+    noise: False for exact signals.
+    kit: a name of `excite.simulation.KITS`.
+    effects: effects that the model lacks, NAME[@WHERE]=MAGNITUDE each.
+    Raises LogError for a profile, MachineError for an effect, SimulationError for a motion that can't be integrated.
     """
     model = load(machine)
     workflows.require_known("kit", kit, simulation.KITS)
@@ -112,23 +118,23 @@ def identify(machine: Machine, logs: Source | Sequence[Source], method: str | No
     """Estimate the parameters of a machine, with uncertainty, from one log or several.
 
     method: a name of `excite.identification.METHODS`, the one recommended for the machine if not given.
-    Raises LogError for a log that can't be used, NoEstimate where it gives no answer, UsageError for an unknown method.
+    Raises LogError for an unusable log, NoEstimateError if there is no estimate, UsageError for an unknown method.
     """
     model = load(machine)
     name = workflows.choose_method(method, model)
-    read, notes = _read(model, logs, identification.needed_sensors(model, name))
-    estimate = workflows.identify_from(model, read, name).estimate
-    return replace(estimate, notes=(*notes, *estimate.notes))
+    ready = readers.prepare(model, _several(logs), identification.needed_sensors(model, name))
+    estimate = workflows.identify_from(ready.model, ready.logs, name).estimate
+    return replace(estimate, notes=(*ready.notes, *estimate.notes))
 
 
 def diagnose(machine: Machine, logs: Source | Sequence[Source]) -> Account:
-    """Find what the model of a machine gets wrong along logs: named causes, their magnitudes, what each gains.
+    """Find what the model of a machine gets wrong along logs: named causes, their magnitudes, the gain of each.
 
-    Raises LogError for a log that can't be used, NoEstimate where nothing can be fitted.
+    Raises LogError for an unusable log, NoEstimateError if nothing can be fitted.
     """
     model = load(machine)
-    read, _ = _read(model, logs, identification.needed_sensors(model, "joint"))
-    return workflows.diagnose_from(model, read)
+    ready = readers.prepare(model, _several(logs), identification.needed_sensors(model, "joint"))
+    return workflows.diagnose_from(ready.model, ready.logs)
 
 
 def verify(
@@ -143,7 +149,7 @@ def verify(
     """Simulate a drive with sensor flaws and identify from it, many times.
 
     drive: as in `simulate`. runs: simulated test days. The verification gives each parameter's bias, dispersion,
-    predicted standard deviation and how often its 95 % interval holds. Raises UsageError for an unknown method or kit.
+    predicted standard deviation and coverage of the 95 % interval. Raises UsageError for an unknown method or kit.
     """
     model = load(machine)
     workflows.require_known("kit", kit, simulation.KITS)
@@ -163,24 +169,23 @@ def compare(
 ) -> Comparison:
     """Compare the designed drive with the usual ones on the same problem, limits and time.
 
-    against: names of `excite.trajectories.USUAL`, all of them if not given. samples: drives of every random kind.
+    against: names of `excite.trajectories.BASELINES`, all of them if not given. samples: drives of every random kind.
     Raises UsageError for an unknown name, MachineError for sensors of unknown noise.
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
     _, chosen = workflows.choose_problem(model.machine, problem, None)
     workflows.require_noise_figures(model)
     for usual in against:
-        workflows.require_known("against", usual, tuple(trajectories.USUAL))
+        workflows.require_known("against", usual, tuple(trajectories.BASELINES))
     return trajectories.compare(model, chosen, samples, seed, budget, None, against)
 
 
-def _read(model: Model, logs: Source | Sequence[Source], needs: Sequence[str]) -> tuple[list[Log], list[str]]:
-    several = [logs] if isinstance(logs, str | Path | pd.DataFrame | Log) else list(logs)
-    return readers.read_stretches(several, model.machine, needs)
+def _several(logs: Source | Sequence[Source]) -> list[Source]:
+    return [logs] if isinstance(logs, str | Path | pd.DataFrame | Log) else list(logs)
 
 
 def _torques(model: Model, drive: Drive) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Torques (N, n_u) [N m] of a drive and the state that it starts from."""
+    """Return the torques (N, n_u) [N m] of a drive and the state at its start."""
     if isinstance(drive, np.ndarray):
         return drive, None, None
     if isinstance(drive, Design):

@@ -1,4 +1,16 @@
-"""."""
+"""Parameters of a machine from its logs, with their uncertainty.
+
+- `identify` estimates the base parameters from logs by one of `METHODS` and returns an `Estimate`: least squares (ols,
+  the paper's method, and wls, tls), instrumental variables (iv), output error (oe) or joint smoothing (joint), and the
+  linear ones restricted to physically possible machines (`ols+consistent`). `recommend_method` names the method for a
+  machine, `needed_sensors` what it must have measured.
+- `verify` simulates a motion with sensor noise many times and identifies from each log (`Verification`), which shows
+  bias, dispersion and coverage of the intervals.
+- `add_bias` estimates the bias of a method on given logs from simulated ones.
+- `compare_torques` and `compare_motions` test an estimate on another log (`SignalComparison`).
+- `prior_from_logs` makes an estimate the prior of the next design.
+- `describe_late_channels`, `far_from_nominal` and `parameters_at_rest` find faults of logs that spoil an estimate.
+"""
 
 import lazy_loader
 

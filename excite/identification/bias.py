@@ -1,5 +1,7 @@
-"""How biased is a method on this very log? By simulated logs of the identified machine (Efron and Tibshirani, "An
-Introduction to the Bootstrap", 1993, ch. 6 and 10)."""
+"""Bias of a method on given logs, from simulated logs of the identified machine (parametric bootstrap).
+
+Source: Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 6 and 10.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,10 @@ from excite.model.machine import Filter
 from excite.simulation import Motion, exact_readings, respond
 from excite.text import format_number, format_percent
 
-RUNS = 8
-HOLD_TIME = 1.0  # time constant with which the simulated joints are held to the log's speeds [s]
-SIGNIFICANT_BIAS = 3.0  # standard deviations of the mean that make a bias
-NOTABLE_BIAS = 0.5  # of a parameter's own standard deviation: a smaller bias is not worth a remark
+RUNS = 8  # simulated logs; chosen
+HOLD_TIME = 1.0  # time constant of the pull towards the log's joint speeds [s]; chosen
+SIGNIFICANT_BIAS = 3.0  # smallest bias that is significant [standard deviations of the mean]; chosen
+NOTABLE_BIAS = 0.5  # smallest bias that is reported [standard deviations of the parameter]; chosen
 
 Estimator = Callable[[Model, Sequence[Log], Filter], Estimate]
 
@@ -35,13 +37,15 @@ def add_bias(
     runs: int = RUNS,
     seed: int = 0,
 ) -> Estimate:
-    """The estimate with `bias` and `bias_std` (n_base,), and a note on those that matter.
+    """Return the estimate with `bias` and `bias_std` (n_base,) [SI], and a note on significant biases.
 
-    The identified machine drives the log's torques, its joints held loosely to the log's speeds; its sensors add white
-    noise as found in the log and counts as in the machine file; the method is applied to each of `runs` such logs. The
-    bias at the parameters `around` (n_base,), by default the estimate's own, stands for the bias at the truth. At an
-    estimate that is far off it is far too small: better parameters, of a consistent method, make a better place. A
-    note says so where the machine can't be simulated.
+    The identified machine is simulated under the log's torques, with its joints pulled gently towards the log's speeds.
+    Sensors add white noise as found in the log, and counts as in the machine file. The method is applied to each
+    simulated log. If the machine cannot be simulated, a note says so.
+
+    around (n_base,): parameters of the simulated machine, by default the estimate's own. The bias there stands for the
+        bias at the true parameters, so those of a consistent method are better than an estimate that is far off.
+    runs: number of simulated logs.
     """
     from excite.errors import NotConsistentError
     from excite.identification.consistency import nearest_possible
@@ -56,19 +60,20 @@ def add_bias(
         motions = [simulate_along_log(model, log, X, filter) for log in logs]
     except (SimulationError, NotConsistentError) as err:
         return add_notes(
-            estimate, f"{estimate.method}: bias unknown, the identified machine can't be simulated ({err})"
+            estimate, f"{estimate.method}: bias unknown, as the identified machine cannot be simulated ({err})"
         )
     rng = np.random.default_rng(seed)
     errors = []
     for _ in range(runs):
-        again = [measured_again(model, log, motion, X, rng) for log, motion in zip(logs, motions, strict=True)]
+        simulated = [measured_again(model, log, motion, X, rng) for log, motion in zip(logs, motions, strict=True)]
         try:
-            errors.append(method(model, again, filter).value - X)
+            errors.append(method(model, simulated, filter).value - X)
         except NotIdentifiableError:
             continue
     if len(errors) < 2:
         return add_notes(
-            estimate, f"{estimate.method}: bias unknown, it fails on simulated logs of the identified machine"
+            estimate,
+            f"{estimate.method}: bias unknown, as the method fails on simulated logs of the identified machine",
         )
     bias = np.mean(errors, axis=0)
     std = np.std(errors, axis=0, ddof=1) / np.sqrt(len(errors))
@@ -80,10 +85,10 @@ def add_bias(
 def _describe_bias(model: Model, estimate: Estimate, bias: np.ndarray, std: np.ndarray, runs: int) -> str:
     size = np.maximum(np.abs(np.nan_to_num(estimate.value)), model.scale)
     with np.errstate(invalid="ignore"):
-        matters = (np.abs(bias) > SIGNIFICANT_BIAS * std) & (np.abs(bias) > NOTABLE_BIAS * estimate.std)
-    if not matters.any():
+        notable = (np.abs(bias) > SIGNIFICANT_BIAS * std) & (np.abs(bias) > NOTABLE_BIAS * estimate.std)
+    if not notable.any():
         return f"{estimate.method}: no bias found on {runs} simulated logs of the identified machine"
-    order = [k for k in np.argsort(-np.abs(bias) / size) if matters[k]]
+    order = [k for k in np.argsort(-np.abs(bias) / size) if notable[k]]
     listed = ", ".join(
         f"{estimate.names[k]} {'+' if bias[k] > 0 else ''}{format_percent(100 * bias[k] / size[k])}"
         f" (+-{format_number(float(100 * std[k] / size[k]), 1)})"
@@ -102,31 +107,33 @@ def _is_possible(model: Model, X: np.ndarray) -> bool:
 
 
 def _covariance_with_defaults(model: Model, estimate: Estimate) -> np.ndarray:
-    """The covariance, with the scale in place of what is not known."""
+    """The covariance with the parameter's scale as standard deviation where it is unknown."""
     covariance = estimate.covariance.copy()
-    lost = np.isnan(np.diag(covariance))
-    covariance[lost], covariance[:, lost] = 0.0, 0.0
-    covariance[lost, lost] = model.scale[lost] ** 2
+    unknown = np.isnan(np.diag(covariance))
+    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = model.scale[unknown] ** 2
     return covariance
 
 
 def simulate_along_log(model: Model, log: Log, X: np.ndarray, filter: Filter) -> Motion:
-    """The machine X (n_base,) driven as in a log: its low-passed torques, with a pull towards the speeds of its joints,
-    so that small errors of torques don't lead elsewhere. Raises SimulationError."""
+    """Simulate the machine X (n_base,) under the log's low-passed torques, pulled towards its joint speeds.
+
+    The pull keeps small torque errors from accumulating. Raises SimulationError.
+    """
     s = samples(model, log, filter)
     rows, n_q = list(model.actuated), len(model.coordinates)
     torque = lowpass(s.Y[rows], float(model.machine.sampling_hz), filter).T - model.offsets @ X
-    wanted = s.nu[rows].T
+    speed = s.nu[rows].T
     gain = _inertia(model, s, X, rows) / HOLD_TIME
 
     def driven(k: int, state: np.ndarray) -> np.ndarray:
-        return torque[k] + gain * (wanted[max(k - 1, 0)] - state[n_q:][rows])
+        return torque[k] + gain * (speed[max(k - 1, 0)] - state[n_q:][rows])
 
     return respond(model, len(log), driven, X, s.q[:, 0], s.nu[:, 0])
 
 
 def _inertia(model: Model, s: Samples, X: np.ndarray, rows: Sequence[int]) -> np.ndarray:
-    """Inertia (n_u,) that a joint's own acceleration meets: the mass matrix at the first sample."""
+    """Inertia (n_u,) of each actuated joint's own acceleration, from the mass matrix at the first sample."""
     a = np.eye(len(model.coordinates))
     q, nu = (np.repeat(v[:, :1], len(a), axis=1) for v in (s.q, s.nu))
     p = model.expand @ X
@@ -135,7 +142,7 @@ def _inertia(model: Model, s: Samples, X: np.ndarray, rows: Sequence[int]) -> np
 
 
 def measured_again(model: Model, log: Log, motion: Motion, X: np.ndarray, rng: np.random.Generator) -> Log:
-    """The log that the log's own sensors would write of a motion."""
+    """Simulate the log that the log's own sensors would record of a motion."""
     exact = exact_readings(model, motion, X)
     values = {
         s.name: measure_again(s, exact[s.name], white_noise(log.values[s.name]), rng)

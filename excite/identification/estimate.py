@@ -1,4 +1,4 @@
-"""What every method of identification hands back, and why it can't."""
+"""Result of every identification method."""
 
 from __future__ import annotations
 
@@ -8,23 +8,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-NOTHING_MOVES_MESSAGE = "the log says nothing of any parameter: does the machine move in it?"
+NOTHING_MOVES_MESSAGE = "no parameter is identifiable from this log: does the machine move in it?"
 
 
 def held_note(names: Sequence[str]) -> str:
-    """What an estimate says of parameters that it took from the machine file."""
-    return f"held at the machine file's value: {', '.join(names)}; the others hold if the file is right there"
+    """Note for parameters that are held at the machine file's value."""
+    return f"held at the machine file's value: {', '.join(names)}; the other values depend on these"
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Base parameters of a log, by method.
+    """Base parameters identified from logs.
 
-    value, std (n,) [SI] by `names`; an unidentifiable parameter has NaN in both and its reason in `unidentifiable`.
-    covariance (n, n). cond_w, cond_phi: condition numbers of W and W diag(value). residual (rows, N): filtered,
-    decimated. degrees: of freedom of the residual. bias, bias_std (n,) [SI]: mean error of the method on simulated logs
-    of the identified machine and how well it is known, where somebody asked for it. sides (2, n) [SI]: standard
-    deviations below and above where the likelihood is lopsided; std lies between them.
+    method; names, units: of the n parameters.
+    value (n,), covariance (n, n) [SI]: NaN for unidentifiable parameters, whose reason is in `unidentifiable`.
+    cond_w, cond_phi: condition numbers of W and of W diag(value).
+    relative_error_percent: 100 |Y - W X| / |Y|. residual (rows, N): filtered and decimated.
+    degrees: degrees of freedom of the residual.
+    bias, bias_std (n,) [SI]: mean error of the method on simulated logs, and its standard deviation, if computed.
+    one_sided_std (2, n) [SI]: standard deviations below and above if the likelihood is skewed; std lies between them.
     """
 
     method: str
@@ -41,10 +43,11 @@ class Estimate:
     notes: tuple[str, ...]
     bias: np.ndarray | None = None
     bias_std: np.ndarray | None = None
-    sides: np.ndarray | None = None
+    one_sided_std: np.ndarray | None = None
 
     @property
     def std(self) -> np.ndarray:
+        """Standard deviations (n,) [SI]."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -55,16 +58,16 @@ class Estimate:
 
     @property
     def quantile95(self) -> float:
-        """From the value to an end of its 95 % interval, in standard deviations to that side."""
+        """Half width of a 95 % interval in standard deviations."""
         return float(scipy.stats.t.ppf(0.975, max(self.degrees, 1)))
 
     @property
     def interval95(self) -> np.ndarray:
         """Ends of the 95 % intervals (2, n) [SI]."""
-        below, above = (self.std, self.std) if self.sides is None else self.sides
+        below, above = (self.std, self.std) if self.one_sided_std is None else self.one_sided_std
         return np.array([self.value - self.quantile95 * below, self.value + self.quantile95 * above])
 
 
 def add_notes(estimate: Estimate, *notes: str) -> Estimate:
-    """The estimate with remarks for the report added."""
+    """Return the estimate with notes for the report appended."""
     return replace(estimate, notes=estimate.notes + notes)

@@ -1,10 +1,9 @@
-"""Joint smoothing: states, true torques and parameters of a log estimated together (errors in variables).
+"""Joint smoothing: states, true torques and parameters of logs estimated together (errors in variables).
 
-Maximum likelihood of everything at once: the machine's dynamics hold exactly between samples, the delivered torques are
-linear between samples and differ from the measured ones by white noise and an offset, and every sensor has a noise of
-its own. The answer is found by `newton`, how sure it is by `deviations`; with no measurement at all, along a motion
-alone, the covariance is the Cramer-Rao bound. Source: Bryson and Ho, "Applied Optimal Control", ch. 13 (smoothing as a
-two-point problem).
+Maximum likelihood: the dynamics hold exactly between samples, delivered torques are linear between samples and differ
+from the measured ones by white noise and an offset, and every sensor has its own noise. `excite.smoothing` finds the
+maximum and its uncertainty. Source: Bryson and Ho, "Applied Optimal Control", ch. 13 (smoothing as a two-point
+boundary value problem).
 """
 
 from __future__ import annotations
@@ -38,107 +37,107 @@ from excite.smoothing import (
     smoothed_motion,
 )
 
-ACCEPTED_STEP = 0.1  # a step, in standard deviations, at which a fit that runs out of passes is an estimate
-# Disturbing forces where the model is not trusted, larger until the innovations are what they should be.
+# Largest step of an estimate whose iteration ran out of passes [standard deviations]; chosen.
+ACCEPTED_STEP = 0.1
+# Levels of process noise, tried in turn until the innovations are as expected; chosen.
 PROCESS_NOISE_LEVELS = (1.0, 4.0, 16.0)
-SUSPECT_MEAN_SQUARE = (
-    2.5  # mean square of innovations, all or slow ones, that the model can't explain; null logs stay below 1.6
-)
+# Mean square of a sensor's normalised innovations that the model does not explain. Logs without a cause stay below 1.6.
+SUSPECT_MEAN_SQUARE = 2.5
 UNEXPLAINED_NOTE = (
-    "the log shows something that the model doesn't know, so the intervals do not hold: these values allow for"
-    " disturbing forces, and may be off by more than their intervals, much more where the cause is no such force (a"
-    " sensor, a torque channel); run `excite diagnose`"
+    "the model does not explain this log, so the 95 % intervals do not hold: the values allow for process noise, and"
+    " may be off by much more than their intervals if the cause is a sensor or a torque channel; run `excite diagnose`"
 )
 BIASED_NOTE = (
-    "what this log shows poorly may be off by a deviation more than its interval says, as no estimate without that bias"
-    " was found: a drive that moves more tells more"
+    "parameters that this log excites poorly may be off by one standard deviation more than their interval says, as"
+    " only a biased estimate was found: record a drive with more motion"
 )
 
 
 def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
-    """Base parameters by joint smoothing of all logs, from the machine file's values.
+    """Estimate the base parameters by joint smoothing of all logs, from the machine file's values.
 
-    Encoders that beat with the clock weigh as others do, which keeps the estimate unbiased; its deviations count the
-    beats (`deviations`). A log that tells too little for that has an estimate that is drawn in, with a note.
-    Where the innovations say that the machine does something that the model doesn't know, or the exact dynamics find
-    no estimate, the answer is that of a model with white disturbing forces, as large as it takes, with a note. Raises
-    NotConverged where that fails too, NotIdentifiable where a torque is missing.
+    Encoders that beat with the clock keep their weight, which keeps the estimate unbiased; the standard deviations
+    account for the beats. If no unbiased fit is found, a slightly biased one is returned with a note. If the
+    innovations show that the model does not explain a log, or exact dynamics give no fit, the model gets as much
+    process noise as needed, and a note.
+
+    Raises NotConvergedError if that fails too, NotIdentifiableError if a torque is missing.
     """
     space = build_state_space(model, common_sensors(model, logs))
     measurements = [prepare_measurements(space, log, unbiased=True) for log in logs]
-    steady = [replace(data, unbiased=False) for data in measurements]
+    weighted = [replace(data, unbiased=False) for data in measurements]
     starts = [initial_trajectory(space, data, log, filter) for data, log in zip(measurements, logs, strict=True)]
     notes = describe_noise(space, measurements)
     held = identifiability.parameters_at_rest(model, logs, filter, slow=False)
 
     def ways() -> Iterator[tuple[np.ndarray, bool]]:
         yield held, False
-        still = held | identifiability.parameters_at_rest(model, logs, filter, slow=True)
-        less = (still & ~held).any()
-        if less:
-            yield still, False
-        # The model with disturbing forces finds its way from further off.
+        held_if_slow = held | identifiability.parameters_at_rest(model, logs, filter, slow=True)
+        differs = (held_if_slow & ~held).any()
+        if differs:
+            yield held_if_slow, False
+        # With process noise the iteration converges from further away.
         yield held, True
-        if less:
-            yield still, True
+        if differs:
+            yield held_if_slow, True
 
-    trouble: NotConvergedError | None = None
-    loose: Fit | None = None
-    doubted: tuple[tuple[bool, float], Fit, np.ndarray, list[str]] | None = None
-    for free, further in ways():
+    failure: NotConvergedError | None = None
+    noisy_fit: Fit | None = None
+    suspect_fit: tuple[tuple[bool, float], Fit, np.ndarray, list[str]] | None = None
+    for held_now, with_noise in ways():
         try:
-            if further:
-                loose = fit_with_process_noise(space, logs, steady, starts, model.nominal, starts, free)
-            trajectories, X = (starts, model.nominal) if loose is None else (loose.trajectories, loose.X)
-            fit, drawn = _fit_exact(space, measurements, steady, trajectories, X, starts, free)
+            if with_noise:
+                noisy_fit = fit_with_process_noise(space, logs, weighted, starts, model.nominal, starts, held_now)
+            trajectories, X = (starts, model.nominal) if noisy_fit is None else (noisy_fit.trajectories, noisy_fit.X)
+            fit, bias_notes = _fit_exact(space, measurements, weighted, trajectories, X, starts, held_now)
         except NotConvergedError as failed:
-            trouble = trouble or failed
+            failure = failure or failed
             continue
-        found = find_suspect_sensors(space, logs, fit)
-        if not found:
-            if drawn:
-                return _build_estimate(space, measurements, fit, filter, (*notes, *drawn))
-            fit, sides, flat = quantify_uncertainty(space, measurements, starts, fit)
-            return _build_estimate(space, measurements, fit, filter, (*notes, *flat), sides)
-        rank = bool(drawn), fit.cost  # costs of one kind of records can be compared
-        if doubted is None or rank < doubted[0]:
-            doubted = rank, fit, free, found
-        if free is held:
-            break  # nothing was held back: it is the machine, not the way to it
-    said = str(trouble)
-    if doubted is not None:
-        _, fit, free, found = doubted
-        said = "; ".join(found)
+        suspects = find_suspect_sensors(space, logs, fit)
+        if not suspects:
+            if bias_notes:
+                return _build_estimate(space, measurements, fit, filter, (*notes, *bias_notes))
+            fit, one_sided, flat_notes = quantify_uncertainty(space, measurements, starts, fit)
+            return _build_estimate(space, measurements, fit, filter, (*notes, *flat_notes), one_sided)
+        rank = bool(bias_notes), fit.cost  # only costs of the same measurements are comparable
+        if suspect_fit is None or rank < suspect_fit[0]:
+            suspect_fit = rank, fit, held_now, suspects
+        if held_now is held:
+            break  # no parameter was held, so the model is the cause
+    reason = str(failure)
+    if suspect_fit is not None:
+        _, fit, held_now, suspects = suspect_fit
+        reason = "; ".join(suspects)
         try:
-            loose = fit_with_process_noise(space, logs, steady, fit.trajectories, fit.X, starts, free)
+            noisy_fit = fit_with_process_noise(space, logs, weighted, fit.trajectories, fit.X, starts, held_now)
         except NotConvergedError as failed:
-            trouble = failed
-    if loose is None:
-        assert trouble is not None
-        raise trouble
-    return _build_estimate(space, measurements, loose, filter, (*notes, said, UNEXPLAINED_NOTE))
+            failure = failed
+    if noisy_fit is None:
+        assert failure is not None
+        raise failure
+    return _build_estimate(space, measurements, noisy_fit, filter, (*notes, reason, UNEXPLAINED_NOTE))
 
 
 def _fit_exact(
     space: StateSpace,
     measurements: Sequence[Measurements],
-    steady: Sequence[Measurements],
+    weighted: Sequence[Measurements],
     trajectories: Sequence[Trajectory],
     X: np.ndarray,
     starts: Sequence[Trajectory],
     held: np.ndarray,
 ) -> tuple[Fit, tuple[str, ...]]:
-    """The fit with exact dynamics, unbiased where the log determines it, and what to say of it. Raises NotConverged."""
-    trouble: NotConvergedError | None = None
-    for own, said in ((measurements, ()), (steady, (BIASED_NOTE,))):
+    """Fit with exact dynamics, unbiased if possible; return the fit and its notes. Raises NotConvergedError."""
+    failure: NotConvergedError | None = None
+    for chosen, notes in ((measurements, ()), (weighted, (BIASED_NOTE,))):
         try:
-            return fit_logs(space, own, trajectories, X, starts, 0.0, held), said
+            return fit_logs(space, chosen, trajectories, X, starts, 0.0, held), notes
         except NotConvergedError as failed:
             if failed.fit is not None and failed.step < ACCEPTED_STEP:
-                return failed.fit, said
-            trouble = trouble or failed
-    assert trouble is not None
-    raise trouble
+                return failed.fit, notes
+            failure = failure or failed
+    assert failure is not None
+    raise failure
 
 
 def fit_with_process_noise(
@@ -150,21 +149,21 @@ def fit_with_process_noise(
     starts: Sequence[Trajectory],
     held: np.ndarray,
 ) -> Fit:
-    """The fit with disturbing forces as large as the innovations ask for. Raises NotConverged."""
-    trouble: NotConvergedError | None = None
+    """Fit with the lowest level of process noise that explains the innovations. Raises NotConvergedError."""
+    failure: NotConvergedError | None = None
     fit: Fit | None = None
-    for times in PROCESS_NOISE_LEVELS:
+    for level in PROCESS_NOISE_LEVELS:
         try:
-            fit = fit_logs(space, measurements, trajectories, X, starts, times, held)
+            fit = fit_logs(space, measurements, trajectories, X, starts, level, held)
         except NotConvergedError as failed:
-            trouble = failed
+            failure = failed
             continue
         if not find_suspect_sensors(space, logs, fit):
             return fit
         trajectories, X = fit.trajectories, fit.X
     if fit is None:
-        assert trouble is not None
-        raise trouble
+        assert failure is not None
+        raise failure
     return fit
 
 
@@ -174,9 +173,9 @@ def _build_estimate(
     fit: Fit,
     filter: Filter,
     notes: tuple[str, ...],
-    sides: np.ndarray | None = None,
+    one_sided: np.ndarray | None = None,
 ) -> Estimate:
-    """The answer as `identify` gives it: regressor along the smoothed states, residual of the torques."""
+    """Convert a fit to an Estimate: regressor along the smoothed states, torque residual."""
     model = space.model
     weak = fit.unidentifiable | (fit.std > MAX_IDENTIFIABLE_STD * np.maximum(np.abs(fit.X), model.scale))
     if weak.all():
@@ -185,26 +184,26 @@ def _build_estimate(
         held = [n for n, yes in zip(model.base.names, fit.unidentifiable, strict=True) if yes]
         notes = (*notes, held_note(held))
     reasons = {
-        name: "this log hardly moves with it: what is known of it is the machine file's value"
+        name: "hardly identifiable from this log: only the machine file's value is known"
         for name, yes in zip(model.base.names, weak, strict=True)
         if yes
     }
     W, Y, errors = [], [], []
     for data, trajectory in zip(measurements, fit.trajectories, strict=True):
         q, nu, z, u, a = smoothed_motion(space, data, trajectory, fit.X)
-        beside = () if model.plain else (u.T, z.T)
-        forced = fit.process_noise > 0 and model.plain
-        if forced:  # what the forces do is not the model's
+        effect_inputs = () if model.plain else (u.T, z.T)
+        plain_with_noise = fit.process_noise > 0 and model.plain
+        if plain_with_noise:  # accelerations by process noise are not the model's
             a = derivative(nu.T, float(model.machine.sampling_hz)).T
-        rows = model.stacked_regressor(q.T, nu.T, a.T, *beside)
+        rows = model.stacked_regressor(q.T, nu.T, a.T, *effect_inputs)
         W.append(rows.reshape(-1, len(fit.X)))
         measured, error = np.zeros((2, len(model.rows), len(u)))
         measured[list(model.actuated)], error[list(model.actuated)] = data.torque.T, -trajectory.sampled_torque_error.T
-        if forced:
+        if plain_with_noise:
             error = measured - (rows @ fit.X).T
         Y.append(decimate(measured, filter.decimation))
         errors.append(decimate(error, filter.decimation))
-    # In blocks that fit the cache: ten times faster than all rows at once.
+    # Blocks that fit the cache are ten times faster than all rows at once.
     R = np.linalg.qr(np.concatenate([np.linalg.qr(w, mode="r") for rows in W for w in np.array_split(rows, 40)]), "r")
     residual = np.concatenate(errors, axis=1)
     covariance = fit.covariance.copy()
@@ -226,12 +225,12 @@ def _build_estimate(
         int(sum(data.used.sum() for data in measurements)) - len(fit.X),
         reasons,
         notes,
-        sides=None if sides is None else np.where(weak, np.nan, sides),
+        one_sided_std=None if one_sided is None else np.where(weak, np.nan, one_sided),
     )
 
 
 def find_suspect_sensors(space: StateSpace, logs: Sequence[Log], fit: Fit) -> list[str]:
-    """Sensors whose innovations are not what the model and their noise say, each as a line for the report."""
+    """List the sensors whose innovations the model and noise do not explain, one line each."""
     texts = []
     for log, linear in zip(logs, fit.linear, strict=True):
         for sensor, (size, slow, blocks) in zip(space.sensors, innovation_statistics(linear), strict=True):

@@ -1,4 +1,4 @@
-"""Estimates with uncertainty: from logs to parameters."""
+"""Table of identification methods, and the way from logs to an estimate."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from excite.model.machine import Filter
 
 @dataclass(frozen=True)
 class Method:
-    """A way to estimate: a function(model, logs, filter).
+    """An identification method: a function(model, logs, filter) that returns an Estimate.
 
-    `effects`: which it can estimate with the base parameters: none, those in whose amounts the equations of motion are
-    linear, or any. `simulates`: it finds a speed that nothing measures from the dynamics. `biased`: by slips that are
-    measured with noise, so that `excite identify` looks for how much.
+    effects: which it estimates beside the base parameters: none, those linear in the equations of motion, or any.
+    simulates: finds an unmeasured speed from the dynamics. biased: noisy slips bias it, so `excite identify` estimates
+        its bias.
     """
 
     find: Estimator
@@ -39,11 +39,13 @@ class Method:
 
 
 def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Filter | None = None) -> Estimate:
-    """Base parameters from one log or several; single spikes are repaired, with a note (see `examine`), what
-    is doubtful about a log is said, and a parameter that the logs don't show comes with the drive that would (see
-    `hidden`).
+    """Estimate the base parameters from one log or several.
 
-    Raises ValueError for an unknown method, NotIdentifiable, LogError for a log that can't be repaired.
+    Single spikes are repaired with a note (see `examine`), doubts about a log are noted, and an unidentifiable
+    parameter comes with the manoeuvre that would identify it.
+
+    Raises ValueError for an unknown method, MachineError for sensors or effects the method does not support,
+    NotIdentifiableError, and LogError for a log that cannot be repaired.
     """
     if method not in METHODS:
         raise ValueError(f"method: {method} is unknown, allowed: {', '.join(METHODS)}")
@@ -51,29 +53,29 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
         raise ValueError("identify: no log given")
     require_sensors(model)
     _require_method_for_effects(model, method)
-    examined = [examine(model, log) for log in logs]
-    mended, filter = [e.log for e in examined], filter or model.machine.filter
-    if not any(v.any() for log in mended for v in log.values.values()):
-        raise NotIdentifiableError(f"{mended[0].source}: every signal is zero: is the log empty of measurements?")
-    doubtful = [line for e in examined for line in e.doubts]
-    with doubts_in_errors(doubtful):
+    examined = [examine(model.machine, log) for log in logs]
+    repaired, filter = [e.log for e in examined], filter or model.machine.filter
+    if not any(v.any() for log in repaired for v in log.values.values()):
+        raise NotIdentifiableError(f"{repaired[0].source}: every signal is zero: is the log empty of measurements?")
+    doubts = [line for e in examined for line in e.doubts]
+    with doubts_in_errors(doubts):
         try:
-            estimate = add_advice(model, mended, METHODS[method].find(model, mended, filter), filter)
+            estimate = add_advice(model, repaired, METHODS[method].find(model, repaired, filter), filter)
         except np.linalg.LinAlgError:
             raise NotIdentifiableError(
-                f"{mended[0].source}: the equations of {method} are singular along this log: check the sign and unit of"
-                " every column, and that the machine moves"
+                f"{repaired[0].source}: the equations of {method} are singular along this log: check the sign and unit"
+                " of every column, and that the machine moves"
             ) from None
-    return add_notes(estimate, *(note for e in examined for note in e.notes), *doubtful)
+    return add_notes(estimate, *(note for e in examined for note in e.notes), *doubts)
 
 
 def require_sensors(model: Model) -> None:
-    """Refuses a machine file whose sensors can't say what its equations need. Raises MachineError."""
+    """Raise MachineError if the machine file's sensors cannot determine the motion and torques."""
     machine = model.machine
-    have = {(s.kind, s.body) for s in machine.sensor}
+    present = {(s.kind, s.body) for s in machine.sensor}
     for body in machine.actuated:
         for kind in ("angle", "torque"):
-            if (kind, body.index) not in have:
+            if (kind, body.index) not in present:
                 raise MachineError(
                     f"{machine.name}: sensor: none of kind {kind} on joint {body.index} ({body.where}): identification"
                     " needs one"
@@ -82,40 +84,43 @@ def require_sensors(model: Model) -> None:
         return
     wheels = [s for s in machine.sensors("full") if s.kind == "wheel"]
     turns = machine.body[0].coordinates[2] in model.coordinates
-    apart = len({float(s.lateral or 0) for s in wheels})
-    if not wheels or (turns and apart < 2):
+    tracks = len({float(s.lateral or 0) for s in wheels})
+    if not wheels or (turns and tracks < 2):
         raise MachineError(
             f"{machine.name}: sensor: {'two measuring wheels apart' if turns else 'a measuring wheel'} (kind wheel)"
-            " must tell the speed over ground" + (" and the yaw rate" if turns else "")
+            " must measure the speed over ground" + (" and the yaw rate" if turns else "")
         )
 
 
 def _require_method_for_effects(model: Model, method: str) -> None:
-    """Refuses a method that can't estimate a machine's effects. Raises MachineError."""
-    able = METHODS[method].effects
-    if model.plain or able == "any":
+    """Raise MachineError if a method cannot estimate the machine's effects."""
+    supported = METHODS[method].effects
+    if model.plain or supported == "any":
         return
     machine, others = model.machine.name, " or ".join(name for name, m in METHODS.items() if m.effects != "none")
-    if able == "none":
+    if supported == "none":
         raise MachineError(f"{machine}: effect: method {method} doesn't know effects, use {others}")
     for e in model.effects:
         if e.name in model.nonlinear or e.effect.sensor_only:
             raise MachineError(
-                f"{machine}: effect {e.name}: no least squares finds it, since the equations of motion are not linear"
-                " in its amount: use joint"
+                f"{machine}: effect {e.name}: least squares cannot find it, as the equations of motion are not linear"
+                " in its magnitude: use joint"
             )
 
 
 def add_bias(
     model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter | None = None, runs: int = bias.RUNS
 ) -> Estimate:
-    """The estimate with its method's bias on these logs, from simulated ones (see `bootstrap`).
+    """Add the bias of the method on these logs, from simulated ones (see `bias.add_bias`).
 
-    Of the machine that joint smoothing finds, or instrumental variables, where they find one: least squares can be so
-    far off that its own machine says nothing of its bias.
+    The simulated machine is that of joint smoothing, or of instrumental variables, if one of them finds it. Least
+    squares may be so far off that its own machine does not show the bias.
     """
     if not model.plain:
-        return add_notes(estimate, "the method's bias on these logs was not looked for: the machine has effects")
+        return add_notes(
+            estimate,
+            "the method's bias on these logs is unknown: simulated logs exist only for machines without effects",
+        )
     filter = filter or model.machine.filter
     around: np.ndarray | None = None
     if METHODS[estimate.method].biased:
@@ -127,24 +132,22 @@ def add_bias(
 
 
 def recommend_method(model: Model) -> str:
-    """The method that a machine calls for: joint smoothing where slips, which are measured with noise, make the
-    regressor, and for a machine with effects; least squares where a joint's own motion makes it.
-    """
+    """Recommend joint smoothing for a machine with effects, or with slips (a noisy regressor), else ols."""
     return "joint" if model.slips or not model.plain else "ols"
 
 
 def needed_sensors(model: Model, method: str) -> tuple[str, ...]:
-    """Names of the sensors without which a method can't work on this machine."""
+    """Return the names of the sensors that a method needs on this machine."""
     speed = () if METHODS[method].simulates else ("lateral_speed",)
     kinds = (*NEEDED, *speed)
     return tuple(s.name for s in model.machine.sensors("full") if s.kind in kinds)
 
 
 def restrict_to_possible(plain: Estimator) -> Estimator:
-    """A linear method held to physically possible machines."""
+    """Restrict a linear method to physically possible machines."""
 
     def method(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
-        """The same, held to physically possible machines: the nearest one, by a convex program."""
+        """The linear method restricted to physically possible machines: the nearest one, by a convex program."""
         from excite.identification.consistency import constrained_estimate  # cvxpy takes a second to load
 
         return constrained_estimate(model, plain(model, logs, filter), filtered_blocks(model, logs, filter))

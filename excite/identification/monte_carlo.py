@@ -1,4 +1,4 @@
-"""How true and how sure: simulate a drive with the sensors' flaws, identify, many times over."""
+"""Monte Carlo verification: simulate a motion with sensor noise and identify, many times."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Verification:
-    """N runs of one drive: value, std (runs, n) estimates and their own standard deviations, interval (runs, 2, n) the
-    ends of their 95 % intervals; true (n,).
+    """Estimates of all runs.
 
-    A run whose identification failed has NaN; `failures` says why, by run.
+    value, std (runs, n) [SI]: estimates and their standard deviations. interval (runs, 2, n): ends of the 95 %
+    intervals.
+    true, scale (n,): true parameters and their scales. failures: reason by run; a failed run has NaN.
     """
 
     method: str
@@ -38,22 +39,22 @@ class Verification:
 
     @property
     def reference(self) -> np.ndarray:
-        """(n,) what errors are relative to: the true value, the scale where that is zero."""
+        """Size (n,) that errors are relative to: the true value, or the scale if that is zero."""
         return np.where(self.true != 0, self.true, self.scale)
 
     @property
     def error_percent(self) -> np.ndarray:
-        """(runs, n) error of every run: 100 (value / true - 1), so that minus means too small in size."""
+        """Error (runs, n) of every run, 100 (value / true - 1): negative means too small in size."""
         return 100 * (self.value - self.true) / self.reference
 
     @property
     def std_percent(self) -> np.ndarray:
-        """(runs, n) standard deviation that each run predicts."""
+        """Standard deviation (runs, n) that each run predicts [%]."""
         return 100 * self.std / np.abs(self.reference)
 
     @property
     def covered(self) -> np.ndarray:
-        """(runs, n) 1 where the 95 % interval holds the truth, 0 where not, NaN where there is no estimate."""
+        """Coverage (runs, n): 1 if the 95 % interval contains the true value, 0 if not, NaN without an estimate."""
         low, high = self.interval.transpose(1, 0, 2)
         inside = (low <= self.true) & (self.true <= high)
         return np.where(np.isfinite(low), inside.astype(float), np.nan)
@@ -70,22 +71,25 @@ def verify(
     jobs: int = -1,
     progress: Progress | None = None,
 ) -> Verification:
-    """Measures a motion of the true `model` with new sensor noise in every run and identifies from that log alone.
+    """Measure a motion of the true model with new sensor noise in every run, and identify from that log alone.
 
-    `start`: the model that identification knows (a machine file with other nominal values), the true one by default.
-    Runs are the same whatever the number of jobs. Raises ValueError for bad arguments.
+    start: model that identification assumes (other nominal values), by default the true one.
+    jobs: number of processes; the result does not depend on it.
+    progress: called with the number of finished runs and of all runs.
+
+    Raises ValueError for bad arguments.
     """
     if runs < 1:
         raise ValueError(f"runs: must be at least 1 (got {runs})")
     seeds = np.random.SeedSequence(seed).generate_state(runs)
-    true, known = model.machine.model_dump_json(), (start or model).machine.model_dump_json()
-    work = Parallel(n_jobs=jobs, return_as="generator_unordered")(
-        delayed(_run)(k, true, known, motion, method, kit, int(s)) for k, s in enumerate(seeds)
+    true, assumed = model.machine.model_dump_json(), (start or model).machine.model_dump_json()
+    results = Parallel(n_jobs=jobs, return_as="generator_unordered")(
+        delayed(_run)(k, true, assumed, motion, method, kit, int(s)) for k, s in enumerate(seeds)
     )
     n = len(model.base.names)
     value, std, interval = (np.full((runs, *shape), np.nan) for shape in ((n,), (n,), (2, n)))
     failures: dict[int, str] = {}
-    for done, (k, found, reason) in enumerate(work, 1):
+    for done, (k, found, reason) in enumerate(results, 1):
         if found is None:
             failures[k] = reason
         else:
@@ -110,9 +114,9 @@ Found = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _run(
-    k: int, true: str, known: str, motion: Motion, method: str, kit: str, seed: int
+    k: int, true_json: str, assumed_json: str, motion: Motion, method: str, kit: str, seed: int
 ) -> tuple[int, Found | None, str]:
-    model, assumed = build_cached(true), build_cached(known)
+    model, assumed = build_cached(true_json), build_cached(assumed_json)
     table = simulation.measure(model, motion, kit=kit, seed=seed)
     measured = logs.from_table(table, assumed.machine, methods.needed_sensors(assumed, method))
     try:
@@ -122,28 +126,28 @@ def _run(
     return k, (estimate.value, estimate.std, estimate.interval95), ""
 
 
-def summarise_runs(v: Verification) -> dict[str, dict[str, float | str]]:
-    """Per parameter: unit, true, mean, bias, spread, predicted spread [%] and coverage of the 95 % interval [0..1]."""
+def summarise_runs(verification: Verification) -> dict[str, dict[str, float | str]]:
+    """Summarise each parameter: unit, true value, mean, bias, dispersion, predicted dispersion [%], coverage [0..1]."""
     table: dict[str, dict[str, float | str]] = {}
-    for k, name in enumerate(v.names):
-        error = v.error_percent[:, k][np.isfinite(v.value[:, k])]
-        some, many = len(error) > 0, len(error) > 1
+    for k, name in enumerate(verification.names):
+        error = verification.error_percent[:, k][np.isfinite(verification.value[:, k])]
+        any_run, several = len(error) > 0, len(error) > 1
         table[name] = {
-            "unit": v.units[k],
-            "true": float(v.true[k]),
-            "mean": float(np.nanmean(v.value[:, k])) if some else np.nan,
-            "bias_percent": float(error.mean()) if some else np.nan,
-            "bias_std_percent": float(error.std(ddof=1) / np.sqrt(len(error))) if many else np.nan,
-            "std_percent": float(error.std(ddof=1)) if many else np.nan,
-            "predicted_std_percent": float(np.nanmean(v.std_percent[:, k])) if some else np.nan,
-            "rms_percent": float(np.sqrt(np.mean(error**2))) if some else np.nan,
-            "coverage95": float(np.nanmean(v.covered[:, k])) if some else np.nan,
+            "unit": verification.units[k],
+            "true": float(verification.true[k]),
+            "mean": float(np.nanmean(verification.value[:, k])) if any_run else np.nan,
+            "bias_percent": float(error.mean()) if any_run else np.nan,
+            "bias_std_percent": float(error.std(ddof=1) / np.sqrt(len(error))) if several else np.nan,
+            "std_percent": float(error.std(ddof=1)) if several else np.nan,
+            "predicted_std_percent": float(np.nanmean(verification.std_percent[:, k])) if any_run else np.nan,
+            "rms_percent": float(np.sqrt(np.mean(error**2))) if any_run else np.nan,
+            "coverage95": float(np.nanmean(verification.covered[:, k])) if any_run else np.nan,
         }
     return table
 
 
 def biased_parameters(table: dict[str, dict[str, float | str]]) -> list[str]:
-    """Parameters of a `summary` whose mean error is more than one predicted standard deviation, and beyond chance."""
+    """Name the parameters of a summary whose bias is significant and exceeds one predicted standard deviation."""
     return [
         name
         for name, row in table.items()

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-import difflib
-import itertools
-import re
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 import pandas as pd
 
-from excite.errors import LogError
 from excite.logs import log
-from excite.logs.plausibility import RATES, against, as_speed, doubts, is_speed, own_file, unchanging
-from excite.logs.repair import NEEDED, find_dropouts, find_spikes
-from excite.logs.tables import COMMENTS
-from excite.model.machine import TURN, UNITS, Machine, Sensor, load_machine, shipped_machines
+from excite.logs.plausibility import against, doubts, own_file, unchanging
+from excite.logs.preparation import as_log, at_rate_of, read_stretches
+from excite.logs.refusal import caught, lookalike, speed_for_angle, stray_rows, unbroken_rows, wrong_time_unit
+from excite.logs.repair import NEEDED, examine, find_dropouts, find_spikes
+from excite.logs.resampling import BRIDGED_STEPS, Stretch, held_every, ordinal
+from excite.logs.time_axis import order_rows
+from excite.logs.times import has_time, seconds
+from excite.model.machine import UNITS, Machine, Sensor, load_machine, shipped_machines
 
 T = TypeVar("T")
 SHOWN = 5  # places named of a fault that is there many times
 STUCK = 50  # equal extreme readings in a row that look like the end of a range
 ALIKE = 0.6  # share of a machine's columns that makes a log look like one of its
-CLOSE = 0.05  # of a unit's size, when a wrong rate of sampling is taken for time in that unit
 
 
 @dataclass(frozen=True)
@@ -77,14 +75,15 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
     """Everything that is wrong with a table of measurements, not only the first fault. Never raises for its content."""
     columns, faults, remarks = [], [], []
     found = {c: s for s in machine.sensors("full") for c in s.columns} if machine else {}
-    strays = _strays(table)
+    strays = stray_rows(table)
     faults += list(strays.values())[:SHOWN]
     if len(strays) > SHOWN:
         faults.append(f"{len(strays) - SHOWN} more such rows")
+    bridged = caught(lambda: read_stretches(table, machine), None) is not None if machine else False
     for name in map(str, table.columns):
         column, fault = _column(table, name, machine, found.get(name), list(strays))
         columns.append(column)
-        if fault and machine and (name in found or name == machine.time_column):
+        if fault and machine and not bridged and (name in found or name == machine.time_column):
             faults.append(fault)
         elif fault and not machine:
             remarks.append(fault)
@@ -92,13 +91,16 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         remarks.append("no shipped machine has these columns: name yours with --machine to have them checked")
         remarks = [*faults, *remarks]
         return Inspection(source, None, len(table), np.nan, np.nan, tuple(columns), (), (), tuple(remarks), {}, ())
-    t, gaps = _time(table, machine, faults)
+    t, gaps = _time(table, machine, faults, remarks, bool(strays))
     signals: dict[str, tuple[np.ndarray, np.ndarray, str]] = {}
     readings: dict[str, np.ndarray] = {}
     rate = float(machine.sampling_hz)
-    unbroken = _unbroken(t, machine) if len(t) else slice(None)
+    if len(t) > 1 and t[-1] > t[0] and not gaps:
+        rate = (len(t) - 1) / float(t[-1] - t[0])
+    unbroken = unbroken_rows(t, machine) if len(t) else slice(None)
     after = tuple(f"row {int(np.searchsorted(t, gap)) + 2}," for gap in gaps)
     absent: list[str] = []
+    pieces = _pieces(table, machine) if len(t) else []
     for sensor in machine.sensors("full"):
         missing = [c for c in sensor.columns if c not in table.columns]
         if missing:
@@ -109,7 +111,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
             else:
                 remarks.append(line + ("; some methods need it" if "paper" in sensor.kits else "; optional"))
             continue
-        values = _caught(lambda s=sensor: log.values_of(s, machine, table, ""), None)  # type: ignore[misc]
+        values = caught(lambda s=sensor: log.values_of(s, machine, table, ""), None)  # type: ignore[misc]
         when = t if len(t) else np.arange(len(table)) / rate
         if values is None:  # shown as far as it can be read
             number = pd.to_numeric(table[sensor.column], errors="coerce").to_numpy(dtype=float)
@@ -117,12 +119,18 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
             continue
         readings[sensor.name] = values
         signals[" - ".join(sensor.columns)] = (when, values, machine.si_unit(sensor))
+        if pieces:
+            continue  # looked at piece by piece
         jumps: list[str] = []
-        _caught(lambda s=sensor, v=values: log.check_values(s, v, rate, machine, ""), jumps)  # type: ignore[misc]
-        speed = _speed(sensor, values[unbroken], table.iloc[unbroken], machine) if jumps else ""
+        caught(lambda s=sensor, v=values: log.check_values(s, v, rate, machine, ""), jumps)  # type: ignore[misc]
+        speed = speed_for_angle(sensor, values[unbroken], table.iloc[unbroken], machine) if jumps else ""
         jumps = [speed] if speed else jumps
         faults += [line for line in jumps if not line.startswith(after)]  # across a gap an angle may jump
         remarks += _oddities(sensor, values)
+    for stretch in pieces:
+        more, odd = _piece(stretch, machine)
+        faults += more
+        remarks += odd
     faults += against(machine, readings)
     if readings or not found.keys().isdisjoint(table.columns):
         faults += absent
@@ -139,11 +147,16 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         remarks.append(f"not used: {', '.join(unknown)}")
     if line := log.too_short(len(table), machine):
         faults.append(line)
-    if not faults:  # what the piecewise look does not see
-        _caught(lambda: log.from_table(table, machine, (), ""), faults)
+    if not faults:  # what the piecewise look does not see, and what `identify` would refuse
+        caught(lambda: _ready(table, machine, remarks), faults)
     seconds = float(t[-1] - t[0]) if len(t) > 1 else np.nan
     typical = 1 / float(np.median(np.diff(t))) if len(t) > 1 and np.median(np.diff(t)) > 0 else np.nan
-    doubtful = (*contradicted, *(() if faults else doubts(machine, readings)))
+    remarks = [line for line in remarks if "that is held" not in line]
+    doubtful = (
+        *contradicted,
+        *(() if any("there twice" in r for r in remarks) else _held(table, machine)),
+        *(() if faults else doubts(machine, readings)),
+    )
     return Inspection(
         source,
         machine.name,
@@ -157,126 +170,6 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         signals,
         gaps,
     )
-
-
-def refuse(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> None:
-    """Raises LogError for what `log.check` refuses as well, where it can be told what to write instead: a column of
-    another name, time in another unit, a speed for an angle. needs: names of sensors that must be there."""
-    lacking = [
-        (f"{', '.join(missing)} ({log.what_of(s, machine)})", lookalike(missing, table, machine))
-        for s in machine.sensors("full")
-        if s.name in needs and (missing := [c for c in s.columns if c not in table.columns])
-    ]
-    if any(hint for _, hint in lacking):
-        raise LogError(f"{source}: no column {', '.join(name + hint for name, hint in lacking)}")
-    if lacking or machine.time_column not in table.columns:
-        return
-    for stray in _strays(table).values():
-        raise LogError(f"{source}: {stray}")
-    t = _caught(lambda: log.times(table, machine, source), None)
-    if t is not None and (clock := _clock(t, machine)):
-        raise LogError(f"{source}: {clock}")
-    if t is not None:
-        table = table.iloc[_unbroken(t, machine)].reset_index(drop=True)
-    for sensor in machine.sensors("full"):
-        if sensor.kind != "angle" or not set(sensor.columns) <= set(table.columns):
-            continue
-        values = _caught(lambda s=sensor: log.values_of(s, machine, table, source), None)  # type: ignore[misc]
-        if values is not None and len(values) > 1 and (speed := _speed(sensor, values, table, machine)):
-            raise LogError(f"{source}: {speed}")
-
-
-def _unbroken(t: np.ndarray, machine: Machine) -> slice:
-    """Rows of the longest stretch of times (N,) [s] without a gap: across one an angle may jump."""
-    edges = [0, *log.gap_rows(t, machine), len(t)]
-    return slice(*max(itertools.pairwise(edges), key=lambda ends: ends[1] - ends[0]))
-
-
-def _speed(sensor: Sensor, values: np.ndarray, table: pd.DataFrame, machine: Machine) -> str:
-    """What is wrong with an angle (N,) [SI] that its joint can't follow but that could be its speed, and goes with the
-    torques as if it were; "" otherwise."""
-    body, rate = machine.find(sensor.body), float(machine.sampling_hz)
-    if sensor.kind != "angle" or sensor.is_rate or sensor.factor is not None or body.joint != "revolute":
-        return ""
-    if _possible(sensor, values, machine) or np.abs(np.diff(values)).max() > TURN / 2:
-        return ""  # not unwrapped, say
-    rates = {unit: sensor.model_copy(update={"unit": unit, "counts_per_turn": None}) for unit in RATES}
-    units = [u for u, s in rates.items() if _possible(s, values * (s.gain / sensor.gain), machine)]
-    # What moves a roll is the torque of all of them.
-    pulling = [b.index for b in machine.actuated if b.contact is not None] if body.contact else [body.index]
-    there = [s for s in machine.sensors("full") if set(s.columns) <= set(table.columns)]
-    drives = [s for s in there if s.kind == "torque" and s.body in pulling]
-    torques = [_caught(lambda s=s: log.values_of(s, machine, table, ""), None) for s in drives]  # type: ignore[misc]
-    known = [u for u in torques if u is not None]
-    if not units or not is_speed(values, known, rate):
-        return ""
-    return (
-        f"column {sensor.column}: changes faster than the joint can turn, as its speed would: is it one? then"
-        f" {as_speed(units, machine)}"
-    )
-
-
-def _possible(sensor: Sensor, values: np.ndarray, machine: Machine) -> bool:
-    """Whether a joint can do what readings (N,) [SI] say."""
-    said: list[str] = []
-    _caught(lambda: log.check_values(sensor, values, float(machine.sampling_hz), machine, ""), said)
-    return not said
-
-
-def _clock(t: np.ndarray, machine: Machine) -> str:
-    """What is wrong with times (N,) [s] that are in another unit than the machine file says, "" where they aren't."""
-    typical, rate = float(np.median(np.diff(t))) if len(t) > 1 else 0.0, float(machine.sampling_hz)
-    if typical <= 0:
-        return ""
-    for unit in ("s", "ms", "us", "min"):
-        ratio = UNITS[unit][1] / UNITS[machine.time_unit][1]
-        if unit != machine.time_unit and abs(typical * rate * ratio - 1) <= CLOSE:
-            line = f'time_unit = "{unit}"'
-            return (
-                f"column {machine.time_column}: sampled at {1 / typical:.4g} Hz, the machine file says {rate:g} Hz:"
-                f" is it in {unit}? then write {line} in {own_file(machine)}"
-            )
-    return ""
-
-
-def lookalike(missing: Sequence[str], table: pd.DataFrame, machine: Machine) -> str:
-    """A question after the first of the columns that a sensor lacks: whether one that nothing uses is meant, "" where
-    none has a name like it. Numbers in a name say which joint it is: they must be the same."""
-    used = {machine.time_column, *(c for s in machine.sensor for c in s.columns)}
-    free = [c for c in map(str, table.columns) if c not in used and _digits(c) == _digits(missing[0])]
-    like = difflib.get_close_matches(missing[0], free, n=1)
-    if not like:
-        return ""
-    key = "column" if any(s.column == missing[0] for s in machine.sensor) else "return_column"
-    line = f'{key} = "{like[0]}"'
-    return f": is {like[0]} this column? rename it, or write {line} in {own_file(machine)}"
-
-
-def _digits(name: str) -> list[str]:
-    return re.findall(r"\d+", name)
-
-
-def _caught(work: Callable[[], T], faults: list[str] | None) -> T | None:
-    """The result, or None with the fault's line kept."""
-    try:
-        return work()
-    except LogError as err:
-        if faults is not None:
-            faults.append(str(err).removeprefix(": "))
-        return None
-
-
-def _strays(table: pd.DataFrame) -> dict[int, str]:
-    """Rows (from 0) that are no data, each with what is said of it: the header once more, a comment."""
-    names = [str(c) for c in table.columns]
-    found = {}
-    for k, cell in enumerate(table.iloc[:, 0].tolist() if names else ()):
-        text = cell.strip() if isinstance(cell, str) else ""
-        if text.startswith(COMMENTS) and table.iloc[k, 1:].isna().all():
-            found[k] = f"row {k + 1}: is a comment ({text[:30]!r}), not data; cut it"
-        elif text and text == names[0] and [str(c).strip() for c in table.iloc[k]] == names:
-            found[k] = f"row {k + 1}: is the header once more, not data; cut it"
-    return found
 
 
 def _units(table: pd.DataFrame, machine: Machine) -> tuple[list[str], list[str]]:
@@ -332,31 +225,76 @@ def _column(
     return Column(name, what, unit, low, high, int(bad.sum())), fault
 
 
-def _time(table: pd.DataFrame, machine: Machine, faults: list[str]) -> tuple[np.ndarray, tuple[float, ...]]:
-    """The times [s], empty where they can't be read, and where gaps begin [s]."""
-    name, rate = machine.time_column, float(machine.sampling_hz)
-    if name not in table.columns:
-        faults.append(f"no column {name} (time)")
+def _pieces(table: pd.DataFrame, machine: Machine) -> list[Stretch]:
+    """The even stretches of a log whose rows are uneven, have gaps or begin anew; none of an even log."""
+    read = caught(lambda: read_stretches(table, machine), None)
+    if read is None or (len(read[0]) == 1 and not read[0][0].interpolated and len(read[0][0].table) == len(table)):
+        return []
+    return read[0]
+
+
+def _piece(stretch: Stretch, machine: Machine) -> tuple[list[str], list[str]]:
+    """Faults and remarks of one even stretch, sensor by sensor."""
+    faults, remarks = list[str](), list[str]()
+    for sensor in machine.sensors("full"):
+        if not set(sensor.columns) <= set(stretch.table.columns):
+            continue
+        values = caught(lambda s=sensor: log.values_of(s, machine, stretch.table, ""), faults)  # type: ignore[misc]
+        if values is None:
+            continue
+        caught(lambda s=sensor, v=values: log.check_values(s, v, stretch.rate, machine, ""), faults)  # type: ignore[misc]
+        remarks += _oddities(sensor, values)
+    where = f"from row {stretch.first_row + 1}: " if stretch.first_row else ""
+    return [where + line for line in faults], [where + line for line in remarks]
+
+
+def _held(table: pd.DataFrame, machine: Machine) -> list[str]:
+    """A line for each channel that changes in every n-th row only."""
+    lines = []
+    for sensor in machine.sensors("full"):
+        if sensor.column not in table.columns or sensor.resolution is not None:
+            continue
+        x = pd.to_numeric(table[sensor.column], errors="coerce").dropna().to_numpy(dtype=float)
+        if (n := held_every(x)) > 1:
+            lines.append(
+                f"column {sensor.column}: changes in every {ordinal(n)} row only: a slower signal that is held"
+            )
+    return lines
+
+
+def _ready(table: pd.DataFrame, machine: Machine, remarks: list[str]) -> None:
+    """Make a log ready as for an estimate, with notes of what is done. Raises LogError for what is refused."""
+    stretches, notes = read_stretches(table, machine)
+    remarks += [line.removeprefix("log: ") for line in notes if line.removeprefix("log: ") not in remarks]
+    for stretch in stretches:
+        one = as_log(stretch, at_rate_of(machine, stretch.rate), (), "")
+        repaired = examine(machine, one)
+        remarks += [line.removeprefix(": ") for line in repaired.notes]
+
+
+def _time(
+    table: pd.DataFrame, machine: Machine, faults: list[str], remarks: list[str], strays: bool
+) -> tuple[np.ndarray, tuple[float, ...]]:
+    """The times [s], empty where they can't be read or ordered, and where gaps begin [s]."""
+    if not has_time(table, machine):
+        faults.append(f"no column {machine.time_column} (time)")
         return np.empty(0), ()
-    t = _caught(lambda: log.times(table, machine, ""), None)
+    t = caught(lambda: seconds(table, machine, ""), None if strays else faults)
     if t is None or len(t) < 2:
         return np.empty(0), ()
-    dt = np.diff(t)
-    back = np.flatnonzero(dt <= 0)
-    if len(back):
-        rows = ", ".join(str(k + 2) for k in back[:SHOWN]) + (", ..." if len(back) > SHOWN else "")
-        faults.append(f"column {name}: time goes back or stands still {len(back)} times (rows {rows}); sort or cut it")
-    typical = float(np.median(dt))
-    wide = np.flatnonzero(dt > log.GAP * typical) if typical > 0 else np.empty(0, int)
-    if typical > 0 and abs(typical * rate - 1) <= log.OFF_RATE:
-        for k in wide[:SHOWN]:
-            faults.append(f"column {name}: a gap of {dt[k]:.4g} s in row {k + 2} (from {t[k]:g} s to {t[k + 1]:g} s)")
-        if len(wide) > SHOWN:
-            faults.append(f"column {name}: {len(wide) - SHOWN} more gaps")
-    elif clock := _clock(t, machine):
+    if clock := wrong_time_unit(t, machine):
         faults.append(clock)
-    elif typical > 0:
-        _caught(lambda: log.check_time(t, rate, name, ""), faults)
+        return t, ()
+    read = t
+    ordered = caught(lambda: order_rows(read, table, machine.time_column, ""), faults)
+    if ordered is None:
+        return t, ()
+    remarks += [line.removeprefix(": ") for line in ordered[1]]
+    if len(ordered[0]) == 1 and len(ordered[0][0].t) == len(t):
+        t = ordered[0][0].t
+    dt = np.diff(t)
+    typical = float(np.median(dt))
+    wide = np.flatnonzero(dt > BRIDGED_STEPS * typical) if typical > 0 else np.empty(0, int)
     return t, tuple(float(t[k]) for k in wide)
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,20 +12,32 @@ import pandas as pd
 from excite.errors import LogError as LogError
 from excite.logs import tables
 from excite.logs.tables import MDF_TIME, UNCLEAR
+from excite.logs.times import has_time, seconds
 from excite.model.machine import UNITS, Machine, Sensor, load_machine, shipped_machines, torque_per_pressure
 
 SHORTEST = 100  # samples: below this no filter and no estimate makes sense
 OFF_RATE = 0.02  # by which the usual rate of sampling may differ from the machine file's
+MAX_JUMP = 4.0  # times the usual largest step of an angle, from which a lasting one is a jump; chosen
 GAP = 1.5  # samples from one row to the next that leave something out
 
 
 @dataclass(frozen=True)
 class Log:
-    """Checked measurements: t (N,) [s] evenly spaced, values (N,) by sensor name [SI]."""
+    """Checked measurements: t (N,) [s] evenly spaced, values (N,) by sensor name [SI].
+
+    interpolated: rows were uneven and are readings between those of the file. sampled: by sensor name the rows (N,) at
+    which a channel slower than the log was read; the readings between are interpolated.
+    """
 
     source: str
     t: np.ndarray
     values: dict[str, np.ndarray]
+    interpolated: bool = False
+    sampled: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def readings(self, sensor: str) -> np.ndarray:
+        """The readings (M,) of a sensor at the rows where it was read."""
+        return self.values[sensor][self.sampled.get(sensor, slice(None))]
 
     def __len__(self) -> int:
         return len(self.t)
@@ -44,30 +55,32 @@ def read_log(path: str | Path, machine: Machine, needs: Sequence[str] = ()) -> L
 def table_of(path: str | Path, machine: Machine) -> pd.DataFrame:
     """The columns of a log as they are; MDF files give the machine's time column its name. Raises LogError."""
     table = tables.read_table(path)
+    wanted = {machine.time_column, *(c for s in machine.sensor for c in s.columns)}
+    missing = {c.strip().lower(): c for c in wanted if c not in table.columns}
+    table = table.rename(columns={c: missing[k] for c in table.columns if (k := str(c).strip().lower()) in missing})
     if MDF_TIME in table.columns and machine.time_column not in table.columns:
         one = UNITS[machine.time_unit][1]
         table.insert(0, machine.time_column, table[MDF_TIME] / one)
     return table
 
 
-def from_table(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> Log:
-    """A table of columns as a Log. Raises LogError."""
+def from_table(
+    table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log", t: np.ndarray | None = None
+) -> Log:
+    """Check a table of even rows and return it as a Log.
+
+    t (N,) [s]: times that are known to be even; by default those of the time column, which must be at the machine
+    file's rate. Raises LogError.
+    """
     wanted = machine.sensors("full")
-    known = [s for s in wanted if set(s.columns) <= set(table.columns)]
-    if machine.time_column not in table.columns:
-        raise LogError(
-            f"{source}: no column {machine.time_column} (time), {columns_of(table)}{looks_like(table, machine)}"
-        )
-    missing = [s for s in wanted if s.name in needs and s not in known]
-    if missing:
-        names = ", ".join(f"{c} ({what_of(s, machine)})" for s in missing for c in s.columns if c not in table.columns)
-        raise LogError(f"{source}: no column {names}, {columns_of(table)}{looks_like(table, machine)}")
-    t = times(table, machine, source)
+    known = require_columns(table, machine, needs, source)
+    given, t = t, seconds(table, machine, source) if t is None else t
     if line := too_short(len(t), machine):
         raise LogError(f"{source}: {line}")
     rate = float(machine.sampling_hz)
     values = {s.name: values_of(s, machine, table, source) for s in known}
-    check_time(t, rate, machine.time_column, source)
+    if given is None:
+        check_time(t, rate, machine.time_column, source)
     for s in known:
         check_values(s, values[s.name], rate, machine, source)
     for s in machine.sensor:
@@ -78,20 +91,27 @@ def from_table(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (),
                     f"{source}: column {s.column}: moves by {np.ptp(moved):.2g} {machine.si_unit(s)}, {machine.name}"
                     " holds it still; is this a log of another machine?"
                 )
-    return Log(source, np.arange(len(t)) / rate, values)
+    return Log(source, np.arange(len(t)) / rate if given is None else t, values)
 
 
-def times(table: pd.DataFrame, machine: Machine, source: str) -> np.ndarray:
-    """The time column (N,) [s]: numbers in the machine file's unit, or dates from the first on. Raises LogError."""
-    raw = table[machine.time_column]
-    if len(raw) and raw.dtype.kind in "OTU" and pd.to_numeric(raw, errors="coerce").isna().all():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # a format that pandas has to guess
-            raw = pd.to_datetime(raw, errors="coerce", utc=True)
-    if raw.dtype.kind == "M":
-        since = (raw - raw.iloc[0]).dt.total_seconds()
-        return numbers(pd.DataFrame({machine.time_column: since}), machine.time_column, source)
-    return UNITS[machine.time_unit][1] * numbers(table, machine.time_column, source)
+def require_columns(table: pd.DataFrame, machine: Machine, needs: Sequence[str], source: str) -> list[Sensor]:
+    """Return the sensors that a table has. Raises LogError without a time column or a sensor of `needs`."""
+    wanted = machine.sensors("full")
+    known = [s for s in wanted if set(s.columns) <= set(table.columns)]
+    if not has_time(table, machine):
+        rate = f"{float(machine.sampling_hz):g}"
+        raise LogError(
+            f"{source}: no column {machine.time_column} (time), {columns_of(table)}{looks_like(table, machine)}; if the"
+            f" rows are even, write a column {machine.time_column} with row number / rate (at {rate} Hz 0, "
+            f"{1 / float(machine.sampling_hz):g}, ...)"
+        )
+    missing = [s for s in wanted if s.name in needs and s not in known]
+    if missing:
+        names = ", ".join(f"{c} ({what_of(s, machine)})" for s in missing for c in s.columns if c not in table.columns)
+        kit = without_optional(table, machine)
+        read = "".join(f"; {line}" for line in table.attrs.get("notes", ()))
+        raise LogError(f"{source}: no column {names}, {columns_of(table)}{read}{kit or looks_like(table, machine)}")
+    return known
 
 
 def values_of(sensor: Sensor, machine: Machine, table: pd.DataFrame, source: str) -> np.ndarray:
@@ -140,9 +160,14 @@ def numbers(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
     return values
 
 
+def fewest_rows(machine: Machine) -> int:
+    """The fewest rows of which an estimate can be made."""
+    return max(SHORTEST, sum(machine.filter.drop) + 12 * machine.filter.decimation)
+
+
 def too_short(rows: int, machine: Machine) -> str:
     """What is said of a log of so few rows that nothing can be made of it, "" otherwise."""
-    least = max(SHORTEST, sum(machine.filter.drop) + 12 * machine.filter.decimation)
+    least = fewest_rows(machine)
     return f"only {rows} rows, at least {least} are needed: is the file complete?" if rows < least else ""
 
 
@@ -204,6 +229,15 @@ def check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Machi
                 " unwrap it (encoder angles are counted on) or cut the log there"
             )
         fastest = _fastest(sensor, machine)
+        usual = max(float(np.quantile(step, 0.999)), 0.0 if fastest is None else fastest / rate)
+        jumps = np.flatnonzero(step > MAX_JUMP * usual + MAX_JUMP * (sensor.resolution or 0.0))
+        lasting = [j for j in jumps.tolist() if abs(values[min(j + 2, len(values) - 1)] - values[j]) > step[j] / 2]
+        if lasting and usual > 0 and len(lasting) < 0.001 * len(step) + 1:
+            j = int(lasting[0])
+            raise LogError(
+                f"{source}: row {j + 2}, column {sensor.column}: jumps by {step[j]:.3g} rad in one sample, the machine"
+                f" turns at most {usual:.2g} rad in it: an encoder that was reset? cut the log there"
+            )
         if fastest is not None and step[k] * rate > 5 * fastest and np.percentile(step, 99) * rate > 3 * fastest:
             raise LogError(
                 f"{source}: column {sensor.column}: turns at {np.percentile(step, 99) * rate:.3g} rad/s, the machine"
@@ -248,10 +282,14 @@ def columns_of(table: pd.DataFrame) -> str:
     return f"the file has {shown}"
 
 
+def without_optional(table: pd.DataFrame, machine: Machine) -> str:
+    """Advice where only sensors are missing that joint smoothing does without."""
+    paper = {s.column for s in machine.sensors("paper")}
+    return "; without it --method joint works" if paper <= {str(c) for c in table.columns} else ""
+
+
 def looks_like(table: pd.DataFrame, machine: Machine) -> str:
     """A shipped machine whose log this looks like."""
-    if {s.column for s in machine.sensors("paper")} <= {str(c) for c in table.columns}:
-        return "; without it --method joint works"
     for name in shipped_machines():
         if name == machine.name:
             continue

@@ -40,8 +40,11 @@ SMALL, LARGE, REFUSED = 0.01, 3.0, 10.0  # times the drive's limit; more than th
 THOUSAND = {"N m": "kN m", "Nm": "kNm", "N": "kN", "Pa": "kPa", "kPa": "MPa"}
 
 
-def doubts(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[str, ...]:
-    """A line for everything that is doubtful about readings (N,) by sensor name [SI], evenly sampled."""
+def doubts(machine: Machine, values: Mapping[str, np.ndarray], interpolated: bool = False) -> tuple[str, ...]:
+    """Return a line for everything that is doubtful about readings (N,) by sensor name [SI], evenly sampled.
+
+    interpolated: readings that stand between counts are expected.
+    """
     found = {(s.kind, s.body): s for s in machine.sensors("full") if s.name in values}
     driven = [b for b in machine.actuated if ("angle", b.index) in found and ("torque", b.index) in found]
     angles = {b.index: found["angle", b.index] for b in driven}
@@ -49,7 +52,7 @@ def doubts(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[str, ...
     rate = float(machine.sampling_hz)
     position = {i: np.cumsum(values[s.name]) / rate if s.is_rate else values[s.name] for i, s in angles.items()}
     moved = [b for b in driven if np.ptp(position[b.index]) > MOVED]
-    counted = [s for s in machine.sensors("full") if s.name in values and s.resolution is not None]
+    counted = [s for s in machine.sensors("full") if s.name in values and s.resolution is not None and not interpolated]
     counts = {s.name: line for s in counted if (line := _counts(s, machine, values[s.name]))}
     scales = (_scale(torques[b.index], b, machine, values[torques[b.index].name]) for b in moved)
     dead = _dead(machine, values)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from excite.errors import LogError
 from excite.logs.log import Log
 from excite.logs.plausibility import doubts
-from excite.model import Model
-from excite.model.machine import Sensor
+from excite.model.machine import Machine, Sensor
 
 SPIKE = 10.0  # robust deviations from the neighbours that make an outlier
 STEPS = 8.0  # counts, likewise
@@ -34,7 +33,7 @@ class Examination:
     doubts: tuple[str, ...] = ()
 
 
-def examine(model: Model, log: Log) -> Examination:
+def examine(machine: Machine, log: Log) -> Examination:
     """Spikes of a single sample are replaced by the mean of their neighbours, with a note; drop-outs are noted.
 
     Raises LogError where a channel has more spikes than repair can answer for, or a drop-out in which the machine moves
@@ -44,7 +43,7 @@ def examine(model: Model, log: Log) -> Examination:
     notes: list[str] = []
     spikes: dict[str, tuple[int, ...]] = {}
     dropouts: dict[str, tuple[tuple[int, int], ...]] = {}
-    for sensor in model.machine.sensors("full"):
+    for sensor in machine.sensors("full"):
         if sensor.name not in values:
             continue
         rows = find_spikes(sensor, values[sensor.name])
@@ -62,7 +61,7 @@ def examine(model: Model, log: Log) -> Examination:
             shown = ", ".join(str(r + 1) for r in rows[:5]) + (", ..." if len(rows) > 5 else "")
             notes.append(
                 f"{log.source}: column {sensor.column}: {len(rows)} spike{'s' if len(rows) > 1 else ''} of up to"
-                f" {size:.3g} {model.machine.si_unit(sensor)} replaced by the mean of the neighbours (row {shown})"
+                f" {size:.3g} {machine.si_unit(sensor)} replaced by the mean of the neighbours (row {shown})"
             )
         held = find_dropouts(sensor, values[sensor.name])
         if held:
@@ -78,8 +77,8 @@ def examine(model: Model, log: Log) -> Examination:
                 )
                 raise LogError(f"{text}; {rest}")
             notes.append(f"{text}: what is in between counts as measured")
-    doubtful = tuple(f"{log.source}: {line}" for line in doubts(model.machine, values))
-    return Examination(Log(log.source, log.t, values), tuple(notes), spikes, dropouts, doubtful)
+    doubtful = tuple(f"{log.source}: {line}" for line in doubts(machine, values, log.interpolated))
+    return Examination(replace(log, values=values), tuple(notes), spikes, dropouts, doubtful)
 
 
 def find_spikes(sensor: Sensor, x: np.ndarray) -> np.ndarray:
@@ -107,9 +106,9 @@ def find_spikes(sensor: Sensor, x: np.ndarray) -> np.ndarray:
     return np.array(alone, int)
 
 
-def moves(model: Model, log: Log) -> bool:
+def moves(machine: Machine, log: Log) -> bool:
     """Whether any angle goes further than a count or two; taken for granted where one isn't counted."""
-    turning = [s for s in model.machine.sensors("full") if s.kind in ("angle", "wheel") and s.name in log.values]
+    turning = [s for s in machine.sensors("full") if s.kind in ("angle", "wheel") and s.name in log.values]
     return any(s.resolution is None or np.ptp(log.values[s.name]) > 2.5 * s.resolution for s in turning)
 
 

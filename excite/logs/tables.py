@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import gzip
 import io
 import re
 import warnings
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +20,8 @@ from excite.model.machine import UNITS
 
 SEPARATORS = ("\t", ";", ",", "|")
 ENCODINGS = ("utf-8-sig", "cp1252")  # the second reads any byte: what European loggers write
+BLANK = " "  # columns between blanks, as numpy.savetxt and MATLAB's -ascii write them
+MAX_METADATA_LINES = 60  # lines above the header
 COMMENTS = ("#", "%")
 COMMA = re.compile(r"\s*[+-]?(?:\d*|\d{1,3}(?:\.\d{3})+),\d+(?:[eE][+-]?\d+)?\s*")  # perhaps with points: 1.238,5
 THOUSANDS = re.compile(r"\s*[+-]?\d{1,3}(?:\.\d{3}){2,}\s*")  # 1.238.500
@@ -50,13 +54,19 @@ def read_table(path: str | Path) -> pd.DataFrame:
 def _csv(path: Path) -> pd.DataFrame:
     """Any of the usual separators, decimal commas, lines of comment before the header, a line of units below it, which
     are kept by column in attrs["units"]."""
-    lines = _text(path).split("\n")
+    notes: list[str] = []
+    lines = _text(path, notes).split("\n")
     head = next((k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith(COMMENTS)), None)
     if head is None:
         raise LogError(f"{path}: the file is empty, there is no header with the names of columns")
     if lines[head].strip().lower().startswith("sep="):
         head += 1
+    head = _find_header(lines, head, notes)
     separator = _separator(lines[head])
+    if separator == BLANK:
+        lines = [",".join(line.replace(",", ".").split()) for line in lines]
+        separator = ","
+    _drop_cut_row(lines, head, separator, notes)
     header = _header(path, lines, head, separator)
     start = next((k for k in range(head + 1, len(lines)) if lines[k].strip()), len(lines))
     below = _row(path, lines, start, separator) if start < len(lines) else []
@@ -91,8 +101,65 @@ def _csv(path: Path) -> pd.DataFrame:
         if comma:
             table[name], unclear[name] = _without_commas(table[name], comma)
         table[name] = _dates(table[name])
-    table.attrs |= {"units": units, UNCLEAR: unclear}
+    table.attrs |= {"units": units, UNCLEAR: unclear, "notes": notes}
     return table
+
+
+def _find_header(lines: list[str], first: int, notes: list[str]) -> int:
+    """The line (from 0) with the names of the columns; metadata may stand above it, a comment sign in front of it.
+
+    first: the first line that is neither empty nor a comment.
+    """
+    ahead = range(first, min(first + MAX_METADATA_LINES, len(lines)))
+    numbers = next((k for k in ahead if _is_data(lines[k])), None)
+    if numbers is None:
+        return first
+    width = len(lines[numbers].split(_separator(lines[numbers])))
+    if width < 2 and _separator(lines[numbers]) != BLANK:
+        return first
+    found, best = None, None
+    for k in range(numbers - 1, -1, -1):
+        bare = lines[k].lstrip().lstrip("".join(COMMENTS)).strip()
+        blank = _separator(lines[numbers]) == BLANK
+        cells = [c.strip() for c in (bare.split() if blank else bare.split(_separator(bare)))]
+        if len(cells) != width or any(_numeric(c) for c in cells):
+            break
+        found = k
+        if len(set(cells)) == width and all(cells):
+            best = k
+    head = best if best is not None else found
+    if head is None or (head >= first and not lines[head].lstrip().startswith(COMMENTS)):
+        return first if head is None else head
+    if lines[head].lstrip().startswith(COMMENTS):
+        if any(_is_names(lines[k], width) for k in range(first, numbers)):
+            return first  # a header of its own stands below the comments
+        notes.append(f"line {head + 1}: the header was taken from a comment")
+        lines[head] = lines[head].lstrip().lstrip("".join(COMMENTS)).strip()
+    return head
+
+
+def _is_names(line: str, width: int) -> bool:
+    """Tell if a line has as many names as the rows have cells."""
+    cells = [c.strip() for c in line.split(_separator(line))]
+    return len(cells) == width and not any(_numeric(c) for c in cells) and not line.lstrip().startswith(COMMENTS)
+
+
+def _is_data(line: str) -> bool:
+    """Tell if a line is one of numbers."""
+    separator = _separator(line)
+    cells = line.split() if separator == BLANK else line.split(separator)
+    return bool(cells) and sum(_numeric(c) for c in cells) > len(cells) / 2
+
+
+def _drop_cut_row(lines: list[str], head: int, separator: str, notes: list[str]) -> None:
+    """Leave out a last row that has fewer cells than the header: the logger was stopped in it."""
+    last = len(lines) - 1
+    while last > head and not lines[last].strip():
+        last -= 1
+    width = lines[head].count(separator)
+    if last > head + 1 and lines[last].count(separator) < width and lines[last - 1].count(separator) >= width:
+        notes.append(f"line {last + 1}: the last row is cut short, left out")
+        del lines[last:]
 
 
 def _row(path: Path, lines: list[str], k: int, separator: str) -> list[str]:
@@ -189,12 +256,22 @@ def _dates(column: pd.Series) -> pd.Series:
     return column
 
 
-def _text(path: Path) -> str:
+def _text(path: Path, notes: list[str]) -> str:
+    """Read a file as text; what was left out is added to the notes. Raises LogError."""
     try:
         raw = path.read_bytes()
     except OSError as err:
         raise LogError(f"{path}: can't be read: {err.strerror}") from None
+    if path.suffix.lower() == ".gz":
+        try:
+            raw = gzip.decompress(raw)
+        except (OSError, EOFError, zlib.error) as err:
+            raise LogError(f"{path}: not a gzip file that can be read: {err}") from None
     encodings = ("utf-16",) if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else ENCODINGS
+    if encodings is ENCODINGS and raw.endswith(b"\x00"):
+        whole = raw.rstrip(b"\x00")
+        notes.append(f"ends in {len(raw) - len(whole)} zero bytes (the logger lost power?), read up to them")
+        raw = whole
     for encoding in encodings:
         try:
             text = raw.decode(encoding)
@@ -207,9 +284,12 @@ def _text(path: Path) -> str:
 
 
 def _separator(header: str) -> str:
+    """The separator of a line: one of the usual ones, BLANK where words stand between blanks only."""
     counts = {s: header.count(s) for s in SEPARATORS}
     best = max(SEPARATORS, key=lambda s: counts[s])
-    return best if counts[best] else ","
+    if counts[best]:
+        return best
+    return BLANK if len(header.split()) > 2 else ","
 
 
 def _cells(lines: list[str], start: int, separator: str) -> list[str]:
@@ -228,9 +308,10 @@ def _numeric_below(lines: list[str], start: int, separator: str) -> bool:
 
 def _parquet(path: Path) -> pd.DataFrame:
     try:
-        return pd.read_parquet(path)
+        table = pd.read_parquet(path)
     except Exception as err:  # what the parsers of these formats raise on damaged bytes is anything at all
         raise LogError(f"{path}: not a Parquet file: {' '.join(str(err).split())[:120]}") from None
+    return table.reset_index() if table.index.name is not None else table
 
 
 def _mat(path: Path) -> pd.DataFrame:
@@ -251,11 +332,13 @@ def _mat(path: Path) -> pd.DataFrame:
     }
     if not columns:
         raise LogError(f"{path}: holds no columns of numbers")
-    lengths = {k: len(v) for k, v in columns.items()}
-    if len(set(lengths.values())) > 1:
-        listed = ", ".join(f"{k} {n}" for k, n in lengths.items())
-        raise LogError(f"{path}: the variables have different lengths ({listed}), they must be one table")
-    return pd.DataFrame(columns)
+    lengths = [len(v) for v in columns.values()]
+    usual = max(set(lengths), key=lambda n: (lengths.count(n), n))
+    others = [k for k, v in columns.items() if len(v) != usual]
+    table = pd.DataFrame({k: v for k, v in columns.items() if len(v) == usual})
+    if others:
+        table.attrs["notes"] = [f"variables of another length are not used: {', '.join(others)}"]
+    return table
 
 
 def _mdf(path: Path) -> pd.DataFrame:
@@ -282,6 +365,7 @@ READERS: dict[str, Callable[[Path], pd.DataFrame]] = {
     ".mat": _mat,
     ".txt": _csv,
     ".tsv": _csv,
+    ".gz": _csv,
     ".mf4": _mdf,
     ".mdf": _mdf,
 }

@@ -118,7 +118,9 @@ def prepare_measurements(space: StateSpace, log: Log, unbiased: bool = False) ->
         count_size = sensor.resolution
         reading[:, j] = value
         if count_size is None:
-            sigma[j] = max(white_noise(value), 1e-9 + 1e-3 * float(sensor.noise or 0))
+            sigma[j] = max(white_noise(log.readings(sensor.name)), 1e-9 + 1e-3 * float(sensor.noise or 0))
+            if sensor.name in log.sampled:
+                used[:, j] = log.sampled[sensor.name]
             continue
         sigma[j] = count_size
         counts = np.round(value / count_size)
@@ -129,8 +131,13 @@ def prepare_measurements(space: StateSpace, log: Log, unbiased: bool = False) ->
         change = np.diff(counts, prepend=counts[0])
         reading[:, j] = (counts + (change < 0)) * count_size
         used[:, j] = change != 0
+    # Torques interpolated over k rows err alike in all of them: as much as white noise that is sqrt(k) times as large.
+    rows_per_reading = [N / max(len(log.readings(s.name)), 1) for s in torques]
     torque_noise = np.array(
-        [max(white_noise(u), 1e-3 * float(s.noise or 1)) for u, s in zip(torque.T, torques, strict=True)]
+        [
+            np.sqrt(k) * max(white_noise(log.readings(s.name)), 1e-3 * float(s.noise or 1))
+            for k, s in zip(rows_per_reading, torques, strict=True)
+        ]
     )
     return Measurements(
         torque,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,8 @@ from excite import identification, logs, operator, simulation, text as wording, 
 from excite.errors import MachineError
 from excite.model import Model, build, effects
 from excite.model.machine import EffectEntry, Problem
-from excite.operator import Phased
-from excite.trajectories import Aim, Design, design
+from excite.operator import PhasedDrive
+from excite.trajectories import CompositeObjective, Design, design
 
 POOR_PERCENT = 5.0  # attainable standard deviation [%] above which the summary gives advice; chosen
 ROBUST_MACHINES = 5  # machines of a robust design; chosen
@@ -62,9 +62,9 @@ class DesignResult:
     """
 
     model: Model
-    aim: Aim
+    aim: CompositeObjective
     design: Design
-    phased: Phased | None = None
+    phased: PhasedDrive | None = None
 
 
 def add_rival_effects(model: Model, between: tuple[str, ...], duration: float) -> Model:
@@ -86,8 +86,8 @@ def with_rivals(model: Model, rivals: Sequence[EffectEntry]) -> Model:
     for e in both.effects[-2:]:
         if e.name not in both.base.names:
             raise MachineError(
-                f"effect {e.name}: no equation of motion shows its amount at once (it sits in a sensor, or acts through"
-                " what it remembers), so no drive can be designed for it by the regressor"
+                f"effect {e.name}: no equation of motion shows its magnitude at once (it sits in a sensor, or acts"
+                " through its memory), so no drive can be designed for it by the regressor"
             )
     return both
 
@@ -113,22 +113,21 @@ def design_from(
     """Design a drive for a model and a problem as requested.
 
     Raises MachineError for sensors of unknown noise, UndrivableError for a drive that no person can follow, and the
-    errors of `trajectories.design`, `logs.read_log` and `identification.identify`.
+    errors of `trajectories.design`, `logs.prepare` and `identification.identify`.
     """
     if request.driver:
-        operator.check(model, problem, request.phase_min_s)
+        operator.check_phase_length(model, problem, request.phase_min_s)
     require_noise_figures(model)
     prior = None
     if request.after:
         needs = identification.needed_sensors(model, "joint")
-        known = identification.prior_from_logs(
-            model, [logs.read_log(path, model.machine, needs) for path in request.after]
-        )
-        model, prior = known.model, known.information
+        ready = logs.prepare(model, list(request.after), needs)
+        known = identification.prior_from_logs(ready.model, ready.logs)
+        model, prior = replace(known.model, machine=model.machine), known.information
     machines = (
         simulation.perturbed_machines(model, ROBUST_MACHINES, ROBUST_SPREAD, request.seed) if request.robust else ()
     )
-    aim = trajectories.aim(model, request.objective, request.sigma_max, prior, machines)
+    aim = trajectories.compose_objective(model, request.objective, request.sigma_max, prior, machines)
     if not request.driver:
         return DesignResult(
             model, aim, design(model, problem, aim, request.starts, request.seed, request.budget_s, progress)
@@ -140,7 +139,9 @@ def design_from(
     def out_of_time() -> bool:
         return request.budget_s is not None and time.time() > begin + request.budget_s
 
-    made = operator.phased(model, problem, aim, free.motion, request.phase_min_s, request.seed, out_of_time, progress)
+    made = operator.design_phases(
+        model, problem, aim, free.motion, request.phase_min_s, request.seed, out_of_time, progress
+    )
     return DesignResult(model, aim, operator.as_design(model, problem, free, made), made)
 
 
@@ -181,12 +182,12 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
     return summary
 
 
-def _by_hand(request: DesignRequest, aim: Aim, made: Phased) -> dict[str, Any]:
+def _by_hand(request: DesignRequest, aim: CompositeObjective, made: PhasedDrive) -> dict[str, Any]:
     """Summarise a design for people: phases, scores of three ways of driving, limits that people exceed."""
     ways = ("played_back", "smoothed", "by_hand")
     scores = {
         way: {
-            "score": trajectories.reported(aim.name, score),
+            "score": trajectories.reported_value(aim.name, score),
             "cond_phi": attained.cond_phi,
             "worst_parameter": attained.worst,
             "worst_percent": attained.worst_percent,
@@ -208,7 +209,7 @@ def advice(request: DesignRequest, worst: str, percent: float) -> str | None:
     """Return what to do about a poorly identifiable parameter, None if all are below POOR_PERCENT."""
     if percent <= POOR_PERCENT:
         return None
-    condition_only = trajectories.conditions(request.objective) and request.sigma_max is None
+    condition_only = trajectories.is_condition_number(request.objective) and request.sigma_max is None
     poor = f"{worst} can't be found better than {wording.format_percent(percent)}"
     if not condition_only:
         return f"poor accuracy: {poor}; drive longer, or on more room"

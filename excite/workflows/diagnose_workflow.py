@@ -12,7 +12,7 @@ from excite import diagnosis, identification, reports
 from excite.diagnosis import Account, Diagnosis, Rivals, forked
 from excite.errors import InfeasibleError, MachineError, NotIdentifiableError, SimulationError
 from excite.identification import FILTERS
-from excite.logs import Log, doubts_in_errors, examine, moves, read_stretches
+from excite.logs import Log, doubts_in_errors, examine, moves, prepare
 from excite.model import Model, build
 from excite.model.machine import Filter, Machine
 from excite.workflows import design_request, design_workflow, requests
@@ -35,10 +35,10 @@ class PreparedLogs:
 
 
 def _prepare_logs(model: Model, logs: Sequence[Log], filtering: str) -> PreparedLogs:
-    examined = [examine(model, one) for one in logs]
+    examined = [examine(model.machine, one) for one in logs]
     repaired = [e.log for e in examined]
     doubts = [line for e in examined for line in e.doubts]
-    if not any(moves(model, one) for one in repaired):
+    if not any(moves(model.machine, one) for one in repaired):
         sources = ", ".join(one.source for one in repaired)
         raise NotIdentifiableError(f"{sources}: nothing moves, which shows no cause; give a log of a drive as well")
     chosen, reason = FILTERS[filtering](model, repaired)
@@ -77,12 +77,13 @@ def diagnose(
             return lambda share, what: advance(round(1000 * (begin + share * (end - begin))), 1000, None)
 
         needs = identification.needed_sensors(model, "joint")
-        read, notes = read_stretches(logs, model.machine, needs)
-        prepared = _prepare_logs(model, read, filtering)
+        ready = prepare(model, logs, needs)
+        model, notes = ready.model, ready.notes
+        prepared = _prepare_logs(model, ready.logs, filtering)
         with doubts_in_errors(prepared.doubts):
             found = diagnosis.diagnose(model, prepared.logs, prepared.filter, report_share(0.0, DIAGNOSE_SHARE), forked)
         title = model.machine.title
-        drawings = reports.drawings(place, found, title)
+        drawings = reports.figure_calls(place, found, title)
         account = diagnosis.account(found, report_share(DIAGNOSE_SHARE, 1.0), forked, drawings)
         text = diagnosis.machine_file(machine, model.machine, found)
         if text is not None:

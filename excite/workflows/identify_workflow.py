@@ -12,7 +12,7 @@ import numpy as np
 from excite import identification, reports
 from excite.errors import SimulationError
 from excite.identification import FILTERS, Estimate, describe_late_channels
-from excite.logs import Log, examine, read_stretches
+from excite.logs import Log, examine, prepare
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Filter
 from excite.workflows import requests
@@ -35,7 +35,7 @@ def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str
     """
     chosen, reason = FILTERS[filtering](model, logs)
     estimate = identification.identify(model, logs, method, chosen)
-    used = [examine(model, one).log for one in logs]
+    used = [examine(model.machine, one).log for one in logs]
     if model.slips and identification.METHODS[method].biased:
         estimate = identification.add_bias(model, used, estimate, chosen)
     found = estimate.value if estimate.method == "joint" and np.isfinite(estimate.value).all() else None
@@ -62,13 +62,16 @@ def identify(
     model = requests.build_model(machine)
     method = requests.choose_method(method, model)
     needs = identification.needed_sensors(model, method)
-    read, cut = read_stretches(logs, model.machine, needs)
-    others, others_cut = read_stretches(validate, model.machine, needs, "validated on")
-    examined = [examine(model, one) for one in others]
+    ready = prepare(model, logs, needs)
+    model, cut = ready.model, ready.notes
+    others = (
+        prepare(model, validate, needs, "validated on", rate=float(model.machine.sampling_hz)) if validate else None
+    )
+    examined = [examine(model.machine, one) for one in others.logs] if others else []
     unfitted = [e.log for e in examined]
-    more_notes = [*others_cut, *(line for e in examined for line in (*e.notes, *e.doubts))]
+    more_notes = [*(others.notes if others else ()), *(line for e in examined for line in (*e.notes, *e.doubts))]
     with bar("identifying"):
-        found = identify_from(model, read, method, filtering)
+        found = identify_from(model, ready.logs, method, filtering)
     read, estimate, chosen = found.logs, found.estimate, found.filter
     summary = {
         "machine": model.machine.name,

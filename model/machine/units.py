@@ -49,7 +49,9 @@ UNITS: dict[str, tuple[str, float]] = {
     "s": ("time", 1.0),
     "ms": ("time", 1e-3),
     "us": ("time", 1e-6),
+    "ns": ("time", 1e-9),
     "min": ("time", 60.0),
+    "day": ("time", 86400.0),
 }
 
 # kind of sensor -> quantities its column may hold; the rate of an angle is a reading of its own

@@ -17,7 +17,7 @@ from support.commands import Excite
 from support.drives import designed, gentle
 from support.logs import calm, logged, make_log, slope
 
-from excite import smoothing
+from excite import diagnosis as package, smoothing
 from excite.diagnosis import (
     Rivals,
     diagnosis,
@@ -499,7 +499,7 @@ def test_every_log_is_drawn(straight: Model, tmp_path: Path, monkeypatch: pytest
     for after, asked in ((without, []), (beside, [without, beside])):
         loosened.clear()
         d: Any = SimpleNamespace(before=without, after=after, stages=(after,))
-        for draw in diagnosis_figures.drawings(tmp_path, d, "a roller"):
+        for draw in diagnosis_figures.figure_calls(tmp_path, d, "a roller"):
             draw()
         assert all(a is b for a, b in zip(loosened, asked, strict=True))
         drawn = {p.name for p in tmp_path.iterdir()}
@@ -916,7 +916,7 @@ def test_what_an_effect_must_gain_to_be_worth_a_place(
     and where the model isn't near the log yet a further one as much. Of what another gained: what its formula is off
     by, the more where that looks at a map of the ground."""
     monkeypatch.setattr(selection, "_sureness", lambda stage: 0.0)
-    known = SimpleNamespace(name="a@b", mapped=mapped)
+    known = SimpleNamespace(name="a@b", uses_map=mapped)
     stage: Any = SimpleNamespace(
         model=SimpleNamespace(effects=[known]),
         fit=SimpleNamespace(process_noise=forces),
@@ -961,8 +961,8 @@ def test_what_is_followed_with_coarse_sensors_only_is_named(
     assert told.whole.interval[0] > 50
     assert told.located == ()
     assert all(np.isnan(row["std_before"]) and row["moved"] is None for row in findings.parameters(d).values())
-    monkeypatch.setattr(diagnose_workflow, "diagnose", lambda *args: d)
-    said, _ = diagnose_workflow.diagnose(tmp_path, "va12_straight", straight, [sloping], "machine", lambda *a: None)
+    monkeypatch.setattr(package, "diagnose", lambda *args: d)
+    said = diagnose_workflow.diagnose(tmp_path, "va12_straight", [sloping])
     assert any(f"fitted to sensors taken for {followed:g} times as noisy" in note for note in said["notes"])
     # Innovations are held against the sensors' true noise, not that of coarse ones.
     assert max(size.slow for size in told.before.values()) > 20

@@ -173,7 +173,7 @@ def test_log_check_doubts_and_ends_with_0(va12: Model, va12_motion: Motion, tmp_
     table.assign(u2_Nm=-table["u2_Nm"]).to_csv(tmp_path / "log.csv", index=False)
     code, stdout, _ = excite("log", "check", tmp_path / "log.csv", "--out", tmp_path / "out")
     assert code == 0
-    assert "doubtful: the torque u2_Nm does more work against theta2_rad's motion than with it" in " ".join(
+    assert "Doubtful: the torque u2_Nm does more work against theta2_rad's motion than with it" in " ".join(
         stdout.split()
     )
     assert len(json.loads((tmp_path / "out" / "summary.json").read_text())["doubts"]) == 1

@@ -11,7 +11,7 @@ from support.drives import designed
 from support.logs import make_log
 
 from excite.errors import LogError
-from excite.identification import estimate_delays, filter_choice, methods
+from excite.identification import delays, filter_choice, methods
 from excite.logs import Log, log, repair
 from excite.model import Model
 from excite.simulation import Motion
@@ -32,17 +32,17 @@ def test_clean_logs_are_left_alone(
     for seed in range(5):
         for model, motion in ((straight, straight_motion), (va12, va12_motion)):
             one = make_log(model, motion, seed=seed, noise=seed > 0)
-            found = repair.examine(model, one)
+            found = repair.examine(model.machine, one)
             assert (found.notes, found.spikes, found.dropouts) == ((), {}, {})
             assert all((found.log.values[k] == v).all() for k, v in one.values.items())
-    assert repair.examine(emps, log.read_log(emps_data, emps.machine)).notes == ()
+    assert repair.examine(emps.machine, log.read_log(emps_data, emps.machine)).notes == ()
 
 
 @pytest.mark.parametrize(("name", "size"), [("u1", 900.0), ("theta1", 0.05), ("thetal", -0.02)])
 def test_spikes_are_repaired_and_named(straight: Model, clean: Log, name: str, size: float) -> None:
     x = clean.values[name].copy()
     x[[700, 2100]] += size
-    found = repair.examine(straight, changed(clean, name, x))
+    found = repair.examine(straight.machine, changed(clean, name, x))
     assert found.spikes == {name: (700, 2100)}
     assert "2 spikes" in found.notes[0]
     assert "row 701, 2101" in found.notes[0]
@@ -65,33 +65,33 @@ def test_too_many_spikes_are_refused(straight: Model, clean: Log) -> None:
     x = clean.values["u4"].copy()
     x[100:3900:40] += 2000
     with pytest.raises(LogError, match=r"u4_Nm: 95 spikes.*too many to repair"):
-        repair.examine(straight, changed(clean, "u4", x))
+        repair.examine(straight.machine, changed(clean, "u4", x))
 
 
 def test_a_step_is_no_spike(straight: Model, clean: Log) -> None:
     x = clean.values["u1"].copy()
     x[2000:] += 3000
-    assert repair.examine(straight, changed(clean, "u1", x)).spikes == {}
+    assert repair.examine(straight.machine, changed(clean, "u1", x)).spikes == {}
 
 
 @pytest.mark.parametrize("frequency", [12.0, 25.0, 100 / 3, 45.0])
 def test_vibration_is_no_spike(straight: Model, clean: Log, frequency: float) -> None:
     x = clean.values["u1"].copy()
     x[1000:2000] += 1500 * np.sin(2 * np.pi * frequency * clean.t[1000:2000] + 0.3)
-    assert len(repair.examine(straight, changed(clean, "u1", x)).spikes.get("u1", ())) <= 1
+    assert len(repair.examine(straight.machine, changed(clean, "u1", x)).spikes.get("u1", ())) <= 1
 
 
 def test_dropouts_are_found(straight: Model, straight_motion: Motion, clean: Log) -> None:
     x = clean.values["u1"].copy()
     x[1500:1530] = x[1500]
-    found = repair.examine(straight, changed(clean, "u1", x))
+    found = repair.examine(straight.machine, changed(clean, "u1", x))
     assert found.dropouts == {"u1": ((1500, 1529),)}
     assert "stands still from row 1501 to 1530" in found.notes[0]
     fast = int(np.argmax(np.abs(straight_motion.nu[:, 1])))
     y = clean.values["theta1"].copy()
     y[fast : fast + 30] = y[fast]
     with pytest.raises(LogError, match=r"theta1_rad: 1 drop-out.*two logs"):
-        repair.examine(straight, changed(clean, "theta1", y))
+        repair.examine(straight.machine, changed(clean, "theta1", y))
 
 
 def test_a_jump_after_standing_still_is_a_dropout(straight: Model, straight_motion: Motion, clean: Log) -> None:
@@ -101,7 +101,7 @@ def test_a_jump_after_standing_still_is_a_dropout(straight: Model, straight_moti
     y = clean.values["theta1"].copy()
     y[slow : slow + 100] = y[slow]
     with pytest.raises(LogError, match=rf"theta1_rad: 1 drop-out.*row {slow + 1} to {slow + 100} "):
-        repair.examine(straight, changed(clean, "theta1", y))
+        repair.examine(straight.machine, changed(clean, "theta1", y))
 
 
 @pytest.mark.parametrize(("name", "column"), [("u1", "u1_Nm"), ("theta1", "theta1_rad"), ("thetal", "thetal_rad")])
@@ -113,7 +113,7 @@ def test_a_channel_that_dies_is_told_from_then_on(
     x = clean.values[name].copy()
     x[dies:] = x[dies]
     with pytest.raises(LogError, match=rf"{column}: 1 drop-out.* row {dies + 1} to {len(x)} .*; cut the log there"):
-        repair.examine(straight, changed(clean, name, x))
+        repair.examine(straight.machine, changed(clean, name, x))
     coasts, rests = np.cumsum(0.98 ** np.arange(800)), dict(clean.values)
     for sensor in straight.machine.sensors("full"):
         own, step = clean.values[sensor.name], sensor.resolution
@@ -121,7 +121,7 @@ def test_a_channel_that_dies_is_told_from_then_on(
             rests[sensor.name] = np.append(own, own[-1] + step * np.round((own[-1] - own[-11]) / 10 * coasts / step))
         else:
             rests[sensor.name] = np.append(own, own[-1] + np.random.default_rng(0).normal(0, 40, 800))
-    assert repair.examine(straight, Log("rests", np.arange(len(x) + 800) / 100, rests)).dropouts == {}
+    assert repair.examine(straight.machine, Log("rests", np.arange(len(x) + 800) / 100, rests)).dropouts == {}
 
 
 def test_what_stands_exactly_still_is_no_dropout(straight: Model, clean: Log) -> None:
@@ -136,15 +136,15 @@ def test_what_stands_exactly_still_is_no_dropout(straight: Model, clean: Log) ->
 
 def test_late_channels_are_found_to_a_millisecond(straight: Model, clean: Log) -> None:
     """No alarm on a clean log; 30 ms on one channel is 30 ms on that one, and none on the other."""
-    assert estimate_delays.late_channels(straight, clean) == ()
+    assert delays.describe_late_channels(straight, clean) == ()
     late = np.concatenate([np.full(3, clean.values["u1"][0]), clean.values["u1"][:-3]])
-    first, other = estimate_delays.delays(straight, changed(clean, "u1", late))
+    first, other = delays.estimate_delays(straight, changed(clean, "u1", late))
     assert first.name == "u1"
     assert first.value == pytest.approx(0.030, abs=0.002)
     assert first.significant
     assert abs(other.value) < 0.002
     assert not other.significant
-    (note,) = estimate_delays.late_channels(straight, changed(clean, "u1", late))
+    (note,) = delays.describe_late_channels(straight, changed(clean, "u1", late))
     assert "ms (+-" in note
     assert "late" in note
 
@@ -152,7 +152,7 @@ def test_late_channels_are_found_to_a_millisecond(straight: Model, clean: Log) -
 def test_early_channels_of_the_whole_machine(va12: Model, va12_motion: Motion) -> None:
     one = make_log(va12, va12_motion, seed=3)
     early = np.concatenate([one.values["u2"][4:], np.full(4, one.values["u2"][-1])])
-    found = {d.name: d for d in estimate_delays.delays(va12, changed(one, "u2", early))}
+    found = {d.name: d for d in delays.estimate_delays(va12, changed(one, "u2", early))}
     assert found["u2"].value == pytest.approx(-0.040, abs=0.003)
     assert not found["u1"].significant
     assert not found["u4"].significant
@@ -162,11 +162,11 @@ def test_noise_of_slips_is_no_delay(va12: Model) -> None:
     """Along R60 slips are small: what their noise leaves in the rows seems 15 ms early, in every log. It hides a part
     of 80 ms that a channel is late."""
     one = make_log(va12, designed("R60", va12), seed=3)
-    assert any(d.significant for d in estimate_delays.delays(va12, one))
+    assert any(d.significant for d in delays.estimate_delays(va12, one))
     for X in (va12.nominal, None):
-        assert estimate_delays.late_channels(va12, one, X=X) == ()
+        assert delays.describe_late_channels(va12, one, X=X) == ()
     late = np.concatenate([np.full(8, one.values["u1"][0]), one.values["u1"][:-8]])
-    (note,) = estimate_delays.late_channels(va12, changed(one, "u1", late), X=va12.nominal)
+    (note,) = delays.describe_late_channels(va12, changed(one, "u1", late), X=va12.nominal)
     told = re.search(r"u1 is late against the motion, by ([0-9.]+) ms .* as far as noise tells", note)
     assert told is not None
     assert 40 < float(told[1]) < 85

@@ -12,6 +12,7 @@ import scipy.io
 
 from excite.errors import LogError
 from excite.logs import log, tables
+from excite.logs.times import seconds
 from excite.model import Model
 from excite.simulation import Motion, sensors
 
@@ -147,7 +148,7 @@ def test_dates_with_points_have_the_day_first(form: str, va12: Model, tmp_path: 
     cells = [w.strftime(form)[:-4] for w in when]
     cells[50] = cells[50][:-3]  # a full second without its zeros
     read = _read(tmp_path, "t_s;u1_Nm\n" + "".join(f"{cell};0\n" for cell in cells))
-    t = log.times(read, va12.machine, "log")
+    t = seconds(read, va12.machine, "log")
     assert t == pytest.approx(np.arange(100) / 100, abs=1e-6)
 
 

@@ -13,7 +13,7 @@ from support.drives import designed
 
 from excite.errors import LogError
 from excite.identification import identify
-from excite.logs import gaps, inspection
+from excite.logs import inspection, prepare
 from excite.model import Model
 from excite.simulation import sensors, simulate
 
@@ -29,12 +29,14 @@ def table(straight: Model) -> pd.DataFrame:
 
 def test_a_gap_makes_two_logs(straight: Model, table: pd.DataFrame) -> None:
     """Also while the machine moves: what was not seen is not made up."""
-    whole, none = gaps.split(table, straight.machine)
+    ready = prepare(straight, [table])
+    whole, none = ready.logs, ready.notes
     holed = table.drop(index=range(1700, 1853)).reset_index(drop=True)
-    logs, notes = gaps.split(holed, straight.machine, source="holed.csv")
+    ready = prepare(straight, [holed])
+    logs, notes = ready.logs, ready.notes
     assert (len(whole), none) == (1, [])
     assert [len(one) for one in logs] == [1700, 4001 - 1853]
-    assert notes == ["holed.csv: a gap (1.54 s before row 1701): identified from the 2 stretches between"]
+    assert notes == ["log: 1 gap: used are 2 of 2 stretches between, 38.46 of 40 s"]
     full, both = identify(straight, whole, "joint"), identify(straight, logs, "joint")
     assert np.sqrt(np.mean(((both.value - straight.nominal) / both.std) ** 2)) < 1.6
     assert (both.std > 0.95 * full.std).all()  # counts of two stretches begin anew: a little more or less harm
@@ -43,12 +45,18 @@ def test_a_gap_makes_two_logs(straight: Model, table: pd.DataFrame) -> None:
 
 @pytest.mark.parametrize(
     "drop",
-    [range(100, 200), range(3700, 3800), [k for k in range(500, 3500) if k % 100 < 20]],
+    [range(100, 200), range(3900, 3950), [k for k in range(4001) if k % 100 < 20]],
     ids=["near the start", "near the end", "everywhere"],
 )
 def test_gaps_beside_which_too_little_is_left(straight: Model, table: pd.DataFrame, drop: list[int]) -> None:
-    with pytest.raises(LogError, match="gap of"):
-        gaps.split(table.drop(index=list(drop)).reset_index(drop=True), straight.machine)
+    holed = table.drop(index=list(drop)).reset_index(drop=True)
+    if len(drop) > 100:
+        with pytest.raises(LogError, match="no stretch between gaps lasts 2 s"):
+            prepare(straight, [holed])
+        return
+    ready = prepare(straight, [holed])
+    assert len(ready.logs) == 1
+    assert any("used are 1 of 2 stretches" in note for note in ready.notes)
 
 
 @pytest.mark.parametrize("lost", [20, 300, 900])
@@ -57,10 +65,11 @@ def test_a_gap_is_a_gap_wherever_it_is(straight: Model, lost: int) -> None:
     table = sensors.measure(straight, designed("S40", straight), seed=1)
     for first in range(600, 2500, 50):
         holed = table.drop(index=range(first, first + lost)).reset_index(drop=True)
-        logs, _ = gaps.split(holed, straight.machine)
+        logs = prepare(straight, [holed]).logs
         assert [len(one) for one in logs] == [first, len(table) - first - lost]
-        (fault,) = inspection.inspect(holed, straight.machine).faults
-        assert "a gap of" in fault
+        found = inspection.inspect(holed, straight.machine)
+        assert found.faults == ()
+        assert any("1 gap: used are 2 of 2" in line for line in found.remarks)
 
 
 def test_identify_reports_the_cut(excite: Excite, table: pd.DataFrame, tmp_path: Path) -> None:
@@ -69,7 +78,7 @@ def test_identify_reports_the_cut(excite: Excite, table: pd.DataFrame, tmp_path:
     summary = json.loads(stdout)
     assert code == 0
     assert [source.partition(" ")[2] for source in summary["logs"]] == ["from row 1", "from row 1701"]
-    assert any("a gap (1.54 s before row 1701)" in note for note in summary["notes"])
+    assert any("1 gap: used are 2 of 2 stretches" in note for note in summary["notes"])
 
 
 def test_a_gap_in_a_log_to_validate_with(excite: Excite, table: pd.DataFrame, tmp_path: Path) -> None:
@@ -84,4 +93,4 @@ def test_a_gap_in_a_log_to_validate_with(excite: Excite, table: pd.DataFrame, tm
     assert [v["log"].partition("holed.csv ")[2] for v in summary["validation"]] == ["from row 1", "from row 1701"]
     for v in summary["validation"]:
         assert max(v["torque_error_percent"].values()) < 20
-    assert sum("validated on the 2 stretches between" in note for note in summary["notes"]) == 1
+    assert sum("used are 2 of 2 stretches between" in note and "validated on" in note for note in summary["notes"]) == 1

@@ -1,0 +1,194 @@
+"""Logs made ready: read, placed on an even grid of time, cut at gaps and rests. The one way in for every command."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from excite.errors import LogError
+from excite.logs import log, refusal
+from excite.logs.log import Log
+from excite.logs.resampling import SAME_RATE, Stretch, at_rate, even_stretches, slower
+from excite.logs.time_axis import order_rows
+from excite.logs.times import has_time, seconds
+from excite.model import Model
+from excite.model.machine import Machine
+
+FASTEST_HZ = 150.0  # rate [Hz] beyond which a rolling machine tells nothing more: its slips relax within tens of ms
+REST_S = 5.0  # [s] of standing still that is left out; chosen
+REST_MARGIN_S = 0.3  # [s] of a rest that stays with the motion before and after it; chosen
+
+TIME_NAME = re.compile(r"(?i)(t|time|timestamp)([_ ].*)?|.*[_ ](t|time|timestamp)([_ ].*)?")
+
+Source = str | Path | pd.DataFrame | Log
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Logs on one even grid, the model at their rate of sampling, and notes of what was done to them."""
+
+    model: Model
+    logs: list[Log]
+    notes: list[str]
+
+
+def prepare(
+    model: Model, sources: Sequence[Source], needs: Sequence[str] = (), use: str = "", rate: float | None = None
+) -> Prepared:
+    """Read logs (files, tables in the machine's columns, or logs as they are) and make them ready for estimation.
+
+    Each row's own time counts: the model returned has the logs' rate of sampling, whatever the machine file says.
+    needs: names of sensors that must be there. use: what the notes say that the logs are for. rate [Hz]: of the grid,
+    that of the slowest log if not given. Raises LogError: file, row and column, what is wrong, what to do.
+    """
+    machine = model.machine
+    notes = list[str]()
+    stretches = list[tuple[str, Stretch, Machine]]()
+    given = list[Log]()
+    for source in sources:
+        if isinstance(source, Log):
+            given.append(source)
+            continue
+        found, said = read_stretches(source, machine, needs)
+        name = "log" if isinstance(source, pd.DataFrame) else str(source)
+        for stretch in found:
+            one = slower(stretch, machine, FASTEST_HZ) if model.slips and rate is None else stretch
+            if one is not stretch:
+                said.append(f"{name}: {stretch.rate:.4g} Hz is faster than the machine: reduced to {one.rate:.4g} Hz")
+            where = name if len(found) == 1 else f"{name} from row {stretch.first_row + 1}"
+            stretches.append((where, one, machine))
+        notes += [f"{line} ({use})" if use else line for line in dict.fromkeys(said)]
+    rates = [s.rate for _, s, _ in stretches]
+    if given:
+        rates.append((len(given[0]) - 1) / float(given[0].t[-1] - given[0].t[0]))
+    common = rate or min(rates)
+    if max(rates) / common - 1 > SAME_RATE:
+        notes.append(f"logs at {common:.6g} to {max(rates):.6g} Hz are brought to {common:.6g} Hz")
+        stretches = [(n, slower_to(s, m, common), m) for n, s, m in stretches]
+    at_rate = with_rate(model, common)
+    logs = [as_log(stretch, at_rate.machine, needs, name) for name, stretch, _ in stretches]
+    return Prepared(
+        at_rate, [*given, *(part for one in logs for part in without_rests(one, at_rate.machine, notes))], notes
+    )
+
+
+def read_stretches(
+    source: str | Path | pd.DataFrame, machine: Machine, needs: Sequence[str] = (), rate: float | None = None
+) -> tuple[list[Stretch], list[str]]:
+    """Read one log as even stretches, with notes. Raises LogError."""
+    table = source if isinstance(source, pd.DataFrame) else log.table_of(source, machine)
+    name = "log" if isinstance(source, pd.DataFrame) else str(source)
+    notes = [f"{name}: {line}" for line in table.attrs.get("notes", ())]
+    if not has_time(table, machine) and (merged := merge_own_times(table, machine)) is not None:
+        table = merged
+    refusal.refuse(table, machine, needs, name)
+    log.require_columns(table, machine, needs, name)
+    t = seconds(table, machine, name)
+    if line := log.too_short(len(t), machine):
+        raise LogError(f"{name}: {line}")
+    runs, said = order_rows(t, table, machine.time_column, name)
+    stretches = list[Stretch]()
+    for run in runs:
+        found, more = even_stretches(table, run, machine, name, rate)
+        stretches += found
+        said += more
+    least = log.fewest_rows(machine)
+    long = [s for s in stretches if len(s.table) >= least]
+    if long and len(long) < len(stretches):
+        said.append(f"{name}: {len(stretches) - len(long)} stretches of less than {least} rows are left out")
+    return long or stretches, [*notes, *said]
+
+
+def merge_own_times(table: pd.DataFrame, machine: Machine) -> pd.DataFrame | None:
+    """Merge channels that have time columns of their own, each to the left of its channels, into one time column."""
+    used = {c for s in machine.sensor for c in s.columns}
+    clocks = [c for c in table.columns if c not in used and TIME_NAME.fullmatch(str(c))]
+    if len(clocks) < 2:
+        return None
+    parts, clock = list[pd.DataFrame](), None
+    for name in table.columns:
+        if name in clocks:
+            clock = name
+        elif clock is not None and name in used:
+            one = table[[clock, name]].dropna().rename(columns={clock: machine.time_column})
+            parts.append(one.groupby(machine.time_column, as_index=False).mean(numeric_only=True))
+    if not parts:
+        return None
+    merged = parts[0]
+    for one in parts[1:]:
+        merged = merged.merge(one, on=machine.time_column, how="outer")
+    return merged.sort_values(machine.time_column, ignore_index=True)
+
+
+def slower_to(stretch: Stretch, machine: Machine, rate: float) -> Stretch:
+    """A stretch at a given rate."""
+    return stretch if abs(stretch.rate / rate - 1) < SAME_RATE else at_rate(stretch, machine, rate)
+
+
+def with_rate(model: Model, rate: float) -> Model:
+    """The model with another rate of sampling [Hz]; the same object if it is the machine file's."""
+    machine = at_rate_of(model.machine, rate)
+    return model if machine is model.machine else replace(model, machine=machine)
+
+
+def at_rate_of(machine: Machine, rate: float) -> Machine:
+    """The machine with another rate of sampling [Hz]; the same object if it is the machine file's."""
+    nominal = machine.sampling_hz
+    if abs(rate / float(nominal) - 1) < SAME_RATE:
+        return machine
+    said = nominal.model_copy(update={"value": rate, "source": "measured", "note": "of the log"})
+    return machine.model_copy(update={"sampling_hz": said})
+
+
+def as_log(stretch: Stretch, machine: Machine, needs: Sequence[str], source: str) -> Log:
+    """A stretch as a checked log. Raises LogError."""
+    table = stretch.table.assign(**{machine.time_column: 0.0})
+    table.attrs = {}
+    made = log.from_table(table, machine, needs, source, np.arange(len(table)) / stretch.rate)
+    sampled = {s.name: stretch.sampled[s.column] for s in machine.sensors("full") if s.column in stretch.sampled}
+    return replace(made, interpolated=stretch.interpolated, sampled=sampled)
+
+
+def without_rests(one: Log, machine: Machine, notes: list[str]) -> list[Log]:
+    """A log's stretches of motion: standing still for long tells nothing and is left out, with a note."""
+    moving = np.zeros(len(one), bool)
+    for sensor in machine.sensors("full"):
+        if sensor.name not in one.values or sensor.kind not in ("angle", "wheel"):
+            continue
+        x = one.values[sensor.name]
+        if sensor.resolution is None:
+            return [one]  # where noise moves the reading, rest can't be told by it
+        change = np.flatnonzero(np.abs(np.diff(x)) > 0.5 * sensor.resolution)
+        moving[change] = moving[change + 1] = True
+    if not moving.any():
+        return [one]
+    rate = float(machine.sampling_hz)
+    rows = np.flatnonzero(moving)
+    margin = round(REST_MARGIN_S * rate)
+    edges = np.flatnonzero(np.diff(rows) > REST_S * rate)
+    first = [max(rows[0] - margin, 0) if rows[0] > REST_S * rate else 0, *(rows[edges + 1] - margin)]
+    end = len(one) - 1
+    last = [*(rows[edges] + margin), min(rows[-1] + margin, end) if end - rows[-1] > REST_S * rate else end]
+    if len(first) == 1 and first[0] == 0 and last[0] == end:
+        return [one]
+    least = log.fewest_rows(machine)
+    parts = [(a, b) for a, b in zip(first, last, strict=True) if b - a + 1 >= least]
+    if not parts:
+        return [one]
+    used = sum(b - a for a, b in parts) / rate
+    notes.append(f"{one.source}: the machine stands still for {(end / rate) - used:.4g} s, which is left out")
+    return [
+        replace(
+            one,
+            source=one.source if len(parts) == 1 else f"{one.source} from row {a + 1}",
+            t=np.arange(b - a + 1) / rate,
+            values={n: v[a : b + 1] for n, v in one.values.items()},
+            sampled={n: v[a : b + 1] for n, v in one.sampled.items()},
+        )
+        for a, b in parts
+    ]

@@ -1,0 +1,318 @@
+"""Rows at their own times, brought onto an even grid.
+
+Even rows at any rate stay as they are. Uneven ones (jitter, lost rows, channels with rates of their own) are
+interpolated from each channel's own rows: angles linearly (the error is second order in the step, and between two
+counts of an encoder nothing better is known), other channels from the nearest reading along its slope, so that noise
+stays white. A gap longer than a few rows cuts the log into stretches. A log that is faster than asked for is averaged
+over the rows of a new one (noise) or thinned (counts).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+import scipy.signal
+
+from excite.errors import LogError
+from excite.logs.time_axis import Run
+from excite.model.machine import Machine, Sensor
+
+EVEN = 0.02  # relative deviation of a step from the usual one up to which rows are even; chosen
+SAME_RATE = 1e-4  # relative deviation of two rates of sampling that count as one: 0.1 deviation of a mass; chosen
+BRIDGED_STEPS = (
+    3.5  # usual steps from one reading to the next, up to which what is lost between is interpolated; chosen
+)
+BRIDGED_S = 0.03  # [s] the same for fast logs; chosen
+SLOW = 0.67  # of the grid's rate, below which a channel's readings are marked; chosen
+SHORTEST_STRETCH_S = 2.0  # [s] of a log between two gaps that is worth using; chosen
+ORDINALS = {2: "second", 3: "third", 4: "fourth", 5: "fifth", 6: "sixth", 8: "eighth", 10: "tenth"}
+HELD_ROWS = 0.9  # share of changes of a channel in every n-th row, from which it is taken for held; chosen
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Even rows: a table in the machine's columns without times, its first row's time [s], and the rate [Hz]."""
+
+    table: pd.DataFrame
+    start: float
+    rate: float
+    first_row: int
+    interpolated: bool = False
+    sampled: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def used_sensors(table: pd.DataFrame, machine: Machine) -> list[Sensor]:
+    """The sensors of a machine whose columns a table has."""
+    return [s for s in machine.sensors("full") if set(s.columns) <= set(table.columns)]
+
+
+def even_stretches(
+    table: pd.DataFrame, run: Run, machine: Machine, source: str, rate: float | None = None
+) -> tuple[list[Stretch], list[str]]:
+    """Bring one run of rows onto an even grid, cut at its gaps, with notes of what was done.
+
+    rate [Hz]: of the grid; by default the log's own, or the machine file's where they differ by less than SAME_RATE
+    or the rows are uneven about it. Raises LogError for a channel without numbers or where no stretch is long enough.
+    """
+    columns = list(dict.fromkeys(c for s in used_sensors(table, machine) for c in s.columns))
+    columns += [c for s in machine.sensor if s.column in table.columns for c in (s.column,) if c not in columns]
+    if not columns:
+        raise LogError(f"{source}: none of the columns of {machine.name} is there")
+    part, notes = table.iloc[run.rows].reset_index(drop=True), list[str]()
+    there = {c: _readings(part[c], c, source) for c in columns}
+    by_column = {c: s for s in machine.sensor for c in s.columns}
+    for name in columns:
+        x = pd.to_numeric(part[name], errors="coerce").to_numpy(dtype=float)
+        every = held_every(x[there[name]]) if by_column[name].resolution is None else 1
+        if every > 1:
+            change = np.diff(x, prepend=np.nan) != 0
+            there[name] &= change
+            notes.append(
+                f"{source}: column {name}: changes in every {ordinal(every)} row only: a"
+                f" {own_rate(run.t) / every:.3g} Hz signal that is held, used at the rows where it changes"
+            )
+    for name, rows in there.items():
+        if not rows.any():
+            raise LogError(f"{source}: column {name}: there is no number in it; leave the column out")
+    nominal, own = float(machine.sampling_hz), _usual_rate(run.t, there)
+    dt = np.diff(run.t)
+    whole = all(rows.all() for rows in there.values())
+    if whole and _is_even(dt, own):
+        own = (len(run.t) - 1) / float(run.t[-1] - run.t[0])
+        own = nominal if abs(own / nominal - 1) < SAME_RATE else own
+        stretch = Stretch(part, float(run.t[0]), own, int(run.rows[0]))
+        if rate is None or abs(own / rate - 1) < SAME_RATE:
+            return [stretch], notes
+        return [at_rate(stretch, machine, rate)], [f"{source}: resampled from {own:.6g} to {rate:.6g} Hz"]
+    grid = rate or (nominal if abs(own / nominal - 1) < EVEN else own)
+    # For filters the step must be even, so a rate close to the log's is as good as any.
+    longest = max(BRIDGED_STEPS / own, min(BRIDGED_S, 10 / own))
+    holes = [_holes(run.t[rows], max(longest, BRIDGED_STEPS * _usual_step(run.t[rows]))) for rows in there.values()]
+    first = max(float(run.t[rows][0]) for rows in there.values())
+    last = min(float(run.t[rows][-1]) for rows in there.values())
+    spans = _between(first, last, sorted(itertools.chain.from_iterable(holes)))
+    kept = [(a, b) for a, b in spans if b - a >= min(SHORTEST_STRETCH_S, last - first)]
+    if not kept:
+        raise LogError(f"{source}: no stretch between gaps lasts {SHORTEST_STRETCH_S:g} s; log without gaps")
+    notes += _notes(run.t, there, own, grid, spans, kept, source, first, last)
+    return [_interpolated(part, run, there, machine, a, b, grid) for a, b in kept], notes
+
+
+def slower(stretch: Stretch, machine: Machine, most_hz: float) -> Stretch:
+    """Thin a stretch to `most_hz` at most: noise is averaged over the rows that are left out, counts are not."""
+    factor = int(np.ceil(stretch.rate / most_hz - EVEN))
+    if factor < 2:
+        return stretch
+    return at_rate(stretch, machine, stretch.rate / factor)
+
+
+def held_every(values: np.ndarray) -> int:
+    """Tell in every how many rows a channel (N,) changes, if that is regular and more than one; 1 otherwise."""
+    change = np.flatnonzero(np.diff(values) != 0)
+    if len(change) < 20:
+        return 1
+    gaps, counts = np.unique(np.diff(change), return_counts=True)
+    k = int(np.argmax(counts))
+    return int(gaps[k]) if gaps[k] > 1 and counts[k] > HELD_ROWS * counts.sum() else 1
+
+
+def ordinal(n: int) -> str:
+    """A number as "fifth"."""
+    return ORDINALS.get(n, f"{n}th")
+
+
+def _readings(column: pd.Series, name: str, source: str) -> np.ndarray:
+    """Rows (N,) in which a column has a number. Raises LogError for a cell that is neither a number nor empty."""
+    if column.dtype.kind in "biu":
+        return np.ones(len(column), bool)
+    number = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float)
+    missing = column.isna().to_numpy() | (column.astype(str).str.strip() == "").to_numpy()
+    wrong = ~np.isfinite(number) & ~missing
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        raise LogError(f"{source}: row {k + 1}, column {name}: is {str(column.iloc[k])[:30]!r}, not a finite number")
+    return ~missing
+
+
+def own_rate(t: np.ndarray) -> float:
+    """The usual rate [Hz] of times."""
+    return 1 / _usual_step(t)
+
+
+def _usual_step(t: np.ndarray) -> float:
+    """The usual step [s] of times: the mean of those that are no gap."""
+    dt = np.diff(t)
+    if not len(dt):
+        return 0.0
+    return float(dt[dt <= 1.5 * np.median(dt)].mean())
+
+
+def _usual_rate(t: np.ndarray, there: dict[str, np.ndarray]) -> float:
+    """The rate [Hz] of the fastest channel."""
+    steps = [_usual_step(t[rows]) for rows in there.values() if rows.sum() > 1]
+    return 1 / min(steps) if steps and min(steps) > 0 else np.nan
+
+
+def _is_even(dt: np.ndarray, rate: float) -> bool:
+    return bool(len(dt)) and bool(np.abs(dt * rate - 1).max() <= EVEN)
+
+
+def _holes(t: np.ndarray, longest: float) -> list[tuple[float, float]]:
+    """Spans between two readings that are further apart than what is bridged."""
+    return [(float(t[k]), float(t[k + 1])) for k in np.flatnonzero(np.diff(t) > longest * (1 + EVEN))]
+
+
+def _between(first: float, last: float, holes: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """What is left of first..last without the holes."""
+    spans, at = list[tuple[float, float]](), first
+    for a, b in holes:
+        if a > at:
+            spans.append((at, a))
+        at = max(at, b)
+    if last > at:
+        spans.append((at, last))
+    return spans
+
+
+def at_rate(stretch: Stretch, machine: Machine, rate: float) -> Stretch:
+    """A stretch at another rate."""
+    n = len(stretch.table)
+    t = np.arange(n) / stretch.rate
+    grid = np.arange(int(np.floor(t[-1] * rate + 1e-6)) + 1) / rate
+    factor = stretch.rate / rate
+    columns = {}
+    for sensor in machine.sensor:
+        for name in (c for c in sensor.columns if c in stretch.table.columns):
+            x = pd.to_numeric(stretch.table[name]).to_numpy(dtype=float)
+            counted = sensor.resolution is not None
+            if factor > 1.5 and not counted:
+                x = _block_means(x, round(factor))
+            at = grid * stretch.rate
+            near = np.round(at).astype(int)
+            whole = counted and np.abs(at - near).max() < 1e-6
+            columns[name] = x[near] if whole else np.interp(grid, t, x)
+    return Stretch(pd.DataFrame(columns), stretch.start, rate, stretch.first_row)
+
+
+def _block_means(x: np.ndarray, width: int) -> np.ndarray:
+    """Means (N,) over `width` rows about each row: white noise stays white where every width-th of them is kept."""
+    weights = np.ones(width | 1)
+    if width % 2 == 0:
+        weights[[0, -1]] = 0.5
+    half = len(weights) // 2
+    if len(x) <= 2 * half:
+        return x
+    ends = 2 * x[0] - x[half:0:-1], 2 * x[-1] - x[-2 : -half - 2 : -1]  # a ramp goes on as it is
+    return np.convolve(np.concatenate([ends[0], x, ends[1]]), weights / weights.sum(), mode="valid")
+
+
+def _interpolated(
+    part: pd.DataFrame, run: Run, there: dict[str, np.ndarray], machine: Machine, a: float, b: float, rate: float
+) -> Stretch:
+    """One stretch from a to b [s] on a grid that meets the rows of the encoders: each channel from its own readings."""
+    by_column = {c: s for s in machine.sensor for c in s.columns}
+    counted = [c for c in there if by_column[c].resolution is not None]
+    reference = run.t[there[(counted or list(there))[0]]]
+    a = float(reference[min(int(np.searchsorted(reference, a - 1e-9)), len(reference) - 1)])
+    grid = a + np.arange(int(np.floor((b - a) * rate + 1e-6)) + 1) / rate
+    columns, sampled, between = {}, dict[str, np.ndarray](), False
+    for name, rows in there.items():
+        x = pd.to_numeric(part[name], errors="coerce").to_numpy(dtype=float)[rows]
+        t, sensor = run.t[rows], by_column[name]
+        own = 1 / _usual_step(t) / rate
+        if own > 1.5 and sensor.resolution is None:
+            x = _block_means(x, round(own))
+        plain = sensor.kind in ("angle", "wheel") or not SLOW < own < 1.5
+        y = np.interp(grid, t, x) if plain else _nearest(grid, t, x)
+        if own < SLOW and sensor.resolution is None:
+            inside = (t >= grid[0]) & (t <= grid[-1])
+            at = np.round((t[inside] - a) * rate).astype(int)
+            slope = np.gradient(y, 1 / rate)
+            y[at] = x[inside] + slope[at] * (grid[at] - t[inside])
+            sampled[name] = np.zeros(len(grid), bool)
+            sampled[name][at] = True
+        if sensor.resolution is not None and _meets(grid, t, rate):
+            y = _whole_counts(sensor, x, y)
+        elif sensor.resolution is not None:
+            between = True
+        columns[name] = y
+    first = int(run.rows[int(np.searchsorted(run.t, a - 1e-9))])
+    return Stretch(pd.DataFrame(columns), a, rate, first, between, sampled)
+
+
+def _nearest(grid: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Readings x at times t, each moved to the grid along its slope: noise stays as it is, white, from row to row."""
+    slope = scipy.signal.savgol_filter(x, 7, 2, deriv=1) / np.gradient(t) if len(x) > 7 else np.gradient(x, t)
+    after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
+    near = np.where(grid - t[after - 1] < t[after] - grid, after - 1, after)
+    far = np.abs(grid - t[near]) > np.diff(t).max() / 2 + 1e-12
+    moved = x[near] + slope[near] * (grid - t[near])
+    return np.where(far, np.interp(grid, t, x), moved)
+
+
+def _meets(grid: np.ndarray, t: np.ndarray, rate: float) -> bool:
+    """Tell if readings are on the grid where none is lost: then only lost ones stand between counts."""
+    own = t[(t >= grid[0]) & (t <= grid[-1])]
+    at = (own - grid[0]) * rate
+    return bool(len(own)) and bool(np.abs(at - np.round(at)).max() < 5 * EVEN)
+
+
+def _whole_counts(sensor: Sensor, readings: np.ndarray, between: np.ndarray) -> np.ndarray:
+    """Interpolated readings of an encoder as whole counts, if the readings are."""
+    if sensor.resolution is None or len(sensor.columns) > 1:
+        return between
+    step = sensor.resolution / abs(sensor.gain)
+    if np.abs(readings / step - np.round(readings / step)).max() > 0.01:
+        return between
+    return np.asarray(np.round(between / step) * step)
+
+
+def _notes(
+    t: np.ndarray,
+    there: dict[str, np.ndarray],
+    own: float,
+    grid: float,
+    spans: list[tuple[float, float]],
+    kept: list[tuple[float, float]],
+    source: str,
+    first: float,
+    last: float,
+) -> list[str]:
+    """Say what was done to uneven rows."""
+    notes = []
+    dt = np.diff(t)
+    step, wide = 1 / own, dt[dt <= BRIDGED_STEPS / own]
+    rates: dict[str, list[str]] = {}
+    for name, rows in there.items():
+        usual = _usual_step(t[rows])
+        rates.setdefault(f"{1 / usual:.3g} Hz" if usual > 0 else "one reading", []).append(name)
+    lost = int((wide > 1.5 * step).sum())
+    sparse = sum(int((~rows).sum()) for rows in there.values())
+    if len(rates) > 1 and sparse:
+        listed = "; ".join(f"{', '.join(names)} at {rate}" for rate, names in rates.items())
+        notes.append(f"{source}: channels with times of their own ({listed}), each interpolated onto {grid:.4g} Hz")
+    elif sparse:
+        notes.append(f"{source}: {sparse} empty {'cell' if sparse == 1 else 'cells'}, interpolated")
+    even = np.abs(wide / step - np.round(wide / step)).max() < 5 * EVEN if len(wide) else True
+    if not even:
+        low, high = 1e3 * float(np.quantile(dt, 0.01)), 1e3 * float(np.quantile(dt, 0.99))
+        notes.append(
+            f"{source}: rows are {low:.3g} to {high:.3g} ms apart, interpolated at their own times onto"
+            f" {1e3 / grid:.4g} ms"
+        )
+    elif lost and not sparse:
+        notes.append(f"{source}: rows are lost in {lost} {'place' if lost == 1 else 'places'}, interpolated")
+    if len(spans) > 1:
+        gaps = len(spans) - 1
+        used = sum(b - a for a, b in kept)
+        notes.append(
+            f"{source}: {gaps} {'gap' if gaps == 1 else 'gaps'}: used are {len(kept)} of {len(spans)} stretches"
+            f" between, {used:.4g} of {last - first:.4g} s"
+        )
+    whole = float(t[-1] - t[0])
+    if last - first < 0.99 * whole:
+        notes.append(f"{source}: not all channels last as long: used are {last - first:.4g} of {whole:.4g} s")
+    return notes

@@ -1,0 +1,101 @@
+"""The order of a log's rows in time: clocks that wrap, restart or tick coarsely, rows that are there twice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from excite.errors import LogError
+from excite.logs.times import DAY_S
+
+HOUR_S = 3600.0  # [s] by which a clock is set for summer time
+SLACK_STEPS = 20.0  # steps by which a clock's jump may differ from a whole day or hour; chosen
+MIN_RUN_ROWS = 20  # rows that a part of a log must have to be a log of its own; chosen
+SORTED_EVEN = 0.05  # relative deviation of steps up to which sorted rows count as even; chosen
+
+
+@dataclass(frozen=True)
+class Run:
+    """Rows (N,) of a table whose times t (N,) [s] increase."""
+
+    rows: np.ndarray
+    t: np.ndarray
+
+
+def order_rows(t: np.ndarray, table: pd.DataFrame, column: str, source: str) -> tuple[list[Run], list[str]]:
+    """Bring rows with times t (N,) [s] into runs of increasing time, with a note for each thing that was done.
+
+    A time of day past midnight and a clock set back an hour are read on; rows that repeat the one before are dropped;
+    a clock coarser than the rows is replaced by even steps along it; where time begins anew a new run begins.
+    Raises LogError where the order can't be known.
+    """
+    rows, notes = np.arange(len(t)), list[str]()
+    t = t.copy()
+    positive = np.diff(t)[np.diff(t) > 0]
+    step = float(np.median(positive)) if len(positive) else 0.0
+    for span, what in ((DAY_S, "time of day passes midnight"), (HOUR_S, "the clock is set back an hour")):
+        for k in np.flatnonzero(np.abs(np.diff(t) + span) <= SLACK_STEPS * step):
+            t[k + 1 :] += span
+            notes.append(f"{source}: row {k + 2}, column {column}: {what}, read on")
+    repeated = np.flatnonzero(np.diff(t) == 0) + 1
+    if len(repeated):
+        before = table.iloc[repeated - 1].reset_index(drop=True)
+        same = (table.iloc[repeated].reset_index(drop=True).eq(before) | before.isna()).all(axis=1).to_numpy()
+        if same.all() or same.sum() > len(t) // 3:
+            drop = repeated[same]
+            keep = np.setdiff1d(rows, drop)
+            rows, t = rows[keep], t[keep]
+            which = (
+                "every row is there twice" if len(drop) >= len(keep) - 1 else f"{len(drop)} rows repeat the one before"
+            )
+            notes.append(f"{source}: {which}, the copies are left out")
+    runs = _split(rows, t, column, source, notes)
+    return [_even_ticks(run, column, source, notes) for run in runs], notes
+
+
+def _split(rows: np.ndarray, t: np.ndarray, column: str, source: str, notes: list[str]) -> list[Run]:
+    """Runs between the rows where time begins anew; sorted rows where these are even."""
+    back = np.flatnonzero(np.diff(t) < 0) + 1
+    if not len(back):
+        return [Run(rows, t)]
+    parts = np.split(np.arange(len(t)), back)
+    if min(map(len, parts)) >= MIN_RUN_ROWS:
+        where = ", ".join(str(rows[k] + 1) for k in back)
+        notes.append(f"{source}: time begins anew in row {where}: read as {len(parts)} logs in one file")
+        return [Run(rows[p], t[p]) for p in parts]
+    order = np.argsort(t, kind="stable")
+    steps = np.diff(t[order])
+    if (steps > 0).all() and np.abs(steps / np.median(steps) - 1).max() < SORTED_EVEN:
+        notes.append(f"{source}: {len(back)} rows are not in order of time, sorted")
+        return [Run(rows[order], t[order])]
+    k = int(back[0])
+    raise LogError(
+        f"{source}: row {rows[k] + 1}, column {column}: time goes back ({t[k - 1]:g} s, then {t[k]:g} s;"
+        f" {len(back)} times in all), and no order of the rows is even: is it the time of all channels?"
+    )
+
+
+def _even_ticks(run: Run, column: str, source: str, notes: list[str]) -> Run:
+    """A run whose times increase strictly: rows that share a tick of a coarse clock are spread evenly along it."""
+    t = run.t
+    shared = int((np.diff(t) == 0).sum())
+    if not shared:
+        return run
+    ticks = np.unique(t)
+    tick = float(np.median(np.diff(ticks))) if len(ticks) > 1 else 0.0
+    k = np.arange(len(t))
+    slope, start = np.polyfit(k, t, 1)
+    off = float(np.abs(t - (start + slope * k)).max())
+    if tick <= 0 or slope <= 0 or off > 1.5 * tick:
+        first = int(np.argmax(np.diff(t) == 0)) + 1
+        raise LogError(
+            f"{source}: row {run.rows[first] + 1}, column {column}: {shared} rows share their time with the row before,"
+            " and rows are not even along the clock: log a finer time"
+        )
+    notes.append(
+        f"{source}: {shared} {'row shares its' if shared == 1 else 'rows share their'} time with the row before: the"
+        f" clock ticks every {tick:.3g} s, the rows are taken to be {slope:.4g} s apart"
+    )
+    return Run(run.rows, start + slope * k)

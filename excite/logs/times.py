@@ -1,0 +1,142 @@
+"""Time columns in any notation as seconds: numbers, dates (ISO 8601 and others), times of day, durations."""
+
+from __future__ import annotations
+
+import re
+import warnings
+
+import numpy as np
+import pandas as pd
+
+from excite.errors import LogError
+from excite.model.machine import UNITS, Machine
+
+DAY_S = 86400.0  # [s]
+SECONDS_BY_WORD = {
+    "s": 1.0,
+    "sec": 1.0,
+    "secs": 1.0,
+    "second": 1.0,
+    "seconds": 1.0,
+    "ms": 1e-3,
+    "msec": 1e-3,
+    "us": 1e-6,
+    "µs": 1e-6,
+    "ns": 1e-9,
+    "min": 60.0,
+    "minutes": 60.0,
+    "hr": 3600.0,
+    "h": 3600.0,
+    "hours": 3600.0,
+    "day": DAY_S,
+    "days": DAY_S,
+}
+NUMBER_AND_UNIT = re.compile(r"\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*([a-zµ]+)\s*")
+CLOCK = re.compile(r"\s*([+-]?)(?:(\d+)\s+days?,?\s*)?\+?(\d+):(\d{1,2})(?::(\d{1,2}))?(?:[.,:](\d+))?\s*")
+
+
+def has_time(table: pd.DataFrame, machine: Machine) -> bool:
+    """Tell if a table has the machine's time column, or a date and a time of day in two columns."""
+    return machine.time_column in table.columns or _date_and_time(table) is not None
+
+
+def seconds(table: pd.DataFrame, machine: Machine, source: str) -> np.ndarray:
+    """Read the times (N,) [s] of a table, counted from its first row; order and gaps are not checked.
+
+    Numbers are in the machine file's `time_unit`. Raises LogError with the first cell that is not understood.
+    """
+    name = machine.time_column
+    pair = _date_and_time(table)
+    if pair is not None and (name not in table.columns or name in pair):
+        raw = table[pair[0]].astype(str).str.strip() + " " + table[pair[1]].astype(str).str.strip()
+    else:
+        raw = table[name]
+    found = _parse(raw, UNITS[machine.time_unit][1])
+    bad = ~np.isfinite(found)
+    if bad.any():
+        k = int(np.argmax(bad))
+        cell = raw.iloc[k]
+        empty = pd.isna(cell) or not str(cell).strip()
+        what = "is empty" if empty else f"is {str(cell)[:40]!r}, which is not understood as a time"
+        more = f"; {int(bad.sum())} such cells in this column" if bad.sum() > 1 else ""
+        advice = "cut the row" if empty else "write seconds, or ISO 8601 (2026-11-22T10:00:00.010)"
+        raise LogError(f"{source}: row {k + 1}, column {name}: {what}{more}; {advice}")
+    return found
+
+
+def _date_and_time(table: pd.DataFrame) -> tuple[str, str] | None:
+    """Find the names of a date column and a time-of-day column."""
+    names = {str(c).strip().lower(): str(c) for c in table.columns}
+    if "date" not in names or "time" not in names:
+        return None
+    date, clock = table[names["date"]], table[names["time"]]
+    if not len(table) or not CLOCK.fullmatch(str(clock.iloc[0])) or pd.api.types.is_numeric_dtype(date):
+        return None
+    return names["date"], names["time"]
+
+
+def _parse(raw: pd.Series, unit_s: float) -> np.ndarray:
+    """Times (N,) [s] from the first one, NaN where a cell is not understood."""
+    if not len(raw):
+        return np.empty(0)
+    if raw.dtype == object and isinstance(raw.iloc[0], pd.Timedelta):
+        raw = pd.to_timedelta(raw, errors="coerce")
+    if raw.dtype.kind == "M" or isinstance(raw.dtype, pd.DatetimeTZDtype):
+        return _since_first(pd.to_datetime(raw, utc=True).astype("datetime64[ns, UTC]").astype("int64"), raw.isna())
+    if raw.dtype.kind == "m":
+        return _since_first(raw.astype("timedelta64[ns]").astype("int64"), raw.isna())
+    if raw.dtype.kind in "iu":  # nanoseconds since 1970 have more digits than a float
+        first = int(raw.iloc[0])
+        start = first * unit_s if abs(first) < 2**53 and abs(first) * unit_s < 1e6 else 0.0
+        return np.array([int(x) - first for x in raw.tolist()], float) * unit_s + start
+    number = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float)
+    if np.isfinite(number).any() or raw.dtype.kind not in "OTU":
+        return number * unit_s
+    text = raw.astype(str).str.strip()
+    for parse in (_with_unit, _clock, _dates):
+        found = parse(text)
+        if np.isfinite(found[0]):
+            return found
+    return np.full(len(raw), np.nan)
+
+
+def _since_first(ns: pd.Series, missing: pd.Series) -> np.ndarray:
+    values = ns.to_numpy()
+    return np.where(missing.to_numpy(), np.nan, (values - values[0]) / 1e9)
+
+
+def _with_unit(text: pd.Series) -> np.ndarray:
+    """Cells such as "0.01 sec"."""
+    parts = text.str.extract(f"^{NUMBER_AND_UNIT.pattern}$")
+    number = pd.to_numeric(parts[0], errors="coerce").to_numpy(dtype=float)
+    return number * parts[1].map(SECONDS_BY_WORD).to_numpy(dtype=float)
+
+
+def _clock(text: pd.Series) -> np.ndarray:
+    """Cells such as "10:00:00.010", "10:00:00:010" or "0 days 00:00:00.010000"; "mm:ss.fff" has two parts."""
+    if not CLOCK.fullmatch(text.iloc[0]):
+        return np.full(len(text), np.nan)
+    parts = text.str.extract(f"^{CLOCK.pattern}$")
+    first, second, third = (pd.to_numeric(parts[k], errors="coerce").to_numpy(dtype=float) for k in (2, 3, 4))
+    days = pd.to_numeric(parts[1], errors="coerce").fillna(0).to_numpy(dtype=float)
+    fraction = pd.to_numeric("0." + parts[5].fillna("0"), errors="coerce").to_numpy(dtype=float)
+    whole = np.where(np.isfinite(third), 3600 * first + 60 * second + third, 60 * first + second)
+    sign = np.where(parts[0] == "-", -1.0, 1.0)
+    return sign * (days * DAY_S + whole + fraction)
+
+
+def _dates(text: pd.Series) -> np.ndarray:
+    """Dates: ISO 8601 in all its forms, with the day first where there are points, or what pandas recognises."""
+    text = text.str.replace(r"(:\d{2}),(\d)", r"\1.\2", regex=True)
+    dotted = bool(re.match(r"\d{1,2}\.\d{1,2}\.\d{2,4}", text.iloc[0]))
+    best = np.full(len(text), np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a format that pandas has to guess
+        for how in ({"format": "ISO8601"}, {"format": "mixed", "dayfirst": dotted}):
+            parsed = pd.to_datetime(text, errors="coerce", utc=True, **how)
+            found = _since_first(parsed.astype("datetime64[ns, UTC]").astype("int64"), parsed.isna())
+            if np.isfinite(found).sum() > np.isfinite(best).sum():
+                best = found
+            if np.isfinite(best).all():
+                break
+    return best
