@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from excite import identification, logs as readers, model as models, simulation, trajectories, workflows
-from excite.diagnosis import Account
+from excite.diagnosis import Assessment
 from excite.errors import LogError
 from excite.identification import Estimate, Verification
 from excite.logs import Log
@@ -127,7 +127,7 @@ def identify(machine: Machine, logs: Source | Sequence[Source], method: str | No
     return replace(estimate, notes=(*ready.notes, *estimate.notes))
 
 
-def diagnose(machine: Machine, logs: Source | Sequence[Source]) -> Account:
+def diagnose(machine: Machine, logs: Source | Sequence[Source]) -> Assessment:
     """Find what the model of a machine gets wrong along logs: named causes, their magnitudes, the gain of each.
 
     Raises LogError for an unusable log, NoEstimateError if nothing can be fitted.

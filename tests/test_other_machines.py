@@ -400,7 +400,7 @@ def test_what_is_advised_has_the_machines_names(own: str) -> None:
     """A robot and a loader have no rolls: neither in what a log hides, nor in what separates causes, nor in the cab."""
     model = model_of(own)
     texts = [c.text for c in identifiability.list_manoeuvres(model, np.zeros(len(model.coordinates), bool))]
-    texts += [separating_run._said(run, model.machine) for run in separating_run.RUNS]
+    texts += [separating_run._describe_change(run, model.machine) for run in separating_run.DRIVE_CHANGES]
     texts += sheet.set_up_lines(model.machine)
     contacts = [b.where.replace("_", " ") for b in model.machine.contacts]
     assert any(f"drive {contacts[0]}" in text and contacts[-1] in text for text in texts)
@@ -432,8 +432,8 @@ def test_a_diagnosis_names_what_a_robot_has(biased: tuple[Motion, Diagnosis]) ->
     motion, found = biased
     assert (found.verdict, [f.name for f in found.findings]) == ("named", ["yaw_rate_bias@yaw_rate"])
     (bias,) = found.findings
-    assert abs(bias.amount - 0.01) < 4 * bias.amount_std
-    (course,) = residuals.courses(found.after)
+    assert abs(bias.magnitude - 0.01) < 4 * bias.magnitude_std
+    (course,) = residuals.residuals_of_logs(found.after)
     machine = model_of("skid_robot").machine
     (Vx, _, yaw, *spins), slips = motion.nu.T, course.quantities["slip"][1]
     for body, spin in zip(machine.contacts, spins, strict=True):
@@ -461,7 +461,7 @@ def test_a_diagnosis_names_what_a_roll_has_that_nothing_drives(cause: str) -> No
     found = diagnose.diagnose(model, [make_log(wrong, motion, seed=1, known=model)], model.machine.filter)
     name, _, amount = cause.partition("=")
     assert (found.verdict, [f.name for f in found.findings]) == ("named", [name])
-    assert abs(found.findings[0].amount - float(amount)) < 2 * found.findings[0].amount_std < 0.15 * float(amount)
+    assert abs(found.findings[0].magnitude - float(amount)) < 2 * found.findings[0].magnitude_std < 0.15 * float(amount)
 
 
 @pytest.mark.parametrize(
@@ -481,8 +481,8 @@ def test_the_run_that_separates_has_the_machines_names(
     tied = (placing.parse_effect(f"{rival}=1", machine, 8.0),)
     found = replace(biased[1].findings[0], effect=effect, where=where, rivals=tied)
     diagnosis = replace(biased[1], findings=(found,))
-    assert separating_run.run(diagnosis) == said
-    pairs = separating_run.rivals(diagnosis)
+    assert separating_run.recommend_run(diagnosis) == said
+    pairs = separating_run.rival_pairs(diagnosis)
     assert [(p.machine, p.between) for p in pairs] == ([] if said is None else [(machine, (found.entry, tied[0]))])
 
 

@@ -1,15 +1,15 @@
 from .diagnosis import Diagnosis as Diagnosis, diagnose as diagnose
-from .findings import Account as Account, account as account, machine_file as machine_file, summarise as summarise
-from .parallel import forked as forked
+from .findings import Assessment as Assessment, assess as assess, machine_file as machine_file, summarise as summarise
+from .parallel import run_forked as run_forked
 from .residuals import (
     BLOCK_S as BLOCK_S,
-    FEWEST as FEWEST,
-    Course as Course,
-    binned as binned,
-    courses as courses,
-    loosened as loosened,
-    over_time as over_time,
-    spectrum as spectrum,
-    strength as strength,
+    MIN_BIN_SAMPLES as MIN_BIN_SAMPLES,
+    LogResiduals as LogResiduals,
+    amplitude_spectrum as amplitude_spectrum,
+    bin_means as bin_means,
+    dependence_strength as dependence_strength,
+    innovation_levels_over_time as innovation_levels_over_time,
+    refit_with_process_noise as refit_with_process_noise,
+    residuals_of_logs as residuals_of_logs,
 )
-from .separating_run import Rivals as Rivals, rivals as rivals
+from .separating_run import RivalPair as RivalPair, rival_pairs as rival_pairs

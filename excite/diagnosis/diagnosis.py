@@ -19,27 +19,36 @@ import numpy as np
 import scipy.stats
 
 from excite.diagnosis import hold_out as gains, magnitude_interval, selection
-from excite.diagnosis.fits import SMALL, Stage, as_measured, fitted, forced, refitted
-from excite.diagnosis.parallel import Together, in_turn
-from excite.diagnosis.residual_tests import anomalies
+from excite.diagnosis.fits import (
+    MIN_PROCESS_NOISE,
+    ExtendedFit,
+    fit_machine,
+    fit_with_process_noise,
+    refit,
+    with_true_sensor_noise,
+)
+from excite.diagnosis.parallel import CallRunner, run_in_turn
+from excite.diagnosis.residual_tests import find_anomalies
 from excite.diagnosis.score_test import Score
-from excite.diagnosis.selection import Advance, Choice
+from excite.diagnosis.selection import Choice, ProgressCallback
 from excite.logs import Log
 from excite.model import Model, effects
 from excite.model.machine import EffectEntry, Filter
 from excite.smoothing import NotConvergedError
 
-MOST = 4  # effects that are looked for; so many kinds, none of which explains MOSTLY, patch up what has no name
-MOSTLY = 0.7  # of the misfit
-FORMULA = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
+MAX_EFFECTS = 4  # effects that are looked for; so many kinds, none of which explains MOSTLY, patch up what has no name
+MAIN_CAUSE_SHARE = 0.7  # of the misfit
+FORMULA_STD_FACTOR = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
 # Of an amount: what another formula of the same effect makes of it. ALIKE is what it does in the middle; nine in ten of
 # the amounts in results/diagnosis are within intervals that allow for so much.
-OTHERWISE = 0.05
+FORMULA_STD_SHARE = 0.05
 # Of the excess misfit that names must explain, or it is unexplained: what nature has beside its formula looks like many
 # a cause. Right names of results/diagnosis explain 0.85 and more, a slope that liquid in a tank was taken for 0.83.
-ENOUGH = 0.85
-FAINT = 0.1  # of what another effect promises beside a name, that the name must gain where it needs disturbing forces
-ODD = 50.0  # misfit that every line of what is odd beside names stands for, at least
+MIN_EXPLAINED_SHARE = 0.85
+MIN_GAIN_SHARE_OF_NEXT = (
+    0.1  # of what another effect promises beside a name, that the name must gain where it needs disturbing forces
+)
+MIN_COST_PER_ANOMALY = 50.0  # misfit that every line of what is odd beside names stands for, at least
 
 
 @dataclass(frozen=True)
@@ -51,11 +60,11 @@ class Finding:
     where: str
     rivals: tuple[EffectEntry, ...]
     p_value: float
-    amount: float
-    amount_std: float
+    magnitude: float
+    magnitude_std: float
     unit: str
     shapes: Mapping[str, tuple[float, float, str]]
-    gain: float
+    likelihood_ratio: float
 
     @property
     def name(self) -> str:
@@ -68,13 +77,13 @@ class Finding:
     @property
     def entry(self) -> EffectEntry:
         """As a machine file has it."""
-        return selection.identified(
-            self.effect, self.where, self.amount, {n: value for n, (value, _, _) in self.shapes.items()}
+        return selection.identified_entry(
+            self.effect, self.where, self.magnitude, {n: value for n, (value, _, _) in self.shapes.items()}
         )
 
 
 @dataclass(frozen=True)
-class Nearest:
+class NearestEffect:
     """An effect that explains a share of the misfit and is no name, and the parameters that with it would have a value
     that no machine has, a line each."""
 
@@ -94,87 +103,99 @@ class Diagnosis:
 
     verdict: str
     findings: tuple[Finding, ...]
-    before: Stage
-    after: Stage
+    before: ExtendedFit
+    after: ExtendedFit
     share: float
     located: tuple[str, ...]
-    stages: tuple[Stage, ...]
-    nearest: Nearest | None = None
+    stages: tuple[ExtendedFit, ...]
+    nearest: NearestEffect | None = None
 
 
 def diagnose(
-    model: Model, logs: Sequence[Log], filter: Filter, advance: Advance | None = None, together: Together = in_turn
+    model: Model,
+    logs: Sequence[Log],
+    filter: Filter,
+    progress: ProgressCallback | None = None,
+    runner: CallRunner = run_in_turn,
 ) -> Diagnosis:
     """What these logs show that the model doesn't know. together: how what is independent is computed; the answer is
     the same. Raises NotConverged where the machine file's parameters give no motion at all, NotIdentifiable where a
     torque is missing."""
-    tell = advance or (lambda share, what: None)
-    tell(0.0, "fitting the model")
-    first = before = fitted(model.machine, logs, filter, together)
+    report = progress or (lambda share, what: None)
+    report(0.0, "fitting the model")
+    first = before = fit_machine(model.machine, logs, filter, runner)
     chosen = list[Choice]()
-    if before.prepared.coarse > 1:
-        tell(0.15, "fitting effects with coarse sensors")
-        sharp = selection.sharp(before, together)
-        before, chosen = sharp or (forced(before, together), chosen)
+    if before.data.noise_inflation > 1:
+        report(0.15, "fitting effects with coarse sensors")
+        sharp = selection.choose_with_inflated_noise(before, runner)
+        before, chosen = sharp or (fit_with_process_noise(before, runner), chosen)
     tried: Container[str] = ()
-    if not (before.settled or chosen):
-        tell(0.15, "fitting effects from the beginning")
-        before, chosen, tried = selection.unfollowed(before, together)
-    chosen, left = extended(before, chosen, together, tell)
-    chosen, odd, nearest = weighed(before, chosen, left)
-    if not (chosen or (before.exact and before.near)):  # a fit with coarse sensors has forces, too
-        tell(0.85, "fitting less likely effects from the beginning")
-        old = before if before.prepared.coarse == 1 else forced(before, together)
-        before, anew = selection.unlikely(first, old, tried if old is first else (), together)
+    if not (before.estimated or chosen):
+        report(0.15, "fitting effects from the beginning")
+        before, chosen, tried = selection.choose_from_start(before, runner)
+    chosen, next_ratio = extend_model(before, chosen, runner, report)
+    chosen, anomalies, nearest = drop_weak_effects(before, chosen, next_ratio)
+    if not (chosen or (before.exact and before.is_close)):  # a fit with coarse sensors has forces, too
+        report(0.85, "fitting less likely effects from the beginning")
+        old = before if before.data.noise_inflation == 1 else fit_with_process_noise(before, runner)
+        before, anew = selection.choose_unlikely(first, old, tried if old is first else (), runner)
         if anew or before is not old:
-            anew, left = extended(before, anew, together, lambda share, what: tell(max(share, 0.85), what))
+            anew, next_ratio = extend_model(before, anew, runner, lambda share, what: report(max(share, 0.85), what))
             nearest = None if before is not old else nearest
-        chosen, odd, closer = weighed(before, anew, left)
+        chosen, anomalies, closer = drop_weak_effects(before, anew, next_ratio)
         nearest = closer or nearest
     if len(chosen) > 1:
-        tell(0.9, "judging each given the others")
-        chosen, odd, nearest = weighed(before, needed(before, reviewed(before, chosen, together)), left)
-    if (largest := _patched(chosen, odd)) is not None:
-        chosen, odd, nearest = [], _odd(before), largest
+        report(0.9, "judging each given the others")
+        chosen, anomalies, nearest = drop_weak_effects(
+            before, drop_unneeded(before, review_effects(before, chosen, runner)), next_ratio
+        )
+    if (largest := _largest_of_patchwork(chosen, anomalies)) is not None:
+        chosen, anomalies, nearest = [], _anomaly_lines(before), largest
     stage = chosen[-1].stage if chosen else before
-    return concluded(before, stage, chosen, odd, left, nearest, together)
+    return conclude(before, stage, chosen, anomalies, next_ratio, nearest, runner)
 
 
-def extended(before: Stage, first: Sequence[Choice], together: Together, tell: Advance) -> tuple[list[Choice], float]:
+def extend_model(
+    before: ExtendedFit, first: Sequence[Choice], runner: CallRunner, report: ProgressCallback
+) -> tuple[list[Choice], float]:
     """Effects one after the other, after those that were chosen first, until nothing is left that has a name; and what
     a further one would gain that was not worth one."""
-    chosen, stage, left = list(first), first[-1].stage if first else before, 0.0
-    while stage.settled and len(chosen) < MOST and not stage.vain:
+    chosen, stage, next_ratio = list(first), first[-1].stage if first else before, 0.0
+    while stage.estimated and len(chosen) < MAX_EFFECTS and not stage.is_dead_end:
         turn = len(chosen)
-        tell(0.15 + 0.2 * turn, "scoring effects")
-        scores = selection.scored(stage, together)
-        hopeless = _hopeless(before, chosen, scores)
-        choice = None if hopeless else selection.choose(stage, scores, chosen, together, tell, 0.2 + 0.2 * turn)
-        if choice is not None and before.settled and _outgrows(choice, chosen):
+        report(0.15 + 0.2 * turn, "scoring effects")
+        scores = selection.score_effects(stage, runner)
+        hopeless = _cannot_explain(before, chosen, scores)
+        choice = None if hopeless else selection.choose_effect(stage, scores, chosen, runner, report, 0.2 + 0.2 * turn)
+        if choice is not None and before.estimated and _exceeds_earlier(choice, chosen):
             return [], 0.0
-        if choice is None or _makes_good(choice, chosen):
-            left = max(0.0, scores[0].gain - selection.LEVEL) if scores else 0.0
+        if choice is None or _replaces_earlier(choice, chosen):
+            next_ratio = max(0.0, scores[0].likelihood_ratio - selection.MIN_LIKELIHOOD_RATIO) if scores else 0.0
             break
         chosen.append(choice)
         stage = choice.stage
-    return chosen, left
+    return chosen, next_ratio
 
 
-def _hopeless(before: Stage, chosen: Sequence[Choice], scores: Sequence[Score]) -> bool:
+def _cannot_explain(before: ExtendedFit, chosen: Sequence[Choice], scores: Sequence[Score]) -> bool:
     """Whether effects leave more than all that may still come beside them would explain, and the last of them has no
     name as it is: then nothing gives it one."""
     if not (chosen and chosen[-1].stage.exact):
         return False
     stage = chosen[-1].stage
-    gained = sum(x.gain for x in chosen)
-    most = (MOST - len(chosen)) * selection.OVER * max((s.gain for s in scores), default=0.0)
-    too_little = gained + min(most, stage.excess) < ENOUGH * (gained + stage.excess)
-    return too_little and len(weighed(before, chosen)[0]) < len(chosen)
+    gained = sum(x.likelihood_ratio for x in chosen)
+    most = (
+        (MAX_EFFECTS - len(chosen))
+        * selection.MAX_RATIO_OVER_SCORE
+        * max((s.likelihood_ratio for s in scores), default=0.0)
+    )
+    too_little = gained + min(most, stage.excess_cost) < MIN_EXPLAINED_SHARE * (gained + stage.excess_cost)
+    return too_little and len(drop_weak_effects(before, chosen)[0]) < len(chosen)
 
 
-def weighed(
-    before: Stage, chosen: Sequence[Choice], left: float = 0.0
-) -> tuple[list[Choice], tuple[str, ...], Nearest | None]:
+def drop_weak_effects(
+    before: ExtendedFit, chosen: Sequence[Choice], next_ratio: float = 0.0
+) -> tuple[list[Choice], tuple[str, ...], NearestEffect | None]:
     """Effects without the last ones that are no names: one that leaves most of the misfit where it was is none, unless
     with what came after it nothing is left, or with the disturbing forces that it was judged with, which may have left
     nothing without it as well: it must not be faint beside what another one would gain, left; nor is one with which no
@@ -182,37 +203,40 @@ def weighed(
     kept, nearest = list(chosen), None
     while True:
         stage = kept[-1].stage if kept else before
-        odd = _odd(stage)
-        impossible = stage.impossible if kept and stage.settled else ()
-        if not kept or (stage.exact and not odd and not impossible):
+        anomalies = _anomaly_lines(stage)
+        impossible = stage.impossible if kept and stage.estimated else ()
+        if not kept or (stage.exact and not anomalies and not impossible):
             break
-        explained = _share(kept[-1].gain, stage, odd)
-        if explained >= ENOUGH and not impossible:
+        explained = _explained_share(kept[-1].likelihood_ratio, stage, anomalies)
+        if explained >= MIN_EXPLAINED_SHARE and not impossible:
             break
-        loose = kept[-1].loose
-        faint = kept[-1].gain < FAINT * left
+        process_noise_fit = kept[-1].process_noise_fit
+        faint = kept[-1].likelihood_ratio < MIN_GAIN_SHARE_OF_NEXT * next_ratio
         if (
-            loose is not None
+            process_noise_fit is not None
             and not (impossible or faint)
-            and _share(kept[-1].gain, loose, odd_loose := _odd(loose)) >= ENOUGH
+            and _explained_share(
+                kept[-1].likelihood_ratio, process_noise_fit, anomalies_with_noise := _anomaly_lines(process_noise_fit)
+            )
+            >= MIN_EXPLAINED_SHARE
         ):
             # Exact dynamics make a large misfit of a formula that is nearly right; it was judged with forces.
-            kept[-1], odd = replace(kept[-1], stage=loose), odd_loose
+            kept[-1], anomalies = replace(kept[-1], stage=process_noise_fit), anomalies_with_noise
             break
-        nearest = Nearest(kept.pop().name, explained, impossible)
-    return kept, odd, nearest
+        nearest = NearestEffect(kept.pop().name, explained, impossible)
+    return kept, anomalies, nearest
 
 
-def _patched(chosen: Sequence[Choice], odd: Sequence[str]) -> Nearest | None:
+def _largest_of_patchwork(chosen: Sequence[Choice], anomalies: Sequence[str]) -> NearestEffect | None:
     """The effect that gains most of so many kinds that they only patch up what has no name; None where they don't."""
-    if len({x.name.split("@")[0] for x in chosen}) < MOST:
+    if len({x.name.split("@")[0] for x in chosen}) < MAX_EFFECTS:
         return None
-    most, gained = max(chosen, key=lambda x: x.gain), sum(x.gain for x in chosen)
-    share = _share(gained, chosen[-1].stage, odd) * most.gain / gained
-    return Nearest(most.name, share) if share < MOSTLY else None
+    most, gained = max(chosen, key=lambda x: x.likelihood_ratio), sum(x.likelihood_ratio for x in chosen)
+    share = _explained_share(gained, chosen[-1].stage, anomalies) * most.likelihood_ratio / gained
+    return NearestEffect(most.name, share) if share < MAIN_CAUSE_SHARE else None
 
 
-def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_turn) -> list[Choice]:
+def review_effects(before: ExtendedFit, chosen: Sequence[Choice], runner: CallRunner = run_in_turn) -> list[Choice]:
     """Each of several effects again, given all that came after it as well, so that their order doesn't count: one that
     the others make good for is dropped, one that another name suits better gets that name, rivals are those beside the
     others. What came first stays where nothing better was found."""
@@ -220,58 +244,62 @@ def reviewed(before: Stage, chosen: Sequence[Choice], together: Together = in_tu
     for first in chosen[:-1]:
         rest, whole = queue[1:], queue[-1].stage
         try:
-            stage = _without(first.name, whole)
+            stage = _refit_without(first.name, whole)
         except NotConvergedError:
-            queue = [*rest, replace(first, stage=whole, loose=None)]  # nothing fits without it
+            queue = [*rest, replace(first, stage=whole, process_noise_fit=None)]  # nothing fits without it
             continue
-        choice = selection.choose(
-            stage, selection.scored(stage, together), rest, together, lambda share, what: None, 0.0
+        choice = selection.choose_effect(
+            stage, selection.score_effects(stage, runner), rest, runner, lambda share, what: None, 0.0
         )
-        queue = [*rest, choice] if choice is not None else [*rest[:-1], replace(rest[-1], stage=stage, loose=None)]
+        queue = (
+            [*rest, choice]
+            if choice is not None
+            else [*rest[:-1], replace(rest[-1], stage=stage, process_noise_fit=None)]
+        )
     whole, judged = queue[-1].stage, {x.name: x for x in queue}
     same = judged.keys() == {x.name for x in chosen}
-    worse = whole.fit.cost - found.fit.cost > selection.LEVEL * found.spread
+    worse = whole.fit.cost - found.fit.cost > selection.MIN_LIKELIHOOD_RATIO * found.dispersion
     if same or worse or whole.fit.process_noise > found.fit.process_noise:
         judged = judged if same else {x.name: x for x in chosen}
-        return [replace(x, rivals=_others(judged[x.name], judged)) for x in chosen]
+        return [replace(x, rivals=_remaining_rivals(judged[x.name], judged)) for x in chosen]
     # The one that came last comes last again.
-    again = _one_by_one(before, (*queue[1:], queue[0]), whole)
-    return [replace(x, rivals=_others(x, judged)) for x in again] if again else list(chosen)
+    again = _refit_one_by_one(before, (*queue[1:], queue[0]), whole)
+    return [replace(x, rivals=_remaining_rivals(x, judged)) for x in again] if again else list(chosen)
 
 
-def _one_by_one(before: Stage, chosen: Sequence[Choice], whole: Stage) -> list[Choice]:
+def _refit_one_by_one(before: ExtendedFit, chosen: Sequence[Choice], whole: ExtendedFit) -> list[Choice]:
     """Effects that a model has, put into the one without them one after the other; gains are over those that stand
     before. None of them where the logs can't be fitted on the way."""
-    if before.prepared.coarse > 1:
-        return _one_from_another(chosen, whole)
+    if before.data.noise_inflation > 1:
+        return _refit_backwards(chosen, whole)
     made = [before]
     try:
         for x in chosen:
-            machine = effects.with_effects(made[-1].machine, selection.entry_of(whole, x.name))
-            made.append(refitted(machine, made[-1], before.fit.process_noise))
+            machine = effects.with_effects(made[-1].machine, selection.fitted_entry(whole, x.name))
+            made.append(refit(machine, made[-1], before.fit.process_noise))
         made[-1] = made[-1] if whole.fit.process_noise == before.fit.process_noise else whole
     except NotConvergedError:
         return []
     found = []
     for x, old, new in zip(chosen, made, made[1:], strict=False):
-        alike = old.settled and old.fit.process_noise == new.fit.process_noise
-        gain = old.fit.cost - new.fit.cost if alike else x.gain
-        found.append(replace(x, stage=new, gain=max(gain, x.gain), loose=None))
+        alike = old.estimated and old.fit.process_noise == new.fit.process_noise
+        gain = old.fit.cost - new.fit.cost if alike else x.likelihood_ratio
+        found.append(replace(x, stage=new, likelihood_ratio=max(gain, x.likelihood_ratio), process_noise_fit=None))
     return found
 
 
-def _one_from_another(chosen: Sequence[Choice], whole: Stage) -> list[Choice]:
+def _refit_backwards(chosen: Sequence[Choice], whole: ExtendedFit) -> list[Choice]:
     """The same from the model with all of them, where the one without any follows coarse sensors only."""
     made = [whole]
     try:
         for x in reversed(chosen[1:]):
-            made.append(_without(x.name, made[-1]))
+            made.append(_refit_without(x.name, made[-1]))
     except NotConvergedError:
         return []
-    return [replace(x, stage=stage, loose=None) for x, stage in zip(chosen, reversed(made), strict=True)]
+    return [replace(x, stage=stage, process_noise_fit=None) for x, stage in zip(chosen, reversed(made), strict=True)]
 
 
-def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
+def drop_unneeded(before: ExtendedFit, chosen: Sequence[Choice]) -> list[Choice]:
     """Several effects without those that were needed on the way only: in the last fit their amount is hardly known to
     be any, and without it the fit is as good, or foretells as much of what it hasn't seen: then it is shapes that
     follow the noise. Disturbing forces hide what else a right name explains."""
@@ -279,139 +307,156 @@ def needed(before: Stage, chosen: Sequence[Choice]) -> list[Choice]:
     for x in chosen:
         # Of one that is nothing at infinity the amount's deviation says little.
         doubtful = whole.exact and whole.placed(x.name).effect.inverse
-        if len(kept) == 1 or (_surely(x.name, whole) and not doubtful):
+        if len(kept) == 1 or (_is_significant(x.name, whole) and not doubtful):
             continue
         beside = np.inf  # nothing fits without it
         with suppress(NotConvergedError):
-            without = _without(x.name, whole)
+            without = _refit_without(x.name, whole)
             if without.fit.process_noise <= whole.fit.process_noise:
                 beside = without.fit.cost - whole.fit.cost
         proven = whole.placed(x.name).effect.inverse or np.isinf(beside)
-        if beside < selection.threshold(x.name, whole, x.tried) or not (proven or _foretells(without, whole)):
+        if beside < selection.required_likelihood_ratio(x.name, whole, x.n_candidates) or not (
+            proven or _predicts_better(without, whole)
+        ):
             kept, whole = [y for y in kept if y.name != x.name], without
         else:
-            kept = [replace(y, beside=beside) if y.name == x.name else y for y in kept]
+            kept = [replace(y, conditional_ratio=beside) if y.name == x.name else y for y in kept]
     if len(kept) == len(chosen):
         return kept
-    return _one_by_one(before, kept, whole) or [replace(x, stage=whole, loose=None) for x in kept]
+    return _refit_one_by_one(before, kept, whole) or [replace(x, stage=whole, process_noise_fit=None) for x in kept]
 
 
-def _foretells(without: Stage, whole: Stage) -> bool:
+def _predicts_better(without: ExtendedFit, whole: ExtendedFit) -> bool:
     """Whether a stage errs less than one without an effect on stretches that were hidden from both, if any can be."""
-    found = gains.gain(gains.withheld(without), gains.withheld(whole))
+    found = gains.hold_out_gain(gains.hold_out_errors(without), gains.hold_out_errors(whole))
     return found is None or found.percent > 0
 
 
-def _surely(name: str, stage: Stage) -> bool:
+def _is_significant(name: str, stage: ExtendedFit) -> bool:
     """Whether an effect is surely any in a fit; one that is nothing at infinity is taken for sure."""
-    return stage.placed(name).effect.inverse or selection.wald(name, stage) > selection.LEVEL
+    return stage.placed(name).effect.inverse or selection.wald_statistic(name, stage) > selection.MIN_LIKELIHOOD_RATIO
 
 
-def _makes_good(choice: Choice, chosen: Sequence[Choice]) -> bool:
+def _replaces_earlier(choice: Choice, chosen: Sequence[Choice]) -> bool:
     """Whether a choice takes the place of an effect that explains more: then it is but a piece of another explanation,
     which needs several names for what one explains."""
-    return any(choice.gain < x.gain and not _surely(x.name, choice.stage) for x in chosen)
+    return any(
+        choice.likelihood_ratio < x.likelihood_ratio and not _is_significant(x.name, choice.stage) for x in chosen
+    )
 
 
-def _outgrows(choice: Choice, chosen: Sequence[Choice]) -> bool:
+def _exceeds_earlier(choice: Choice, chosen: Sequence[Choice]) -> bool:
     """Whether a choice gains more, under disturbing forces, than all that came before it: then these forces hide how
     little the first ones explain, and one after the other would get a name. None has one then."""
-    return bool(chosen) and not choice.stage.exact and choice.gain > sum(x.gain for x in chosen)
+    return bool(chosen) and not choice.stage.exact and choice.likelihood_ratio > sum(x.likelihood_ratio for x in chosen)
 
 
-def _others(choice: Choice, found: Container[str]) -> tuple[EffectEntry, ...]:
+def _remaining_rivals(choice: Choice, found: Container[str]) -> tuple[EffectEntry, ...]:
     """The rivals of an effect that aren't found beside it."""
     return tuple(e for e in choice.rivals if e.label not in found)
 
 
-def _without(name: str, stage: Stage) -> Stage:
+def _refit_without(name: str, stage: ExtendedFit) -> ExtendedFit:
     """A stage's model without one of its effects, fitted. Raises NotConverged."""
     machine = effects.without_effect(stage.machine, name)
     try:
-        return refitted(machine, stage, stage.fit.process_noise)
+        return refit(machine, stage, stage.fit.process_noise)
     except NotConvergedError:
-        return refitted(machine, stage, max(stage.fit.process_noise, SMALL))
+        return refit(machine, stage, max(stage.fit.process_noise, MIN_PROCESS_NOISE))
 
 
-def _odd(stage: Stage) -> tuple[str, ...]:
+def _anomaly_lines(stage: ExtendedFit) -> tuple[str, ...]:
     """What is left beside noise, a line each: innovations that are too large, and what stands out in them, the most
     striking first."""
-    stage = as_measured(stage)
-    logs = stage.prepared.logs
+    stage = with_true_sensor_noise(stage)
+    logs = stage.data.logs
     found = [
         (f"{log.source}: {a}" if len(logs) > 1 else str(a), a.size)
         for k, log in enumerate(logs)
-        for a in anomalies(stage.machine, stage.prepared.c.sensors, log, stage.fit, k)
+        for a in find_anomalies(stage.machine, stage.data.space.sensors, log, stage.fit, k)
     ]
-    return tuple(dict.fromkeys([*stage.suspects, *(line for line, _ in sorted(found, key=lambda x: -x[1]))]))
+    return tuple(dict.fromkeys([*stage.suspect_sensors, *(line for line, _ in sorted(found, key=lambda x: -x[1]))]))
 
 
-def _share(gained: float, stage: Stage, odd: Sequence[str]) -> float:
+def _explained_share(gained: float, stage: ExtendedFit, anomalies: Sequence[str]) -> float:
     """Of the misfit, how much effects explain that gained so much, by what is left of it in a stage and what is odd."""
-    left = _rest(stage, odd)
-    return gained / (gained + left) if gained + left > 0 else 0.0
+    next_ratio = _unexplained_cost(stage, anomalies)
+    return gained / (gained + next_ratio) if gained + next_ratio > 0 else 0.0
 
 
-def _rest(stage: Stage, odd: Sequence[str]) -> float:
+def _unexplained_cost(stage: ExtendedFit, anomalies: Sequence[str]) -> float:
     """The misfit that is left in a stage."""
-    return max(stage.excess, ODD * len(odd))
+    return max(stage.excess_cost, MIN_COST_PER_ANOMALY * len(anomalies))
 
 
-def concluded(
-    before: Stage,
-    after: Stage,
+def conclude(
+    before: ExtendedFit,
+    after: ExtendedFit,
     chosen: Sequence[Choice],
-    odd: tuple[str, ...],
-    left: float,
-    nearest: Nearest | None = None,
-    together: Together = in_turn,
+    anomalies: tuple[str, ...],
+    next_ratio: float,
+    nearest: NearestEffect | None = None,
+    runner: CallRunner = run_in_turn,
 ) -> Diagnosis:
     """The verdict: what is named must explain most of the misfit, and what is left must be noise or be shown; where
     something explains it and is no name, it is unexplained. left: what a further effect would gain that was not worth a
     name."""
     share = 1.0
-    if odd or not after.exact:
-        share = _share(sum(x.gain for x in chosen), after, odd)
-        left = max(left, _rest(after, odd))
-    findings = tuple(_finding(x, after, left, len(chosen) == 1, together) for x in chosen)
+    if anomalies or not after.exact:
+        share = _explained_share(sum(x.likelihood_ratio for x in chosen), after, anomalies)
+        next_ratio = max(next_ratio, _unexplained_cost(after, anomalies))
+    findings = tuple(_make_finding(x, after, next_ratio, len(chosen) == 1, runner) for x in chosen)
     nearest = None if findings else nearest
     verdict = "clean"
     if findings:
         verdict = "tied" if any(f.tied_with for f in findings) else "named"
-    if not after.settled or (odd and (share < ENOUGH or not findings)) or (not after.exact and not findings):
+    if (
+        not after.estimated
+        or (anomalies and (share < MIN_EXPLAINED_SHARE or not findings))
+        or (not after.exact and not findings)
+    ):
         verdict = "unexplained"
     if nearest is not None:
         verdict, share = "unexplained", 0.0
     stages = tuple(x.stage for x in chosen)
-    return Diagnosis(verdict, findings, before, after, share, odd, stages, nearest)
+    return Diagnosis(verdict, findings, before, after, share, anomalies, stages, nearest)
 
 
-def opposite(phase: float) -> float:
+def opposite_phase(phase: float) -> float:
     """The phase [rad] half a turn on, from -pi to pi: an effect with it is the same as one with the amount negative."""
     return float(np.angle(-np.exp(1j * phase)))
 
 
-def _beside(choice: Choice, after: Stage) -> float:
+def _conditional_ratio(choice: Choice, after: ExtendedFit) -> float:
     """What an effect gains given all the others of the last fit: as it was measured, or Wald's statistic, which needs
     no fit without it. No less than any gain for one that is nothing at infinity."""
-    if choice.beside is not None:
-        return choice.beside / choice.spread
+    if choice.conditional_ratio is not None:
+        return choice.conditional_ratio / choice.dispersion
     if after.placed(choice.name).effect.inverse:
         return np.inf
-    return selection.wald(choice.name, after) / choice.spread
+    return selection.wald_statistic(choice.name, after) / choice.dispersion
 
 
-def _finding(choice: Choice, after: Stage, left: float, alone: bool, together: Together = in_turn) -> Finding:
+def _make_finding(
+    choice: Choice, after: ExtendedFit, next_ratio: float, alone: bool, runner: CallRunner = run_in_turn
+) -> Finding:
     """A choice with amount and shapes as the last fit has them. The amount is as unsure as what is left says of the
     formula: where that is a part of what the effect gains, about half its root is a part of the amount; as shapes that
     the logs hardly tell; and never surer than another formula of the same effect would leave it."""
     placed = after.placed(choice.name)
-    std = after.fit.std * after.doubt
+    std = after.fit.std * after.std_inflation
     values = dict(zip(after.model.base.names, zip(after.fit.X, std, strict=True), strict=True))
     amount, sure = values[placed.name]
-    formula = FORMULA * amount * np.sqrt(left / max(choice.gain, left, 1.0))
+    formula = FORMULA_STD_FACTOR * amount * np.sqrt(next_ratio / max(choice.likelihood_ratio, next_ratio, 1.0))
     sure = float(
-        np.linalg.norm([sure, OTHERWISE * amount, formula, magnitude_interval.unsure(placed, after, together)])
+        np.linalg.norm(
+            [
+                sure,
+                FORMULA_STD_SHARE * amount,
+                formula,
+                magnitude_interval.std_over_weak_shapes(placed, after, runner),
+            ]
+        )
     )
     shapes = {
         s: (*values.get(f"{placed.name}.{s}", (placed.values[s], 0.0)), shape.unit)
@@ -421,10 +466,14 @@ def _finding(choice: Choice, after: Stage, left: float, alone: bool, together: T
         # The same half a turn on.
         amount = -amount
         for s in circular:
-            shapes[s] = (opposite(shapes[s][0]), *shapes[s][1:])
-    gain = choice.gain / choice.spread
-    told = gain if alone else min(gain, _beside(choice, after))  # the gain of one of several is that on the way to them
-    p = min(1.0, choice.tried * float(scipy.stats.chi2.sf(told, selection.freedom(choice.name, after))))
+            shapes[s] = (opposite_phase(shapes[s][0]), *shapes[s][1:])
+    gain = choice.likelihood_ratio / choice.dispersion
+    told = (
+        gain if alone else min(gain, _conditional_ratio(choice, after))
+    )  # the gain of one of several is that on the way to them
+    p = min(
+        1.0, choice.n_candidates * float(scipy.stats.chi2.sf(told, selection.degrees_of_freedom(choice.name, after)))
+    )
     return Finding(
         placed.effect.name,
         placed.where,

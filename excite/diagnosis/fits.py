@@ -1,8 +1,8 @@
-"""A machine's model fitted to logs, and fitted again with other effects.
+"""Fit a machine's model to logs, alone or with further effects.
 
-Exact dynamics come first; where these find no estimate, disturbing forces as small as the logs let them be; where these
-don't bring the model near, sensors that are taken to be coarser than they are. Fits that have nothing to do with each
-other are computed side by side: what is sent back from there is fits alone, as charts and effects know their code.
+Exact dynamics come first. If they give no estimate, process noise as small as the logs allow is added; if the model is
+still far from the logs, the sensor noise is inflated. Independent fits run side by side. Only their `Fit`s are sent
+back from other processes, since models hold compiled code.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from excite import identification, smoothing
 from excite.diagnosis import score_test
-from excite.diagnosis.parallel import Together, ahead, in_turn
+from excite.diagnosis.parallel import CallRunner, run_ahead, run_in_turn
 from excite.logs import Log
 from excite.model import Model, build, required_signs
 from excite.model.effects import PlacedEffect
@@ -38,64 +38,73 @@ from excite.smoothing import (
     transfer_trajectory,
 )
 
-NEARER = 100.0  # of a cost, by which what was not found comes nearer to logs that are near already
-FOLLOWED = 2.5  # misfit over readings up to which exact dynamics follow logs where nothing else does
-FAR = 10.0  # misfit over readings, a few passes after the beginning, from which no fit comes near
-SLACK = 0.02  # of the readings, by which the misfit of a right model scatters and noise levels are off
-SURELY, WRONG = 3.0, 0.5  # deviations, and a share of its usual size, by which a parameter's sign is wrong
-PASSES = 14  # of a fit that goes on from another
-COARSE = 10.0, 30.0  # times their noise that sensors are taken to have where nothing follows the logs, in turn
-LESS = 0.1, 0.3  # disturbing forces that are tried next where a model needs any, as shares of those it was fitted with
-SMALL = LESS[0] * identification.PROCESS_NOISE_LEVELS[0]  # the smallest that are tried
+# Cost: twice the negative log-likelihood. A right model's cost is about the number of readings.
+MIN_COST_GAIN_OF_CLOSE_FIT = 100.0  # cost by which an unconverged fit must beat a close one to be continued; chosen
+TRACKING_COST_RATIO = 2.5  # cost over its expected value up to which exact dynamics track the logs; chosen
+LOST_COST_RATIO = 10.0  # cost over the number of readings from which a fit is given up after a few passes; chosen
+COST_TOLERANCE = 0.02  # share of its expected value by which a right model's cost may be larger; chosen
+IMPOSSIBLE_SIGN_STDS = 3.0  # standard deviations beyond zero from which a parameter's sign is impossible; chosen
+IMPOSSIBLE_SIGN_SHARE = 0.5  # share of the parameter's scale beyond zero, likewise; chosen
+RESUMED_PASSES = 14  # largest number of passes of a fit that continues another; chosen
+SENSOR_NOISE_INFLATIONS = 10.0, 30.0  # factors on the sensors' standard deviations, tried in turn; chosen
+PROCESS_NOISE_REDUCTIONS = 0.1, 0.3  # shares of a fit's process noise that are tried next, in turn; chosen
+MIN_PROCESS_NOISE = PROCESS_NOISE_REDUCTIONS[0] * identification.PROCESS_NOISE_LEVELS[0]  # derived: the least tried
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """Logs made ready for a model: chart, records, first guesses, parameters that they don't show."""
+class FitData:
+    """Logs prepared for a model.
 
-    c: StateSpace
+    space: state space of the model. measurements, starts: each log in it, and its initial trajectory. held (n_base,):
+    parameters that stay at the machine file's values, as the logs do not show them.
+    """
+
+    space: StateSpace
     logs: tuple[Log, ...]
-    records: tuple[Measurements, ...]
+    measurements: tuple[Measurements, ...]
     starts: tuple[Trajectory, ...]
     held: np.ndarray
 
     @property
-    def coarse(self) -> float:
-        """How many times as noisy as they are sensors are taken to be."""
-        return self.records[0].noise_inflation
+    def noise_inflation(self) -> float:
+        """Factor on the standard deviations of the sensors."""
+        return self.measurements[0].noise_inflation
 
     @property
-    def readings(self) -> float:
-        """How many readings the logs have: what twice the negative log-likelihood of a right model is about."""
-        return float(sum(r.used.sum() for r in self.records))
+    def n_readings(self) -> float:
+        """Number of readings in all logs: the cost expected of a right model with the true sensor noise."""
+        return float(sum(r.used.sum() for r in self.measurements))
 
     @property
-    def noise(self) -> float:
-        """The misfit that noise makes of a right model."""
-        return self.readings / self.coarse**2
+    def expected_cost(self) -> float:
+        """Cost expected of a right model."""
+        return self.n_readings / self.noise_inflation**2
 
 
 @dataclass(frozen=True)
-class Stage:
-    """A model with the effects found so far, fitted. `exact`: without disturbing forces. Not `settled`: no fit was
-    found, parameters are the file's or, with coarse sensors, those of sensors noisier than they are. loose: the same
-    model with the larger disturbing forces that this fit came from, if it did; beside a fit with coarse sensors the one
-    with disturbing forces that leave much, if there is one. bare: the fit without its disturbing forces, or that there
-    is none, if that is known."""
+class ExtendedFit:
+    """A model with the effects chosen so far, fitted to logs: one stage of the search.
+
+    estimated: the parameters are estimates with the true sensor noise. If False, they are the machine file's, or
+        estimates with inflated sensor noise.
+    process_noise_fit: a fit of the same model with more process noise, if there is one: the one that this fit
+        continues, or beside inflated sensor noise one that is far from the logs.
+    exact_fit: what is known of the fit without process noise: empty if it was not tried, (None,) if there is none.
+    """
 
     machine: Machine
-    prepared: Prepared
+    data: FitData
     fit: Fit
-    settled: bool = True
-    loose: Stage | None = None
-    bare: tuple[Fit | None, ...] = ()
+    estimated: bool = True
+    process_noise_fit: ExtendedFit | None = None
+    exact_fit: tuple[Fit | None, ...] = ()
 
     @property
     def model(self) -> Model:
-        return self.prepared.c.model
+        return self.data.space.model
 
     def placed(self, name: str) -> PlacedEffect:
-        """An effect that the model has."""
+        """Return an effect of the model by its name."""
         return next(e for e in self.model.effects if e.name == name)
 
     @property
@@ -103,369 +112,461 @@ class Stage:
         return self.fit.process_noise == 0
 
     @property
-    def noise(self) -> float:
-        return self.prepared.noise
+    def expected_cost(self) -> float:
+        return self.data.expected_cost
 
     @property
-    def excess(self) -> float:
-        """How much more misfit there is than noise may make."""
-        return max(0.0, self.fit.cost - (1 + SLACK) * self.noise)
+    def excess_cost(self) -> float:
+        """Cost beyond what noise may cause."""
+        return max(0.0, self.fit.cost - (1 + COST_TOLERANCE) * self.expected_cost)
 
     @property
-    def near(self) -> bool:
-        """Whether the misfit is not far from what noise makes."""
-        return self.fit.cost <= smoothing.CLOSE_FIT_COST_RATIO * self.noise
+    def is_close(self) -> bool:
+        """Tell if the cost is near its expected value."""
+        return self.fit.cost <= smoothing.CLOSE_FIT_COST_RATIO * self.expected_cost
 
     @cached_property
-    def ways(self) -> tuple[score_test.Way, ...]:
+    def fitted_logs(self) -> tuple[score_test.FittedLog, ...]:
         """The fitted logs, along which candidates are scored."""
-        return score_test.ways(self.prepared.c, self.prepared.records, self.fit)
+        return score_test.fitted_logs(self.data.space, self.data.measurements, self.fit)
 
     @cached_property
     def scores(self) -> list[tuple[score_test.Score, ...]]:
-        """What candidates score along this fit: empty until `choosing.scored` puts it here."""
+        """Scores of candidates along this fit: empty until `selection.score_effects` stores them."""
         return []
 
     @property
-    def follows(self) -> bool:
-        """Whether exact dynamics follow the logs, by far better than where nothing does: a formula that is nearly right
-        leaves much where an effect is large."""
-        return self.near or (self.exact and self.fit.cost <= FOLLOWED * self.noise)
+    def tracks_logs(self) -> bool:
+        """Tell if the fit is close, or exact dynamics are not far off.
+
+        A nearly right formula leaves a large misfit where its effect is large.
+        """
+        return self.is_close or (self.exact and self.fit.cost <= TRACKING_COST_RATIO * self.expected_cost)
 
     @property
-    def spread(self) -> float:
-        """How many times less sure gains are than without what is left of the misfit."""
-        return max(1.0, self.fit.cost / self.noise)
+    def dispersion(self) -> float:
+        """Ratio of the cost to its expected value, at least 1: likelihood ratios count less by this factor."""
+        return max(1.0, self.fit.cost / self.expected_cost)
 
     @property
-    def rough(self) -> bool:
-        """Whether first-order gains are."""
-        return not self.exact or not self.near
+    def first_order_is_rough(self) -> bool:
+        """Tell if first-order likelihood ratios are unreliable."""
+        return not self.exact or not self.is_close
 
     @property
-    def doubt(self) -> float:
-        """How much larger deviations are than the fit has them, for what it leaves unexplained: slow innovations."""
+    def std_inflation(self) -> float:
+        """Factor on the standard deviations for slow innovations that the fit leaves unexplained."""
         sizes = np.concatenate([innovation_statistics(linear) for linear in self.fit.linear])
-        told = sizes[:, 2] > 0
-        return float(np.sqrt(max(1.0, sizes[told, 1].mean()))) if told.any() else 1.0
+        valid = sizes[:, 2] > 0
+        return float(np.sqrt(max(1.0, sizes[valid, 1].mean()))) if valid.any() else 1.0
 
     @cached_property
     def impossible(self) -> tuple[str, ...]:
-        """Parameters that surely have a sign that no machine has, friction that drives or soil that pulls, a line each.
-        What makes them so is no cause, however much it explains."""
+        """Parameters whose sign no machine has, a line each: friction that drives, soil that pulls.
+
+        An effect that makes them so is not the cause, however much it explains.
+        """
         fit, base = self.fit, self.model.base
-        of = required_signs(self.machine) | {e.name: 1.0 for e in self.model.effects if e.effect.opposes_motion}
-        sure = np.maximum(SURELY * self.doubt * fit.std, WRONG * self.model.scale)
+        required = required_signs(self.machine) | {e.name: 1.0 for e in self.model.effects if e.effect.opposes_motion}
+        margin = np.maximum(
+            IMPOSSIBLE_SIGN_STDS * self.std_inflation * fit.std, IMPOSSIBLE_SIGN_SHARE * self.model.scale
+        )
         found: list[str] = []
         for k, (name, unit) in enumerate(zip(base.names, base.units, strict=True)):
-            # What stands for one standard parameter alone has its sign, whatever the machine file calls it.
+            # A base parameter that is one standard parameter alone has its sign.
             alone = np.count_nonzero(base.matrix[k]) == 1
-            sign = of.get(base.standard[base.independent[k]], 0.0) if alone else 0.0
-            if sign * fit.X[k] < -sure[k]:
+            sign = required.get(base.standard[base.independent[k]], 0.0) if alone else 0.0
+            if sign * fit.X[k] < -margin[k]:
                 found.append(f"{name} = {fit.X[k]:.4g} {unit}")
         return tuple(found)
 
     @property
-    def vain(self) -> bool:
-        """Whether effects leave nothing but noise, and no machine is possible with them: there is nothing by which
-        others could tell better."""
-        return bool(self.model.effects) and self.exact and self.excess == 0 and bool(self.impossible)
+    def is_dead_end(self) -> bool:
+        """Tell if effects leave only noise but make a parameter impossible.
+
+        No misfit is left by which other effects could be told apart.
+        """
+        return bool(self.model.effects) and self.exact and self.excess_cost == 0 and bool(self.impossible)
 
     @property
-    def suspects(self) -> list[str]:
-        return identification.find_suspect_sensors(self.prepared.c, self.prepared.logs, self.fit)
+    def suspect_sensors(self) -> list[str]:
+        return identification.find_suspect_sensors(self.data.space, self.data.logs, self.fit)
 
 
-Fits = tuple[Fit, Fit | None]  # of a stage and of the one with larger disturbing forces that it came from, if it did
+FitPair = tuple[Fit, Fit | None]  # a fit, and the one with more process noise that it continues
 
 
-def staged(machine: Machine, prepared: Prepared, fit: Fit, loose: Fit | None = None) -> Stage:
-    """A stage from fits: its own, and that with larger disturbing forces that it came from, if it did."""
-    came_from = None if loose is None else staged(machine, prepared, loose)
-    return Stage(machine, prepared, fit, prepared.coarse == 1, came_from)
+def assemble_fit(machine: Machine, data: FitData, fit: Fit, process_noise_fit: Fit | None = None) -> ExtendedFit:
+    """Build an extended fit from its fit and the one with more process noise that it continues."""
+    larger_noise = None if process_noise_fit is None else assemble_fit(machine, data, process_noise_fit)
+    return ExtendedFit(machine, data, fit, data.noise_inflation == 1, larger_noise)
 
 
-def fitted(machine: Machine, logs: Sequence[Log], filter: Filter, together: Together = in_turn) -> Stage:
-    """A machine's model fitted to logs, with shapes of effects free.
+def fit_machine(machine: Machine, logs: Sequence[Log], filter: Filter, runner: CallRunner = run_in_turn) -> ExtendedFit:
+    """Fit a machine's model to logs, with the shapes of its effects free.
 
-    Where exact dynamics find no estimate, or none that is less than FAR off after a few passes, nor one near the logs
-    from that with disturbing forces, with such forces as small as the log lets them be: the less they may take up, the
-    plainer the cause. Where these leave the model far off, with sensors taken for much noisier than they are, which
-    most models follow; otherwise as `forced` has it.
-    Each way is set out upon before it is known to be needed, where there are processes for it. Raises NotConverged.
+    Exact dynamics are given up if they stay LOST_COST_RATIO off after a few passes. Then comes process noise, as little
+    as the logs allow: the less it absorbs, the clearer the cause; exact dynamics are tried again from there. If that is
+    far from the logs too, sensor noise is inflated. If all fail, `fit_with_process_noise` applies.
+
+    All attempts start at once where there are processes for them. Raises NotConvergedError.
     """
-    prepared = _prepared(machine, logs, filter)
+    data = _prepare(machine, logs, filter)
     calls: list[Callable[[], Any]] = [
-        partial(_strictly, prepared),
-        partial(with_forces, machine, prepared, identification.PROCESS_NOISE_LEVELS[0]),
-        *(partial(from_first, noisy(prepared, times), identification.PROCESS_NOISE_LEVELS[0]) for times in COARSE),
+        partial(_fit_exact_from_start, data),
+        partial(fit_reducing_process_noise, machine, data, identification.PROCESS_NOISE_LEVELS[0]),
+        *(
+            partial(fit_from_start, inflate_sensor_noise(data, times), identification.PROCESS_NOISE_LEVELS[0])
+            for times in SENSOR_NOISE_INFLATIONS
+        ),
     ]
-    ways = together(calls)
-    with closing(ways):
-        exact = next(ways)
+    results = runner(calls)
+    with closing(results):
+        exact = next(results)
         if exact is not None:
-            return staged(machine, prepared, *exact)
-        disturbed = next(ways)
-        stage = None if disturbed is None else staged(machine, prepared, *disturbed)
-        if stage is None or not stage.near:
-            for times, fit in zip(COARSE, ways, strict=True):
+            return assemble_fit(machine, data, *exact)
+        with_noise = next(results)
+        stage = None if with_noise is None else assemble_fit(machine, data, *with_noise)
+        if stage is None or not stage.is_close:
+            for times, fit in zip(SENSOR_NOISE_INFLATIONS, results, strict=True):
                 if fit is not None:
-                    return Stage(machine, noisy(prepared, times), fit, False, stage)
-    if stage is not None and stage.near:
-        return exact_if_near(stage)
+                    return ExtendedFit(machine, inflate_sensor_noise(data, times), fit, False, stage)
+    if stage is not None and stage.is_close:
+        return exact_if_close(stage)
     return (
-        _forced(machine, prepared, identification.PROCESS_NOISE_LEVELS[1:], together)
+        _fit_by_noise_levels(machine, data, identification.PROCESS_NOISE_LEVELS[1:], runner)
         if stage is None
-        else _with_least(stage, together)
+        else _resume_with_least_noise(stage, runner)
     )
 
 
-def forced(stage: Stage, together: Together) -> Stage:
-    """In place of a fit with coarse sensors one with disturbing forces, no matter how much the smaller ones leave.
-    Where large ones find none, or leave the model FAR off, one with the file's parameters: what these leave shows where
-    to look. Raises NotConverged where those don't either."""
-    if stage.loose is not None:
-        return _with_least(stage.loose, together)
-    return _forced(stage.machine, noisy(stage.prepared, 1.0), identification.PROCESS_NOISE_LEVELS[1:], together)
+def fit_with_process_noise(stage: ExtendedFit, runner: CallRunner) -> ExtendedFit:
+    """Replace a fit with inflated sensor noise by one with process noise, however much that leaves.
+
+    If no level gives a fit within LOST_COST_RATIO, the machine file's parameters are kept: their misfit shows where to
+    look. Raises NotConvergedError if these give none either.
+    """
+    if stage.process_noise_fit is not None:
+        return _resume_with_least_noise(stage.process_noise_fit, runner)
+    return _fit_by_noise_levels(
+        stage.machine, inflate_sensor_noise(stage.data, 1.0), identification.PROCESS_NOISE_LEVELS[1:], runner
+    )
 
 
-def _forced(machine: Machine, prepared: Prepared, forces: Sequence[float], together: Together) -> Stage:
+def _fit_by_noise_levels(
+    machine: Machine, data: FitData, noise_levels: Sequence[float], runner: CallRunner
+) -> ExtendedFit:
+    """Fit with the first level of process noise that gives a fit, else with the machine file's parameters."""
     calls: list[Callable[[], Any]] = [
-        *(partial(_worthy, prepared, d, FAR * prepared.readings) for d in forces),
-        partial(_as_filed, prepared),
+        *(partial(_fit_below_cost, data, d, LOST_COST_RATIO * data.n_readings) for d in noise_levels),
+        partial(_fit_with_file_parameters, data),
     ]
-    with closing(together(calls)) as ways:
-        fit = next((fit for fit in islice(ways, len(forces)) if fit is not None), None)
+    with closing(runner(calls)) as results:
+        fit = next((fit for fit in islice(results, len(noise_levels)) if fit is not None), None)
         if fit is None:
-            return Stage(machine, prepared, next(ways), settled=False)
-    stage = staged(machine, prepared, fit)
-    return exact_if_near(staged(machine, prepared, *_lessened(stage, together))) if stage.near else stage
+            return ExtendedFit(machine, data, next(results), estimated=False)
+    stage = assemble_fit(machine, data, fit)
+    return (
+        exact_if_close(assemble_fit(machine, data, *_reduce_noise_while_close(stage, runner)))
+        if stage.is_close
+        else stage
+    )
 
 
-def _as_filed(prepared: Prepared) -> Fit:
-    """A fit with the file's parameters and small disturbing forces."""
-    asis = replace(prepared, held=np.ones_like(prepared.held))
+def _fit_with_file_parameters(data: FitData) -> Fit:
+    """Fit the trajectories alone, with the machine file's parameters and small process noise."""
+    all_held = replace(data, held=np.ones_like(data.held))
     try:
-        fit = iterated(asis, prepared.starts, prepared.c.model.nominal, identification.PROCESS_NOISE_LEVELS[0])
+        fit = iterate(all_held, data.starts, data.space.model.nominal, identification.PROCESS_NOISE_LEVELS[0])
     except NotConvergedError as failed:
         if failed.fit is None:
             raise
         fit = failed.fit
     unknown = np.full_like(fit.covariance, np.nan)
-    known = smoothing.prior_information(prepared.c.model, prepared.held, fit.X)
-    return light(replace(fit, unidentifiable=prepared.held, prior=known, covariance=unknown))
+    known = smoothing.prior_information(data.space.model, data.held, fit.X)
+    return without_smoother_levels(replace(fit, unidentifiable=data.held, prior=known, covariance=unknown))
 
 
-def noisy(prepared: Prepared, coarse: float) -> Prepared:
-    """The same logs with sensors so coarse."""
-    return replace(prepared, records=tuple(replace(r, noise_inflation=coarse) for r in prepared.records))
+def inflate_sensor_noise(data: FitData, noise_inflation: float) -> FitData:
+    """Return the same logs with the sensors' standard deviations times `noise_inflation`."""
+    return replace(data, measurements=tuple(replace(r, noise_inflation=noise_inflation) for r in data.measurements))
 
 
-def as_measured(stage: Stage) -> Stage:
-    """A stage's motion and parameters against the sensors as noisy as they are."""
-    if stage.prepared.coarse == 1:
+def with_true_sensor_noise(stage: ExtendedFit) -> ExtendedFit:
+    """Evaluate a fit's trajectories and parameters against the true sensor noise."""
+    if stage.data.noise_inflation == 1:
         return stage
-    prepared, fit = noisy(stage.prepared, 1.0), stage.fit
+    data, fit = inflate_sensor_noise(stage.data, 1.0), stage.fit
     linear = smoothing.linearise_logs(
-        prepared.c, prepared.records, fit.trajectories, prepared.starts, fit.X, fit.process_noise
+        data.space, data.measurements, fit.trajectories, data.starts, fit.X, fit.process_noise
     )
     if linear is None:
         return stage
     cost = sum(float(x.Z[0, 0]) for x in linear)
-    return replace(stage, prepared=prepared, fit=light(replace(fit, linear=tuple(linear), cost=cost)), bare=())
+    return replace(
+        stage, data=data, fit=without_smoother_levels(replace(fit, linear=tuple(linear), cost=cost)), exact_fit=()
+    )
 
 
-def sharpened(found: Sequence[Stage], disturbed: float, together: Together) -> Iterator[Stage | None]:
-    """Stages with coarse sensors gone on with, with sensors as they are and so large disturbing forces, side by side
-    and set out upon at once; None where no fit comes anywhere near."""
-    prepared = [noisy(x.prepared, 1.0) for x in found]
-    calls = [partial(_resumable, p, x, disturbed, FAR * p.readings) for p, x in zip(prepared, found, strict=True)]
-    every = zip(prepared, found, ahead(calls, together), strict=True)
-    return (None if fit is None else staged(x.machine, p, fit) for p, x, fit in every)
+def resume_with_true_sensor_noise(
+    found: Sequence[ExtendedFit], process_noise: float, runner: CallRunner
+) -> Iterator[ExtendedFit | None]:
+    """Continue fits with inflated sensor noise with the true noise and a level of process noise, side by side.
+
+    The first starts at once. None stands for a fit that gets nowhere near the logs.
+    """
+    data = [inflate_sensor_noise(x.data, 1.0) for x in found]
+    calls = [
+        partial(_resume_or_none, p, x, process_noise, LOST_COST_RATIO * p.n_readings)
+        for p, x in zip(data, found, strict=True)
+    ]
+    answers = zip(data, found, run_ahead(calls, runner), strict=True)
+    return (None if fit is None else assemble_fit(x.machine, p, fit) for p, x, fit in answers)
 
 
-def from_first(
-    prepared: Prepared, disturbed: float, most: float = np.inf, worth: float = np.inf, patient: bool = False
+def fit_from_start(
+    data: FitData, process_noise: float, cost_limit: float = np.inf, max_cost: float = np.inf, patient: bool = False
 ) -> Fit | None:
-    """A fit from first guesses; None where none is found or it is given up, as it still costs more than `most`, or
-    more than it is worth and no less than before. To the patient one that is as good as found is none."""
-    p = prepared
+    """Fit from initial trajectories; None if no fit is found.
+
+    cost_limit: cost above which the fit is given up. max_cost: cost above which it is given up once costs stagnate.
+    patient: iterate to the end; nearly converged fits count as none.
+    """
     try:
-        return light(iterated(p, p.starts, p.c.model.nominal, disturbed, most=most, patient=patient, worth=worth))
+        return without_smoother_levels(
+            iterate(
+                data,
+                data.starts,
+                data.space.model.nominal,
+                process_noise,
+                cost_limit=cost_limit,
+                patient=patient,
+                max_cost=max_cost,
+            )
+        )
     except NotConvergedError as failed:
-        return None if failed.acceptable_fit is None or patient else light(failed.acceptable_fit)
+        return None if failed.acceptable_fit is None or patient else without_smoother_levels(failed.acceptable_fit)
 
 
-def _strictly(prepared: Prepared) -> Fits | None:
-    """A fit from first guesses by exact dynamics; None where it is given up, as it stays FAR off."""
-    fit = from_first(prepared, 0.0, FAR * prepared.readings, patient=True)
+def _fit_exact_from_start(data: FitData) -> FitPair | None:
+    """Fit exact dynamics from initial trajectories; None if they stay LOST_COST_RATIO off."""
+    fit = fit_from_start(data, 0.0, LOST_COST_RATIO * data.n_readings, patient=True)
     return None if fit is None else (fit, None)
 
 
-def with_forces(machine: Machine, prepared: Prepared, disturbed: float, worth: float = np.inf) -> Fits | None:
-    """A fit from first guesses with disturbing forces, and from there with smaller ones where it is near; None of one
-    that costs more than it is worth."""
-    fit = _worthy(prepared, disturbed, worth)
+def fit_reducing_process_noise(
+    machine: Machine, data: FitData, process_noise: float, max_cost: float = np.inf
+) -> FitPair | None:
+    """Fit from initial trajectories with process noise, and reduce that if the fit is close.
+
+    Return None if the fit costs more than max_cost.
+    """
+    fit = _fit_below_cost(data, process_noise, max_cost)
     if fit is None:
         return None
-    stage = staged(machine, prepared, fit)
-    return _lessened(stage) if stage.near else (fit, None)
+    stage = assemble_fit(machine, data, fit)
+    return _reduce_noise_while_close(stage) if stage.is_close else (fit, None)
 
 
-def _worthy(prepared: Prepared, disturbed: float, worth: float) -> Fit | None:
-    """A fit from first guesses with disturbing forces, None of one that costs more than it is worth."""
-    fit = from_first(prepared, disturbed, worth=worth)
-    return None if fit is None or fit.cost > worth else fit
+def _fit_below_cost(data: FitData, process_noise: float, max_cost: float) -> Fit | None:
+    """Fit from initial trajectories with process noise; None if it costs more than max_cost."""
+    fit = fit_from_start(data, process_noise, max_cost=max_cost)
+    return None if fit is None or fit.cost > max_cost else fit
 
 
-def _with_least(stage: Stage, together: Together) -> Stage:
-    """A stage gone on with with the smallest disturbing forces that it takes, without any where that is near."""
-    if stage.loose is not None:
-        return exact_if_near(stage)
-    return exact_if_near(staged(stage.machine, stage.prepared, *_lessened(stage, together)))
+def _resume_with_least_noise(stage: ExtendedFit, runner: CallRunner) -> ExtendedFit:
+    """Continue a fit with the least process noise that gives one, and without any if that is close."""
+    if stage.process_noise_fit is not None:
+        return exact_if_close(stage)
+    return exact_if_close(assemble_fit(stage.machine, stage.data, *_reduce_noise_while_close(stage, runner)))
 
 
-def _lessened(first: Stage, together: Together = in_turn) -> Fits:
-    """A fit with smaller disturbing forces, and smaller ones yet as long as these let the model come near the logs:
-    large ones hide what else there is. And the one that it came from."""
-    stage = _with_less(first, together)
+def _reduce_noise_while_close(first: ExtendedFit, runner: CallRunner = run_in_turn) -> FitPair:
+    """Reduce process noise once, then on as long as the fit stays close: large levels hide other effects.
+
+    Return the fit and the one that it came from.
+    """
+    stage = _reduce_noise(first, runner)
     if stage is None:
         return first.fit, None
-    while (smaller := _with_less(stage, together)) is not None and smaller.near:
+    while (smaller := _reduce_noise(stage, runner)) is not None and smaller.is_close:
         stage = smaller
     return stage.fit, first.fit
 
 
-def _with_less(stage: Stage, together: Together) -> Stage | None:
-    """The fit of a stage gone on with with smaller disturbing forces, None where there is none."""
-    smaller = [d for d in (less * stage.fit.process_noise for less in LESS) if d >= SMALL]
-    with closing(together([partial(_resumable, stage.prepared, stage, forces) for forces in smaller])) as fits:
-        return next((replace(stage, fit=fit, bare=()) for fit in fits if fit is not None), None)
+def _reduce_noise(stage: ExtendedFit, runner: CallRunner) -> ExtendedFit | None:
+    """Continue a fit with the smallest of the reduced levels that gives one; None if none does."""
+    smaller = [
+        d for d in (less * stage.fit.process_noise for less in PROCESS_NOISE_REDUCTIONS) if d >= MIN_PROCESS_NOISE
+    ]
+    with closing(runner([partial(_resume_or_none, stage.data, stage, level) for level in smaller])) as fits:
+        return next((replace(stage, fit=fit, exact_fit=()) for fit in fits if fit is not None), None)
 
 
-def refitted(machine: Machine, of: Stage, disturbed: float) -> Stage:
-    """The model of a machine with other effects fitted to the logs of a stage, from its fit, with so large disturbing
-    forces. Raises NotConverged."""
-    prepared = prepared_for(machine, of)
-    return staged(machine, prepared, resume(prepared, of, disturbed))
+def refit(machine: Machine, previous: ExtendedFit, process_noise: float) -> ExtendedFit:
+    """Fit a machine with other effects to the same logs, from a previous fit. Raises NotConvergedError."""
+    data = adapt_data(machine, previous)
+    return assemble_fit(machine, data, resume_fit(data, previous, process_noise))
 
 
-Wish = tuple[Machine, Stage, float]  # what `refitted` is called with
+RefitRequest = tuple[Machine, ExtendedFit, float]  # machine, previous fit and process noise of a refit
 
 
-def refits(
-    wishes: Sequence[Wish],
-    together: Together,
-    most: float = np.inf,
+def refit_all(
+    requests: Sequence[RefitRequest],
+    runner: CallRunner,
+    cost_limit: float = np.inf,
     held: Sequence[str] = (),
-) -> Iterator[Stage | None]:
-    """Several refitted, side by side; None where no fit is found or it is given up, as it still costs more than `most`
-    after a few passes. held: of each a parameter that stays at the machine file's value, if any are."""
-    prepared = [prepared_for(machine, of) for machine, of, _ in wishes]
+) -> Iterator[ExtendedFit | None]:
+    """Refit several machines side by side; None for each that fails or costs more than cost_limit after a few passes.
+
+    held: for each machine a parameter that stays at its file's value.
+    """
+    data = [adapt_data(machine, previous) for machine, previous, _ in requests]
     if held:
-        prepared = [_holding(p, name) for p, name in zip(prepared, held, strict=True)]
+        data = [_hold_parameter(p, name) for p, name in zip(data, held, strict=True)]
     calls = [
-        partial(_resumable, p, of, disturbed, most) for p, (_, of, disturbed) in zip(prepared, wishes, strict=True)
+        partial(_resume_or_none, p, previous, process_noise, cost_limit)
+        for p, (_, previous, process_noise) in zip(data, requests, strict=True)
     ]
-    every = zip(prepared, wishes, together(calls), strict=True)
-    return (None if fit is None else staged(machine, p, fit) for p, (machine, _, _), fit in every)
+    answers = zip(data, requests, runner(calls), strict=True)
+    return (None if fit is None else assemble_fit(machine, p, fit) for p, (machine, _, _), fit in answers)
 
 
-def refitted_and_freed(machine: Machine, of: Stage, together: Together) -> tuple[Stage | None, Stage]:
-    """The model of a machine with other effects fitted from the fit of a stage, None where no fit is found, and beside
-    it the stage itself without its disturbing forces, if it has any and is near, as it will be asked for."""
-    prepared, frees = prepared_for(machine, of), of.near and not of.exact
-    calls = [partial(_resumable, prepared, of, of.fit.process_noise), *([partial(_exact, of)] if frees else [])]
-    fit, *bare = together(calls)
-    other = None if fit is None else staged(machine, prepared, fit)
-    return other, replace(of, bare=tuple(bare)) if frees else of
+def refit_and_drop_noise(
+    machine: Machine, previous: ExtendedFit, runner: CallRunner
+) -> tuple[ExtendedFit | None, ExtendedFit]:
+    """Refit a machine with other effects, and the previous fit without its process noise, side by side.
+
+    Return the refit, None if it fails, and the previous fit, which knows its exact fit if it is close and has noise.
+    """
+    data, drops_noise = adapt_data(machine, previous), previous.is_close and not previous.exact
+    calls = [
+        partial(_resume_or_none, data, previous, previous.fit.process_noise),
+        *([partial(_exact_fit, previous)] if drops_noise else []),
+    ]
+    fit, *exact_fit = runner(calls)
+    other = None if fit is None else assemble_fit(machine, data, fit)
+    return other, replace(previous, exact_fit=tuple(exact_fit)) if drops_noise else previous
 
 
-def _holding(prepared: Prepared, name: str) -> Prepared:
-    return replace(prepared, held=prepared.held | (np.array(prepared.c.model.base.names) == name))
+def _hold_parameter(data: FitData, name: str) -> FitData:
+    return replace(data, held=data.held | (np.array(data.space.model.base.names) == name))
 
 
-def freed(found: Sequence[Stage], together: Together) -> Iterator[Stage | None]:
-    """Stages without their disturbing forces, side by side; None where exact dynamics are far from the logs: they make
-    a large misfit of a formula that is nearly right."""
-    for stage, fit in zip(found, together([partial(_exact, x) for x in found]), strict=True):
-        yield None if fit is None else replace(stage, fit=fit, bare=())
+def drop_process_noise(found: Sequence[ExtendedFit], runner: CallRunner) -> Iterator[ExtendedFit | None]:
+    """Refit without process noise, side by side; None where exact dynamics are far from the logs."""
+    for stage, fit in zip(found, runner([partial(_exact_fit, x) for x in found]), strict=True):
+        yield None if fit is None else replace(stage, fit=fit, exact_fit=())
 
 
-def exact_if_near(stage: Stage) -> Stage:
-    """A stage without its disturbing forces where exact dynamics come near the logs, otherwise as it is."""
-    without = None if stage.exact or not stage.near else next(freed([stage], in_turn))
-    return without if without is not None and without.near else stage
+def exact_if_close(stage: ExtendedFit) -> ExtendedFit:
+    """Drop a fit's process noise if exact dynamics come close to the logs; otherwise return it unchanged."""
+    without = None if stage.exact or not stage.is_close else next(drop_process_noise([stage], run_in_turn))
+    return without if without is not None and without.is_close else stage
 
 
-def _exact(stage: Stage) -> Fit | None:
-    if stage.bare:
-        return stage.bare[0]
-    most = FAR * stage.prepared.readings
+def _exact_fit(stage: ExtendedFit) -> Fit | None:
+    if stage.exact_fit:
+        return stage.exact_fit[0]
+    cost_limit = LOST_COST_RATIO * stage.data.n_readings
     try:
-        fit = resume(stage.prepared, stage, 0.0, most)
+        fit = resume_fit(stage.data, stage, 0.0, cost_limit)
     except NotConvergedError:
         return None
-    return fit if fit.cost < most else None
+    return fit if fit.cost < cost_limit else None
 
 
-def _resumable(prepared: Prepared, of: Stage, disturbed: float, most: float = np.inf) -> Fit | None:
+def _resume_or_none(
+    data: FitData, previous: ExtendedFit, process_noise: float, cost_limit: float = np.inf
+) -> Fit | None:
     try:
-        return resume(prepared, of, disturbed, most)
+        return resume_fit(data, previous, process_noise, cost_limit)
     except NotConvergedError:
         return None
 
 
-def resume(prepared: Prepared, of: Stage, disturbed: float, most: float = np.inf) -> Fit:
-    """The fit of a stage gone on with, for logs made ready for another model. Raises NotConverged."""
-    c, untold = prepared.c, _untold(prepared, of, disturbed)
-    old = dict(zip(of.model.base.names, of.fit.X, strict=True))
-    X = np.array([old.get(n, x) for n, x in zip(c.model.base.names, c.model.nominal, strict=True)])
-    X = np.where(prepared.held, c.model.nominal, X)
-    points = [
-        transfer_trajectory(c, r, p, of.prepared.c, X)
-        for r, p in zip(prepared.records, of.fit.trajectories, strict=True)
+def resume_fit(data: FitData, previous: ExtendedFit, process_noise: float, cost_limit: float = np.inf) -> Fit:
+    """Fit data of another model, starting from a previous fit. Raises NotConvergedError.
+
+    If the first attempt fails, it is accepted as it is, or continued once, if its cost shows that it is on the way.
+    """
+    space, initially_held = data.space, _initially_held(data, previous, process_noise)
+    old = dict(zip(previous.model.base.names, previous.fit.X, strict=True))
+    X = np.array([old.get(n, x) for n, x in zip(space.model.base.names, space.model.nominal, strict=True)])
+    X = np.where(data.held, space.model.nominal, X)
+    trajectories = [
+        transfer_trajectory(space, r, p, previous.data.space, X)
+        for r, p in zip(data.measurements, previous.fit.trajectories, strict=True)
     ]
     try:
-        fit = _nearly(prepared, points, X, disturbed, most, untold)
+        fit = _iterate_resumed(data, trajectories, X, process_noise, cost_limit, initially_held)
     except NotConvergedError as failed:
         found = failed.fit
         if found is None:
             raise
-        if disturbed > 0:
-            # It came near the logs as the stage that it began from did not with such forces: what began or ended at an
-            # instant may keep it from settling, and exact dynamics tell later what it is worth.
-            alike = of.fit.process_noise >= disturbed and of.prepared.coarse == prepared.coarse
-            if alike and not of.near and found.cost <= min(smoothing.CLOSE_FIT_COST_RATIO * prepared.noise, most):
-                return light(found)
+        if process_noise > 0:
+            # Accept a fit that came close where the previous one with such noise did not: an effect that begins or
+            # ends at an instant may keep it from converging, and exact dynamics judge it later.
+            comparable = (
+                previous.fit.process_noise >= process_noise and previous.data.noise_inflation == data.noise_inflation
+            )
+            if (
+                comparable
+                and not previous.is_close
+                and found.cost <= min(smoothing.CLOSE_FIT_COST_RATIO * data.expected_cost, cost_limit)
+            ):
+                return without_smoother_levels(found)
             raise
-        # By exact dynamics it came near the logs as the stage that it began from did not, or nearer by far: what does
-        # that is right, from however far it came, and is gone on with.
-        alike = of.near and of.prepared.coarse == prepared.coarse
-        near = of.fit.cost - NEARER if alike else smoothing.CLOSE_FIT_COST_RATIO * prepared.noise
-        if found.cost > min(near, most):
+        # Continue an exact fit that came close where the previous one did not, or that is much better than it.
+        was_close = previous.is_close and previous.data.noise_inflation == data.noise_inflation
+        acceptable = (
+            previous.fit.cost - MIN_COST_GAIN_OF_CLOSE_FIT
+            if was_close
+            else smoothing.CLOSE_FIT_COST_RATIO * data.expected_cost
+        )
+        if found.cost > min(acceptable, cost_limit):
             raise
-        fit = _nearly(prepared, found.trajectories, found.X, disturbed, most, untold)
-    return light(fit)
+        fit = _iterate_resumed(data, found.trajectories, found.X, process_noise, cost_limit, initially_held)
+    return without_smoother_levels(fit)
 
 
-def _untold(prepared: Prepared, of: Stage, disturbed: float) -> np.ndarray:
-    """Parameters (n_base,) that the logs don't show in the fit of a stage, where neither smaller disturbing forces nor
-    finer sensors may show them now. Most often they don't with other effects either: left free they would first lead
-    each of these fits astray."""
-    names = prepared.c.model.base.names
-    if of.fit.process_noise > disturbed or of.prepared.coarse != prepared.coarse or not of.settled:
+def _initially_held(data: FitData, previous: ExtendedFit, process_noise: float) -> np.ndarray:
+    """Return the parameters (n_base,) that the previous fit could not identify and that nothing new may show.
+
+    Smaller process noise or sensor noise may show them. Free from the first pass, they would lead each refit astray.
+    """
+    names = data.space.model.base.names
+    if (
+        previous.fit.process_noise > process_noise
+        or previous.data.noise_inflation != data.noise_inflation
+        or not previous.estimated
+    ):
         return np.zeros(len(names), bool)
-    unseen = {n for n, yes in zip(of.model.base.names, of.fit.unidentifiable, strict=True) if yes}
+    unseen = {n for n, yes in zip(previous.model.base.names, previous.fit.unidentifiable, strict=True) if yes}
     return np.array([n in unseen for n in names])
 
 
-def _nearly(
-    prepared: Prepared, points: Sequence[Trajectory], X: np.ndarray, disturbed: float, most: float, untold: np.ndarray
+def _iterate_resumed(
+    data: FitData,
+    trajectories: Sequence[Trajectory],
+    X: np.ndarray,
+    process_noise: float,
+    cost_limit: float,
+    initially_held: np.ndarray,
 ) -> Fit:
-    """A fit that goes on from another, as far as it came if that is as good as found. Raises NotConverged."""
+    """Iterate from another fit; accept one that nearly converged. Raises NotConvergedError."""
     try:
-        return iterated(prepared, points, X, disturbed, smoothing.RESUMED_DAMPING, PASSES, most, untold=untold)
+        return iterate(
+            data,
+            trajectories,
+            X,
+            process_noise,
+            smoothing.RESUMED_DAMPING,
+            RESUMED_PASSES,
+            cost_limit,
+            initially_held=initially_held,
+        )
     except NotConvergedError as failed:
         found = failed.acceptable_fit or failed.oscillating_fit
         if found is None:
@@ -473,59 +574,81 @@ def _nearly(
         return found
 
 
-def iterated(
-    prepared: Prepared,
-    points: Sequence[Trajectory],
+def iterate(
+    data: FitData,
+    trajectories: Sequence[Trajectory],
     X: np.ndarray,
-    disturbed: float,
+    process_noise: float,
     damping: float = smoothing.INITIAL_DAMPING,
     passes: int = smoothing.MAX_PASSES,
-    most: float = np.inf,
+    cost_limit: float = np.inf,
     patient: bool = False,
-    worth: float = np.inf,
-    untold: np.ndarray | None = None,
+    max_cost: float = np.inf,
+    initially_held: np.ndarray | None = None,
 ) -> Fit:
-    """A fit from points and X. With large disturbing forces it is found as soon as it nearly is: gains are larger
-    by far than what another pass would change. With the smallest, whose gains may be small, and by exact dynamics it
-    leaves undone what is less than an amount is ever known to, the patient one nothing. Raises NotConverged."""
-    p, enough = (
-        prepared,
-        smoothing.ACCEPTABLE_STEP if disturbed > SMALL else 0.0 if patient else smoothing.SUFFICIENT_STEP,
-    )
+    """Fit from given trajectories and parameters X (n_base,).
+
+    With process noise above its minimum an acceptable step ends the fit: likelihood ratios are much larger than what a
+    further pass changes. Otherwise a sufficient step ends it; a patient fit goes to full convergence. Raises
+    NotConvergedError.
+    """
+    sufficient_step = 0.0 if patient else smoothing.SUFFICIENT_STEP
+    if process_noise > MIN_PROCESS_NOISE:
+        sufficient_step = smoothing.ACCEPTABLE_STEP
     return smoothing.fit_logs(
-        p.c, p.records, points, X, p.starts, disturbed, p.held, damping, passes, enough, most, patient, worth, untold
+        data.space,
+        data.measurements,
+        trajectories,
+        X,
+        data.starts,
+        process_noise,
+        data.held,
+        damping,
+        passes,
+        sufficient_step,
+        cost_limit,
+        patient,
+        max_cost,
+        initially_held,
     )
 
 
-def light(fit: Fit) -> Fit:
-    """A fit without what only its own iteration needs."""
+def without_smoother_levels(fit: Fit) -> Fit:
+    """Drop what only the fit's own iteration needs."""
     return replace(fit, linear=tuple(replace(x, chain=x.chain.without_levels) for x in fit.linear))
 
 
-def _charted(machine: Machine, logs: Sequence[Log]) -> StateSpace:
+def _build_space(machine: Machine, logs: Sequence[Log]) -> StateSpace:
     model = build(machine, fit_shapes=True)
     return build_state_space(model, common_sensors(model, logs))
 
 
-def _prepared(machine: Machine, logs: Sequence[Log], filter: Filter) -> Prepared:
-    c = _charted(machine, logs)
-    records = tuple(prepare_measurements(c, log) for log in logs)
-    starts = tuple(initial_trajectory(c, r, log, filter) for r, log in zip(records, logs, strict=True))
-    return Prepared(
-        c, tuple(logs), records, starts, identification.parameters_at_rest(c.model, logs, filter, slow=False)
+def _prepare(machine: Machine, logs: Sequence[Log], filter: Filter) -> FitData:
+    space = _build_space(machine, logs)
+    measurements = tuple(prepare_measurements(space, log) for log in logs)
+    starts = tuple(initial_trajectory(space, r, log, filter) for r, log in zip(measurements, logs, strict=True))
+    return FitData(
+        space,
+        tuple(logs),
+        measurements,
+        starts,
+        identification.parameters_at_rest(space.model, logs, filter, slow=False),
     )
 
 
-def prepared_for(machine: Machine, of: Stage) -> Prepared:
-    """The logs of a stage made ready for a machine with other effects."""
-    before = of.prepared
-    if machine is of.machine:
+def adapt_data(machine: Machine, previous: ExtendedFit) -> FitData:
+    """Prepare a previous fit's logs for a machine with other effects."""
+    before = previous.data
+    if machine is previous.machine:
         return before
-    c = _charted(machine, before.logs)
-    model = c.model
-    records = tuple(replace(r, offset_sensors=encoders_with_offset(c, r.read_at_edges)) for r in before.records)
-    starts = tuple(
-        transfer_trajectory(c, r, p, before.c, model.nominal) for r, p in zip(records, before.starts, strict=True)
+    space = _build_space(machine, before.logs)
+    model = space.model
+    measurements = tuple(
+        replace(r, offset_sensors=encoders_with_offset(space, r.read_at_edges)) for r in before.measurements
     )
-    held = dict(zip(of.model.base.names, before.held, strict=True))
-    return Prepared(c, before.logs, records, starts, np.array([held.get(n, False) for n in model.base.names]))
+    starts = tuple(
+        transfer_trajectory(space, r, p, before.space, model.nominal)
+        for r, p in zip(measurements, before.starts, strict=True)
+    )
+    held = dict(zip(previous.model.base.names, before.held, strict=True))
+    return FitData(space, before.logs, measurements, starts, np.array([held.get(n, False) for n in model.base.names]))

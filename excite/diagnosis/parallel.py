@@ -1,8 +1,8 @@
-"""Work side by side in processes that share this one's memory, so that models need not be built again.
+"""Run calls side by side in forked processes that share this process's memory, so that models need not be built again.
 
-A forked process begins where this one stands: what it is to do is passed without copying, only its answer is sent, its
-arrays in memory that this one maps. That takes milliseconds, where a fresh process takes seconds to load the program.
-Forking is sound on Linux alone; elsewhere all is done in this process, with the same answer.
+A forked process starts within milliseconds; a fresh one takes seconds to load the program. It needs no copy of its
+input. Only its answer is sent back, arrays in memory that this process maps. Forking is sound on Linux alone; elsewhere
+all calls run in this process, with the same answers.
 """
 
 from __future__ import annotations
@@ -23,75 +23,75 @@ from typing import Any, Protocol, TypeVar
 
 R = TypeVar("R")
 
-PR_SET_PDEATHSIG = 1  # <linux/prctl.h>: the signal that a process gets when its parent ends
-ALIGNED = 64  # bytes: where an array may begin
+PR_SET_PDEATHSIG = 1  # from <linux/prctl.h>: signal that a process gets when its parent ends
+ARRAY_ALIGNMENT = 64  # alignment of arrays [bytes]: a cache line
 LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None  # loaded before any fork
 
 
-class Together(Protocol):
-    """Carries out calls that have nothing to do with each other, and gives what they return in their order.
+class CallRunner(Protocol):
+    """Runs independent calls and yields their results in order.
 
-    A caller that wants no more of them closes what it got."""
+    A caller that wants no more results closes the generator.
+    """
 
     def __call__(self, calls: Sequence[Callable[[], R]], /) -> Generator[R, None, None]: ...
 
 
-def cores() -> int:
-    """How many processes pay; one where forking isn't sound."""
+def usable_cores() -> int:
+    """Return the number of processes that pay; one where forking is not sound."""
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else 1
 
 
-def in_turn(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
-    """What each call returns, one after the other in this process."""
+def run_in_turn(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
+    """Run calls one after the other in this process."""
     return (call() for call in calls)
 
 
-def ahead(calls: Sequence[Callable[[], R]], together: Together) -> Generator[R, None, None]:
-    """What calls return, where the first is set out upon at once if there are processes for it, while this one goes
-    on."""
-    ways: Generator[Any, None, None] = together([_nothing, *calls])
-    next(ways)
-    return ways
+def run_ahead(calls: Sequence[Callable[[], R]], runner: CallRunner) -> Generator[R, None, None]:
+    """Run calls, the first at once if there are processes for it, while this process goes on."""
+    results: Generator[Any, None, None] = runner([_do_nothing, *calls])
+    next(results)
+    return results
 
 
-def _nothing() -> None:
+def _do_nothing() -> None:
     pass
 
 
-def forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
-    """The same from as many processes at a time as there are cores, in the order of the calls.
+def run_forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
+    """Run calls in as many forked processes at a time as there are cores, and yield results in order.
 
-    What a process does not finish, because the call raises or something ends it, is done again in this one when its
-    turn comes, and so is what no process can be had for. However this one ends, the others end too.
+    A call that a process does not finish, because it raises or the process ends, is repeated here in its turn; so is a
+    call for which no process can be had. However this process ends, the others end too.
     """
-    at_once = cores()
-    if min(at_once, len(calls)) < 2:
-        yield from in_turn(calls)
+    n_processes = usable_cores()
+    if min(n_processes, len(calls)) < 2:
+        yield from run_in_turn(calls)
         return
     running: dict[Connection, tuple[int, _Worker]] = {}
     done: dict[int, R] = {}
-    left: set[int] = set()  # to this process
-    begun = 0
+    to_repeat: set[int] = set()  # calls that this process must run
+    started = 0
     try:
         for k in range(len(calls)):
             while k not in done:
-                for number in range(begun, min(begun + at_once - len(running), len(calls))):
+                for number in range(started, min(started + n_processes - len(running), len(calls))):
                     try:
-                        worker = _started(calls[number], list(running))
+                        worker = _start_worker(calls[number], list(running))
                         running[worker.answer] = number, worker
                     except OSError:  # no memory, processes or files left
-                        left.add(number)
-                    begun += 1
-                if k in left:
+                        to_repeat.add(number)
+                    started += 1
+                if k in to_repeat:
                     done[k] = calls[k]()
                     break
                 ready = wait(list(running))
                 for answer in [a for a in running if a in ready]:
                     number, worker = running[answer]
                     try:
-                        done[number] = _received(worker)
+                        done[number] = _receive(worker)
                     except (EOFError, OSError):
-                        left.add(number)
+                        to_repeat.add(number)
                     worker.process.join()
                     worker.close()
                     del running[answer]
@@ -105,7 +105,7 @@ def forked(calls: Sequence[Callable[[], R]]) -> Generator[R, None, None]:
 
 @dataclass(frozen=True)
 class _Worker:
-    """A process at work, where its answer comes, and the file that takes the arrays of it."""
+    """A running process, the pipe of its answer, and the file that takes the answer's arrays."""
 
     process: BaseProcess
     answer: Connection
@@ -116,17 +116,19 @@ class _Worker:
         os.close(self.arrays)
 
 
-def _started(call: Callable[[], R], others: Sequence[Connection]) -> _Worker:
-    """A process at work. others: where the answers of earlier processes come."""
+def _start_worker(call: Callable[[], R], others: Sequence[Connection]) -> _Worker:
+    """Start a process for a call. others: pipes of earlier processes."""
     fork = multiprocessing.get_context("fork")
-    arrays = _file()
+    arrays = _memory_file()
     try:
         answer, own = fork.Pipe(duplex=False)
     except OSError:
         os.close(arrays)
         raise
-    with own:  # here it is closed in any case: the process has its own
-        process = fork.Process(target=_carry, args=(call, own, arrays, [answer, *others], os.getpid()), daemon=True)
+    with own:  # close this process's copy in any case
+        process = fork.Process(
+            target=_run_worker, args=(call, own, arrays, [answer, *others], os.getpid()), daemon=True
+        )
         worker = _Worker(process, answer, arrays)
         try:
             process.start()
@@ -136,49 +138,51 @@ def _started(call: Callable[[], R], others: Sequence[Connection]) -> _Worker:
     return worker
 
 
-def _file() -> int:
-    """A file in memory, or where a Python knows none, a temporary one without a name."""
+def _memory_file() -> int:
+    """Open a file in memory, or a temporary file without a name where Python has none."""
     if hasattr(os, "memfd_create"):
         return os.memfd_create("answer")
     with tempfile.TemporaryFile() as file:
         return os.dup(file.fileno())
 
 
-def _received(worker: _Worker) -> Any:
-    """The answer of a process, its arrays where it left them. Raises EOFError or OSError where there is none."""
+def _receive(worker: _Worker) -> Any:
+    """Return the answer of a process, with its arrays in mapped memory. Raises EOFError or OSError if there is none."""
     rest, spans = worker.answer.recv()
     if not any(end > begin for begin, end in spans):
         return pickle.loads(rest, buffers=[bytearray()] * len(spans))
-    # Private: what is written to an array is seen here alone. The memory, and a descriptor of it, lives as long as one
-    # of the arrays.
+    # A private mapping: writing to an array changes this process's copy alone. It lives as long as one of the arrays.
     memory = memoryview(mmap.mmap(worker.arrays, 0, access=mmap.ACCESS_COPY))
     return pickle.loads(rest, buffers=[memory[a:b] for a, b in spans])
 
 
-def _carry(
+def _run_worker(
     call: Callable[[], object], answer: Connection, memory: int, others: Sequence[Connection], parent: int
 ) -> None:
-    """In the forked process. It ends without the clean-up of a Python program: files and buffers are not its own."""
+    """Run a call in the forked process and send its answer.
+
+    The process ends without Python's clean-up, since files and buffers belong to its parent.
+    """
     try:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the process that waits, which ends this one
-        _end_with(parent)
-        for read in others:  # a pipe breaks only when nobody can read it: this process must not keep any open
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Ctrl-C the waiting parent ends this process
+        _end_with_parent(parent)
+        for read in others:  # a pipe breaks only when no process can read it
             read.close()
         arrays: list[pickle.PickleBuffer] = []
         rest = pickle.dumps(call(), 5, buffer_callback=arrays.append)
         spans: list[tuple[int, int]] = []
         with open(memory, "wb") as file:
             for array in arrays:
-                begin = file.seek(-(-file.tell() // ALIGNED) * ALIGNED)
+                begin = file.seek(-(-file.tell() // ARRAY_ALIGNMENT) * ARRAY_ALIGNMENT)
                 spans.append((begin, begin + file.write(array.raw())))
         answer.send((rest, spans))
     finally:
         os._exit(0)
 
 
-def _end_with(parent: int) -> None:
-    """This process ends when its parent does, or the parent's thread that began it, whatever ends that."""
+def _end_with_parent(parent: int) -> None:
+    """Let this process end when its parent, or the thread that forked it, ends for any reason."""
     if LIBC is not None:
         LIBC.prctl(PR_SET_PDEATHSIG, ctypes.c_ulong(signal.SIGKILL))
-    if os.getppid() != parent:  # it had ended before
+    if os.getppid() != parent:  # the parent had ended before
         os._exit(0)

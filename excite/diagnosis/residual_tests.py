@@ -1,7 +1,7 @@
-"""What a fitted log holds beside noise that need not be an effect of the catalogue: jumps, bursts, tones, stuck counts.
+"""Tests of a fitted log for jumps, bursts, drifts, tones, stuck counts and missing bits.
 
-Right innovations are white, of variance one and without outliers, all along the log. Each test looks for one way not to
-be, over the whole log and in windows; its threshold allows for all windows, frequencies and signals that are tried.
+Null hypothesis: innovations are white with variance one and without outliers, all along the log. Each test looks for
+one departure, over the whole log and in windows. Its threshold allows for all windows, frequencies and signals tried.
 """
 
 from __future__ import annotations
@@ -18,29 +18,52 @@ from excite.logs import Log, white_noise
 from excite.model.machine import Machine, Sensor
 from excite.smoothing import Fit
 
-ALARM = 1e-4  # chance of a false alarm of each test in a log
-WINDOWS = 0.5, 2.0  # [s]
-LOUDER = 1.6  # mean square of innovations in a window that counts, however sure
-STUCK = 3.0  # counts that an encoder should have made while it stood still
-SHAKING = 10.0  # [Hz]: above that a torque that is driven has little
-FEW = 50  # samples by which shaking is told
-SURE = 3.0  # deviations
-SCATTER = 3.0  # of the logarithm of a median square of third differences, over the root of their number
-# Values that never occur between such as do, as a converter with a stuck bit leaves them out: holes HOLE times wider
-# than the distance of values about them, MANY of them at least, every other band of one width.
-HOLE, ABOUT, MANY, EVERY = 20.0, 40, 4, 0.1
-# Values at either edge of a hole whose distances are averaged, those that they are compared with, and how much larger
-# they may be.
-EDGE, WIDELY, SHARP = 5, 201, 2.0
-TAIL = 1.6  # by which outliers of encoders may exceed those of normal noise: an edge's error is not normal
+FALSE_ALARM_PROBABILITY = 1e-4  # of each test in one log; chosen
+MIN_READINGS = 50  # readings of a signal that are tested; chosen
+OUTLIER_MARGIN = 1.6  # factor on the threshold of outliers, as encoder edges have no normal errors; chosen
+
+WINDOWS_S = 0.5, 2.0  # lengths of windows [s]; chosen
+MIN_WINDOWS = 3  # windows in a log that are tested; chosen
+MIN_WINDOW_READINGS = 10  # readings in a window that counts; chosen
+MIN_WINDOW_MEAN_SQUARE = 1.6  # mean square of innovations of a burst, however significant; chosen
+BURST_MARGIN = 1.3  # factor on the threshold of the normalised sum of squares; chosen
+DRIFT_MARGIN = 1.2  # factor on the threshold of the normalised sum; chosen
+
+SPECTRUM_NEIGHBOURS = 201  # ordinates of the periodogram whose median is the level about a peak; chosen
+TONE_BAND = 0.0, 0.5  # band of tones in innovations, shares of the sampling rate: all
+TONE_MARGIN = 1.3  # factor on the threshold of tones in innovations; chosen
+TORQUE_TONE_BAND = 0.2, 0.48  # the same above an actuator's bandwidth; chosen
+TORQUE_TONE_MARGIN = 2.0  # factor on the threshold of tones in a torque channel; chosen
+
+MIN_STUCK_COUNTS = 3.0  # counts before and after a sample without any that make it stuck; chosen
+MIN_STUCK_SAMPLES = 3  # stuck samples in a log that are reported; chosen
+
+SHAKING_HZ = 10.0  # frequency [Hz] above which actuated torques contain little; chosen
+MIN_SHAKING_SAMPLES = 50  # samples with and without the effect that are compared; chosen
+SHAKING_STDS = 3.0  # standard deviations from which the difference is significant; chosen
+
+# Medians of squares of standard normal noise.
+MEDIAN_SQUARE = 0.4549  # median of chi-squared with one degree of freedom
+MEDIAN_SQUARE_SCATTER = 2.33  # relative standard deviation of the median of N squares, times sqrt(N); asymptotic
+LOG_MEDIAN_SQUARE_SCATTER = 3.0  # the same of its logarithm, for third differences of white noise; by simulation
+
+# A stuck bit of a converter leaves holes between bands of values, all of one width.
+MIN_HOLE_RATIO = 20.0  # gap between sorted values over the usual gap there that makes a hole; chosen
+HOLE_NEIGHBOURS = 40  # gaps whose median is the usual gap; chosen
+MIN_HOLES = 4  # number of holes; chosen
+MIN_REGULAR_SHARE = 0.8  # share of the holes that must follow each other at twice the width; chosen
+HOLE_SPACING_TOLERANCE = 0.1  # relative error of that spacing; chosen
+EDGE_GAPS = 5  # gaps on either side of a hole that show how sharp its edges are; chosen
+EDGE_REFERENCE_GAPS = 201  # gaps whose median they are compared with; chosen
+MAX_EDGE_RATIO = 2.0  # largest ratio of the two at a sharp edge; chosen
 
 
 @dataclass(frozen=True)
 class Anomaly:
-    """Something beside noise: its signal, kind (jump, burst, drift, tone, stuck, bands), span of time [s], frequency
-    [Hz].
+    """A departure from noise in one signal.
 
-    size: the statistic over its threshold.
+    kind: jump, burst, drift, tone, stuck or bands. begin, end [s]. frequency [Hz] of a tone. size: the statistic over
+    its threshold.
     """
 
     signal: str
@@ -62,140 +85,158 @@ class Anomaly:
         return f"{self.signal}: {what}"
 
 
-def anomalies(machine: Machine, sensors: tuple[Sensor, ...], log: Log, fit: Fit, number: int = 0) -> list[Anomaly]:
-    """What a fitted log holds beside noise, the most striking first. number: which of the fit's logs it is."""
+def find_anomalies(machine: Machine, sensors: tuple[Sensor, ...], log: Log, fit: Fit, number: int = 0) -> list[Anomaly]:
+    """Find departures from noise in a fitted log, the most striking first. number: index of the log in the fit."""
     z = fit.linear[number].innovations
     t, rate = log.t, float(machine.sampling_hz)
     found: list[Anomaly] = []
     for j, sensor in enumerate(sensors):
-        found += _in_innovations(sensor.name, t, z[:, j], rate, sensor.resolution is not None)
+        found += _innovation_anomalies(sensor.name, t, z[:, j], rate, sensor.resolution is not None)
         if sensor.resolution is not None:
-            found += _stuck(sensor, t, log.values[sensor.name])
+            found += _stuck_counts(sensor, t, log.values[sensor.name])
     for sensor in machine.sensors("full"):
         if sensor.kind == "torque" and sensor.name in log.values:
-            found += _in_torque(sensor.name, t, log.values[sensor.name], rate)
+            found += _torque_anomalies(sensor.name, t, log.values[sensor.name], rate)
         if sensor.resolution is None and sensor.name in log.values:
-            found += _bands(sensor.name, t, log.values[sensor.name])
+            found += _value_bands(sensor.name, t, log.values[sensor.name])
     return sorted(found, key=lambda a: -a.size)
 
 
-def shakes(u: np.ndarray, there: np.ndarray, rate: float) -> bool | None:
-    """Whether a torque channel u (N,), sampled at a rate [Hz], is surely louder above SHAKING where `there` (N,) is one
-    than where it is none; None where that can't be told."""
-    inside, outside = there > 0.9, there < 0.1
-    if min(int(inside.sum()), int(outside.sum())) < FEW or rate < 4 * SHAKING:
+def is_shaking(u: np.ndarray, active: np.ndarray, rate: float) -> bool | None:
+    """Tell if a torque channel u (N,) at a sampling rate [Hz] is louder above SHAKING_HZ while an effect acts.
+
+    active (N,): one where the effect acts, zero where it does not. Return None if the log cannot tell.
+    """
+    inside, outside = active > 0.9, active < 0.1
+    if min(int(inside.sum()), int(outside.sum())) < MIN_SHAKING_SAMPLES or rate < 4 * SHAKING_HZ:
         return None
-    high = scipy.signal.sosfiltfilt(scipy.signal.butter(4, SHAKING, "high", fs=rate, output="sos"), u) ** 2
-    independent = 1 - 2 * SHAKING / rate  # share of the samples
-    # Medians: the steps of a drive are loud and rare. That of squares of normal noise scatters by 2.33 / sqrt(N).
-    spread = 2.33 * np.sqrt((1 / inside.sum() + 1 / outside.sum()) / independent)
-    return bool(np.median(high[inside]) > (1 + SURE * spread) * np.median(high[outside]))
+    high = scipy.signal.sosfiltfilt(scipy.signal.butter(4, SHAKING_HZ, "high", fs=rate, output="sos"), u) ** 2
+    independent = 1 - 2 * SHAKING_HZ / rate  # share of the samples that count as independent
+    # Medians, since steps of an actuated torque are loud and rare.
+    scatter = MEDIAN_SQUARE_SCATTER * np.sqrt((1 / inside.sum() + 1 / outside.sum()) / independent)
+    return bool(np.median(high[inside]) > (1 + SHAKING_STDS * scatter) * np.median(high[outside]))
 
 
-def _in_innovations(name: str, t: np.ndarray, z: np.ndarray, rate: float, counts: bool) -> Iterator[Anomaly]:
-    told = np.isfinite(z)
-    count = int(told.sum())
-    if count < 50:
+def _innovation_anomalies(name: str, t: np.ndarray, z: np.ndarray, rate: float, counts: bool) -> Iterator[Anomaly]:
+    valid = np.isfinite(z)
+    count = int(valid.sum())
+    if count < MIN_READINGS:
         return
-    own = np.where(told, z, 0.0)
-    limit = TAIL * float(scipy.stats.norm.isf(ALARM / count / 2))
+    own = np.where(valid, z, 0.0)
+    limit = OUTLIER_MARGIN * float(scipy.stats.norm.isf(FALSE_ALARM_PROBABILITY / count / 2))
     k = int(np.argmax(np.abs(own)))
     if abs(own[k]) > limit:
         yield Anomaly(name, "jump", t[k], t[k], None, abs(own[k]) / limit)
-    heavy = max(float(np.mean(own[told] ** 4)) / float(np.mean(own[told] ** 2)) ** 2 - 1, 1.0)
-    for width in WINDOWS:
-        yield from _in_windows(name, t, own, told, round(width * rate), heavy)
+    square_variance = max(float(np.mean(own[valid] ** 4)) / float(np.mean(own[valid] ** 2)) ** 2 - 1, 1.0)
+    for width in WINDOWS_S:
+        yield from _window_anomalies(name, t, own, valid, round(width * rate), square_variance)
     if not counts:
-        yield from _tone(name, own, rate, (0.0, 0.5), 1.3)
+        yield from _tone(name, own, rate, TONE_BAND, TONE_MARGIN)
 
 
-def _in_windows(
-    name: str, t: np.ndarray, z: np.ndarray, told: np.ndarray, width: int, heavy: float
+def _window_anomalies(
+    name: str, t: np.ndarray, z: np.ndarray, valid: np.ndarray, width: int, square_variance: float
 ) -> Iterator[Anomaly]:
-    """A burst and a drift, where the sum of squares or the sum over a window is too large. heavy: variance of z^2."""
+    """Find a burst, by a window's sum of squares, and a drift, by its sum.
+
+    square_variance: variance of the squared innovations.
+    """
     n = len(z) // width
-    if n < 3:
+    if n < MIN_WINDOWS:
         return
-    squares, sums, counts = (x[: n * width].reshape(n, width).sum(axis=1) for x in (z**2, z, told.astype(float)))
-    enough = counts >= 10
+    squares, sums, counts = (x[: n * width].reshape(n, width).sum(axis=1) for x in (z**2, z, valid.astype(float)))
+    enough = counts >= MIN_WINDOW_READINGS
     if not enough.any():
         return
-    limit = float(scipy.stats.norm.isf(ALARM / n))
+    limit = float(scipy.stats.norm.isf(FALSE_ALARM_PROBABILITY / n))
     level = np.median(squares[enough] / counts[enough])
-    loud = np.where(enough, (squares / np.maximum(counts, 1) / max(level, 1.0) - 1) * np.sqrt(counts / heavy), 0.0)
-    k = int(np.argmax(loud))
-    # A sum of squares is no normal variable: of narrow windows more are large.
-    free = 2 * max(float(counts[k]), 1.0) / heavy
-    skewed = (float(scipy.stats.chi2.isf(ALARM / n, free)) / free - 1) * np.sqrt(free / 2)
-    if loud[k] > max(limit * 1.3, skewed) and squares[k] > LOUDER * counts[k]:
-        yield Anomaly(name, "burst", t[k * width], t[(k + 1) * width - 1], None, loud[k] / limit)
-    slow = np.where(enough, np.abs(sums) / np.sqrt(np.maximum(counts, 1)), 0.0)
-    k = int(np.argmax(slow))
-    if slow[k] > limit * 1.2:
-        yield Anomaly(name, "drift", t[k * width], t[(k + 1) * width - 1], None, slow[k] / limit)
+    burst_statistic = np.where(
+        enough, (squares / np.maximum(counts, 1) / max(level, 1.0) - 1) * np.sqrt(counts / square_variance), 0.0
+    )
+    k = int(np.argmax(burst_statistic))
+    # The sum of squares over a narrow window is skewed: use chi-squared.
+    freedom = 2 * max(float(counts[k]), 1.0) / square_variance
+    chi2_limit = (float(scipy.stats.chi2.isf(FALSE_ALARM_PROBABILITY / n, freedom)) / freedom - 1) * np.sqrt(
+        freedom / 2
+    )
+    if burst_statistic[k] > max(limit * BURST_MARGIN, chi2_limit) and squares[k] > MIN_WINDOW_MEAN_SQUARE * counts[k]:
+        yield Anomaly(name, "burst", t[k * width], t[(k + 1) * width - 1], None, burst_statistic[k] / limit)
+    drift_statistic = np.where(enough, np.abs(sums) / np.sqrt(np.maximum(counts, 1)), 0.0)
+    k = int(np.argmax(drift_statistic))
+    if drift_statistic[k] > limit * DRIFT_MARGIN:
+        yield Anomaly(name, "drift", t[k * width], t[(k + 1) * width - 1], None, drift_statistic[k] / limit)
 
 
 def _tone(name: str, x: np.ndarray, rate: float, band: tuple[float, float], margin: float) -> Iterator[Anomaly]:
-    """A peak of the periodogram over its surroundings, in a band (shares of the rate): of white noise it is exponential
-    (Fisher, 1929). margin: on the threshold, for a spectrum that isn't quite flat."""
+    """Find a peak of the periodogram over its surroundings, in a band (shares of the rate).
+
+    The ordinates of white noise are exponential (Fisher, 1929). margin: factor on the threshold, for spectra not quite
+    flat.
+    """
     f, power = scipy.signal.periodogram(x, rate, detrend="constant")
     f, power = f[2:], power[2:]
-    around = scipy.ndimage.median_filter(power, 201, mode="reflect") / np.log(2)
-    keep = (f >= band[0] * rate) & (f <= band[1] * rate)
-    over = np.where(keep, power / np.maximum(around, 1e-30), 0.0)
-    limit = float(np.log(len(f) / ALARM)) * margin
-    k = int(np.argmax(over))
-    if over[k] > limit:
-        yield Anomaly(name, "tone", 0.0, len(x) / rate, float(f[k]), over[k] / limit)
+    around = scipy.ndimage.median_filter(power, SPECTRUM_NEIGHBOURS, mode="reflect") / np.log(2)
+    in_band = (f >= band[0] * rate) & (f <= band[1] * rate)
+    ratio = np.where(in_band, power / np.maximum(around, 1e-30), 0.0)
+    limit = float(np.log(len(f) / FALSE_ALARM_PROBABILITY)) * margin
+    k = int(np.argmax(ratio))
+    if ratio[k] > limit:
+        yield Anomaly(name, "tone", 0.0, len(x) / rate, float(f[k]), ratio[k] / limit)
 
 
-def _stuck(sensor: Sensor, t: np.ndarray, value: np.ndarray) -> Iterator[Anomaly]:
-    """Counts that stand still for a sample between samples in which several were made."""
+def _stuck_counts(sensor: Sensor, t: np.ndarray, value: np.ndarray) -> Iterator[Anomaly]:
+    """Find counts that stand still for a sample between samples with several counts."""
     step = np.abs(np.diff(value)) / float(sensor.resolution or 1)
     still = step < 0.5
     around = np.minimum(step[:-2], step[2:])
-    bad = np.flatnonzero(still[1:-1] & (around > STUCK))
-    if len(bad) >= 3:
-        yield Anomaly(sensor.name, "stuck", t[bad[0] + 2], t[bad[-1] + 2], None, len(bad) / 3)
+    bad = np.flatnonzero(still[1:-1] & (around > MIN_STUCK_COUNTS))
+    if len(bad) >= MIN_STUCK_SAMPLES:
+        yield Anomaly(sensor.name, "stuck", t[bad[0] + 2], t[bad[-1] + 2], None, len(bad) / MIN_STUCK_SAMPLES)
 
 
-def _bands(name: str, t: np.ndarray, value: np.ndarray) -> Iterator[Anomaly]:
-    """Values of a channel that come in every other band of one width alone."""
+def _value_bands(name: str, t: np.ndarray, value: np.ndarray) -> Iterator[Anomaly]:
+    """Find values of a channel that occur only in every other band of one width: a bit of the converter is stuck."""
     x = np.sort(value)
     gap = np.diff(x)
-    usual = scipy.ndimage.median_filter(gap, ABOUT, mode="nearest") / np.log(2)
-    at = np.flatnonzero((usual > 0) & (gap > HOLE * usual))
-    if len(at) < MANY:
+    usual = scipy.ndimage.median_filter(gap, HOLE_NEIGHBOURS, mode="nearest") / np.log(2)
+    holes = np.flatnonzero((usual > 0) & (gap > MIN_HOLE_RATIO * usual))
+    if len(holes) < MIN_HOLES:
         return
-    width = float(np.median(gap[at]))
-    place = (x[at] + gap[at] / 2) / (2 * width)
-    # The width is a little too large, by the distance of values: so is what is found of the way from hole to hole.
-    apart = np.diff(place)
-    apart /= np.maximum(np.round(apart), 1.0)
-    period = float(np.median(apart))
-    regular = (np.abs(apart - period) < EVERY) & (np.abs(gap[at][1:] / width - 1) < 2 * EVERY)
-    # A bit cuts values off where they are as dense as elsewhere; noise about levels that a drive steps to fades.
-    beside = np.add.outer(at, [*range(-EDGE, 0), *range(1, EDGE + 1)])
-    around = scipy.ndimage.median_filter(gap, WIDELY, mode="nearest")[at] / np.log(2)
-    edges = gap[np.clip(beside, 0, len(gap) - 1)].mean(axis=1) / around
-    sharp, often = np.median(edges) <= SHARP, regular.sum() >= max(MANY - 1, 0.8 * len(regular))
-    if sharp and often and abs(period - 1) < EVERY:
-        yield Anomaly(name, "bands", t[0], t[-1], None, len(at) / MANY)
+    width = float(np.median(gap[holes]))
+    place = (x[holes] + gap[holes] / 2) / (2 * width)
+    # The width is too large by the usual gap, and so is the spacing from hole to hole.
+    spacing = np.diff(place)
+    spacing /= np.maximum(np.round(spacing), 1.0)
+    period = float(np.median(spacing))
+    regular = (np.abs(spacing - period) < HOLE_SPACING_TOLERANCE) & (
+        np.abs(gap[holes][1:] / width - 1) < 2 * HOLE_SPACING_TOLERANCE
+    )
+    # A stuck bit cuts values off where they are dense; noise about the levels of a stepped torque fades.
+    neighbours = np.add.outer(holes, [*range(-EDGE_GAPS, 0), *range(1, EDGE_GAPS + 1)])
+    around = scipy.ndimage.median_filter(gap, EDGE_REFERENCE_GAPS, mode="nearest")[holes] / np.log(2)
+    edges = gap[np.clip(neighbours, 0, len(gap) - 1)].mean(axis=1) / around
+    is_sharp, is_regular = (
+        np.median(edges) <= MAX_EDGE_RATIO,
+        regular.sum() >= max(MIN_HOLES - 1, MIN_REGULAR_SHARE * len(regular)),
+    )
+    if is_sharp and is_regular and abs(period - 1) < HOLE_SPACING_TOLERANCE:
+        yield Anomaly(name, "bands", t[0], t[-1], None, len(holes) / MIN_HOLES)
 
 
-def _in_torque(name: str, t: np.ndarray, u: np.ndarray, rate: float) -> Iterator[Anomaly]:
-    """Tones above what a drive can do, and windows of louder noise, in a torque channel itself."""
-    yield from _tone(name, u, rate, (0.2, 0.48), 2.0)
+def _torque_anomalies(name: str, t: np.ndarray, u: np.ndarray, rate: float) -> Iterator[Anomaly]:
+    """Find tones above an actuator's bandwidth and windows of louder noise in a torque channel."""
+    yield from _tone(name, u, rate, TORQUE_TONE_BAND, TORQUE_TONE_MARGIN)
     noise = white_noise(u)
-    rough = np.diff(u, 3) / (np.sqrt(20) * max(noise, 1e-12))
-    width = round(WINDOWS[1] * rate)
-    n = len(rough) // width
-    if n < 3:
+    third_difference = np.diff(u, 3) / (np.sqrt(20) * max(noise, 1e-12))
+    width = round(WINDOWS_S[1] * rate)
+    n = len(third_difference) // width
+    if n < MIN_WINDOWS:
         return
-    level = np.median(rough[: n * width].reshape(n, width) ** 2, axis=1) / 0.4549
-    # The third difference of white noise is coloured. The logarithm of its median square over a window is about normal,
-    # and scatters by SCATTER / sqrt(width): found by simulation.
-    limit = float(np.exp(scipy.stats.norm.isf(ALARM / n) * SCATTER / np.sqrt(width)))
+    level = np.median(third_difference[: n * width].reshape(n, width) ** 2, axis=1) / MEDIAN_SQUARE
+    # The logarithm of a window's median square is about normal.
+    limit = float(
+        np.exp(scipy.stats.norm.isf(FALSE_ALARM_PROBABILITY / n) * LOG_MEDIAN_SQUARE_SCATTER / np.sqrt(width))
+    )
     k = int(np.argmax(level))
-    if level[k] > limit and level[k] > LOUDER:
+    if level[k] > limit and level[k] > MIN_WINDOW_MEAN_SQUARE:
         yield Anomaly(name, "burst", t[k * width], t[(k + 1) * width - 1], None, level[k] / limit)

@@ -14,21 +14,23 @@ import numpy as np
 import scipy
 
 from excite import identification
-from excite.diagnosis.fits import Stage, as_measured, refits
-from excite.diagnosis.parallel import in_turn
+from excite.diagnosis.fits import ExtendedFit, refit_all, with_true_sensor_noise
+from excite.diagnosis.parallel import run_in_turn
 from excite.smoothing import LinearisedLog, advance, differentiate, state_scale
 
 BLOCK_S = 0.25  # [s] over which slow errors are means
-BINS = 24  # of a quantity
-FEWEST = 20  # samples in a bin that is shown
-MOMENT = 0.02  # of a log: what is shorter is told by when it was
-CONCENTRATED = 0.6, 0.3  # so much of the misfit in at most so much of the samples is a place
-PEAK = 15.0  # of a periodogram over its mean; noise stays below 11
-EXCESS = 1.6  # mean square of innovations from which a signal has something beside noise: null logs stay below
+N_BINS = 24  # of a quantity
+MIN_BIN_SAMPLES = 20  # samples in a bin that is shown
+MIN_RANGE_SHARE = 0.02  # of a log: what is shorter is told by when it was
+CONCENTRATION = 0.6, 0.3  # so much of the misfit in at most so much of the samples is a place
+MIN_PEAK_RATIO = 15.0  # of a periodogram over its mean; noise stays below 11
+MAX_NOISE_MEAN_SQUARE = (
+    1.6  # mean square of innovations from which a signal has something beside noise: null logs stay below
+)
 
 
 @dataclass(frozen=True)
-class Course:
+class LogResiduals:
     """One log along a fit of N samples; all [SI].
 
     missing: torque of each driven joint, and with disturbing forces each force, by label: (N,), unit, standard
@@ -58,41 +60,41 @@ class Course:
 
 
 @dataclass(frozen=True)
-class Size:
+class InnovationLevel:
     """How large a signal's innovations are: mean squares of all and of slow ones (means over BLOCK_S), 1 for noise."""
 
-    all: float
-    slow: float
+    mean_square: float
+    slow_mean_square: float
 
     @property
     def systematic_percent(self) -> float:
         """The share of the (slow) error that noise doesn't make; 0 where chance may make it as large."""
-        worst = max(self.all, self.slow)
+        worst = max(self.mean_square, self.slow_mean_square)
         if not np.isfinite(worst):
             return float("nan")
-        return 100 * (1 - 1 / worst) if worst > EXCESS else 0.0
+        return 100 * (1 - 1 / worst) if worst > MAX_NOISE_MEAN_SQUARE else 0.0
 
 
-def loosened(stage: Stage) -> Stage:
+def refit_with_process_noise(stage: ExtendedFit) -> ExtendedFit:
     """The same model with disturbing forces of some size; as it is where those find no fit."""
     least, known = identification.PROCESS_NOISE_LEVELS[0], stage
-    while known.fit.process_noise < least or known.prepared.coarse > 1:
-        if known.loose is None:
-            (found,) = refits([(stage.machine, stage, least)], in_turn)
+    while known.fit.process_noise < least or known.data.noise_inflation > 1:
+        if known.process_noise_fit is None:
+            (found,) = refit_all([(stage.machine, stage, least)], run_in_turn)
             return found or stage
-        known = known.loose
+        known = known.process_noise_fit
     return known
 
 
-def courses(stage: Stage) -> tuple[Course, ...]:
+def residuals_of_logs(stage: ExtendedFit) -> tuple[LogResiduals, ...]:
     """What each log of a stage shows."""
-    stage = as_measured(stage)
-    return tuple(_course(stage, k) for k in range(len(stage.prepared.logs)))
+    stage = with_true_sensor_noise(stage)
+    return tuple(_residuals_of_log(stage, k) for k in range(len(stage.data.logs)))
 
 
-def _course(stage: Stage, k: int) -> Course:
-    c, fit, model = stage.prepared.c, stage.fit, stage.model
-    log, r, p = stage.prepared.logs[k], stage.prepared.records[k], fit.trajectories[k]
+def _residuals_of_log(stage: ExtendedFit, k: int) -> LogResiduals:
+    c, fit, model = stage.data.space, stage.fit, stage.model
+    log, r, p = stage.data.logs[k], stage.data.measurements[k], fit.trajectories[k]
     N = len(p.state)
     rate = float(stage.machine.sampling_hz)
     t = np.arange(N) / rate
@@ -106,12 +108,12 @@ def _course(stage: Stage, k: int) -> Course:
         missing[label] = w[:, j], "N m" if body.joint == "revolute" else "N", float(r.noise.torque[j])
         own[label] = body.index
     if not stage.exact:
-        for label, force, unit, index in _forces(stage, p.state, c.inputs(u, p.ground_inputs)):
+        for label, force, unit, index in _process_forces(stage, p.state, c.inputs(u, p.ground_inputs)):
             before = missing.get(label)
             # Where forces act on a driven joint they are its missing torque as well.
             missing[label] = (before[0] + force, unit, float("nan")) if before else (force, unit, float("nan"))
             own.setdefault(label, index)
-    return Course(
+    return LogResiduals(
         log.source,
         t,
         missing,
@@ -121,9 +123,9 @@ def _course(stage: Stage, k: int) -> Course:
     )
 
 
-def _forces(stage: Stage, s: np.ndarray, u: np.ndarray) -> list[tuple[str, np.ndarray, str, int | None]]:
+def _process_forces(stage: ExtendedFit, s: np.ndarray, u: np.ndarray) -> list[tuple[str, np.ndarray, str, int | None]]:
     """The smoothed disturbing forces along states s under inputs u: label, values (N,), unit, driven body or None."""
-    c, X, model = stage.prepared.c, stage.fit.X, stage.model
+    c, X, model = stage.data.space, stage.fit.X, stage.model
     defect = (s[1:] - advance(c, s[:-1], u[:-1], u[1:], X)) / state_scale(c)
     F = differentiate(c, s, u[:-1], u[1:], X, force=True).F / state_scale(c)[:, None]
     square = F.transpose(0, 2, 1) @ F
@@ -149,7 +151,7 @@ def _forces(stage: Stage, s: np.ndarray, u: np.ndarray) -> list[tuple[str, np.nd
 
 
 def _quantities(
-    stage: Stage, q: np.ndarray, nu: np.ndarray, u: np.ndarray, own: Mapping[str, int | None]
+    stage: ExtendedFit, q: np.ndarray, nu: np.ndarray, u: np.ndarray, own: Mapping[str, int | None]
 ) -> dict[str, tuple[str, dict[str, np.ndarray]]]:
     """What the machine does at each sample, as each missing torque or force sees it: one that belongs to a joint sees
     that joint's, one that belongs to none what the contacts do on average."""
@@ -199,21 +201,23 @@ def _quantities(
     return found
 
 
-def binned(x: np.ndarray, y: np.ndarray, sigma: float, bins: int = BINS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def bin_means(
+    x: np.ndarray, y: np.ndarray, sigma: float, bins: int = N_BINS
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Means of y in bins of x with as many samples in each as can be: centres, means, twice their deviation where y is
     white noise of deviation sigma."""
     low, high = np.quantile(x, (0.002, 0.998))
     edges = np.linspace(low, high, bins + 1)
     at = np.clip(np.digitize(x, edges) - 1, 0, bins - 1)
     count = np.bincount(at, minlength=bins).astype(float)
-    some = count >= FEWEST
+    some = count >= MIN_BIN_SAMPLES
     safe = np.maximum(count, 1)
     centre = np.bincount(at, x, bins) / safe
     mean = np.bincount(at, y, bins) / safe
     return centre[some], mean[some], 2 * sigma / np.sqrt(count[some])
 
 
-def strength(course: Course, row: str, quantity: str) -> float:
+def dependence_strength(course: LogResiduals, row: str, quantity: str) -> float:
     """How clearly a quantity orders what is missing: variance between its bins over that within them (Fisher's F), of
     means over BLOCK_S; about 1 where it doesn't, 0 where it has nothing to do with it."""
     values = course.quantities[quantity][1]
@@ -224,7 +228,7 @@ def strength(course: Course, row: str, quantity: str) -> float:
     # Of an angle a mean over a block is no angle: its sample in the middle stands for it.
     x = values[row][: n * b].reshape(n, b)[:, b // 2]
     y = course.missing[row][0][: n * b].reshape(n, b).mean(axis=1)
-    edges = np.unique(np.quantile(x, np.linspace(0, 1, BINS // 2 + 1)))
+    edges = np.unique(np.quantile(x, np.linspace(0, 1, N_BINS // 2 + 1)))
     if len(edges) < 3:
         return 0.0
     at = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
@@ -235,71 +239,72 @@ def strength(course: Course, row: str, quantity: str) -> float:
     return between / within if within > 0 else 0.0
 
 
-def spectrum(course: Course, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def amplitude_spectrum(course: LogResiduals, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies [Hz] and amplitude density [unit/sqrt(Hz)] of a series of the course."""
     f, power = scipy.signal.welch(y, course.rate, nperseg=min(len(y), round(10.24 * course.rate)))
     return f[1:], np.sqrt(power[1:])
 
 
-def sizes(course: Course) -> dict[str, Size]:
+def innovation_levels(course: LogResiduals) -> dict[str, InnovationLevel]:
     """Innovations of every sensor; NaN where it tells too little."""
     found = {}
     for name, column in zip(course.sensors, course.innovations.T, strict=True):
         own = column[np.isfinite(column)]
-        if len(own) < 4 * FEWEST:
-            found[name] = Size(float("nan"), float("nan"))
+        if len(own) < 4 * MIN_BIN_SAMPLES:
+            found[name] = InnovationLevel(float("nan"), float("nan"))
             continue
         block = max(2, round(len(own) * course.block / len(column)))
         sums = own[: len(own) // block * block].reshape(-1, block).sum(axis=1)
-        found[name] = Size(float(np.mean(own**2)), float(np.mean(sums**2) / block))
+        found[name] = InnovationLevel(float(np.mean(own**2)), float(np.mean(sums**2) / block))
     return found
 
 
-def over_time(course: Course) -> tuple[np.ndarray, np.ndarray]:
+def innovation_levels_over_time(course: LogResiduals) -> tuple[np.ndarray, np.ndarray]:
     """Mean square of innovations in blocks of BLOCK_S: times [s] (n,), (m, n), NaN where a sensor tells nothing."""
     b = course.block
     n = len(course.t) // b
     square = (course.innovations[: n * b] ** 2).reshape(n, b, -1)
-    told = np.isfinite(square).sum(axis=1)
-    mean = np.nansum(square, axis=1) / np.where(told > 0, told, np.nan)
+    valid = np.isfinite(square).sum(axis=1)
+    mean = np.nansum(square, axis=1) / np.where(valid > 0, valid, np.nan)
     return course.t[: n * b : b] + BLOCK_S / 2, mean.T
 
 
-def located(stage: Stage) -> tuple[str, ...]:
+def locate_misfit(stage: ExtendedFit) -> tuple[str, ...]:
     """Lines that say where a misfit sits: in which signals, when, at what frequency, in which part of what the machine
     does. Empty where innovations are noise."""
     lines: list[str] = []
-    for course in courses(stage):
-        for name, size in sizes(course).items():
-            if not max(size.all, size.slow) > EXCESS:
+    for course in residuals_of_logs(stage):
+        for name, size in innovation_levels(course).items():
+            if not max(size.mean_square, size.slow_mean_square) > MAX_NOISE_MEAN_SQUARE:
                 continue
             z = course.innovations[:, course.sensors.index(name)]
             parts = [
-                f"innovations {np.sqrt(size.all):.2f} times, slow ones {np.sqrt(size.slow):.2f} times what noise gives",
-                *_places(course, z),
+                f"innovations {np.sqrt(size.mean_square):.2f} times,"
+                f" slow ones {np.sqrt(size.slow_mean_square):.2f} times what noise gives",
+                *_concentrations(course, z),
             ]
-            peak = _peak(course, z)
+            peak = _spectral_peak(course, z)
             if peak is not None:
                 parts.append(f"a peak at {peak:.3g} Hz")
-            lines.append((f"{course.source}: " if len(stage.prepared.logs) > 1 else "") + f"{name}: {'; '.join(parts)}")
+            lines.append((f"{course.source}: " if len(stage.data.logs) > 1 else "") + f"{name}: {'; '.join(parts)}")
         for label, (y, unit, _) in course.missing.items():
-            peak = _peak(course, y)
+            peak = _spectral_peak(course, y)
             if peak is not None:
                 size_y = float(np.std(y))
                 lines.append(f"{label}: {size_y:.3g} {unit} missing (rms), with a peak at {peak:.3g} Hz")
     return tuple(lines)
 
 
-def _places(course: Course, z: np.ndarray) -> list[str]:
+def _concentrations(course: LogResiduals, z: np.ndarray) -> list[str]:
     """Ranges of quantities that hold most of the excess of innovations z (N,) in few of the samples."""
     b = course.block
     n = len(z) // b
     square = z[: n * b].reshape(n, b) ** 2
-    told = np.isfinite(square)
-    excess = np.nansum(square, axis=1) - told.sum(axis=1)
-    slow = np.nansum(np.where(told, z[: n * b].reshape(n, b), 0.0), axis=1) ** 2 / np.maximum(told.sum(axis=1), 1) - 1
+    valid = np.isfinite(square)
+    excess = np.nansum(square, axis=1) - valid.sum(axis=1)
+    slow = np.nansum(np.where(valid, z[: n * b].reshape(n, b), 0.0), axis=1) ** 2 / np.maximum(valid.sum(axis=1), 1) - 1
     excess = np.maximum(excess, 0) + np.maximum(slow, 0)
-    told_blocks = told.any(axis=1)
+    told_blocks = valid.any(axis=1)
     excess = np.where(told_blocks, excess, 0.0)
     if not excess.sum() > 0:
         return []
@@ -307,18 +312,18 @@ def _places(course: Course, z: np.ndarray) -> list[str]:
     for name, (unit, values) in course.quantities.items():
         if name == "distance":
             continue  # says what time says
-        for label, series in _distinct(values).items():
-            low, high, share, of = _densest(series[: n * b].reshape(n, b).mean(axis=1), excess)
-            if of < MOMENT and name != "time":
+        for label, series in _distinct_series(values).items():
+            low, high, share, of = _densest_range(series[: n * b].reshape(n, b).mean(axis=1), excess)
+            if of < MIN_RANGE_SHARE and name != "time":
                 continue
-            if share >= CONCENTRATED[0] and of <= CONCENTRATED[1]:
+            if share >= CONCENTRATION[0] and of <= CONCENTRATION[1]:
                 where = f"{name}{label} from {low:.3g} to {high:.3g} {unit}".removesuffix(" -")
                 found.append((share / of, f"{100 * share:.0f} % of it at {where}, {100 * of:.2g} % of the log"))
     found.sort(reverse=True)
     return [text for _, text in found[:2]]
 
 
-def _distinct(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _distinct_series(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The different courses that a quantity has, by what to add to its name: nothing where there is one for all, else
     the joint or contact that it is of."""
     first, *others = values.values()
@@ -328,11 +333,11 @@ def _distinct(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {f" of {row.partition(', ')[2]}": x for row, x in values.items() if ", " in row}
 
 
-def _densest(x: np.ndarray, excess: np.ndarray) -> tuple[float, float, float, float]:
+def _densest_range(x: np.ndarray, excess: np.ndarray) -> tuple[float, float, float, float]:
     """The shortest run of blocks in order of x that holds CONCENTRATED of the excess: range, share, share of blocks."""
     order = np.argsort(x, kind="stable")
     total = np.concatenate([[0.0], np.cumsum(excess[order])])
-    goal = CONCENTRATED[0] * total[-1]
+    goal = CONCENTRATION[0] * total[-1]
     ends = np.searchsorted(total, total[:-1] + goal)
     length = np.where(ends < len(total), ends - np.arange(len(ends)), len(x) + 1)
     k = int(np.argmin(length))
@@ -345,12 +350,12 @@ def _densest(x: np.ndarray, excess: np.ndarray) -> tuple[float, float, float, fl
     )
 
 
-def _peak(course: Course, z: np.ndarray) -> float | None:
+def _spectral_peak(course: LogResiduals, z: np.ndarray) -> float | None:
     """The frequency [Hz] of a line that stands out of the spectrum about it, above what moves with the drive (2 Hz)."""
-    told = np.isfinite(z)
-    if told.mean() < 0.5:
+    valid = np.isfinite(z)
+    if valid.mean() < 0.5:
         return None
-    z = scipy.signal.detrend(np.where(told, z, 0.0))
+    z = scipy.signal.detrend(np.where(valid, z, 0.0))
     f, power = scipy.signal.periodogram(z, course.rate, window="hann")
     level = scipy.ndimage.median_filter(power, 101, mode="reflect") / np.log(2)
     high = (f > 2.0) & (level > 0)
@@ -358,15 +363,18 @@ def _peak(course: Course, z: np.ndarray) -> float | None:
         return None
     ratio = np.where(high, power / np.maximum(level, 1e-300), 0.0)
     k = int(np.argmax(ratio))
-    return float(f[k]) if ratio[k] > PEAK + np.log(len(f)) else None
+    return float(f[k]) if ratio[k] > MIN_PEAK_RATIO + np.log(len(f)) else None
 
 
-def mean_sizes(all_courses: Sequence[Course]) -> dict[str, Size]:
+def mean_innovation_levels(all_courses: Sequence[LogResiduals]) -> dict[str, InnovationLevel]:
     """Innovations of every sensor over several logs."""
-    every = [sizes(c) for c in all_courses]
+    every = [innovation_levels(c) for c in all_courses]
 
     def mean(values: list[float]) -> float:
-        told = [v for v in values if np.isfinite(v)]
-        return float(np.mean(told)) if told else float("nan")
+        valid = [v for v in values if np.isfinite(v)]
+        return float(np.mean(valid)) if valid else float("nan")
 
-    return {n: Size(mean([e[n].all for e in every]), mean([e[n].slow for e in every])) for n in every[0]}
+    return {
+        n: InnovationLevel(mean([e[n].mean_square for e in every]), mean([e[n].slow_mean_square for e in every]))
+        for n in every[0]
+    }

@@ -1,7 +1,7 @@
-"""Fits begun anew: machines with other effects fitted to logs from first guesses.
+"""Fit machines with other effects from initial trajectories, most of them only to the beginning of the logs.
 
-Most come to nothing. The first part of each log tells so in a fraction of the time, and only those that set out on it
-are fitted to the whole.
+Most such fits fail. A fit to the first part of each log shows it in a fraction of the time; only machines that pass are
+fitted to the whole.
 """
 
 from __future__ import annotations
@@ -15,188 +15,210 @@ import numpy as np
 
 from excite import smoothing
 from excite.diagnosis.fits import (
-    FAR,
-    SLACK,
-    SMALL,
-    Fits,
-    Prepared,
-    Stage,
-    from_first,
-    iterated,
-    noisy,
-    prepared_for,
-    resume,
-    staged,
-    with_forces,
+    COST_TOLERANCE,
+    LOST_COST_RATIO,
+    MIN_PROCESS_NOISE,
+    ExtendedFit,
+    FitData,
+    FitPair,
+    adapt_data,
+    assemble_fit,
+    fit_from_start,
+    fit_reducing_process_noise,
+    inflate_sensor_noise,
+    iterate,
+    resume_fit,
 )
-from excite.diagnosis.parallel import Together
+from excite.diagnosis.parallel import CallRunner
 from excite.model.machine import Machine
 from excite.smoothing import NotConvergedError, Trajectory
 
-SHORTEST = 30.0  # [s] that the beginning of a log has at least
-# Passes after which an effect that leaves as much as the model without it, but for a share, is known to do nothing.
-BRIEF, SAME = 2, 0.1
-ONSETS = 0.25, 0.33, 0.4, 0.5  # shares of logs that are taken for their beginning, in turn
-TELLING = 0.15  # of what exact dynamics leave, that is as much as a beginning must hold of it
-LENIENT = 0.5  # of what a fit must take, that it must take of what is left of the beginning
+MIN_BEGINNING_S = 30.0  # shortest beginning of a log [s]; chosen
+BRIEF_PASSES = 2  # passes after which a useless effect is recognised; chosen
+MIN_BRIEF_REDUCTION = 0.1  # share by which an effect must reduce the cost by then; chosen
+BEGINNING_SHARES = 0.25, 0.33, 0.4, 0.5  # shares of the logs that are tried as their beginning, in turn; chosen
+MIN_EXCESS_SHARE_OF_BEGINNING = 0.15  # share of the excess cost that the beginning must contain; chosen
+BEGINNING_GAIN_SHARE = 0.5  # share of the required reduction that is asked of the beginning; chosen
 
 
 @dataclass(frozen=True)
-class Onset:
-    """How many samples of each log are its beginning, and the most that a fit may cost there, from which it isn't worth
-    the whole; with `or_found` unless it is as good as found there. whole: not after a few passes, but as far as it
-    comes. without: what the model that has no further effect costs there after BRIEF passes, if that is known."""
+class ScreeningTest:
+    """A test of a fit to the beginning of each log.
+
+    samples: number of samples of each log. cost_limit: largest cost there of a fit that is worth the whole logs.
+    accept_converged: a nearly converged fit passes as well. full_iteration: judge the converged fit, not a few passes.
+    cost_without: cost there of the model without a further effect, after BRIEF_PASSES.
+    """
 
     samples: tuple[int, ...]
-    most: float
-    or_found: bool = False
-    whole: bool = False
-    without: float = np.inf
+    cost_limit: float
+    accept_converged: bool = False
+    full_iteration: bool = False
+    cost_without: float = np.inf
 
 
-def begun(
+def fit_screened(
     machines: Sequence[Machine],
-    of: Stage,
-    disturbed: float,
-    together: Together,
-    worth: float = np.inf,
-    enough: Callable[[int, Stage], bool] = lambda k, stage: False,
-) -> Iterator[Stage | None]:
-    """Machines with other effects, each fitted to the logs of a stage from first guesses, with so large disturbing
-    forces or smaller ones, side by side; None where no fit is found. With forces none either where so large ones don't
-    bring it near, or its beginning tells that they won't. By exact dynamics none where it costs more than it is worth,
-    or its beginning tells that it will, or is FAR off already; where they leave much, with small disturbing forces
-    after all, if they bring it near or it doesn't follow. enough: whether a stage, of the machine of that number, is
-    one beside which those that come after it are of use only where they come near as well: none of these whose
-    beginning tells that it won't."""
-    onsets, near, at = [_onset(of, disturbed, worth)], _where_near(of), 0
+    previous: ExtendedFit,
+    process_noise: float,
+    runner: CallRunner,
+    max_cost: float = np.inf,
+    enough: Callable[[int, ExtendedFit], bool] = lambda k, stage: False,
+) -> Iterator[ExtendedFit | None]:
+    """Fit machines with other effects to the logs of a previous fit, side by side; None for each that fails.
+
+    process_noise: level of the fits, reduced where it gives a close fit. With noise, a fit that is not close fails.
+        With exact dynamics, a fit fails that costs more than max_cost or is LOST_COST_RATIO off; one that is not close
+        gets a little process noise if that brings it close or if it does not track the logs.
+    enough: tells, by the number of a machine and its fit, that only close fits are of use from there on.
+
+    Fits whose beginning shows that they will fail are not continued.
+    """
+    tests, close_test, at = [_screening_test(previous, process_noise, max_cost)], _test_of_close_fit(previous), 0
     while at < len(machines):
-        calls = [partial(_begun, m, of, tuple(onsets), disturbed, worth) for m in machines[at:]]
-        with closing(together(calls)) as ways:
-            for fits in ways:
+        calls = [partial(_fit_if_promising, m, previous, tuple(tests), process_noise, max_cost) for m in machines[at:]]
+        with closing(runner(calls)) as results:
+            for fits in results:
                 machine, at = machines[at], at + 1
-                stage = staged(machine, _anew(machine, of), *fits) if fits else None
+                stage = assemble_fit(machine, _restart_data(machine, previous), *fits) if fits else None
                 yield stage
-                if near is not None and len(onsets) == 1 and stage is not None and enough(at - 1, stage):
-                    onsets.append(replace(near, whole=True))
+                if close_test is not None and len(tests) == 1 and stage is not None and enough(at - 1, stage):
+                    tests.append(replace(close_test, full_iteration=True))
                     break
 
 
-def _beginnings(prepared: Prepared) -> list[tuple[int, ...]]:
-    """How many samples of each log such beginnings have, SHORTEST at least, the shortest first; none that is more than
-    half of them all."""
-    rate, lengths = float(prepared.c.model.machine.sampling_hz), [len(r.used) for r in prepared.records]
-    every = (tuple(min(n, max(round(SHORTEST * rate), int(share * n))) for n in lengths) for share in ONSETS)
-    return [samples for samples in dict.fromkeys(every) if 2 * sum(samples) <= sum(lengths)]
+def _beginning_lengths(data: FitData) -> list[tuple[int, ...]]:
+    """Return possible lengths of the beginning, samples of each log, shortest first; none above half of all samples."""
+    rate, lengths = float(data.space.model.machine.sampling_hz), [len(r.used) for r in data.measurements]
+    lengths_by_share = (
+        tuple(min(n, max(round(MIN_BEGINNING_S * rate), int(share * n))) for n in lengths) for share in BEGINNING_SHARES
+    )
+    return [samples for samples in dict.fromkeys(lengths_by_share) if 2 * sum(samples) <= sum(lengths)]
 
 
-def _until(prepared: Prepared, samples: Sequence[int]) -> Prepared:
-    """The first samples of each log only."""
-    records = tuple(r.until(n) for r, n in zip(prepared.records, samples, strict=True))
-    return replace(prepared, records=records, starts=tuple(map(Trajectory.until, prepared.starts, samples)))
+def _cut_data(data: FitData, samples: Sequence[int]) -> FitData:
+    """Keep the first samples of each log."""
+    measurements = tuple(r.until(n) for r, n in zip(data.measurements, samples, strict=True))
+    return replace(data, measurements=measurements, starts=tuple(map(Trajectory.until, data.starts, samples)))
 
 
-def _onset(of: Stage, disturbed: float, worth: float) -> Onset | None:
-    """The beginning of the logs that tells, in a fraction of the time, which fits with such disturbing forces come to
-    nothing; worth: the most that one may cost. None where no half of the logs tells."""
-    if disturbed > 0:
-        onset = _where_near(of)
-    elif np.isinf(worth):
-        onset = _where_far(of)
+def _screening_test(previous: ExtendedFit, process_noise: float, max_cost: float) -> ScreeningTest | None:
+    """Choose the test that shows early which fits fail; None if no half of the logs shows it."""
+    if process_noise > 0:
+        test = _test_of_close_fit(previous)
+    elif np.isinf(max_cost):
+        test = _test_of_tracking(previous)
     else:
-        onset = _where_gained(of, worth) if of.settled and of.exact else None
-    if onset is None:
+        test = _test_of_gain(previous, max_cost) if previous.estimated and previous.exact else None
+    if test is None:
         return None
-    cost, _ = _began(_until(noisy(of.prepared, 1.0), onset.samples), disturbed, np.inf, BRIEF)
-    return replace(onset, without=cost or np.inf)
+    cost, _ = _fit_beginning(
+        _cut_data(inflate_sensor_noise(previous.data, 1.0), test.samples), process_noise, np.inf, BRIEF_PASSES
+    )
+    return replace(test, cost_without=cost or np.inf)
 
 
-def _where_near(of: Stage) -> Onset | None:
-    """The shortest beginning: what leaves more there, beside noise, than the whole may leave and still be near, isn't
-    near the whole."""
-    samples = next(iter(_beginnings(of.prepared)), None)
+def _test_of_close_fit(previous: ExtendedFit) -> ScreeningTest | None:
+    """Use the shortest beginning: it must not cost more beyond noise than a close fit of the whole logs may."""
+    samples = next(iter(_beginning_lengths(previous.data)), None)
     if samples is None:
         return None
-    return Onset(
-        samples, _until(of.prepared, samples).readings + (smoothing.CLOSE_FIT_COST_RATIO - 1) * of.prepared.readings
+    return ScreeningTest(
+        samples,
+        _cut_data(previous.data, samples).n_readings + (smoothing.CLOSE_FIT_COST_RATIO - 1) * previous.data.n_readings,
     )
 
 
-def _where_far(of: Stage) -> Onset | None:
-    """The shortest beginning that exact dynamics of a stage's own model stay FAR off: what does as well doesn't follow
-    the logs either. The shortest where none is."""
-    onsets = [Onset(x, FAR * _until(of.prepared, x).readings, True) for x in _beginnings(of.prepared)]
-    sharp = noisy(of.prepared, 1.0)
-    return next((x for x in onsets if not _sets_out(sharp, x, 0.0)), onsets[0] if onsets else None)
+def _test_of_tracking(previous: ExtendedFit) -> ScreeningTest | None:
+    """Use the shortest beginning on which the model without a further effect is lost, else the shortest."""
+    tests = [
+        ScreeningTest(x, LOST_COST_RATIO * _cut_data(previous.data, x).n_readings, True)
+        for x in _beginning_lengths(previous.data)
+    ]
+    true_noise = inflate_sensor_noise(previous.data, 1.0)
+    return next((x for x in tests if not _passes_screening(true_noise, x, 0.0)), tests[0] if tests else None)
 
 
-def _where_gained(of: Stage, worth: float) -> Onset | None:
-    """The shortest beginning that holds a good part of what a stage's exact dynamics leave beside noise: there a fit
-    must take as fair a part of what its own model comes to as of the whole."""
-    part = LENIENT * (of.fit.cost - worth) / max(of.excess, 1e-9)
-    missed = [np.square(way.white.E[:, :, 0]).sum(axis=1, dtype=float) for way in of.ways]
-    for samples in _beginnings(of.prepared):
-        begin = _until(of.prepared, samples)
-        cost = sum(float(x[:n].sum()) for x, n in zip(missed, samples, strict=True))
-        if cost - (1 + SLACK) * begin.noise >= TELLING * of.excess:
-            cost = _began(begin, 0.0, np.inf)[0] or cost  # after as few passes as others have
-            return Onset(samples, cost - part * max(0.0, cost - (1 + SLACK) * begin.noise))
+def _test_of_gain(previous: ExtendedFit, max_cost: float) -> ScreeningTest | None:
+    """Use the shortest beginning with a fair part of the excess cost, which a fit must reduce as well as the whole."""
+    part = BEGINNING_GAIN_SHARE * (previous.fit.cost - max_cost) / max(previous.excess_cost, 1e-9)
+    squares = [np.square(log.white.E[:, :, 0]).sum(axis=1, dtype=float) for log in previous.fitted_logs]
+    for samples in _beginning_lengths(previous.data):
+        beginning = _cut_data(previous.data, samples)
+        cost = sum(float(x[:n].sum()) for x, n in zip(squares, samples, strict=True))
+        if (
+            cost - (1 + COST_TOLERANCE) * beginning.expected_cost
+            >= MIN_EXCESS_SHARE_OF_BEGINNING * previous.excess_cost
+        ):
+            cost = _fit_beginning(beginning, 0.0, np.inf)[0] or cost  # after the same few passes as the others
+            return ScreeningTest(samples, cost - part * max(0.0, cost - (1 + COST_TOLERANCE) * beginning.expected_cost))
     return None
 
 
-def _sets_out(prepared: Prepared, onset: Onset | None, disturbed: float) -> bool:
-    """Whether a fit may come to what it is worth, as far as the beginning of the logs tells, if any does."""
-    if onset is None:
+def _passes_screening(data: FitData, test: ScreeningTest | None, process_noise: float) -> bool:
+    """Tell if a fit to the beginning of the logs may come to what is asked."""
+    if test is None:
         return True
-    begin = _until(prepared, onset.samples)
-    brief = max(onset.most, (1 - SAME) * onset.without)
-    if not np.isinf(brief) and _began(begin, disturbed, np.inf, BRIEF)[0] > brief:
+    beginning = _cut_data(data, test.samples)
+    brief = max(test.cost_limit, (1 - MIN_BRIEF_REDUCTION) * test.cost_without)
+    if not np.isinf(brief) and _fit_beginning(beginning, process_noise, np.inf, BRIEF_PASSES)[0] > brief:
         return False
-    if onset.whole:
-        cost, found = _began(begin, disturbed, np.inf, smoothing.MAX_PASSES)
+    if test.full_iteration:
+        cost, found = _fit_beginning(beginning, process_noise, np.inf, smoothing.MAX_PASSES)
     else:
-        cost, found = _began(begin, disturbed, onset.most)
-    return cost <= onset.most or (found and onset.or_found)
+        cost, found = _fit_beginning(beginning, process_noise, test.cost_limit)
+    return cost <= test.cost_limit or (found and test.accept_converged)
 
 
-def _began(
-    begin: Prepared, disturbed: float, most: float, passes: int = smoothing.SETTLING_PASSES + 1
+def _fit_beginning(
+    beginning: FitData, process_noise: float, cost_limit: float, passes: int = smoothing.SETTLING_PASSES + 1
 ) -> tuple[float, bool]:
-    """What a fit to the beginning of logs costs after a few passes, nothing where there is none, and whether it is as
-    good as found then. most: what it is given up above."""
-    X = begin.c.model.nominal
+    """Return the cost of a fit to the beginning after a few passes, and whether it nearly converged.
+
+    cost_limit: cost above which the fit is given up. The cost is 0 if there is no fit.
+    """
+    X = beginning.space.model.nominal
     try:
-        return iterated(begin, begin.starts, X, disturbed, passes=passes, most=most).cost, True
+        return iterate(beginning, beginning.starts, X, process_noise, passes=passes, cost_limit=cost_limit).cost, True
     except NotConvergedError as failed:
         return (0.0 if failed.fit is None else failed.fit.cost), failed.acceptable_fit is not None
 
 
-def _begun(machine: Machine, of: Stage, onsets: Sequence[Onset | None], disturbed: float, worth: float) -> Fits | None:
-    """A fit from first guesses, as `begun` has it; None of one that doesn't set out."""
-    prepared = _anew(machine, of)
-    if not all(_sets_out(prepared, onset, disturbed) for onset in onsets):
+def _fit_if_promising(
+    machine: Machine,
+    previous: ExtendedFit,
+    tests: Sequence[ScreeningTest | None],
+    process_noise: float,
+    max_cost: float,
+) -> FitPair | None:
+    """Fit from initial trajectories, as in `fit_screened`; None if the fit fails the tests or is not found."""
+    data = _restart_data(machine, previous)
+    if not all(_passes_screening(data, test, process_noise) for test in tests):
         return None
-    if disturbed > 0:
-        return with_forces(machine, prepared, disturbed, smoothing.CLOSE_FIT_COST_RATIO * prepared.noise)
-    return _plain(machine, prepared, worth)
+    if process_noise > 0:
+        return fit_reducing_process_noise(
+            machine, data, process_noise, smoothing.CLOSE_FIT_COST_RATIO * data.expected_cost
+        )
+    return _fit_exact(machine, data, max_cost)
 
 
-def _plain(machine: Machine, prepared: Prepared, worth: float) -> Fits | None:
-    """A fit from first guesses by exact dynamics, or by small disturbing forces from there where much is left; None of
-    one that costs more than it is worth."""
-    fit = from_first(prepared, 0.0, FAR * prepared.readings, worth)
-    if fit is None or fit.cost > worth:
+def _fit_exact(machine: Machine, data: FitData, max_cost: float) -> FitPair | None:
+    """Fit exact dynamics, adding a little process noise if the fit is not close; None above max_cost."""
+    fit = fit_from_start(data, 0.0, LOST_COST_RATIO * data.n_readings, max_cost)
+    if fit is None or fit.cost > max_cost:
         return None
-    stage = staged(machine, prepared, fit)
-    if stage.near:
+    stage = assemble_fit(machine, data, fit)
+    if stage.is_close:
         return fit, None
     try:
-        loose = resume(prepared, stage, SMALL)
+        process_noise_fit = resume_fit(data, stage, MIN_PROCESS_NOISE)
     except NotConvergedError:
         return fit, None
-    return (fit if stage.follows and not replace(stage, fit=loose).near else loose), None
+    return (
+        fit if stage.tracks_logs and not replace(stage, fit=process_noise_fit).is_close else process_noise_fit
+    ), None
 
 
-def _anew(machine: Machine, of: Stage) -> Prepared:
-    """The logs of a stage made ready for a machine with other effects, with sensors as noisy as they are."""
-    return noisy(prepared_for(machine, of), 1.0)
+def _restart_data(machine: Machine, previous: ExtendedFit) -> FitData:
+    """Prepare the logs of a previous fit for a machine with other effects, with the true sensor noise."""
+    return inflate_sensor_noise(adapt_data(machine, previous), 1.0)

@@ -14,26 +14,26 @@ from itertools import combinations
 import numpy as np
 
 from excite.diagnosis.diagnosis import Diagnosis
-from excite.diagnosis.fits import Stage
-from excite.diagnosis.score_test import remembered
+from excite.diagnosis.fits import ExtendedFit
+from excite.diagnosis.score_test import integrate_memory
 from excite.logs import passes
 from excite.model import SignatureFunctions, effects, signatures
 from excite.model.effects import PlacedEffect, Site
 from excite.model.machine import EffectEntry, Machine
 from excite.smoothing import smoothed_motion
 
-APART = 0.4  # relative difference of two answers from which they are told apart
-SAME = 1e-6  # share of two signatures that isn't in common, below which no drive tells them apart
-SAMPLES = 3000  # of the log that effects are asked along, at most
-SLOW = 0.05  # [m/s, rad/s] below which a machine or joint stands
-LOADED = 0.05  # of the largest torque, from which a torque counts
-STEADY = 2.0  # fast over slow stretches' speed, from which a log has both
-AROUND = 2.5  # [rad] of heading from which a log has been driven both ways along the lane
-STEERED = 0.05  # [rad] of a steered joint, or without one [rad/s] of yaw, from which a log turns
+MIN_RESPONSE_DIFFERENCE = 0.4  # relative difference of two answers from which they are told apart
+MAX_SIGNATURE_DIFFERENCE = 1e-6  # share of two signatures that isn't in common, below which no drive tells them apart
+MAX_SAMPLES = 3000  # of the log that effects are asked along, at most
+STANDSTILL_SPEED = 0.05  # [m/s, rad/s] below which a machine or joint stands
+LOADED_TORQUE_SHARE = 0.05  # of the largest torque, from which a torque counts
+MIN_SPEED_RATIO = 2.0  # fast over slow stretches' speed, from which a log has both
+TURNED_AROUND_RAD = 2.5  # [rad] of heading from which a log has been driven both ways along the lane
+MIN_TURN = 0.05  # [rad] of a steered joint, or without one [rad/s] of yaw, from which a log turns
 
 
 @dataclass(frozen=True)
-class Motion:
+class SampledMotion:
     """A motion as effects see it: coordinates, velocities, accelerations (N, n_q), torques (N, n_u), time (N,)."""
 
     q: np.ndarray
@@ -44,62 +44,68 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Run:
+class DriveChange:
     """A change of the drive: what to do, on a machine that drives and on one that stands on a bench; what becomes of a
     motion; whether a motion holds it already. In `text` {against} stands for the machine's driven contacts at work
     against each other, or against a wall."""
 
     text: str
     bench: str | None
-    change: Callable[[Machine, Motion], Motion]
-    held: Callable[[Machine, Motion], bool]
+    change: Callable[[Machine, SampledMotion], SampledMotion]
+    held: Callable[[Machine, SampledMotion], bool]
 
 
-def run(d: Diagnosis) -> str | None:
+def recommend_run(d: Diagnosis) -> str | None:
     """The simplest run that separates what is tied, in words; None where nothing is, or where it is not a matter of
     the drive, as no drive tells which of two wheels of one side resists."""
     said: list[str] = []
     for f in d.findings:
         if f.tied_with:
-            text = _separating(d.after, [f.name, *f.tied_with])
+            text = _describe_separation(d.after, [f.name, *f.tied_with])
             if text is not None and text not in said:
                 said.append(text)
     return "; then ".join(said) or None
 
 
 @dataclass(frozen=True)
-class Rivals:
+class RivalPair:
     """Two causes that are tied, as the logs have them, and the machine with what else was found."""
 
     machine: Machine
     between: tuple[EffectEntry, EffectEntry]
 
 
-def rivals(d: Diagnosis) -> list[Rivals]:
+def rival_pairs(d: Diagnosis) -> list[RivalPair]:
     """The pairs of tied causes that do not the same whatever is driven, the likeliest first."""
-    found: list[Rivals] = []
+    found: list[RivalPair] = []
     for f in d.findings:
         if not f.rivals:
             continue
-        tied = [_placed(d.after, name) for name in (f.name, *f.tied_with)]
+        tied = [_placed_effect(d.after, name) for name in (f.name, *f.tied_with)]
         pairs = [(0, k) for k in range(1, len(tied))]
-        apart = set(pairs) - _same(_Asked(d.after, tied)(_stirred(_motion(d.after))), pairs)
+        apart = set(pairs) - _equivalent_pairs(
+            _EffectResponses(d.after, tied)(_perturb(_longest_motion(d.after))), pairs
+        )
         machine = effects.with_effects(d.before.machine, *(x.entry for x in d.findings if x is not f))
-        found += [Rivals(machine, (f.entry, f.rivals[k - 1])) for _, k in sorted(apart)]
+        found += [RivalPair(machine, (f.entry, f.rivals[k - 1])) for _, k in sorted(apart)]
     return found
 
 
-def _separating(stage: Stage, names: Sequence[str]) -> str | None:
+def _describe_separation(stage: ExtendedFit, names: Sequence[str]) -> str | None:
     machine = stage.machine
-    tied = [_placed(stage, name) for name in names]
-    motion = _motion(stage)
-    asked = _Asked(stage, tied)
+    tied = [_placed_effect(stage, name) for name in names]
+    motion = _longest_motion(stage)
+    asked = _EffectResponses(stage, tied)
     here = asked(motion)
     pairs = list(combinations(range(len(tied)), 2))
     open_ = {p for p in pairs if tied[p[0]].effect is not tied[p[1]].effect or tied[p[0]].where != tied[p[1]].where}
-    chosen: list[Run] = []
+    chosen: list[DriveChange] = []
     # Each run takes the pairs that it separates; the one that separates most comes first, the simplest of equals.
-    options = [(r, _split(here, asked(r.change(machine, motion)), pairs)) for r in RUNS if _possible(r, machine)]
+    options = [
+        (r, _separated_pairs(here, asked(r.change(machine, motion)), pairs))
+        for r in DRIVE_CHANGES
+        if _is_possible(r, machine)
+    ]
     fresh = [(r, s) for r, s in options if not r.held(machine, motion)]
     for group in (fresh, options):
         while open_:
@@ -108,33 +114,33 @@ def _separating(stage: Stage, names: Sequence[str]) -> str | None:
                 break
             chosen.append(r)
             open_ -= split
-    texts = [_said(r, machine) for r in dict.fromkeys(chosen)]
+    texts = [_describe_change(r, machine) for r in dict.fromkeys(chosen)]
     # A machine that its file holds on a line turns where it is let go.
     held = set(machine.body[0].coordinates) & set(machine.locked)
-    same = set() if held else _same(asked(_stirred(motion)), pairs)
+    same = set() if held else _equivalent_pairs(asked(_perturb(motion)), pairs)
     rest = [(tied[i], tied[j]) for i, j in sorted(open_ - same)]
     for a, b in rest:
-        more = _by_place(machine, a, b)
+        more = _separate_by_place(machine, a, b)
         if more is not None and more not in texts:
             texts.append(more)
     return ", and ".join(texts) if texts else None
 
 
-def _said(r: Run, machine: Machine) -> str:
+def _describe_change(r: DriveChange, machine: Machine) -> str:
     """What to do, with the machine's own names."""
     if not machine.planar:
         return r.bench or r.text
-    driven = [_words(b.where) for b in machine.actuated if b.contact is not None]
+    driven = [_spaced(b.where) for b in machine.actuated if b.contact is not None]
     each = f"{driven[0]} against {driven[1]}" if len(driven) == 2 else f"{', '.join(driven)} against each other"
     wall = "against a wall"
     return r.text.format(against=f"{each}, or {wall}" if len(driven) > 1 else wall)
 
 
-def _words(where: str) -> str:
+def _spaced(where: str) -> str:
     return where.replace("_", " ")
 
 
-def _placed(stage: Stage, name: str) -> PlacedEffect:
+def _placed_effect(stage: ExtendedFit, name: str) -> PlacedEffect:
     """A tied effect with the amount and shapes that it was found with, or the catalogue's."""
     known = next((e for e in stage.model.effects if e.name == name), None)
     if known is not None:
@@ -142,31 +148,31 @@ def _placed(stage: Stage, name: str) -> PlacedEffect:
     name, _, where = name.partition("@")
     effect = effects.CATALOGUE[name]
     bodies, sensor = effects.allowed_places(stage.machine, effect)[where]
-    log = stage.prepared.logs[0]
+    log = stage.data.logs[0]
     site = Site.of(stage.machine, bodies, float(log.t[-1] - log.t[0]))
     shapes = {n: s.default * s.size(site) for n, s in effect.shapes.items()}
     return PlacedEffect(effect, where, bodies, sensor, {"A": effect.typical_magnitude(site), **shapes})
 
 
-def _motion(stage: Stage) -> Motion:
+def _longest_motion(stage: ExtendedFit) -> SampledMotion:
     """The longest log's smoothed motion, from its start, thinned to SAMPLES."""
-    c, fit = stage.prepared.c, stage.fit
-    k = int(np.argmax([len(log) for log in stage.prepared.logs]))
-    p, r = fit.trajectories[k], stage.prepared.records[k]
+    c, fit = stage.data.space, stage.fit
+    k = int(np.argmax([len(log) for log in stage.data.logs]))
+    p, r = fit.trajectories[k], stage.data.measurements[k]
     q, nu, _, u, a = smoothed_motion(c, r, p, fit.X)
     root = stage.machine.body[0].coordinates
     if stage.machine.planar and root[2] in stage.model.coordinates:
         heading = stage.model.coordinates.index(root[2])
         q[:, heading] = np.cumsum(nu[:, heading]) / float(stage.machine.sampling_hz)
     t = np.arange(len(u)) / float(stage.machine.sampling_hz)
-    step = max(1, len(u) // SAMPLES)
-    return Motion(*(x[::step] for x in (q, nu, a, u, t)))
+    step = max(1, len(u) // MAX_SAMPLES)
+    return SampledMotion(*(x[::step] for x in (q, nu, a, u, t)))
 
 
-class _Asked:
+class _EffectResponses:
     """What effects add along a motion: (C, K), forces and readings each in units of their size."""
 
-    def __init__(self, stage: Stage, placed: Sequence[PlacedEffect]) -> None:
+    def __init__(self, stage: ExtendedFit, placed: Sequence[PlacedEffect]) -> None:
         model = stage.model
         standard = tuple(n for n in model.base.standard if "@" not in n)
         self.model, self.machine, self.placed = model, stage.machine, placed
@@ -175,10 +181,10 @@ class _Asked:
         self.rows = {b.index: k for b, k in zip(stage.machine.actuated, model.actuated, strict=True)}
         self.readings = self.made.reading.size1_out(0)
 
-    def __call__(self, m: Motion) -> np.ndarray:
+    def __call__(self, m: SampledMotion) -> np.ndarray:
         N, C = len(m.t), len(self.placed)
         over = passes(self.model, m.q, m.nu, float(m.t[1] - m.t[0])) if self.made.n_map_inputs else np.zeros((N, 0))
-        z = remembered(self.made, m.q, m.nu, m.u, m.t, self.p, over)
+        z = integrate_memory(self.made, m.q, m.nu, m.u, m.t, self.p, over)
         exact = np.broadcast_to(np.abs(m.t)[:, None], (N, self.readings)) * 0.1
         exact = exact * np.sign(m.nu.sum() or 1.0)
         given = [x.T for x in (m.q, m.nu, m.a, m.u, m.t[:, None], z, exact)]
@@ -190,7 +196,7 @@ class _Asked:
                 force[:, :, k] += self._misread(e, m)
         return np.concatenate([force, reading]).transpose(2, 0, 1).reshape(C, -1)
 
-    def _misread(self, e: PlacedEffect, m: Motion) -> np.ndarray:
+    def _misread(self, e: PlacedEffect, m: SampledMotion) -> np.ndarray:
         """What a torque channel reads beside the torque (n_q, N)."""
         gain, offset, delay = e.channel(m.t)
         added = np.zeros((m.q.shape[1], len(m.t)))
@@ -201,16 +207,18 @@ class _Asked:
         return added
 
 
-def _split(here: np.ndarray, there: np.ndarray, pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
+def _separated_pairs(here: np.ndarray, there: np.ndarray, pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
     """Pairs of effects whose signatures answer differently to a change: by their sign and size along the motion."""
     size = np.maximum((here**2).sum(axis=1), 1e-300)
     answer = (there * here).sum(axis=1) / size
     return {
-        (i, j) for i, j in pairs if abs(answer[i] - answer[j]) > APART * max(1.0, min(abs(answer[i]), abs(answer[j])))
+        (i, j)
+        for i, j in pairs
+        if abs(answer[i] - answer[j]) > MIN_RESPONSE_DIFFERENCE * max(1.0, min(abs(answer[i]), abs(answer[j])))
     }
 
 
-def _stirred(m: Motion) -> Motion:
+def _perturb(m: SampledMotion) -> SampledMotion:
     """A motion about this one in which everything moves, each at a frequency of its own."""
 
     def stir(x: np.ndarray, first: float) -> np.ndarray:
@@ -220,13 +228,13 @@ def _stirred(m: Motion) -> Motion:
     return replace(m, q=stir(m.q, 0.5), nu=stir(m.nu, 0.7), u=stir(m.u, 0.9))
 
 
-def _same(signature: np.ndarray, pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
+def _equivalent_pairs(signature: np.ndarray, pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
     """Pairs of effects that do the same along a motion (C, K), but for their size: wheels of one side resist alike."""
     unit = signature / np.maximum(np.linalg.norm(signature, axis=1, keepdims=True), 1e-300)
-    return {(i, j) for i, j in pairs if abs(unit[i] @ unit[j]) > 1 - SAME}
+    return {(i, j) for i, j in pairs if abs(unit[i] @ unit[j]) > 1 - MAX_SIGNATURE_DIFFERENCE}
 
 
-def _by_place(machine: Machine, a: PlacedEffect, b: PlacedEffect) -> str | None:
+def _separate_by_place(machine: Machine, a: PlacedEffect, b: PlacedEffect) -> str | None:
     """What separates two causes that answer alike because they differ in place alone, or not even in that."""
     if a.where != b.where and machine.planar:
         pulling = {x.index for x in machine.actuated if x.contact is not None}
@@ -234,8 +242,8 @@ def _by_place(machine: Machine, a: PlacedEffect, b: PlacedEffect) -> str | None:
         if not all(pulls) or not {*a.bodies, *b.bodies} <= pulling:
             return "tight turns to both sides"
         first, second = sorted((a, b), key=lambda e: len(e.bodies))
-        other = "the others" if len(second.bodies) > 1 else f"{_words(second.where)} alone"
-        return f"pull with {_words(first.where)} alone, then with {other}"
+        other = "the others" if len(second.bodies) > 1 else f"{_spaced(second.where)} alone"
+        return f"pull with {_spaced(first.where)} alone, then with {other}"
     if (a.effect.channel is None) != (b.effect.channel is None):
         return "the same drive with a known ballast on the machine"
     return None
@@ -244,27 +252,27 @@ def _by_place(machine: Machine, a: PlacedEffect, b: PlacedEffect) -> str | None:
 # ------------------------------------------------------------------------------------------------ the runs
 
 
-def _possible(r: Run, machine: Machine) -> bool:
+def _is_possible(r: DriveChange, machine: Machine) -> bool:
     return machine.planar or r.bench is not None
 
 
-def _ahead(machine: Machine, m: Motion) -> np.ndarray:
+def _forward_speed(machine: Machine, m: SampledMotion) -> np.ndarray:
     """The speed that counts as forward (N,): of the root along its axis, or of the first joint."""
     return m.nu[:, 0]
 
 
-def _pushing(m: Motion) -> np.ndarray:
+def _has_torque(m: SampledMotion) -> np.ndarray:
     top = np.abs(m.u).max(axis=0, initial=1e-9)
-    return (np.abs(m.u) > LOADED * np.maximum(top, 1e-9)).any(axis=1)
+    return (np.abs(m.u) > LOADED_TORQUE_SHARE * np.maximum(top, 1e-9)).any(axis=1)
 
 
-def _heading(machine: Machine) -> int | None:
+def _heading_index(machine: Machine) -> int | None:
     root = machine.body[0].coordinates
     return machine.coordinates.index(root[2]) if machine.planar and root[2] in machine.coordinates else None
 
 
-def _turned_around(machine: Machine, m: Motion) -> Motion:
-    k = _heading(machine)
+def _turn_around(machine: Machine, m: SampledMotion) -> SampledMotion:
+    k = _heading_index(machine)
     q = m.q.copy()
     if k is None:
         # Held straight: turned around, the ground's fixed direction comes from the other side, as in reverse.
@@ -273,97 +281,97 @@ def _turned_around(machine: Machine, m: Motion) -> Motion:
     return replace(m, q=q)
 
 
-def _been_around(machine: Machine, m: Motion) -> bool:
-    k = _heading(machine)
-    return k is not None and bool(np.ptp(m.q[:, k]) > AROUND)
+def _has_turned_around(machine: Machine, m: SampledMotion) -> bool:
+    k = _heading_index(machine)
+    return k is not None and bool(np.ptp(m.q[:, k]) > TURNED_AROUND_RAD)
 
 
-def _both_ways(machine: Machine, m: Motion) -> bool:
-    v = _ahead(machine, m)
-    return bool((v > SLOW).mean() > 0.1 and (v < -SLOW).mean() > 0.1)
+def _has_both_directions(machine: Machine, m: SampledMotion) -> bool:
+    v = _forward_speed(machine, m)
+    return bool((v > STANDSTILL_SPEED).mean() > 0.1 and (v < -STANDSTILL_SPEED).mean() > 0.1)
 
 
-def _stood(machine: Machine, m: Motion) -> bool:
-    still = (np.abs(m.nu) < SLOW).all(axis=1)
-    return bool((still & _pushing(m)).mean() > 0.05)
+def _has_stood_with_torque(machine: Machine, m: SampledMotion) -> bool:
+    still = (np.abs(m.nu) < STANDSTILL_SPEED).all(axis=1)
+    return bool((still & _has_torque(m)).mean() > 0.05)
 
 
-def _steady(machine: Machine, m: Motion) -> bool:
-    v = np.abs(_ahead(machine, m))
-    v = v[v > SLOW]
-    return len(v) > 0 and bool(np.quantile(v, 0.9) > STEADY * np.quantile(v, 0.3))
+def _has_two_speeds(machine: Machine, m: SampledMotion) -> bool:
+    v = np.abs(_forward_speed(machine, m))
+    v = v[v > STANDSTILL_SPEED]
+    return len(v) > 0 and bool(np.quantile(v, 0.9) > MIN_SPEED_RATIO * np.quantile(v, 0.3))
 
 
-def _turns(machine: Machine) -> list[int]:
+def _turning_coordinates(machine: Machine) -> list[int]:
     """Coordinates that are zero straight ahead: sideways, yaw and steered joints."""
     across = machine.body[0].coordinates[1:] if machine.planar else ()
     joints = [b.coordinates[0] for b in machine.actuated if b.contact is None] if machine.planar else []
     return [machine.coordinates.index(c) for c in (*across, *joints) if c in machine.coordinates]
 
 
-def _straight(machine: Machine, m: Motion) -> Motion:
-    q, nu, a, k = m.q.copy(), m.nu.copy(), m.a.copy(), _turns(machine)
-    heading = _heading(machine)
+def _straighten(machine: Machine, m: SampledMotion) -> SampledMotion:
+    q, nu, a, k = m.q.copy(), m.nu.copy(), m.a.copy(), _turning_coordinates(machine)
+    heading = _heading_index(machine)
     q[:, [i for i in k if i != heading]] = 0
     nu[:, k], a[:, k] = 0, 0
     return replace(m, q=q, nu=nu, a=a)
 
 
-def _went_straight(machine: Machine, m: Motion) -> bool:
+def _has_straight_and_turns(machine: Machine, m: SampledMotion) -> bool:
     joints = [machine.coordinates.index(b.coordinates[0]) for b in machine.actuated if b.contact is None]
-    heading = _heading(machine)
+    heading = _heading_index(machine)
     if not machine.planar or heading is None:
         return True
     turn = np.abs(m.q[:, joints] if joints else m.nu[:, heading, None]).max(axis=1)
-    return bool((turn < STEERED / 2).mean() > 0.2 and (turn > STEERED).mean() > 0.2)
+    return bool((turn < MIN_TURN / 2).mean() > 0.2 and (turn > MIN_TURN).mean() > 0.2)
 
 
-def _never(machine: Machine, m: Motion) -> bool:
+def _is_never_held(machine: Machine, m: SampledMotion) -> bool:
     return False
 
 
-RUNS = (
-    Run(
+DRIVE_CHANGES = (
+    DriveChange(
         "the same lane driven in the other direction (machine turned around)",
         None,
-        _turned_around,
-        _been_around,
+        _turn_around,
+        _has_turned_around,
     ),
-    Run(
+    DriveChange(
         "the same lane driven backward as well as forward",
         "the same motion in the other direction",
         lambda machine, m: replace(m, nu=-m.nu, u=-m.u),
-        _both_ways,
+        _has_both_directions,
     ),
-    Run(
+    DriveChange(
         "standing still with torque: {against}",
         "standing still with torque, against a stop",
         lambda machine, m: replace(m, nu=0 * m.nu, a=0 * m.a),
-        _stood,
+        _has_stood_with_torque,
     ),
-    Run(
+    DriveChange(
         "towed with the motors off",
         "moved by something else with the motor off",
         lambda machine, m: replace(m, u=0 * m.u),
-        _never,
+        _is_never_held,
     ),
-    Run(
+    DriveChange(
         "the same drive at twice or half the speed",
         "the same motion at twice or half the speed",
         lambda machine, m: replace(m, nu=2 * m.nu),
-        _steady,
+        _has_two_speeds,
     ),
-    Run("stretches straight ahead and tight turns", None, _straight, _went_straight),
-    Run(
+    DriveChange("stretches straight ahead and tight turns", None, _straighten, _has_straight_and_turns),
+    DriveChange(
         "torques that change quickly: steps, and short reversals",
         "torques that change quickly: steps, and short reversals",
         lambda machine, m: replace(m, u=np.gradient(m.u, m.t, axis=0) * 0.2 + m.u),
-        _never,
+        _is_never_held,
     ),
-    Run(
+    DriveChange(
         "a longer drive: the same again for as long",
         "a longer drive: the same again for as long",
         lambda machine, m: replace(m, t=m.t + m.t[-1]),
-        _never,
+        _is_never_held,
     ),
 )

@@ -13,7 +13,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from excite import diagnosis
-from excite.diagnosis import Course, Diagnosis
+from excite.diagnosis import Diagnosis, LogResiduals
 from excite.reports.figures import COLOURS, escape_dollar, save
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
@@ -39,21 +39,23 @@ def _draw(place: Path, d: Diagnosis, title: str, kind: str) -> None:
     before, after = d.before, d.after
     if kind == "misfit" and before.exact != after.exact:
         # Show forces that one of the two models needs for the other as well.
-        before, after = diagnosis.loosened(before), diagnosis.loosened(after)
-    without = diagnosis.courses(before)
-    beside = diagnosis.courses(after) if d.stages else [None] * len(without)
+        before, after = diagnosis.refit_with_process_noise(before), diagnosis.refit_with_process_noise(after)
+    without = diagnosis.residuals_of_logs(before)
+    beside = diagnosis.residuals_of_logs(after) if d.stages else [None] * len(without)
     figure = misfit_figure if kind == "misfit" else when_figure
     for k, (old, new) in enumerate(zip(without, beside, strict=True)):
         name = f"{kind}-{k + 1}.png" if len(without) > 1 else f"{kind}.png"
         save(figure(old, new, f"{title}: {Path(old.source).name}"), place / name)
 
 
-def misfit_figure(before: Course, after: Course | None, title: str) -> Figure:
+def misfit_figure(before: LogResiduals, after: LogResiduals | None, title: str) -> Figure:
     """Plot the largest missing torques and forces against the state of the machine, and their spectra.
 
     A thick frame marks the quantity on which a torque depends most clearly.
     """
-    evidence = {row: {q: diagnosis.strength(before, row, q) for q in before.quantities} for row in before.missing}
+    evidence = {
+        row: {q: diagnosis.dependence_strength(before, row, q) for q in before.quantities} for row in before.missing
+    }
     rows = sorted(evidence, key=lambda row: -max(evidence[row].values()))[:MAX_ROWS]
     panels = max(sum(row in v for _, v in before.quantities.values()) for row in rows) + 1
     block = HEAD + -(-panels // MAX_COLUMNS) * PANEL[1]
@@ -91,10 +93,10 @@ def misfit_figure(before: Course, after: Course | None, title: str) -> Figure:
     return figure
 
 
-def _against(ax: Axes, before: Course, after: Course | None, row: str, column: str) -> None:
+def _against(ax: Axes, before: LogResiduals, after: LogResiduals | None, row: str, column: str) -> None:
     y, _, sigma = before.missing[row]
     x = before.quantities[column][1][row]
-    centre, mean, band = diagnosis.binned(x, y, sigma if np.isfinite(sigma) else 0.0)
+    centre, mean, band = diagnosis.bin_means(x, y, sigma if np.isfinite(sigma) else 0.0)
     if np.isfinite(sigma):
         ax.fill_between(centre, -band, band, color="0.8", linewidth=0)
     ax.axhline(0, color="black", linewidth=0.6)
@@ -102,7 +104,7 @@ def _against(ax: Axes, before: Course, after: Course | None, row: str, column: s
     if after is not None and row in after.missing:
         at = after.quantities[column][1].get(row)
         if at is not None:
-            centre, mean, _ = diagnosis.binned(at, after.missing[row][0], 0.0)
+            centre, mean, _ = diagnosis.bin_means(at, after.missing[row][0], 0.0)
             ax.plot(centre, mean, color=AFTER, linewidth=1.4, linestyle="--")
     ax.locator_params("x", nbins=6, steps=(1, 2, 5, 10))
     ax.ticklabel_format(scilimits=PLAIN_POWERS, useOffset=False)
@@ -112,17 +114,17 @@ def _against(ax: Axes, before: Course, after: Course | None, row: str, column: s
     ax.grid(alpha=0.3)
 
 
-def _spectrum(ax: Axes, before: Course, after: Course | None, row: str) -> None:
-    f, size = diagnosis.spectrum(before, before.missing[row][0])
+def _spectrum(ax: Axes, before: LogResiduals, after: LogResiduals | None, row: str) -> None:
+    f, size = diagnosis.amplitude_spectrum(before, before.missing[row][0])
     ax.loglog(f, size, color=BEFORE, linewidth=1.0)
     if after is not None and row in after.missing:
-        f, size = diagnosis.spectrum(after, after.missing[row][0])
+        f, size = diagnosis.amplitude_spectrum(after, after.missing[row][0])
         ax.loglog(f, size, color=AFTER, linewidth=1.0, linestyle="--")
     ax.set_xlabel(f"frequency [Hz], up: {before.missing[row][1]}/√Hz", fontsize=8, labelpad=1)
     ax.grid(alpha=0.3)
 
 
-def when_figure(before: Course, after: Course | None, title: str) -> Figure:
+def when_figure(before: LogResiduals, after: LogResiduals | None, title: str) -> Figure:
     """Plot innovations over time by signal (1 is noise), and over speed and steering angle or torque."""
     shown = [(before, "without what was found" if after is not None else "")]
     if after is not None:
@@ -134,7 +136,7 @@ def when_figure(before: Course, after: Course | None, title: str) -> Figure:
     norm = LogNorm(1 / 3, MAX_INNOVATION)
     picture = None
     for k, (course, words) in enumerate(shown):
-        t, size = diagnosis.over_time(course)
+        t, size = diagnosis.innovation_levels_over_time(course)
         ax = axes[k, 0]
         step = diagnosis.BLOCK_S / 2
         picture = ax.pcolormesh(
@@ -152,7 +154,7 @@ def when_figure(before: Course, after: Course | None, title: str) -> Figure:
     return figure
 
 
-def _map(ax: Axes, course: Course, norm: LogNorm) -> None:
+def _map(ax: Axes, course: LogResiduals, norm: LogNorm) -> None:
     """Plot innovations over speed and steering angle, or torque if nothing steers."""
     names = list(course.quantities)
     up = next((n for n in names if n.endswith(" angle")), None)
@@ -164,7 +166,7 @@ def _map(ax: Axes, course: Course, norm: LogNorm) -> None:
     bins = [_edges(x), _edges(y)]
     total = np.histogram2d(x, y, bins, weights=np.where(finite, z, 0.0).sum(axis=1))[0]
     count = np.histogram2d(x, y, bins, weights=finite.sum(axis=1).astype(float))[0]
-    mean = np.where(count >= diagnosis.FEWEST, total / np.maximum(count, 1), np.nan)
+    mean = np.where(count >= diagnosis.MIN_BIN_SAMPLES, total / np.maximum(count, 1), np.nan)
     ax.pcolormesh(*bins, mean.T, norm=norm, cmap="inferno_r", rasterized=True)
     ax.set_title("where, over all signals", fontsize=9, loc="left")
     ax.set_xlabel(f"speed [{x_unit}]")

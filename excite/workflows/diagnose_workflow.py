@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from excite import diagnosis, identification, reports
-from excite.diagnosis import Account, Diagnosis, Rivals, forked
+from excite.diagnosis import Assessment, Diagnosis, RivalPair, run_forked
 from excite.errors import InfeasibleError, MachineError, NotIdentifiableError, SimulationError
 from excite.identification import FILTERS
 from excite.logs import Log, doubts_in_errors, examine, moves, prepare
@@ -46,15 +46,15 @@ def _prepare_logs(model: Model, logs: Sequence[Log], filtering: str) -> Prepared
     return PreparedLogs(repaired, notes, doubts, chosen)
 
 
-def diagnose_from(model: Model, logs: Sequence[Log], filtering: str = "machine") -> Account:
+def diagnose_from(model: Model, logs: Sequence[Log], filtering: str = "machine") -> Assessment:
     """Diagnose checked logs and measure the gain of each finding.
 
     filtering: a name of `FILTERS`, used for the first guess. Raises LogError, NotIdentifiableError, NoEstimateError.
     """
     prepared = _prepare_logs(model, logs, filtering)
     with doubts_in_errors(prepared.doubts):
-        found = diagnosis.diagnose(model, prepared.logs, prepared.filter, together=forked)
-    return diagnosis.account(found, together=forked)
+        found = diagnosis.diagnose(model, prepared.logs, prepared.filter, runner=run_forked)
+    return diagnosis.assess(found, runner=run_forked)
 
 
 def diagnose(
@@ -81,10 +81,12 @@ def diagnose(
         model, notes = ready.model, ready.notes
         prepared = _prepare_logs(model, ready.logs, filtering)
         with doubts_in_errors(prepared.doubts):
-            found = diagnosis.diagnose(model, prepared.logs, prepared.filter, report_share(0.0, DIAGNOSE_SHARE), forked)
+            found = diagnosis.diagnose(
+                model, prepared.logs, prepared.filter, report_share(0.0, DIAGNOSE_SHARE), run_forked
+            )
         title = model.machine.title
         drawings = reports.figure_calls(place, found, title)
-        account = diagnosis.account(found, report_share(DIAGNOSE_SHARE, 1.0), forked, drawings)
+        account = diagnosis.assess(found, report_share(DIAGNOSE_SHARE, 1.0), run_forked, drawings)
         text = diagnosis.machine_file(machine, model.machine, found)
         if text is not None:
             (place / MACHINE).write_text(text, encoding="utf-8")
@@ -98,7 +100,7 @@ def diagnose(
             "versions": requests.package_versions(),
         }
         reports.save(reports.signals_figure(summary["signals"], bool(found.stages), title), place / "signals.png")
-    tied = diagnosis.rivals(found)
+    tied = diagnosis.rival_pairs(found)
     summary["separating_drive"] = separating_drive(place, model.machine, tied, design_next, bar)
     reports.write_report(place, "diagnose", summary)
     return summary
@@ -106,9 +108,9 @@ def diagnose(
 
 def _baseline_note(found: Diagnosis) -> list[str]:
     """Say which model the "before" numbers are of, if the model without the findings can't follow the logs."""
-    if found.before.settled:
+    if found.before.estimated:
         return []
-    inflation = found.before.prepared.coarse
+    inflation = found.before.data.noise_inflation
     other = f"fitted to sensors taken for {inflation:g} times as noisy as they are"
     if not inflation > 1:
         other = "the machine file's"
@@ -116,7 +118,7 @@ def _baseline_note(found: Diagnosis) -> list[str]:
 
 
 def separating_drive(
-    place: Path, machine: Machine, tied: Sequence[Rivals], design_next: bool, bar: Bar = no_bar
+    place: Path, machine: Machine, tied: Sequence[RivalPair], design_next: bool, bar: Bar = no_bar
 ) -> dict[str, Any] | None:
     """Return the first pair of tied causes that a drive can separate; None without such a pair or a design problem.
 

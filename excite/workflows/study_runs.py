@@ -115,7 +115,7 @@ def _diagnose(model: Model, logs: Sequence[Log]) -> Row:
     from excite.diagnosis import diagnose
 
     repaired = [examine(model.machine, one).log for one in logs]
-    summary = diagnosis.summarise(diagnosis.account(diagnose(model, repaired, model.machine.filter)))
+    summary = diagnosis.summarise(diagnosis.assess(diagnose(model, repaired, model.machine.filter)))
     keys = ("effect", "where", "tied_with", "p_value", "amount", "amount_std", "unit", "gain_percent", "gain_ci95")
     return {
         "verdict": summary["verdict"],

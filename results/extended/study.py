@@ -29,7 +29,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from excite import output
-from excite.diagnosis import diagnosis, forked
+from excite.diagnosis import diagnosis, run_forked
 from excite.errors import NoEstimateError, SimulationError
 from excite.identification import methods, monte_carlo
 from excite.logs import Log, log, profile, repair
@@ -89,7 +89,7 @@ def study_effect(hidden: str, runs: int, jobs: int) -> dict[str, Any]:
     found = diagnosed(old, measured(prediction.build(old), true, motions["old"], 1000))
     row: dict[str, Any] = {"hidden": hidden, "verdict": found.verdict, "found": [], "ways": {}}
     for f in found.findings:
-        magnitude = {"amount": f.amount, "std": f.amount_std, "unit": f.unit, "tied_with": f.tied_with}
+        magnitude = {"amount": f.magnitude, "std": f.magnitude_std, "unit": f.unit, "tied_with": f.tied_with}
         row["found"].append({"name": f.name, **magnitude})
     files = {"old": prediction.build(old)}
     if found.findings and found.verdict != "unexplained":
@@ -118,7 +118,7 @@ def motion_limits(excess: dict[str, float]) -> dict[str, float]:
 
 def diagnosed(old: Machine, one: Log) -> diagnosis.Diagnosis:
     model = prediction.build(old)
-    return diagnosis.diagnose(model, [repair.examine(model, one).log], old.filter, together=forked)
+    return diagnosis.diagnose(model, [repair.examine(model, one).log], old.filter, runner=run_forked)
 
 
 def measured(known: Model, true: Model, motion: Motion, seed: int) -> Log:

@@ -19,17 +19,17 @@ from support.logs import calm, logged, make_log, slope
 
 from excite import diagnosis as package, smoothing
 from excite.diagnosis import (
-    Rivals,
+    RivalPair,
     diagnosis,
     findings,
     fits,
-    forked,
     hold_out,
     magnitude_interval,
     residuals,
+    run_forked,
     selection,
 )
-from excite.diagnosis.parallel import in_turn
+from excite.diagnosis.parallel import run_in_turn
 from excite.logs import log, profile
 from excite.model import Model, prediction
 from excite.model.effects import placing
@@ -57,7 +57,7 @@ def test_a_log_too_short_to_hide_stretches_has_no_gain(
 def test_short_logs_are_hidden_in_turn(straight: Model, straight_motion: Motion) -> None:
     """Forty seconds in six stretches and then in those beside them, so that noise is a small part of a gain."""
     one = make_log(straight, straight_motion, seed=3)
-    found = hold_out.withheld(fits.fitted(straight.machine, [one], straight.machine.filter))
+    found = hold_out.hold_out_errors(fits.fit_machine(straight.machine, [one], straight.machine.filter))
     assert found is not None
     assert len(found.squares) >= 3 * 6 - 1
     assert found.counts.sum() == pytest.approx(len(found.squares) * 200 * len(found.sensors), rel=0.05)
@@ -66,10 +66,10 @@ def test_short_logs_are_hidden_in_turn(straight: Model, straight_motion: Motion)
 def test_a_gain_is_of_the_stretches_that_both_models_foretell() -> None:
     """One of the turns in which a short log is hidden may leave no fit."""
 
-    def errs(by: float, *turns: int) -> hold_out.Withheld:
+    def errs(by: float, *turns: int) -> hold_out.HoldOutErrors:
         ones, count = np.ones((len(turns), 1)), len(turns)
         each = (np.array(turns) + 1) ** 2
-        return hold_out.Withheld(
+        return hold_out.HoldOutErrors(
             (("u1", "N m"),),
             by * ones * each[:, None],
             np.ones((count, 1), int),
@@ -78,20 +78,20 @@ def test_a_gain_is_of_the_stretches_that_both_models_foretell() -> None:
             np.array(turns),
         )
 
-    made = hold_out.gain(errs(4.0, 0, 0, 1), errs(1.0, 1, 2, 2))
+    made = hold_out.hold_out_gain(errs(4.0, 0, 0, 1), errs(1.0, 1, 2, 2))
     assert made is not None
     assert (made.before, made.percent) == (pytest.approx(400.0), pytest.approx(50.0))
-    assert hold_out.gain(errs(4.0, 0), errs(1.0, 1)) is None
-    assert hold_out.gain(None, errs(1.0, 1)) is None
+    assert hold_out.hold_out_gain(errs(4.0, 0), errs(1.0, 1)) is None
+    assert hold_out.hold_out_gain(None, errs(1.0, 1)) is None
 
 
 def test_one_stretch_tells_no_interval() -> None:
-    def errs(by: float) -> hold_out.Withheld:
-        return hold_out.Withheld(
+    def errs(by: float) -> hold_out.HoldOutErrors:
+        return hold_out.HoldOutErrors(
             (("u1", "N m"),), np.array([[by]]), np.array([[1]]), np.ones(1), np.ones(1), np.zeros(1)
         )
 
-    made = hold_out.gain(errs(4.0), errs(1.0))
+    made = hold_out.hold_out_gain(errs(4.0), errs(1.0))
     assert made is not None
     assert (made.percent, made.interval) == (pytest.approx(50.0), None)
 
@@ -134,14 +134,18 @@ def test_where_nothing_promises_anything_effects_begin_anew(
     sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Far from any fit first-order gains say little. The right cause is found by what it makes of exact dynamics."""
-    for way in ("choose", "sharp"):
+    for way in ("choose_effect", "choose_with_inflated_noise"):
         monkeypatch.setattr(f"excite.diagnosis.selection.{way}", lambda *asked: None)
-    monkeypatch.setattr("excite.diagnosis.selection.unfollowed", lambda stage, together: (stage, [], frozenset()))
+    monkeypatch.setattr(
+        "excite.diagnosis.selection.choose_from_start", lambda stage, together: (stage, [], frozenset())
+    )
     one = log.read_log(sloping, straight.machine)
     found = diagnosis.diagnose(straight, [one], straight.machine.filter)
     assert [f.name for f in found.findings] == ["ground_slope@machine"]
-    assert found.findings[0].amount == pytest.approx(0.01, rel=0.02)
-    monkeypatch.setattr("excite.diagnosis.selection.unlikely", lambda scanned, stage, tried, together: (stage, []))
+    assert found.findings[0].magnitude == pytest.approx(0.01, rel=0.02)
+    monkeypatch.setattr(
+        "excite.diagnosis.selection.choose_unlikely", lambda scanned, stage, tried, together: (stage, [])
+    )
     assert diagnosis.diagnose(straight, [one], straight.machine.filter).verdict == "unexplained"
 
 
@@ -154,15 +158,15 @@ def test_a_second_cause_with_which_exact_dynamics_follow_is_no_flaw_of_the_first
     both = prediction.build(placing.with_effects(straight.machine, slope))
     motion = simulate(both, gentle(straight, 30.0).u)
     one = make_log(both, motion, seed=3, known=straight)
-    stage = fits.forced(fits.fitted(straight.machine, [one], straight.machine.filter), in_turn)
+    stage = fits.fit_with_process_noise(fits.fit_machine(straight.machine, [one], straight.machine.filter), run_in_turn)
     assert stage.fit.process_noise > 0
-    scores = selection.scored(stage, in_turn)
-    first = selection.Choice("torque_gain@rear_roll", stage, 6 * scores[0].gain, 1.0, 200, (), 1.0)
-    found = selection.choose(stage, scores, [first], in_turn, lambda share, what: None, 0.0)
+    scores = selection.score_effects(stage, run_in_turn)
+    first = selection.Choice("torque_gain@rear_roll", stage, 6 * scores[0].likelihood_ratio, 1.0, 200, (), 1.0)
+    found = selection.choose_effect(stage, scores, [first], run_in_turn, lambda share, what: None, 0.0)
     assert found is not None
-    assert (found.name, found.stage.exact, found.stage.near) == ("ground_slope@machine", True, True)
+    assert (found.name, found.stage.exact, found.stage.is_close) == ("ground_slope@machine", True, True)
     monkeypatch.setattr("excite.diagnosis.selection.freed", lambda found, together: (None for _ in found))
-    assert selection.choose(stage, scores, [first], in_turn, lambda share, what: None, 0.0) is None
+    assert selection.choose_effect(stage, scores, [first], run_in_turn, lambda share, what: None, 0.0) is None
 
 
 @pytest.mark.parametrize(
@@ -184,11 +188,13 @@ def test_many_names_are_none(
     stage = calm(straight)
     gains = {"ground_slope@machine": 1000.0} if verdict == "named" else {}
     chosen = [selection.Choice(n, stage, gains.get(n, 100.0 + k), 1.0, 200, (), 1.0) for k, n in enumerate(names)]
-    kept = {"fitted": stage, "extended": (chosen, 0.0), "reviewed": chosen, "needed": chosen}
-    for name, answer in (*kept.items(), ("weighed", (chosen, (), None))):
+    kept = {"fit_machine": stage, "extend_model": (chosen, 0.0), "review_effects": chosen, "drop_unneeded": chosen}
+    for name, answer in (*kept.items(), ("drop_weak_effects", (chosen, (), None))):
         monkeypatch.setattr(f"excite.diagnosis.diagnosis.{name}", lambda *asked, answer=answer: answer)
-    monkeypatch.setattr("excite.diagnosis.diagnosis._finding", lambda *asked, **more: SimpleNamespace(tied_with=()))
-    found = diagnosis.diagnose(straight, stage.prepared.logs, straight.machine.filter)
+    monkeypatch.setattr(
+        "excite.diagnosis.diagnosis._make_finding", lambda *asked, **more: SimpleNamespace(tied_with=())
+    )
+    found = diagnosis.diagnose(straight, stage.data.logs, straight.machine.filter)
     assert (found.verdict, len(found.findings)) == (verdict, len(names) if verdict == "named" else 0)
     if verdict == "unexplained":
         assert found.after is stage
@@ -205,11 +211,11 @@ def test_a_phase_that_was_found_the_other_way_round_is_turned(sloping: Path, str
     downhill = uphill.model_copy(
         update={"amount": Quantity(value=-0.008, source="assumed"), "shape": turned},
     )
-    stage = fits.fitted(placing.with_effects(straight.machine, downhill), [one], straight.machine.filter)
+    stage = fits.fit_machine(placing.with_effects(straight.machine, downhill), [one], straight.machine.filter)
     assert dict(zip(stage.model.base.names, stage.fit.X, strict=True))["ground_slope@machine"] < 0
     choice = selection.Choice("ground_slope@machine", stage, 1e4, 1.0, 200, (), 0.5)
-    found = diagnosis._finding(choice, stage, 0.0, alone=True)
-    assert found.amount == pytest.approx(0.01, rel=0.02)
+    found = diagnosis._make_finding(choice, stage, 0.0, alone=True)
+    assert found.magnitude == pytest.approx(0.01, rel=0.02)
     assert found.shapes["direction"][0] == pytest.approx(0, abs=0.2)
 
 
@@ -218,12 +224,12 @@ def test_what_promises_nothing_at_all_is_not_tried(
 ) -> None:
     """A candidate whose best amount has the wrong sign can't even be put into a machine file."""
     one = log.read_log(emps_data, emps.machine)
-    stage = fits.fitted(emps.machine, [one], emps.machine.filter)
-    scores = selection.scored(stage, in_turn)
+    stage = fits.fit_machine(emps.machine, [one], emps.machine.filter)
+    scores = selection.score_effects(stage, run_in_turn)
     late = next(s for s in scores if s.candidate.placed.effect.name == "channel_delay")
-    scores = (replace(late, gain=0.0, values={**late.values, "A": -0.01}),)
-    monkeypatch.setattr("excite.diagnosis.selection.scored", lambda stage, together: scores)
-    assert not selection.unlikely(stage, fits.forced(stage, in_turn), (), in_turn)[1]
+    scores = (replace(late, likelihood_ratio=0.0, values={**late.values, "A": -0.01}),)
+    monkeypatch.setattr("excite.diagnosis.selection.score_effects", lambda stage, together: scores)
+    assert not selection.choose_unlikely(stage, fits.fit_with_process_noise(stage, run_in_turn), (), run_in_turn)[1]
     # Nor is what was begun already.
     begun = list[str]()
 
@@ -231,10 +237,10 @@ def test_what_promises_nothing_at_all_is_not_tried(
         begun.extend(e.name for m in machines for e in m.effect)
         return [None for _ in machines]
 
-    scores = (replace(late, gain=100.0, values={**late.values, "A": 0.01}),)
+    scores = (replace(late, likelihood_ratio=100.0, values={**late.values, "A": 0.01}),)
     monkeypatch.setattr("excite.diagnosis.selection.begun", begin)
     for tried, expected in (((late.candidate.name,), []), ((), ["channel_delay"])):
-        assert selection.unlikely(stage, stage, tried, in_turn) == (stage, [])
+        assert selection.choose_unlikely(stage, stage, tried, run_in_turn) == (stage, [])
         assert begun == expected
 
 
@@ -272,7 +278,7 @@ def test_a_drive_is_designed_for_what_is_tied(straight: Model, tmp_path: Path) -
     machine = straight.machine.model_copy(update={"problems": {"S40": short}, "problem": "S40"})
     told = ("torque_deadband@rear_roll=80", "asymmetric_coulomb@rear_roll=60", "encoder_eccentricity@rear_roll=0.01")
     deadband, coulomb, eccentric = (placing.parse_effect(text, machine, 12.0) for text in told)
-    pairs = [Rivals(machine, (deadband, eccentric)), Rivals(machine, (deadband, coulomb))]
+    pairs = [RivalPair(machine, (deadband, eccentric)), RivalPair(machine, (deadband, coulomb))]
     assert diagnose_workflow.separating_drive(tmp_path, machine, pairs[:1], True) is None
     nowhere = machine.model_copy(update={"problem": None})
     assert diagnose_workflow.separating_drive(tmp_path, nowhere, pairs, True) is None
@@ -293,8 +299,8 @@ def test_a_drive_is_designed_for_what_is_tied(straight: Model, tmp_path: Path) -
     both = [prediction.build(placing.with_effects(machine, e)) for e in (deadband, coulomb)]
     motion = simulate(both[0], torque, q0=q0, nu0=nu0)
     one = log.from_table(sensors.measure(both[0], motion, seed=2), machine)
-    right, wrong = (fits.fitted(m.machine, [one], machine.filter).fit for m in both)
-    assert wrong.cost - right.cost > selection.CLOSE
+    right, wrong = (fits.fit_machine(m.machine, [one], machine.filter).fit for m in both)
+    assert wrong.cost - right.cost > selection.TIE_LIKELIHOOD_RATIO
 
 
 @pytest.mark.slow
@@ -361,19 +367,19 @@ def test_a_drive_that_hardly_shows_the_machine_still_shows_a_cause(seed: int, st
     table = sensors.measure(truth, designed("S40", truth), seed=seed)
     (found,) = diagnosis.diagnose(straight, [log.from_table(table, straight.machine)], straight.machine.filter).findings
     assert found.name == "stribeck_friction@front_roll"
-    assert abs(found.amount - 150) < 3 * found.amount_std
+    assert abs(found.magnitude - 150) < 3 * found.magnitude_std
 
 
 @pytest.mark.slow
 def test_a_stop_tells_by_which_law_its_rubber_hardens(va12: Model) -> None:
     """What it is at first touch is seen nowhere alone: by the wrong law it would come out twice as stiff."""
     shapes = {"stop": 0.25, "hardening": 1.0, "power": 1.0}
-    hidden = selection.identified("articulation_stop_spring", "articulation", 10000.0, shapes)
+    hidden = selection.identified_entry("articulation_stop_spring", "articulation", 10000.0, shapes)
     truth = prediction.build(placing.with_effects(va12.machine, hidden))
     table = sensors.measure(truth, designed("R60_accuracy", truth), kit="full", seed=5)
     (found,) = diagnosis.diagnose(va12, [log.from_table(table, va12.machine)], va12.machine.filter).findings
     assert found.name == hidden.label
-    assert abs(found.amount - 10000) < 3 * found.amount_std < 6000
+    assert abs(found.magnitude - 10000) < 3 * found.magnitude_std < 6000
     for name, value in shapes.items():
         assert abs(found.shapes[name][0] - value) < 4 * found.shapes[name][1], name
 
@@ -389,16 +395,18 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
     both = prediction.build(placing.with_effects(straight.machine, *true))
     motion = simulate(both, straight_motion.u)
     one = make_log(both, motion, seed=4, known=straight)
-    found, same = (diagnosis.diagnose(straight, [one], straight.machine.filter, together=t) for t in (forked, in_turn))
+    found, same = (
+        diagnosis.diagnose(straight, [one], straight.machine.filter, runner=t) for t in (run_forked, run_in_turn)
+    )
     assert found.findings == same.findings
     np.testing.assert_array_equal(found.after.fit.X, same.after.fit.X)
     names = [e.label for e in true]
     assert (found.verdict, sorted(f.name for f in found.findings)) == ("named", sorted(names))
     for f, e in zip(sorted(found.findings, key=lambda f: f.name), true, strict=True):
-        assert abs(f.amount - float(e.amount)) < 4 * f.amount_std
+        assert abs(f.magnitude - float(e.amount)) < 4 * f.magnitude_std
 
     wrong = placing.parse_effect("asymmetric_coulomb@rear_roll=60", straight.machine, 40.0)
-    more = fits.refitted(placing.with_effects(found.after.machine, wrong), found.after, 0.0)
+    more = fits.refit(placing.with_effects(found.after.machine, wrong), found.after, 0.0)
     name = wrong.label
     for order, stage in (
         (names[::-1], found.after),
@@ -406,25 +414,25 @@ def test_the_order_in_which_several_are_found_does_not_count(straight: Model, st
         ([names[0], name, names[1]], more),
     ):
         chosen = [selection.Choice(n, stage, 1000.0, 1.0, 100, (), 1.0) for n in order]
-        again = diagnosis.reviewed(found.before, chosen)
+        again = diagnosis.review_effects(found.before, chosen)
         assert [x.name for x in again] == [n for n in order if n in names]
         assert again[-1].stage.fit.cost == pytest.approx(found.after.fit.cost, abs=0.1)
     # One whose amount comes out as nothing goes, and the others stand as if it had never been there. What was gained on
     # the way makes it no surer.
     chosen = [selection.Choice(n, more, 1000.0, 1.0, 100, (), 1.0) for n in (name, *names)]
-    p_values = [f.p_value for f in diagnosis.concluded(found.before, more, chosen, (), 0.0).findings]
+    p_values = [f.p_value for f in diagnosis.conclude(found.before, more, chosen, (), 0.0).findings]
     assert p_values[0] > 0.05
     assert max(p_values[1:]) < 1e-100
-    left = diagnosis.needed(found.before, chosen)
+    left = diagnosis.drop_unneeded(found.before, chosen)
     assert [x.name for x in left] == names
     assert [e.name for e in left[0].stage.machine.effect] == [names[0].split("@")[0]]
-    assert [x.name for x in diagnosis.needed(found.before, left)] == names
+    assert [x.name for x in diagnosis.drop_unneeded(found.before, left)] == names
     # Nor does one stay whose amount says that it is nothing, however sure that amount seems to be.
     faint = placing.parse_effect("shear_saturation@rear_roll=6", straight.machine, 40.0)
-    more = fits.refitted(placing.with_effects(found.after.machine, faint), found.after, 0.0)
+    more = fits.refit(placing.with_effects(found.after.machine, faint), found.after, 0.0)
     name = faint.label
     chosen = [selection.Choice(n, more, 1000.0, 1.0, 100, (), 1.0) for n in (name, *names)]
-    assert [x.name for x in diagnosis.needed(found.before, chosen)] == names
+    assert [x.name for x in diagnosis.drop_unneeded(found.before, chosen)] == names
 
 
 def test_what_gets_a_name_is_no_chance(straight: Model, straight_motion: Motion) -> None:
@@ -433,14 +441,14 @@ def test_what_gets_a_name_is_no_chance(straight: Model, straight_motion: Motion)
     entries = [placing.parse_effect(text, straight.machine, 40.0) for text in told]
     has = prediction.build(placing.with_effects(straight.machine, *entries))
     motion = simulate(has, straight_motion.u, q0=straight_motion.q[0], nu0=straight_motion.nu[0])
-    stage = fits.fitted(has.machine, [make_log(has, motion, seed=3)], has.machine.filter)
+    stage = fits.fit_machine(has.machine, [make_log(has, motion, seed=3)], has.machine.filter)
     names = [e.name for e in stage.model.effects]
-    assert [selection.freedom(n, stage) for n in names] == [1, 2, 3]
-    levels = [selection.threshold(n, stage, 2000) for n in names]
-    assert levels[0] == selection.LEVEL <= levels[1] < levels[2]
+    assert [selection.degrees_of_freedom(n, stage) for n in names] == [1, 2, 3]
+    levels = [selection.required_likelihood_ratio(n, stage, 2000) for n in names]
+    assert levels[0] == selection.MIN_LIKELIHOOD_RATIO <= levels[1] < levels[2]
     for name, level in zip(names, levels, strict=True):
         chosen = [selection.Choice(name, stage, level, 1.0, 2000, (), 1.0)]
-        assert diagnosis.concluded(stage, stage, chosen, (), 0.0).findings[0].p_value <= selection.CHANCE * 1.000001
+        assert diagnosis.conclude(stage, stage, chosen, (), 0.0).findings[0].p_value <= selection.MAX_P_VALUE * 1.000001
 
 
 def test_an_amount_is_as_unsure_as_shapes_that_a_log_hardly_tells(straight: Model) -> None:
@@ -462,22 +470,24 @@ def test_an_amount_is_as_unsure_as_shapes_that_a_log_hardly_tells(straight: Mode
     motion = simulate(hidden, np.column_stack([push, 0.8 * push]))
     assert 2 < np.ptp(motion.q[:, 0]) < 4
     one = make_log(hidden, motion, seed=3, known=straight)
-    before = fits.fitted(straight.machine, [one], straight.machine.filter)
+    before = fits.fit_machine(straight.machine, [one], straight.machine.filter)
     for amount, each in ((0.05, 3.0), (0.05, 15.0), (0.05, 50.0)):
-        after = fits.refitted(packed(amount, each), before, 0.0)
+        after = fits.refit(packed(amount, each), before, 0.0)
         k = after.model.base.names.index(name)
         assert each == 50.0 or 0.06 - after.fit.X[k] > 3 * after.fit.std[k]
         chosen = [selection.Choice(name, after, 1000.0, 1.0, 100, (), 1.0)]
-        (found,) = diagnosis.concluded(before, after, chosen, (), 0.0).findings
-        assert 0.06 - found.amount < 2.5 * found.amount_std
-        assert found.amount_std < found.amount
+        (found,) = diagnosis.conclude(before, after, chosen, (), 0.0).findings
+        assert 0.06 - found.magnitude < 2.5 * found.magnitude_std
+        assert found.magnitude_std < found.magnitude
     # Nor does it where the shape is held, as nothing shows it at all; a shape that is told needs no other fit.
     shape = after.model.base.names.index(f"{name}.pass")
     held = replace(after.fit, unidentifiable=np.arange(len(after.fit.X)) == shape)
     sure = after.fit.covariance.copy()
     sure[shape] = sure[:, shape] = 0.0
     for fit, more in ((replace(held, covariance=sure), True), (replace(after.fit, covariance=sure), False)):
-        assert (magnitude_interval.unsure(after.placed(name), replace(after, fit=fit), in_turn) > 0) == more
+        assert (
+            magnitude_interval.std_over_weak_shapes(after.placed(name), replace(after, fit=fit), run_in_turn) > 0
+        ) == more
 
 
 def test_a_figure_says_that_nothing_could_be_withheld() -> None:
@@ -492,10 +502,10 @@ def test_a_figure_says_that_nothing_could_be_withheld() -> None:
 def test_every_log_is_drawn(straight: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Forces that only the one model needs are shown for the other too."""
     logs = [make_log(straight, gentle(straight, 6.0), seed=k) for k in (3, 4)]
-    without = fits.fitted(straight.machine, logs, straight.machine.filter)
+    without = fits.fit_machine(straight.machine, logs, straight.machine.filter)
     beside = replace(without, fit=replace(without.fit, process_noise=1.0))
-    loosened = list[fits.Stage]()
-    monkeypatch.setattr(residuals, "loosened", lambda stage: (loosened.append(stage), beside)[1])
+    loosened = list[fits.ExtendedFit]()
+    monkeypatch.setattr(residuals, "refit_with_process_noise", lambda stage: (loosened.append(stage), beside)[1])
     for after, asked in ((without, []), (beside, [without, beside])):
         loosened.clear()
         d: Any = SimpleNamespace(before=without, after=after, stages=(after,))
@@ -511,7 +521,7 @@ def test_panels_keep_apart_whatever_their_numbers(size: float) -> None:
     rng, t = np.random.default_rng(0), np.arange(6001) / 100
     quantities = {n: ("m/s", {"torque u1": size * rng.standard_normal(len(t))}) for n in "abcde"}
     missing = {"torque u1": (size * rng.standard_normal(len(t)), "N m", size)}
-    course = residuals.Course("log.csv", t, missing, quantities, (), cast(Any, None))
+    course = residuals.LogResiduals("log.csv", t, missing, quantities, (), cast(Any, None))
     figure = diagnosis_figures.misfit_figure(course, course, "a roller")
     FigureCanvasAgg(figure).draw()
     *axes, _ = figure.axes
@@ -533,7 +543,7 @@ def test_the_usual_range_of_a_shape(va12: Model) -> None:
         (placed,) = prediction.build(
             placing.with_effects(va12.machine, entry.model_copy(update={"shape": own}))
         ).effects
-        return magnitude_interval._usual(placed, shape, va12.machine)
+        return magnitude_interval._usual_range(placed, shape, va12.machine)
 
     assert usual("compaction_per_pass=0.3", "pass") == (5.0, 50.0)
     assert usual("slip_relaxation@front_roll=0.05", "moment") == (0.0, 1.0)
@@ -549,8 +559,8 @@ def test_what_no_machine_has_is_no_name(straight: Model, straight_motion: Motion
     comes nearest and why it is none; as plain as it may be otherwise, and with nothing left that is odd."""
     entry = placing.parse_effect("rolling_resistance@rear_roll=400", straight.machine, 40.0)
     one = make_log(straight, straight_motion, seed=3)
-    before = fits.fitted(straight.machine, [one], straight.machine.filter)
-    after = fits.refitted(placing.with_effects(straight.machine, entry), before, 0.0)
+    before = fits.fit_machine(straight.machine, [one], straight.machine.filter)
+    after = fits.refit(placing.with_effects(straight.machine, entry), before, 0.0)
     names = after.model.base.names
 
     def said(name: str, value: float) -> diagnosis.Diagnosis:
@@ -559,8 +569,8 @@ def test_what_no_machine_has_is_no_name(straight: Model, straight_motion: Motion
         X[names.index(name)] = value
         stage = replace(after, fit=replace(after.fit, X=X, covariance=np.diag((0.01 * X) ** 2)))
         chosen = [selection.Choice("rolling_resistance@rear_roll", stage, 1000.0, 1.0, 100, (), 1.0)]
-        kept, odd, nearest = diagnosis.weighed(before, chosen)
-        return diagnosis.concluded(before, kept[-1].stage if kept else before, kept, odd, 0.0, nearest)
+        kept, odd, nearest = diagnosis.drop_weak_effects(before, chosen)
+        return diagnosis.conclude(before, kept[-1].stage if kept else before, kept, odd, 0.0, nearest)
 
     assert said("Fs4", 150.0).verdict == "named"
     for name, value in (("Fs4", -150.0), ("Fv1", -90.0), ("Kx4", 1e5), ("rolling_resistance@rear_roll", -400.0)):
@@ -569,7 +579,7 @@ def test_what_no_machine_has_is_no_name(straight: Model, straight_motion: Motion
         assert d.nearest is not None
         assert (d.nearest.name, len(d.nearest.impossible)) == ("rolling_resistance@rear_roll", 1)
         assert d.nearest.impossible[0].startswith(f"{name} = -" if value < 0 else f"{name} = 1e+05")
-        assert "which no machine has" in findings.answer(findings.account(d))
+        assert "which no machine has" in findings.answer_text(findings.assess(d))
 
 
 @pytest.mark.parametrize(("left", "kept"), [(0.0, True), (900.0, True), (1100.0, False)])
@@ -580,12 +590,12 @@ def test_a_name_that_is_faint_beside_another_is_none_under_forces(
     compares with another's promise."""
     entry = placing.parse_effect("rolling_resistance@rear_roll=400", straight.machine, 40.0)
     one = make_log(straight, straight_motion, seed=3)
-    before = fits.fitted(straight.machine, [one], straight.machine.filter)
-    loose = fits.refitted(placing.with_effects(straight.machine, entry), before, 0.0)
-    far = replace(loose, fit=replace(loose.fit, cost=3 * loose.noise))
+    before = fits.fit_machine(straight.machine, [one], straight.machine.filter)
+    loose = fits.refit(placing.with_effects(straight.machine, entry), before, 0.0)
+    far = replace(loose, fit=replace(loose.fit, cost=3 * loose.expected_cost))
     chosen = [selection.Choice("rolling_resistance@rear_roll", far, 100.0, 1.0, 100, (), 1.0, loose)]
-    monkeypatch.setattr(diagnosis, "_odd", lambda stage: ("theta1: a slow error",) if stage is far else ())
-    names, _, nearest = diagnosis.weighed(before, chosen, left)
+    monkeypatch.setattr(diagnosis, "_anomaly_lines", lambda stage: ("theta1: a slow error",) if stage is far else ())
+    names, _, nearest = diagnosis.drop_weak_effects(before, chosen, left)
     assert (bool(names), nearest is None) == (kept, kept)
 
 
@@ -604,8 +614,8 @@ def test_a_vibration_shakes_a_sensor_in_one_log_at_least(straight: Model) -> Non
         ([short, quiet], False),
         ([quiet, loud], True),
     ):
-        stage = fits.fitted(shaken.machine, logs, straight.machine.filter)
-        assert selection._felt("vibration_on@rear_roll", stage) == felt
+        stage = fits.fit_machine(shaken.machine, logs, straight.machine.filter)
+        assert selection._is_plausible("vibration_on@rear_roll", stage) == felt
 
 
 @pytest.mark.parametrize(("load", "so"), [(50e3, True), (2e3, False), (400e3, False)])
@@ -615,10 +625,10 @@ def test_a_roll_out_of_round_carries_a_share_of_the_machine(load: float, so: boo
     entry = entry.model_copy(update={"shape": {"load": Quantity(value=load, source="assumed")}})
     known = placing.with_effects(straight.machine, entry)
     one = make_log(prediction.build(known), gentle(straight, 12.0), seed=3, known=straight)
-    stage = fits.fitted(known, [one], straight.machine.filter)
+    stage = fits.fit_machine(known, [one], straight.machine.filter)
     names = stage.model.base.names
     assert "roll_out_of_round@rear_roll.load" in names
-    assert selection._felt("roll_out_of_round@rear_roll", stage) == so
+    assert selection._is_plausible("roll_out_of_round@rear_roll", stage) == so
 
 
 def test_a_cause_without_which_nothing_is_left_and_no_machine_possible_stays_alone(
@@ -627,18 +637,18 @@ def test_a_cause_without_which_nothing_is_left_and_no_machine_possible_stays_alo
     """There is nothing by which a further effect could tell that it makes the machine possible again."""
     stage = calm(prediction.build(placing.with_effects(straight.machine, slope(straight))))
     choice = selection.Choice("ground_slope@machine", stage, 1e4, 1.0, 1, (), 1.0)
-    asked = list[fits.Stage]()
+    asked = list[fits.ExtendedFit]()
 
-    def scored(of: fits.Stage, *given: Any) -> tuple[()]:
+    def scored(of: fits.ExtendedFit, *given: Any) -> tuple[()]:
         asked.append(of)
         return ()
 
-    monkeypatch.setattr(selection, "scored", scored)
+    monkeypatch.setattr(selection, "score_effects", scored)
     for lines, left, goes_on in ((("M = -1",), 0.0, False), ((), 0.0, True), (("M = -1",), 1e4, True)):
         asked.clear()
-        monkeypatch.setattr(fits.Stage, "impossible", lines)
+        monkeypatch.setattr(fits.ExtendedFit, "impossible", lines)
         more = replace(choice, stage=replace(stage, fit=replace(stage.fit, cost=stage.fit.cost + left)))
-        found, _ = diagnosis.extended(stage, [more], in_turn, lambda share, what: None)
+        found, _ = diagnosis.extend_model(stage, [more], run_in_turn, lambda share, what: None)
         assert found == [more]
         assert bool(asked) == goes_on
 
@@ -667,15 +677,20 @@ def test_nothing_is_looked_for_beside_names_where_no_more_could_explain_the_misf
     anything, and what has a name already keeps it."""
     stage = calm(prediction.build(placing.with_effects(straight.machine, slope(straight))))
     excess = left / (1 - left) * 1000.0  # after a gain of 1000
-    far = replace(stage, fit=replace(stage.fit, cost=(1 + fits.SLACK) * stage.noise + excess, process_noise=forces))
-    score = next(s for s in selection.scored(stage, in_turn) if s.values["A"] != 0)
-    forced = replace(stage, fit=replace(stage.fit, process_noise=fits.SMALL)) if named == "with forces" else None
+    far = replace(
+        stage,
+        fit=replace(stage.fit, cost=(1 + fits.COST_TOLERANCE) * stage.expected_cost + excess, process_noise=forces),
+    )
+    score = next(s for s in selection.score_effects(stage, run_in_turn) if s.values["A"] != 0)
+    forced = (
+        replace(stage, fit=replace(stage.fit, process_noise=fits.MIN_PROCESS_NOISE)) if named == "with forces" else None
+    )
     choice = selection.Choice("ground_slope@machine", far, 1000.0, 1.0, 1, (), 1.0, forced)
-    monkeypatch.setattr(diagnosis, "_odd", lambda of: () if named == "nothing odd" else ("a roll that hops",))
+    monkeypatch.setattr(diagnosis, "_anomaly_lines", lambda of: () if named == "nothing odd" else ("a roll that hops",))
     asked = list[int]()
-    monkeypatch.setattr(selection, "scored", lambda *given: (replace(score, gain=promised),))
-    monkeypatch.setattr(selection, "choose", lambda *given: asked.append(1))
-    found, _ = diagnosis.extended(stage, [choice], in_turn, lambda share, what: None)
+    monkeypatch.setattr(selection, "score_effects", lambda *given: (replace(score, likelihood_ratio=promised),))
+    monkeypatch.setattr(selection, "choose_effect", lambda *given: asked.append(1))
+    found, _ = diagnosis.extend_model(stage, [choice], run_in_turn, lambda share, what: None)
     assert found == [choice]
     assert bool(asked) == goes_on
 
@@ -684,25 +699,27 @@ def test_further_variants_of_the_likeliest_names_are_tried(straight: Model) -> N
     """Beside so many candidates in all: a formula may be right in one form only, which scores last."""
     stage = calm(straight)
     best: dict[str, Any] = {}
-    for score in selection.scored(stage, in_turn):
+    for score in selection.score_effects(stage, run_in_turn):
         if score.values["A"] != 0 and len(score.candidate.variant) > 1:
             best.setdefault(score.candidate.name, score)
-    names = list(best)[: selection.TRIED]
-    assert len(names) == selection.TRIED
+    names = list(best)[: selection.MAX_CANDIDATES]
+    assert len(names) == selection.MAX_CANDIDATES
 
     def variant(name: str, form: str, gain: float) -> Any:
         placed = best[name].candidate.placed
-        return replace(best[name], gain=gain, candidate=SimpleNamespace(name=name, variant=(name, form), placed=placed))
+        return replace(
+            best[name], likelihood_ratio=gain, candidate=SimpleNamespace(name=name, variant=(name, form), placed=placed)
+        )
 
     firsts = [variant(name, "first", 1000.0 - k) for k, name in enumerate(names)]
     others = [variant(name, "other", 900.0 - k) for k, name in enumerate(names)]
     told = selection._shortlist(stage, [*firsts, *others], ())
-    assert told == [*firsts, *others[: selection.PAIR]]
+    assert told == [*firsts, *others[: selection.FIRST_BATCH]]
 
 
 @pytest.mark.parametrize(
     ("impossible", "forces", "left", "chosen"),
-    [(0, 0.0, 0.0, 0), (1, 0.0, 0.0, 1), (1, 0.0, 1e4, 0), (2, 0.0, 0.0, 0), (1, fits.SMALL, 0.0, 0)],
+    [(0, 0.0, 0.0, 0), (1, 0.0, 0.0, 1), (1, 0.0, 1e4, 0), (2, 0.0, 0.0, 0), (1, fits.MIN_PROCESS_NOISE, 0.0, 0)],
 )
 def test_a_machine_that_can_be_is_preferred(
     impossible: int, forces: float, left: float, chosen: int, straight: Model, monkeypatch: pytest.MonkeyPatch
@@ -710,17 +727,19 @@ def test_a_machine_that_can_be_is_preferred(
     """Of effects that explain all that a log shows about as well; where more is left, more may come. Not one with which
     no machine can be either, and that explains less, nor one that only forces let explain as much."""
     stage = calm(straight)
-    scores = {s.candidate.name: s for s in selection.scored(stage, in_turn)}
+    scores = {s.candidate.name: s for s in selection.score_effects(stage, run_in_turn)}
     tries = []
     for k, text in enumerate(("ground_slope=0.009", "rolling_resistance@rear_roll=200")):
         extended = placing.with_effects(straight.machine, placing.parse_effect(text, straight.machine, 40.0))
-        found = fits.refitted(extended, stage, 0.0)
-        fit = replace(found.fit, cost=(1 + fits.SLACK) * stage.noise - 1 + left + 3 * k, process_noise=forces * k)
-        tries.append((scores[found.model.effects[0].name], replace(found, fit=fit, bare=(None,) * (forces > 0))))
+        found = fits.refit(extended, stage, 0.0)
+        fit = replace(
+            found.fit, cost=(1 + fits.COST_TOLERANCE) * stage.expected_cost - 1 + left + 3 * k, process_noise=forces * k
+        )
+        tries.append((scores[found.model.effects[0].name], replace(found, fit=fit, exact_fit=(None,) * (forces > 0))))
     names = [s.candidate.name for s, _ in tries[:impossible]]
     lines = property(lambda of: ("Fv1 = -1",) if of.model.effects[0].name in names else ())
-    monkeypatch.setattr(fits.Stage, "impossible", lines)
-    choice = selection._chosen(tries, 1000.0, 100, in_turn)
+    monkeypatch.setattr(fits.ExtendedFit, "impossible", lines)
+    choice = selection._make_choice(tries, 1000.0, 100, run_in_turn)
     assert choice.name == tries[chosen][0].candidate.name
     assert [e.label for e in choice.rivals] == ([] if chosen else [tries[1][0].candidate.name])
 
@@ -731,30 +750,30 @@ def test_where_exact_dynamics_find_no_way_a_known_fit_with_forces_is_gone_on_wit
     """The one that the last name was judged with, if it was with such forces."""
     sloped = placing.with_effects(straight.machine, slope(straight))
     stage = calm(prediction.build(sloped))
-    small, large = (replace(stage, fit=replace(stage.fit, process_noise=d)) for d in (fits.SMALL, 1.0))
-    made, judged = list[float](), list[fits.Stage]()
+    small, large = (replace(stage, fit=replace(stage.fit, process_noise=d)) for d in (fits.MIN_PROCESS_NOISE, 1.0))
+    made, judged = list[float](), list[fits.ExtendedFit]()
 
-    def refitted(machine: Any, of: fits.Stage, disturbed: float) -> fits.Stage:
+    def refitted(machine: Any, of: fits.ExtendedFit, disturbed: float) -> fits.ExtendedFit:
         made.append(disturbed)
         return replace(of, fit=replace(of.fit, process_noise=disturbed))
 
-    def scanned(of: fits.Stage, *given: Any) -> list[Any]:
+    def scanned(of: fits.ExtendedFit, *given: Any) -> list[Any]:
         judged.append(of)
         return []
 
-    scores = [s for s in selection.scored(stage, in_turn) if s.values["A"] != 0]
+    scores = [s for s in selection.score_effects(stage, run_in_turn) if s.values["A"] != 0]
     likely = scores[:1]
-    monkeypatch.setattr(selection, "_likely", lambda *given: likely)
-    monkeypatch.setattr(selection, "_tries", lambda *given: ([], set()))
+    monkeypatch.setattr(selection, "_refined_shortlist", lambda *given: likely)
+    monkeypatch.setattr(selection, "_fit_candidates", lambda *given: ([], set()))
     monkeypatch.setattr(selection, "refitted", refitted)
-    monkeypatch.setattr(selection, "_scanned", scanned)
+    monkeypatch.setattr(selection, "_score_along", scanned)
     for loose, again in ((small, False), (large, True), (None, True)):
         made.clear()
         judged.clear()
         before = selection.Choice("ground_slope@machine", stage, 1000.0, 1.0, 1, (), 1.0, loose)
-        assert selection.choose(stage, scores, [before], in_turn, lambda share, what: None, 0.0) is None
-        assert made == ([fits.SMALL] if again else [])
-        assert [x.fit.process_noise for x in judged] == [fits.SMALL]
+        assert selection.choose_effect(stage, scores, [before], run_in_turn, lambda share, what: None, 0.0) is None
+        assert made == ([fits.MIN_PROCESS_NOISE] if again else [])
+        assert [x.fit.process_noise for x in judged] == [fits.MIN_PROCESS_NOISE]
         assert again or judged == [small]
 
 
@@ -764,39 +783,39 @@ def test_where_no_way_to_the_likeliest_cause_is_found_no_others_are_tried(
 ) -> None:
     """By exact dynamics: all are judged with disturbing forces then."""
     stage = calm(straight)
-    likely = selection.scored(stage, in_turn)
+    likely = selection.score_effects(stage, run_in_turn)
     likely = list({s.candidate.name: s for s in likely if s.values["A"] != 0}.values())[:3]
     assert len(likely) == 3
     wished = list[str]()
 
-    def refits(wishes: Sequence[fits.Wish], *given: Any) -> list[fits.Stage | None]:
+    def refits(wishes: Sequence[fits.RefitRequest], *given: Any) -> list[fits.ExtendedFit | None]:
         told = [*found[len(wished) :], True]
         wished.extend(machine.effect[-1].label for machine, _, _ in wishes)
         return [stage if yes else None for yes, _ in zip(told, wishes, strict=False)]
 
     monkeypatch.setattr(selection, "refits", refits)
-    monkeypatch.setattr(selection, "_felt", lambda name, of: True)
-    monkeypatch.setattr(selection, "_vanished", lambda name, of: False)
-    selection._tries(stage, likely, in_turn, lambda k: None)
+    monkeypatch.setattr(selection, "_is_plausible", lambda name, of: True)
+    monkeypatch.setattr(selection, "_fell_to_zero", lambda name, of: False)
+    selection._fit_candidates(stage, likely, run_in_turn, lambda k: None)
     assert len(wished) == asked
 
 
 def test_what_a_fit_leads_to_zero_is_no_way_to_a_cause(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither tried nor refused: as if the fit hadn't been found."""
     stage = calm(straight)
-    likely = [s for s in selection.scored(stage, in_turn) if s.values["A"] != 0][:1]
+    likely = [s for s in selection.score_effects(stage, run_in_turn) if s.values["A"] != 0][:1]
     (name,) = (s.candidate.name for s in likely)
     monkeypatch.setattr(selection, "refits", lambda wishes, *given: [stage])
-    monkeypatch.setattr(selection, "_felt", lambda name, of: True)
+    monkeypatch.setattr(selection, "_is_plausible", lambda name, of: True)
     for zero in (True, False):
-        monkeypatch.setattr(selection, "_vanished", lambda name, of, zero=zero: zero)
-        tries, refused = selection._tries(stage, likely, in_turn, lambda k: None)
+        monkeypatch.setattr(selection, "_fell_to_zero", lambda name, of, zero=zero: zero)
+        tries, refused = selection._fit_candidates(stage, likely, run_in_turn, lambda k: None)
         assert [s.candidate.name for s, _ in tries] == ([] if zero else [name])
         assert not refused
-        assert selection._lost(likely, tries, refused) == zero
-        exact, unknown = selection._without_forces([(likely[0], stage)], in_turn)
+        assert selection._likeliest_not_found(likely, tries, refused) == zero
+        exact, unknown = selection._trials_without_noise([(likely[0], stage)], run_in_turn)
         assert (len(exact), len(unknown)) == ((0, 1) if zero else (1, 0))
-        assert selection._is_any(name, stage) != zero
+        assert selection._is_effective(name, stage) != zero
 
 
 def test_an_amount_at_zero_can_be_written(straight: Model) -> None:
@@ -807,7 +826,7 @@ def test_an_amount_at_zero_can_be_written(straight: Model) -> None:
     stage = calm(prediction.build(machine))
     k = stage.model.base.names.index("torque_deadband@front_roll")
     X = np.where(np.arange(len(stage.fit.X)) == k, 1e-15, stage.fit.X)
-    entry = selection.entry_of(replace(stage, fit=replace(stage.fit, X=X)), "torque_deadband@front_roll")
+    entry = selection.fitted_entry(replace(stage, fit=replace(stage.fit, X=X)), "torque_deadband@front_roll")
     assert placing.with_effects(straight.machine, entry).effect
 
 
@@ -823,7 +842,7 @@ def test_stretches_are_withheld_from_fits_that_are_near_enough(
 
     monkeypatch.setattr(smoothing, "fit_logs", noted)
     for disturbed in (0.0, 0.1):
-        assert hold_out.withheld(replace(stage, fit=replace(stage.fit, process_noise=disturbed))) is not None
+        assert hold_out.hold_out_errors(replace(stage, fit=replace(stage.fit, process_noise=disturbed))) is not None
     assert set(asked) == {(0.0, gauss_newton.SUFFICIENT_STEP), (0.1, gauss_newton.ACCEPTABLE_STEP)}
 
 
@@ -837,10 +856,12 @@ def test_candidates_are_scored_once_along_a_fit(straight: Model, monkeypatch: py
         return true(along, fit, *asked)
 
     monkeypatch.setattr(selection.score_test, "scan", noted)
-    first = selection.scored(stage, in_turn)
-    assert selection.scored(stage, in_turn) is first
+    first = selection.score_effects(stage, run_in_turn)
+    assert selection.score_effects(stage, run_in_turn) is first
     other = replace(stage, fit=replace(stage.fit, cost=2 * stage.fit.cost))
-    assert [s.gain for s in selection.scored(other, in_turn)] == [s.gain for s in first]
+    assert [s.likelihood_ratio for s in selection.score_effects(other, run_in_turn)] == [
+        s.likelihood_ratio for s in first
+    ]
     assert scans == [stage.fit, other.fit]
 
 
@@ -851,11 +872,11 @@ def test_forces_hide_which_of_two_is_right(
     """Where the better one explains little without them, the other is tried without them too."""
     stage = calm(straight)
     best, other = ("ground_slope=0.009", "rolling_resistance@rear_roll=200")
-    scores = {s.candidate.name: s for s in selection.scored(stage, in_turn)}
-    noise, tries = stage.noise, []
+    scores = {s.candidate.name: s for s in selection.score_effects(stage, run_in_turn)}
+    noise, tries = stage.expected_cost, []
     for text, cost in ((best, noise), (other, noise + 600.0)):
         extended = placing.with_effects(straight.machine, placing.parse_effect(text, straight.machine, 40.0))
-        found = fits.refitted(extended, stage, 1.0)
+        found = fits.refit(extended, stage, 1.0)
         fit = replace(found.fit, cost=cost)
         tries.append((scores[found.model.effects[0].name], replace(found, fit=fit)))
 
@@ -866,10 +887,10 @@ def test_forces_hide_which_of_two_is_right(
             yield replace(x, fit=replace(x.fit, cost=cost, process_noise=0.0))
 
     monkeypatch.setattr(selection, "freed", freed)
-    choice = selection._chosen(tries, 3000.0, 100, in_turn)
+    choice = selection._make_choice(tries, 3000.0, 100, run_in_turn)
     assert choice.name == tries[chosen][0].candidate.name
     assert choice.stage.exact
-    assert choice.gain == pytest.approx(3000.0 - 600.0 * chosen)
+    assert choice.likelihood_ratio == pytest.approx(3000.0 - 600.0 * chosen)
     assert bool(choice.rivals) == (excess == (4.0, 3.9))
 
 
@@ -884,8 +905,10 @@ def test_a_harmonic_is_no_ripple_elsewhere(straight: Model, straight_motion: Mot
     one = make_log(hiding, simulate(hiding, straight_motion.u), seed=3, known=straight)
     found = []
     for known in (straight.machine, placing.with_effects(straight.machine, ripple(40, 7))):
-        stage = fits.fitted(known, [one], straight.machine.filter)
-        found.append({s.candidate.name: s.gain for s in reversed(selection.scored(stage, in_turn))})
+        stage = fits.fit_machine(known, [one], straight.machine.filter)
+        found.append(
+            {s.candidate.name: s.likelihood_ratio for s in reversed(selection.score_effects(stage, run_in_turn))}
+        )
     bare, rippled = found
     assert bare["torque_ripple@front_roll"] > 100
     assert "torque_ripple@front_roll" not in rippled
@@ -915,19 +938,19 @@ def test_what_an_effect_must_gain_to_be_worth_a_place(
     """Of an excess of 1e4: a part; where large forces leave much the first must explain what the largest of three does,
     and where the model isn't near the log yet a further one as much. Of what another gained: what its formula is off
     by, the more where that looks at a map of the ground."""
-    monkeypatch.setattr(selection, "_sureness", lambda stage: 0.0)
+    monkeypatch.setattr(selection, "_total_wald_statistic", lambda stage: 0.0)
     known = SimpleNamespace(name="a@b", uses_map=mapped)
     stage: Any = SimpleNamespace(
         model=SimpleNamespace(effects=[known]),
         fit=SimpleNamespace(process_noise=forces),
         exact=forces == 0,
-        near=near,
-        rough=forces > 0 or not near,
-        excess=1e4,
+        is_close=near,
+        first_order_is_rough=forces > 0 or not near,
+        excess_cost=1e4,
     )
-    chosen: Any = [SimpleNamespace(name=known.name, gain=gained, left=1.0)] if gained else []
+    chosen: Any = [SimpleNamespace(name=known.name, likelihood_ratio=gained, unabsorbed_share=1.0)] if gained else []
     candidate: Any = SimpleNamespace(placed=SimpleNamespace(effect=SimpleNamespace(timed=False)))
-    assert selection._least(stage, chosen, candidate, 0.0) == pytest.approx(least)
+    assert selection._required_gain(stage, chosen, candidate, 0.0) == pytest.approx(least)
 
 
 def unfit(monkeypatch: pytest.MonkeyPatch, refused: Callable[[Any, int], bool], coarse: float = 1.0) -> None:
@@ -942,7 +965,10 @@ def unfit(monkeypatch: pytest.MonkeyPatch, refused: Callable[[Any, int], bool], 
     monkeypatch.setattr(smoothing, "fit_logs", found)
 
 
-@pytest.mark.parametrize(("refused", "followed"), [(1, fits.COARSE[0]), (fits.COARSE[0], fits.COARSE[1])])
+@pytest.mark.parametrize(
+    ("refused", "followed"),
+    [(1, fits.SENSOR_NOISE_INFLATIONS[0]), (fits.SENSOR_NOISE_INFLATIONS[0], fits.SENSOR_NOISE_INFLATIONS[1])],
+)
 def test_what_is_followed_with_coarse_sensors_only_is_named(
     refused: float, followed: float, sloping: Path, straight: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -951,22 +977,22 @@ def test_what_is_followed_with_coarse_sensors_only_is_named(
     d = diagnosis.diagnose(straight, [log.read_log(sloping, straight.machine)], straight.machine.filter)
     assert d.verdict == "named"
     assert [f.name for f in d.findings] == ["ground_slope@machine"]
-    assert abs(d.findings[0].amount - 0.01) < 2 * d.findings[0].amount_std < 0.001
-    assert (d.before.prepared.coarse, d.before.settled) == (followed, False)
-    assert (d.after.prepared.coarse, d.after.settled, d.after.exact) == (1, True, True)
+    assert abs(d.findings[0].magnitude - 0.01) < 2 * d.findings[0].magnitude_std < 0.001
+    assert (d.before.data.noise_inflation, d.before.estimated) == (followed, False)
+    assert (d.after.data.noise_inflation, d.after.estimated, d.after.exact) == (1, True, True)
     beside = list[int]()
-    told = findings.account(d, beside=[lambda: beside.append(1)])
+    told = findings.assess(d, extra_calls=[lambda: beside.append(1)])
     assert beside == [1]
-    assert told.whole is not None
-    assert told.whole.interval[0] > 50
+    assert told.total_gain is not None
+    assert told.total_gain.interval[0] > 50
     assert told.located == ()
-    assert all(np.isnan(row["std_before"]) and row["moved"] is None for row in findings.parameters(d).values())
+    assert all(np.isnan(row["std_before"]) and row["moved"] is None for row in findings.parameter_table(d).values())
     monkeypatch.setattr(package, "diagnose", lambda *args: d)
     said = diagnose_workflow.diagnose(tmp_path, "va12_straight", [sloping])
     assert any(f"fitted to sensors taken for {followed:g} times as noisy" in note for note in said["notes"])
     # Innovations are held against the sensors' true noise, not that of coarse ones.
-    assert max(size.slow for size in told.before.values()) > 20
-    assert max(size.slow for size in told.after.values()) < 3
+    assert max(size.slow_mean_square for size in told.before.values()) > 20
+    assert max(size.slow_mean_square for size in told.after.values()) < 3
 
 
 def test_a_value_that_is_nothing_can_be_written() -> None:
@@ -981,31 +1007,34 @@ def test_a_model_that_coarse_sensors_lead_to_needs_no_effect(straight: Model, mo
     one = make_log(straight, gentle(straight, 20.0), seed=3)
     unfit(monkeypatch, lambda c, passes: passes == gauss_newton.MAX_PASSES)
     d = diagnosis.diagnose(straight, [one], straight.machine.filter)
-    assert (d.verdict, d.findings, d.before.prepared.coarse, d.before.exact) == ("clean", (), 1, True)
+    assert (d.verdict, d.findings, d.before.data.noise_inflation, d.before.exact) == ("clean", (), 1, True)
 
 
 def test_coarse_sensors_blur_no_estimate(straight: Model) -> None:
     """A right model has the misfit that noise makes, and parameters are where sharp sensors have them."""
     one = make_log(straight, gentle(straight, 20.0), seed=3)
-    sharp = fits.fitted(straight.machine, [one], straight.machine.filter)
+    sharp = fits.fit_machine(straight.machine, [one], straight.machine.filter)
     coarse = replace(
-        sharp.prepared, records=tuple(replace(r, noise_inflation=fits.COARSE[0]) for r in sharp.prepared.records)
+        sharp.data,
+        measurements=tuple(
+            replace(r, noise_inflation=fits.SENSOR_NOISE_INFLATIONS[0]) for r in sharp.data.measurements
+        ),
     )
-    blurred = fits.refitted(straight.machine, replace(sharp, prepared=coarse), 0.0)
-    assert not blurred.settled
-    assert 0.5 < blurred.fit.cost / blurred.noise < 2
+    blurred = fits.refit(straight.machine, replace(sharp, data=coarse), 0.0)
+    assert not blurred.estimated
+    assert 0.5 < blurred.fit.cost / blurred.expected_cost < 2
     assert np.abs((blurred.fit.X - sharp.fit.X) / blurred.fit.std).max() < 0.7
-    (again,) = fits.sharpened([blurred], 0.0, in_turn)
+    (again,) = fits.resume_with_true_sensor_noise([blurred], 0.0, run_in_turn)
     assert again is not None
     np.testing.assert_allclose(again.fit.X, sharp.fit.X, atol=0.02 * sharp.fit.std.max(), rtol=1e-3)
-    assert fits.as_measured(blurred).fit.cost == pytest.approx(sharp.fit.cost, rel=0.2)
+    assert fits.with_true_sensor_noise(blurred).fit.cost == pytest.approx(sharp.fit.cost, rel=0.2)
 
 
-def unneeded(model: Model, *texts: str) -> tuple[fits.Stage, list[selection.Choice]]:
+def unneeded(model: Model, *texts: str) -> tuple[fits.ExtendedFit, list[selection.Choice]]:
     """A clean log's stage, and effects chosen for it all the same, all in one fit."""
     clean = calm(model)
     entries = [placing.parse_effect(text, model.machine, 12.0) for text in texts]
-    both = fits.refitted(placing.with_effects(model.machine, *entries), clean, 0.0)
+    both = fits.refit(placing.with_effects(model.machine, *entries), clean, 0.0)
     return clean, [selection.Choice(e.name, both, 1000.0, 1.0, 100, (), 1.0) for e in both.model.effects]
 
 
@@ -1014,7 +1043,7 @@ def test_an_amount_that_nothing_shows_is_not_sure(straight: Model) -> None:
     clean, chosen = unneeded(straight, "compaction_per_pass=0.3", "stribeck_friction@rear_roll=9")
     both, names = chosen[0].stage, [x.name for x in chosen]
     assert [bool(both.fit.unidentifiable[both.model.base.names.index(n)]) for n in names] == [True, False]
-    assert [x.name for x in diagnosis.needed(clean, chosen)] == names[1:]
+    assert [x.name for x in diagnosis.drop_unneeded(clean, chosen)] == names[1:]
 
 
 def test_an_amount_and_its_shapes_are_sure_together(straight: Model) -> None:
@@ -1032,7 +1061,7 @@ def test_an_amount_and_its_shapes_are_sure_together(straight: Model) -> None:
     )
     for unseen, expected in (([], 8 / 0.05 + 1), (at[1:], 4.0), (at, 0.0)):
         told = replace(fit, X=X, covariance=covariance, unidentifiable=np.isin(np.arange(len(X)), unseen))
-        assert selection.wald(name, replace(stage, fit=told)) == pytest.approx(expected)
+        assert selection.wald_statistic(name, replace(stage, fit=told)) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("percent", [-0.5, 0.5])
@@ -1040,16 +1069,16 @@ def test_what_foretells_nothing_is_no_name(percent: float, straight: Model, monk
     """An effect whose amount is hardly known must pay on stretches hidden from the fit, however good that is."""
     clean, chosen = unneeded(straight, "ground_slope=0.001", "rolling_resistance@rear_roll=9")
     names = [x.name for x in chosen]
-    monkeypatch.setattr(selection, "threshold", lambda *_: -np.inf)
+    monkeypatch.setattr(selection, "required_likelihood_ratio", lambda *_: -np.inf)
     seen: list[int] = []
 
-    def measured(before: hold_out.Withheld, after: hold_out.Withheld) -> SimpleNamespace:
+    def measured(before: hold_out.HoldOutErrors, after: hold_out.HoldOutErrors) -> SimpleNamespace:
         seen.append(len(before.squares))
         assert before.squares.shape == after.squares.shape
         return SimpleNamespace(percent=percent)
 
     monkeypatch.setattr(diagnosis.gains, "gain", measured)
-    left = [x.name for x in diagnosis.needed(clean, chosen)]
+    left = [x.name for x in diagnosis.drop_unneeded(clean, chosen)]
     assert left == (names if percent > 0 else names[1:])
     assert min(seen) > 0
 

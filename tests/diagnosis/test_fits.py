@@ -16,8 +16,8 @@ from support.drives import gentle
 from support.logs import calm, make_log, slope
 
 from excite import smoothing
-from excite.diagnosis import fits as stages, forked, screening, selection
-from excite.diagnosis.parallel import in_turn
+from excite.diagnosis import fits as stages, run_forked, screening, selection
+from excite.diagnosis.parallel import run_in_turn
 from excite.logs import log
 from excite.model import Model, prediction
 from excite.model.effects import placing
@@ -32,14 +32,14 @@ def test_what_a_process_found_can_be_sent_back(straight: Model, straight_motion:
         return (pickle.loads(pickle.dumps(call())) for call in calls)
 
     one = make_log(straight, straight_motion, seed=3)
-    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    stage = stages.fit_machine(straight.machine, [one], straight.machine.filter)
     sloped = placing.with_effects(straight.machine, placing.parse_effect("ground_slope=0.001", straight.machine, 10.0))
     for disturbed in (0.0, 1.0):
-        (found,) = screening.begun([sloped], stage, disturbed, sent)
+        (found,) = screening.fit_screened([sloped], stage, disturbed, sent)
         assert found is not None
         assert found.fit.process_noise < max(disturbed, 0.01)
-        assert (found.loose is None) == found.exact
-    (found,) = stages.refits([(sloped, stage, 0.0)], sent)
+        assert (found.process_noise_fit is None) == found.exact
+    (found,) = stages.refit_all([(sloped, stage, 0.0)], sent)
     assert found is not None
 
 
@@ -54,18 +54,18 @@ def test_coarse_sensors_are_no_measure_of_how_near_sharp_ones_come(
     def nearly(*given: Any) -> gauss_newton.Fit:
         calls.append(given[3])
         if len(calls) == 1:
-            raise gauss_newton.NotConvergedError("no fit", replace(stage.fit, cost=1.1 * stage.noise), 5.0)
+            raise gauss_newton.NotConvergedError("no fit", replace(stage.fit, cost=1.1 * stage.expected_cost), 5.0)
         return stage.fit
 
-    monkeypatch.setattr(stages, "_nearly", nearly)
-    coarse = replace(stage, prepared=stages.noisy(stage.prepared, 10.0))
-    coarse = replace(coarse, fit=replace(stage.fit, cost=coarse.noise))
-    assert coarse.near
-    assert stages.resume(stage.prepared, coarse, 0.0).cost == stage.fit.cost
+    monkeypatch.setattr(stages, "_iterate_resumed", nearly)
+    coarse = replace(stage, data=stages.inflate_sensor_noise(stage.data, 10.0))
+    coarse = replace(coarse, fit=replace(stage.fit, cost=coarse.expected_cost))
+    assert coarse.is_close
+    assert stages.resume_fit(stage.data, coarse, 0.0).cost == stage.fit.cost
     assert calls == [0.0, 0.0]
     calls.clear()
     with pytest.raises(gauss_newton.NotConvergedError):
-        stages.resume(stage.prepared, stage, 0.0)
+        stages.resume_fit(stage.data, stage, 0.0)
 
 
 def test_ways_that_are_not_needed_are_given_up(straight: Model) -> None:
@@ -79,9 +79,9 @@ def test_ways_that_are_not_needed_are_given_up(straight: Model) -> None:
             yield call()
 
     others = multiprocessing.active_children()
-    there = stages.fitted(straight.machine, [one], straight.machine.filter, forked)
+    there = stages.fit_machine(straight.machine, [one], straight.machine.filter, run_forked)
     assert set(multiprocessing.active_children()) <= set(others)
-    here = stages.fitted(straight.machine, [one], straight.machine.filter, counted)
+    here = stages.fit_machine(straight.machine, [one], straight.machine.filter, counted)
     assert carried == [0]
     np.testing.assert_array_equal(there.fit.X, here.fit.X)
 
@@ -89,7 +89,7 @@ def test_ways_that_are_not_needed_are_given_up(straight: Model) -> None:
 def test_a_fit_whose_steps_cease_to_shrink_ends(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Near an answer as one that is as good as found, far from any without; whoever is patient goes on for longer."""
     stage = calm(straight)
-    p, true = stage.prepared, gauss_newton.newton_step
+    p, true = stage.data, gauss_newton.newton_step
     steps: list[float] = []
 
     def scripted(*args: Any) -> Any:
@@ -102,8 +102,8 @@ def test_a_fit_whose_steps_cease_to_shrink_ends(straight: Model, monkeypatch: py
             steps[:] = [500.0, 90.0, 80.0, 40.0, *[end] * 10]
             with pytest.raises(gauss_newton.NotConvergedError) as failed:
                 gauss_newton.fit_logs(
-                    p.c,
-                    p.records,
+                    p.space,
+                    p.measurements,
                     stage.fit.trajectories,
                     stage.fit.X,
                     p.starts,
@@ -120,7 +120,7 @@ def test_a_fit_whose_steps_cease_to_shrink_ends(straight: Model, monkeypatch: py
 def test_a_fit_is_found_where_its_steps_are_small_enough(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """With disturbing forces, whose deviations are no promise, sooner than without, unless that is asked for."""
     stage = calm(straight)
-    p, true = stage.prepared, gauss_newton.newton_step
+    p, true = stage.data, gauss_newton.newton_step
     steps: list[float] = []
 
     def scripted(*args: Any) -> Any:
@@ -136,8 +136,8 @@ def test_a_fit_is_found_where_its_steps_are_small_enough(straight: Model, monkey
     ):
         steps[:] = [5.0, 1.5, 0.5, 0.15, 1e-4, 1e-4]
         gauss_newton.fit_logs(
-            p.c,
-            p.records,
+            p.space,
+            p.measurements,
             stage.fit.trajectories,
             stage.fit.X,
             p.starts,
@@ -156,18 +156,18 @@ def test_a_fit_that_goes_downhill_goes_on(
     """A parameter that must become many times as large takes many passes, whose steps grow first: near the logs, as
     long as costs fall, that is no swing about an answer."""
     stage = calm(straight)
-    p, true = stage.prepared, gauss_newton.newton_step
+    p, true = stage.data, gauss_newton.newton_step
     steps, costs = list[float](), list[float]()
 
     def scripted(*args: Any) -> Any:
         covariance, move, *_ = true(*args)
         ahead = [np.full_like(m, 1e-6) for m in move]
-        costs.append(misfit * stage.noise - falling * len(costs))
+        costs.append(misfit * stage.expected_cost - falling * len(costs))
         return covariance, ahead, steps.pop(0), costs[-1]
 
     monkeypatch.setattr(gauss_newton, "newton_step", scripted)
     steps[:] = [500.0, 90.0, 3.0, 0.9, 1.0, 1.4, 1.8, 2.1, 1.9, 1.2, 0.3, 0.1, 0.01, 1e-4]
-    given = p.c, p.records, stage.fit.trajectories, stage.fit.X, p.starts, 0.0, p.held
+    given = p.space, p.measurements, stage.fit.trajectories, stage.fit.X, p.starts, 0.0, p.held
     if found:
         told = steps.copy()
         fit = gauss_newton.fit_logs(*given, passes=14, patient=False)
@@ -193,15 +193,15 @@ def test_far_from_the_logs_forces_need_no_more_than_nearly(
 ) -> None:
     """Near them costs are compared that hardly differ."""
     stage = calm(straight)
-    p, true = stage.prepared, gauss_newton.newton_step
+    p, true = stage.data, gauss_newton.newton_step
     steps: list[float] = [5.0, 1.5, 0.5, 0.15, 1e-4]
 
     def scripted(*args: Any) -> Any:
         covariance, move, *_ = true(*args)
-        return covariance, move, steps.pop(0), misfit * stage.noise
+        return covariance, move, steps.pop(0), misfit * stage.expected_cost
 
     monkeypatch.setattr(gauss_newton, "newton_step", scripted)
-    given = p.c, p.records, stage.fit.trajectories, stage.fit.X, p.starts, 0.1, p.held
+    given = p.space, p.measurements, stage.fit.trajectories, stage.fit.X, p.starts, 0.1, p.held
     gauss_newton.fit_logs(*given, passes=5, patient=patient)
     assert 5 - len(steps) == spent
 
@@ -215,11 +215,11 @@ def test_small_forces_are_fitted_as_closely_as_none(straight: Model, monkeypatch
         return stage.fit
 
     monkeypatch.setattr(smoothing, "fit_logs", noted)
-    for disturbed in (0.0, stages.SMALL, 1.0):
-        stages.refitted(straight.machine, stage, disturbed)
+    for disturbed in (0.0, stages.MIN_PROCESS_NOISE, 1.0):
+        stages.refit(straight.machine, stage, disturbed)
     assert asked == {
         0.0: gauss_newton.SUFFICIENT_STEP,
-        stages.SMALL: gauss_newton.SUFFICIENT_STEP,
+        stages.MIN_PROCESS_NOISE: gauss_newton.SUFFICIENT_STEP,
         1.0: gauss_newton.ACCEPTABLE_STEP,
     }
 
@@ -232,58 +232,60 @@ def test_smaller_forces_side_by_side_are_the_smallest_that_do(straight: Model, m
     def at_once(calls: Sequence[Callable[[], Any]]) -> Generator[Any, None, None]:
         return (x for x in [call() for call in calls])
 
-    def resumable(prepared: Any, of: stages.Stage, disturbed: float, most: float = np.inf) -> gauss_newton.Fit | None:
+    def resumable(
+        prepared: Any, of: stages.ExtendedFit, disturbed: float, most: float = np.inf
+    ) -> gauss_newton.Fit | None:
         asked.append(disturbed)
         return None if disturbed < least else replace(stage.fit, process_noise=disturbed)
 
-    monkeypatch.setattr(stages, "_resumable", resumable)
-    wanted = [x for x in stages.LESS if x >= stages.SMALL]
+    monkeypatch.setattr(stages, "_resume_or_none", resumable)
+    wanted = [x for x in stages.PROCESS_NOISE_REDUCTIONS if x >= stages.MIN_PROCESS_NOISE]
     for k, least in enumerate(wanted):
-        for together, tried in ((in_turn, wanted[: k + 1]), (at_once, wanted)):
+        for together, tried in ((run_in_turn, wanted[: k + 1]), (at_once, wanted)):
             asked.clear()
-            less = stages._with_less(loose, together)
+            less = stages._reduce_noise(loose, together)
             assert less is not None
             assert (less.fit.process_noise, asked) == (least, tried)
     least = np.inf
-    assert stages._with_less(loose, at_once) is None
+    assert stages._reduce_noise(loose, at_once) is None
 
 
 def test_a_stage_is_freed_once(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it was freed beside another fit, that is what it is without its forces."""
     stage, asked = calm(straight), list[float]()
-    true = stages.resume
+    true = stages.resume_fit
 
-    def resume(prepared: Any, of: stages.Stage, disturbed: float, *given: Any) -> gauss_newton.Fit:
+    def resume(prepared: Any, of: stages.ExtendedFit, disturbed: float, *given: Any) -> gauss_newton.Fit:
         asked.append(disturbed)
         return true(prepared, of, disturbed, *given)
 
-    loose = stages.refitted(straight.machine, stage, 1.0)
-    monkeypatch.setattr(stages, "resume", resume)
-    (plain,) = stages.freed([loose], in_turn)
+    loose = stages.refit(straight.machine, stage, 1.0)
+    monkeypatch.setattr(stages, "resume_fit", resume)
+    (plain,) = stages.drop_process_noise([loose], run_in_turn)
     assert plain is not None
     sloped = placing.with_effects(straight.machine, slope(straight))
     asked.clear()
-    other, known = stages.refitted_and_freed(sloped, loose, in_turn)
+    other, known = stages.refit_and_drop_noise(sloped, loose, run_in_turn)
     assert asked == [1.0, 0.0]
     assert other is not None
     assert [e.name for e in other.model.effects] == ["ground_slope@machine"]
-    (again,) = stages.freed([known], in_turn)
+    (again,) = stages.drop_process_noise([known], run_in_turn)
     assert asked == [1.0, 0.0]
     assert again is not None
-    assert (again.bare, again.fit.cost) == ((), plain.fit.cost)
+    assert (again.exact_fit, again.fit.cost) == ((), plain.fit.cost)
     np.testing.assert_array_equal(again.fit.X, plain.fit.X)
     # Nor is it asked twice for what can't be had; with other forces it is another fit.
-    monkeypatch.setattr(stages, "FAR", 1e-3)
-    _, known = stages.refitted_and_freed(sloped, loose, in_turn)
+    monkeypatch.setattr(stages, "LOST_COST_RATIO", 1e-3)
+    _, known = stages.refit_and_drop_noise(sloped, loose, run_in_turn)
     asked.clear()
-    assert list(stages.freed([known], in_turn)) == [None]
+    assert list(stages.drop_process_noise([known], run_in_turn)) == [None]
     assert asked == []
-    less = stages._with_less(known, in_turn)
+    less = stages._reduce_noise(known, run_in_turn)
     assert less is not None
-    assert less.bare == ()
+    assert less.exact_fit == ()
     # Nothing is freed that has no forces.
     asked.clear()
-    _, same = stages.refitted_and_freed(sloped, stage, in_turn)
+    _, same = stages.refit_and_drop_noise(sloped, stage, run_in_turn)
     assert (asked, same) == ([0.0], stage)
 
 
@@ -291,7 +293,7 @@ def test_a_fit_that_is_not_worth_more_passes_is_given_up(straight: Model, monkey
     """As soon as its cost doesn't fall in two passes, from the fourth on; not while it falls, nor where it costs no
     more."""
     stage = calm(straight)
-    p, true = stage.prepared, gauss_newton.newton_step
+    p, true = stage.data, gauss_newton.newton_step
     seen: list[Any] = []
 
     def scripted(c: Any, records: Any, linear: Any, *asked: Any) -> Any:
@@ -311,8 +313,8 @@ def test_a_fit_that_is_not_worth_more_passes_is_given_up(straight: Model, monkey
         seen.clear()
         with pytest.raises(gauss_newton.NotConvergedError) as failed:
             gauss_newton.fit_logs(
-                p.c,
-                p.records,
+                p.space,
+                p.measurements,
                 stage.fit.trajectories,
                 stage.fit.X,
                 p.starts,
@@ -339,7 +341,7 @@ def test_steps_that_stay_large_end_a_fit(
     steps: list[float], spent: int, straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = calm(straight)
-    p, true = stage.prepared, gauss_newton.newton_step
+    p, true = stage.data, gauss_newton.newton_step
     seen: list[Any] = []
 
     def scripted(c: Any, records: Any, linear: Any, *asked: Any) -> Any:
@@ -351,7 +353,9 @@ def test_steps_that_stay_large_end_a_fit(
     monkeypatch.setattr(gauss_newton, "newton_step", scripted)
     monkeypatch.setattr(gauss_newton, "HOPELESS_PASSES", 8)
     with pytest.raises(gauss_newton.NotConvergedError):
-        gauss_newton.fit_logs(p.c, p.records, stage.fit.trajectories, stage.fit.X, p.starts, 0.0, p.held, passes=8)
+        gauss_newton.fit_logs(
+            p.space, p.measurements, stage.fit.trajectories, stage.fit.X, p.starts, 0.0, p.held, passes=8
+        )
     assert len(seen) == spent
 
 
@@ -366,16 +370,16 @@ def test_what_takes_too_little_of_a_beginning_is_not_fitted_to_the_whole(
         )
     )
     one = make_log(stuck, simulate(stuck, gentle(straight, 40.0).u), seed=3, known=straight)
-    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    stage = stages.fit_machine(straight.machine, [one], straight.machine.filter)
     assert stage.exact
-    assert stage.excess > 1000
+    assert stage.excess_cost > 1000
     lengths, _ = fits(monkeypatch)
-    monkeypatch.setattr(screening, "SHORTEST", 5.0)
-    worth, whole = stage.fit.cost - 0.3 * stage.excess, len(one)
+    monkeypatch.setattr(screening, "MIN_BEGINNING_S", 5.0)
+    worth, whole = stage.fit.cost - 0.3 * stage.excess_cost, len(one)
     for effect, found in (("torque_deadband@rear_roll=100", True), ("torque_offset_drift@front_roll=0.1", False)):
         lengths.clear()
         machine = placing.with_effects(straight.machine, placing.parse_effect(effect, straight.machine, 40.0))
-        (made,) = screening.begun([machine], stage, 0.0, in_turn, worth)
+        (made,) = screening.fit_screened([machine], stage, 0.0, run_in_turn, worth)
         assert (made is not None) == found
         assert lengths[:2] == [whole // 4] * 2  # without it, and with it
         assert (max(lengths) == whole) == found
@@ -385,7 +389,7 @@ def test_what_is_held_is_where_it_is_held_a_pass_later(straight: Model, monkeypa
     """However far it went until the log was known not to show it, and however much it makes sense above zero only; how
     far it is from there is no step, but nothing is found, not even nearly, before it is there."""
     stage = calm(straight)
-    p, true, scale = stage.prepared, gauss_newton.newton_step, stage.model.scale
+    p, true, scale = stage.data, gauss_newton.newton_step, stage.model.scale
     nominal = stage.model.nominal
     sure = stage.fit.std / np.maximum(np.abs(stage.fit.X), scale)
     worst = int(np.argmax(np.where(p.held, 0.0, sure)))
@@ -401,13 +405,15 @@ def test_what_is_held_is_where_it_is_held_a_pass_later(straight: Model, monkeypa
 
     monkeypatch.setattr(gauss_newton, "newton_step", blind)
     monkeypatch.setattr(gauss_newton, "MAX_RELATIVE_STEP", 0.01)
-    monkeypatch.setitem(vars(p.c.model), "positive", np.arange(len(scale)) == worst)
+    monkeypatch.setitem(vars(p.space.model), "positive", np.arange(len(scale)) == worst)
     X = stage.fit.X + 30 * scale * (np.arange(len(scale)) == worst)
     for told, disturbed in (([], 0.0), ([50.0, 50.0, 50.0, 50.0, 0.005], 0.0), ([50.0, 50.0, 50.0, 50.0, 0.1], 0.1)):
         seen.clear()
         steps[:] = [*told, *[50.0 for _ in told]]
         with pytest.raises(gauss_newton.NotConvergedError) as failed:  # the others only creep
-            gauss_newton.fit_logs(p.c, p.records, stage.fit.trajectories, X, p.starts, disturbed, p.held, 0.0, passes=7)
+            gauss_newton.fit_logs(
+                p.space, p.measurements, stage.fit.trajectories, X, p.starts, disturbed, p.held, 0.0, passes=7
+            )
         assert abs(seen[gauss_newton.SETTLING_PASSES][0] - nominal[worst]) > 20 * scale[worst]
         # The pass in which it is held is computed twice.
         assert seen[gauss_newton.SETTLING_PASSES + 2][0] == pytest.approx(
@@ -424,13 +430,13 @@ def test_what_makes_sense_above_zero_only_ends_there(straight: Model, effect: st
     """A log that would like an amount best below zero has it near zero, all others where they are without it."""
     stage = calm(straight)
     machine = placing.with_effects(straight.machine, placing.parse_effect(effect, straight.machine, 10.0))
-    p, without = stages.prepared_for(machine, stage), stage.fit
-    fit = stages.iterated(p, p.starts, p.c.model.nominal, 0.0, patient=True)
-    (amount,) = (k for k, name in enumerate(p.c.model.base.names) if name not in straight.base.names)
+    p, without = stages.adapt_data(machine, stage), stage.fit
+    fit = stages.iterate(p, p.starts, p.space.model.nominal, 0.0, patient=True)
+    (amount,) = (k for k, name in enumerate(p.space.model.base.names) if name not in straight.base.names)
     assert 0 < fit.X[amount] < gauss_newton.CONVERGED_STEP * fit.std[amount]
     assert abs(fit.cost - without.cost) < 0.05
     assert (np.abs(np.delete(fit.X, amount) - without.X) < 0.05 * without.std).all()
-    assert selection._vanished("torque_deadband@front_roll", stages.staged(machine, p, fit))
+    assert selection._fell_to_zero("torque_deadband@front_roll", stages.assemble_fit(machine, p, fit))
 
 
 def test_an_amount_that_began_near_zero_leaves_it(straight: Model) -> None:
@@ -439,10 +445,10 @@ def test_an_amount_that_began_near_zero_leaves_it(straight: Model) -> None:
     hidden = prediction.build(placing.with_effects(straight.machine, effect))
     one = make_log(hidden, gentle(hidden, 12.0), seed=3, known=straight)
     effect = placing.parse_effect("torque_deadband@front_roll=0.001", straight.machine, 10.0)
-    stage = stages.fitted(placing.with_effects(straight.machine, effect), [one], straight.machine.filter)
+    stage = stages.fit_machine(placing.with_effects(straight.machine, effect), [one], straight.machine.filter)
     fit, amount = stage.fit, hidden.base.names.index("torque_deadband@front_roll")
     assert abs(fit.X[amount] - 60) < 3 * fit.std[amount] < 30
-    assert not selection._vanished("torque_deadband@front_roll", stage)
+    assert not selection._fell_to_zero("torque_deadband@front_roll", stage)
 
 
 @pytest.mark.parametrize("alike", [-0.9, 0.9])
@@ -477,9 +483,9 @@ def test_a_step_that_was_cut_short_goes_further_when_it_is_told_again(
 ) -> None:
     """A fit is found from a torque offset forty times its scale off, which without that is given up on the way."""
     stage = calm(straight)
-    p, k = stage.prepared, stage.model.base.names.index("u10")
+    p, k = stage.data, stage.model.base.names.index("u10")
     start = stage.fit.X - 40 * stage.model.scale * (np.arange(len(stage.fit.X)) == k)
-    asked = p.c, p.records, stage.fit.trajectories, start, p.starts, 0.0, p.held, 0.0
+    asked = p.space, p.measurements, stage.fit.trajectories, start, p.starts, 0.0, p.held, 0.0
     monkeypatch.setattr(gauss_newton, "MAX_RELATIVE_STEP", 0.1)
     found = gauss_newton.fit_logs(*asked)
     assert (np.abs(found.X - stage.fit.X) < stage.fit.std).all()
@@ -494,13 +500,13 @@ def test_the_whole_log_is_fitted_where_its_beginning_can_be(
     """A cause that leaves a quarter of a log far off leaves all of it so. A log that is hardly longer is fitted at
     once, and so is one that is followed without any cause: then none is waited for that costs more than it is worth."""
     one = log.read_log(sloping, straight.machine)
-    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    stage = stages.fit_machine(straight.machine, [one], straight.machine.filter)
     lengths, forces = fits(monkeypatch)
     right = placing.with_effects(straight.machine, slope(straight))
     wrong = placing.with_effects(
         straight.machine, placing.parse_effect("brake_drag@rear_roll=50", straight.machine, 40.0)
     )
-    (good,) = screening.begun([right], stage, 0.0, in_turn)
+    (good,) = screening.fit_screened([right], stage, 0.0, run_in_turn)
     assert good is not None
     cost, whole = good.fit.cost, len(one)
     for onset, worth, first, follows in (
@@ -510,20 +516,20 @@ def test_the_whole_log_is_fitted_where_its_beginning_can_be(
         (5.0, cost + 1, whole, True),
         (5.0, cost - 1, whole, False),
     ):
-        monkeypatch.setattr(screening, "SHORTEST", onset)
+        monkeypatch.setattr(screening, "MIN_BEGINNING_S", onset)
         for machines, found in ((right, follows), (wrong, False)):
             lengths.clear()
-            (made,) = screening.begun([machines], stage, 0.0, in_turn, worth)
-            assert (made is not None and made.near) == found
+            (made,) = screening.fit_screened([machines], stage, 0.0, run_in_turn, worth)
+            assert (made is not None and made.is_close) == found
             assert lengths[0] == first
             assert (max(lengths) == whole) == (found or first == whole)
     # What forces don't bring near isn't either, nor is the whole log fitted where they don't bring its beginning near.
     for onset, first in ((5.0, whole // 4), (30.0, whole)):
-        monkeypatch.setattr(screening, "SHORTEST", onset)
+        monkeypatch.setattr(screening, "MIN_BEGINNING_S", onset)
         for machines, found in ((right, True), (wrong, False)):
             lengths.clear()
             forces.clear()
-            (made,) = screening.begun([machines], stage, 1.0, in_turn)
+            (made,) = screening.fit_screened([machines], stage, 1.0, run_in_turn)
             assert (made is not None) == found
             assert lengths[0] == first
             assert (max(lengths) == whole) == (found or first == whole)
@@ -536,9 +542,9 @@ def test_beside_a_cause_only_that_is_fitted_whose_beginning_tells_that_it_comes_
     """What stays off is of no use any more; a rival that comes near as well is still found. Where what came near is no
     cause all others are fitted."""
     one = log.read_log(sloping, straight.machine)
-    stage = stages.fitted(straight.machine, [one], straight.machine.filter)
+    stage = stages.fit_machine(straight.machine, [one], straight.machine.filter)
     lengths, _ = fits(monkeypatch)
-    monkeypatch.setattr(screening, "SHORTEST", 5.0)
+    monkeypatch.setattr(screening, "MIN_BEGINNING_S", 5.0)
     monkeypatch.setattr(screening, "FAR", np.inf)
     right = placing.with_effects(straight.machine, slope(straight))
     wrong = placing.with_effects(
@@ -554,23 +560,27 @@ def test_beside_a_cause_only_that_is_fitted_whose_beginning_tells_that_it_comes_
         lengths.clear()
         found: list[bool] = []
         whole = [0]
-        for made in screening.begun(machines, stage, 0.0, in_turn, np.inf, lambda k, x, so=enough: so and x.near):
-            found.append(made is not None and made.near)
+        for made in screening.fit_screened(
+            machines, stage, 0.0, run_in_turn, np.inf, lambda k, x, so=enough: so and x.is_close
+        ):
+            found.append(made is not None and made.is_close)
             whole.append(lengths.count(len(one)))
         assert found == near
         at = machines.index(wrong)
         assert (whole[at + 1] > whole[at]) == tried
     running = {x.pid for x in multiprocessing.active_children()}  # of other tests
-    ways = screening.begun([right, wrong, right], stage, 0.0, forked, np.inf, lambda k, x: x.near)
+    ways = screening.fit_screened([right, wrong, right], stage, 0.0, run_forked, np.inf, lambda k, x: x.is_close)
     assert [x is not None for x in ways] == [True, False, True]
     assert {x.pid for x in multiprocessing.active_children()} <= running
     for felt in (True, False):
-        monkeypatch.setattr(selection, "_is_any", lambda name, x, felt=felt: felt and name == "b")
-        (made,) = screening.begun([right], stage, 0.0, in_turn)
+        monkeypatch.setattr(selection, "_is_effective", lambda name, x, felt=felt: felt and name == "b")
+        (made,) = screening.fit_screened([right], stage, 0.0, run_in_turn)
         assert made is not None
-        assert selection._settles(["a", "b"], 1, made) == felt
-        assert not selection._settles(["a", "b"], 0, made)
-        assert not selection._settles(["a", "b"], 1, replace(made, fit=replace(made.fit, process_noise=0.1)))
+        assert selection._is_close_and_effective(["a", "b"], 1, made) == felt
+        assert not selection._is_close_and_effective(["a", "b"], 0, made)
+        assert not selection._is_close_and_effective(
+            ["a", "b"], 1, replace(made, fit=replace(made.fit, process_noise=0.1))
+        )
 
 
 @pytest.mark.parametrize(
@@ -591,18 +601,20 @@ def test_a_fit_goes_on_without_what_was_not_seen(
     stage = calm(straight)
     names, unseen = stage.model.base.names, stage.fit.unidentifiable.copy()
     unseen[names.index("u10")] = True
-    of = replace(stage, settled=settled, fit=replace(stage.fit, unidentifiable=unseen, process_noise=forces))
-    of = replace(of, prepared=stages.noisy(of.prepared, coarse))
-    more = stages.noisy(stages.prepared_for(placing.with_effects(straight.machine, slope(straight)), stage), 1.0)
-    told = stages._untold(more, of, asked)
-    assert [n for n, yes in zip(more.c.model.base.names, told, strict=True) if yes] == (["u10"] if held else [])
+    of = replace(stage, estimated=settled, fit=replace(stage.fit, unidentifiable=unseen, process_noise=forces))
+    of = replace(of, data=stages.inflate_sensor_noise(of.data, coarse))
+    more = stages.inflate_sensor_noise(
+        stages.adapt_data(placing.with_effects(straight.machine, slope(straight)), stage), 1.0
+    )
+    told = stages._initially_held(more, of, asked)
+    assert [n for n, yes in zip(more.space.model.base.names, told, strict=True) if yes] == (["u10"] if held else [])
 
 
 def test_what_was_not_seen_is_judged_again(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the log shows after all is let go: before a fit is found, however soon that is. What it doesn't show never
     leaves the file's value."""
     stage = calm(straight)
-    p, names = stage.prepared, stage.model.base.names
+    p, names = stage.data, stage.model.base.names
     k = names.index("u10")
     assert not stage.fit.unidentifiable[k]
     untold = np.arange(len(names)) == k
@@ -614,7 +626,7 @@ def test_what_was_not_seen_is_judged_again(straight: Model, monkeypatch: pytest.
         return true(c, r, point, first, X, *asked)
 
     monkeypatch.setattr(gauss_newton, "linearise_log", noted)
-    asked = p.c, p.records, stage.fit.trajectories, start, p.starts, 0.0, p.held, gauss_newton.RESUMED_DAMPING
+    asked = p.space, p.measurements, stage.fit.trajectories, start, p.starts, 0.0, p.held, gauss_newton.RESUMED_DAMPING
     found = gauss_newton.fit_logs(*asked, initially_held=untold)
     assert not found.unidentifiable[k]
     assert abs(found.X[k] - stage.fit.X[k]) < 0.1 * stage.fit.std[k]
@@ -647,15 +659,15 @@ def test_what_the_beginning_of_a_log_may_cost(
     """By exact dynamics ten times its noise, unless a fit is found; with forces no more beside its noise than the whole
     log may: three tenths of what is four times as much. What can't be integrated may set out."""
     stage = calm(straight)
-    quarter = len(stage.prepared.logs[0]) // 4
-    monkeypatch.setattr(screening, "SHORTEST", quarter / 100)
+    quarter = len(stage.data.logs[0]) // 4
+    monkeypatch.setattr(screening, "MIN_BEGINNING_S", quarter / 100)
     asked = iterated(stage, monkeypatch, lambda samples: cost, found)
-    onset = screening._onset(stage, disturbed, np.inf)
+    onset = screening._screening_test(stage, disturbed, np.inf)
     assert onset is not None
     # Exact dynamics were asked first where they are far off, and both what they do after a few passes.
     assert (onset.samples, asked[0], asked[-1]) == ((quarter,), quarter, quarter)
     assert (len(asked) == 1) == (disturbed > 0)
-    assert screening._sets_out(stage.prepared, replace(onset, without=np.inf), disturbed) == expected
+    assert screening._passes_screening(stage.data, replace(onset, cost_without=np.inf), disturbed) == expected
 
 
 @pytest.mark.parametrize(("cost", "before", "passes"), [(9.0, 9.9, 1), (9.0, 10.1, 2), (2.0, 1.0, 2)])
@@ -665,16 +677,16 @@ def test_what_a_few_passes_show_to_do_nothing_goes_no_further(
     """That is, nine tenths and more of what the model leaves without it, and more than there may be; what is less than
     that is given all passes."""
     stage = calm(straight)
-    quarter = len(stage.prepared.logs[0]) // 4
-    monkeypatch.setattr(screening, "SHORTEST", quarter / 100)
+    quarter = len(stage.data.logs[0]) // 4
+    monkeypatch.setattr(screening, "MIN_BEGINNING_S", quarter / 100)
     told = [before]
     asked = iterated(stage, monkeypatch, lambda samples: told[-1], False)
-    onset = screening._onset(stage, 1.0, np.inf)
+    onset = screening._screening_test(stage, 1.0, np.inf)
     assert onset is not None
-    assert onset.without == pytest.approx(before * quarter)
+    assert onset.cost_without == pytest.approx(before * quarter)
     asked.clear()
     told.append(cost)
-    assert screening._sets_out(stage.prepared, onset, 1.0) == (cost < 2.2)
+    assert screening._passes_screening(stage.data, onset, 1.0) == (cost < 2.2)
     assert asked == [quarter] * passes
 
 
@@ -683,28 +695,28 @@ def test_a_beginning_tells_where_the_model_as_it_is_stays_far_off(
 ) -> None:
     """The shortest such one: what stays off it too is no cause. A quarter, where none is up to a half."""
     stage = calm(straight)
-    n = len(stage.prepared.logs[0])
-    monkeypatch.setattr(screening, "SHORTEST", n / 400)
+    n = len(stage.data.logs[0])
+    monkeypatch.setattr(screening, "MIN_BEGINNING_S", n / 400)
     for late, share in ((0.0, 0.25), (0.3, 0.33), (0.45, 0.5), (0.9, 0.25)):
         with monkeypatch.context() as patch:
             iterated(stage, patch, lambda samples, late=late: 20.0 if samples > late * n else 5.0, False)
-            onset = screening._onset(stage, 0.0, np.inf)
+            onset = screening._screening_test(stage, 0.0, np.inf)
         assert onset is not None
         assert onset.samples == (int(share * n),)
 
 
 def iterated(
-    stage: stages.Stage, monkeypatch: pytest.MonkeyPatch, cost: Callable[[int], float | None], found: bool
+    stage: stages.ExtendedFit, monkeypatch: pytest.MonkeyPatch, cost: Callable[[int], float | None], found: bool
 ) -> list[int]:
     """In place of fits: what each costs, times its noise, by how many samples it has, and whether it is found. How many
     samples were asked for, one after the other."""
     asked = list[int]()
-    monkeypatch.setattr(stages.Prepared, "readings", property(lambda p: float(len(p.records[0].used))))
+    monkeypatch.setattr(stages.FitData, "n_readings", property(lambda p: float(len(p.measurements[0].used))))
 
-    def fit_of(prepared: stages.Prepared, *given: Any, **more: Any) -> gauss_newton.Fit:
-        asked.append(len(prepared.records[0].used))
+    def fit_of(prepared: stages.FitData, *given: Any, **more: Any) -> gauss_newton.Fit:
+        asked.append(len(prepared.measurements[0].used))
         told = cost(asked[-1])
-        fit = None if told is None else replace(stage.fit, cost=told * prepared.readings)
+        fit = None if told is None else replace(stage.fit, cost=told * prepared.n_readings)
         if found and fit is not None:
             return fit
         raise gauss_newton.NotConvergedError("no fit", fit, 50.0)
@@ -718,9 +730,9 @@ def test_smaller_forces_are_tried_where_the_model_is_near(
 ) -> None:
     """They leave more. Where large ones leave it far off, the file's parameters show where to look."""
     one = log.read_log(sloping, straight.machine)
-    far = stages.fitted(straight.machine, [one], straight.machine.filter)
-    assert (far.prepared.coarse, far.settled) == (10.0, False)
-    far = replace(far, loose=None)
+    far = stages.fit_machine(straight.machine, [one], straight.machine.filter)
+    assert (far.data.noise_inflation, far.estimated) == (10.0, False)
+    far = replace(far, process_noise_fit=None)
     for name in ("_lessened", "freed"):
         true = getattr(stages, name)
         monkeypatch.setattr(stages, name, lambda *asked, name=name, true=true: (tried.append(name), true(*asked))[1])
@@ -732,9 +744,9 @@ def test_smaller_forces_are_tried_where_the_model_is_near(
     ):
         tried = list[str]()
         monkeypatch.setattr(smoothing, "CLOSE_FIT_COST_RATIO", strong)
-        monkeypatch.setattr(stages, "FAR", most)
-        told = stages.forced(far, in_turn)
-        assert (tried, told.settled) == (expected, settled)
+        monkeypatch.setattr(stages, "LOST_COST_RATIO", most)
+        told = stages.fit_with_process_noise(far, run_in_turn)
+        assert (tried, told.estimated) == (expected, settled)
     np.testing.assert_allclose(told.fit.X, straight.nominal, rtol=1e-3)
 
 
@@ -749,10 +761,10 @@ def test_what_begins_anew_beside_exact_dynamics_must_take_a_good_part_of_the_mis
         return [None for _ in machines]
 
     monkeypatch.setattr("excite.diagnosis.selection.begun", begin)
-    far = replace(stage, fit=replace(stage.fit, cost=2 * stage.noise))
-    for of in (far, replace(far, settled=False), replace(far, fit=replace(far.fit, process_noise=0.1))):
-        assert selection.unlikely(of, of, (), in_turn) == (of, [])
-    assert asked == [pytest.approx(2 * stage.noise - 0.3 * 0.98 * stage.noise), np.inf, np.inf]
+    far = replace(stage, fit=replace(stage.fit, cost=2 * stage.expected_cost))
+    for of in (far, replace(far, estimated=False), replace(far, fit=replace(far.fit, process_noise=0.1))):
+        assert selection.choose_unlikely(of, of, (), run_in_turn) == (of, [])
+    assert asked == [pytest.approx(2 * stage.expected_cost - 0.3 * 0.98 * stage.expected_cost), np.inf, np.inf]
 
 
 def test_a_fit_that_fails_stands_where_it_was_as_good_as_found(
@@ -761,7 +773,7 @@ def test_a_fit_that_fails_stands_where_it_was_as_good_as_found(
     """Otherwise where it was last. Steps that swing between what costs alike end a fit under disturbing forces as well:
     none by exact dynamics, none whose costs rise or still fall."""
     stage = calm(straight)
-    p, true = stage.prepared, gauss_newton.newton_step
+    p, true = stage.data, gauss_newton.newton_step
     seen: list[np.ndarray] = []
     far = [500.0, 90.0, 80.0]
 
@@ -777,7 +789,9 @@ def test_a_fit_that_fails_stands_where_it_was_as_good_as_found(
         monkeypatch.setattr(gauss_newton, "newton_step", scripted)
         points, X = stage.fit.trajectories, stage.fit.X * 1.01
         with pytest.raises(gauss_newton.NotConvergedError) as raised:
-            gauss_newton.fit_logs(p.c, p.records, points, X, p.starts, disturbed, p.held, passes=10, patient=False)
+            gauss_newton.fit_logs(
+                p.space, p.measurements, points, X, p.starts, disturbed, p.held, passes=10, patient=False
+            )
         return raised.value
 
     end = failed([*far, 4.0, 0.6, 0.8, 5.0, 4.0, 6.0, 20.0], [1000.0] * 10, 0.0)
@@ -809,7 +823,7 @@ def test_a_fit_that_came_near_the_log_is_gone_on_with(straight: Model, monkeypat
 
     monkeypatch.setattr(gauss_newton, "newton_step", scripted)
     lost = [500.0, 90.0, 80.0, 40.0, *[30.0] * 4]
-    off = replace(stage, fit=replace(stage.fit, cost=2 * stage.noise))
+    off = replace(stage, fit=replace(stage.fit, cost=2 * stage.expected_cost))
     loose = replace(off, fit=replace(off.fit, process_noise=0.1))
     for of, disturbed, far, most, found in (
         (off, 0.0, 1.0, np.inf, True),
@@ -819,12 +833,12 @@ def test_a_fit_that_came_near_the_log_is_gone_on_with(straight: Model, monkeypat
         (loose, 0.1, 2.0, np.inf, False),
         (loose, 0.1, 1.0, stage.fit.cost / 2, False),
         (loose, 0.2, 1.0, np.inf, False),
-        (replace(loose, fit=replace(loose.fit, cost=stage.noise)), 0.1, 1.0, np.inf, False),
+        (replace(loose, fit=replace(loose.fit, cost=stage.expected_cost)), 0.1, 1.0, np.inf, False),
         (off, 0.0, 1.0, stage.fit.cost / 2, False),
         (stage, 0.0, 1.0, np.inf, False),
     ):
         steps[:], times[0] = [*lost, 1.0, 0.01, 1e-4, 1e-6], far
-        (tried,) = stages.refits([(stage.machine, of, disturbed)], in_turn, most)
+        (tried,) = stages.refit_all([(stage.machine, of, disturbed)], run_in_turn, most)
         assert (tried is not None) == found
         if tried is None:
             assert len(steps) >= 4
@@ -836,7 +850,7 @@ def test_who_gains_too_little_with_coarse_sensors_is_given_up(
     straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """From the first candidate on; the right one isn't."""
-    stage = stages.fitted(straight.machine, [log.read_log(sloping, straight.machine)], straight.machine.filter)
+    stage = stages.fit_machine(straight.machine, [log.read_log(sloping, straight.machine)], straight.machine.filter)
     true, bars = selection.refits, list[float]()
 
     def noted(wishes: Any, together: Any, most: float) -> Any:
@@ -844,11 +858,14 @@ def test_who_gains_too_little_with_coarse_sensors_is_given_up(
         return true(wishes, together, most)
 
     monkeypatch.setattr(selection, "refits", noted)
-    found = selection.sharp(stage, in_turn)
+    found = selection.choose_with_inflated_noise(stage, run_in_turn)
     assert found is not None
     assert [x.name for x in found[1]] == ["ground_slope@machine"]
-    assert bars[0] == stage.fit.cost - selection.BEHIND * selection.LEAST[1] * stage.excess
-    assert stage.prepared.coarse > 1
+    assert (
+        bars[0]
+        == stage.fit.cost - selection.CANDIDATE_PROGRESS_SHARE * selection.MIN_EXCESS_SHARE[1] * stage.excess_cost
+    )
+    assert stage.data.noise_inflation > 1
 
 
 def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -863,25 +880,30 @@ def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatc
         return iterate(c, *args, **more)
 
     monkeypatch.setattr(smoothing, "fit_logs", noted)
-    stage = stages.fitted(straight.machine, [log.read_log(sloping, straight.machine)], straight.machine.filter)
-    likely = selection.scored(stage, in_turn)
-    for pair, over in ((2, selection.OVER), (1, 1e3)):
-        monkeypatch.setattr(selection, "PAIR", pair)
-        monkeypatch.setattr(selection, "OVER", over)
+    stage = stages.fit_machine(straight.machine, [log.read_log(sloping, straight.machine)], straight.machine.filter)
+    likely = selection.score_effects(stage, run_in_turn)
+    for pair, over in ((2, selection.MAX_RATIO_OVER_SCORE), (1, 1e3)):
+        monkeypatch.setattr(selection, "FIRST_BATCH", pair)
+        monkeypatch.setattr(selection, "MAX_RATIO_OVER_SCORE", over)
         bars.clear()
-        choice = selection.choose(stage, likely, (), in_turn, lambda share, what: None, 0.0)
+        choice = selection.choose_effect(stage, likely, (), run_in_turn, lambda share, what: None, 0.0)
         assert choice is not None
         assert choice.name == "ground_slope@machine"
         assert not stage.exact
-        assert not stage.near
-        first = stage.fit.cost - selection.BEHIND * selection.MAIN * stage.excess
+        assert not stage.is_close
+        first = (
+            stage.fit.cost
+            - selection.CANDIDATE_PROGRESS_SHARE * selection.MIN_EXCESS_SHARE_OF_FIRST * stage.excess_cost
+        )
         assert bars[0] == (choice.name, first)
         bar = next(bar for name, bar in bars if name != choice.name)
-        assert bar == pytest.approx(first if pair > 1 else stage.fit.cost - selection.BEHIND * choice.gain)
+        assert bar == pytest.approx(
+            first if pair > 1 else stage.fit.cost - selection.CANDIDATE_PROGRESS_SHARE * choice.likelihood_ratio
+        )
     texts = ("ground_slope=0.009", "roll_unbalance@rear_roll=500")
     machines = [placing.with_effects(straight.machine, placing.parse_effect(t, straight.machine, 40.0)) for t in texts]
     for most, found in ((np.inf, [True, True]), (bar, [True, False])):
-        tried = stages.refits([(m, stage, stage.fit.process_noise) for m in machines], in_turn, most)
+        tried = stages.refit_all([(m, stage, stage.fit.process_noise) for m in machines], run_in_turn, most)
         assert [x is not None for x in tried] == found
 
 

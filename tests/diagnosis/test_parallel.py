@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from excite.diagnosis import forked, parallel
-from excite.diagnosis.parallel import ahead, cores, in_turn
+from excite.diagnosis import parallel, run_forked
+from excite.diagnosis.parallel import run_ahead, run_in_turn, usable_cores
 
 
 def test_answers_come_in_order_and_from_elsewhere() -> None:
@@ -25,12 +25,12 @@ def test_answers_come_in_order_and_from_elsewhere() -> None:
 
     here = os.getpid()
     calls = [partial(told, k) for k in range(7)]
-    assert list(in_turn(calls)) == [(k, True) for k in range(7)]
-    assert [k for k, _ in forked(calls)] == list(range(7))
-    if cores() > 1:
-        assert not any(own for _, own in forked(calls))
-    assert list(forked(calls[:1])) == [(0, True)]
-    assert list(forked([])) == []
+    assert list(run_in_turn(calls)) == [(k, True) for k in range(7)]
+    assert [k for k, _ in run_forked(calls)] == list(range(7))
+    if usable_cores() > 1:
+        assert not any(own for _, own in run_forked(calls))
+    assert list(run_forked(calls[:1])) == [(0, True)]
+    assert list(run_forked([])) == []
 
 
 def test_a_call_is_set_out_upon_before_it_is_asked_for(tmp_path: Path) -> None:
@@ -41,15 +41,15 @@ def test_a_call_is_set_out_upon_before_it_is_asked_for(tmp_path: Path) -> None:
         return k
 
     calls = [partial(told, k) for k in range(3)]
-    here, there = ahead(calls, in_turn), ahead(calls, forked)
-    if cores() > 1:
+    here, there = run_ahead(calls, run_in_turn), run_ahead(calls, run_forked)
+    if usable_cores() > 1:
         assert _pids(tmp_path, 1) != {os.getpid()}
     assert list(there) == [0, 1, 2]
     for file in tmp_path.iterdir():
         file.unlink()
     assert not list(tmp_path.iterdir())
     assert list(here) == [0, 1, 2]
-    assert list(ahead([], forked)) == []
+    assert list(run_ahead([], run_forked)) == []
 
 
 def test_arrays_come_whole_and_are_ones_own() -> None:
@@ -65,8 +65,8 @@ def test_arrays_come_whole_and_are_ones_own() -> None:
         return parts if k else {"none": np.empty(0)}
 
     calls = [partial(made, k) for k in range(5)]
-    answers = list(forked(calls))
-    for found, here in zip(answers, in_turn(calls), strict=True):
+    answers = list(run_forked(calls))
+    for found, here in zip(answers, run_in_turn(calls), strict=True):
         for name, array in here.items():
             np.testing.assert_array_equal(found[name], array, strict=True)
             assert found[name].flags.writeable
@@ -83,21 +83,21 @@ def test_no_descriptor_stays_open(monkeypatch: pytest.MonkeyPatch) -> None:
     def opened() -> list[str]:
         return sorted(os.listdir("/proc/self/fd"))
 
-    monkeypatch.setattr(parallel, "cores", lambda: 2)
+    monkeypatch.setattr(parallel, "usable_cores", lambda: 2)
     calls = [partial(np.full, 1000, k) for k in range(4)]
     before = opened()
-    assert [x[0] for x in forked(calls)] == [0, 1, 2, 3]
+    assert [x[0] for x in run_forked(calls)] == [0, 1, 2, 3]
     assert opened() == before
-    monkeypatch.setattr(parallel, "_received", fails)
+    monkeypatch.setattr(parallel, "_receive", fails)
     with pytest.raises(MemoryError):
-        list(forked(calls))
+        list(run_forked(calls))
     assert opened() == before
 
 
 def test_a_python_without_files_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those built against an old C library lack them."""
     monkeypatch.delattr(os, "memfd_create", raising=False)
-    found = list(forked([partial(np.full, 1000, k) for k in range(4)]))
+    found = list(run_forked([partial(np.full, 1000, k) for k in range(4)]))
     assert [x.sum() for x in found] == [0, 1000, 2000, 3000]
 
 
@@ -108,16 +108,16 @@ def test_what_a_process_does_not_finish_is_done_here(tmp_path: Path) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         return "done"
 
-    if cores() > 1:
-        assert list(forked([partial(killed, tmp_path / name) for name in "abc"])) == ["done"] * 3
+    if usable_cores() > 1:
+        assert list(run_forked([partial(killed, tmp_path / name) for name in "abc"])) == ["done"] * 3
 
     def fails() -> str:
         raise ValueError("no such thing")
 
     calls: list[Callable[[], str]] = [lambda: "fine", fails, fails]
     with pytest.raises(ValueError, match="no such thing"):
-        list(forked(calls))
-    answers = forked(calls)
+        list(run_forked(calls))
+    answers = run_forked(calls)
     assert next(answers) == "fine"  # whose turn has not come fails nobody
     answers.close()
 
@@ -133,8 +133,8 @@ def test_what_no_process_can_be_had_for_is_done_here(granted: list[int], monkeyp
     fork = os.fork
     asked: list[int] = []
     monkeypatch.setattr(os, "fork", refusing)
-    assert list(forked([partial(int, k) for k in range(7)])) == list(range(7))
-    assert len(asked) == (7 if cores() > 1 else 0)
+    assert list(run_forked([partial(int, k) for k in range(7)])) == list(range(7))
+    assert len(asked) == (7 if usable_cores() > 1 else 0)
 
 
 def test_nothing_is_left_running_behind_an_interrupt(tmp_path: Path) -> None:
@@ -142,9 +142,9 @@ def test_nothing_is_left_running_behind_an_interrupt(tmp_path: Path) -> None:
         (tmp_path / name).write_text(f"{os.getpid()}\n")
         signal.pause()
 
-    answers = forked([lambda: None, partial(waits, "second"), partial(waits, "third")])
+    answers = run_forked([lambda: None, partial(waits, "second"), partial(waits, "third")])
     next(answers)
-    begun = _pids(tmp_path, min(cores(), 3) - 1)
+    begun = _pids(tmp_path, min(usable_cores(), 3) - 1)
     answers.close()
     for pid in begun:
         with pytest.raises(ProcessLookupError):

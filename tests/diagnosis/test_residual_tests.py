@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 
 from excite.diagnosis import residual_tests
-from excite.diagnosis.residual_tests import shakes
+from excite.diagnosis.residual_tests import is_shaking
 
 
 def times(rate: float) -> tuple[np.ndarray, np.ndarray]:
@@ -35,14 +35,14 @@ def test_a_channel_shakes_where_a_vibration_is_on_it(rate: float, frequency: flo
     """Of an amplitude like that of its noise; also at a frequency that the sampling folds."""
     t, there = times(rate)
     shaken = [driven(k, t, steps) + 50 * there * np.sin(2 * np.pi * frequency * t) for k in range(20)]
-    assert sum(bool(shakes(u, there, rate)) for u in shaken) >= 19
+    assert sum(bool(is_shaking(u, there, rate)) for u in shaken) >= 19
 
 
 @pytest.mark.parametrize("steps", [False, True])
 @pytest.mark.parametrize("rate", [50, 100, 1000])
 def test_no_channel_shakes_of_its_noise(rate: float, steps: bool) -> None:
     t, there = times(rate)
-    told = [shakes(driven(k, t, steps), there, rate) for k in range(60)]
+    told = [is_shaking(driven(k, t, steps), there, rate) for k in range(60)]
     assert None not in told
     assert sum(map(bool, told)) <= 2
 
@@ -50,17 +50,21 @@ def test_no_channel_shakes_of_its_noise(rate: float, steps: bool) -> None:
 def test_what_cannot_be_told() -> None:
     """What is always there, or never, and a rate at which no vibration is seen."""
     t, there = times(100)
-    assert shakes(driven(0, t, False), np.ones(len(t)), 100) is None
-    assert shakes(driven(0, t, False), np.zeros(len(t)), 100) is None
+    assert is_shaking(driven(0, t, False), np.ones(len(t)), 100) is None
+    assert is_shaking(driven(0, t, False), np.zeros(len(t)), 100) is None
     t, there = times(20)
-    assert shakes(driven(0, t, False), there, 20) is None
+    assert is_shaking(driven(0, t, False), there, 20) is None
 
 
 def test_noise_alone_is_no_burst() -> None:
     """Of 3000 torque channels of two minutes a third of one is allowed a line. Median squares are no normal variables:
     thresholds for such ones gave two."""
     rng, t = np.random.default_rng(0), np.arange(12_000) / 100
-    found = [a for _ in range(3000) for a in residual_tests._in_torque("u", t, 40 * rng.standard_normal(len(t)), 100.0)]
+    found = [
+        a
+        for _ in range(3000)
+        for a in residual_tests._torque_anomalies("u", t, 40 * rng.standard_normal(len(t)), 100.0)
+    ]
     assert [a for a in found if a.kind == "burst"] == []
 
 
@@ -71,12 +75,12 @@ def test_a_bit_that_is_always_set_leaves_bands(bit: int, steps: bool) -> None:
     for seed in range(10):
         u = driven(seed, t, steps)
         stuck = u + np.where((u // bit) % 2 == 0, bit, 0)
-        assert [str(a) for a in residual_tests._bands("u1", t, stuck)] == [
+        assert [str(a) for a in residual_tests._value_bands("u1", t, stuck)] == [
             "u1: values in bands of one width with nothing between them: a bit of its converter never changes"
         ]
-        assert not list(residual_tests._bands("u1", t, u))
-        assert not list(residual_tests._bands("u1", t, np.round(u / bit) * bit))
-        assert not list(residual_tests._bands("u1", t, np.round(u)))
+        assert not list(residual_tests._value_bands("u1", t, u))
+        assert not list(residual_tests._value_bands("u1", t, np.round(u / bit) * bit))
+        assert not list(residual_tests._value_bands("u1", t, np.round(u)))
 
 
 @pytest.mark.parametrize(
@@ -89,4 +93,4 @@ def test_a_drive_in_steps_of_one_size_is_no_converter(level: float, noise: float
         u = np.repeat(level * rng.integers(-4, 5, 40), len(t) // 40)
         if rise:
             u = np.convolve(np.pad(u, rise, mode="edge"), np.ones(2 * rise + 1) / (2 * rise + 1), mode="valid")
-        assert not list(residual_tests._bands("u1", t, u + noise * rng.normal(size=len(u)))), seed
+        assert not list(residual_tests._value_bands("u1", t, u + noise * rng.normal(size=len(u)))), seed

@@ -12,7 +12,7 @@ from support.drives import designed, gentle
 from support.logs import make_log
 
 from excite.diagnosis import fits, score_test, selection
-from excite.diagnosis.diagnosis import opposite
+from excite.diagnosis.diagnosis import opposite_phase
 from excite.errors import MachineError
 from excite.identification import identify
 from excite.logs import log, passes
@@ -88,14 +88,14 @@ CIRCULAR = {e.name: (e, s) for e in CATALOGUE.values() for s, shape in e.shapes.
 def test_a_negative_amount_is_a_positive_one_half_a_turn_on(effect: Effect, circular: str) -> None:
     """So that a fit which came to a negative one is given as a positive one."""
     size, told = typical(effect), []
-    for amount, phase in ((-size, 0.7), (size, opposite(0.7))):
+    for amount, phase in ((-size, 0.7), (size, opposite_phase(0.7))):
         model = extended(effect, amount, {circular: phase})
         q, nu, _, u, z = samples(model)
         wheels = np.linspace(-3, 3, q.shape[1]) * np.ones((2, 1))
         read = model.read(q, nu, wheels, u, z, model.nominal).full()
         told.append(np.vstack([model.acceleration(q, nu, u, z, model.nominal).full(), read]))
     np.testing.assert_allclose(told[0], told[1], rtol=1e-9, atol=1e-9)
-    assert abs(opposite(0.7)) <= np.pi
+    assert abs(opposite_phase(0.7)) <= np.pi
 
 
 @pytest.mark.parametrize("slow", [0.0, 0.6])
@@ -660,7 +660,7 @@ def test_points_between_the_grids_are_tried_for_every_way_of_counting(straight: 
     passes = [x for x in found if x.name == "compaction_per_pass@drive" and x.placed.values["pass"] == 15.0]
     assert len({x.variant for x in passes}) == 3
     for one in passes:
-        near = score_test.finer([score_test.Score(one, 100.0, {}, 1.0)], straight.machine, 40.0)
+        near = score_test.refine_candidates([score_test.Score(one, 100.0, {}, 1.0)], straight.machine, 40.0)
         assert {x.variant for x in near} == {one.variant}
         tried = sorted({x.placed.values["pass"] for x in near})
         assert len(tried) == 5
@@ -776,15 +776,15 @@ def test_noise_of_torques_is_no_gain_and_no_delay() -> None:
     taken from noisy torques, what a gain or a delay would do follows that noise (z of 5.7, gain of 27 on this log)."""
     known = build(VA12)
     measured = log.from_table(sensors.measure(known, designed("R60", known), seed=3), VA12)
-    plain = fits.fitted(VA12, [measured], VA12.filter)
+    plain = fits.fit_machine(VA12, [measured], VA12.filter)
     entry = EffectEntry(name="torque_gain", where="articulation", amount=Quantity(value=0.005, source="assumed"))
-    found = fits.refitted(placing.with_effects(VA12, entry), plain, 0.0)
+    found = fits.refit(placing.with_effects(VA12, entry), plain, 0.0)
     at = found.model.base.names.index("torque_gain@articulation")
     assert abs(found.fit.X[at]) < 3.5 * found.fit.std[at]
     assert found.fit.cost < plain.fit.cost + 1  # both are found to so much
-    every = score_test.candidates(VA12, [s.name for s in plain.prepared.c.sensors], 60.0)
-    scores = score_test.scan(plain.ways, plain.fit, every)
-    assert max(s.gain for s in scores if s.candidate.name == "channel_delay@articulation") < 12
+    every = score_test.candidates(VA12, [s.name for s in plain.data.space.sensors], 60.0)
+    scores = score_test.score_candidates(plain.fitted_logs, plain.fit, every)
+    assert max(s.likelihood_ratio for s in scores if s.candidate.name == "channel_delay@articulation") < 12
 
 
 @pytest.mark.parametrize("samples", [350, 1001, 1201, 2001, 2137])
@@ -793,12 +793,12 @@ def test_stretch_by_stretch_tells_what_the_whole_log_does(
 ) -> None:
     """Whatever is left over at its end."""
     way, known = _along(straight, samples)
-    found = score_test.Signatures(way, known).products()
+    found = score_test.SignatureColumns(way, known).products()
     monkeypatch.setattr(innovations, "BATCH_SIZE", 10**9)
     once, _ = _along(straight, samples)
     for name in ("E", "start_response", "transitions"):
         np.testing.assert_allclose(getattr(way.white, name), getattr(once.white, name), rtol=1e-5, atol=1e-5)
-    off = found - score_test.Signatures(once, known).products()
+    off = found - score_test.SignatureColumns(once, known).products()
     size = np.sqrt(np.diag(found))
     assert (np.abs(off) <= 1e-4 * np.outer(size, size)).all()
 
@@ -807,8 +807,8 @@ def test_stretch_by_stretch_tells_what_the_whole_log_does(
 def test_what_has_no_bounds_tells_nothing_and_spoils_nothing(far: float, straight: Model) -> None:
     """From wherever on it has none."""
     way, known = _along(straight, 2137)
-    whole = score_test.Signatures(way, known).products()
-    made = score_test.Signatures(way, known)
+    whole = score_test.SignatureColumns(way, known).products()
+    made = score_test.SignatureColumns(way, known)
     bounded = made.reading
 
     def reading(*held: np.ndarray) -> list[np.ndarray]:
@@ -824,13 +824,13 @@ def test_what_has_no_bounds_tells_nothing_and_spoils_nothing(far: float, straigh
     np.testing.assert_array_equal(form[np.ix_(rest, rest)], whole[np.ix_(rest, rest)])
 
 
-def _along(model: Model, samples: int) -> tuple[score_test.Way, list[score_test.Candidate]]:
+def _along(model: Model, samples: int) -> tuple[score_test.FittedLog, list[score_test.Candidate]]:
     """A fitted log without anything hidden, and some candidates."""
     one = make_log(model, gentle(model, (samples - 1) / 100), seed=3)
-    stage = fits.fitted(model.machine, [one], model.machine.filter)
+    stage = fits.fit_machine(model.machine, [one], model.machine.filter)
     names = "ground_slope", "torque_gain", "measuring_wheel_radius"
-    every = score_test.candidates(model.machine, [s.name for s in stage.prepared.c.sensors], samples / 100)
-    return stage.ways[0], score_test.renumbered([x for x in every if x.placed.effect.name in names])
+    every = score_test.candidates(model.machine, [s.name for s in stage.data.space.sensors], samples / 100)
+    return stage.fitted_logs[0], score_test.renumber_columns([x for x in every if x.placed.effect.name in names])
 
 
 @pytest.mark.parametrize("duration", [2.0, 5.0, 7.0, 10.0, 12.0, 15.0, 60.0])
@@ -839,7 +839,7 @@ def test_every_candidate_can_be_tried_closer(duration: float) -> None:
     every = score_test.candidates(VA12, [s.name for s in VA12.sensors("full")], duration)
     assert len(every) > 100
     for x in every:
-        nearby = score_test.finer([score_test.Score(x, 1.0, x.placed.values, 1.0)], VA12, duration)
+        nearby = score_test.refine_candidates([score_test.Score(x, 1.0, x.placed.values, 1.0)], VA12, duration)
         assert all(y.name == x.name for y in nearby)
 
 
@@ -849,8 +849,8 @@ def test_what_acts_between_two_instants_begins_before_it_ends() -> None:
         found = [x for x in score_test.candidates(VA12, [], duration) if "begin" in x.placed.values]
         assert {x.placed.effect.name for x in found} == {"brake_drag", "vibration_on"}
         scores = [score_test.Score(x, 1.0, x.placed.values, 1.0) for x in found]
-        for reach in (1.0, 0.35, *selection._reaches(duration)):
-            found = score_test.finer(scores, VA12, duration, reach)
+        for reach in (1.0, 0.35, *selection._reaches_in_time(duration)):
+            found = score_test.refine_candidates(scores, VA12, duration, reach)
             for values in (x.placed.values for x in found):
                 end = values.get("end", values["begin"] + values.get("length", 0.0))
                 assert 0 <= values["begin"] < end <= duration

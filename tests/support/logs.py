@@ -32,10 +32,10 @@ def logged(model: Model, motion: Motion, path: Path, seed: int, *texts: str) -> 
     return path
 
 
-def calm(model: Model) -> fits.Stage:
+def calm(model: Model) -> fits.ExtendedFit:
     """The model fitted to a log of that without anything hidden."""
     one = make_log(model, gentle(model, 12.0), seed=3)
-    return fits.fitted(model.machine, [one], model.machine.filter)
+    return fits.fit_machine(model.machine, [one], model.machine.filter)
 
 
 def slope(straight: Model) -> EffectEntry:
