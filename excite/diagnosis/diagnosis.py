@@ -1,12 +1,9 @@
-"""What a simulation gets wrong, why, and what mending it gains.
+"""Diagnose from logs what a model gets wrong.
 
-A log is smoothed with the machine's model. Where the innovations hold more than noise, every effect of the catalogue is
-scored (`evidence`), the best are fitted with amount and shapes as parameters, and the one that the log likes best is
-added to the model; then again, until nothing is left or nothing in the catalogue helps. Names that the log likes as
-well are given together. What no name explains, or only four together, is said to be unexplained. Where the model
-without effects can be fitted to much coarser sensors only, the first effect, or two that only together do, are found
-with these and the fit sharpened with them; where not even that, effects are scored along the file's parameters and
-fitted from the logs' beginning; so are those that promise less where nothing explains the logs.
+Forward selection: the model is fitted to the logs, every effect that it lacks is scored (`score_test`), the likeliest
+are fitted, and the best is added to the model (`selection`). This is repeated until the innovations are noise or no
+effect helps. Effects that explain the logs about as well are tied. A misfit that no effect explains, or only a
+patchwork of MAX_EFFECTS, is unexplained.
 """
 
 from __future__ import annotations
@@ -53,8 +50,12 @@ MIN_COST_PER_ANOMALY = 50.0  # misfit that every line of what is odd beside name
 
 @dataclass(frozen=True)
 class Finding:
-    """A named cause. gain: of twice the log-likelihood; p_value: that of no effect at all beside the others, for all
-    that were tried; rivals: what it is tied with, as the logs have it."""
+    """A named cause.
+
+    rivals: effects that the cause is tied with, as fitted. p_value: of no effect at all given the others, corrected for
+    the number of candidates. shapes: value, standard deviation, unit. likelihood_ratio: 2 delta log L over the
+    dispersion.
+    """
 
     effect: str
     where: str
@@ -76,7 +77,7 @@ class Finding:
 
     @property
     def entry(self) -> EffectEntry:
-        """As a machine file has it."""
+        """The cause as an entry of the machine file."""
         return selection.identified_entry(
             self.effect, self.where, self.magnitude, {n: value for n, (value, _, _) in self.shapes.items()}
         )
@@ -84,8 +85,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class NearestEffect:
-    """An effect that explains a share of the misfit and is no name, and the parameters that with it would have a value
-    that no machine has, a line each."""
+    """An effect that explains a share of the misfit but is not named, and the parameters that it makes impossible."""
 
     name: str
     share: float
@@ -94,11 +94,11 @@ class NearestEffect:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """verdict: clean, named, tied or unexplained. `before`, `after`: the model without and with what was found.
+    """Verdict and findings of a diagnosis.
 
-    share: of the excess misfit that the names explain. located: lines that say where what is unexplained sits. stages:
-    the model with the first finding, the first two, and so on. nearest: where nothing is named, the effect that
-    explains most.
+    verdict: clean, named, tied or unexplained. before, after: fits without and with the findings. share: share of the
+    excess misfit that they explain. located: lines that describe what is unexplained. stages: fits with the first
+    finding, the first two, and so on. nearest: the effect that explains most, if nothing is named.
     """
 
     verdict: str
@@ -118,9 +118,11 @@ def diagnose(
     progress: ProgressCallback | None = None,
     runner: CallRunner = run_in_turn,
 ) -> Diagnosis:
-    """What these logs show that the model doesn't know. together: how what is independent is computed; the answer is
-    the same. Raises NotConverged where the machine file's parameters give no motion at all, NotIdentifiable where a
-    torque is missing."""
+    """Diagnose what these logs show that the model lacks.
+
+    runner: runs independent calls; the answer does not depend on it. Raises NotConvergedError if the machine file's
+    parameters give no motion, NotIdentifiableError if a torque is missing.
+    """
     report = progress or (lambda share, what: None)
     report(0.0, "fitting the model")
     first = before = fit_machine(model.machine, logs, filter, runner)
@@ -158,8 +160,11 @@ def diagnose(
 def extend_model(
     before: ExtendedFit, first: Sequence[Choice], runner: CallRunner, report: ProgressCallback
 ) -> tuple[list[Choice], float]:
-    """Effects one after the other, after those that were chosen first, until nothing is left that has a name; and what
-    a further one would gain that was not worth one."""
+    """Add effects one after the other until none is worth a place.
+
+    first: effects that were chosen already. Return all choices, and the excess of the next score over
+    MIN_LIKELIHOOD_RATIO, which was not enough.
+    """
     chosen, stage, next_ratio = list(first), first[-1].stage if first else before, 0.0
     while stage.estimated and len(chosen) < MAX_EFFECTS and not stage.is_dead_end:
         turn = len(chosen)
@@ -178,8 +183,7 @@ def extend_model(
 
 
 def _cannot_explain(before: ExtendedFit, chosen: Sequence[Choice], scores: Sequence[Score]) -> bool:
-    """Whether effects leave more than all that may still come beside them would explain, and the last of them has no
-    name as it is: then nothing gives it one."""
+    """Tell if even the best further effects could not explain enough, and the last one chosen does not hold by itself."""
     if not (chosen and chosen[-1].stage.exact):
         return False
     stage = chosen[-1].stage
@@ -196,10 +200,12 @@ def _cannot_explain(before: ExtendedFit, chosen: Sequence[Choice], scores: Seque
 def drop_weak_effects(
     before: ExtendedFit, chosen: Sequence[Choice], next_ratio: float = 0.0
 ) -> tuple[list[Choice], tuple[str, ...], NearestEffect | None]:
-    """Effects without the last ones that are no names: one that leaves most of the misfit where it was is none, unless
-    with what came after it nothing is left, or with the disturbing forces that it was judged with, which may have left
-    nothing without it as well: it must not be faint beside what another one would gain, left; nor is one with which no
-    machine is possible. Also what is odd beside those that stay, and the last one that doesn't."""
+    """Drop the last effects as long as they do not explain the misfit or make a parameter impossible.
+
+    An effect holds if nothing is left with it, or if it explains MIN_EXPLAINED_SHARE; also with the process noise by
+    which it was judged, unless its gain is small beside next_ratio, the score of the next effect. Return the effects
+    kept, lines about anomalies beside them, and the last effect dropped.
+    """
     kept, nearest = list(chosen), None
     while True:
         stage = kept[-1].stage if kept else before
@@ -228,7 +234,9 @@ def drop_weak_effects(
 
 
 def _largest_of_patchwork(chosen: Sequence[Choice], anomalies: Sequence[str]) -> NearestEffect | None:
-    """The effect that gains most of so many kinds that they only patch up what has no name; None where they don't."""
+    """Return the effect with the largest gain if MAX_EFFECTS kinds are a patchwork without a main cause; otherwise
+    None.
+    """
     if len({x.name.split("@")[0] for x in chosen}) < MAX_EFFECTS:
         return None
     most, gained = max(chosen, key=lambda x: x.likelihood_ratio), sum(x.likelihood_ratio for x in chosen)
@@ -237,9 +245,11 @@ def _largest_of_patchwork(chosen: Sequence[Choice], anomalies: Sequence[str]) ->
 
 
 def review_effects(before: ExtendedFit, chosen: Sequence[Choice], runner: CallRunner = run_in_turn) -> list[Choice]:
-    """Each of several effects again, given all that came after it as well, so that their order doesn't count: one that
-    the others make good for is dropped, one that another name suits better gets that name, rivals are those beside the
-    others. What came first stays where nothing better was found."""
+    """Choose each of several effects again given all others, so that their order does not count.
+
+    An effect that the others replace is dropped; one that another explains better is replaced; rivals are found anew.
+    The first result stands unless the new one is better.
+    """
     queue, found = list(chosen), chosen[-1].stage
     for first in chosen[:-1]:
         rest, whole = queue[1:], queue[-1].stage
@@ -268,8 +278,7 @@ def review_effects(before: ExtendedFit, chosen: Sequence[Choice], runner: CallRu
 
 
 def _refit_one_by_one(before: ExtendedFit, chosen: Sequence[Choice], whole: ExtendedFit) -> list[Choice]:
-    """Effects that a model has, put into the one without them one after the other; gains are over those that stand
-    before. None of them where the logs can't be fitted on the way."""
+    """Add a model's effects one after the other, each with its gain over those before it; empty if a fit fails."""
     if before.data.noise_inflation > 1:
         return _refit_backwards(chosen, whole)
     made = [before]
@@ -289,7 +298,9 @@ def _refit_one_by_one(before: ExtendedFit, chosen: Sequence[Choice], whole: Exte
 
 
 def _refit_backwards(chosen: Sequence[Choice], whole: ExtendedFit) -> list[Choice]:
-    """The same from the model with all of them, where the one without any follows coarse sensors only."""
+    """Remove a model's effects one after the other, if without any it tracks only with inflated noise; empty if a fit
+    fails.
+    """
     made = [whole]
     try:
         for x in reversed(chosen[1:]):
@@ -300,9 +311,11 @@ def _refit_backwards(chosen: Sequence[Choice], whole: ExtendedFit) -> list[Choic
 
 
 def drop_unneeded(before: ExtendedFit, chosen: Sequence[Choice]) -> list[Choice]:
-    """Several effects without those that were needed on the way only: in the last fit their amount is hardly known to
-    be any, and without it the fit is as good, or foretells as much of what it hasn't seen: then it is shapes that
-    follow the noise. Disturbing forces hide what else a right name explains."""
+    """Drop effects that are insignificant beside the others.
+
+    Such an effect is kept only if the fit without it is significantly worse and predicts withheld stretches worse:
+    otherwise its shapes follow the noise.
+    """
     kept, whole = list(chosen), chosen[-1].stage
     for x in chosen:
         # Of one that is nothing at infinity the amount's deviation says little.
@@ -327,37 +340,37 @@ def drop_unneeded(before: ExtendedFit, chosen: Sequence[Choice]) -> list[Choice]
 
 
 def _predicts_better(without: ExtendedFit, whole: ExtendedFit) -> bool:
-    """Whether a stage errs less than one without an effect on stretches that were hidden from both, if any can be."""
+    """Tell if a model with an effect predicts withheld stretches better than without, or if none can be withheld."""
     found = gains.hold_out_gain(gains.hold_out_errors(without), gains.hold_out_errors(whole))
     return found is None or found.percent > 0
 
 
 def _is_significant(name: str, stage: ExtendedFit) -> bool:
-    """Whether an effect is surely any in a fit; one that is nothing at infinity is taken for sure."""
+    """Tell if an effect's magnitude is significant; one that vanishes at infinity counts as significant."""
     return stage.placed(name).effect.inverse or selection.wald_statistic(name, stage) > selection.MIN_LIKELIHOOD_RATIO
 
 
 def _replaces_earlier(choice: Choice, chosen: Sequence[Choice]) -> bool:
-    """Whether a choice takes the place of an effect that explains more: then it is but a piece of another explanation,
-    which needs several names for what one explains."""
+    """Tell if a choice makes an earlier effect insignificant that explained more: several effects for what one
+    explains.
+    """
     return any(
         choice.likelihood_ratio < x.likelihood_ratio and not _is_significant(x.name, choice.stage) for x in chosen
     )
 
 
 def _exceeds_earlier(choice: Choice, chosen: Sequence[Choice]) -> bool:
-    """Whether a choice gains more, under disturbing forces, than all that came before it: then these forces hide how
-    little the first ones explain, and one after the other would get a name. None has one then."""
+    """Tell if a choice gains more, with process noise, than all before it: the noise hid how little these explain."""
     return bool(chosen) and not choice.stage.exact and choice.likelihood_ratio > sum(x.likelihood_ratio for x in chosen)
 
 
 def _remaining_rivals(choice: Choice, found: Container[str]) -> tuple[EffectEntry, ...]:
-    """The rivals of an effect that aren't found beside it."""
+    """Return the rivals of an effect that are not found beside it."""
     return tuple(e for e in choice.rivals if e.label not in found)
 
 
 def _refit_without(name: str, stage: ExtendedFit) -> ExtendedFit:
-    """A stage's model without one of its effects, fitted. Raises NotConverged."""
+    """Refit a model without one of its effects. Raises NotConvergedError."""
     machine = effects.without_effect(stage.machine, name)
     try:
         return refit(machine, stage, stage.fit.process_noise)
@@ -366,8 +379,7 @@ def _refit_without(name: str, stage: ExtendedFit) -> ExtendedFit:
 
 
 def _anomaly_lines(stage: ExtendedFit) -> tuple[str, ...]:
-    """What is left beside noise, a line each: innovations that are too large, and what stands out in them, the most
-    striking first."""
+    """Describe what is left beside noise, a line each, the most striking first."""
     stage = with_true_sensor_noise(stage)
     logs = stage.data.logs
     found = [
@@ -379,13 +391,13 @@ def _anomaly_lines(stage: ExtendedFit) -> tuple[str, ...]:
 
 
 def _explained_share(gained: float, stage: ExtendedFit, anomalies: Sequence[str]) -> float:
-    """Of the misfit, how much effects explain that gained so much, by what is left of it in a stage and what is odd."""
+    """Return the share of the misfit that effects explain by their gain."""
     next_ratio = _unexplained_cost(stage, anomalies)
     return gained / (gained + next_ratio) if gained + next_ratio > 0 else 0.0
 
 
 def _unexplained_cost(stage: ExtendedFit, anomalies: Sequence[str]) -> float:
-    """The misfit that is left in a stage."""
+    """Return the misfit that is left, at least MIN_COST_PER_ANOMALY for each anomaly."""
     return max(stage.excess_cost, MIN_COST_PER_ANOMALY * len(anomalies))
 
 
@@ -398,9 +410,11 @@ def conclude(
     nearest: NearestEffect | None = None,
     runner: CallRunner = run_in_turn,
 ) -> Diagnosis:
-    """The verdict: what is named must explain most of the misfit, and what is left must be noise or be shown; where
-    something explains it and is no name, it is unexplained. left: what a further effect would gain that was not worth a
-    name."""
+    """Reach the verdict.
+
+    Effects that are named must explain most of the misfit, and the rest must be noise or is described. next_ratio: gain
+    of a further effect that was not worth a name.
+    """
     share = 1.0
     if anomalies or not after.exact:
         share = _explained_share(sum(x.likelihood_ratio for x in chosen), after, anomalies)
@@ -423,13 +437,15 @@ def conclude(
 
 
 def opposite_phase(phase: float) -> float:
-    """The phase [rad] half a turn on, from -pi to pi: an effect with it is the same as one with the amount negative."""
+    """Return the phase [rad] half a turn on, from -pi to pi, which stands for a negative magnitude."""
     return float(np.angle(-np.exp(1j * phase)))
 
 
 def _conditional_ratio(choice: Choice, after: ExtendedFit) -> float:
-    """What an effect gains given all the others of the last fit: as it was measured, or Wald's statistic, which needs
-    no fit without it. No less than any gain for one that is nothing at infinity."""
+    """Return the likelihood ratio of an effect given all others, as computed or by Wald's statistic.
+
+    It is infinite for an effect that vanishes at infinity.
+    """
     if choice.conditional_ratio is not None:
         return choice.conditional_ratio / choice.dispersion
     if after.placed(choice.name).effect.inverse:
@@ -440,9 +456,11 @@ def _conditional_ratio(choice: Choice, after: ExtendedFit) -> float:
 def _make_finding(
     choice: Choice, after: ExtendedFit, next_ratio: float, alone: bool, runner: CallRunner = run_in_turn
 ) -> Finding:
-    """A choice with amount and shapes as the last fit has them. The amount is as unsure as what is left says of the
-    formula: where that is a part of what the effect gains, about half its root is a part of the amount; as shapes that
-    the logs hardly tell; and never surer than another formula of the same effect would leave it."""
+    """Report a choice with magnitude and shapes of the last fit.
+
+    The standard deviation of the magnitude includes the error of the formula, by what a further effect would gain and
+    by FORMULA_STD_SHARE, and shapes that the logs hardly determine.
+    """
     placed = after.placed(choice.name)
     std = after.fit.std * after.std_inflation
     values = dict(zip(after.model.base.names, zip(after.fit.X, std, strict=True), strict=True))

@@ -1,4 +1,4 @@
-"""A diagnosis as people and programs read it: the summary of `excite diagnose`, and the extended machine file."""
+"""The summary of a diagnosis, for people and programs, and the extended machine file."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from excite.diagnosis.residuals import InnovationLevel
 from excite.diagnosis.selection import ProgressCallback
 from excite.model.machine import EffectEntry, Machine, shipped_machines
 
-MACHINE_FILE_DIGITS = 8  # of amounts in a machine file
-FIRST_ANOMALY_LINES = 3  # lines of what is odd that come before all others
-MIN_NEAREST_SHARE = 0.05  # of the misfit, that what comes nearest explains to be worth a word
-FULL_EXPLANATION_SHARE = 0.9  # of the misfit: names that explain less are told with the share that they do
+MACHINE_FILE_DIGITS = 8  # significant digits of magnitudes in a machine file; chosen
+FIRST_ANOMALY_LINES = 3  # lines about anomalies that precede all others; chosen
+MIN_NEAREST_SHARE = 0.05  # share of the misfit above which the nearest effect is mentioned; chosen
+FULL_EXPLANATION_SHARE = 0.9  # share of the misfit below which the answer gives it; chosen
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """What is to be told of a diagnosis.
+    """A diagnosis with what its findings gain.
 
-    whole, single: gains of all findings and of each, on stretches that were withheld; None where no model could be
-    fitted to what these leave. before, after: how large each signal's innovations are without and with what was found.
-    located: where the misfit sits. run: what would separate causes that are tied.
+    total_gain, gains: hold-out gain of all findings, and of each; None if no model could be fitted to the rest of the
+    logs. before, after: size of each signal's innovations without and with the findings. located: where the misfit is.
+    separating_run: the run that would separate tied causes.
     """
 
     diagnosis: Diagnosis
@@ -50,8 +50,11 @@ def assess(
     runner: CallRunner = run_in_turn,
     extra_calls: Sequence[Callable[[], None]] = (),
 ) -> Assessment:
-    """Measures gains and locates the misfit. Each finding's gain is that of the model with it over the model with those
-    found before it. beside: further calls, carried out side by side with the measuring."""
+    """Measure hold-out gains and locate the misfit.
+
+    The gain of a finding is that over the model with the findings before it. extra_calls: calls that are run side by
+    side with the measurement.
+    """
     report = progress or (lambda share, what: None)
     stages = [d.before, *d.stages]
     calls: list[Callable[[], HoldOutErrors | None]] = [
@@ -60,16 +63,16 @@ def assess(
     ]
     done = list[HoldOutErrors | None]()
     report(0.0, "measuring the gain")
-    for one in runner(calls):
-        done.append(one)
+    for errors in runner(calls):
+        done.append(errors)
         report(len(done) / (len(calls) + 1), "measuring the gain")
     held = done[len(extra_calls) :]
-    single = tuple(hold_out.hold_out_gain(a, b) for a, b in pairwise(held))
-    whole = hold_out.hold_out_gain(held[0], held[-1])
+    gains = tuple(hold_out.hold_out_gain(a, b) for a, b in pairwise(held))
+    total_gain = hold_out.hold_out_gain(held[0], held[-1])
     before = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.before))
     after = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.after)) if d.stages else before
     located = d.located
-    if d.verdict == "unexplained":  # which signals, and how much more than noise there is in them, is in these lines
+    if d.verdict == "unexplained":  # replace lines of suspect sensors by located misfits
         measured = with_true_sensor_noise(d.after)
         other_lines = [line for line in d.located if line not in measured.suspect_sensors]
         located = (
@@ -77,12 +80,13 @@ def assess(
             *residuals.locate_misfit(measured),
             *other_lines[FIRST_ANOMALY_LINES:],
         )
-    return Assessment(d, whole, single, before, after, tuple(dict.fromkeys(located)), separating_run.recommend_run(d))
+    return Assessment(
+        d, total_gain, gains, before, after, tuple(dict.fromkeys(located)), separating_run.recommend_run(d)
+    )
 
 
 def summarise(a: Assessment) -> dict[str, Any]:
-    """The keys of the contract, and: shapes, errors of each signal before and after, what is noise and what is
-    systematic, base parameters before and after."""
+    """Return the summary of `excite diagnose`, ready for JSON."""
     d = a.diagnosis
     return {
         "verdict": d.verdict,
@@ -129,16 +133,16 @@ def _interval_list(g: HoldOutGain | None) -> list[float] | None:
 
 
 def signal_table(a: Assessment) -> dict[str, dict[str, Any]]:
-    """Per signal: error on withheld stretches before and after [unit]; what of the innovations is systematic [%]."""
+    """Tabulate hold-out errors [unit] and the systematic share of the innovations [%] by signal, before and after."""
     rows: dict[str, dict[str, Any]] = {}
     for name in a.before:
-        was, now, unit = (
+        rms_before, rms_after, unit = (
             a.total_gain.signals[name] if a.total_gain and name in a.total_gain.signals else (np.nan, np.nan, "")
         )
         rows[name] = {
             "unit": unit,
-            "rms_before": was,
-            "rms_after": now,
+            "rms_before": rms_before,
+            "rms_after": rms_after,
             "systematic_before_percent": a.before[name].systematic_percent,
             "systematic_after_percent": a.after[name].systematic_percent,
         }
@@ -146,8 +150,10 @@ def signal_table(a: Assessment) -> dict[str, dict[str, Any]]:
 
 
 def parameter_table(d: Diagnosis) -> dict[str, dict[str, Any]]:
-    """Base parameters without and with what was found: value and deviation, none where no model without it followed the
-    logs; `moved`: in deviations before."""
+    """Tabulate base parameters and standard deviations before and after; `moved` is in standard deviations before.
+
+    There is no standard deviation before if no model without the findings followed the logs.
+    """
     after = dict(zip(d.after.model.base.names, zip(d.after.fit.X, d.after.fit.std, strict=True), strict=True))
     rows = {}
     model = d.before.model
@@ -168,12 +174,12 @@ def parameter_table(d: Diagnosis) -> dict[str, dict[str, Any]]:
 
 
 def describe_place(effect: str, where: str) -> str:
-    """An effect at its place, in words."""
+    """Return an effect at its place in words."""
     return f"{effect.replace('_', ' ')} ({where.replace('_', ' ')})"
 
 
 def format_magnitude(row: Mapping[str, Any]) -> str:
-    """An amount with its deviation, to the digits that it has."""
+    """Format a magnitude with its standard deviation, to its significant digits."""
     value, std = float(row["amount"]), float(row["amount_std"])
     unit = "" if row["unit"] == "-" else f" {row['unit']}"
     if not (np.isfinite(std) and std > 0):
@@ -183,62 +189,68 @@ def format_magnitude(row: Mapping[str, Any]) -> str:
 
 
 def answer_text(a: Assessment) -> str:
-    """The diagnosis in a sentence or two."""
+    """Return the diagnosis in a sentence or two."""
     d = a.diagnosis
     logs = "The log shows" if len(d.before.data.logs) == 1 else "The logs show"
     if d.verdict == "clean":
-        return f"{logs} nothing that the model doesn't know: what is left between the two is noise."
+        return f"{logs} nothing that the model lacks: the residuals are noise."
     rows = [_finding_row(f, g) for f, g in zip(d.findings, a.gains, strict=True)]
     named = ", and ".join(
         " or ".join(describe_place(*x.split("@")) for x in (f"{r['effect']}@{r['where']}", *r["tied_with"]))
         for r in rows
     )
     if d.verdict == "unexplained":
-        text = f"{logs} something that no known effect explains"
+        text = f"{logs} a misfit that no known effect explains"
         if rows:
             more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
             first = describe_place(rows[0]["effect"], rows[0]["where"])
-            text += f"; {first}{more} would account for {100 * d.share:.0f} % of it, too little to be its name"
-        elif d.nearest and (d.nearest.share >= MIN_NEAREST_SHARE or d.nearest.impossible):
             text += (
-                f"; nearest comes {describe_place(*d.nearest.name.split('@'))} with {100 * d.nearest.share:.0f} % of it"
+                f"; {first}{more} would account for {100 * d.share:.0f} % of it, too little to be named as the cause"
             )
+        elif d.nearest and (d.nearest.share >= MIN_NEAREST_SHARE or d.nearest.impossible):
+            nearest = describe_place(*d.nearest.name.split("@"))
+            text += f"; the nearest effect, {nearest}, explains {100 * d.nearest.share:.0f} % of it"
             if d.nearest.impossible:
-                text += f", but then {', '.join(d.nearest.impossible)}, which no machine has (check its dimensions)"
+                values = ", ".join(d.nearest.impossible)
+                text += f", but then {values}, which no machine has (check the machine's dimensions)"
         return text + "."
-    gained = ""
+    remark = ""
     if a.total_gain:
-        better = [(1 - now / was, n) for n, (was, now, _) in a.total_gain.signals.items() if was > 0]
-        most = max(better)
+        reductions = [
+            (1 - rms_after / rms_before, n)
+            for n, (rms_before, rms_after, _) in a.total_gain.signals.items()
+            if rms_before > 0
+        ]
+        largest = max(reductions)
         change = _describe_change(a.total_gain.percent, a.total_gain.interval)
-        gained = (
-            f" On stretches that were not fitted on, the model with it errs {change}; most in {most[1]}, by"
-            f" {100 * most[0]:.0f} %."
+        remark = (
+            f" On withheld stretches the error of the model with it is {change}; most in {largest[1]}, by"
+            f" {100 * largest[0]:.0f} %."
         )
     if d.share < FULL_EXPLANATION_SHARE:
-        gained = f" That is {100 * d.share:.0f} % of what the model lacks, the rest has no name.{gained}"
+        remark = f" That is {100 * d.share:.0f} % of the misfit; the rest is unexplained.{remark}"
     if d.verdict == "tied":
-        return f"{logs} {named}: this data can't tell which.{gained}"
-    return f"{logs} {named}: {'; '.join(format_magnitude(r) for r in rows)}.{gained}"
+        return f"{logs} {named}: the data cannot tell which.{remark}"
+    return f"{logs} {named}: {'; '.join(format_magnitude(r) for r in rows)}.{remark}"
 
 
 def _describe_change(percent: float, interval: tuple[float, float] | None) -> str:
     if interval is None:
-        return f"{abs(percent):.2g} % {'less' if percent >= 0 else 'more'}"
+        return f"{abs(percent):.2g} % {'smaller' if percent >= 0 else 'larger'}"
     low, high = interval
     if percent >= 0:
-        return f"{percent:.2g} % less (95 %: {low:.2g} to {high:.2g} %)"
-    return f"{-percent:.2g} % more (95 %: {-high:.2g} to {-low:.2g} %)"
+        return f"{percent:.2g} % smaller (95 %: {low:.2g} to {high:.2g} %)"
+    return f"{-percent:.2g} % larger (95 %: {-high:.2g} to {-low:.2g} %)"
 
 
 # ------------------------------------------------------------------------------------------------ machine file
 
 
 def machine_file(name: str, machine: Machine, d: Diagnosis) -> str | None:
-    """The machine with what was found in it, as a TOML file; None where nothing is named.
+    """Return the machine with the findings as a TOML file; None if nothing is named.
 
-    Of a shipped machine only what is new; of a file all of it, so that it stands on its own. Base parameters are
-    groups of what a file gives, and stay out.
+    For a shipped machine the file holds only what is new; for a machine file it holds everything. Base parameters
+    combine several parameters of the file and are left out.
     """
     if not d.findings or d.verdict == "unexplained":
         return None
@@ -253,8 +265,8 @@ def machine_file(name: str, machine: Machine, d: Diagnosis) -> str | None:
     head = [
         f"# {machine.title}, with what `excite diagnose` found in {logs}.",
         *(f"# {f.name} could as well be {' or '.join(f.tied_with)}." for f in d.findings if f.tied_with),
-        "# The other parameters are as they were: logs tell combinations of masses and inertias, not each of them;",
-        "# `excite identify` with this file gives those.",
+        "# The other parameters are unchanged: logs identify combinations of masses and inertias, not each of them.",
+        "# `excite identify` with this file gives these combinations.",
     ]
     return "\n".join(head) + "\n\n" + tomli_w.dumps({**content, "effect": entries})
 
@@ -273,12 +285,12 @@ def _effect_table(f: Finding) -> dict[str, Any]:
 
 
 def _entry_table(entry: EffectEntry | Mapping[str, Any]) -> dict[str, Any]:
-    """An effect as a table of a machine file."""
+    """Return an effect as a table of a machine file."""
     if isinstance(entry, EffectEntry):
         return entry.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
     return {key: value for key, value in entry.items() if value != {}}
 
 
 def _rounded(value: float) -> float:
-    """A number to as many digits as a file needs."""
+    """Round a number to the digits of a machine file."""
     return float(f"{value:.{MACHINE_FILE_DIGITS}g}")

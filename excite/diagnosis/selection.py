@@ -1,9 +1,11 @@
-"""One effect chosen for a model: candidates are scored, the likeliest fitted, and those that the logs like about as
-well kept as rivals of the best.
+"""Choose one further effect for a model, with the rivals that explain the logs about as well.
 
-Where no model follows the logs, the first, or two of which neither does alone, are chosen with coarse sensors
-(`sharp`), or the first from the logs' beginning (`unfollowed`); where nothing explains them, from their beginning too,
-however little it promises (`unlikely`).
+Candidates are scored to first order, the likeliest are fitted, and the best fit is chosen. If no model tracks the logs,
+the first effect, or a pair, is chosen with inflated sensor noise (`choose_with_inflated_noise`) or by fits from initial
+trajectories (`choose_from_start`). If nothing explains the logs, candidates with low scores are fitted too
+(`choose_unlikely`).
+
+Likelihood ratio means 2 delta log L, the decrease of the cost.
 """
 
 from __future__ import annotations
@@ -109,12 +111,13 @@ _Trial = tuple[score_test.Score, ExtendedFit]
 
 @dataclass(frozen=True)
 class Choice:
-    """An effect that was added, the model with it, and the rivals that the log likes about as well.
+    """An effect that was added, the model with it, and its rivals.
 
-    gain: of twice the log-likelihood (Wald's statistic where no model without it could be fitted), which what is left
-    of the misfit makes `spread` times less sure. left: the share of the effect that parameters don't absorb. loose: the
-    model with it and the disturbing forces that it was judged with, where it needs none. beside: what it gains given
-    the others, where that was measured.
+    likelihood_ratio: over the model without it (Wald's statistic if that could not be fitted). dispersion: factor by
+        which the remaining misfit reduces its significance. n_candidates: number of candidates that were scored.
+    unabsorbed_share: share of the effect that parameters do not absorb.
+    process_noise_fit: the fit with process noise by which it was judged, if `stage` needs none.
+    conditional_ratio: likelihood ratio given all other effects, if it was computed.
     """
 
     name: str
@@ -129,8 +132,11 @@ class Choice:
 
 
 def wald_statistic(name: str, stage: ExtendedFit) -> float:
-    """By how many deviations an effect's amount and the shapes that are none by default are from none together in a
-    fit, squared (Wald's statistic): one may stand for the other. 0 of what was held, as nothing shows it."""
+    """Return Wald's statistic of an effect: squared distance of its magnitude from zero, in standard deviations.
+
+    Signed shapes count together with the magnitude, as one may stand for the other. It is 0 for unidentifiable
+    parameters.
+    """
     shapes, names, fit = stage.placed(name).effect.shapes, stage.model.base.names, stage.fit
     told = [name, *(f"{name}.{s}" for s, shape in shapes.items() if shape.signed and not shape.circular)]
     at = [k for k in (names.index(n) for n in told if n in names) if not fit.unidentifiable[k]]
@@ -139,23 +145,26 @@ def wald_statistic(name: str, stage: ExtendedFit) -> float:
 
 
 def degrees_of_freedom(name: str, stage: ExtendedFit) -> int:
-    """How many parameters an effect has in a model: its amount and the shapes that are fitted."""
+    """Return the number of an effect's fitted parameters: magnitude and shapes."""
     return sum(n == name or n.startswith(f"{name}.") for n in stage.model.base.names)
 
 
 def required_likelihood_ratio(name: str, stage: ExtendedFit, tried: int) -> float:
-    """What an effect must gain of twice the log-likelihood to be one, of so many candidates that were tried."""
+    """Return the likelihood ratio from which an effect is significant, given the number of candidates (Bonferroni)."""
     return max(MIN_LIKELIHOOD_RATIO, float(scipy.stats.chi2.isf(MAX_P_VALUE / tried, degrees_of_freedom(name, stage))))
 
 
 def _total_wald_statistic(stage: ExtendedFit) -> float:
-    """Wald's statistic of all the amounts in a model together."""
+    """Return the sum of Wald's statistics of a model's effects."""
     return sum(wald_statistic(e.name, stage) for e in stage.model.effects if not e.effect.inverse)
 
 
 def score_effects(stage: ExtendedFit, runner: CallRunner) -> tuple[score_test.Score, ...]:
-    """What every effect that a model does not have promises, best first. None that is as well a harmonic of what it
-    has: of a ripple of one contact, say, when all turn at about the same speed."""
+    """Score every effect that a model lacks, best first, once for each fit.
+
+    An effect that is as well a harmonic of one in the model is left out, such as a ripple of another wheel that turns
+    equally fast.
+    """
     if not stage.scores:
         stage.scores.append(_score_new_effects(stage, runner))
     return stage.scores[0]
@@ -191,7 +200,7 @@ def _duration(logs: Sequence[Log]) -> float:
 
 
 def _start_entry(score: score_test.Score) -> EffectEntry:
-    """A candidate as an entry of the machine file: where a fit begins."""
+    """Return a candidate as an entry of the machine file, from which a fit starts."""
     e, values = score.candidate.placed, dict(score.values)
     amount = values.pop("A")
     if len(e.effect.grid) > 1:
@@ -204,7 +213,7 @@ def _start_entry(score: score_test.Score) -> EffectEntry:
 
 
 def fitted_entry(stage: ExtendedFit, name: str) -> EffectEntry:
-    """An effect with amount and shapes as a stage's fit has them."""
+    """Return an effect as an entry of the machine file, with magnitude and shapes of a fit."""
     placed = stage.placed(name)
     values = _fitted_values(stage, placed)
     amount = values.pop("A")
@@ -215,12 +224,14 @@ def fitted_entry(stage: ExtendedFit, name: str) -> EffectEntry:
 
 
 def _fitted_values(stage: ExtendedFit, placed: PlacedEffect) -> dict[str, float]:
-    """Amount and shapes of an effect as a stage's fit has them."""
+    """Return magnitude and shapes of an effect in a fit."""
     fitted = dict(zip(stage.model.base.names, stage.fit.X, strict=True))
     return {key: float(fitted.get(p, placed.values[key])) for p, (key, _) in placed.parameters.items()}
 
 
 def identified_entry(effect: str, where: str, amount: float, shapes: Mapping[str, float]) -> EffectEntry:
+    """Return an effect with identified magnitude and shapes as an entry of the machine file."""
+
     def told(value: float) -> Quantity:
         return Quantity(value=value if abs(value) > SMALLEST_VALUE else 0.0, source="identified")
 
@@ -232,8 +243,10 @@ def identified_entry(effect: str, where: str, amount: float, shapes: Mapping[str
 def _shortlist(
     stage: ExtendedFit, scores: Sequence[score_test.Score], chosen: Sequence[Choice]
 ) -> list[score_test.Score]:
-    """The best candidate of each name, best first, as far as worth a fit; another variant where it scores alike. TRIED
-    in all, beside further variants of the likeliest PAIR of names."""
+    """Return the best candidate of each variant, best first, as far as it is worth a fit.
+
+    There are MAX_CANDIDATES, and further variants of the likeliest FIRST_BATCH names.
+    """
     best: dict[tuple[str, ...], score_test.Score] = {}
     most: dict[str, float] = {}
     hope = max(MIN_SCORE, MIN_SCORE_SHARE[stage.first_order_is_rough] * scores[0].likelihood_ratio) if scores else 0.0
@@ -256,7 +269,7 @@ def _shortlist(
 def _refined_shortlist(
     stage: ExtendedFit, scores: Sequence[score_test.Score], chosen: Sequence[Choice], runner: CallRunner
 ) -> list[score_test.Score]:
-    """What is worth a fit, with shapes between the grid's points."""
+    """Return the candidates that are worth a fit, refined between trial values."""
     shortlist, duration = _shortlist(stage, scores, chosen), _duration(stage.data.logs)
     for reach in (*REFINEMENT_REACHES, *_reaches_in_time(duration)) if shortlist else ():
         about = [s for s in shortlist if reach in REFINEMENT_REACHES or s.candidate.placed.effect.timed]
@@ -271,7 +284,7 @@ def _refined_shortlist(
 
 
 def _reaches_in_time(duration: float) -> list[float]:
-    """Further reaches for what acts at some time in a log of duration [s], until instants are known."""
+    """Return further reaches of refinement until instants are known, for a log of a duration [s]."""
     found = [REFINEMENT_REACHES[-1]]
     while found[-1] * duration / 12 > INSTANT_ACCURACY_S:  # of a grid as wide as a quarter of the log, thirds are tried
         found.append(found[-1] * REFINEMENT_REACHES[-1])
@@ -286,7 +299,7 @@ def choose_effect(
     report: ProgressCallback,
     done: float,
 ) -> Choice | None:
-    """The effect that the logs like best beside those that were chosen; None if none is worth it."""
+    """Choose the effect that explains most beside those chosen; None if none is worth a place."""
     shortlist = _refined_shortlist(stage, scores, chosen, runner)
     if not shortlist:
         return None
@@ -333,8 +346,11 @@ def choose_effect(
 
 
 def _make_choice(trials: Sequence[_Trial], gain: float, tried: int, runner: CallRunner) -> Choice:
-    """The best of tries without disturbing forces where that can be, and what is close to it as its rivals: those as
-    well that only with such forces are known to be as good. With a machine that can be where one of them has one."""
+    """Choose the best trial, without process noise if possible, and its ties as rivals.
+
+    Trials that tie only with process noise are rivals, too. A trial that makes parameters impossible gives way to one
+    that does not.
+    """
     dispersion, forced = trials[0][1].dispersion, {s.candidate.name: stage for s, stage in trials if not stage.exact}
     close = _tied_trials(trials, gain)
     exact, unknown = _trials_without_noise(close, runner)
@@ -360,10 +376,13 @@ def _make_choice(trials: Sequence[_Trial], gain: float, tried: int, runner: Call
 
 
 def choose_with_inflated_noise(stage: ExtendedFit, runner: CallRunner) -> tuple[ExtendedFit, list[Choice]] | None:
-    """Where the model follows the logs with coarse sensors only: the effect with which it follows them with sensors as
-    they are, and the stage without. Coarse sensors leave of a misfit what shows its cause, and are followed by what is
-    nearly right. Two effects where none does by itself. No effect where the model does without after all, None where
-    nothing comes near."""
+    """Choose the first effect with inflated sensor noise, if the model tracks the logs only then.
+
+    Inflated noise leaves the misfit that shows the cause, and nearly right models track the logs. The effect must let
+    the model track the logs with the true noise; a pair is tried if none does. Return the fit without the effect, and
+    the
+    choices: none if the model needs no effect after all. Return None if nothing tracks the logs.
+    """
     begun_without = resume_with_true_sensor_noise([stage], 0.0, runner)
     scores, least = score_effects(stage, runner), MIN_EXCESS_SHARE[1] * stage.excess_cost
     plain = next(begun_without)
@@ -407,10 +426,12 @@ def choose_with_inflated_noise(stage: ExtendedFit, runner: CallRunner) -> tuple[
 def _ratio_with_true_noise(
     name: str, best: ExtendedFit, gain: float, coarse: ExtendedFit, plain: ExtendedFit | None
 ) -> float:
-    """What an effect gains with sharp sensors, of which coarse ones say gain: Wald's statistic is of the same kind, and
-    smaller where that is large. Far from no effect it says too much, and further effects are measured by it. Coarse
-    sensors say too little: without the effect the misfit is what a plain fit has, or as large for sharp ones, as far as
-    a fit is waited for."""
+    """Estimate the likelihood ratio with the true sensor noise, from the one with inflated noise.
+
+    Wald's statistic bounds it, but is too large far from zero. The inflated fit says too little: without the effect,
+    the cost would be that of the plain fit, or if there is none, larger by the inflation, as far as a fit is not given
+    up.
+    """
     times = coarse.data.noise_inflation
     without = (
         min(times**2 * gain, LOST_COST_RATIO * best.expected_cost - best.fit.cost)
@@ -421,8 +442,10 @@ def _ratio_with_true_noise(
 
 
 def _choose_pair(stage: ExtendedFit, first: _Trial, tried: int, runner: CallRunner) -> list[Choice]:
-    """Two effects with which the model comes near coarse sensors, as it does with none, and exact dynamics near sharp
-    ones; the first is the best alone and takes a good part of what is left without. None where there aren't two."""
+    """Choose two effects that together let exact dynamics come close to the logs; empty if there are none.
+
+    The first is the best with inflated noise, and must explain a good part of the excess.
+    """
     score, beside = first
     if stage.fit.cost - beside.fit.cost < MIN_EXCESS_SHARE_OF_FIRST * stage.excess_cost:
         return []
@@ -451,10 +474,11 @@ def _choose_pair(stage: ExtendedFit, first: _Trial, tried: int, runner: CallRunn
 
 
 def choose_from_start(stage: ExtendedFit, runner: CallRunner) -> tuple[ExtendedFit, list[Choice], frozenset[str]]:
-    """Where no fit was found: the effect with which the model can follow the logs, with as small disturbing forces as
-    there is one. With it there may be a fit without it after all, which then is what it is compared with, and may be as
-    good: the model began too far off. The stage as it was and no effect where nothing helps, and the names that were
-    tried then."""
+    """Choose the first effect by fits from initial trajectories, if no model without effects was found.
+
+    With the effect there may be a fit without it after all, since the start was too far off; it is then compared with
+    that. Return the fit without the effect, the choices, and if there are none, the names that were tried.
+    """
     scores = score_effects(stage, runner)
     shortlist = _refined_shortlist(stage, scores, (), runner)
     noise_levels = 0.0, identification.PROCESS_NOISE_LEVELS[0], identification.PROCESS_NOISE_LEVELS[-1]
@@ -465,9 +489,12 @@ def choose_from_start(stage: ExtendedFit, runner: CallRunner) -> tuple[ExtendedF
 def choose_unlikely(
     scanned: ExtendedFit, stage: ExtendedFit, tried: Container[str], runner: CallRunner
 ) -> tuple[ExtendedFit, list[Choice]]:
-    """Where nothing was found that explains the logs: far from any fit an effect promises little of what it explains,
-    or something else does. So those that promise anything in a stage, scanned, begin anew with exact dynamics, which
-    follow the logs with the right one only; but those that were tried so. As `unfollowed` has it."""
+    """Choose an effect by fits with exact dynamics from initial trajectories, whatever its score, if nothing explains
+    the logs.
+
+    Far from any fit the scores say little, and exact dynamics track the logs with the right effect only. scanned: the
+    fit that gives the scores. tried: names that were tried already. Return the fit without the effect, and the choices.
+    """
     scores = score_effects(scanned, runner)
     best = {s.candidate.name: s for s in reversed(scores) if s.likelihood_ratio > 0 and s.values["A"] != 0}
     most = sorted(best.values(), key=lambda s: -s.likelihood_ratio)[:MAX_RESTARTS]
@@ -482,8 +509,10 @@ def _choose_screened(
     tried: int,
     runner: CallRunner,
 ) -> tuple[ExtendedFit, list[Choice]] | None:
-    """The effect with which a model can follow the logs from the beginning, with the first forces that do. Where exact
-    dynamics were fitted without any, one that takes less than MAIN of what they leave isn't waited for."""
+    """Choose an effect by fits from initial trajectories, with the first level of process noise that gives one.
+
+    If exact dynamics were fitted without an effect, it must explain MIN_EXCESS_SHARE_OF_FIRST.
+    """
     machines = [effects.with_effects(stage.machine, _start_entry(s)) for s in shortlist]
     worth = (
         stage.fit.cost - MIN_EXCESS_SHARE_OF_FIRST * stage.excess_cost if stage.estimated and stage.exact else np.inf
@@ -515,7 +544,7 @@ def _choose_screened(
 
 
 def _is_close_and_effective(names: Sequence[str], k: int, stage: ExtendedFit) -> bool:
-    """Whether one of several effects, begun anew, is a cause: beside it only what brings the model as near is any."""
+    """Tell if the fit of effect k is close and exact: beside it only close fits count."""
     return stage.is_close and stage.exact and _is_effective(names[k], stage)
 
 
@@ -525,8 +554,10 @@ def _required_gain(
     candidate: score_test.Candidate,
     hidden: float = MIN_GAIN_SHARE_WITH_NOISE,
 ) -> float:
-    """What an effect must gain to be worth a place beside those that were chosen. hidden: of what they gained, where
-    forces hide how good their formulas are; none where exact dynamics come near the logs with it."""
+    """Return the likelihood ratio that makes an effect worth a place beside those chosen.
+
+    share_with_noise: share of their gains that is required if process noise hides errors of their formulas.
+    """
     part = max(SHAPE[0], MIN_GAIN_SHARE_TIMED * candidate.placed.effect.timed, hidden * (not stage.exact))
     mapped = {e.name for e in stage.model.effects if e.uses_map}
     own = (
@@ -543,18 +574,19 @@ def _required_gain(
 
 
 def _noise_hides_misfit(stage: ExtendedFit) -> bool:
-    """Whether large disturbing forces leave much: these go far with any model, and with many an effect further."""
+    """Tell if large process noise leaves a misfit: with it many wrong models come far."""
     return stage.fit.process_noise >= identification.PROCESS_NOISE_LEVELS[0] and not stage.is_close
 
 
 def _explains_rest(found: ExtendedFit, before: ExtendedFit) -> bool:
-    """Whether exact dynamics leave nothing with a further effect and much without: what is wrong with the others'
-    formulas no other effect would take away as a whole."""
+    """Tell if exact dynamics leave nothing with an effect and much without: no error of another formula is removed
+    entirely.
+    """
     return _has_large_excess(before) and found.exact and found.excess_cost == 0
 
 
 def _has_large_excess(stage: ExtendedFit) -> bool:
-    """Whether exact dynamics leave much beside noise."""
+    """Tell if exact dynamics leave a large misfit."""
     return stage.exact and stage.excess_cost > LARGE_EXCESS_RATIO * stage.expected_cost
 
 
@@ -565,10 +597,13 @@ def _fit_candidates(
     report: Callable[[int], None],
     ceiling: float = np.inf,
 ) -> tuple[list[_Trial], set[str]]:
-    """The candidates whose fits were found, as the model without them was fitted: the likeliest two first, the others
-    as long as they don't stay far behind what these gain. Those that promise far less than the best come last, and only
-    where they may still come near what was gained. What a fit led to zero wasn't found. And the names that were fitted
-    and are none: they are not felt. ceiling: cost that no fit may stay above."""
+    """Fit candidates with the model's process noise, and return the best variant of each name and the implausible
+    names.
+
+    The likeliest FIRST_BATCH are fitted first, the others as long as they do not stay far behind. Those with much lower
+    scores come last, and only if they may still come near. A magnitude that falls to zero counts as no fit.
+    cost_limit: cost above which every fit is given up.
+    """
     trials, refused = list[_Trial](), set[str]()
     near = max(
         FIRST_BATCH, sum(MAX_RATIO_OVER_SCORE * s.likelihood_ratio >= shortlist[0].likelihood_ratio for s in shortlist)
@@ -603,21 +638,22 @@ def _fit_candidates(
 
 
 def _unique_names(scores: Sequence[score_test.Score]) -> list[str]:
-    """Of candidates, each once."""
+    """Return the names of candidates, each once."""
     return list(dict.fromkeys(s.candidate.name for s in scores))
 
 
 def _likeliest_not_found(
     shortlist: Sequence[score_test.Score], trials: Sequence[_Trial], refused: Container[str]
 ) -> bool:
-    """Whether no way was found to the likeliest cause."""
+    """Tell if no fit of the likeliest candidate was found."""
     name = shortlist[0].candidate.name
     return name not in refused and all(s.candidate.name != name for s, _ in trials)
 
 
 def _is_plausible(name: str, stage: ExtendedFit) -> bool:
-    """Whether an effect's shapes are such as there are, and the torque sensor shakes, in one of the logs, while it acts
-    if that shakes it; also where none of them can tell."""
+    """Tell if an effect's fitted shapes are possible, and if it shakes a torque sensor, that one log shows it or none
+    can.
+    """
     placed = stage.placed(name)
     fitted = replace(placed, values={**placed.values, **_fitted_values(stage, placed)})
     if not effects.shapes_possible(stage.machine, fitted):
@@ -633,7 +669,7 @@ def _is_plausible(name: str, stage: ExtendedFit) -> bool:
 
 
 def _fell_to_zero(name: str, stage: ExtendedFit) -> bool:
-    """Whether a fit led an effect that makes sense above zero only to zero: that was no way to what it promised."""
+    """Tell if a fit led an effect that must be positive to zero."""
     effect, fit, k = stage.placed(name).effect, stage.fit, stage.model.base.names.index(name)
     return (
         effect.positive
@@ -644,12 +680,12 @@ def _fell_to_zero(name: str, stage: ExtendedFit) -> bool:
 
 
 def _is_effective(name: str, stage: ExtendedFit) -> bool:
-    """Whether an effect in a fit is one at all."""
+    """Tell if an effect in a fit is present and plausible."""
     return not _fell_to_zero(name, stage) and _is_plausible(name, stage)
 
 
 def _best_variants(trials: Sequence[_Trial]) -> list[_Trial]:
-    """The best variant of each name, best first: with as small disturbing forces as can be."""
+    """Return the best variant of each name, best first: least process noise, then least cost."""
     best: dict[str, _Trial] = {}
     for x in sorted(trials, key=lambda x: (x[1].fit.process_noise, x[1].fit.cost)):
         best.setdefault(x[0].candidate.name, x)
@@ -657,9 +693,11 @@ def _best_variants(trials: Sequence[_Trial]) -> list[_Trial]:
 
 
 def _tied_trials(trials: Sequence[_Trial], gain: float, share: float | None = None) -> list[_Trial]:
-    """The best of sorted tries and those that the logs like about as well: no difference counts that is a matter of the
-    formula, of an effect that gains so much or is so sure. share: of the gain that is, the more where forces had to
-    help."""
+    """Return the best of sorted trials, and those that explain the logs about as well.
+
+    Differences that errors of the best effect's formula may cause do not count. share: share of the gain that such
+    errors take.
+    """
     score, best = trials[0]
     share = share or (SHAPE[1] if best.exact else TIE_GAIN_SHARE_WITH_NOISE)
     near = max(TIE_LIKELIHOOD_RATIO * best.dispersion, TIE_EXCESS_SHARE * best.excess_cost, share * gain)
@@ -670,8 +708,10 @@ def _tied_trials(trials: Sequence[_Trial], gain: float, share: float | None = No
 
 
 def _trials_without_noise(trials: Sequence[_Trial], runner: CallRunner) -> tuple[list[_Trial], list[_Trial]]:
-    """Those that need no disturbing forces any more, best first, and as they are those for which no such fit is found;
-    what forces leave far off is neither."""
+    """Refit trials without process noise: those with an exact fit, best first, and those without one.
+
+    Trials that are far from the logs with process noise are neither.
+    """
     good = [x for x in trials if x[1].exact or x[1].is_close]
     without = drop_process_noise([s for _, s in good if not s.exact], runner)
     found = [(x, x[1] if x[1].exact else next(without)) for x in good]

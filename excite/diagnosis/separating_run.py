@@ -1,8 +1,8 @@
-"""Which ordinary run would separate causes that a log can't tell apart.
+"""Find the ordinary run that would separate causes that a log cannot tell apart.
 
-Not a table of pairs: each effect is asked what it does. Along the log as it was driven, and as it would be in the other
-direction, at rest, towed, faster, straight ahead, with quicker torques or later, its hooks say what it adds. Where two
-causes answer differently to such a change, and the log doesn't hold it yet, the run that makes it is the one to drive.
+Each effect's response is computed along the log as driven and with the drive changed: the other direction, at rest,
+towed, faster, straight ahead, with quicker torques or longer. If two causes respond differently to a change that the
+log does not contain yet, that run is recommended.
 """
 
 from __future__ import annotations
@@ -22,19 +22,22 @@ from excite.model.effects import PlacedEffect, Site
 from excite.model.machine import EffectEntry, Machine
 from excite.smoothing import smoothed_motion
 
-MIN_RESPONSE_DIFFERENCE = 0.4  # relative difference of two answers from which they are told apart
-MAX_SIGNATURE_DIFFERENCE = 1e-6  # share of two signatures that isn't in common, below which no drive tells them apart
-MAX_SAMPLES = 3000  # of the log that effects are asked along, at most
-STANDSTILL_SPEED = 0.05  # [m/s, rad/s] below which a machine or joint stands
-LOADED_TORQUE_SHARE = 0.05  # of the largest torque, from which a torque counts
-MIN_SPEED_RATIO = 2.0  # fast over slow stretches' speed, from which a log has both
-TURNED_AROUND_RAD = 2.5  # [rad] of heading from which a log has been driven both ways along the lane
-MIN_TURN = 0.05  # [rad] of a steered joint, or without one [rad/s] of yaw, from which a log turns
+MIN_RESPONSE_DIFFERENCE = 0.4  # relative difference of two responses that separates effects; chosen
+MAX_SIGNATURE_DIFFERENCE = 1e-6  # 1 - cosine of two signatures below which no run separates effects; rounding
+MAX_SAMPLES = 3000  # samples of the log along which responses are computed; chosen
+STANDSTILL_SPEED = 0.05  # speed [m/s, rad/s] below which a machine or joint stands; chosen
+LOADED_TORQUE_SHARE = 0.05  # share of the largest torque above which a joint is loaded; chosen
+MIN_STANDSTILL_SHARE = 0.05  # share of a log at standstill under load that makes a run of it; chosen
+MIN_DIRECTION_SHARE = 0.1  # share of a log in either direction that makes it a run in both; chosen
+MIN_SPEED_RATIO = 2.0  # 90 % over 30 % quantile of the speed above which a log has two speeds; chosen
+TURNED_AROUND_RAD = 2.5  # range of the heading [rad] above which the lane was driven both ways; chosen
+MIN_TURN = 0.05  # steering angle [rad], or yaw rate [rad/s] without one, above which a machine turns; chosen
+MIN_TURN_SHARE = 0.2  # share of a log straight ahead, and in turns, that makes a run of both; chosen
 
 
 @dataclass(frozen=True)
 class SampledMotion:
-    """A motion as effects see it: coordinates, velocities, accelerations (N, n_q), torques (N, n_u), time (N,)."""
+    """A motion as effects see it: coordinates, velocities, accelerations (N, n_q), torques (N, n_u), time (N,) [s]."""
 
     q: np.ndarray
     nu: np.ndarray
@@ -45,38 +48,40 @@ class SampledMotion:
 
 @dataclass(frozen=True)
 class DriveChange:
-    """A change of the drive: what to do, on a machine that drives and on one that stands on a bench; what becomes of a
-    motion; whether a motion holds it already. In `text` {against} stands for the machine's driven contacts at work
-    against each other, or against a wall."""
+    """A change of the drive.
+
+    text, bench: instructions for a machine that drives and one on a bench; {against} stands for the machine's driven
+    contacts working against each other or a wall. apply: changes a motion. held: tells if a motion contains it
+    already.
+    """
 
     text: str
     bench: str | None
-    change: Callable[[Machine, SampledMotion], SampledMotion]
+    apply: Callable[[Machine, SampledMotion], SampledMotion]
     held: Callable[[Machine, SampledMotion], bool]
 
 
 def recommend_run(d: Diagnosis) -> str | None:
-    """The simplest run that separates what is tied, in words; None where nothing is, or where it is not a matter of
-    the drive, as no drive tells which of two wheels of one side resists."""
-    said: list[str] = []
+    """Describe the simplest run that separates tied causes; None without ties, or if no run separates them."""
+    texts: list[str] = []
     for f in d.findings:
         if f.tied_with:
             text = _describe_separation(d.after, [f.name, *f.tied_with])
-            if text is not None and text not in said:
-                said.append(text)
-    return "; then ".join(said) or None
+            if text is not None and text not in texts:
+                texts.append(text)
+    return "; then ".join(texts) or None
 
 
 @dataclass(frozen=True)
 class RivalPair:
-    """Two causes that are tied, as the logs have them, and the machine with what else was found."""
+    """Two tied causes with the magnitudes and shapes found, and the machine with the other findings."""
 
     machine: Machine
     between: tuple[EffectEntry, EffectEntry]
 
 
 def rival_pairs(d: Diagnosis) -> list[RivalPair]:
-    """The pairs of tied causes that do not the same whatever is driven, the likeliest first."""
+    """List the pairs of tied causes that some run can separate, the likeliest first."""
     found: list[RivalPair] = []
     for f in d.findings:
         if not f.rivals:
@@ -95,30 +100,32 @@ def _describe_separation(stage: ExtendedFit, names: Sequence[str]) -> str | None
     machine = stage.machine
     tied = [_placed_effect(stage, name) for name in names]
     motion = _longest_motion(stage)
-    asked = _EffectResponses(stage, tied)
-    here = asked(motion)
+    responses = _EffectResponses(stage, tied)
+    here = responses(motion)
     pairs = list(combinations(range(len(tied)), 2))
-    open_ = {p for p in pairs if tied[p[0]].effect is not tied[p[1]].effect or tied[p[0]].where != tied[p[1]].where}
+    unseparated = {
+        p for p in pairs if tied[p[0]].effect is not tied[p[1]].effect or tied[p[0]].where != tied[p[1]].where
+    }
     chosen: list[DriveChange] = []
-    # Each run takes the pairs that it separates; the one that separates most comes first, the simplest of equals.
+    # Greedy: take the run that separates most pairs, the simplest of equals, as long as pairs are left.
     options = [
-        (r, _separated_pairs(here, asked(r.change(machine, motion)), pairs))
-        for r in DRIVE_CHANGES
-        if _is_possible(r, machine)
+        (change, _separated_pairs(here, responses(change.apply(machine, motion)), pairs))
+        for change in DRIVE_CHANGES
+        if _is_possible(change, machine)
     ]
-    fresh = [(r, s) for r, s in options if not r.held(machine, motion)]
-    for group in (fresh, options):
-        while open_:
-            r, split = max(group, key=lambda x: len(x[1] & open_), default=(None, set()))
-            if r is None or not split & open_:
+    not_held = [(change, s) for change, s in options if not change.held(machine, motion)]
+    for group in (not_held, options):
+        while unseparated:
+            change, split = max(group, key=lambda x: len(x[1] & unseparated), default=(None, set()))
+            if change is None or not split & unseparated:
                 break
-            chosen.append(r)
-            open_ -= split
-    texts = [_describe_change(r, machine) for r in dict.fromkeys(chosen)]
-    # A machine that its file holds on a line turns where it is let go.
-    held = set(machine.body[0].coordinates) & set(machine.locked)
-    same = set() if held else _equivalent_pairs(asked(_perturb(motion)), pairs)
-    rest = [(tied[i], tied[j]) for i, j in sorted(open_ - same)]
+            chosen.append(change)
+            unseparated -= split
+    texts = [_describe_change(change, machine) for change in dict.fromkeys(chosen)]
+    # A machine whose file locks it to a line could turn if released.
+    locked = set(machine.body[0].coordinates) & set(machine.locked)
+    same = set() if locked else _equivalent_pairs(responses(_perturb(motion)), pairs)
+    rest = [(tied[i], tied[j]) for i, j in sorted(unseparated - same)]
     for a, b in rest:
         more = _separate_by_place(machine, a, b)
         if more is not None and more not in texts:
@@ -126,14 +133,14 @@ def _describe_separation(stage: ExtendedFit, names: Sequence[str]) -> str | None
     return ", and ".join(texts) if texts else None
 
 
-def _describe_change(r: DriveChange, machine: Machine) -> str:
-    """What to do, with the machine's own names."""
+def _describe_change(change: DriveChange, machine: Machine) -> str:
+    """Return the instructions of a change with the machine's own names."""
     if not machine.planar:
-        return r.bench or r.text
+        return change.bench or change.text
     driven = [_spaced(b.where) for b in machine.actuated if b.contact is not None]
     each = f"{driven[0]} against {driven[1]}" if len(driven) == 2 else f"{', '.join(driven)} against each other"
     wall = "against a wall"
-    return r.text.format(against=f"{each}, or {wall}" if len(driven) > 1 else wall)
+    return change.text.format(against=f"{each}, or {wall}" if len(driven) > 1 else wall)
 
 
 def _spaced(where: str) -> str:
@@ -141,7 +148,7 @@ def _spaced(where: str) -> str:
 
 
 def _placed_effect(stage: ExtendedFit, name: str) -> PlacedEffect:
-    """A tied effect with the amount and shapes that it was found with, or the catalogue's."""
+    """Return a tied effect with the magnitude and shapes found, or with the catalogue's defaults."""
     known = next((e for e in stage.model.effects if e.name == name), None)
     if known is not None:
         return known
@@ -155,11 +162,11 @@ def _placed_effect(stage: ExtendedFit, name: str) -> PlacedEffect:
 
 
 def _longest_motion(stage: ExtendedFit) -> SampledMotion:
-    """The longest log's smoothed motion, from its start, thinned to SAMPLES."""
-    c, fit = stage.data.space, stage.fit
+    """Return the longest log's smoothed motion from its start, thinned to MAX_SAMPLES."""
+    space, fit = stage.data.space, stage.fit
     k = int(np.argmax([len(log) for log in stage.data.logs]))
-    p, r = fit.trajectories[k], stage.data.measurements[k]
-    q, nu, _, u, a = smoothed_motion(c, r, p, fit.X)
+    p, change = fit.trajectories[k], stage.data.measurements[k]
+    q, nu, _, u, a = smoothed_motion(space, change, p, fit.X)
     root = stage.machine.body[0].coordinates
     if stage.machine.planar and root[2] in stage.model.coordinates:
         heading = stage.model.coordinates.index(root[2])
@@ -170,7 +177,7 @@ def _longest_motion(stage: ExtendedFit) -> SampledMotion:
 
 
 class _EffectResponses:
-    """What effects add along a motion: (C, K), forces and readings each in units of their size."""
+    """Forces and readings that effects add along a motion (C, K), each scaled by its size."""
 
     def __init__(self, stage: ExtendedFit, placed: Sequence[PlacedEffect]) -> None:
         model = stage.model
@@ -197,7 +204,7 @@ class _EffectResponses:
         return np.concatenate([force, reading]).transpose(2, 0, 1).reshape(C, -1)
 
     def _misread(self, e: PlacedEffect, m: SampledMotion) -> np.ndarray:
-        """What a torque channel reads beside the torque (n_q, N)."""
+        """Return the torque that a channel reads beside the true one (n_q, N)."""
         gain, offset, delay = e.channel(m.t)
         added = np.zeros((m.q.shape[1], len(m.t)))
         for k, body in enumerate(self.machine.actuated):
@@ -208,7 +215,7 @@ class _EffectResponses:
 
 
 def _separated_pairs(here: np.ndarray, there: np.ndarray, pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
-    """Pairs of effects whose signatures answer differently to a change: by their sign and size along the motion."""
+    """Return the pairs of effects whose responses to a change differ, by sign and size along the motion."""
     size = np.maximum((here**2).sum(axis=1), 1e-300)
     answer = (there * here).sum(axis=1) / size
     return {
@@ -219,7 +226,7 @@ def _separated_pairs(here: np.ndarray, there: np.ndarray, pairs: Sequence[tuple[
 
 
 def _perturb(m: SampledMotion) -> SampledMotion:
-    """A motion about this one in which everything moves, each at a frequency of its own."""
+    """Add motion to every coordinate, velocity and torque, each at its own frequency."""
 
     def stir(x: np.ndarray, first: float) -> np.ndarray:
         size = np.maximum(np.abs(x).max(axis=0), 0.1)
@@ -229,13 +236,13 @@ def _perturb(m: SampledMotion) -> SampledMotion:
 
 
 def _equivalent_pairs(signature: np.ndarray, pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
-    """Pairs of effects that do the same along a motion (C, K), but for their size: wheels of one side resist alike."""
+    """Return the pairs of effects with proportional signatures (C, K), such as resistance of two wheels of one side."""
     unit = signature / np.maximum(np.linalg.norm(signature, axis=1, keepdims=True), 1e-300)
     return {(i, j) for i, j in pairs if abs(unit[i] @ unit[j]) > 1 - MAX_SIGNATURE_DIFFERENCE}
 
 
 def _separate_by_place(machine: Machine, a: PlacedEffect, b: PlacedEffect) -> str | None:
-    """What separates two causes that answer alike because they differ in place alone, or not even in that."""
+    """Describe what separates two causes that respond alike, by their places."""
     if a.where != b.where and machine.planar:
         pulling = {x.index for x in machine.actuated if x.contact is not None}
         pulls = [bool(e.effect.torque or e.effect.soil or e.effect.channel) for e in (a, b)]
@@ -249,15 +256,15 @@ def _separate_by_place(machine: Machine, a: PlacedEffect, b: PlacedEffect) -> st
     return None
 
 
-# ------------------------------------------------------------------------------------------------ the runs
+# ------------------------------------------------------------------------------------------------ changes of the drive
 
 
-def _is_possible(r: DriveChange, machine: Machine) -> bool:
-    return machine.planar or r.bench is not None
+def _is_possible(change: DriveChange, machine: Machine) -> bool:
+    return machine.planar or change.bench is not None
 
 
 def _forward_speed(machine: Machine, m: SampledMotion) -> np.ndarray:
-    """The speed that counts as forward (N,): of the root along its axis, or of the first joint."""
+    """Return the speed that counts as forward (N,): of the root along its axis, or of the first joint."""
     return m.nu[:, 0]
 
 
@@ -275,7 +282,7 @@ def _turn_around(machine: Machine, m: SampledMotion) -> SampledMotion:
     k = _heading_index(machine)
     q = m.q.copy()
     if k is None:
-        # Held straight: turned around, the ground's fixed direction comes from the other side, as in reverse.
+        # Locked straight: turning around changes nothing here; driving in reverse covers it.
         return m
     q[:, k] += np.pi
     return replace(m, q=q)
@@ -288,12 +295,14 @@ def _has_turned_around(machine: Machine, m: SampledMotion) -> bool:
 
 def _has_both_directions(machine: Machine, m: SampledMotion) -> bool:
     v = _forward_speed(machine, m)
-    return bool((v > STANDSTILL_SPEED).mean() > 0.1 and (v < -STANDSTILL_SPEED).mean() > 0.1)
+    return bool(
+        (v > STANDSTILL_SPEED).mean() > MIN_DIRECTION_SHARE and (v < -STANDSTILL_SPEED).mean() > MIN_DIRECTION_SHARE
+    )
 
 
 def _has_stood_with_torque(machine: Machine, m: SampledMotion) -> bool:
     still = (np.abs(m.nu) < STANDSTILL_SPEED).all(axis=1)
-    return bool((still & _has_torque(m)).mean() > 0.05)
+    return bool((still & _has_torque(m)).mean() > MIN_STANDSTILL_SHARE)
 
 
 def _has_two_speeds(machine: Machine, m: SampledMotion) -> bool:
@@ -303,10 +312,10 @@ def _has_two_speeds(machine: Machine, m: SampledMotion) -> bool:
 
 
 def _turning_coordinates(machine: Machine) -> list[int]:
-    """Coordinates that are zero straight ahead: sideways, yaw and steered joints."""
+    """Return the coordinates that are zero straight ahead: sideways, yaw and steered joints."""
     across = machine.body[0].coordinates[1:] if machine.planar else ()
     joints = [b.coordinates[0] for b in machine.actuated if b.contact is None] if machine.planar else []
-    return [machine.coordinates.index(c) for c in (*across, *joints) if c in machine.coordinates]
+    return [machine.coordinates.index(space) for space in (*across, *joints) if space in machine.coordinates]
 
 
 def _straighten(machine: Machine, m: SampledMotion) -> SampledMotion:
@@ -323,7 +332,7 @@ def _has_straight_and_turns(machine: Machine, m: SampledMotion) -> bool:
     if not machine.planar or heading is None:
         return True
     turn = np.abs(m.q[:, joints] if joints else m.nu[:, heading, None]).max(axis=1)
-    return bool((turn < MIN_TURN / 2).mean() > 0.2 and (turn > MIN_TURN).mean() > 0.2)
+    return bool((turn < MIN_TURN / 2).mean() > MIN_TURN_SHARE and (turn > MIN_TURN).mean() > MIN_TURN_SHARE)
 
 
 def _is_never_held(machine: Machine, m: SampledMotion) -> bool:

@@ -35,8 +35,9 @@ def filtered_regression(model: Model, log: Log, filter: Filter, block: int = BLO
 
 
 def regression(model: Model, s: Samples, filter: Filter, block: int = BLOCK) -> tuple[np.ndarray, np.ndarray]:
-    """The same from samples. The regressor at the log's rate is never in memory as a whole: it is made, filtered and
-    decimated in blocks that overlap as far as the filter reaches."""
+    """Return filtered, decimated rows of regressor and measurement from samples. The regressor at the log's rate is
+    never in memory as a whole: it is made, filtered and decimated in blocks that overlap as far as the filter
+    reaches."""
     first, last = filter.drop[0], s.q.shape[1] - filter.drop[1]
     W = np.concatenate(list(_blocks(model, s, first, last, filter.decimation, block)), axis=1)
     return W, decimate(s.Y[:, first:last], filter.decimation)
@@ -55,7 +56,7 @@ def _blocks(model: Model, s: Samples, first: int, last: int, factor: int, block:
 
 
 def kept_samples(first: int, last: int, factor: int) -> np.ndarray:
-    """Which of the samples first .. last a decimation keeps: the last one and every factor-th before it."""
+    """Return the samples that a decimation keeps: the last of first .. last and every factor-th before it."""
     return np.arange(first + (last - first - 1) % factor, last, factor)
 
 
@@ -111,7 +112,7 @@ def _beside(model: Model, q: np.ndarray, nu: np.ndarray, Y: np.ndarray) -> tuple
 
 
 def remember(model: Model, q: np.ndarray, nu: np.ndarray, u: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """What a model's effects remember (N, n_z) along a motion, from rest, and what a map of the ground tells."""
+    """Return the memory of a model's effects (N, n_z) along a motion, from rest, and what a map of the ground tells."""
     n_q, n_u, sample = len(model.coordinates), len(model.inputs), 1 / float(model.machine.sampling_hz)
     at, z = ca.SX.sym("at", 2 * n_q + n_u), ca.SX.sym("z", len(model.memory))
     rate = model.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q :], z, ca.DM(X))
@@ -120,8 +121,8 @@ def remember(model: Model, q: np.ndarray, nu: np.ndarray, u: np.ndarray, X: np.n
 
 
 def passes(model: Model, q: np.ndarray, nu: np.ndarray, step: float) -> np.ndarray:
-    """What a map of the ground tells (N, n_contacts MOST) along a motion with samples `step` [s] apart, whose pose
-    follows from its velocities."""
+    """Return the inputs from a map of the ground (N, n_contacts MOST) along a motion with samples `step` [s] apart,
+    whose pose follows from its velocities."""
     if not model.machine.contacts:
         return np.zeros((len(q), 0))
     at = q.copy()

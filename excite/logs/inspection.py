@@ -1,4 +1,4 @@
-"""What is in a log, and everything that is wrong with it: `excite log check`."""
+"""Inspection of a log: its content and everything that is wrong with it (`excite log check`)."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
 
 
 def _units(table: pd.DataFrame, machine: Machine) -> tuple[list[str], list[str]]:
-    """What a line of units in a file says against the machine file's, and what of it nobody knows."""
+    """Compare a file's line of units with the machine file: contradictions, and units that are not known."""
     said: dict[str, str] = table.attrs.get("units", {})
     own: dict[str, tuple[str, str, float]] = {machine.time_column: (machine.time_unit, *UNITS[machine.time_unit])}
     for sensor in machine.sensors("full"):
@@ -299,7 +299,7 @@ def _time(
 
 
 def _oddities(sensor: Sensor, values: np.ndarray) -> list[str]:
-    """What leaves a log usable: a channel that never changes or is at the end of its range, spikes, drop-outs."""
+    """Remark on what leaves a log usable: channels that never change or stand at an end, spikes, drop-outs."""
     name = sensor.column
     if line := unchanging(sensor, values):
         return [line]

@@ -26,7 +26,8 @@ class Log:
     """Checked measurements: t (N,) [s] evenly spaced, values (N,) by sensor name [SI].
 
     interpolated: rows were uneven and are readings between those of the file. sampled: by sensor name the rows (N,) at
-    which a channel slower than the log was read; the readings between are interpolated.
+    which a channel was read, if not in all; the readings between are interpolated. edges: by encoder (N,) the edges
+    that it passed, moved to the rows' times, NaN where it passed none; for rows that were uneven.
     """
 
     source: str
@@ -34,6 +35,11 @@ class Log:
     values: dict[str, np.ndarray]
     interpolated: bool = False
     sampled: dict[str, np.ndarray] = field(default_factory=dict)
+    edges: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def read_in(self, sensor: str) -> np.ndarray:
+        """Rows (N,) in which a sensor was read."""
+        return self.sampled.get(sensor, np.ones(len(self), bool))
 
     def readings(self, sensor: str) -> np.ndarray:
         """The readings (M,) of a sensor at the rows where it was read."""
@@ -166,7 +172,7 @@ def fewest_rows(machine: Machine) -> int:
 
 
 def too_short(rows: int, machine: Machine) -> str:
-    """What is said of a log of so few rows that nothing can be made of it, "" otherwise."""
+    """Return a line for a log of too few rows, "" otherwise."""
     least = fewest_rows(machine)
     return f"only {rows} rows, at least {least} are needed: is the file complete?" if rows < least else ""
 
@@ -276,7 +282,7 @@ def what_of(sensor: Sensor, machine: Machine) -> str:
 
 
 def columns_of(table: pd.DataFrame) -> str:
-    """What a file holds instead of a column that it lacks."""
+    """List the columns of a file for a message."""
     names = [str(c) for c in table.columns]
     shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
     return f"the file has {shown}"

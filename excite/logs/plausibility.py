@@ -1,4 +1,4 @@
-"""What may be wrong with a log though every value is possible: a sign turned around, a torque a thousand times off, a
+"""Doubts about a log in which every value is possible: a sign turned around, a torque a thousand times off, a
 speed for an angle, other counts than the machine file's.
 
 The drive of a joint that steers does more work with the joint's motion than against it, since friction takes some. A
@@ -134,14 +134,14 @@ def _sides(machine: Machine, sensors: Sequence[Sensor]) -> dict[str, float]:
 
 
 def _opposed(one: Sensor, other: Sensor, values: Mapping[str, np.ndarray]) -> bool:
-    """Whether two contacts or measuring wheels turn against each other."""
+    """Tell if two contacts or measuring wheels turn against each other."""
     a, b = (values[s.name][::10] if s.is_rate else np.diff(values[s.name][::10]) for s in (one, other))
     a, b = a[: len(b)], b[: len(a)]
     return len(a) > 10 and np.ptp(a) > 0 and np.ptp(b) > 0 and bool(np.corrcoef(a, b)[0, 1] < OPPOSED)
 
 
 def unchanging(sensor: Sensor, values: np.ndarray) -> str:
-    """What is said of a channel that always reads the same, "" of any other."""
+    """Return a line for a channel that always reads the same, "" otherwise."""
     name = " - ".join(sensor.columns)
     return f"column {name}: never changes ({values[0]:g}): is the sensor connected?" if np.ptp(values) == 0 else ""
 
@@ -182,7 +182,7 @@ def _alike(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def is_speed(values: np.ndarray, torques: Sequence[np.ndarray], rate: float) -> bool:
-    """Whether readings (N,) of an angle, in any unit, are rather its speed: what they do goes with the torques (N,), by
+    """Tell if readings (N,) of an angle, in any unit, are rather its speed: what they do goes with the torques (N,), by
     inertia and friction, better if they are taken for one."""
     half = max(1, round(SPAN * rate))
     moving = [u for u in torques if np.ptp(u) > 0]
@@ -194,14 +194,14 @@ def is_speed(values: np.ndarray, torques: Sequence[np.ndarray], rate: float) -> 
 
 
 def as_speed(units: Sequence[str], machine: Machine) -> str:
-    """What to write for a column that holds a speed in one of these units."""
+    """Advise what to write for a column that holds a speed in one of these units."""
     line = " or ".join(f'unit = "{unit}"' for unit in units)
     return f"write {line} for it in {own_file(machine)}, with its noise [rad/s] instead of counts_per_turn"
 
 
 def _unexplained(torques: np.ndarray, speed: np.ndarray, acceleration: np.ndarray) -> float:
-    """What a speed (N,) and its change leave of the combination of torques (N, k) that goes best with them, as a share:
-    one less the largest canonical correlation squared."""
+    """Return the share that a speed (N,) and its change leave of the combination of torques (N, k) that goes best with
+    them, as a share: one less the largest canonical correlation squared."""
     dry = np.tanh(speed / (SHARE * np.abs(speed).max() or 1.0))
     both = _directions(torques).T @ _directions(np.column_stack([speed, acceleration, dry]))
     return max(1 - float(np.linalg.norm(both, 2)) ** 2, 1e-300)
@@ -217,7 +217,7 @@ def _directions(A: np.ndarray) -> np.ndarray:
 
 @contextmanager
 def doubts_in_errors(lines: Sequence[str]) -> Iterator[None]:
-    """Where no estimate is found, the message says what is doubtful about the logs as well."""
+    """Add what is doubtful about the logs to the message of an estimate that fails."""
     try:
         yield
     except NoEstimateError as err:
@@ -247,7 +247,7 @@ def _mean(x: np.ndarray, half: int) -> np.ndarray:
 
 
 def _works(motion: tuple[np.ndarray, np.ndarray], torque: np.ndarray, half: int) -> bool:
-    """Whether a torque, but for its offset, goes clearly against the speed."""
+    """Tell if a torque, but for its offset, goes clearly against the speed."""
     speed, _ = motion
     if np.ptp(torque) == 0 or np.ptp(speed) == 0:
         return False
@@ -263,7 +263,7 @@ def _pulls(
     means: Mapping[int, np.ndarray],
     half: int,
 ) -> bool:
-    """Whether a contact turns slower for more torque, by least squares over the torques of all contacts and friction.
+    """Tell if a contact turns slower for more torque, by least squares over the torques of all contacts and friction.
 
     As a share of what the machine's mass at the rims makes of a force. Torques that go together all along share the
     effect equally: of one half of them turned around that half is found.

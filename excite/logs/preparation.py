@@ -150,8 +150,9 @@ def as_log(stretch: Stretch, machine: Machine, needs: Sequence[str], source: str
     table = stretch.table.assign(**{machine.time_column: 0.0})
     table.attrs = {}
     made = log.from_table(table, machine, needs, source, np.arange(len(table)) / stretch.rate)
+    edges = {s.name: s.gain * stretch.edges[s.column] for s in machine.sensors("full") if s.column in stretch.edges}
     sampled = {s.name: stretch.sampled[s.column] for s in machine.sensors("full") if s.column in stretch.sampled}
-    return replace(made, interpolated=stretch.interpolated, sampled=sampled)
+    return replace(made, interpolated=stretch.interpolated, sampled=sampled, edges=edges)
 
 
 def without_rests(one: Log, machine: Machine, notes: list[str]) -> list[Log]:
@@ -189,6 +190,7 @@ def without_rests(one: Log, machine: Machine, notes: list[str]) -> list[Log]:
             t=np.arange(b - a + 1) / rate,
             values={n: v[a : b + 1] for n, v in one.values.items()},
             sampled={n: v[a : b + 1] for n, v in one.sampled.items()},
+            edges={n: v[a : b + 1] for n, v in one.edges.items()},
         )
         for a, b in parts
     ]

@@ -57,7 +57,7 @@ def unbroken_rows(t: np.ndarray, machine: Machine) -> slice:
 
 
 def speed_for_angle(sensor: Sensor, values: np.ndarray, table: pd.DataFrame, machine: Machine) -> str:
-    """What is wrong with an angle (N,) [SI] that its joint can't follow but that could be its speed, and goes with the
+    """Return a line for an angle (N,) [SI] that its joint can't follow but that could be its speed, and goes with the
     torques as if it were; "" otherwise."""
     body, rate = machine.find(sensor.body), float(machine.sampling_hz)
     if sensor.kind != "angle" or sensor.is_rate or sensor.factor is not None or body.joint != "revolute":
@@ -81,14 +81,14 @@ def speed_for_angle(sensor: Sensor, values: np.ndarray, table: pd.DataFrame, mac
 
 
 def _possible(sensor: Sensor, values: np.ndarray, machine: Machine) -> bool:
-    """Whether a joint can do what readings (N,) [SI] say."""
+    """Tell if a joint can do what readings (N,) [SI] say."""
     said: list[str] = []
     caught(lambda: log.check_values(sensor, values, float(machine.sampling_hz), machine, ""), said)
     return not said
 
 
 def wrong_time_unit(t: np.ndarray, machine: Machine) -> str:
-    """What is wrong with times (N,) [s] that are in another unit than the machine file says, "" where they aren't."""
+    """Return a line for times (N,) [s] in another unit than the machine file says, "" otherwise."""
     typical, rate = float(np.median(np.diff(t))) if len(t) > 1 else 0.0, float(machine.sampling_hz)
     if typical <= 0:
         return ""

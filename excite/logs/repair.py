@@ -46,7 +46,8 @@ def examine(machine: Machine, log: Log) -> Examination:
     for sensor in machine.sensors("full"):
         if sensor.name not in values:
             continue
-        rows = find_spikes(sensor, values[sensor.name])
+        rows, there = find_spikes(sensor, values[sensor.name]), log.read_in(sensor.name)
+        rows = rows[there[rows] & there[rows - 1] & there[rows + 1]]
         if len(rows) > max(3, MANY * len(log)):
             raise LogError(
                 f"{log.source}: column {sensor.column}: {len(rows)} spikes of a single sample, the first in row"
@@ -107,7 +108,7 @@ def find_spikes(sensor: Sensor, x: np.ndarray) -> np.ndarray:
 
 
 def moves(machine: Machine, log: Log) -> bool:
-    """Whether any angle goes further than a count or two; taken for granted where one isn't counted."""
+    """Tell if any angle goes further than a count or two; taken for granted where one isn't counted."""
     turning = [s for s in machine.sensors("full") if s.kind in ("angle", "wheel") and s.name in log.values]
     return any(s.resolution is None or np.ptp(log.values[s.name]) > 2.5 * s.resolution for s in turning)
 

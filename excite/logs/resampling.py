@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
-import scipy.signal
 
 from excite.errors import LogError
+from excite.logs.grid import edges as encoder_edges, on_grid
 from excite.logs.time_axis import Run
 from excite.model.machine import Machine, Sensor
 
@@ -25,8 +25,7 @@ SAME_RATE = 1e-4  # relative deviation of two rates of sampling that count as on
 BRIDGED_STEPS = (
     3.5  # usual steps from one reading to the next, up to which what is lost between is interpolated; chosen
 )
-BRIDGED_S = 0.03  # [s] the same for fast logs; chosen
-SLOW = 0.67  # of the grid's rate, below which a channel's readings are marked; chosen
+BRIDGED_S = 0.1  # [s] the most of a quarter period of the filter that is bridged as well; chosen
 SHORTEST_STRETCH_S = 2.0  # [s] of a log between two gaps that is worth using; chosen
 ORDINALS = {2: "second", 3: "third", 4: "fourth", 5: "fifth", 6: "sixth", 8: "eighth", 10: "tenth"}
 HELD_ROWS = 0.9  # share of changes of a channel in every n-th row, from which it is taken for held; chosen
@@ -42,6 +41,7 @@ class Stretch:
     first_row: int
     interpolated: bool = False
     sampled: dict[str, np.ndarray] = field(default_factory=dict)
+    edges: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def used_sensors(table: pd.DataFrame, machine: Machine) -> list[Sensor]:
@@ -89,7 +89,7 @@ def even_stretches(
         return [at_rate(stretch, machine, rate)], [f"{source}: resampled from {own:.6g} to {rate:.6g} Hz"]
     grid = rate or (nominal if abs(own / nominal - 1) < EVEN else own)
     # For filters the step must be even, so a rate close to the log's is as good as any.
-    longest = max(BRIDGED_STEPS / own, min(BRIDGED_S, 10 / own))
+    longest = max(BRIDGED_STEPS / own, min(BRIDGED_S, 0.25 / float(machine.filter.cutoff_hz)))
     holes = [_holes(run.t[rows], max(longest, BRIDGED_STEPS * _usual_step(run.t[rows]))) for rows in there.values()]
     first = max(float(run.t[rows][0]) for rows in there.values())
     last = min(float(run.t[rows][-1]) for rows in there.values())
@@ -143,11 +143,13 @@ def own_rate(t: np.ndarray) -> float:
 
 
 def _usual_step(t: np.ndarray) -> float:
-    """The usual step [s] of times: the mean of those that are no gap."""
+    """The usual step [s] of times: of rows that are even but for lost ones that of two rows, else the mean."""
     dt = np.diff(t)
     if not len(dt):
         return 0.0
-    return float(dt[dt <= 1.5 * np.median(dt)].mean())
+    median = float(np.median(dt))
+    lost_only = median > 0 and np.quantile(np.abs(dt / median - np.round(dt / median)), 0.99) < 0.1
+    return float(dt[dt <= (1.5 if lost_only else 10) * median].mean()) if median > 0 else 0.0
 
 
 def _usual_rate(t: np.ndarray, there: dict[str, np.ndarray]) -> float:
@@ -166,7 +168,7 @@ def _holes(t: np.ndarray, longest: float) -> list[tuple[float, float]]:
 
 
 def _between(first: float, last: float, holes: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """What is left of first..last without the holes."""
+    """Return the spans of first..last between the holes."""
     spans, at = list[tuple[float, float]](), first
     for a, b in holes:
         if a > at:
@@ -217,57 +219,21 @@ def _interpolated(
     counted = [c for c in there if by_column[c].resolution is not None]
     reference = run.t[there[(counted or list(there))[0]]]
     a = float(reference[min(int(np.searchsorted(reference, a - 1e-9)), len(reference) - 1)])
-    grid = a + np.arange(int(np.floor((b - a) * rate + 1e-6)) + 1) / rate
-    columns, sampled, between = {}, dict[str, np.ndarray](), False
+    n = int(np.floor((b - a) * rate + 1e-6)) + 1
+    columns, sampled, edges = {}, dict[str, np.ndarray](), dict[str, np.ndarray]()
     for name, rows in there.items():
         x = pd.to_numeric(part[name], errors="coerce").to_numpy(dtype=float)[rows]
         t, sensor = run.t[rows], by_column[name]
-        own = 1 / _usual_step(t) / rate
-        if own > 1.5 and sensor.resolution is None:
-            x = _block_means(x, round(own))
-        plain = sensor.kind in ("angle", "wheel") or not SLOW < own < 1.5
-        y = np.interp(grid, t, x) if plain else _nearest(grid, t, x)
-        if own < SLOW and sensor.resolution is None:
-            inside = (t >= grid[0]) & (t <= grid[-1])
-            at = np.round((t[inside] - a) * rate).astype(int)
-            slope = np.gradient(y, 1 / rate)
-            y[at] = x[inside] + slope[at] * (grid[at] - t[inside])
-            sampled[name] = np.zeros(len(grid), bool)
-            sampled[name][at] = True
-        if sensor.resolution is not None and _meets(grid, t, rate):
-            y = _whole_counts(sensor, x, y)
-        elif sensor.resolution is not None:
-            between = True
-        columns[name] = y
+        placed = on_grid(t, x[:, None], a, 1 / rate, n)
+        columns[name] = placed.values[:, 0]
+        if placed.filled.any():
+            sampled[name] = ~placed.filled
+        if placed.moved and sensor.resolution is not None and len(sensor.columns) == 1:
+            step = sensor.resolution / abs(sensor.gain)
+            if np.abs(x / step - np.round(x / step)).max() < 0.01:
+                edges[name] = encoder_edges(t, x, step, a, 1 / rate, n)
     first = int(run.rows[int(np.searchsorted(run.t, a - 1e-9))])
-    return Stretch(pd.DataFrame(columns), a, rate, first, between, sampled)
-
-
-def _nearest(grid: np.ndarray, t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Readings x at times t, each moved to the grid along its slope: noise stays as it is, white, from row to row."""
-    slope = scipy.signal.savgol_filter(x, 7, 2, deriv=1) / np.gradient(t) if len(x) > 7 else np.gradient(x, t)
-    after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
-    near = np.where(grid - t[after - 1] < t[after] - grid, after - 1, after)
-    far = np.abs(grid - t[near]) > np.diff(t).max() / 2 + 1e-12
-    moved = x[near] + slope[near] * (grid - t[near])
-    return np.where(far, np.interp(grid, t, x), moved)
-
-
-def _meets(grid: np.ndarray, t: np.ndarray, rate: float) -> bool:
-    """Tell if readings are on the grid where none is lost: then only lost ones stand between counts."""
-    own = t[(t >= grid[0]) & (t <= grid[-1])]
-    at = (own - grid[0]) * rate
-    return bool(len(own)) and bool(np.abs(at - np.round(at)).max() < 5 * EVEN)
-
-
-def _whole_counts(sensor: Sensor, readings: np.ndarray, between: np.ndarray) -> np.ndarray:
-    """Interpolated readings of an encoder as whole counts, if the readings are."""
-    if sensor.resolution is None or len(sensor.columns) > 1:
-        return between
-    step = sensor.resolution / abs(sensor.gain)
-    if np.abs(readings / step - np.round(readings / step)).max() > 0.01:
-        return between
-    return np.asarray(np.round(between / step) * step)
+    return Stretch(pd.DataFrame(columns), a, rate, first, bool(sampled or edges), sampled, edges)
 
 
 def _notes(

@@ -93,6 +93,7 @@ def _csv(path: Path) -> pd.DataFrame:
     except (pd.errors.ParserWarning, pd.errors.ParserError) as err:
         why = _too_wide(path, lines, start, len(header), separator) or " ".join(str(err).split())
         raise LogError(f"{path}: not a table: {why}") from None
+    table = _without_copies(table, header, path, head + 1, notes)
     table.columns = table.columns.astype(str).str.strip()
     if header and header[-1] == "" and table.iloc[:, -1].isna().all():  # a separator at the end of every line
         table = table.iloc[:, :-1].copy()
@@ -185,13 +186,25 @@ def _header(path: Path, lines: list[str], k: int, separator: str) -> list[str]:
         raise LogError(
             f"{path}: line {k + 1} holds numbers, there is no header: write a line with the names of the columns above"
         )
-    if twice:
-        raise LogError(f"{path}: line {k + 1}: column {twice[0] or 'without a name'} is there twice, keep one")
+    if twice and not twice[0]:
+        raise LogError(f"{path}: line {k + 1}: column without a name is there twice, keep one")
     return header
 
 
+def _without_copies(table: pd.DataFrame, header: list[str], path: Path, line: int, notes: list[str]) -> pd.DataFrame:
+    """A table without columns that are there twice with the same cells. Raises LogError where the cells differ."""
+    for name in dict.fromkeys(n for n in header if n and header.count(n) > 1):
+        first, *others = [k for k, n in enumerate(header) if n == name]
+        if not all(table.iloc[:, k].equals(table.iloc[:, first]) for k in others):
+            raise LogError(f"{path}: line {line}: column {name} is there twice, keep one")
+        notes.append(f"column {name} is there {len(others) + 1} times with the same cells, used once")
+        keep = [k for k in range(len(header)) if k not in others]
+        table, header = table.iloc[:, keep], [header[k] for k in keep]
+    return table
+
+
 def _too_wide(path: Path, lines: list[str], start: int, names: int, separator: str) -> str:
-    """What is said of the first line (from 0) that has more cells than there are names, "" where none has."""
+    """Return a line about the first row that has more cells than there are names, "" if none has."""
     for k in range(start, len(lines)):
         cells = _row(path, lines, k, separator)
         if len(cells) <= names:

@@ -117,20 +117,25 @@ def prepare_measurements(space: StateSpace, log: Log, unbiased: bool = False) ->
         value = log.values[sensor.name]
         count_size = sensor.resolution
         reading[:, j] = value
+        there = log.read_in(sensor.name)
+        used[:, j] = there
         if count_size is None:
             sigma[j] = max(white_noise(log.readings(sensor.name)), 1e-9 + 1e-3 * float(sensor.noise or 0))
-            if sensor.name in log.sampled:
-                used[:, j] = log.sampled[sensor.name]
             continue
         sigma[j] = count_size
+        if sensor.name in log.edges:
+            edge = log.edges[sensor.name]
+            at_edges[j], used[:, j] = True, np.isfinite(edge) & there
+            reading[:, j] = np.where(np.isfinite(edge), edge, value)
+            continue
         counts = np.round(value / count_size)
-        if np.abs(value - counts * count_size).max() > MAX_COUNT_ERROR * count_size:
+        if np.abs(value - counts * count_size)[there].max() > MAX_COUNT_ERROR * count_size:
             sigma[j] = count_size / np.sqrt(12)
             continue
         at_edges[j] = True
         change = np.diff(counts, prepend=counts[0])
         reading[:, j] = (counts + (change < 0)) * count_size
-        used[:, j] = change != 0
+        used[:, j] = (change != 0) & there & np.append(True, there[:-1])
     # Torques interpolated over k rows err alike in all of them: as much as white noise that is sqrt(k) times as large.
     rows_per_reading = [N / max(len(log.readings(s.name)), 1) for s in torques]
     torque_noise = np.array(

@@ -165,7 +165,7 @@ def test_a_second_cause_with_which_exact_dynamics_follow_is_no_flaw_of_the_first
     found = selection.choose_effect(stage, scores, [first], run_in_turn, lambda share, what: None, 0.0)
     assert found is not None
     assert (found.name, found.stage.exact, found.stage.is_close) == ("ground_slope@machine", True, True)
-    monkeypatch.setattr("excite.diagnosis.selection.freed", lambda found, together: (None for _ in found))
+    monkeypatch.setattr("excite.diagnosis.selection.drop_process_noise", lambda found, together: (None for _ in found))
     assert selection.choose_effect(stage, scores, [first], run_in_turn, lambda share, what: None, 0.0) is None
 
 
@@ -238,7 +238,7 @@ def test_what_promises_nothing_at_all_is_not_tried(
         return [None for _ in machines]
 
     scores = (replace(late, likelihood_ratio=100.0, values={**late.values, "A": 0.01}),)
-    monkeypatch.setattr("excite.diagnosis.selection.begun", begin)
+    monkeypatch.setattr("excite.diagnosis.selection.fit_screened", begin)
     for tried, expected in (((late.candidate.name,), []), ((), ["channel_delay"])):
         assert selection.choose_unlikely(stage, stage, tried, run_in_turn) == (stage, [])
         assert begun == expected
@@ -765,7 +765,7 @@ def test_where_exact_dynamics_find_no_way_a_known_fit_with_forces_is_gone_on_wit
     likely = scores[:1]
     monkeypatch.setattr(selection, "_refined_shortlist", lambda *given: likely)
     monkeypatch.setattr(selection, "_fit_candidates", lambda *given: ([], set()))
-    monkeypatch.setattr(selection, "refitted", refitted)
+    monkeypatch.setattr(selection, "refit", refitted)
     monkeypatch.setattr(selection, "_score_along", scanned)
     for loose, again in ((small, False), (large, True), (None, True)):
         made.clear()
@@ -793,7 +793,7 @@ def test_where_no_way_to_the_likeliest_cause_is_found_no_others_are_tried(
         wished.extend(machine.effect[-1].label for machine, _, _ in wishes)
         return [stage if yes else None for yes, _ in zip(told, wishes, strict=False)]
 
-    monkeypatch.setattr(selection, "refits", refits)
+    monkeypatch.setattr(selection, "refit_all", refits)
     monkeypatch.setattr(selection, "_is_plausible", lambda name, of: True)
     monkeypatch.setattr(selection, "_fell_to_zero", lambda name, of: False)
     selection._fit_candidates(stage, likely, run_in_turn, lambda k: None)
@@ -805,7 +805,7 @@ def test_what_a_fit_leads_to_zero_is_no_way_to_a_cause(straight: Model, monkeypa
     stage = calm(straight)
     likely = [s for s in selection.score_effects(stage, run_in_turn) if s.values["A"] != 0][:1]
     (name,) = (s.candidate.name for s in likely)
-    monkeypatch.setattr(selection, "refits", lambda wishes, *given: [stage])
+    monkeypatch.setattr(selection, "refit_all", lambda wishes, *given: [stage])
     monkeypatch.setattr(selection, "_is_plausible", lambda name, of: True)
     for zero in (True, False):
         monkeypatch.setattr(selection, "_fell_to_zero", lambda name, of, zero=zero: zero)
@@ -849,13 +849,13 @@ def test_stretches_are_withheld_from_fits_that_are_near_enough(
 def test_candidates_are_scored_once_along_a_fit(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Along another one anew, however alike."""
     stage, scans = calm(straight), list[gauss_newton.Fit]()
-    true = selection.score_test.scan
+    true = selection.score_test.score_candidates
 
     def noted(along: Any, fit: gauss_newton.Fit, *asked: Any) -> Any:
         scans.append(fit)
         return true(along, fit, *asked)
 
-    monkeypatch.setattr(selection.score_test, "scan", noted)
+    monkeypatch.setattr(selection.score_test, "score_candidates", noted)
     first = selection.score_effects(stage, run_in_turn)
     assert selection.score_effects(stage, run_in_turn) is first
     other = replace(stage, fit=replace(stage.fit, cost=2 * stage.fit.cost))
@@ -886,7 +886,7 @@ def test_forces_hide_which_of_two_is_right(
             cost = noise * (1 + excess[names.index(x.model.effects[0].name)])
             yield replace(x, fit=replace(x.fit, cost=cost, process_noise=0.0))
 
-    monkeypatch.setattr(selection, "freed", freed)
+    monkeypatch.setattr(selection, "drop_process_noise", freed)
     choice = selection._make_choice(tries, 3000.0, 100, run_in_turn)
     assert choice.name == tries[chosen][0].candidate.name
     assert choice.stage.exact
@@ -1077,7 +1077,7 @@ def test_what_foretells_nothing_is_no_name(percent: float, straight: Model, monk
         assert before.squares.shape == after.squares.shape
         return SimpleNamespace(percent=percent)
 
-    monkeypatch.setattr(diagnosis.gains, "gain", measured)
+    monkeypatch.setattr(diagnosis.gains, "hold_out_gain", measured)
     left = [x.name for x in diagnosis.drop_unneeded(clean, chosen)]
     assert left == (names if percent > 0 else names[1:])
     assert min(seen) > 0

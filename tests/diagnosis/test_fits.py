@@ -545,7 +545,7 @@ def test_beside_a_cause_only_that_is_fitted_whose_beginning_tells_that_it_comes_
     stage = stages.fit_machine(straight.machine, [one], straight.machine.filter)
     lengths, _ = fits(monkeypatch)
     monkeypatch.setattr(screening, "MIN_BEGINNING_S", 5.0)
-    monkeypatch.setattr(screening, "FAR", np.inf)
+    monkeypatch.setattr(screening, "LOST_COST_RATIO", np.inf)
     right = placing.with_effects(straight.machine, slope(straight))
     wrong = placing.with_effects(
         straight.machine, placing.parse_effect("torque_gain@front_roll=0.1", straight.machine, 40.0)
@@ -721,7 +721,7 @@ def iterated(
             return fit
         raise gauss_newton.NotConvergedError("no fit", fit, 50.0)
 
-    monkeypatch.setattr(screening, "iterated", fit_of)
+    monkeypatch.setattr(screening, "iterate", fit_of)
     return asked
 
 
@@ -733,12 +733,12 @@ def test_smaller_forces_are_tried_where_the_model_is_near(
     far = stages.fit_machine(straight.machine, [one], straight.machine.filter)
     assert (far.data.noise_inflation, far.estimated) == (10.0, False)
     far = replace(far, process_noise_fit=None)
-    for name in ("_lessened", "freed"):
+    for name in ("_reduce_noise_while_close", "drop_process_noise"):
         true = getattr(stages, name)
         monkeypatch.setattr(stages, name, lambda *asked, name=name, true=true: (tried.append(name), true(*asked))[1])
     # So far off every fit is near, then none, then none is worth anything.
     for strong, most, expected, settled in (
-        (1e3, 1e3, ["_lessened", "freed"], True),
+        (1e3, 1e3, ["_reduce_noise_while_close", "drop_process_noise"], True),
         (0.1, 1e3, [], True),
         (0.1, 0.5, [], False),
     ):
@@ -760,7 +760,7 @@ def test_what_begins_anew_beside_exact_dynamics_must_take_a_good_part_of_the_mis
         asked.append(worth)
         return [None for _ in machines]
 
-    monkeypatch.setattr("excite.diagnosis.selection.begun", begin)
+    monkeypatch.setattr("excite.diagnosis.selection.fit_screened", begin)
     far = replace(stage, fit=replace(stage.fit, cost=2 * stage.expected_cost))
     for of in (far, replace(far, estimated=False), replace(far, fit=replace(far.fit, process_noise=0.1))):
         assert selection.choose_unlikely(of, of, (), run_in_turn) == (of, [])
@@ -851,13 +851,13 @@ def test_who_gains_too_little_with_coarse_sensors_is_given_up(
 ) -> None:
     """From the first candidate on; the right one isn't."""
     stage = stages.fit_machine(straight.machine, [log.read_log(sloping, straight.machine)], straight.machine.filter)
-    true, bars = selection.refits, list[float]()
+    true, bars = selection.refit_all, list[float]()
 
     def noted(wishes: Any, together: Any, most: float) -> Any:
         bars.append(most)
         return true(wishes, together, most)
 
-    monkeypatch.setattr(selection, "refits", noted)
+    monkeypatch.setattr(selection, "refit_all", noted)
     found = selection.choose_with_inflated_noise(stage, run_in_turn)
     assert found is not None
     assert [x.name for x in found[1]] == ["ground_slope@machine"]

@@ -161,16 +161,16 @@ def large(name):
     (pathlib.Path({folder!r}) / name).write_text(f"{{os.getpid()}}\\n")
     return bytes(10_000_000)
 
-parallel.cores = lambda: 3
+parallel.usable_cores = lambda: 3
 {also}
-answers = parallel.forked([int, partial(large, "second"), partial(large, "third")])
+answers = parallel.run_forked([int, partial(large, "second"), partial(large, "third")])
 next(answers)
 signal.pause()
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
-@pytest.mark.parametrize("also", ["", "parallel._end_with = lambda parent: None"], ids=["signal", "pipe"])
+@pytest.mark.parametrize("also", ["", "parallel._end_with_parent = lambda parent: None"], ids=["signal", "pipe"])
 def test_nothing_is_left_running_behind_a_parent_that_is_killed(tmp_path: Path, also: str) -> None:
     script = STALLED.format(folder=str(tmp_path), also=also)
     with subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parents[2]) as parent:

@@ -1,0 +1,137 @@
+"""Small inputs that failed once, with the right behaviour (../shared/cases); skipped where they are not there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.files import SHARED
+
+import excite
+from excite.errors import LogError
+from excite.logs import inspect, prepare, read_table
+from excite.model import Model
+
+CASES = SHARED.parent / "cases"
+
+# file: (rate [Hz], stretches, words of a note)
+READ: dict[str, tuple[float, int, str]] = {
+    "T1_rate/rate1008.csv": (100.8, 1, ""),
+    "T1_rate/rate995.csv": (99.5, 1, ""),
+    "T2_jitter/j1_jitter2ms.csv": (100, 1, "rows are 6 to 14 ms apart"),
+    "T2_jitter/j2_walk.csv": (100, 1, "rows are 9 to 11 ms apart"),
+    "T3_iso_whole_seconds/iso_py.csv": (100, 1, ""),
+    "T4_text_times/sec_suffix.csv": (100, 1, ""),
+    "T4_text_times/pandas_timedelta.csv": (100, 1, ""),
+    "T4_text_times/tod_colon_ms.csv": (100, 1, ""),
+    "T5_coarse_clock/coarse_clock.csv": (100, 1, "the clock ticks every 0.0156 s"),
+    "T5_coarse_clock/j11_tenths.csv": (100, 1, "the clock ticks every 0.1 s"),
+    "T5_coarse_clock/j6_twice.csv": (100, 1, "every row is there twice"),
+    "T6_no_time_hint/date_and_time.csv": (100, 1, ""),
+    "T6_no_time_hint/index.parquet": (100, 1, ""),
+    "T6_no_time_hint/dtindex.parquet": (100, 1, ""),
+    "T6_no_time_hint/j8_own_times.csv": (100, 1, "channels with times of their own"),
+    "T8_restart/dst.csv": (100, 1, "the clock is set back an hour"),
+    "T8_restart/tod_midnight.csv": (100, 1, "time of day passes midnight"),
+    "T8_restart/w_concat.csv": (100, 2, "time begins anew in row 6002"),
+    "T9_nanoseconds/timedelta.parquet": (100, 1, ""),
+    "F1_commented_header/savetxt.csv": (100, 1, "the header was taken from a comment"),
+    "F2_whitespace/spaces.txt": (100, 1, ""),
+    "F2_whitespace/aligned.txt": (100, 1, ""),
+    "F3_nul_tail/nul_tail.csv": (100, 1, "ends in 4096 zero bytes"),
+    "F5_mat_extra/plus_gains.mat": (100, 1, "variables of another length are not used: gear"),
+    "F7_merged_nan/j7_merged_nan.csv": (100, 1, "channels with times of their own"),
+    "F7_merged_nan/j5_dropped1pct.csv": (100, 1, "rows are lost in"),
+    "L1_check_says_usable/j1b_jitter1ms.csv": (100, 1, "rows are 8 to 12 ms apart"),
+    "R2_held_channel/j9_torque_held5.csv": (100, 1, "changes in every fifth row only"),
+}
+
+
+def case(name: str) -> Path:
+    path = CASES / name
+    if not path.is_file():
+        pytest.skip(f"the shared cases are not here ({path})")
+    return path
+
+
+@pytest.mark.parametrize("name", READ)
+def test_log_is_read_at_its_own_times(name: str, va12: Model) -> None:
+    rate, stretches, words = READ[name]
+    ready = prepare(va12, [case(name)])
+    assert float(ready.model.machine.sampling_hz) == pytest.approx(rate, rel=1e-3)
+    assert len(ready.logs) == stretches
+    assert all(np.isfinite(v).all() for one in ready.logs for v in one.values.values())
+    assert words in " ".join(ready.notes)
+    assert inspect(read_table(case(name)), va12.machine).faults == () or "T6" in name
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("T6_no_time_hint/notime.csv", "no column t_s"),
+        ("T9_nanoseconds/epoch_ns.csv", "is it in ns"),
+        ("R1_encoder_reset/e_reset_theta1.csv", "row 3001, column theta1_rad: jumps by 1.5 rad in one sample"),
+        ("R1_encoder_reset/e_reset_theta2.csv", "row 3001, column theta2_rad: jumps by 0.176 rad in one sample"),
+        ("R1_encoder_reset/e_slip_count_wheel.csv", "row 3001, column thetal_rad: jumps by"),
+    ],
+)
+def test_log_is_refused_with_advice(name: str, words: str, va12: Model) -> None:
+    with pytest.raises(LogError) as refused:
+        prepare(va12, [case(name)])
+    assert words in str(refused.value)
+    assert "--method joint" not in str(refused.value)
+
+
+def test_a_held_channel_is_a_doubt(va12: Model) -> None:
+    found = inspect(read_table(case("R2_held_channel/j9_imu_held5.csv")), va12.machine)
+    assert any("yaw_rate_rad_s: changes in every fifth row only" in line for line in found.doubts)
+
+
+@pytest.mark.parametrize(
+    ("name", "inside", "worst"),
+    [
+        ("T1_rate/rate1008.csv", 21, 1.0),
+        ("T2_jitter/j2_walk.csv", 20, 3.5),
+        pytest.param("T1_rate/rate995.csv", 20, 1.5, marks=pytest.mark.slow),
+        pytest.param("T2_jitter/j1_jitter2ms.csv", 20, 3.5, marks=pytest.mark.slow),
+        pytest.param("R2_held_channel/j9_imu_held5.csv", 20, 1.0, marks=pytest.mark.slow),
+        pytest.param("R2_held_channel/j9_torque_held5.csv", 20, 5.0, marks=pytest.mark.slow),
+    ],
+)
+def test_intervals_hold_at_the_logs_own_times(name: str, inside: int, worst: float, va12: Model) -> None:
+    estimate = excite.identify(va12, case(name))
+    low, high = estimate.interval95
+    assert ((low <= va12.nominal) & (va12.nominal <= high)).sum() >= inside
+    assert (100 * np.abs(estimate.value - va12.nominal) / va12.scale).max() < worst
+
+
+def test_emps_follows_its_clock(emps: Model) -> None:
+    """Times x 0.992: the mass is 93.59 kg; every fifth row +- 1: within half a per cent of the even rows."""
+    fast = excite.identify(emps, case("T1_rate/emps_rate.csv"))
+    np.testing.assert_allclose(fast.value[:3], [93.5915, 201.898, 20.3907], rtol=1e-4)
+    folder = case("T2_jitter/emps200.toml").parent
+    uneven, even = (
+        excite.identify(folder / "emps200.toml", folder / f) for f in ("emps200_jit1.csv", "emps200_even.csv")
+    )
+    assert uneven.value[0] == pytest.approx(even.value[0], rel=5e-3)
+
+
+@pytest.mark.slow
+def test_standing_still_makes_nothing_less_sure(va12: Model) -> None:
+    """30 s of rest before and after a drive: deviations as without, nothing withheld."""
+    drive = Path(__file__).parents[2] / "results" / "R60_accuracy" / "design"
+    alone = excite.identify(va12, excite.simulate(va12, drive, seed=3))
+    rests = excite.identify(va12, excite.simulate(va12, case("S1_standstill/still30_profile.csv"), seed=3))
+    np.testing.assert_allclose(rests.std, alone.std, rtol=0.1)
+    assert any("the machine stands still for" in note for note in rests.notes)
+
+
+@pytest.mark.slow
+def test_a_kilohertz_is_reduced(va12: Model) -> None:
+    folder = case("H1_1khz/va12_1k.toml").parent
+    log = excite.simulate(folder / "va12_1k.toml", folder / "profile1k_u.csv", seed=3)
+    estimate = excite.identify(folder / "va12_1k.toml", log)
+    low, high = estimate.interval95
+    assert ((low <= va12.nominal) & (va12.nominal <= high)).sum() >= 20
+    assert any("is faster than the machine: reduced to 142.9 Hz" in note for note in estimate.notes)
