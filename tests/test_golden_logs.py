@@ -35,12 +35,14 @@ def test_golden_log(name: str) -> None:
     assert (np.abs(estimate.value - value) / std).max() < 1e-3
     np.testing.assert_allclose(estimate.std, std, rtol=1e-3)
     assert estimate.cond_phi == pytest.approx(want["cond_phi"], rel=1e-4)
-    account = excite.diagnose("va12_straight", log)
-    found = account.diagnosis.findings
-    assert account.diagnosis.verdict == want["verdict"]
+    assessment = excite.diagnose("va12_straight", log)
+    found = assessment.diagnosis.findings
+    assert assessment.diagnosis.verdict == want["verdict"]
     assert [[f.effect, f.where] for f in found] == [f[:2] for f in want["findings"]]
-    for finding, gain, (_, _, amount, amount_std, percent) in zip(found, account.single, want["findings"], strict=True):
-        assert finding.amount == pytest.approx(amount, abs=0.01 * amount_std)
-        assert finding.amount_std == pytest.approx(amount_std, rel=0.01)
+    for finding, gain, (_, _, amount, amount_std, percent) in zip(
+        found, assessment.gains, want["findings"], strict=True
+    ):
+        assert finding.magnitude == pytest.approx(amount, abs=0.01 * amount_std)
+        assert finding.magnitude_std == pytest.approx(amount_std, rel=0.01)
         assert gain is not None
         assert gain.percent == pytest.approx(percent, abs=0.5)

@@ -183,7 +183,7 @@ def extend_model(
 
 
 def _cannot_explain(before: ExtendedFit, chosen: Sequence[Choice], scores: Sequence[Score]) -> bool:
-    """Tell if even the best further effects could not explain enough, and the last one chosen does not hold by itself."""
+    """Tell if no further effects could explain enough, and the last one chosen does not hold by itself."""
     if not (chosen and chosen[-1].stage.exact):
         return False
     stage = chosen[-1].stage
