@@ -33,19 +33,13 @@ from excite.model import Model, effects
 from excite.model.machine import EffectEntry, Filter
 from excite.smoothing import NotConvergedError
 
-MAX_EFFECTS = 4  # effects that are looked for; so many kinds, none of which explains MOSTLY, patch up what has no name
-MAIN_CAUSE_SHARE = 0.7  # of the misfit
-FORMULA_STD_FACTOR = 0.5  # of an amount, times the root of the share of a gain that its formula leaves to others
-# Of an amount: what another formula of the same effect makes of it. ALIKE is what it does in the middle; nine in ten of
-# the amounts in results/diagnosis are within intervals that allow for so much.
-FORMULA_STD_SHARE = 0.05
-# Of the excess misfit that names must explain, or it is unexplained: what nature has beside its formula looks like many
-# a cause. Right names of results/diagnosis explain 0.85 and more, a slope that liquid in a tank was taken for 0.83.
-MIN_EXPLAINED_SHARE = 0.85
-MIN_GAIN_SHARE_OF_NEXT = (
-    0.1  # of what another effect promises beside a name, that the name must gain where it needs disturbing forces
-)
-MIN_COST_PER_ANOMALY = 50.0  # misfit that every line of what is odd beside names stands for, at least
+MAX_EFFECTS = 4  # number of effects; so many kinds without a main cause are a patchwork; chosen
+MAIN_CAUSE_SHARE = 0.7  # share of the misfit that a main cause explains; chosen
+MIN_EXPLAINED_SHARE = 0.85  # of the excess misfit, for a name; right causes in results/diagnosis explain 0.85 or more
+MIN_GAIN_SHARE_OF_NEXT = 0.1  # share of the next effect's score that an effect with process noise must gain; chosen
+MIN_COST_PER_ANOMALY = 50.0  # cost that an anomaly counts at least; chosen
+FORMULA_STD_FACTOR = 0.5  # of a magnitude, times the root of the share of its gain left to other effects; chosen
+FORMULA_STD_SHARE = 0.05  # of a magnitude, for other formulas; calibrated: covers nine in ten in results/diagnosis
 
 
 @dataclass(frozen=True)
@@ -128,17 +122,17 @@ def diagnose(
     first = before = fit_machine(model.machine, logs, filter, runner)
     chosen = list[Choice]()
     if before.data.noise_inflation > 1:
-        report(0.15, "fitting effects with coarse sensors")
+        report(0.15, "fitting effects with inflated sensor noise")
         sharp = selection.choose_with_inflated_noise(before, runner)
         before, chosen = sharp or (fit_with_process_noise(before, runner), chosen)
     tried: Container[str] = ()
     if not (before.estimated or chosen):
-        report(0.15, "fitting effects from the beginning")
+        report(0.15, "fitting effects from initial trajectories")
         before, chosen, tried = selection.choose_from_start(before, runner)
     chosen, next_ratio = extend_model(before, chosen, runner, report)
     chosen, anomalies, nearest = drop_weak_effects(before, chosen, next_ratio)
-    if not (chosen or (before.exact and before.is_close)):  # a fit with coarse sensors has forces, too
-        report(0.85, "fitting less likely effects from the beginning")
+    if not (chosen or (before.exact and before.is_close)):  # a fit with inflated sensor noise has process noise, too
+        report(0.85, "fitting less likely effects")
         old = before if before.data.noise_inflation == 1 else fit_with_process_noise(before, runner)
         before, anew = selection.choose_unlikely(first, old, tried if old is first else (), runner)
         if anew or before is not old:
@@ -147,7 +141,7 @@ def diagnose(
         chosen, anomalies, closer = drop_weak_effects(before, anew, next_ratio)
         nearest = closer or nearest
     if len(chosen) > 1:
-        report(0.9, "judging each given the others")
+        report(0.9, "testing each effect given the others")
         chosen, anomalies, nearest = drop_weak_effects(
             before, drop_unneeded(before, review_effects(before, chosen, runner)), next_ratio
         )
@@ -226,7 +220,7 @@ def drop_weak_effects(
             )
             >= MIN_EXPLAINED_SHARE
         ):
-            # Exact dynamics make a large misfit of a formula that is nearly right; it was judged with forces.
+            # A nearly right formula leaves a large misfit of exact dynamics; the effect was judged with process noise.
             kept[-1], anomalies = replace(kept[-1], stage=process_noise_fit), anomalies_with_noise
             break
         nearest = NearestEffect(kept.pop().name, explained, impossible)
@@ -234,9 +228,7 @@ def drop_weak_effects(
 
 
 def _largest_of_patchwork(chosen: Sequence[Choice], anomalies: Sequence[str]) -> NearestEffect | None:
-    """Return the effect with the largest gain if MAX_EFFECTS kinds are a patchwork without a main cause; otherwise
-    None.
-    """
+    """Return the effect with the largest gain if MAX_EFFECTS kinds lack a main cause; otherwise None."""
     if len({x.name.split("@")[0] for x in chosen}) < MAX_EFFECTS:
         return None
     most, gained = max(chosen, key=lambda x: x.likelihood_ratio), sum(x.likelihood_ratio for x in chosen)
@@ -256,7 +248,7 @@ def review_effects(before: ExtendedFit, chosen: Sequence[Choice], runner: CallRu
         try:
             stage = _refit_without(first.name, whole)
         except NotConvergedError:
-            queue = [*rest, replace(first, stage=whole, process_noise_fit=None)]  # nothing fits without it
+            queue = [*rest, replace(first, stage=whole, process_noise_fit=None)]  # there is no fit without it
             continue
         choice = selection.choose_effect(
             stage, selection.score_effects(stage, runner), rest, runner, lambda share, what: None, 0.0
@@ -272,7 +264,7 @@ def review_effects(before: ExtendedFit, chosen: Sequence[Choice], runner: CallRu
     if same or worse or whole.fit.process_noise > found.fit.process_noise:
         judged = judged if same else {x.name: x for x in chosen}
         return [replace(x, rivals=_remaining_rivals(judged[x.name], judged)) for x in chosen]
-    # The one that came last comes last again.
+    # Restore the order: each was moved to the end once, the last one not.
     again = _refit_one_by_one(before, (*queue[1:], queue[0]), whole)
     return [replace(x, rivals=_remaining_rivals(x, judged)) for x in again] if again else list(chosen)
 
@@ -298,9 +290,7 @@ def _refit_one_by_one(before: ExtendedFit, chosen: Sequence[Choice], whole: Exte
 
 
 def _refit_backwards(chosen: Sequence[Choice], whole: ExtendedFit) -> list[Choice]:
-    """Remove a model's effects one after the other, if without any it tracks only with inflated noise; empty if a fit
-    fails.
-    """
+    """Remove a model's effects one after the other, if it has no fit without any; empty if a fit fails."""
     made = [whole]
     try:
         for x in reversed(chosen[1:]):
@@ -318,11 +308,11 @@ def drop_unneeded(before: ExtendedFit, chosen: Sequence[Choice]) -> list[Choice]
     """
     kept, whole = list(chosen), chosen[-1].stage
     for x in chosen:
-        # Of one that is nothing at infinity the amount's deviation says little.
+        # The standard deviation of a magnitude that vanishes at infinity says little.
         doubtful = whole.exact and whole.placed(x.name).effect.inverse
         if len(kept) == 1 or (_is_significant(x.name, whole) and not doubtful):
             continue
-        beside = np.inf  # nothing fits without it
+        beside = np.inf  # there is no fit without it
         with suppress(NotConvergedError):
             without = _refit_without(x.name, whole)
             if without.fit.process_noise <= whole.fit.process_noise:
@@ -351,8 +341,9 @@ def _is_significant(name: str, stage: ExtendedFit) -> bool:
 
 
 def _replaces_earlier(choice: Choice, chosen: Sequence[Choice]) -> bool:
-    """Tell if a choice makes an earlier effect insignificant that explained more: several effects for what one
-    explains.
+    """Tell if a choice makes an earlier effect insignificant that explained more.
+
+    It is then part of another explanation, which takes several effects for what one explains.
     """
     return any(
         choice.likelihood_ratio < x.likelihood_ratio and not _is_significant(x.name, choice.stage) for x in chosen
@@ -481,7 +472,7 @@ def _make_finding(
         for s, shape in placed.shapes.items()
     }
     if amount < 0 and (circular := [s for s, shape in placed.shapes.items() if shape.circular]):
-        # The same half a turn on.
+        # A negative magnitude is a positive one half a turn on.
         amount = -amount
         for s in circular:
             shapes[s] = (opposite_phase(shapes[s][0]), *shapes[s][1:])

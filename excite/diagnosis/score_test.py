@@ -387,8 +387,8 @@ def score_candidates(
     ends = np.cumsum([len(x.columns) for x in found])
     middle = int(np.searchsorted(ends, ends[-1] / 2)) if len(found) and ends[-1] > MIN_COLUMNS_TO_SPLIT else 0
     parts = [part for part in (found[:middle], found[middle:]) if part]
-    is_shown = runner([partial(_score_values, along, fit, renumber_columns(part)) for part in parts])
-    every = zip(found, (x for part in is_shown for x in part), strict=True)
+    answers = runner([partial(_score_values, along, fit, renumber_columns(part)) for part in parts])
+    every = zip(found, (x for part in answers for x in part), strict=True)
     scores = [Score(x, *values) for x, values in every if values is not None]
     return tuple(sorted(scores, key=lambda s: -s.likelihood_ratio))
 
@@ -426,8 +426,8 @@ def _score(x: Candidate, S: np.ndarray, g: np.ndarray, own: np.ndarray) -> Score
     # Leave out a sine or cosine without effect, such as a slope across a straight lane.
     shown = size > MIN_PHASE_SHARE * size.max()
     at = [k for k, is_shown in zip(x.columns, shown, strict=True) if is_shown]
-    left = float(np.min(np.diag(S)[at] / np.diag(own)[at]))
-    if not left > MIN_UNABSORBED_SHARE:
+    unabsorbed = float(np.min(np.diag(S)[at] / np.diag(own)[at]))
+    if not unabsorbed > MIN_UNABSORBED_SHARE:
         return None
     step = np.zeros(len(shown))
     step[shown] = -np.linalg.solve(S[np.ix_(at, at)] + 1e-9 * np.diag(np.diag(own)[at]), g[at])
@@ -441,5 +441,5 @@ def _score(x: Candidate, S: np.ndarray, g: np.ndarray, own: np.ndarray) -> Score
     # If negative magnitudes are tried, a step back from a positive one belongs to those.
     is_forward = effect.positive or min(effect.grid) < 0
     if is_forward and step[0] <= 0 and len(shown) == 1:
-        return 0.0, values, left
-    return float(-step[shown] @ g[at]), values, left
+        return 0.0, values, unabsorbed
+    return float(-step[shown] @ g[at]), values, unabsorbed

@@ -40,72 +40,51 @@ from excite.model.effects import Effect, PlacedEffect
 from excite.model.machine import EffectEntry, Quantity
 from excite.smoothing import NotConvergedError
 
-# Of twice the log-likelihood that an effect must gain; logs without any stayed below 16. Chi-squared gives 2.1 % of
-# logs of a minute above what `threshold` makes of it, 2.7 % of longer ones, at most: summed over the 371 and 441
-# candidates of va12 as if these had nothing in common, with all their shapes.
-MIN_LIKELIHOOD_RATIO = 22.0
-MAX_P_VALUE = 0.05  # p-value above which no effect has a name: those with many shapes must gain more than LEVEL
-MIN_SCORE = 15.0  # a first-order gain below which a candidate isn't fitted
-MIN_SCORE_SHARE = (
-    0.4,
-    0.15,
-)  # share of the best first-order gain below which a candidate isn't fitted: weak misfit, strong misfit
-MAX_CANDIDATES = 5  # candidates that are fitted, beside further variants of the likeliest names
-VARIANT_SCORE_SHARE = 0.7  # share of a name's best first-order gain from which another variant of it is fitted as well
-PLAIN_VARIANT_SCORE_SHARE = (
-    0.5  # the same for the variant without unusual shapes, which the others may mimic before a fit
-)
-MAX_RESTARTS = 12  # effects that begin anew where nothing was found
-# Candidates that are fitted before any is compared with another, or with forces so large that they take up part of any
-# cause.
-FIRST_BATCH = 2
-CANDIDATE_PROGRESS_SHARE = (
-    0.5  # share of what must be gained, or was already, that candidates must have come to after a few passes
-)
-MAX_RATIO_OVER_SCORE = 2.5  # by which what a candidate gains may exceed its first-order gain
-TIE_LIKELIHOOD_RATIO = 10.0  # a rival that is worse by less than this is a tie
-# Of what is explained already, that a further effect must gain, as nature is never exactly the formula: by the fits'
-# gains, and by how many deviations the amounts are from none; the more where parameters absorb most of an effect, as
-# they absorb none of its formula's error; for what acts at some time only; where forces hide how good the formula is;
-# beside what a map of the ground tells, as of a gain two maps of one ground leave each other up to 1.3 %.
-SHAPE = 0.005, 0.002
-MAX_ABSORBED_FORMULA_SHARE, MIN_GAIN_SHARE_TIMED, MIN_GAIN_SHARE_WITH_NOISE, MIN_GAIN_SHARE_MAPPED = (
-    0.1,
-    0.1,
-    0.25,
-    0.02,
-)
-LARGE_EXCESS_RATIO = (
-    0.1  # misfit beside noise, over what noise makes, of which one further effect takes away all only as a cause
-)
-FORMULA_MAGNITUDE_ERROR = (
-    0.03  # of an amount: what two formulas of one effect differ by; those of results/diagnosis do by 1 to 6 %
-)
-MAX_FORMULA_RATIO = 250.0  # a gain that by the latter no effect can be denied, nor counted as a rival
-REFINEMENT_REACHES = (
-    1.0,
-    0.35,
-)  # way to the grid's next points within which the best candidates are tried again, in turn
-INSTANT_ACCURACY_S = 0.5  # [s] about which instants are known before a fit, which finds them from near only
-MIN_EXCESS_SHARE = (
-    0.05,
-    0.15,
-)  # of the excess misfit that an effect must explain to be worth a place: weak misfit, strong misfit
-# The same of the first effect beside exact dynamics or large forces, as the largest of three explains so much, and of a
-# further one where the model isn't near the logs yet: what takes less leads to no name, one patch after another.
-MIN_EXCESS_SHARE_OF_FIRST = 0.3
-MIN_SHARE_FOR_PROCESS_NOISE = (
-    0.7  # of the excess misfit beside coarse sensors, from which a fit with sharp ones is worth disturbing forces
-)
-TIE_GAIN_SHARE_WITH_NOISE = (
-    0.02  # of what is gained with disturbing forces, by which a rival is a tie: they take up part of a difference
-)
-TIE_EXCESS_SHARE = 0.3  # of what the best name leaves unexplained, by which a rival may be worse and still is a tie
-MIN_MAGNITUDE_STDS = (
-    0.3  # deviations above zero, below which a fit ends where the logs would like an amount best below zero
-)
-SMALLEST_VALUE = 1e-12  # what a machine file can't hold is nothing
-ProgressCallback = Callable[[float, str], None]  # told the share that is done and what is done next
+# Significance. Logs without any effect stay below a likelihood ratio of 16. By chi-squared and Bonferroni, at most
+# 2.1 % of logs of a minute exceed the required ratio (371 candidates of va12 with all shapes), 2.7 % of longer (441).
+MIN_LIKELIHOOD_RATIO = 22.0  # calibrated on logs without effects
+MAX_P_VALUE = 0.05  # of an effect, which for many shapes requires more than MIN_LIKELIHOOD_RATIO; chosen
+
+# Candidates that are fitted. Pairs of numbers hold for exact dynamics close to the logs, and otherwise.
+MIN_SCORE = 15.0  # first-order likelihood ratio; chosen
+MIN_SCORE_SHARE = 0.4, 0.15  # share of the best score; chosen
+MAX_CANDIDATES = 5  # number of candidates, beside further variants of the likeliest names; chosen
+VARIANT_SCORE_SHARE = 0.7  # share of the best score of its name at which a variant is fitted, too; chosen
+PLAIN_VARIANT_SCORE_SHARE = 0.5  # the same for the variant without signed shapes, which others may mimic; chosen
+MAX_RESTARTS = 12  # candidates that are fitted from initial trajectories if nothing was found; chosen
+FIRST_BATCH = 2  # candidates that are fitted before others are compared with them; chosen
+CANDIDATE_PROGRESS_SHARE = 0.5  # share of the required or best gain that a fit must reach in a few passes; chosen
+MAX_RATIO_OVER_SCORE = 2.5  # largest likelihood ratio of a fit over the candidate's score; chosen
+REFINEMENT_REACHES = 1.0, 0.35  # shares of the way to the next trial values, refined in turn; chosen
+TIME_TRIAL_SHARE = 12  # duration over the distance of refined trial instants: a grid of quarters, in thirds
+INSTANT_ACCURACY_S = 0.5  # [s] to which instants are refined, as fits find them only from nearby; chosen
+
+# Effects that are worth a place: share of the excess cost that they must explain.
+MIN_EXCESS_SHARE = 0.05, 0.15  # for exact dynamics close to the logs, and otherwise; chosen
+MIN_EXCESS_SHARE_OF_FIRST = 0.3  # of the first effect, or far from the logs: the largest of three; chosen
+MIN_SHARE_FOR_PROCESS_NOISE = 0.7  # with inflated sensor noise, to try process noise with the true one; chosen
+LARGE_EXCESS_RATIO = 0.1  # excess over expected cost that no error of a formula removes entirely; chosen
+
+# Nature is never exactly the formula. Share of the gain of the effects chosen that a further effect must exceed.
+MIN_GAIN_SHARE = 0.005  # of likelihood ratios; chosen
+MIN_WALD_SHARE = 0.002  # of Wald's statistics; chosen
+MAX_FORMULA_RATIO = 250.0  # likelihood ratio that Wald's statistics can require at most; chosen
+FORMULA_MAGNITUDE_ERROR = 0.03  # relative difference of an effect's formulas: 1 to 6 % in results/diagnosis
+MAX_ABSORBED_FORMULA_SHARE = 0.1  # limit where parameters absorb the effect but not its formula's error; chosen
+MIN_GAIN_SHARE_TIMED = 0.1  # for effects that act at some time only; chosen
+MIN_GAIN_SHARE_WITH_NOISE = 0.25  # if process noise hides how good the formulas are; chosen
+MIN_GAIN_SHARE_MAPPED = 0.02  # beside effects on a map of the ground; two maps of one ground differ by up to 1.3 %
+
+# Ties: by how much a rival may be worse.
+TIE_LIKELIHOOD_RATIO = 10.0  # likelihood ratio; chosen
+TIE_EXCESS_SHARE = 0.3  # share of the excess cost that the best effect leaves; chosen
+TIE_GAIN_SHARE_WITH_NOISE = 0.02  # share of the gain with process noise, which absorbs differences; chosen
+
+MIN_MAGNITUDE_STDS = 0.3  # standard deviations from zero below which a positive magnitude fell to zero; chosen
+MAX_SIGNATURE_STEP = 2.0  # factor on a trial magnitude up to which its signature holds; chosen
+MIN_SIGNATURE_STEP = 0.3  # the same downwards; chosen
+SMALLEST_VALUE = 1e-12  # magnitude or shape in a machine file below which it is zero; rounding
+ProgressCallback = Callable[[float, str], None]  # called with the share done and the next step
 _Trial = tuple[score_test.Score, ExtendedFit]
 
 
@@ -138,10 +117,12 @@ def wald_statistic(name: str, stage: ExtendedFit) -> float:
     parameters.
     """
     shapes, names, fit = stage.placed(name).effect.shapes, stage.model.base.names, stage.fit
-    told = [name, *(f"{name}.{s}" for s, shape in shapes.items() if shape.signed and not shape.circular)]
-    at = [k for k in (names.index(n) for n in told if n in names) if not fit.unidentifiable[k]]
-    away = fit.X[at] / fit.std[at]
-    return float(away @ np.linalg.solve(fit.covariance[np.ix_(at, at)] / np.outer(fit.std[at], fit.std[at]), away))
+    parameters = [name, *(f"{name}.{s}" for s, shape in shapes.items() if shape.signed and not shape.circular)]
+    at = [k for k in (names.index(n) for n in parameters if n in names) if not fit.unidentifiable[k]]
+    distance = fit.X[at] / fit.std[at]
+    return float(
+        distance @ np.linalg.solve(fit.covariance[np.ix_(at, at)] / np.outer(fit.std[at], fit.std[at]), distance)
+    )
 
 
 def degrees_of_freedom(name: str, stage: ExtendedFit) -> int:
@@ -149,9 +130,11 @@ def degrees_of_freedom(name: str, stage: ExtendedFit) -> int:
     return sum(n == name or n.startswith(f"{name}.") for n in stage.model.base.names)
 
 
-def required_likelihood_ratio(name: str, stage: ExtendedFit, tried: int) -> float:
+def required_likelihood_ratio(name: str, stage: ExtendedFit, n_candidates: int) -> float:
     """Return the likelihood ratio from which an effect is significant, given the number of candidates (Bonferroni)."""
-    return max(MIN_LIKELIHOOD_RATIO, float(scipy.stats.chi2.isf(MAX_P_VALUE / tried, degrees_of_freedom(name, stage))))
+    return max(
+        MIN_LIKELIHOOD_RATIO, float(scipy.stats.chi2.isf(MAX_P_VALUE / n_candidates, degrees_of_freedom(name, stage)))
+    )
 
 
 def _total_wald_statistic(stage: ExtendedFit) -> float:
@@ -202,13 +185,13 @@ def _duration(logs: Sequence[Log]) -> float:
 def _start_entry(score: score_test.Score) -> EffectEntry:
     """Return a candidate as an entry of the machine file, from which a fit starts."""
     e, values = score.candidate.placed, dict(score.values)
-    amount = values.pop("A")
+    magnitude = values.pop("A")
     if len(e.effect.grid) > 1:
-        # Not proportional to the amount: no further from the grid's value than the signature holds.
-        step = float(np.clip(amount / e.values["A"], 0.3, 2.0))
-        amount = e.values["A"] / step if e.effect.inverse else e.values["A"] * step
+        # The signature is not proportional to the magnitude: stay where it holds.
+        step = float(np.clip(magnitude / e.values["A"], MIN_SIGNATURE_STEP, MAX_SIGNATURE_STEP))
+        magnitude = e.values["A"] / step if e.effect.inverse else e.values["A"] * step
     return identified_entry(
-        e.effect.name, e.where, amount, {n: round(v, 12) for n, v in values.items() if n in e.shapes}
+        e.effect.name, e.where, magnitude, {n: round(v, 12) for n, v in values.items() if n in e.shapes}
     )
 
 
@@ -216,11 +199,10 @@ def fitted_entry(stage: ExtendedFit, name: str) -> EffectEntry:
     """Return an effect as an entry of the machine file, with magnitude and shapes of a fit."""
     placed = stage.placed(name)
     values = _fitted_values(stage, placed)
-    amount = values.pop("A")
-    amount = (
-        max(amount, 2 * SMALLEST_VALUE) if placed.effect.positive else amount
-    )  # zero is none that a machine may have
-    return identified_entry(placed.effect.name, placed.where, amount, values)
+    magnitude = values.pop("A")
+    if placed.effect.positive:  # a machine file must not have zero here
+        magnitude = max(magnitude, 2 * SMALLEST_VALUE)
+    return identified_entry(placed.effect.name, placed.where, magnitude, values)
 
 
 def _fitted_values(stage: ExtendedFit, placed: PlacedEffect) -> dict[str, float]:
@@ -229,14 +211,14 @@ def _fitted_values(stage: ExtendedFit, placed: PlacedEffect) -> dict[str, float]
     return {key: float(fitted.get(p, placed.values[key])) for p, (key, _) in placed.parameters.items()}
 
 
-def identified_entry(effect: str, where: str, amount: float, shapes: Mapping[str, float]) -> EffectEntry:
+def identified_entry(effect: str, where: str, magnitude: float, shapes: Mapping[str, float]) -> EffectEntry:
     """Return an effect with identified magnitude and shapes as an entry of the machine file."""
 
-    def told(value: float) -> Quantity:
+    def quantity(value: float) -> Quantity:
         return Quantity(value=value if abs(value) > SMALLEST_VALUE else 0.0, source="identified")
 
     return EffectEntry(
-        name=effect, where=where, amount=told(amount), shape={name: told(x) for name, x in shapes.items()}
+        name=effect, where=where, amount=quantity(magnitude), shape={name: quantity(x) for name, x in shapes.items()}
     )
 
 
@@ -248,18 +230,22 @@ def _shortlist(
     There are MAX_CANDIDATES, and further variants of the likeliest FIRST_BATCH names.
     """
     best: dict[tuple[str, ...], score_test.Score] = {}
-    most: dict[str, float] = {}
-    hope = max(MIN_SCORE, MIN_SCORE_SHARE[stage.first_order_is_rough] * scores[0].likelihood_ratio) if scores else 0.0
+    best_of_name: dict[str, float] = {}
+    min_score = (
+        max(MIN_SCORE, MIN_SCORE_SHARE[stage.first_order_is_rough] * scores[0].likelihood_ratio) if scores else 0.0
+    )
     for s in scores:
-        whole = _has_large_excess(stage) and MAX_RATIO_OVER_SCORE * s.likelihood_ratio >= stage.excess_cost
-        least = (
+        explains_all = _has_large_excess(stage) and MAX_RATIO_OVER_SCORE * s.likelihood_ratio >= stage.excess_cost
+        required = (
             _required_gain(stage, chosen, s.candidate, 0.0) / MAX_RATIO_OVER_SCORE
-            if stage.estimated and not whole
+            if stage.estimated and not explains_all
             else 0.0
         )
-        worth = s.likelihood_ratio >= max(least, hope) and s.values["A"] != 0
-        like = VARIANT_SCORE_SHARE if len(s.candidate.variant) > 1 else PLAIN_VARIANT_SCORE_SHARE
-        if worth and s.likelihood_ratio >= like * most.setdefault(s.candidate.name, s.likelihood_ratio):
+        is_worth_a_fit = s.likelihood_ratio >= max(required, min_score) and s.values["A"] != 0
+        share = VARIANT_SCORE_SHARE if len(s.candidate.variant) > 1 else PLAIN_VARIANT_SCORE_SHARE
+        if is_worth_a_fit and s.likelihood_ratio >= share * best_of_name.setdefault(
+            s.candidate.name, s.likelihood_ratio
+        ):
             best.setdefault(s.candidate.variant, s)
     shortlist = list(best.values())
     first = _unique_names(shortlist)[:FIRST_BATCH]
@@ -272,9 +258,9 @@ def _refined_shortlist(
     """Return the candidates that are worth a fit, refined between trial values."""
     shortlist, duration = _shortlist(stage, scores, chosen), _duration(stage.data.logs)
     for reach in (*REFINEMENT_REACHES, *_reaches_in_time(duration)) if shortlist else ():
-        about = [s for s in shortlist if reach in REFINEMENT_REACHES or s.candidate.placed.effect.timed]
-        nearby = score_test.refine_candidates(about, stage.machine, duration, reach)
-        if len(nearby) > len(about):
+        refinable = [s for s in shortlist if reach in REFINEMENT_REACHES or s.candidate.placed.effect.timed]
+        nearby = score_test.refine_candidates(refinable, stage.machine, duration, reach)
+        if len(nearby) > len(refinable):
             shortlist = _shortlist(
                 stage,
                 sorted([*shortlist, *_score_along(stage, nearby, runner)], key=lambda s: -s.likelihood_ratio),
@@ -286,7 +272,7 @@ def _refined_shortlist(
 def _reaches_in_time(duration: float) -> list[float]:
     """Return further reaches of refinement until instants are known, for a log of a duration [s]."""
     found = [REFINEMENT_REACHES[-1]]
-    while found[-1] * duration / 12 > INSTANT_ACCURACY_S:  # of a grid as wide as a quarter of the log, thirds are tried
+    while found[-1] * duration / TIME_TRIAL_SHARE > INSTANT_ACCURACY_S:
         found.append(found[-1] * REFINEMENT_REACHES[-1])
     return found[1:]
 
@@ -304,17 +290,17 @@ def choose_effect(
     if not shortlist:
         return None
 
-    def told(k: int) -> None:
+    def report_fit(k: int) -> None:
         report(done + 0.03 * min(k, MAX_CANDIDATES), f"fitting {shortlist[k].candidate.name}")
 
-    ceiling = np.inf
+    cost_limit = np.inf
     if _noise_hides_misfit(stage):
-        ceiling = stage.fit.cost - CANDIDATE_PROGRESS_SHARE * min(
+        cost_limit = stage.fit.cost - CANDIDATE_PROGRESS_SHARE * min(
             _required_gain(stage, chosen, s.candidate, 0.0) for s in shortlist
         )
-    trials, refused = _fit_candidates(stage, shortlist, runner, told, ceiling)
-    if stage.exact and _likeliest_not_found(shortlist, trials, refused):
-        # Exact dynamics find no way to the likeliest cause: all are judged with disturbing forces instead.
+    trials, implausible = _fit_candidates(stage, shortlist, runner, report_fit, cost_limit)
+    if stage.exact and _likeliest_not_found(shortlist, trials, implausible):
+        # Exact dynamics give no fit of the likeliest cause: judge all with process noise.
         known = chosen[-1].process_noise_fit if chosen else None
         if known is not None and known.machine is stage.machine and known.fit.process_noise == MIN_PROCESS_NOISE:
             stage = known
@@ -333,45 +319,50 @@ def choose_effect(
     score, best = trials[0]
     gain = stage.fit.cost - best.fit.cost
     level = required_likelihood_ratio(score.candidate.name, best, len(scores))
-    whole = _explains_rest(best, stage)
-    if gain < max(level * best.dispersion, 0.0 if whole else _required_gain(stage, chosen, score.candidate, 0.0)):
+    explains_all = _explains_rest(best, stage)
+    if gain < max(
+        level * best.dispersion, 0.0 if explains_all else _required_gain(stage, chosen, score.candidate, 0.0)
+    ):
         return None
-    hidden = not whole and gain < _required_gain(stage, chosen, score.candidate)
-    if hidden and not best.is_close:
+    is_weak = not explains_all and gain < _required_gain(stage, chosen, score.candidate)
+    if is_weak and not best.is_close:
         return None
     choice = _make_choice(trials, gain, len(scores), runner)
-    if not hidden:
+    if not is_weak:
         return choice
     return replace(choice, process_noise_fit=None) if choice.stage.exact and choice.stage.is_close else None
 
 
-def _make_choice(trials: Sequence[_Trial], gain: float, tried: int, runner: CallRunner) -> Choice:
+def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runner: CallRunner) -> Choice:
     """Choose the best trial, without process noise if possible, and its ties as rivals.
 
     Trials that tie only with process noise are rivals, too. A trial that makes parameters impossible gives way to one
     that does not.
     """
-    dispersion, forced = trials[0][1].dispersion, {s.candidate.name: stage for s, stage in trials if not stage.exact}
-    close = _tied_trials(trials, gain)
-    exact, unknown = _trials_without_noise(close, runner)
+    dispersion, with_noise = (
+        trials[0][1].dispersion,
+        {s.candidate.name: stage for s, stage in trials if not stage.exact},
+    )
+    ties = _tied_trials(trials, gain)
+    exact, unknown = _trials_without_noise(ties, runner)
     lowest = trials[0][1].fit.cost
-    if forced and exact and not exact[0][1].is_close:
-        # Forces hid that it doesn't explain the logs. One that explained a little less under them may do.
-        left = [x for x in trials if x[0].candidate.name not in {s.candidate.name for s, _ in close}]
+    if with_noise and exact and not exact[0][1].is_close:
+        # Process noise hid that the best does not explain the logs: try those that were a little worse with it.
+        left = [x for x in trials if x[0].candidate.name not in {s.candidate.name for s, _ in ties}]
         others, _ = _trials_without_noise(
             [x for x in left if x[1].fit.cost - lowest <= (1 - VARIANT_SCORE_SHARE) * gain], runner
         )
         exact = sorted([*exact, *others], key=lambda x: x[1].fit.cost)
-    judged = [*_tied_trials(exact, gain, SHAPE[0] if forced else SHAPE[1]), *unknown] if exact else close
+    judged = [*_tied_trials(exact, gain, MIN_GAIN_SHARE if with_noise else MIN_WALD_SHARE), *unknown] if exact else ties
     if judged[0][1].is_dead_end:
         judged = [x for x in judged if x[1].exact and x[1].is_close and not x[1].impossible] or judged
     score, best = judged[0]
     rivals = tuple(fitted_entry(other, s.candidate.name) for s, other in judged[1:])
-    process_noise_fit = forced.get(score.candidate.name) if best.exact else None
+    process_noise_fit = with_noise.get(score.candidate.name) if best.exact else None
     behind = next(x.fit.cost for s, x in trials if s.candidate.name == score.candidate.name) - lowest
-    gain -= min(behind, (1 - VARIANT_SCORE_SHARE) * gain)  # what is close may be further behind where much is left
+    gain -= min(behind, (1 - VARIANT_SCORE_SHARE) * gain)  # a tie may be further behind if much is left
     return Choice(
-        score.candidate.name, best, gain, dispersion, tried, rivals, score.unabsorbed_share, process_noise_fit
+        score.candidate.name, best, gain, dispersion, n_candidates, rivals, score.unabsorbed_share, process_noise_fit
     )
 
 
@@ -384,47 +375,51 @@ def choose_with_inflated_noise(stage: ExtendedFit, runner: CallRunner) -> tuple[
     choices: none if the model needs no effect after all. Return None if nothing tracks the logs.
     """
     begun_without = resume_with_true_sensor_noise([stage], 0.0, runner)
-    scores, least = score_effects(stage, runner), MIN_EXCESS_SHARE[1] * stage.excess_cost
+    scores, required = score_effects(stage, runner), MIN_EXCESS_SHARE[1] * stage.excess_cost
     plain = next(begun_without)
     if plain is not None and plain.is_close:
         return plain, []
     shortlist = _refined_shortlist(stage, scores, (), runner)
     trials, _ = _fit_candidates(
-        stage, shortlist, runner, lambda k: None, stage.fit.cost - CANDIDATE_PROGRESS_SHARE * least
+        stage, shortlist, runner, lambda k: None, stage.fit.cost - CANDIDATE_PROGRESS_SHARE * required
     )
     if not trials:
         return None
     _, best = trials[0]
     gain = stage.fit.cost - best.fit.cost
-    if gain < max(MIN_LIKELIHOOD_RATIO * best.dispersion, least):
+    if gain < max(MIN_LIKELIHOOD_RATIO * best.dispersion, required):
         return None
-    alike = [x for x in trials if stage.fit.cost - x[1].fit.cost >= VARIANT_SCORE_SHARE * gain]
-    follow: list[_Trial] = []
+    is_comparable = [x for x in trials if stage.fit.cost - x[1].fit.cost >= VARIANT_SCORE_SHARE * gain]
+    tracking: list[_Trial] = []
     for process_noise in (
         (0.0, identification.PROCESS_NOISE_LEVELS[0])
         if gain >= MIN_SHARE_FOR_PROCESS_NOISE * (gain + best.excess_cost)
         else (0.0,)
     ):
-        sharp = zip(alike, resume_with_true_sensor_noise([x for _, x in alike], process_noise, runner), strict=True)
+        sharp = zip(
+            is_comparable,
+            resume_with_true_sensor_noise([x for _, x in is_comparable], process_noise, runner),
+            strict=True,
+        )
         found = [(score, x) for (score, _), x in sharp if x is not None and x.tracks_logs]
         found = [(score, x) for score, x in found if not _fell_to_zero(score.candidate.name, x)]
-        follow = follow or found
+        tracking = tracking or found
         if near := _best_variants([x for x in found if x[1].is_close]):
-            follow = near
+            tracking = near
             break
-    if not follow:
+    if not tracking:
         both = _choose_pair(stage, trials[0], len(scores), runner)
         return (stage, both) if both else None
-    follow = _best_variants(follow)
-    score, best = follow[0]
-    sure = _ratio_with_true_noise(score.candidate.name, best, gain, stage, plain)
-    if sure < MIN_LIKELIHOOD_RATIO * best.dispersion:
+    tracking = _best_variants(tracking)
+    score, best = tracking[0]
+    ratio = _ratio_with_true_noise(score.candidate.name, best, gain, stage, plain)
+    if ratio < MIN_LIKELIHOOD_RATIO * best.dispersion:
         return None
-    return stage, [_make_choice(follow, sure, len(scores), runner)]
+    return stage, [_make_choice(tracking, ratio, len(scores), runner)]
 
 
 def _ratio_with_true_noise(
-    name: str, best: ExtendedFit, gain: float, coarse: ExtendedFit, plain: ExtendedFit | None
+    name: str, best: ExtendedFit, gain: float, inflated: ExtendedFit, plain: ExtendedFit | None
 ) -> float:
     """Estimate the likelihood ratio with the true sensor noise, from the one with inflated noise.
 
@@ -432,44 +427,44 @@ def _ratio_with_true_noise(
     the cost would be that of the plain fit, or if there is none, larger by the inflation, as far as a fit is not given
     up.
     """
-    times = coarse.data.noise_inflation
+    inflation = inflated.data.noise_inflation
     without = (
-        min(times**2 * gain, LOST_COST_RATIO * best.expected_cost - best.fit.cost)
+        min(inflation**2 * gain, LOST_COST_RATIO * best.expected_cost - best.fit.cost)
         if plain is None
         else plain.fit.cost - best.fit.cost
     )
-    return min(wald_statistic(name, best), max(times * gain, without))
+    return min(wald_statistic(name, best), max(inflation * gain, without))
 
 
-def _choose_pair(stage: ExtendedFit, first: _Trial, tried: int, runner: CallRunner) -> list[Choice]:
+def _choose_pair(stage: ExtendedFit, first: _Trial, n_candidates: int, runner: CallRunner) -> list[Choice]:
     """Choose two effects that together let exact dynamics come close to the logs; empty if there are none.
 
     The first is the best with inflated noise, and must explain a good part of the excess.
     """
-    score, beside = first
-    if stage.fit.cost - beside.fit.cost < MIN_EXCESS_SHARE_OF_FIRST * stage.excess_cost:
+    score, first_fit = first
+    if stage.fit.cost - first_fit.fit.cost < MIN_EXCESS_SHARE_OF_FIRST * stage.excess_cost:
         return []
-    scores, most = score_effects(beside, runner), TRACKING_COST_RATIO * beside.expected_cost
-    shortlist = _refined_shortlist(beside, scores, (), runner)
+    scores, cost_limit = score_effects(first_fit, runner), TRACKING_COST_RATIO * first_fit.expected_cost
+    shortlist = _refined_shortlist(first_fit, scores, (), runner)
     if not shortlist:
         return []
-    trials, _ = _fit_candidates(beside, shortlist, runner, lambda k: None, most)
-    trials = [x for x in trials if x[1].fit.cost <= most]
+    trials, _ = _fit_candidates(first_fit, shortlist, runner, lambda k: None, cost_limit)
+    trials = [x for x in trials if x[1].fit.cost <= cost_limit]
     every = zip(trials, resume_with_true_sensor_noise([x for _, x in trials], 0.0, runner), strict=True)
-    found = [(s, coarse, x) for (s, coarse), x in every if x is not None and x.is_close]
+    found = [(s, inflated, x) for (s, inflated), x in every if x is not None and x.is_close]
     found = [x for x in found if not any(_fell_to_zero(e.candidate.name, x[2]) for e in (score, x[0]))]
     if not found:
         return []
-    second, coarse, best = min(found, key=lambda x: x[2].fit.cost)
-    sure = (
-        _ratio_with_true_noise(score.candidate.name, best, stage.fit.cost - beside.fit.cost, stage, None),
-        _ratio_with_true_noise(second.candidate.name, best, beside.fit.cost - coarse.fit.cost, stage, None),
+    second, inflated, best = min(found, key=lambda x: x[2].fit.cost)
+    ratio = (
+        _ratio_with_true_noise(score.candidate.name, best, stage.fit.cost - first_fit.fit.cost, stage, None),
+        _ratio_with_true_noise(second.candidate.name, best, first_fit.fit.cost - inflated.fit.cost, stage, None),
     )
-    if min(sure) < MIN_LIKELIHOOD_RATIO * best.dispersion:
+    if min(ratio) < MIN_LIKELIHOOD_RATIO * best.dispersion:
         return []
     return [
-        Choice(score.candidate.name, beside, sure[0], best.dispersion, tried, (), score.unabsorbed_share),
-        _make_choice(_best_variants([(s, x) for s, _, x in found]), sure[1], len(scores), runner),
+        Choice(score.candidate.name, first_fit, ratio[0], best.dispersion, n_candidates, (), score.unabsorbed_share),
+        _make_choice(_best_variants([(s, x) for s, _, x in found]), ratio[1], len(scores), runner),
     ]
 
 
@@ -489,24 +484,23 @@ def choose_from_start(stage: ExtendedFit, runner: CallRunner) -> tuple[ExtendedF
 def choose_unlikely(
     scanned: ExtendedFit, stage: ExtendedFit, tried: Container[str], runner: CallRunner
 ) -> tuple[ExtendedFit, list[Choice]]:
-    """Choose an effect by fits with exact dynamics from initial trajectories, whatever its score, if nothing explains
-    the logs.
+    """Choose an effect by exact fits from initial trajectories, whatever its score, if nothing explains the logs.
 
     Far from any fit the scores say little, and exact dynamics track the logs with the right effect only. scanned: the
     fit that gives the scores. tried: names that were tried already. Return the fit without the effect, and the choices.
     """
     scores = score_effects(scanned, runner)
     best = {s.candidate.name: s for s in reversed(scores) if s.likelihood_ratio > 0 and s.values["A"] != 0}
-    most = sorted(best.values(), key=lambda s: -s.likelihood_ratio)[:MAX_RESTARTS]
-    most = [s for s in most if s.candidate.name not in tried]
-    return _choose_screened(stage, most, (0.0,), len(scores), runner) or (stage, [])
+    likeliest = sorted(best.values(), key=lambda s: -s.likelihood_ratio)[:MAX_RESTARTS]
+    likeliest = [s for s in likeliest if s.candidate.name not in tried]
+    return _choose_screened(stage, likeliest, (0.0,), len(scores), runner) or (stage, [])
 
 
 def _choose_screened(
     stage: ExtendedFit,
     shortlist: Sequence[score_test.Score],
     noise_levels: Sequence[float],
-    tried: int,
+    n_candidates: int,
     runner: CallRunner,
 ) -> tuple[ExtendedFit, list[Choice]] | None:
     """Choose an effect by fits from initial trajectories, with the first level of process noise that gives one.
@@ -514,32 +508,32 @@ def _choose_screened(
     If exact dynamics were fitted without an effect, it must explain MIN_EXCESS_SHARE_OF_FIRST.
     """
     machines = [effects.with_effects(stage.machine, _start_entry(s)) for s in shortlist]
-    worth = (
+    is_worth_a_fit = (
         stage.fit.cost - MIN_EXCESS_SHARE_OF_FIRST * stage.excess_cost if stage.estimated and stage.exact else np.inf
     )
     for process_noise in noise_levels if shortlist else ():
-        few = process_noise > identification.PROCESS_NOISE_LEVELS[0]
-        names = _unique_names(shortlist)[: FIRST_BATCH if few else None]
-        begin = [(s, m) for s, m in zip(shortlist, machines, strict=True) if s.candidate.name in names]
-        enough = partial(_is_close_and_effective, [s.candidate.name for s, _ in begin])
-        found = fit_screened([m for _, m in begin], stage, process_noise, runner, worth, enough)
-        follow = [(s, x) for (s, _), x in zip(begin, found, strict=True) if x is not None and x.tracks_logs]
-        follow = [(s, x) for s, x in follow if _is_effective(s.candidate.name, x)]
-        if not follow:
+        is_large_noise = process_noise > identification.PROCESS_NOISE_LEVELS[0]
+        names = _unique_names(shortlist)[: FIRST_BATCH if is_large_noise else None]
+        started = [(s, m) for s, m in zip(shortlist, machines, strict=True) if s.candidate.name in names]
+        enough = partial(_is_close_and_effective, [s.candidate.name for s, _ in started])
+        found = fit_screened([m for _, m in started], stage, process_noise, runner, is_worth_a_fit, enough)
+        tracking = [(s, x) for (s, _), x in zip(started, found, strict=True) if x is not None and x.tracks_logs]
+        tracking = [(s, x) for s, x in tracking if _is_effective(s.candidate.name, x)]
+        if not tracking:
             continue
-        trials = _best_variants([x for x in follow if x[1].is_close] or follow)
+        trials = _best_variants([x for x in tracking if x[1].is_close] or tracking)
         score, best = trials[0]
         comparable = stage.estimated and stage.fit.process_noise == best.fit.process_noise
         without, best = refit_and_drop_noise(stage.machine, best, runner)
         trials = [(score, best), *(x for x in trials[1:] if x[1].fit.process_noise == best.fit.process_noise)]
         if without is not None:
             stage = stage if comparable and stage.fit.cost < without.fit.cost else without
-        # Wald's statistic is of the same kind, and smaller where much is gained.
-        alike = without is not None or comparable
-        gain = stage.fit.cost - best.fit.cost if alike else wald_statistic(score.candidate.name, best)
+        # Wald's statistic is comparable, and smaller if the gain is large.
+        is_comparable = without is not None or comparable
+        gain = stage.fit.cost - best.fit.cost if is_comparable else wald_statistic(score.candidate.name, best)
         if gain < MIN_LIKELIHOOD_RATIO * best.dispersion:
             return exact_if_close(stage), []
-        return stage, [_make_choice(trials, gain, tried, runner)]
+        return stage, [_make_choice(trials, gain, n_candidates, runner)]
     return None
 
 
@@ -552,13 +546,15 @@ def _required_gain(
     stage: ExtendedFit,
     chosen: Sequence[Choice],
     candidate: score_test.Candidate,
-    hidden: float = MIN_GAIN_SHARE_WITH_NOISE,
+    share_with_noise: float = MIN_GAIN_SHARE_WITH_NOISE,
 ) -> float:
     """Return the likelihood ratio that makes an effect worth a place beside those chosen.
 
     share_with_noise: share of their gains that is required if process noise hides errors of their formulas.
     """
-    part = max(SHAPE[0], MIN_GAIN_SHARE_TIMED * candidate.placed.effect.timed, hidden * (not stage.exact))
+    part = max(
+        MIN_GAIN_SHARE, MIN_GAIN_SHARE_TIMED * candidate.placed.effect.timed, share_with_noise * (not stage.exact)
+    )
     mapped = {e.name for e in stage.model.effects if e.uses_map}
     own = (
         max(
@@ -570,7 +566,9 @@ def _required_gain(
     shape = sum(max(part, share) * x.likelihood_ratio for share, x in zip(own, chosen, strict=True))
     main = not stage.is_close if chosen else _noise_hides_misfit(stage)
     explained = MIN_EXCESS_SHARE_OF_FIRST if main else MIN_EXCESS_SHARE[stage.first_order_is_rough]
-    return max(explained * stage.excess_cost, shape, min(SHAPE[1] * _total_wald_statistic(stage), MAX_FORMULA_RATIO))
+    return max(
+        explained * stage.excess_cost, shape, min(MIN_WALD_SHARE * _total_wald_statistic(stage), MAX_FORMULA_RATIO)
+    )
 
 
 def _noise_hides_misfit(stage: ExtendedFit) -> bool:
@@ -579,8 +577,9 @@ def _noise_hides_misfit(stage: ExtendedFit) -> bool:
 
 
 def _explains_rest(found: ExtendedFit, before: ExtendedFit) -> bool:
-    """Tell if exact dynamics leave nothing with an effect and much without: no error of another formula is removed
-    entirely.
+    """Tell if exact dynamics leave nothing with an effect and much without.
+
+    No effect removes the error of another one's formula entirely.
     """
     return _has_large_excess(before) and found.exact and found.excess_cost == 0
 
@@ -595,46 +594,49 @@ def _fit_candidates(
     shortlist: Sequence[score_test.Score],
     runner: CallRunner,
     report: Callable[[int], None],
-    ceiling: float = np.inf,
+    cost_limit: float = np.inf,
 ) -> tuple[list[_Trial], set[str]]:
-    """Fit candidates with the model's process noise, and return the best variant of each name and the implausible
-    names.
+    """Fit candidates with the model's process noise.
 
     The likeliest FIRST_BATCH are fitted first, the others as long as they do not stay far behind. Those with much lower
     scores come last, and only if they may still come near. A magnitude that falls to zero counts as no fit.
     cost_limit: cost above which every fit is given up.
+
+    Return the best variant of each name, and the names that were fitted but are implausible.
     """
-    trials, refused = list[_Trial](), set[str]()
-    near = max(
+    trials, implausible = list[_Trial](), set[str]()
+    n_promising = max(
         FIRST_BATCH, sum(MAX_RATIO_OVER_SCORE * s.likelihood_ratio >= shortlist[0].likelihood_ratio for s in shortlist)
     )
     for at, batch in (
         (0, shortlist[:FIRST_BATCH]),
-        (FIRST_BATCH, shortlist[FIRST_BATCH:near]),
-        (near, shortlist[near:]),
+        (FIRST_BATCH, shortlist[FIRST_BATCH:n_promising]),
+        (n_promising, shortlist[n_promising:]),
     ):
         gained = max((stage.fit.cost - found.fit.cost for _, found in trials), default=0.0)
-        if not batch or (at >= near and gained > MAX_RATIO_OVER_SCORE * batch[0].likelihood_ratio):
+        if not batch or (at >= n_promising and gained > MAX_RATIO_OVER_SCORE * batch[0].likelihood_ratio):
             continue
-        wishes = [(effects.with_effects(stage.machine, _start_entry(s)), stage, stage.fit.process_noise) for s in batch]
+        requests = [
+            (effects.with_effects(stage.machine, _start_entry(s)), stage, stage.fit.process_noise) for s in batch
+        ]
         report(at)
-        most = min(ceiling, stage.fit.cost - CANDIDATE_PROGRESS_SHARE * gained if trials else np.inf)
-        for k, (score, found) in enumerate(zip(batch, refit_all(wishes, runner, most), strict=True)):
+        batch_limit = min(cost_limit, stage.fit.cost - CANDIDATE_PROGRESS_SHARE * gained if trials else np.inf)
+        for k, (score, found) in enumerate(zip(batch, refit_all(requests, runner, batch_limit), strict=True)):
             report(min(at + k + 1, len(shortlist) - 1))
             if found is None or _fell_to_zero(score.candidate.name, found):
                 continue
             if _is_plausible(score.candidate.name, found):
                 trials.append((score, found))
             else:
-                refused.add(score.candidate.name)
+                implausible.add(score.candidate.name)
         others = shortlist[at + len(batch) :]
         if (
             stage.exact
-            and _likeliest_not_found(shortlist, trials, refused)
+            and _likeliest_not_found(shortlist, trials, implausible)
             and shortlist[0].candidate.name not in _unique_names(others)
         ):
             break
-    return _best_variants(trials), refused
+    return _best_variants(trials), implausible
 
 
 def _unique_names(scores: Sequence[score_test.Score]) -> list[str]:
@@ -643,16 +645,17 @@ def _unique_names(scores: Sequence[score_test.Score]) -> list[str]:
 
 
 def _likeliest_not_found(
-    shortlist: Sequence[score_test.Score], trials: Sequence[_Trial], refused: Container[str]
+    shortlist: Sequence[score_test.Score], trials: Sequence[_Trial], implausible: Container[str]
 ) -> bool:
     """Tell if no fit of the likeliest candidate was found."""
     name = shortlist[0].candidate.name
-    return name not in refused and all(s.candidate.name != name for s, _ in trials)
+    return name not in implausible and all(s.candidate.name != name for s, _ in trials)
 
 
 def _is_plausible(name: str, stage: ExtendedFit) -> bool:
-    """Tell if an effect's fitted shapes are possible, and if it shakes a torque sensor, that one log shows it or none
-    can.
+    """Tell if an effect's fitted shapes are possible.
+
+    If it shakes a torque sensor, one of the logs must show that, or none can.
     """
     placed = stage.placed(name)
     fitted = replace(placed, values={**placed.values, **_fitted_values(stage, placed)})
@@ -660,12 +663,12 @@ def _is_plausible(name: str, stage: ExtendedFit) -> bool:
         return False
     if fitted.effect.shaking is None:
         return True
-    of = (s for s in stage.machine.sensors("full") if s.kind == "torque" and s.body == fitted.bodies[0])
-    sensor, rate = next(of, None), float(stage.machine.sampling_hz)
+    sensors = (s for s in stage.machine.sensors("full") if s.kind == "torque" and s.body == fitted.bodies[0])
+    sensor, rate = next(sensors, None), float(stage.machine.sampling_hz)
     if sensor is None:
         return True
-    told = [is_shaking(x.values[sensor.name], fitted.shaking(x.t), rate) for x in stage.data.logs]
-    return any(told) or all(x is None for x in told)
+    shaking = [is_shaking(x.values[sensor.name], fitted.shaking(x.t), rate) for x in stage.data.logs]
+    return any(shaking) or all(x is None for x in shaking)
 
 
 def _fell_to_zero(name: str, stage: ExtendedFit) -> bool:
@@ -699,12 +702,12 @@ def _tied_trials(trials: Sequence[_Trial], gain: float, share: float | None = No
     errors take.
     """
     score, best = trials[0]
-    share = share or (SHAPE[1] if best.exact else TIE_GAIN_SHARE_WITH_NOISE)
-    near = max(TIE_LIKELIHOOD_RATIO * best.dispersion, TIE_EXCESS_SHARE * best.excess_cost, share * gain)
+    share = share or (MIN_WALD_SHARE if best.exact else TIE_GAIN_SHARE_WITH_NOISE)
+    margin = max(TIE_LIKELIHOOD_RATIO * best.dispersion, TIE_EXCESS_SHARE * best.excess_cost, share * gain)
     if best.exact and not score.candidate.placed.effect.inverse:
-        # What forces let it gain is less than what it gains without them.
-        near = max(near, min(SHAPE[1] * wald_statistic(score.candidate.name, best), MAX_FORMULA_RATIO))
-    return [x for x in trials if x[1].fit.cost - best.fit.cost < near]
+        # With process noise it gains less than without.
+        margin = max(margin, min(MIN_WALD_SHARE * wald_statistic(score.candidate.name, best), MAX_FORMULA_RATIO))
+    return [x for x in trials if x[1].fit.cost - best.fit.cost < margin]
 
 
 def _trials_without_noise(trials: Sequence[_Trial], runner: CallRunner) -> tuple[list[_Trial], list[_Trial]]:
