@@ -60,10 +60,8 @@ def read_log(path: str | Path, machine: Machine, needs: Sequence[str] = ()) -> L
 
 def table_of(path: str | Path, machine: Machine) -> pd.DataFrame:
     """The columns of a log as they are; MDF files give the machine's time column its name. Raises LogError."""
-    table = tables.read_table(path)
-    wanted = {machine.time_column, *(c for s in machine.sensor for c in s.columns)}
-    missing = {c.strip().lower(): c for c in wanted if c not in table.columns}
-    table = table.rename(columns={c: missing[k] for c in table.columns if (k := str(c).strip().lower()) in missing})
+    wanted = [machine.time_column, *(c for s in machine.sensor for c in s.columns)]
+    table = tables.with_names(tables.read_table(path, wanted), wanted)
     if MDF_TIME in table.columns and machine.time_column not in table.columns:
         one = UNITS[machine.time_unit][1]
         table.insert(0, machine.time_column, table[MDF_TIME] / one)

@@ -187,7 +187,8 @@ def test_columns_may_be_counted(tmp_path: Path) -> None:
         ("log.csv", b"PK\x03\x04\x00\x00\xff\x00\x00", "not a text file"),
         ("log.parquet", b"hello", "not a Parquet file"),
         ("log.mat", b"hello", "not a MATLAB file"),
-        ("log.xlsx", b"hello", "unknown kind of file '.xlsx', allowed: .csv"),
+        ("log.xls", b"hello", "unknown kind of file '.xls', allowed: .csv"),
+        ("log.xlsx", b"hello", "not an Excel file"),
     ],
 )
 def test_what_is_no_table_is_one_clear_line(name: str, content: bytes, words: str, tmp_path: Path) -> None:

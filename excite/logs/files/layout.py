@@ -1,0 +1,119 @@
+"""Where the table begins in rows of cells: header, units and other names below it, lines above that are no part."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+
+from excite.model.machine import UNITS
+
+COMMA = re.compile(r"\s*[+-]?(?:\d*|\d{1,3}(?:\.\d{3})+),\d+(?:[eE][+-]?\d+)?\s*")  # perhaps with points: 1.238,5
+UNIT_WORDS = ("unit", "units", "einheit", "einheiten")  # what stands before a line of units
+BRACKETED = re.compile(r"(.*?\S)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]")  # theta1 [deg]
+LONGEST_UNIT = 12  # characters; what is longer is a name; chosen
+ALIKE = 5  # rows below the first one of data that are looked at as well; chosen
+
+
+@dataclass
+class Layout:
+    """Rows (from 0) of the header and of the first data, names of the columns, and what else the header says.
+
+    units: by column; other: further names of columns -> the column.
+    """
+
+    header: int
+    start: int
+    names: list[str]
+    units: dict[str, str] = field(default_factory=dict)
+    other: dict[str, str] = field(default_factory=dict)
+
+
+def is_numeric(cell: str) -> bool:
+    """Tell whether a cell begins as a number, a date or a time does."""
+    if _unit(cell) in UNITS:  # 1/min
+        return False
+    return bool(COMMA.fullmatch(cell)) or bool(re.match(r"^\s*[+-]?(\d|\.\d|nan\b|inf\b)", cell, re.IGNORECASE))
+
+
+def is_data(cells: Sequence[str]) -> bool:
+    """Tell whether cells are a row of data: the first that is not blank is a number or a time, and half of all are."""
+    full = [cell for cell in cells if cell.strip()]
+    return bool(full) and is_numeric(full[0]) and 2 * sum(map(is_numeric, full)) >= len(full)
+
+
+def is_words(cells: Sequence[str]) -> bool:
+    """Tell whether cells hold something, and none a number."""
+    return any(cell.strip() for cell in cells) and not any(map(is_numeric, cells))
+
+
+def width(cells: Sequence[str]) -> int:
+    """Number of cells without the blank ones at the end."""
+    n = len(cells)
+    while n and not cells[n - 1].strip():
+        n -= 1
+    return n
+
+
+def search(rows: Sequence[Sequence[str]], comments: Collection[int] = ()) -> Layout | None:
+    """Find the table in rows of cells by its data: the header is above them, as wide as they are.
+
+    comments: rows (from 0) that are comments, without their mark. None where nothing can be the header.
+    """
+    plain = [k for k in range(len(rows)) if k not in comments and width(rows[k])]
+    start = None
+    for n, k in enumerate(plain):
+        after = [rows[j] for j in plain[n + 1 : n + 1 + ALIKE]]
+        alike = sum(is_data(cells) and abs(len(cells) - len(rows[k])) <= 1 for cells in after)
+        if is_data(rows[k]) and 2 * alike >= len(after):
+            start = k
+            break
+    if start is None:
+        return None
+    first = [rows[k] for k in plain if start <= k][: 1 + ALIKE]
+    most, least = max(map(len, first)), max(map(width, first))
+    above = [k for k in range(start) if is_words(rows[k]) and least <= width(rows[k]) <= most]
+    if not above:
+        return None
+    named = [k for k in above if not _are_units([cell.strip() for cell in rows[k]])] or above
+    unique = [k for k in named if len({cell.strip() for cell in rows[k]}) == len(rows[k])]
+    header = (unique or named)[-1]
+    names = [cell.strip() for cell in rows[header]]
+    units, other = beside_header(
+        names, [rows[k] for k in above if k > header], [rows[k] for k in above if k < header and k not in comments]
+    )
+    return Layout(header, start, names, units, other)
+
+
+def _unit(cell: str) -> str:
+    return cell.strip(" []()")
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    """Tell whether cells are a line of units: one is known, or they stand after the word."""
+    return cells[0].lower().strip(":") in UNIT_WORDS or any(_unit(cell) in UNITS for cell in cells)
+
+
+def beside_header(
+    names: Sequence[str], below: Sequence[Sequence[str]], above: Sequence[Sequence[str]] = ()
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Take units by column, and other names of columns, from lines of words below and above the header."""
+    units: dict[str, str] = {}
+    other: dict[str, str] = {}
+    best = max(below, key=lambda cells: sum(_unit(c) in UNITS for c in cells), default=None)
+    for cells in (*below, *above):
+        texts = [cell.strip() for cell in cells]
+        for name, text in zip(names, texts, strict=False):
+            unit, word = _unit(text), text.lower().strip(":") in UNIT_WORDS
+            if cells is best and unit and not word and (unit in UNITS or len(unit) <= LONGEST_UNIT):
+                units[name] = unit
+            if text and not word and text not in names and texts.count(text) == 1 and unit not in UNITS:
+                other.setdefault(text, name)
+    return units, other
+
+
+def without_units(names: Sequence[str]) -> dict[str, str]:
+    """Names without a unit in brackets -> the column: theta1 -> theta1 [deg]."""
+    bare = [(match.group(1), name) for name in names if (match := BRACKETED.fullmatch(name))]
+    short = [own for own, _ in bare]
+    return {own: name for own, name in bare if own not in names and short.count(own) == 1}

@@ -1,0 +1,67 @@
+"""MDF files (ASAM), versions 3 and 4: bus and bench logs whose groups have times of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from excite.errors import LogError
+from excite.logs.files.common import (
+    TIMESTAMPS,
+    UNITS_SAID,
+    columns_of_array,
+    lacking,
+    merged,
+    refuse_huge,
+    refuse_swollen,
+    unique_name,
+)
+
+
+def read_mdf(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
+    """Read every channel at its own times, time in `timestamps` [s] from the first sample on.
+
+    A cell is NaN where its channel has no sample, or one that the file marks as invalid. Units go to attrs["units"].
+    """
+    try:
+        from asammdf import MDF
+    except ImportError:
+        raise lacking(path, "MDF files need asammdf", "mdf") from None
+    groups: list[tuple[np.ndarray, dict[str, np.ndarray]]] = []
+    units: dict[str, str] = {}
+    taken = {TIMESTAMPS}
+    with MDF(path) as mdf:
+        sizes = [(int(g.channel_group.cycles_nr), getattr(g.channel_group, "samples_byte_nr", 0)) for g in mdf.groups]
+        refuse_swollen(path, sum(rows * int(size or 0) for rows, size in sizes))
+        refuse_huge(path, max((rows for rows, _ in sizes), default=0), 1)
+        for index, group in mdf.virtual_groups.items():
+            entries = [(None, g, c) for g, found in mdf.included_channels(index)[index].items() for c in found]
+            if group.cycles_nr == 0 or not entries:
+                continue
+            refuse_huge(path, int(group.cycles_nr), len(entries))
+            for signal in mdf.select(entries, raw=True, copy_master=False, validate=False):
+                if signal.conversion:
+                    signal.samples = signal.conversion.convert(signal.samples, ignore_value2text_conversions=True)
+                    signal.conversion = None
+                name = unique_name(signal.name, taken)
+                taken.add(name)
+                valid = signal.validate(copy=False)
+                columns = columns_of_array(name, _native(valid.samples))
+                if not columns or not len(valid):
+                    continue
+                groups.append((_native(valid.timestamps).astype(float), columns))
+                if unit := str(signal.unit or "").strip():
+                    units |= dict.fromkeys(columns, unit)
+    if not groups:
+        raise LogError(f"{path}: no channel with numbers")
+    first = min(float(t[0]) for t, _ in groups)
+    table = merged(path, [(t - first, columns) for t, columns in groups])
+    table.attrs[UNITS_SAID] = units
+    return table
+
+
+def _native(values: np.ndarray) -> np.ndarray:
+    """Values in the byte order of this computer."""
+    return values if values.dtype.isnative or values.dtype.names else values.astype(values.dtype.newbyteorder("="))
