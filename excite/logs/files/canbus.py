@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +11,12 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
-from excite.logs.files.common import MOST_CELLS, NOTES, UNITS_SAID, lacking, merged, refuse_huge, said
+from excite.logs.files.common import MOST_BYTES, MOST_CELLS, NOTES, UNITS_SAID, lacking, merged, refuse_huge, said
 
+OBJECT = struct.Struct("<4sHHII")  # signature, bytes of the header, its version, bytes of the object, kind
+CONTAINER = struct.Struct("<H6xL4x")  # method of compression, bytes unpacked
+CONTAINER_KIND = 10
+DEFLATE = 2  # method
 DATABASES = (".dbc", ".kcd", ".sym", ".arxml")
 
 
@@ -22,6 +28,8 @@ def read_can(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     except ImportError:
         raise lacking(path, "CAN logs need python-can and cantools", "can") from None
     database = _database(path, cantools)
+    if path.suffix.lower() == ".blf":
+        _refuse_stuck(path)
     used = {w.rpartition(".")[0].strip().lower() for w in wanted} & {m.name.lower() for m in database.messages}
     known = {m.frame_id: m for m in database.messages if not used or m.name.lower() in used}
     times: dict[tuple[int, Any], list[float]] = {}
@@ -74,6 +82,38 @@ def read_can(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     kept = {name: unit for name, unit in units.items() if name in table.columns}
     table.attrs |= {UNITS_SAID: kept, NOTES: [*table.attrs.get(NOTES, []), *notes]}
     return table
+
+
+def _refuse_stuck(path: Path) -> None:
+    """Raises LogError where an object of a BLF file has no length: python-can would read it for ever."""
+    raw = path.read_bytes()
+    at = int.from_bytes(raw[4:8], "little")
+    rest = b""
+    while at + OBJECT.size <= len(raw):
+        signature, _, _, size, kind = OBJECT.unpack_from(raw, at)
+        if signature != b"LOBJ" or size < OBJECT.size + CONTAINER.size:
+            return  # python-can says so itself
+        if kind == CONTAINER_KIND:
+            method = CONTAINER.unpack_from(raw, at + OBJECT.size)[0]
+            data = raw[at + OBJECT.size + CONTAINER.size : at + size]
+            if method == DEFLATE:
+                try:
+                    data = zlib.decompressobj().decompress(data, MOST_BYTES)
+                except zlib.error:
+                    return
+            data, inner = rest + data, 0
+            while inner + OBJECT.size <= len(data):
+                inner = data.find(b"LOBJ", inner, inner + 8)
+                if inner < 0 or inner + OBJECT.size > len(data):
+                    break
+                length = OBJECT.unpack_from(data, inner)[3]
+                if length < OBJECT.size:
+                    raise LogError(f"{path}: not a CAN log that can be read: an object of {length} bytes")
+                if inner + length > len(data):
+                    break
+                inner += length
+            rest = data[max(inner, 0) :]
+        at += size + size % 4
 
 
 def _database(path: Path, cantools: Any) -> Any:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import re
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -33,17 +35,19 @@ def guarded(reader: Reader, kind: str) -> Reader:
     """Make a reader whose library's errors, whatever they are, become one line of LogError. kind: "an MDF file"."""
 
     def read(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
-        try:
-            with quiet():
+        with quiet():
+            try:
                 return reader(path, wanted)
-        except LogError:
-            raise
-        except MemoryError:
-            raise LogError(f"{path}: needs more memory than there is; is the file damaged?") from None
-        except Exception as err:  # what the parsers of these formats raise on damaged bytes is anything at all
-            if isinstance(err, PermissionError):
-                raise LogError(f"{path}: can't be read: {err.strerror}") from None
-            raise LogError(f"{path}: not {kind} that can be read: {said(err)}") from None
+            except LogError:
+                raise
+            except MemoryError:
+                fault = "needs more memory than there is; is the file damaged?"
+            except PermissionError as err:
+                fault = f"can't be read: {err.strerror}"
+            except Exception as err:  # what the parsers of these formats raise on damaged bytes is anything at all
+                fault = f"not {kind} that can be read: {said(err)}"
+            gc.collect()  # objects of asammdf that failed complain when they are freed
+        raise LogError(f"{path}: {fault}")
 
     return read
 
@@ -57,7 +61,8 @@ def said(err: BaseException) -> str:
 @contextmanager
 def quiet() -> Iterator[None]:
     """Keep what libraries print, log and warn of from the terminal."""
-    before = logging.root.manager.disable
+    before, hook = logging.root.manager.disable, sys.unraisablehook
+    sys.unraisablehook = _ignore
     logging.disable(logging.CRITICAL)
     try:
         with (
@@ -70,6 +75,11 @@ def quiet() -> Iterator[None]:
             yield
     finally:
         logging.disable(before)
+        sys.unraisablehook = hook
+
+
+def _ignore(_: object) -> None:
+    """Say nothing of an error in a destructor."""
 
 
 def lacking(path: Path, what: str, extra: str) -> LogError:

@@ -23,6 +23,7 @@ from excite.logs.files.common import (
     refuse_swollen,
     said,
 )
+from excite.logs.files.matlab5 import refuse_damaged
 
 TIMES = ("time", "t", "timestamps")  # fields that are the time of their struct
 VALUES = ("data", "values")  # fields that are the value of their struct: of a timeseries, of Simulink's signals
@@ -41,6 +42,7 @@ def read_matlab(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
         begin = file.read(MATLAB_HEADER + len(HDF5))
     if HDF5 in (begin[: len(HDF5)], begin[MATLAB_HEADER:]):
         return read_hdf5(path, wanted)
+    refuse_damaged(path)
     try:
         raw = scipy.io.loadmat(path)
     except Exception as err:
