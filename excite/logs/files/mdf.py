@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,6 +19,8 @@ from excite.logs.files.common import (
     refuse_swollen,
     unique_name,
 )
+
+VIRTUAL = (3, 6)  # types of channels that have no bytes
 
 
 def read_mdf(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
@@ -36,6 +39,7 @@ def read_mdf(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
         sizes = [(int(g.channel_group.cycles_nr), getattr(g.channel_group, "samples_byte_nr", 0)) for g in mdf.groups]
         refuse_swollen(path, sum(rows * int(size or 0) for rows, size in sizes))
         refuse_huge(path, max((rows for rows, _ in sizes), default=0), 1)
+        _refuse_outside(path, mdf)
         for index, group in mdf.virtual_groups.items():
             entries = [(None, g, c) for g, found in mdf.included_channels(index)[index].items() for c in found]
             if group.cycles_nr == 0 or not entries:
@@ -60,6 +64,21 @@ def read_mdf(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     table = merged(path, [(t - first, columns) for t, columns in groups])
     table.attrs[UNITS_SAID] = units
     return table
+
+
+def _refuse_outside(path: Path, mdf: Any) -> None:
+    """Raises LogError where a channel lies outside its record: asammdf would read there, and crash."""
+    for group in mdf.groups:
+        record = int(getattr(group.channel_group, "samples_byte_nr", 0) or 0)
+        for channel in group.channels:
+            if getattr(channel, "channel_type", 0) in VIRTUAL and hasattr(channel, "byte_offset"):
+                continue
+            if hasattr(channel, "byte_offset"):  # version 4
+                bits = 8 * channel.byte_offset + channel.bit_offset + channel.bit_count
+            else:
+                bits = 8 * channel.additional_byte_offset + channel.start_offset + channel.bit_count
+            if not 0 < bits <= 8 * record:
+                raise LogError(f"{path}: channel {channel.name} lies outside its record; the file is damaged")
 
 
 def _native(values: np.ndarray) -> np.ndarray:
