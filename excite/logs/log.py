@@ -11,13 +11,13 @@ import pandas as pd
 
 from excite.errors import LogError as LogError
 from excite.logs import tables
+from excite.logs.plausibility import rated_speed
 from excite.logs.tables import MDF_TIME, UNCLEAR
 from excite.logs.times import has_time, seconds
 from excite.model.machine import UNITS, Machine, Sensor, load_machine, shipped_machines, torque_per_pressure
 
 SHORTEST = 100  # samples: below this no filter and no estimate makes sense
 OFF_RATE = 0.02  # by which the usual rate of sampling may differ from the machine file's
-MAX_JUMP = 4.0  # times the usual largest step of an angle, from which a lasting one is a jump; chosen
 GAP = 1.5  # samples from one row to the next that leave something out
 
 
@@ -78,6 +78,7 @@ def from_table(
     """
     wanted = machine.sensors("full")
     known = require_columns(table, machine, needs, source)
+    table = unwrapped(table, machine)
     given, t = t, seconds(table, machine, source) if t is None else t
     if line := too_short(len(t), machine):
         raise LogError(f"{source}: {line}")
@@ -146,7 +147,32 @@ def _joint_angle(sensor: Sensor, machine: Machine, table: pd.DataFrame, source: 
     return values_of(angle, machine, table, source)
 
 
-def numbers(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
+def columns_read(sensor: Sensor, machine: Machine) -> tuple[str, ...]:
+    """Columns behind a sensor's readings, with that of the angle on which the lever of its cylinders depends."""
+    if not sensor.cylinders or all(c.lever is not None for c in sensor.cylinders):
+        return sensor.columns
+    angles = [s.column for s in machine.sensor if s.kind == "angle" and s.body == sensor.body]
+    return (*sensor.columns, *angles[:1])
+
+
+def cells_of(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
+    """The numbers of a column (N,), NaN where a cell is blank. Raises LogError for a cell that holds anything else."""
+    raw = table[column]
+    clear = not table.attrs.get(UNCLEAR, {}).get(column)
+    if clear and raw.dtype.kind in "fiub" and not np.isinf(values := raw.to_numpy(dtype=float)).any():
+        return values
+    blank = raw.isna().to_numpy().copy()
+    if raw.dtype.kind in "OTU":
+        blank |= (raw.astype(str).str.strip() == "").to_numpy()
+    part = raw[~blank].to_frame()
+    part.attrs = table.attrs
+    values = np.full(len(raw), np.nan)
+    values[~blank] = numbers(part, column, source, np.flatnonzero(~blank))
+    return values
+
+
+def numbers(table: pd.DataFrame, column: str, source: str, rows: np.ndarray | None = None) -> np.ndarray:
+    """The numbers of a column (N,). rows: numbers of the rows in their file. Raises LogError where a cell is none."""
     raw = table[column]
     if unclear := table.attrs.get(UNCLEAR, {}).get(column):
         raise LogError(f"{source}: {unclear}")
@@ -160,7 +186,8 @@ def numbers(table: pd.DataFrame, column: str, source: str) -> np.ndarray:
         what = "is empty or not a number (NaN)" if pd.isna(cell) else f"is {str(cell)[:30]!r}, not a finite number"
         count = int(bad.sum())
         more = f"; {count} such cells in this column" if count > 1 else ""
-        raise LogError(f"{source}: row {k + 1}, column {column}: {what}{more}; cut the log there or repair the value")
+        row = k if rows is None else int(rows[k])
+        raise LogError(f"{source}: row {row + 1}, column {column}: {what}{more}; cut the log there or repair the value")
     return values
 
 
@@ -173,15 +200,6 @@ def too_short(rows: int, machine: Machine) -> str:
     """Return a line for a log of too few rows, "" otherwise."""
     least = fewest_rows(machine)
     return f"only {rows} rows, at least {least} are needed: is the file complete?" if rows < least else ""
-
-
-def gap_rows(t: np.ndarray, machine: Machine) -> list[int]:
-    """First rows (from 0) after each gap in times (N,) [s]; none where these are not what they should be in other
-    ways."""
-    dt = np.diff(t) * float(machine.sampling_hz)
-    if not len(dt) or (dt <= 0).any() or abs(float(np.median(dt)) - 1) > OFF_RATE:
-        return []
-    return [int(k) + 1 for k in np.flatnonzero(dt > GAP)]
 
 
 def check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
@@ -212,19 +230,11 @@ def check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
 
 
 def check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Machine, source: str) -> None:
-    """Units and wrapping: what no such machine can do is a wrong log, not a measurement."""
+    """Raise LogError for angles (N,) [SI] that are not unwrapped and for readings far beyond the machine's limits."""
     if len(values) < 2:
         return  # nothing moves in one row
-    body = machine.find(sensor.body)
-    if sensor.is_rate:
-        fastest, usual = _fastest(sensor, machine), float(np.percentile(np.abs(values), 99))
-        if fastest is not None and usual > 3 * fastest:
-            raise LogError(
-                f"{source}: column {sensor.column}: turns at {usual:.3g} rad/s, the machine allows {fastest:.3g} rad/s;"
-                f" is the unit {sensor.unit} right?"
-            )
-        return
-    if sensor.kind == "wheel" or (sensor.kind == "angle" and body.joint == "revolute"):
+    turns = sensor.kind == "wheel" or (sensor.kind == "angle" and machine.find(sensor.body).joint == "revolute")
+    if turns and not sensor.is_rate and "jumps" not in sensor.checks_off:
         step = np.abs(np.diff(values))
         k = int(np.argmax(step))
         if step[k] > 2.0:
@@ -232,23 +242,31 @@ def check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Machi
                 f"{source}: row {k + 2}, column {sensor.column}: the angle jumps by {step[k]:.3g} rad in one sample;"
                 " unwrap it (encoder angles are counted on) or cut the log there"
             )
-        fastest = _fastest(sensor, machine)
-        usual = max(float(np.quantile(step, 0.999)), 0.0 if fastest is None else fastest / rate)
-        jumps = np.flatnonzero(step > MAX_JUMP * usual + MAX_JUMP * (sensor.resolution or 0.0))
-        lasting = [j for j in jumps.tolist() if abs(values[min(j + 2, len(values) - 1)] - values[j]) > step[j] / 2]
-        if lasting and usual > 0 and len(lasting) < 0.001 * len(step) + 1:
-            j = int(lasting[0])
+    if "limits" not in sensor.checks_off:
+        check_limits(sensor, values, rate, machine, source)
+
+
+def check_limits(sensor: Sensor, values: np.ndarray, rate: float, machine: Machine, source: str) -> None:
+    """Raise LogError where readings (N,) [SI] are far beyond what the machine's limits allow."""
+    body = machine.find(sensor.body)
+    if sensor.is_rate:
+        fastest, usual = rated_speed(sensor, machine), float(np.percentile(np.abs(values), 99))
+        if fastest is not None and usual > 3 * fastest:
             raise LogError(
-                f"{source}: row {j + 2}, column {sensor.column}: jumps by {step[j]:.3g} rad in one sample, the machine"
-                f" turns at most {usual:.2g} rad in it: an encoder that was reset? cut the log there"
+                f"{source}: column {sensor.column}: turns at {usual:.3g} rad/s, the machine allows {fastest:.3g} rad/s;"
+                f" is the unit {sensor.unit} right?"
             )
-        if fastest is not None and step[k] * rate > 5 * fastest and np.percentile(step, 99) * rate > 3 * fastest:
+        return
+    if sensor.kind == "angle" and body.joint == "revolute":
+        step = np.abs(np.diff(values))
+        fastest, usual = rated_speed(sensor, machine), float(np.percentile(step, 99)) * rate
+        if fastest is not None and step.max() * rate > 5 * fastest and usual > 3 * fastest:
             raise LogError(
-                f"{source}: column {sensor.column}: turns at {np.percentile(step, 99) * rate:.3g} rad/s, the machine"
-                f" allows {fastest:.3g} rad/s; is the column in degrees?"
+                f"{source}: column {sensor.column}: turns at {usual:.3g} rad/s, the machine allows {fastest:.3g} rad/s;"
+                " is the column in degrees?"
             )
         limit = body.limit.position
-        if sensor.kind == "angle" and limit is not None and np.abs(values).max() > 3 * float(limit):
+        if limit is not None and np.abs(values).max() > 3 * float(limit):
             raise LogError(
                 f"{source}: column {sensor.column}: up to {np.abs(values).max():.3g} rad, the machine allows"
                 f" {float(limit):g} rad; is the column in degrees?"
@@ -262,14 +280,20 @@ def check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Machi
             )
 
 
-def _fastest(sensor: Sensor, machine: Machine) -> float | None:
-    """The rate [rad/s] that a joint's limits allow, None where they don't say."""
-    limit, contact = machine.find(sensor.body).limit, machine.find(sensor.body).contact
-    if sensor.kind != "angle":
-        return None
-    if limit.rim_speed is not None and contact is not None:
-        return float(limit.rim_speed) / float(contact.radius)
-    return None if limit.rate is None else float(limit.rate)
+def unwrapped(table: pd.DataFrame, machine: Machine) -> pd.DataFrame:
+    """The table with encoders counted on that begin anew after `wraps_at`."""
+    counted = [s for s in machine.sensor if s.wraps_at is not None and s.column in table.columns]
+    on = {}
+    for s in counted:
+        x = cells_of(table, s.column, "log").copy()
+        there = np.isfinite(x)
+        x[there] = np.unwrap(x[there], period=s.wraps_at)
+        on[s.column] = x
+    if not on:
+        return table
+    changed = table.assign(**on)
+    changed.attrs = table.attrs
+    return changed
 
 
 def what_of(sensor: Sensor, machine: Machine) -> str:

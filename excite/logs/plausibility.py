@@ -9,8 +9,9 @@ contacts turn about as fast, and angles that are counted move in whole counts.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,43 +37,65 @@ ONE = 0.03  # by which the smallest step may differ from one count, as numbers i
 SHARE = 0.1  # of the highest speed: below, dry friction fades
 SLOW = 0.1  # rad/s: below, friction fades in an average over a span
 MOVED = 0.05  # rad or m: a joint that moves less says nothing of its drive
+RARELY = 0.02  # share of the time with a torque of the other sign, below which it never changes; chosen
 SMALL, LARGE, REFUSED = 0.01, 3.0, 10.0  # times the drive's limit; more than the last `log.check` refuses
 THOUSAND = {"N m": "kN m", "Nm": "kNm", "N": "kN", "Pa": "kPa", "kPa": "MPa"}
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """What is doubtful about sensors, and the name of the check that says so (see LOG_CHECKS)."""
+
+    check: str
+    sensors: tuple[str, ...]
+    text: str
 
 
 def doubts(machine: Machine, values: Mapping[str, np.ndarray], interpolated: bool = False) -> tuple[str, ...]:
     """Return a line for everything that is doubtful about readings (N,) by sensor name [SI], evenly sampled.
 
-    interpolated: readings that stand between counts are expected.
+    interpolated: readings that stand between counts are expected. Checks that a sensor's `checks_off` names are left
+    out.
     """
+    off = {(check, s.name) for s in machine.sensor for check in s.checks_off}
+    found = _find_doubts(machine, values, interpolated)
+    return tuple(d.text for d in found if not any((d.check, name) in off for name in d.sensors))
+
+
+def _find_doubts(machine: Machine, values: Mapping[str, np.ndarray], interpolated: bool) -> Iterator[Doubt]:
+    rate = float(machine.sampling_hz)
     found = {(s.kind, s.body): s for s in machine.sensors("full") if s.name in values}
     driven = [b for b in machine.actuated if ("angle", b.index) in found and ("torque", b.index) in found]
     angles = {b.index: found["angle", b.index] for b in driven}
     torques = {b.index: found["torque", b.index] for b in driven}
-    rate = float(machine.sampling_hz)
     position = {i: np.cumsum(values[s.name]) / rate if s.is_rate else values[s.name] for i, s in angles.items()}
-    moved = [b for b in driven if np.ptp(position[b.index]) > MOVED]
-    counted = [s for s in machine.sensors("full") if s.name in values and s.resolution is not None and not interpolated]
-    counts = {s.name: line for s in counted if (line := _counts(s, machine, values[s.name]))}
-    scales = (_scale(torques[b.index], b, machine, values[torques[b.index].name]) for b in moved)
-    dead = _dead(machine, values)
-    if lines := [line for line in scales if line]:
-        # With a torque that is too small the others seem to move the machine alone.
-        return (*dead, *counts.values(), *lines)
+    moving = [b for b in driven if np.ptp(position[b.index]) > MOVED]
+    yield from _dead(machine, values)
     speeds = _speeds(machine, values, rate)
-    lines = [
-        f"column {s.column}: goes as the speed of {other.column} does, not as its angle: is it a speed? then"
-        f" {as_speed(RATES, machine)}"
-        for s, other in speeds
-    ]
-    for s, _ in speeds:
-        counts.pop(s.name, None)
+    for s in machine.sensors("full"):
+        counted = s.name in values and s.resolution and not interpolated and all(s is not r for r, _ in speeds)
+        if counted and (line := _counts(s, machine, values[s.name])):
+            yield Doubt("counts", (s.name,), line)
+    scaled = [(torques[b.index], _scale(torques[b.index], b, machine, values[torques[b.index].name])) for b in moving]
+    if any(line for _, line in scaled):
+        # With a torque that is too small the others seem to move the machine alone.
+        yield from (Doubt("limits", (s.name,), line) for s, line in scaled if line)
+        return
+    for s, other in speeds:
+        text = (
+            f"column {s.column}: goes as the speed of {other.column} does, not as its angle: is it a speed? then"
+            f" {as_speed(RATES, machine)}"
+        )
+        yield Doubt("speed", (s.name,), text)
     half = max(1, round(SPAN * rate))
-    for b in moved:
+    accused: set[str] = set()
+    for b in moving:
         if len(position[b.index]) < 2 * half * LEAST or (speeds and b.contact):
             continue
         motion = _motion(position[b.index], half, rate)
         means = {c.index: _mean(values[torques[c.index].name], half) for c in driven}
+        if not b.contact and _one_sided(means[b.index]):
+            continue  # a load, gravity say, moves the joint back
         turned = _pulls(machine, b, driven, motion, means, half) if b.contact else _works(motion, means[b.index], half)
         if turned:
             torque, angle = " - ".join(torques[b.index].columns), angles[b.index].column
@@ -81,11 +104,19 @@ def doubts(machine: Machine, values: Mapping[str, np.ndarray], interpolated: boo
                 if b.contact
                 else f"the torque {torque} does more work against {angle}'s motion than with it"
             )
-            lines.append(
+            text = (
                 f"{what}: is the sign of one of them turned around? (right if something else moves this joint: a slope,"
                 " a tow, another drive)"
             )
-    return (*dead, *counts.values(), *lines, *_backward(machine, values))
+            yield Doubt("sign", (torques[b.index].name, angles[b.index].name), text)
+            accused.add(angles[b.index].name)
+    yield from _backward(machine, values)
+    yield from _swapped_wheels(machine, values, rate, accused)
+
+
+def _one_sided(torque: np.ndarray) -> bool:
+    """Whether a torque (N,) hardly ever changes its sign."""
+    return min(float(np.mean(torque > 0)), float(np.mean(torque < 0))) < RARELY
 
 
 def against(machine: Machine, values: Mapping[str, np.ndarray]) -> list[str]:
@@ -103,8 +134,8 @@ def against(machine: Machine, values: Mapping[str, np.ndarray]) -> list[str]:
     return found
 
 
-def _backward(machine: Machine, values: Mapping[str, np.ndarray]) -> list[str]:
-    """A line for every measuring wheel that turns against all contacts beside it."""
+def _backward(machine: Machine, values: Mapping[str, np.ndarray]) -> list[Doubt]:
+    """Doubt every measuring wheel that turns against all contacts beside it."""
     wheels = [s for s in machine.sensors("full") if s.name in values and s.kind == "wheel"]
     contacts = _contacts(machine, values)
     sides = _sides(machine, [*contacts, *wheels])
@@ -112,10 +143,74 @@ def _backward(machine: Machine, values: Mapping[str, np.ndarray]) -> list[str]:
     for wheel in wheels:
         beside = [s for s in contacts if sides[s.name] == sides[wheel.name]]
         if beside and all(_opposed(wheel, s, values) for s in beside):
-            found.append(
-                f"column {wheel.column}: turns against {', '.join(s.column for s in beside)}: is its sign right?"
-            )
+            text = f"column {wheel.column}: turns against {', '.join(s.column for s in beside)}: is its sign right?"
+            found.append(Doubt("sign", (wheel.name,), text))
     return found
+
+
+def _swapped_wheels(
+    machine: Machine, values: Mapping[str, np.ndarray], rate: float, accused: Collection[str] = ()
+) -> Iterator[Doubt]:
+    """Doubt two measuring wheels whose difference turns the machine the other way than its yaw rate or, if its sign is
+    not doubtful (accused), its steering joint."""
+    wheels = [s for s in machine.sensors("full") if s.kind == "wheel" and s.name in values and not s.is_rate]
+    half = max(1, round(SPAN * rate))
+    if len(wheels) != 2 or len(values[wheels[0].name]) < 2 * half * LEAST or _backward(machine, values):
+        return
+    left, right = sorted(wheels, key=lambda s: -float(s.lateral or 0.0))
+    across = float(left.lateral or 0.0) - float(right.lateral or 0.0)
+    if not across:
+        return
+    speed = {s.name: float(s.radius or 0.0) * _motion(values[s.name], half, rate)[0] for s in wheels}
+    yaw = (speed[right.name] - speed[left.name]) / across
+    known = next((s for s in machine.sensors("full") if s.kind == "yaw_rate" and s.name in values), None)
+    if known is not None and np.ptp(values[known.name]) > 0:
+        told, other = _mean(values[known.name], half), f"{known.column}: are left and right swapped?"
+    else:
+        steering = _steering(machine, values)
+        if steering is None or steering[0].name in accused:
+            return
+        joint, curvature = steering
+        forward = sum(speed.values()) / 2
+        told = forward * curvature * _mean(values[joint.name], half)
+        other = f"{joint.column}: are left and right swapped, or is its sign turned around?"
+    if min(np.ptp(yaw), np.ptp(told)) == 0:
+        return
+    r = float(np.corrcoef(yaw, told)[0, 1])
+    if r < OPPOSED and r * np.sqrt(len(yaw) / (2 * half)) < -CLEAR:
+        text = f"columns {left.column}, {right.column}: their difference turns the machine the other way than {other}"
+        yield Doubt("swapped", (left.name, right.name), text)
+
+
+def _steering(machine: Machine, values: Mapping[str, np.ndarray]) -> tuple[Sensor, float] | None:
+    """The angle of the only joint that steers, and the curvature [1/m] of the path per radian of it if contacts roll
+    without slipping sideways; None where the machine steers otherwise."""
+    joints = [b for b in machine.actuated if b.contact is None and b.joint == "revolute"]
+    if len(joints) != 1 or len(machine.contacts) < 2:
+        return None
+    angle = next((s for s in machine.sensors("full") if s.kind == "angle" and s.body == joints[0].index), None)
+    if angle is None or angle.name not in values or angle.is_rate:
+        return None
+    bent = 0.1
+    places = mechanics.body_poses(machine, {joints[0].coordinates[0]: bent})
+    sideways, known = [], []
+    for b in machine.contacts:
+        rotation, place = places[b.index]
+        axle = rotation[:2, 2] / np.linalg.norm(rotation[:2, 2])  # nothing moves along it
+        sideways.append([axle[1], axle[1] * place[0] - axle[0] * place[1]])
+        known.append(-axle[0])
+    (_, turning), *_ = np.linalg.lstsq(np.array(sideways), np.array(known), rcond=None)
+    return angle, float(turning) / bent
+
+
+def rated_speed(sensor: Sensor, machine: Machine) -> float | None:
+    """The rate [rad/s or m/s] that limits allow an angle or a position, None where they don't say."""
+    limit, contact = machine.find(sensor.body).limit, machine.find(sensor.body).contact
+    if sensor.kind != "angle":
+        return None
+    if limit.rim_speed is not None and contact is not None:
+        return float(limit.rim_speed) / float(contact.radius)
+    return None if limit.rate is None else float(limit.rate)
 
 
 def _contacts(machine: Machine, values: Mapping[str, np.ndarray]) -> list[Sensor]:
@@ -146,14 +241,14 @@ def unchanging(sensor: Sensor, values: np.ndarray) -> str:
     return f"column {name}: never changes ({values[0]:g}): is the sensor connected?" if np.ptp(values) == 0 else ""
 
 
-def _dead(machine: Machine, values: Mapping[str, np.ndarray]) -> list[str]:
+def _dead(machine: Machine, values: Mapping[str, np.ndarray]) -> list[Doubt]:
     """Channels of torques, contacts and measuring wheels that never change while something turns."""
     there = [s for s in machine.sensors("full") if s.name in values]
     rolling = [*_contacts(machine, values), *(s for s in there if s.kind == "wheel")]
     if not any(np.ptp(values[s.name]) > MOVED for s in rolling):
         return []
-    found = (unchanging(s, values[s.name]) for s in there if s.kind == "torque" or s in rolling)
-    return [line for line in found if line]
+    found = [(s, unchanging(s, values[s.name])) for s in there if s.kind == "torque" or s in rolling]
+    return [Doubt("constant", (s.name,), line) for s, line in found if line]
 
 
 def _speeds(machine: Machine, values: Mapping[str, np.ndarray], rate: float) -> list[tuple[Sensor, Sensor]]:

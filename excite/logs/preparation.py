@@ -86,7 +86,17 @@ def read_stretches(
     notes = [f"{name}: {line}" for line in table.attrs.get("notes", ())]
     if not has_time(table, machine) and (merged := merge_own_times(table, machine)) is not None:
         table = merged
-    refusal.refuse(table, machine, needs, name)
+    accepted = refusal.accept(table, machine, needs, name)
+    stretches, said = place_rows(accepted.table, machine, needs, name, rate)
+    used = {line.partition(" row only")[0] for line in said}  # of held channels the note says how they are used
+    doubts = [line for line in accepted.doubts if line.partition(" row only")[0] not in used]
+    return stretches, [*notes, *accepted.notes, *said, *doubts]
+
+
+def place_rows(
+    table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), name: str = "log", rate: float | None = None
+) -> tuple[list[Stretch], list[str]]:
+    """Order the rows of a checked table and bring them onto even grids, with notes. Raises LogError."""
     log.require_columns(table, machine, needs, name)
     t = seconds(table, machine, name)
     if line := log.too_short(len(t), machine):
@@ -101,7 +111,7 @@ def read_stretches(
     long = [s for s in stretches if len(s.table) >= least]
     if long and len(long) < len(stretches):
         said.append(f"{name}: {len(stretches) - len(long)} stretches of less than {least} rows are left out")
-    return long or stretches, [*notes, *said]
+    return long or stretches, said
 
 
 def merge_own_times(table: pd.DataFrame, machine: Machine) -> pd.DataFrame | None:

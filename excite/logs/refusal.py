@@ -1,11 +1,11 @@
-"""Faults of a table of measurements for which it can be told what to write instead."""
+"""The refusal of a table of measurements with faults, and advice what to write instead."""
 
 from __future__ import annotations
 
 import difflib
-import itertools
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -13,19 +13,32 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs import log
-from excite.logs.plausibility import RATES, as_speed, is_speed, own_file
+from excite.logs.checks import Finding, findings, record_of, refuse
+from excite.logs.plausibility import own_file
+from excite.logs.repair import mended
 from excite.logs.tables import COMMENTS
 from excite.logs.times import has_time, seconds
-from excite.model.machine import TURN, UNITS, Machine, Sensor
+from excite.model.machine import UNITS, Machine
 
 T = TypeVar("T")
 
 CLOSE = 0.05  # of a unit's size, when a wrong rate of sampling is taken for time in that unit
 
 
-def refuse(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> None:
-    """Raises LogError for what `log.check` refuses as well, where it can be told what to write instead: a column of
-    another name, time in another unit, a speed for an angle. needs: names of sensors that must be there."""
+@dataclass(frozen=True)
+class Accepted:
+    """A table without faults, repaired, with what was done to it and what is doubtful about it."""
+
+    table: pd.DataFrame
+    notes: tuple[str, ...]
+    doubts: tuple[str, ...]
+
+
+def accept(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> Accepted:
+    """Check a table as `inspect` does and repair its spikes. needs: names of sensors that must be there.
+
+    Raises LogError for all faults at once. What only placing rows on even steps shows, `even_stretches` refuses.
+    """
     lacking = [
         (f"{', '.join(missing)} ({log.what_of(s, machine)})", lookalike(missing, table, machine))
         for s in machine.sensors("full")
@@ -34,57 +47,46 @@ def refuse(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sou
     if any(hint for _, hint in lacking):
         raise LogError(f"{source}: no column {', '.join(name + hint for name, hint in lacking)}")
     if lacking or not has_time(table, machine):
-        return
+        return Accepted(table, (), ())
     for stray in stray_rows(table).values():
         raise LogError(f"{source}: {stray}")
+    table = log.unwrapped(table, machine)
     t = caught(lambda: seconds(table, machine, source), None)
     if t is not None and (clock := wrong_time_unit(t, machine)):
         raise LogError(f"{source}: {clock}")
-    if t is not None:
-        table = table.iloc[unbroken_rows(t, machine)].reset_index(drop=True)
-    for sensor in machine.sensors("full"):
-        if sensor.kind != "angle" or not set(sensor.columns) <= set(table.columns):
+    record, unread = record_of(table, machine)
+    cells = [Finding("cells", "fault", "", line) for line in unread.values()]
+    seen = findings(record)
+    doubtful = refuse([*cells, *seen], source)
+    clean, notes = mended(table, record, source)
+    bridged = [f"{source}: {f.text}" for f in seen if f.check == "dropouts" and f.kind == "remark"]
+    units = [f"{source}: {line}" for line in unit_doubts(table, machine)[0]]
+    return Accepted(clean, (*notes, *bridged), (*units, *doubtful))
+
+
+def unit_doubts(table: pd.DataFrame, machine: Machine) -> tuple[list[str], list[str]]:
+    """Compare a file's line of units with the machine file: contradictions, and units that are not known."""
+    said: dict[str, str] = table.attrs.get("units", {})
+    own: dict[str, tuple[str, str, float]] = {machine.time_column: (machine.time_unit, *UNITS[machine.time_unit])}
+    for sensor in (s for s in machine.sensors("full") if "units" not in s.checks_off):
+        quantity, size = UNITS.get(sensor.unit, ("", 0.0))
+        if sensor.factor is not None:  # whatever the unit's name says
+            quantity, size = "", abs(float(sensor.factor))
+        own |= dict.fromkeys(sensor.columns, (sensor.unit, quantity, size))
+    differ, unknown = [], []
+    for name, unit in said.items():
+        if name not in own or unit in (own[name][0], "-"):
             continue
-        values = caught(lambda s=sensor: log.values_of(s, machine, table, source), None)  # type: ignore[misc]
-        if values is not None and len(values) > 1 and (speed := speed_for_angle(sensor, values, table, machine)):
-            raise LogError(f"{source}: {speed}")
-
-
-def unbroken_rows(t: np.ndarray, machine: Machine) -> slice:
-    """Rows of the longest stretch of times (N,) [s] without a gap: across one an angle may jump."""
-    edges = [0, *log.gap_rows(t, machine), len(t)]
-    return slice(*max(itertools.pairwise(edges), key=lambda ends: ends[1] - ends[0]))
-
-
-def speed_for_angle(sensor: Sensor, values: np.ndarray, table: pd.DataFrame, machine: Machine) -> str:
-    """Return a line for an angle (N,) [SI] that its joint can't follow but that could be its speed, and goes with the
-    torques as if it were; "" otherwise."""
-    body, rate = machine.find(sensor.body), float(machine.sampling_hz)
-    if sensor.kind != "angle" or sensor.is_rate or sensor.factor is not None or body.joint != "revolute":
-        return ""
-    if _possible(sensor, values, machine) or np.abs(np.diff(values)).max() > TURN / 2:
-        return ""  # not unwrapped, say
-    rates = {unit: sensor.model_copy(update={"unit": unit, "counts_per_turn": None}) for unit in RATES}
-    units = [u for u, s in rates.items() if _possible(s, values * (s.gain / sensor.gain), machine)]
-    # What moves a roll is the torque of all of them.
-    pulling = [b.index for b in machine.actuated if b.contact is not None] if body.contact else [body.index]
-    there = [s for s in machine.sensors("full") if set(s.columns) <= set(table.columns)]
-    drives = [s for s in there if s.kind == "torque" and s.body in pulling]
-    torques = [caught(lambda s=s: log.values_of(s, machine, table, ""), None) for s in drives]  # type: ignore[misc]
-    known = [u for u in torques if u is not None]
-    if not units or not is_speed(values, known, rate):
-        return ""
-    return (
-        f"column {sensor.column}: changes faster than the joint can turn, as its speed would: is it one? then"
-        f" {as_speed(units, machine)}"
-    )
-
-
-def _possible(sensor: Sensor, values: np.ndarray, machine: Machine) -> bool:
-    """Tell if a joint can do what readings (N,) [SI] say."""
-    said: list[str] = []
-    caught(lambda: log.check_values(sensor, values, float(machine.sampling_hz), machine, ""), said)
-    return not said
+        named, quantity, size = own[name]
+        if unit not in UNITS:
+            unknown.append(f"{unit} for {name}")
+        elif not np.isclose(UNITS[unit][1], size, rtol=1e-6, atol=0) or quantity not in ("", UNITS[unit][0]):
+            line = f'{"time_unit" if name == machine.time_column else "unit"} = "{unit}"'
+            mend = f"if the file is right, write {line} in {own_file(machine)}"
+            what = mend if quantity == UNITS[unit][0] else "which is right?"
+            differ.append(f"the file says {unit} in column {name}, the machine file {named}: {what}")
+    listed = f"the line below the header is taken for units, which are not known: {', '.join(unknown)}"
+    return differ, [listed] if unknown else []
 
 
 def wrong_time_unit(t: np.ndarray, machine: Machine) -> str:

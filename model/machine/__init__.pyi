@@ -1,5 +1,6 @@
 from .hydraulics import torque_per_pressure as torque_per_pressure
 from .machine import (
+    LOG_CHECKS as LOG_CHECKS,
     MACHINES as MACHINES,
     Body as Body,
     Contact as Contact,

@@ -7,6 +7,7 @@ All values are SI.
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,6 +34,22 @@ from excite.model.machine.records import (
 
 MACHINES = Path(__file__).parents[1] / "machines"
 Index = Annotated[int, Field(strict=True, ge=0, le=99)]
+
+# Checks of a log that a sensor can be left out of (`checks_off`), with what each looks for.
+LOG_CHECKS = {
+    "jumps": "a position that goes further in one row than the joint can: an encoder that was reset, counts that wrap",
+    "limits": "readings that the machine's limits rule out: degrees for radians, kN m for N m",
+    "speed": "a speed in the place of an angle",
+    "spikes": "single readings far from their neighbours, which are repaired",
+    "dropouts": "readings that stand still while the machine moves",
+    "held": "readings that change in every n-th row only",
+    "constant": "a channel that never changes",
+    "range": "readings that stand at the end of their range",
+    "counts": "steps that are not whole counts",
+    "sign": "an angle or torque with the wrong sign",
+    "swapped": "left and right, or front and rear, in each other's place",
+    "units": "a unit in the file that is not the machine file's",
+}
 
 
 def _zero() -> Quantity:
@@ -194,6 +211,9 @@ class Sensor(FileRecord):
     A torque may be given as two pressures, in `column` and `return_column`: those of a hydraulic motor with its
     `displacement` [m3 per turn of the joint, gear included], u = displacement / (2 pi) (p - p_return), or those of
     `cylinders` (see `hydraulics`). `factor` is then the pressure of the number 1 [Pa], 4e6 for 0-10 V over 0-400 bar.
+
+    `wraps_at`: reading, in the column's unit, after which an encoder begins anew, such as 360 for degrees; it is then
+    counted on. `checks_off`: names of LOG_CHECKS that this sensor is left out of.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
@@ -211,6 +231,8 @@ class Sensor(FileRecord):
     noise: NotNegative | None = None
     lateral: Quantity | None = None
     radius: Positive | None = None
+    wraps_at: Annotated[float | None, Field(gt=0, allow_inf_nan=False)] = None
+    checks_off: tuple[str, ...] = ()
 
     @property
     def resolution(self) -> float | None:
@@ -264,6 +286,13 @@ class Sensor(FileRecord):
             raise ValueError(f"{'radius' if self.radius else 'lateral'}: is for kind wheel only")
         if self.factor is not None and self.factor.value == 0:
             raise ValueError("factor: must not be 0")
+        if self.wraps_at is not None and (self.kind not in ("angle", "wheel") or self.is_rate):
+            raise ValueError("wraps_at: is for a position that is counted, an angle or a measuring wheel")
+        for name in self.checks_off:
+            if name not in LOG_CHECKS:
+                like = difflib.get_close_matches(name, LOG_CHECKS, n=1)
+                hint = f"did you mean {like[0]}? " if like else ""
+                raise ValueError(f"checks_off: {name!r} is unknown; {hint}allowed: {', '.join(LOG_CHECKS)}")
         if self.noise is not None and self.noise.value == 0 and self.counts_per_turn is None:
             raise ValueError("noise: must be > 0 (got 0); leave it out if it is unknown")
         if "full" not in self.kits:

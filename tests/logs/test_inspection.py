@@ -165,7 +165,7 @@ def test_a_row_that_is_no_data_is_named(
     (line,) = inspection.inspect(read, va12.machine).faults
     assert words in line
     with pytest.raises(LogError, match="row 41"):
-        refusal.refuse(read, va12.machine)
+        refusal.accept(read, va12.machine)
 
 
 def test_only_a_log_without_the_machines_columns_is_anothers(va12: Model, table: pd.DataFrame) -> None:
@@ -247,7 +247,7 @@ def test_a_pressure_that_lacks_its_return(va12: Model, table: pd.DataFrame) -> N
 def test_a_log_of_a_row_is_too_short(rows: int, va12: Model, table: pd.DataFrame) -> None:
     faults = inspection.inspect(table.head(rows), va12.machine).faults
     assert any(f"only {rows} rows" in line for line in faults), faults
-    refusal.refuse(table.head(rows), va12.machine)
+    refusal.accept(table.head(rows), va12.machine)
 
 
 def test_every_fault_at_once(va12: Model, table: pd.DataFrame) -> None:
