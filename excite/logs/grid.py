@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.signal
+import scipy  # scipy.signal is loaded when it is used
 
 ON_GRID = 0.02  # of a step: readings this close to a grid's time are kept as they are; chosen
 WINDOW = 7  # grid points of the local cubic along which readings are moved; passes a fifth of the grid's rate

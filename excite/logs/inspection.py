@@ -119,8 +119,8 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         accused = {f.sensor for f in seen if f.kind == "fault"}
         bad = {c for s in machine.sensors("full") for c in s.columns if s.name in accused}
         used = _as_used(table, record, machine, {*bad, *unread}, faults, remarks)
-        for own, one in () if faults else used:
-            doubtful += doubts(own, one.values, one.interpolated)
+        for with_rate, one in () if faults else used:
+            doubtful += doubts(with_rate, one.values, one.interpolated)
     unknown = [c.name for c in columns if not c.what]
     if unknown:
         remarks.append(f"not used: {', '.join(unknown)}")

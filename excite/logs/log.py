@@ -282,9 +282,10 @@ def check_limits(sensor: Sensor, values: np.ndarray, rate: float, machine: Machi
 
 def unwrapped(table: pd.DataFrame, machine: Machine) -> pd.DataFrame:
     """The table with encoders counted on that begin anew after `wraps_at`."""
-    counted = [s for s in machine.sensor if s.wraps_at is not None and s.column in table.columns]
     on = {}
-    for s in counted:
+    for s in machine.sensor:
+        if s.wraps_at is None or s.column not in table.columns:
+            continue
         x = cells_of(table, s.column, "log").copy()
         there = np.isfinite(x)
         x[there] = np.unwrap(x[there], period=s.wraps_at)

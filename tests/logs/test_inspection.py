@@ -51,7 +51,7 @@ def edit(name: str, row: int, value: object) -> Callable[[pd.DataFrame], pd.Data
     ("change", "faults", "remarks"),
     [
         (edit("u1_Nm", 40, None), [], ["1 empty cell, interpolated"]),
-        (edit("u1_Nm", 40, "error"), ["column u1_Nm: a cell"], []),
+        (edit("u1_Nm", 40, "error"), ["row 41, column u1_Nm: is 'error', not a finite number"], []),
         (lambda t: t.drop(columns="u4_Nm"), ["no column u4_Nm (torque of rear roll); no method does without it"], []),
         (
             lambda t: t.rename(columns={"theta4_rad": "theta_4"}),
@@ -82,7 +82,11 @@ def edit(name: str, row: int, value: object) -> Callable[[pd.DataFrame], pd.Data
         (lambda t: t.assign(theta4_rad=-t["theta4_rad"]), ["theta4_rad: front roll and rear roll turn against"], []),
         (lambda t: t.assign(u2_Nm=3.0), [], ["column u2_Nm: never changes (3)"]),
         (lambda t: t.assign(u1_Nm=t["u1_Nm"].clip(-700, 700)), [], ["u1_Nm: stands at its highest value"]),
-        (edit("vy_m_s", 3000, 4.0), [], ["column vy_m_s: 1 spikes of a single row, the first in row 3001"]),
+        (
+            edit("vy_m_s", 3000, 4.0),
+            [],
+            ["column vy_m_s: 1 spike of up to 4.01 m/s replaced by the mean of the neighbours (row 3001)"],
+        ),
         (lambda t: t.assign(comment=1.0), [], ["not used: comment"]),
         (lambda t: t.head(60), ["only 60 rows"], []),
     ],

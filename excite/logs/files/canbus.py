@@ -68,7 +68,7 @@ def read_can(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
         what = "no frame" if not seen else f"none of {seen} frames is a message of the DBC file"
         raise LogError(f"{path}: {what}{'; ' + notes[-1] if notes else ''}")
     first = min(t[0] for t in times.values())
-    groups, units, taken = [], {}, set[str]()
+    groups, units, taken = [], dict[str, str](), set[str]()
     for key, found in rows.items():
         message = known[key[0]]
         own = message.name if message.name not in taken else f"{message.name} (channel {key[1]})"

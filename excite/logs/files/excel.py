@@ -89,10 +89,12 @@ def _column(cells: list[Any]) -> pd.Series:
             return pd.Series(cells)
         return pd.Series([np.nan if _blank(cell) else float(cell) for cell in cells], dtype=float)
     if kinds <= {datetime.datetime, datetime.date}:
-        return pd.Series(pd.to_datetime([None if _blank(cell) else cell for cell in cells]).as_unit("ns"))
+        return pd.Series(
+            pd.to_datetime(pd.Series([None if _blank(cell) else cell for cell in cells], dtype=object)).dt.as_unit("ns")
+        )
     if kinds <= {datetime.time, datetime.timedelta, datetime.datetime}:
         since = [None if _blank(cell) else _since_midnight(cell) for cell in cells]
-        return pd.Series(pd.to_timedelta(since).as_unit("ns"))
+        return pd.Series(pd.to_timedelta(pd.Series(since, dtype=object)).dt.as_unit("ns"))
     return pd.Series([None if _blank(cell) else cell for cell in cells], dtype=object)
 
 

@@ -41,7 +41,7 @@ def read_parquet(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     columns: dict[str, Any] = {}
     for name in frame.columns:
         columns |= _plain(name, frame[name])
-    attrs = {key: value for key, value in frame.attrs.items() if isinstance(key, str)}
+    attrs: dict[Any, Any] = {key: value for key, value in frame.attrs.items() if isinstance(key, str)}
     made = pd.DataFrame(columns, index=frame.index)
     made.attrs = attrs if all(isinstance(v, dict | list) for v in attrs.values()) else {}
     return made

@@ -141,7 +141,7 @@ def _table(
         raise LogError(f"{path}: no message with numbers{'; ' + notes[-1] if notes else ''}")
     groups = []
     for topic, found in rows.items():
-        t = np.array([at - first for at in times[topic]], dtype=np.int64) / NANOSECONDS
+        t: np.ndarray = np.array([at - first for at in times[topic]], dtype=np.int64) / NANOSECONDS
         frame = pd.DataFrame(found)
         if STAMP in wanted:
             t = frame.get(f"{topic}/header/stamp", pd.Series(np.nan, frame.index)).to_numpy(dtype=float)
