@@ -413,6 +413,8 @@ def identify(
     inputs = [*_machine_file(machine), *logs, *(validate or [])]
     with _result(out, json, partial(terminal.show, "identify"), inputs) as (place, summary):
         summary |= workflows.identify(place, machine, logs, method, filtering, validate or [], terminal.bar)
+    if summary["status"] == "invalid":
+        raise typer.Exit(1)
 
 
 @app.command()

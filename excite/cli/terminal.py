@@ -45,6 +45,9 @@ def show(kind: str, summary: Mapping[str, Any]) -> None:
     description = reports.describe(kind, summary)
     say(f"{description.title}\n{reports.as_sentence(description.headline)}")
     for one in description.tables:
+        if one.grey and description.status == "invalid":
+            say(f"\n{one.caption} See {reports.REPORT}.")
+            continue
         say(f"\n{one.caption}")
         say(_fitted_table(one))
         if len(one.rows) > MAX_ROWS:

@@ -19,6 +19,7 @@ from .monte_carlo import (
     verify as verify,
 )
 from .prior import prior_from_logs as prior_from_logs
+from .status import add_consistent as add_consistent
 from .validation import (
     SignalComparison as SignalComparison,
     compare_motions as compare_motions,

@@ -9,6 +9,7 @@ identification", IJRR 33, 2014).
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -46,7 +47,9 @@ def nearest_possible(model: Model, estimate: Estimate) -> Estimate:
         cp.Minimize(cp.sum_squares(root @ shift)), _possibility_constraints(model, by_name, INTERIOR_MARGIN)
     )
     try:
-        problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of an inaccurate solution, which the status tells as well
+            problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
     except cp.error.SolverError as err:
         raise NotConsistentError(f"no possible machine found near the estimate: {err}") from None
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or X.value is None:

@@ -56,7 +56,7 @@ def estimate_delays(model: Model, log: Log, filter: Filter | None = None) -> tup
     L = whitening_matrices(model, motion, model.nominal, filtered_noise(model, log, filter), filter)
     block = [whiten_block((np.concatenate([W, slopes], axis=2), Y), L)]
     solution = solve_blocks(block)
-    covariance = solution.expand(sandwich_covariance(block, solution))
+    covariance = solution.expand(sandwich_covariance(model, block, solution))
     n = W.shape[2]
     names = [_torque_name(model, row) for row in rows]
     return tuple(

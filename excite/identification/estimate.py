@@ -27,6 +27,9 @@ class Estimate:
     degrees: degrees of freedom of the residual.
     bias, bias_std (n,) [SI]: mean error of the method on simulated logs, and its standard deviation, if computed.
     one_sided_std (2, n) [SI]: standard deviations below and above if the likelihood is skewed; std lies between them.
+    doubt: why the 95 % intervals do not hold, "" if they do. status: valid, doubtful or invalid (see `status.assess`).
+    possible (n,): False for values that no machine has. consistent (n,) [SI]: values of the nearest possible machine,
+        if some value is not possible.
     """
 
     method: str
@@ -44,6 +47,10 @@ class Estimate:
     bias: np.ndarray | None = None
     bias_std: np.ndarray | None = None
     one_sided_std: np.ndarray | None = None
+    doubt: str = ""
+    status: str = "valid"
+    possible: np.ndarray | None = None
+    consistent: np.ndarray | None = None
 
     @property
     def std(self) -> np.ndarray:
@@ -52,9 +59,9 @@ class Estimate:
 
     @property
     def std_percent(self) -> np.ndarray:
-        """Relative standard deviation [%]; infinite for a value of zero."""
+        """Relative standard deviation [%]; NaN for a value of zero."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return 100 * self.std / np.abs(self.value)
+            return np.where(self.value == 0, np.nan, 100 * self.std / np.abs(self.value))
 
     @property
     def quantile95(self) -> float:

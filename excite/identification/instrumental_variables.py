@@ -22,10 +22,12 @@ from excite.identification.linear_methods import (
     effective_degrees,
     project_blocks,
     residual,
+    robust_covariance,
+    rows_in_motion,
     solve_blocks,
-    total_scores_covariance,
     whiten_block,
 )
+from excite.identification.near_rest import leave_out
 from excite.identification.noise_propagation import FilteredNoise, filtered_noise, whitening_matrices
 from excite.logs import Log, Samples, lowpass, regression, samples, unmeasured
 from excite.model import Model
@@ -63,7 +65,8 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         ]
     projection = rest_projection(model, logs, filter, motions=measured)
     blocks = project_blocks([regression(model, s, filter) for s in measured], projection)
-    initial = solve_blocks(blocks, model.scale)
+    moving, notes = rows_in_motion(model, logs, filter, blocks)
+    initial = solve_blocks(leave_out(blocks, moving), model.scale)
     kept = list(initial.kept)
     x, step = model.nominal.copy(), np.full(len(model.nominal), np.nan)
     for _ in range(MAX_PASSES):
@@ -75,9 +78,10 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
             blocks = project_blocks([regression(model, s, filter) for s in measured], projection)
         whitening = [whitening_matrices(model, s, x, n, filter) for s, n in zip(observed, noise, strict=True)]
         simulated_blocks = project_blocks([regression(model, s, filter) for s in observed], projection)
+        simulated_blocks = leave_out(simulated_blocks, moving)
         Z = [whiten_block(b, L)[0] for b, L in zip(simulated_blocks, whitening, strict=True)]
-        whitened = [whiten_block(b, L) for b, L in zip(blocks, whitening, strict=True)]
-        proposed, covariance = _solve_instruments(whitened, Z, kept, x)
+        whitened = [whiten_block(b, L) for b, L in zip(leave_out(blocks, moving), whitening, strict=True)]
+        proposed, covariance = _solve_instruments(model, whitened, Z, kept, x)
         step = proposed - x
         x = proposed
         ratio = np.abs(step[kept]) / np.sqrt(np.diag(covariance))
@@ -90,7 +94,7 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
                 x,
                 covariance,
                 effective_degrees(solve_blocks(whitened, model.scale), covariance),
-                (),
+                notes,
             )
     worst = kept[int(np.argmax(ratio))]
     raise NotIdentifiableError(
@@ -138,7 +142,7 @@ def _fill_observed(s: Samples, observed: Samples, rows: Sequence[int]) -> Sample
 
 
 def _solve_instruments(
-    blocks: Sequence[Block], Z: Sequence[np.ndarray], kept: list[int], x: np.ndarray
+    model: Model, blocks: Sequence[Block], Z: Sequence[np.ndarray], kept: list[int], x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve Z'(Y - W x) = 0 for x (n_base,); return x and the covariance (k, k) of the kept parameters."""
     instruments = np.concatenate([z[:, :, kept].reshape(-1, len(kept)) for z in Z])
@@ -154,7 +158,7 @@ def _solve_instruments(
     found = x.copy()
     found[kept] = np.linalg.solve(A, Q.T @ y)
     half = np.linalg.solve(A, scipy.linalg.solve_triangular(R, np.diag(1 / size), trans="T"))
-    return found, half @ total_scores_covariance(blocks, found, kept, Z) @ half.T
+    return found, robust_covariance(model, half, blocks, found, kept, Z)
 
 
 def observe(model: Model, s: Samples, x: np.ndarray, filter: Filter, unmeasured_rows: Sequence[int] = ()) -> Samples:

@@ -16,6 +16,7 @@ import numpy as np
 from excite.errors import NotIdentifiableError
 from excite.identification import identifiability
 from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Estimate, held_note
+from excite.identification.near_rest import friction_near_rest, with_soft_friction
 from excite.logs import Log, decimate, derivative
 from excite.model import Model
 from excite.model.machine import Filter
@@ -43,10 +44,12 @@ ACCEPTED_STEP = 0.1
 PROCESS_NOISE_LEVELS = (1.0, 4.0, 16.0)
 # Mean square of a sensor's normalised innovations that the model does not explain. Logs without a cause stay below 1.6.
 SUSPECT_MEAN_SQUARE = 2.5
-UNEXPLAINED_NOTE = (
-    "the model does not explain this log, so the 95 % intervals do not hold: the values allow for process noise, and"
-    " may be off by much more than their intervals if the cause is a sensor or a torque channel; run `excite diagnose`"
+UNEXPLAINED_DOUBT = (
+    "the model does not explain this log: the values allow for process noise, and may be off by much more than their"
+    " intervals if the cause is a sensor or a torque channel; run `excite diagnose`"
 )
+STICKING_RATIO = 2.0  # mean square of torque errors near rest over that in motion, above which friction sticks; chosen
+MIN_STICKING_SAMPLES = 30  # near rest, to tell whether friction sticks; chosen
 BIASED_NOTE = (
     "parameters that this log excites poorly may be off by one standard deviation more than their interval says, as"
     " only a biased estimate was found: record a drive with more motion"
@@ -58,8 +61,8 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
 
     Encoders that beat with the clock keep their weight, which keeps the estimate unbiased; the standard deviations
     account for the beats. If no unbiased fit is found, a slightly biased one is returned with a note. If the
-    innovations show that the model does not explain a log, or exact dynamics give no fit, the model gets as much
-    process noise as needed, and a note.
+    innovations show that the model does not explain a log, or exact dynamics give no fit, friction may stick (see
+    `_fit_sticking`); if that does not explain it either, the model gets as much process noise as needed, and a note.
 
     Raises NotConvergedError if that fails too, NotIdentifiableError if a torque is missing.
     """
@@ -81,6 +84,7 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         if differs:
             yield held_if_slow, True
 
+    sticking: Estimate | None = None
     failure: NotConvergedError | None = None
     noisy_fit: Fit | None = None
     suspect_fit: tuple[tuple[bool, float], Fit, np.ndarray, list[str]] | None = None
@@ -91,9 +95,14 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
             trajectories, X = (starts, model.nominal) if noisy_fit is None else (noisy_fit.trajectories, noisy_fit.X)
             fit, bias_notes = _fit_exact(space, measurements, weighted, trajectories, X, starts, held_now)
         except NotConvergedError as failed:
+            if failure is None and (sticking := _fit_sticking(model, logs, filter, held_now)):
+                return sticking
             failure = failure or failed
             continue
         suspects = find_suspect_sensors(space, logs, fit)
+        sticks = bool(suspects) or _sticks(model, logs, filter, fit)
+        if sticks and failure is None and (sticking := _fit_sticking(model, logs, filter, held_now)):
+            return sticking
         if not suspects:
             if bias_notes:
                 return _build_estimate(space, measurements, fit, filter, (*notes, *bias_notes))
@@ -115,7 +124,53 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     if noisy_fit is None:
         assert failure is not None
         raise failure
-    return _build_estimate(space, measurements, noisy_fit, filter, (*notes, reason, UNEXPLAINED_NOTE))
+    estimate = _build_estimate(space, measurements, noisy_fit, filter, (*notes, reason))
+    return replace(estimate, doubt=UNEXPLAINED_DOUBT)
+
+
+def _sticks(model: Model, logs: Sequence[Log], filter: Filter, fit: Fit) -> bool:
+    """Tell if torque errors of joints near rest are larger than those in motion."""
+    near, moving = list[float](), list[float]()
+    for log, trajectory, linear in zip(logs, fit.trajectories, fit.linear, strict=True):
+        slow = friction_near_rest(model, log, filter) > 0
+        square = (trajectory.torque_error / linear.noise) ** 2
+        near += square[slow].tolist()
+        moving += square[~slow].tolist()
+    if min(len(near), len(moving)) < MIN_STICKING_SAMPLES:
+        return False
+    return float(np.mean(near)) > STICKING_RATIO * float(np.mean(moving))
+
+
+def _fit_sticking(model: Model, logs: Sequence[Log], filter: Filter, held: np.ndarray) -> Estimate | None:
+    """Fit with friction of either sign near rest; None if the logs have no rest or are not explained by it.
+
+    A joint that sticks, |U| < Fs, has any friction in between: a torque error of size Fs, while the joint is near rest.
+    """
+    extra = [friction_near_rest(model, log, filter) for log in logs]
+    if not any(x.any() for x in extra):
+        return None
+    soft = with_soft_friction(model, logs, filter)
+    space = build_state_space(soft, common_sensors(soft, logs))
+    measurements = [
+        replace(prepare_measurements(space, log, unbiased=True), extra_torque_noise=x)
+        for log, x in zip(logs, extra, strict=True)
+    ]
+    weighted = [replace(data, unbiased=False) for data in measurements]
+    starts = [initial_trajectory(space, data, log, filter) for data, log in zip(measurements, logs, strict=True)]
+    try:
+        fit, bias_notes = _fit_exact(space, measurements, weighted, starts, model.nominal, starts, held)
+        if find_suspect_sensors(space, logs, fit):
+            return None
+        fit, one_sided, flat_notes = quantify_uncertainty(space, measurements, starts, fit)
+    except NotConvergedError:
+        return None
+    share = float(np.mean([np.mean(x > 0) for x in extra]))
+    note = (
+        f"friction sticks in this log: in the {100 * share:.2g} % of it in which a joint is near rest, the friction may"
+        " have any value up to Fs"
+    )
+    notes = (*describe_noise(space, measurements), *bias_notes, *flat_notes, note)
+    return _build_estimate(space, measurements, fit, filter, notes, one_sided)
 
 
 def _fit_exact(

@@ -20,6 +20,7 @@ from excite.model.mechanics import independent_columns
 DEPENDENCE_TOLERANCE = 1e-10  # relative distance from a combination of other columns, below which a column is dependent
 BLOCK_ROWS = 20_000  # rows of a tall matrix that are reduced at once; chosen
 MAX_COLUMN_RATIO = 10.0  # largest ratio of a dropped column to a kept one; chosen
+CLUSTERS = 10  # stretches of a log between which residuals are independent; chosen
 MAX_LAGS = 20  # largest order of the noise's autoregression; chosen
 
 
@@ -157,6 +158,19 @@ def scores_covariance(Z: np.ndarray, e: np.ndarray) -> np.ndarray:
         effect = scipy.signal.lfilter(one, a, z[::-1], axis=0)[::-1]
         scores += effect * innovation[:, None]
     return np.asarray(scores.T @ scores)
+
+
+def cluster_scores(Z: np.ndarray, e: np.ndarray) -> np.ndarray:
+    """Covariance (k, k) of the sum of Z'e, Z (n_rows, n, k), e (n_rows, n), for errors that last long.
+
+    Errors may correlate in any way within each of CLUSTERS stretches, and not beyond (Cameron and Miller, "A
+    practitioner's guide to cluster-robust inference", Journal of Human Resources 50, 2015).
+    """
+    n = e.shape[1]
+    count = max(2, min(CLUSTERS, n))
+    edges = np.linspace(0, n, count + 1).astype(int)
+    scores = np.add.reduceat(np.einsum("inp,in->np", Z, e), edges[:-1], axis=0)
+    return np.asarray(scores.T @ scores * (count / (count - 1)))
 
 
 def autoregression(x: np.ndarray, max_order: int) -> np.ndarray:

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import scipy
 
 from excite.errors import NotIdentifiableError
-from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Estimate, add_notes, held_note
+from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Estimate, held_note
 from excite.identification.identifiability import rest_projection
 from excite.identification.least_squares import (
     Solution,
     Triangle,
+    cluster_scores,
     lag_one_correlation,
     merge,
     reduce,
     scores_covariance,
     solve,
 )
+from excite.identification.near_rest import Block as Block, leave_out, moving_rows
 from excite.identification.noise_propagation import (
     MIN_ROW_NOISE,
     filtered_noise,
@@ -31,10 +34,9 @@ from excite.logs import Log, filtered_regression, samples
 from excite.model import Model
 from excite.model.machine import Filter
 
-Block = tuple[np.ndarray, np.ndarray]  # W (n_rows, n, n_base) and Y (n_rows, n) of one log
-
 MAX_REWEIGHTINGS = 30  # of the iteration for weights; chosen
 SETTLED_WEIGHTS = 1e-4  # relative change of the weights that ends it; chosen
+MAX_REST_SHIFT = 2.0  # standard deviations by which rows near rest may move an estimate; chosen
 NOTABLE_STD_RATIO = 1.2  # ratio of robust to textbook standard deviations that is reported; chosen
 
 
@@ -49,22 +51,24 @@ def ols(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     blocks = filtered_blocks(model, logs, filter)
     solution = solve_blocks(blocks, model.scale)
     estimate = estimate_with_white_noise(model, blocks, solution, "ols")
-    return add_notes(
-        estimate, *_autocorrelation_note(blocks, solution, estimate, sandwich_covariance(blocks, solution))
-    )
+    doubt = _autocorrelation_doubt(blocks, solution, estimate, sandwich_covariance(model, blocks, solution))
+    return replace(estimate, doubt=doubt)
 
 
 def wls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     """Estimate by weighted least squares, each equation weighted by its residual level, iterated.
 
     No level is below the sensor noise propagated at the machine file's values: a row without torque fits best with
-    parameters near zero and would gain all the weight. Standard deviations account for autocorrelation and for noise
-    that varies along the log. Biased like `ols` if the regressor is noisy, but less if noisy rows have less weight.
+    parameters near zero and would gain all the weight. Rows of joints near rest are left out if they contradict others.
+    Standard deviations account for autocorrelation and for noise that varies along the log. Biased like `ols` if the
+    regressor is noisy, but less if noisy rows have less weight.
     """
-    blocks = filtered_blocks(model, logs, filter)
+    every = filtered_blocks(model, logs, filter)
+    moving, notes = rows_in_motion(model, logs, filter, every)
+    blocks = leave_out(every, moving)
     lowest = row_levels([row_errors(model, log, filter, 1) for log in logs], model.nominal)
     lowest = np.maximum(lowest, MIN_ROW_NOISE * rms_torque(blocks))  # logs without noise have no residual
-    count = sum(Y.shape[1] for _, Y in blocks)
+    count = np.maximum(sum(_used(b).sum(axis=1) for b in blocks), 1)
     level, weighted = lowest, scale_rows(blocks, lowest)
     for _ in range(MAX_REWEIGHTINGS):
         solution = solve_blocks(weighted, model.scale)
@@ -73,10 +77,10 @@ def wls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         if np.abs(level / before - 1).max() < SETTLED_WEIGHTS:
             break
         weighted = scale_rows(blocks, level)
-    covariance = sandwich_covariance(weighted, solution)
+    covariance = sandwich_covariance(model, weighted, solution)
     degrees = effective_degrees(solution, covariance)
     x = restore_tied_parameters(model, blocks, solution, solution.x)
-    return build_estimate(model, blocks, solution, "wls", x, covariance, degrees, ())
+    return build_estimate(model, every, solution, "wls", x, covariance, degrees, notes)
 
 
 def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
@@ -88,7 +92,9 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     (Van Huffel and Vandewalle, "The total least squares problem", 1991, ch. 10). Raises NotIdentifiableError if no
     signal has noise.
     """
-    blocks = filtered_blocks(model, logs, filter)
+    every = filtered_blocks(model, logs, filter)
+    moving, notes = rows_in_motion(model, logs, filter, every)
+    blocks = leave_out(every, moving)
     first = solve_blocks(blocks, model.scale)
     whitening = [
         whitening_matrices(
@@ -98,8 +104,8 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     ]
     whitened = [whiten_block(b, L) for b, L in zip(blocks, whitening, strict=True)]
     errors = [
-        [np.einsum("nij,jnp->inp", L, E) for E in row_errors(model, log, filter)]
-        for log, L in zip(logs, whitening, strict=True)
+        [np.einsum("nij,jnp->inp", L, E * _used(b)[:, :, None]) for E in row_errors(model, log, filter)]
+        for log, L, b in zip(logs, whitening, blocks, strict=True)
     ]
     kept = list(first.kept)
     use = [*kept, len(model.base.names)]
@@ -117,18 +123,18 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     x[kept] = -direction[:-1] / direction[-1]
     level = 1 / float(mu[-1])
     bread = np.linalg.inv(R[:, :-1].T @ R[:, :-1] - level * C[:-1, :-1])
-    covariance = bread @ total_scores_covariance(whitened, x, kept) @ bread
+    covariance = robust_covariance(model, bread, whitened, x, kept)
     note = f"tls: misfit {np.sqrt(level):.2f} times what the sensors' noise and counts explain"
     x = restore_tied_parameters(model, blocks, first, x)
     return build_estimate(
         model,
-        blocks,
+        every,
         first,
         "tls",
         x,
         covariance,
         effective_degrees(solve_blocks(whitened, model.scale), covariance),
-        (note,),
+        (*notes, note),
     )
 
 
@@ -139,6 +145,48 @@ def filtered_blocks(model: Model, logs: Sequence[Log], filter: Filter) -> list[B
     """Filter the rows of every log; parts at rest in all logs are exactly at rest."""
     projection = rest_projection(model, logs, filter)
     return project_blocks([filtered_regression(model, log, filter) for log in logs], projection)
+
+
+def rows_in_motion(
+    model: Model, logs: Sequence[Log], filter: Filter, blocks: Sequence[Block]
+) -> tuple[list[np.ndarray], tuple[str, ...]]:
+    """Find the rows (n_rows, n) of each log to use, with a note.
+
+    Rows of joints near rest are left out if they move an estimate by more than noise explains (test of J. A. Hausman,
+    Econometrica 46, 1978), and every parameter is identified without them. Machines with slips keep all rows: a
+    selection by noisy slips would bias the estimate.
+    """
+    every = [np.ones(Y.shape, bool) for _, Y in blocks]
+    if model.slips:
+        return every, ()
+    moving = [moving_rows(model, log, filter) for log in logs]
+    share = 1 - float(np.mean(np.concatenate(moving, axis=1)))
+    if not share:
+        return every, ()
+    whole = solve_blocks(blocks, model.scale)
+    count = sum(Y.shape[1] for _, Y in blocks)
+    level = np.sqrt(sum((residual(b, whole.x) ** 2).sum(axis=1) for b in blocks) / count)
+    weighted = scale_rows(blocks, np.where(level > 0, level, 1.0))
+    rest = leave_out(weighted, moving)
+    with_rest, without = (solve(reduce_blocks(b), scale=model.scale) for b in (weighted, rest))
+    kept = list(without.kept)
+    if kept != list(with_rest.kept):
+        return every, ()
+    shift = (with_rest.x - without.x)[kept] / np.sqrt(np.diag(sandwich_covariance(model, rest, without)))
+    if not np.abs(shift).max(initial=0.0) > MAX_REST_SHIFT:
+        return every, ()
+    worst = int(np.argmax(np.abs(shift)))
+    note = (
+        f"friction sticks in this log: {100 * share:.2g} % of the rows are of joints near rest and are left out; they"
+        f" would move {model.base.names[kept[worst]]} by {abs(shift[worst]):.0f} standard deviations"
+    )
+    return moving, (note,)
+
+
+def _used(block: Block) -> np.ndarray:
+    """Find the rows (n_rows, n) that are not left out."""
+    W, Y = block
+    return np.asarray(W.any(axis=2) | (Y != 0))
 
 
 def project_blocks(blocks: Sequence[Block], projection: np.ndarray) -> list[Block]:
@@ -215,20 +263,37 @@ def residual(block: Block, x: np.ndarray) -> np.ndarray:
     return np.asarray(Y - W @ x)
 
 
-def total_scores_covariance(
-    blocks: Sequence[Block], x: np.ndarray, kept: Sequence[int], instruments: Sequence[np.ndarray] = ()
+def robust_covariance(
+    model: Model,
+    bread: np.ndarray,
+    blocks: Sequence[Block],
+    x: np.ndarray,
+    kept: Sequence[int],
+    instruments: Sequence[np.ndarray] = (),
 ) -> np.ndarray:
-    """Covariance (k, k) of Z'(Y - W x) summed over all logs, with instruments Z (n_rows, n, n_base), by default W."""
+    """Covariance (k, k) of the estimate bread Z'(Y - W x) for residuals of any autocorrelation and varying level.
+
+    bread (k, k). instruments: Z (n_rows, n, n_base) of each log, by default W. Residuals are noise that is correlated
+    over a few samples (`scores_covariance`), and structure that the model lacks, which lasts longer (`cluster_scores`):
+    each parameter has the larger of the two standard deviations. With slips the noise of the regressor prevails, whose
+    scores have no mean of zero within a stretch, so the second is left out.
+    """
     rows = sum(Y.size for _, Y in blocks)
-    Z = instruments or [W for W, _ in blocks]
-    S = sum(scores_covariance(z[:, :, list(kept)], residual(b, x)) for z, b in zip(Z, blocks, strict=True))
-    return np.asarray(S * (rows / (rows - len(kept))))
+    Z = [z[:, :, list(kept)] for z in instruments or [W for W, _ in blocks]]
+    errors = [residual(b, x) for b in blocks]
+    kinds = (scores_covariance,) if model.slips else (scores_covariance, cluster_scores)
+    sums = [sum(scores(z, e) for z, e in zip(Z, errors, strict=True)) for scores in kinds]
+    short, *long = (bread @ S @ bread.T for S in sums)
+    variance = np.diag(short)
+    ratio = np.ones(len(variance))
+    for other in long:
+        ratio = np.sqrt(np.maximum(np.diag(other) / np.where(variance > 0, variance, np.inf), 1.0))
+    return np.asarray(short * np.outer(ratio, ratio) * (rows / (rows - len(kept))))
 
 
-def sandwich_covariance(blocks: Sequence[Block], solution: Solution) -> np.ndarray:
-    """Covariance (k, k) of a least-squares estimate for noise of any autocorrelation and varying level."""
-    inverse = solution.inverse
-    return inverse @ total_scores_covariance(blocks, solution.x, solution.kept) @ inverse
+def sandwich_covariance(model: Model, blocks: Sequence[Block], solution: Solution) -> np.ndarray:
+    """Robust covariance (k, k) of a least-squares estimate."""
+    return robust_covariance(model, solution.inverse, blocks, solution.x, solution.kept)
 
 
 def effective_degrees(solution: Solution, covariance: np.ndarray) -> int:
@@ -293,17 +358,15 @@ def build_estimate(
     )
 
 
-def _autocorrelation_note(
-    blocks: Sequence[Block], solution: Solution, estimate: Estimate, robust: np.ndarray
-) -> tuple[str, ...]:
-    """Note on the error of standard deviations by (33) if residuals are autocorrelated."""
+def _autocorrelation_doubt(blocks: Sequence[Block], solution: Solution, estimate: Estimate, robust: np.ndarray) -> str:
+    """Say by how much standard deviations by (33) are too small for autocorrelated residuals, "" if they are not."""
     kept = list(solution.kept)
     ratio = np.sqrt(np.diag(robust)) / estimate.std[kept]
     if not ratio.max() > NOTABLE_STD_RATIO:
-        return ()
+        return ""
     correlation = max((float(np.abs(lag_one_correlation(residual(b, solution.x))).max()) for b in blocks), default=0.0)
     worst = int(np.argmax(ratio))
     return (
-        f"ols: residuals are autocorrelated (lag 1: {correlation:.2f}), deviations by (33) are too small by a"
-        f" factor of {np.median(ratio):.1f} in the middle, {ratio[worst]:.1f} for {estimate.names[kept[worst]]}",
+        f"residuals are autocorrelated (lag 1: {correlation:.2f}), so standard deviations by (33) are too small by a"
+        f" factor of up to {ratio[worst]:.1f} ({estimate.names[kept[worst]]}): --method wls states what holds"
     )

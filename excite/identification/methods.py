@@ -18,6 +18,7 @@ from excite.identification.instrumental_variables import iv
 from excite.identification.joint import joint
 from excite.identification.linear_methods import filtered_blocks, ols, tls, wls
 from excite.identification.output_error import oe
+from excite.identification.status import assess
 from excite.logs import NEEDED, Log, doubts_in_errors, examine
 from excite.model import Model
 from excite.model.machine import Filter
@@ -66,6 +67,7 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
                 f"{repaired[0].source}: the equations of {method} are singular along this log: check the sign and unit"
                 " of every column, and that the machine moves"
             ) from None
+    estimate = assess(model, repaired, estimate, filter)
     return add_notes(estimate, *(note for e in examined for note in e.notes), *doubts)
 
 
@@ -132,8 +134,8 @@ def add_bias(
 
 
 def recommend_method(model: Model) -> str:
-    """Recommend joint smoothing for a machine with effects, or with slips (a noisy regressor), else ols."""
-    return "joint" if model.slips or not model.plain else "ols"
+    """Recommend joint smoothing for a machine with effects, or with slips (a noisy regressor), else wls."""
+    return "joint" if model.slips or not model.plain else "wls"
 
 
 def needed_sensors(model: Model, method: str) -> tuple[str, ...]:

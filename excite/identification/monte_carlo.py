@@ -123,6 +123,8 @@ def _run(
         estimate = methods.identify(assumed, [measured], method)
     except NoEstimateError as err:
         return k, None, str(err)
+    if estimate.status == "invalid":
+        return k, None, f"no estimate: {estimate.doubt}, and some values are those of no machine"
     return k, (estimate.value, estimate.std, estimate.interval95), ""
 
 

@@ -26,7 +26,8 @@ SHOWN_VIOLATION = 5e-6  # of a limit's range: smaller ones round to 0.000 %
 class Table:
     """A table of text cells.
 
-    marked: rows (indices) that are set off. optional: columns (indices) that a narrow terminal leaves out.
+    marked: rows (indices) that are set off. optional: columns (indices) that a narrow terminal leaves out. grey: not
+    to be relied on.
     """
 
     caption: str
@@ -34,6 +35,7 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     marked: tuple[int, ...] = ()
     optional: tuple[int, ...] = ()
+    grey: bool = False
 
     @property
     def text_columns(self) -> tuple[int, ...]:
@@ -53,12 +55,14 @@ class Description:
     """A result for people.
 
     title: what it is. headline: the answer in a sentence. remarks: what else the reader must know, a sentence each.
+    status: `valid`, `doubtful` or `invalid`.
     """
 
     title: str
     headline: str
     tables: tuple[Table, ...] = ()
     remarks: tuple[str, ...] = ()
+    status: str = "valid"
 
 
 def describe(kind: str, summary: Summary) -> Description:
@@ -263,6 +267,7 @@ def describe_verify(s: Summary) -> Description:
     return Description(title, headline, tables, tuple(remarks))
 
 
+MAX_NAMES = 4  # parameters that a headline names
 ESTIMATE_COLUMNS = (  # of a parameter: heading, key, digits
     ("value", "value", 6),
     ("std", "std", 3),
@@ -277,20 +282,39 @@ def describe_identify(s: Summary) -> Description:
     rows = s["parameters"]
     known = {n: abs(r["std_percent"]) for n, r in rows.items() if r["std_percent"] is not None}
     known = {n: v for n, v in known.items() if np.isfinite(v)}
-    worst = max(known, key=lambda n: known[n])
+    worst = max(known, key=lambda n: known[n], default="")
     count = (
         f"{len(known)} parameters"
         if not s["unidentifiable"]
         else f"{len(known)} of {len(known) + len(s['unidentifiable'])} parameters"
     )
     logs = "one log" if len(s["logs"]) == 1 else f"{len(s['logs'])} logs"
-    median, error = float(np.median(list(known.values()))), format_percent(float(s["relative_error_percent"]))
-    headline = (
-        f"From {logs}, {count} are identified to {format_percent(median)} (median, one standard deviation; worst"
-        f" {worst}, {format_percent(known[worst])}); the prediction error is {error} of what was measured."
+    error = format_percent(float(s["relative_error_percent"]))
+    accuracy = (
+        f" {format_percent(float(np.median(list(known.values()))))} (median, one standard deviation; worst {worst},"
+        f" {format_percent(known[worst])})"
+        if known
+        else " no known accuracy"
     )
+    headline = (
+        f"From {logs}, {count} are identified to{accuracy}; the prediction error is {error} of what was measured."
+    )
+    if s["status"] == "doubtful":
+        headline = (
+            f"From {logs}, {count} are estimated, but their 95 % intervals do not hold: {s['doubt']}"
+            f" (stated:{accuracy}; prediction error {error})."
+        )
     off = {n: abs(r["bias"] / (r["value"] - r["bias"])) for n, r in rows.items() if n in known and _is_biased(r)}
-    if off:
+    impossible = [n for n, r in rows.items() if not r["possible"]]
+    if impossible and s["status"] == "valid":
+        have = "has a value" if len(impossible) == 1 else "have values"
+        headline = f"{headline[:-1]}; {_join_some(impossible)} {have} that no machine has."
+    if s["status"] == "invalid":
+        reason = f", and {_join_some(impossible)} would have values that no machine has" if impossible else ""
+        headline = (
+            f"No estimate: the model does not explain {logs} (prediction error {error} of what was measured){reason}."
+        )
+    elif off:
         most = max(off, key=lambda n: off[n])
         headline = (
             f"From {logs}, {s['method']} identifies {count}, {len(off)} of them wrong by more than it says: on"
@@ -309,6 +333,7 @@ def describe_identify(s: Summary) -> Description:
             r["unit"],
             *(format_number(r[k], d) for _, k, d in ESTIMATE_COLUMNS),
             *((format_number(r.get("bias"), 3),) if biased else ()),
+            *(("" if r["possible"] else "no", format_number(r.get("consistent"), 6)) if impossible else ()),
         )
         for n, r in rows.items()
     )
@@ -318,11 +343,23 @@ def describe_identify(s: Summary) -> Description:
         "unit",
         *(heading for heading, *_ in ESTIMATE_COLUMNS),
         *(("bias of the method",) if biased else ()),
+        *(("possible", "nearest possible machine") if impossible else ()),
     )
     conds = f"cond(W) {s['cond_w']:.4g}, cond(Phi) {s['cond_phi']:.4g}"
     caption = f"Parameters with one standard deviation and 95 % interval, method {s['method']}; {conds}."
-    tables = (Table(caption, names, table, optional=_meaning_index(s)),)
-    return Description(f"Parameters of {s['machine']}", headline, tables, tuple(remarks))
+    if s["status"] == "invalid":
+        caption = (
+            f"No estimate: where the fit by {s['method']} ended, to find the cause. {conds[0].upper()}{conds[1:]}."
+        )
+    marked = tuple(k for k, r in enumerate(rows.values()) if not r["possible"])
+    tables = (Table(caption, names, table, marked, _meaning_index(s), grey=s["status"] != "valid"),)
+    return Description(f"Parameters of {s['machine']}", headline, tables, tuple(remarks), s["status"])
+
+
+def _join_some(names: Sequence[str]) -> str:
+    """Join the first names, and count the others."""
+    shown = ", ".join(names[:MAX_NAMES])
+    return shown if len(names) <= MAX_NAMES else f"{shown} and {len(names) - MAX_NAMES} more"
 
 
 def _is_biased(row: Mapping[str, Any]) -> bool:

@@ -56,12 +56,14 @@ def report_page(
     tables: Sequence[Table] = (),
     how: Mapping[str, str] | None = None,
     remarks: Sequence[str] = (),
+    status: str = "valid",
 ) -> str:
     """Render a printable report: the answer first, then remarks, figures, tables and how it was made.
 
-    answer: one sentence. remarks: a sentence each. how: name -> value, `command` among them.
+    answer: one sentence, coloured by status (valid, doubtful or invalid). remarks: a sentence each. how: name -> value,
+    `command` among them.
     """
     template = templates().get_template("report.html")
     return template.render(
-        title=title, answer=answer, figures=figures, tables=tables, how=dict(how or {}), remarks=remarks
+        title=title, answer=answer, figures=figures, tables=tables, how=dict(how or {}), remarks=remarks, status=status
     )

@@ -68,6 +68,7 @@ def write_page(place: Path, kind: str, summary: Summary) -> None:
         description.tables,
         provenance(summary),
         description.remarks,
+        description.status,
     )
     (place / REPORT).write_text(text, encoding="utf-8")
 

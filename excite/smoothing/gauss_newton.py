@@ -150,6 +150,10 @@ def linearise_log(
     """
     delivered, behind = space.delivered_torques(data.torque, X, trajectory.sampled_torque_error)
     noise = space.delivered_noise(data.noise.torque, X)
+    if data.extra_torque_noise is None:
+        noise = np.broadcast_to(noise, trajectory.torque_error.shape)
+    else:
+        noise = np.hypot(noise, data.extra_torque_noise)
     left, right = (
         space.inputs(d + trajectory.torque_error, o)
         for d, o in ((delivered[:-1], trajectory.ground_inputs[:-1]), (delivered[1:], trajectory.ground_inputs[1:]))
@@ -176,16 +180,15 @@ def linearise_log(
         jacobians = differentiate(
             space, trajectory.state[begin : end + 1], left[begin:end], right[begin:end], X, process_noise > 0
         )
-        gain = jacobians.B * noise / scale[:, None]
+        gain = jacobians.B * noise[begin:end, None, :] / scale[:, None]
         C = gain @ gain.transpose(0, 2, 1)
         if process_noise > 0:
             process = jacobians.F * (process_noise * PROCESS_NOISE_UNIT * space.forced_inertia) / scale[:, None]
             C += process @ process.transpose(0, 2, 1)
         A = jacobians.A * (scale / scale[:, None])
         b = np.zeros((end - begin, space.n, 1 + n_p + n_o))
-        b[:, :, 0] = (
-            defect[begin:end] / scale - (gain @ (trajectory.torque_error[begin:end] / noise)[:, :, None])[:, :, 0]
-        )
+        relative_error = trajectory.torque_error[begin:end] / noise[begin:end]
+        b[:, :, 0] = defect[begin:end] / scale - (gain @ relative_error[:, :, None])[:, :, 0]
         b[:, :, 1 : 1 + n_p] = (jacobians.X + jacobians.B @ behind[begin:end]) * (space.model.scale / scale[:, None])
         gains.append(gain)
         for k in range(begin, end, PART_SIZE):

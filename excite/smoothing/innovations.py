@@ -46,7 +46,7 @@ class LinearisedLog:
     elements: elements of the chain, part by part.
     H (N, m, n), weight, residual (N, m): slopes, 1 / variance and residual of the readings.
     direct (N, m, n_f + n_o): slopes of the readings by the parameters they depend on directly, and by offsets.
-    noise (n_u,): standard deviation of the delivered torques [N m].
+    noise (N - 1, n_u): standard deviation of the delivered torques [N m].
     beat_inflation (N, m): variance of the readings relative to 1 / weight where encoder errors beat.
     """
 

@@ -48,6 +48,8 @@ class Measurements:
         alone. If False, readings are weighted by their information: estimates are steadier, and poorly known
         directions are biased by half a standard deviation or more.
     noise_inflation: factor on the standard deviations of the sensors.
+    extra_torque_noise (N - 1, n_u) [N m]: standard deviation that the delivered torque of an interval has beside the
+        sensor's noise, or None.
     """
 
     torque: np.ndarray
@@ -58,10 +60,18 @@ class Measurements:
     noise: SensorNoise
     unbiased: bool = False
     noise_inflation: float = 1.0
+    extra_torque_noise: np.ndarray | None = None
 
     def until(self, samples: int) -> Measurements:
         """The first samples only."""
-        return replace(self, torque=self.torque[:samples], reading=self.reading[:samples], used=self.used[:samples])
+        extra = self.extra_torque_noise
+        return replace(
+            self,
+            torque=self.torque[:samples],
+            reading=self.reading[:samples],
+            used=self.used[:samples],
+            extra_torque_noise=None if extra is None else extra[: samples - 1],
+        )
 
 
 @dataclass(frozen=True)

@@ -38,11 +38,17 @@ def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str
     used = [examine(model.machine, one).log for one in logs]
     if model.slips and identification.METHODS[method].biased:
         estimate = identification.add_bias(model, used, estimate, chosen)
+        if estimate.bias is not None and (np.abs(np.nan_to_num(estimate.bias)) > estimate.std).any():
+            doubt = estimate.doubt or f"on simulated logs like this {method} is off by more than its intervals say"
+            estimate = replace(
+                estimate, doubt=doubt, status="doubtful" if estimate.status == "valid" else estimate.status
+            )
     found = estimate.value if estimate.method == "joint" and np.isfinite(estimate.value).all() else None
     late = [remark for one in used for remark in describe_late_channels(model, one, chosen, found)]
     first = (reason,) if reason else ()
     notes = (*first, *estimate.notes, *identification.far_from_nominal(model, estimate), *late)
-    return IdentifyResult(replace(estimate, notes=notes), used, chosen)
+    estimate = identification.add_consistent(model, replace(estimate, notes=notes))
+    return IdentifyResult(estimate, used, chosen)
 
 
 def identify(
@@ -76,6 +82,8 @@ def identify(
     summary = {
         "machine": model.machine.name,
         "logs": [one.source for one in read],
+        "status": estimate.status,
+        "doubt": estimate.doubt,
         "method": estimate.method,
         "parameters": _parameters(estimate),
         "meanings": parameter_descriptions(model),
@@ -110,7 +118,10 @@ def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:
             "std_percent": estimate.std_percent[k],
             "low95": low[k],
             "high95": high[k],
+            "possible": estimate.possible is None or bool(estimate.possible[k]),
         }
+        if estimate.consistent is not None:
+            rows[name]["consistent"] = estimate.consistent[k]
         if estimate.bias is not None and estimate.bias_std is not None:
             rows[name] |= {"bias": estimate.bias[k], "bias_std": estimate.bias_std[k]}
     return rows

@@ -100,6 +100,8 @@ def _run_steps(batch: RunBatch, seed: int) -> Row:
     if steps & {"identify", "verify"}:
         measured = from_table(table, known.machine, identification.needed_sensors(known, batch.method))
         estimate = identification.identify(known, [measured], batch.method)
+        if estimate.status == "invalid":
+            raise NoEstimateError(f"no estimate: {estimate.doubt}, and some values are those of no machine")
         arrays = (estimate.value, estimate.std, *estimate.interval95)
         row |= {name: _json_value(array.tolist()) for name, array in zip(ESTIMATE_COLUMNS, arrays, strict=True)}
         row["relative_error_percent"] = _json_value(estimate.relative_error_percent)

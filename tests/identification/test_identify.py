@@ -147,7 +147,7 @@ def test_unknown_method_is_refused(straight: Model) -> None:
 
 
 def test_recommended_method_follows_the_machine(va12: Model, straight: Model, emps: Model) -> None:
-    assert [methods.recommend_method(m) for m in (va12, straight, emps)] == ["joint", "joint", "ols"]
+    assert [methods.recommend_method(m) for m in (va12, straight, emps)] == ["joint", "joint", "wls"]
 
 
 def test_sensors_that_are_missing_are_named(va12: Model, va12_motion: Motion) -> None:

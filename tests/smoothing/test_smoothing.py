@@ -15,6 +15,7 @@ import scipy.signal
 from support.logs import make_log
 
 from excite import smoothing
+from excite.errors import LogError
 from excite.identification import identify, joint
 from excite.logs import Log
 from excite.model import Model, prediction
@@ -348,9 +349,9 @@ def test_what_the_model_does_not_know_is_seen_in_the_innovations(
     X = perturbed(va12, 1)
     real = nature(va12, amount)
     estimate = identify(va12, [measured(real, simulate(real, energetic(), X), X)], "joint")
-    assert joint.UNEXPLAINED_NOTE in estimate.notes
-    assert "more than their intervals" in joint.UNEXPLAINED_NOTE
-    assert "excite diagnose" in joint.UNEXPLAINED_NOTE
+    assert estimate.status == "doubtful"
+    assert "more than their intervals" in estimate.doubt
+    assert "excite diagnose" in estimate.doubt
     assert any("innovations" in note or "no estimate" in note for note in estimate.notes)
     assert (estimate.std > undisturbed).all()
     assert np.median(np.abs(estimate.value - X) / np.maximum(np.abs(X), va12.scale)) < 0.03
@@ -382,7 +383,7 @@ def test_spikes_are_taken_out_first(va12: Model) -> None:
     log.values["thetal"][1800] += 0.3
     estimate = identify(va12, [log], "joint")
     assert sum("spike" in note for note in estimate.notes) == 2
-    assert joint.UNEXPLAINED_NOTE not in estimate.notes
+    assert estimate.status == "valid"
     assert np.sqrt(np.mean(((estimate.value - X) / estimate.std) ** 2)) < 1.6
 
 
@@ -391,7 +392,7 @@ def test_a_log_of_something_else_gives_no_number(va12: Model) -> None:
     rng = np.random.default_rng(0)
     good = measured(va12, simulate(va12, energetic(20)), va12.nominal)
     values = {name: rng.permutation(value) for name, value in good.values.items()}
-    with pytest.raises(joint.NotConvergedError, match="excite diagnose"):
+    with pytest.raises(LogError, match="the machine allows"):
         identify(va12, [Log("shuffled", good.t, values)], "joint")
 
 

@@ -1,0 +1,107 @@
+"""What an estimate is worth: its status, and values that no machine has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from excite.errors import NotConsistentError
+from excite.identification.estimate import Estimate, add_notes
+from excite.logs import Log, samples
+from excite.model import Model, required_signs
+from excite.model.machine import Filter
+
+CLEAR_STDS = 3.0  # standard deviations beyond the possible that no noise explains; chosen
+MOVED_STDS = 2.0  # shift to the nearest possible machine that makes an inertial value impossible; chosen
+TRIED_POSTURES = 200  # of the logs, in which the mass matrix must be positive definite; chosen
+INERTIAL_INITIALS = "MXYZ"  # of the names of inertial parameters
+NEVER_NEGATIVE = ("M", "XX", "YY", "ZZ")  # standard inertial parameters that no body has below zero
+CAUSES = "the sign of a torque or angle column, a unit, or a radius in the machine file"
+
+
+def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter) -> Estimate:
+    """Give an estimate its status, and mark values that no machine has.
+
+    Status: `valid`; `doubtful` if the 95 % intervals do not hold, `doubt` says why; `invalid` if besides some value is
+    impossible far beyond its standard deviation: then there is no estimate.
+    """
+    possible, clear = _signs_hold(model, estimate)
+    definite = _is_positive_definite(model, logs, estimate, filter)
+    notes = [_note(estimate, int(k)) for k in np.flatnonzero(~possible)]
+    if not definite:
+        moved = np.isin(estimate.names, [n for n in model.base.names if n[0] in INERTIAL_INITIALS])
+        consistent = _nearest(model, estimate)
+        if consistent is not None:
+            with np.errstate(invalid="ignore"):
+                shift = np.abs(consistent - estimate.value) / estimate.std
+            moved &= shift > MOVED_STDS
+            clear |= bool((shift[moved] > CLEAR_STDS).any())
+        possible &= ~moved
+        notes.append("with these values the mass matrix is not positive definite: no machine has them together")
+    status = "valid" if not estimate.doubt else "invalid" if clear else "doubtful"
+    return add_notes(replace(estimate, status=status, possible=possible), *notes)
+
+
+def add_consistent(model: Model, estimate: Estimate) -> Estimate:
+    """Add the values of the nearest possible machine to an estimate with impossible ones, if there is one."""
+    if estimate.possible is None or estimate.possible.all() or not model.plain:
+        return estimate
+    return replace(estimate, consistent=_nearest(model, estimate))
+
+
+def _signs_hold(model: Model, estimate: Estimate) -> tuple[np.ndarray, bool]:
+    """Tell which values (n,) have a sign that a machine may have, and if any clearly has not."""
+    signs = required_signs(model.machine)
+    possible, clear = np.ones(len(estimate.names), bool), False
+    for k in range(min(len(estimate.names), len(model.base.matrix))):
+        row = model.base.matrix[k]
+        members = [(model.base.standard[j], float(row[j])) for j in np.flatnonzero(np.abs(row) > 1e-12)]
+        wanted = {_sign(name, signs) * np.sign(share) for name, share in members}
+        if len(wanted) != 1 or 0 in wanted or not np.isfinite(estimate.value[k]):
+            continue
+        beyond = -float(wanted.pop()) * estimate.value[k]
+        if beyond > 0:
+            possible[k] = False
+            clear |= bool(beyond > CLEAR_STDS * estimate.std[k])
+    return possible, clear
+
+
+def _sign(name: str, signs: dict[str, float]) -> float:
+    """Sign that a standard parameter has on every machine; 0 if either is possible."""
+    if name in signs:
+        return signs[name]
+    return 1.0 if name.rstrip("0123456789") in NEVER_NEGATIVE else 0.0
+
+
+def _is_positive_definite(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter) -> bool:
+    """Tell if the mass matrix is positive definite along the logs; unidentifiable values are the machine file's."""
+    if not model.plain:
+        return True
+    X = np.where(np.isfinite(estimate.value), estimate.value, model.nominal)
+    for log in logs:
+        q = samples(model, log, filter).q
+        at = np.linspace(0, q.shape[1] - 1, min(TRIED_POSTURES, q.shape[1])).astype(int)
+        if not (model.pivots(q[:, at], X).full() > 0).all():
+            return False
+    return True
+
+
+def _nearest(model: Model, estimate: Estimate) -> np.ndarray | None:
+    """Values (n,) of the nearest possible machine, None if there is none."""
+    from excite.identification.consistency import nearest_possible  # cvxpy takes a second to load
+
+    try:
+        return nearest_possible(model, replace(estimate, notes=())).value
+    except (NotConsistentError, np.linalg.LinAlgError):
+        return None
+
+
+def _note(estimate: Estimate, k: int) -> str:
+    """Say of an impossible value what usually causes it."""
+    value, std, unit = estimate.value[k], estimate.std[k], estimate.units[k]
+    text = f"{estimate.names[k]} = {value:.4g} {unit}: no machine has such a value"
+    if abs(value) > CLEAR_STDS * std:
+        return f"{text}; usual causes are {CAUSES}"
+    return f"{text}; with +- {std:.2g} {unit} a possible one is within its uncertainty: the log excites it poorly"

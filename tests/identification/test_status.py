@@ -1,0 +1,71 @@
+"""What is said of an estimate: its status, and values that no machine has."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from support.commands import Excite
+
+from excite.identification import identify, needed_sensors
+from excite.logs import Log, prepare
+from excite.model import Model
+from excite.simulation import Motion, measure
+
+
+@pytest.fixture(scope="module")
+def table(va12: Model, va12_motion: Motion) -> pd.DataFrame:
+    return measure(va12, va12_motion, seed=2)
+
+
+def test_a_turned_torque_gives_no_estimate(table: pd.DataFrame, tmp_path: Path, excite: Excite) -> None:
+    """The headline says so, the exit code is 1, no value is printed, the report greys them out."""
+    table.assign(u4_Nm=-table["u4_Nm"]).to_csv(tmp_path / "log.csv", index=False)
+    code, stdout, _ = excite("identify", "va12", tmp_path / "log.csv", "--method", "ols", "--out", tmp_path / "out")
+    assert code == 1
+    assert "No estimate: the model does not explain one log" in " ".join(stdout.split())
+    assert "dry friction, rear roll" not in stdout
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["status"] == "invalid"
+    assert summary["parameters"]["Fs4"]["possible"] is False
+    assert summary["parameters"]["u40"]["possible"] is True
+    assert summary["parameters"]["Fs4"]["consistent"] >= 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert '<p class="answer invalid">' in page
+    assert '<table class="grey">' in page
+
+
+def test_a_good_log_is_valid(va12: Model, table: pd.DataFrame) -> None:
+    ready = prepare(va12, [table], needed_sensors(va12, "joint"))
+    estimate = identify(ready.model, ready.logs, "joint")
+    assert (estimate.status, estimate.doubt) == ("valid", "")
+    assert estimate.possible is not None
+    assert estimate.possible.all()
+
+
+def test_a_pull_that_nobody_knows_leaves_doubt(va12: Model, table: pd.DataFrame, tmp_path: Path) -> None:
+    pulled = table.assign(u1_Nm=table["u1_Nm"] + 150.0 * (table["t_s"] > 30))
+    ready = prepare(va12, [pulled], needed_sensors(va12, "joint"))
+    estimate = identify(ready.model, ready.logs, "joint")
+    assert estimate.status == "doubtful"
+    assert "does not explain" in estimate.doubt
+
+
+def test_more_of_a_log_is_never_less_sure(straight: Model, straight_motion: Motion) -> None:
+    """A second log, and rests before and after: every deviation stays or shrinks, within a tenth."""
+    first, second = (measure(straight, straight_motion, seed=s) for s in (1, 2))
+    rest = first.iloc[[0] * 2000].reset_index(drop=True)
+    step = first["t_s"].iloc[1] - first["t_s"].iloc[0]
+    rested = pd.concat([rest, first], ignore_index=True)
+    rested["t_s"] = step * rested.index
+    alone, both, still = (_deviations(straight, logs) for logs in ([first], [first, second], [rested]))
+    assert (both < 1.1 * alone).all()
+    assert (still < 1.1 * alone).all()
+
+
+def _deviations(model: Model, tables: list[pd.DataFrame]) -> object:
+    ready = prepare(model, tables, needed_sensors(model, "joint"))
+    logs: list[Log] = ready.logs
+    return identify(ready.model, logs, "joint").std
