@@ -46,7 +46,7 @@ def test_a_good_log_is_valid(va12: Model, table: pd.DataFrame) -> None:
 
 
 def test_a_pull_that_nobody_knows_leaves_doubt(va12: Model, table: pd.DataFrame, tmp_path: Path) -> None:
-    pulled = table.assign(u1_Nm=table["u1_Nm"] + 150.0 * (table["t_s"] > 30))
+    pulled = table.assign(u1_Nm=table["u1_Nm"] + 60.0 * (table["t_s"] > 30))
     ready = prepare(va12, [pulled], needed_sensors(va12, "joint"))
     estimate = identify(ready.model, ready.logs, "joint")
     assert estimate.status == "doubtful"
