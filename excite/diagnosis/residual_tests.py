@@ -214,7 +214,7 @@ def _value_bands(name: str, t: np.ndarray, value: np.ndarray) -> Iterator[Anomal
     # A stuck bit cuts values off where they are dense; noise about the levels of a stepped torque fades.
     neighbours = np.add.outer(holes, [*range(-EDGE_GAPS, 0), *range(1, EDGE_GAPS + 1)])
     around = scipy.ndimage.median_filter(gap, EDGE_REFERENCE_GAPS, mode="nearest")[holes] / np.log(2)
-    edges = gap[np.clip(neighbours, 0, len(gap) - 1)].mean(axis=1) / around
+    edges = gap[np.clip(neighbours, 0, len(gap) - 1)].mean(axis=1) / np.maximum(around, np.finfo(float).tiny)
     is_sharp, is_regular = (
         np.median(edges) <= MAX_EDGE_RATIO,
         regular.sum() >= max(MIN_HOLES - 1, MIN_REGULAR_SHARE * len(regular)),

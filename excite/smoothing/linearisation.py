@@ -489,8 +489,8 @@ def _rosenbrock_step(
         at = y + sum((w * U for w, U in zip(weights, stages, strict=True)), ca.SX(n, 1))
         right_hand_side = rate(at, left + slope * (time * h), X) + gain * h * dt
         right_hand_side += sum((w * U for w, U in zip(c, stages, strict=True)), ca.SX(n, 1)) / h
-        inner = lu_solve(lower, upper, right_hand_side[:core])
-        stages.append(ca.vertcat(inner, GAMMA * h * (Ry @ inner + right_hand_side[core:])))
+        inner = lu_solve(lower, upper, right_hand_side[:core, 0])
+        stages.append(ca.vertcat(inner, GAMMA * h * (Ry @ inner + right_hand_side[core:, 0])))
     error = ca.norm_inf(stages[-1] / error_scale)
     return ca.Function("step", [y, left, slope, h, X], [at + stages[-1], error], {"cse": True})
 
