@@ -62,6 +62,12 @@ def every(
     """
 
 
+TABLE_WRITERS: dict[str, Callable[[Any, Path], None]] = {
+    ".csv": lambda table, path: table.to_csv(path, index=False),
+    ".parquet": lambda table, path: table.to_parquet(path, index=False),
+}
+
+
 @contextmanager
 def _result(
     out: Path, json: bool, describe: Callable[[dict[str, Any]], None], inputs: Sequence[Path] = ()
@@ -355,8 +361,7 @@ def simulate(
     if noise not in ("on", "off"):
         raise UsageError(f"--noise: {noise} is unknown, allowed: on, off")
     workflows.require_known("--kit", kit, simulation.KITS)
-    writers = {".csv": lambda t, p: t.to_csv(p, index=False), ".parquet": lambda t, p: t.to_parquet(p, index=False)}
-    workflows.require_known("--out: ending", out.suffix.lower(), tuple(writers))
+    workflows.require_known("--out: ending", out.suffix.lower(), tuple(TABLE_WRITERS))
     model = workflows.build_model(machine)
     if out.resolve() in [path.resolve() for path in (profile, *_machine_file(machine))]:
         raise UsageError(f"--out {out}: is what the log is made from, choose another file")
@@ -366,7 +371,7 @@ def simulate(
     with output.new_file(out) as path:
         motion = drive(model, torque, q0=q0, nu0=nu0)
         table = simulation.measure(model, motion, kit=kit, seed=seed, noise=noise == "on")
-        writers[out.suffix.lower()](table, path)
+        TABLE_WRITERS[out.suffix.lower()](table, path)
     summary = {
         "machine": model.machine.name,
         "profile": str(profile),
@@ -452,7 +457,7 @@ def diagnose(
         summary |= workflows.diagnose(place, machine, logs, filtering, design_next, terminal.bar)
 
 
-logs = typer.Typer(help="Check a log.", rich_markup_mode=None)
+logs = typer.Typer(help="Check or convert a log.", rich_markup_mode=None)
 app.add_typer(logs, name="log")
 
 
@@ -479,6 +484,46 @@ def check_log(
         lambda place: reports.check_log(place, path, machine, workflows.package_versions()),
         partial(terminal.show, "log"),
     )
+
+
+@logs.command("convert")
+def convert_log(
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="a log of any kind that is read")],
+    machine: Annotated[str, typer.Option("--machine", help="machine of the log")],
+    out: Annotated[Path, typer.Option("--out", help="log to write (.parquet or .csv); several stretches get numbers")],
+    si: Annotated[bool, typer.Option("--si", help="columns named after the sensors, in SI units")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Write a log as it is used: on an even grid of time, checked and repaired, in the machine file's columns.
+
+    Identify from the log itself: where its times are uneven it also says when each count of an encoder came.
+
+    Example: excite log convert log.mf4 --machine va12 --out log.parquet
+    """
+    from excite import output
+    from excite.logs import convert
+
+    workflows.require_known("--out: ending", out.suffix.lower(), tuple(TABLE_WRITERS))
+    model = workflows.build_model(machine)
+    tables, rate, notes = convert(model, path, si)
+    numbered = [out.with_name(f"{out.stem}-{k + 1}{out.suffix}") for k in range(len(tables))]
+    paths = [out] if len(tables) == 1 else numbered
+    if {p.resolve() for p in paths} & {path.resolve(), *(p.resolve() for p in _machine_file(machine))}:
+        raise UsageError(f"--out {out}: is what the log is made from, choose another file")
+    for table, file in zip(tables, paths, strict=True):
+        with output.new_file(file) as part:
+            TABLE_WRITERS[out.suffix.lower()](table, part)
+    files = [
+        {"path": str(file), "rows": len(table), "rate_hz": rate, "duration_s": (len(table) - 1) / rate}
+        for table, file in zip(tables, paths, strict=True)
+    ]
+    if json:
+        terminal.show_json({"machine": model.machine.name, "log": str(path), "files": files, "notes": notes})
+        return
+    for one in files:
+        terminal.say(f"{one['path']}: {one['rows']} rows, {one['duration_s']:.4g} s at {one['rate_hz']:.4g} Hz")
+    for line in notes:
+        terminal.say(f"- {line}")
 
 
 def _check_logs_and_filter(logs: Sequence[Path], filtering: str) -> None:

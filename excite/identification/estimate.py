@@ -27,7 +27,8 @@ class Estimate:
     degrees: degrees of freedom of the residual.
     bias, bias_std (n,) [SI]: mean error of the method on simulated logs, and its standard deviation, if computed.
     one_sided_std (2, n) [SI]: standard deviations below and above if the likelihood is skewed; std lies between them.
-    doubt: why the 95 % intervals do not hold, "" if they do. status: valid, doubtful or invalid (see `status.assess`).
+    doubt: why the 95 % intervals do not hold, "" if they do. understated: factor by which standard deviations are known
+        to be too small. status: valid, doubtful or invalid (see `status.assess`).
     possible (n,): False for values that no machine has. consistent (n,) [SI]: values of the nearest possible machine,
         if some value is not possible.
     """
@@ -48,6 +49,7 @@ class Estimate:
     bias_std: np.ndarray | None = None
     one_sided_std: np.ndarray | None = None
     doubt: str = ""
+    understated: float = 1.0
     status: str = "valid"
     possible: np.ndarray | None = None
     consistent: np.ndarray | None = None

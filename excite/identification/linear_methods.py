@@ -51,8 +51,8 @@ def ols(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     blocks = filtered_blocks(model, logs, filter)
     solution = solve_blocks(blocks, model.scale)
     estimate = estimate_with_white_noise(model, blocks, solution, "ols")
-    doubt = _autocorrelation_doubt(blocks, solution, estimate, sandwich_covariance(model, blocks, solution))
-    return replace(estimate, doubt=doubt)
+    doubt, factor = _autocorrelation_doubt(blocks, solution, estimate, sandwich_covariance(model, blocks, solution))
+    return replace(estimate, doubt=doubt, understated=factor)
 
 
 def wls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
@@ -358,15 +358,16 @@ def build_estimate(
     )
 
 
-def _autocorrelation_doubt(blocks: Sequence[Block], solution: Solution, estimate: Estimate, robust: np.ndarray) -> str:
-    """Say by how much standard deviations by (33) are too small for autocorrelated residuals, "" if they are not."""
+def _autocorrelation_doubt(blocks: Sequence[Block], solution: Solution, estimate: Estimate, robust: np.ndarray) -> tuple[str, float]:
+    """Say by which factor standard deviations by (33) are too small for autocorrelated residuals, "" and 1 if not."""
     kept = list(solution.kept)
     ratio = np.sqrt(np.diag(robust)) / estimate.std[kept]
     if not ratio.max() > NOTABLE_STD_RATIO:
-        return ""
+        return "", 1.0
     correlation = max((float(np.abs(lag_one_correlation(residual(b, solution.x))).max()) for b in blocks), default=0.0)
     worst = int(np.argmax(ratio))
-    return (
+    doubt = (
         f"residuals are autocorrelated (lag 1: {correlation:.2f}), so standard deviations by (33) are too small by a"
         f" factor of up to {ratio[worst]:.1f} ({estimate.names[kept[worst]]}): --method wls states what holds"
     )
+    return doubt, float(ratio[worst])

@@ -25,7 +25,8 @@ def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
     """Give an estimate its status, and mark values that no machine has.
 
     Status: `valid`; `doubtful` if the 95 % intervals do not hold, `doubt` says why; `invalid` if besides some value is
-    impossible far beyond its standard deviation: then there is no estimate.
+    impossible by far, beyond its standard deviation and by the size that the machine file gives: then there is no
+    estimate.
     """
     possible, clear = _signs_hold(model, estimate)
     definite = _is_positive_definite(model, logs, estimate, filter)
@@ -35,9 +36,9 @@ def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
         consistent = _nearest(model, estimate)
         if consistent is not None:
             with np.errstate(invalid="ignore"):
-                shift = np.abs(consistent - estimate.value) / estimate.std
-            moved &= shift > MOVED_STDS
-            clear |= bool((shift[moved] > CLEAR_STDS).any())
+                shift = np.abs(consistent - estimate.value)
+                moved &= shift > MOVED_STDS * estimate.std
+            clear |= bool((shift > np.maximum(CLEAR_STDS * estimate.understated * estimate.std, model.scale))[moved].any())
         possible &= ~moved
         notes.append("with these values the mass matrix is not positive definite: no machine has them together")
     status = "valid" if not estimate.doubt else "invalid" if clear else "doubtful"
@@ -64,7 +65,7 @@ def _signs_hold(model: Model, estimate: Estimate) -> tuple[np.ndarray, bool]:
         beyond = -float(wanted.pop()) * estimate.value[k]
         if beyond > 0:
             possible[k] = False
-            clear |= bool(beyond > CLEAR_STDS * estimate.std[k])
+            clear |= bool(beyond > max(CLEAR_STDS * estimate.understated * estimate.std[k], model.scale[k]))
     return possible, clear
 
 

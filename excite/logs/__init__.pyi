@@ -1,3 +1,4 @@
+from .conversion import convert as convert
 from .filtered import (
     BLOCK as BLOCK,
     Samples as Samples,
@@ -14,7 +15,7 @@ from .filtered import (
     unmeasured as unmeasured,
     white_noise as white_noise,
 )
-from .inspection import guess_machine as guess_machine, inspect as inspect
+from .inspection import Inspection as Inspection, guess_machine as guess_machine, inspect as inspect
 from .log import Log as Log, from_table as from_table, read_log as read_log, table_of as table_of
 from .plausibility import doubts_in_errors as doubts_in_errors
 from .preparation import Prepared as Prepared, prepare as prepare, read_stretches as read_stretches

@@ -39,7 +39,7 @@ class Inspection:
     """The content of a log. faults make it unusable as it is, doubts and remarks don't.
 
     signals: by column what can be drawn, (t, values [SI]). bad: sensor and (first, last) time [s] of each stretch that
-    a finding is about. used: the logs that are made of it, each with the machine at its rate.
+    a finding is about. used: the logs that are made of it, each with the machine at its rate and its first time [s].
     """
 
     source: str
@@ -54,7 +54,7 @@ class Inspection:
     signals: dict[str, tuple[np.ndarray, np.ndarray, str]]
     gaps: tuple[float, ...]
     bad: tuple[tuple[str, tuple[float, float]], ...] = ()
-    used: tuple[tuple[Machine, Log], ...] = ()
+    used: tuple[tuple[Machine, Log, float], ...] = ()
 
     @property
     def usable(self) -> bool:
@@ -88,7 +88,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         lines.append("no shipped machine has these columns: name yours with --machine to have them checked")
         return Inspection(source, None, len(table), np.nan, np.nan, columns, (), (), tuple(lines), {}, ())
     faults, remarks = lines, []
-    if not has_time(table, machine) and (merged := merge_own_times(table, machine)) is not None:
+    if not has_time(table, machine) and (merged := merge_own_times([table], machine)) is not None:
         table = merged
     unwrapped = caught(lambda: log.unwrapped(table, machine), None)
     table = table if unwrapped is None else unwrapped
@@ -112,14 +112,14 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
     remarks += table.attrs.get("notes", ())
     t = caught(lambda: seconds(table, machine, ""), None) if has_time(table, machine) else None
     clock = "" if t is None or strays else wrong_time_unit(t, machine)
-    used: list[tuple[Machine, Log]] = []
+    used: list[tuple[Machine, Log, float]] = []
     if clock:
         faults.append(clock)
     elif not strays:
         accused = {f.sensor for f in seen if f.kind == "fault"}
         bad = {c for s in machine.sensors("full") for c in s.columns if s.name in accused}
         used = _as_used(table, record, machine, {*bad, *unread}, faults, remarks)
-        for with_rate, one in () if faults else used:
+        for with_rate, one, _ in () if faults else used:
             doubtful += doubts(with_rate, one.values, one.interpolated)
     unknown = [c.name for c in columns if not c.what]
     if unknown:
@@ -161,7 +161,7 @@ def _absent(table: pd.DataFrame, machine: Machine) -> tuple[list[str], list[str]
 
 def _as_used(
     table: pd.DataFrame, record: Record, machine: Machine, bad: set[str], faults: list[str], remarks: list[str]
-) -> list[tuple[Machine, Log]]:
+) -> list[tuple[Machine, Log, float]]:
     """Logs that a table makes without bad columns, each with the machine at its rate.
 
     What is done to the table is added to remarks, what else is wrong to faults.
@@ -179,10 +179,11 @@ def _as_used(
         return []
     remarks += [line.removeprefix(": ") for line in (*repaired, *placed[1]) if "that is held" not in line]
     logs = []
+    t = seconds(table, machine, "")
     for stretch in placed[0]:
         own = at_rate_of(machine, stretch.rate)
         made = caught(lambda s=stretch, m=own: as_log(s, m, (), ""), faults)  # type: ignore[misc]
-        logs += [(own, made)] if made is not None else []
+        logs += [(own, made, float(t[min(stretch.first_row, len(t) - 1)]))] if made is not None else []
     return logs
 
 

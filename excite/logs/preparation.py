@@ -13,16 +13,18 @@ import pandas as pd
 from excite.errors import LogError
 from excite.logs import log, refusal
 from excite.logs.log import Log
+from excite.logs.repair import NEEDED
 from excite.logs.resampling import SAME_RATE, Stretch, at_rate, even_stretches, slower
 from excite.logs.time_axis import order_rows
-from excite.logs.times import has_time, seconds
+from excite.logs.times import absolute_seconds, has_time, seconds
 from excite.model import Model
-from excite.model.machine import Machine
+from excite.model.machine import TIME_UNITS, UNITS, Machine, Sensor
 
 FASTEST_HZ = 150.0  # rate [Hz] beyond which a rolling machine tells nothing more: its slips relax within tens of ms
 REST_S = 5.0  # [s] of standing still that is left out; chosen
 REST_MARGIN_S = 0.3  # [s] of a rest that stays with the motion before and after it; chosen
 
+MERGED = "merged"  # of a table's attrs: channels are on one clock already
 TIME_NAME = re.compile(r"(?i)(t|time|timestamp)([_ ].*)?|.*[_ ](t|time|timestamp)([_ ].*)?")
 
 Source = str | Path | pd.DataFrame | Log
@@ -50,12 +52,12 @@ def prepare(
     notes = list[str]()
     stretches = list[tuple[str, Stretch, Machine]]()
     given = list[Log]()
-    for source in sources:
+    for source in _joined(sources, machine):
         if isinstance(source, Log):
             given.append(source)
             continue
         found, said = read_stretches(source, machine, needs)
-        name = "log" if isinstance(source, pd.DataFrame) else str(source)
+        name = _name(source)
         for stretch in found:
             one = slower(stretch, machine, FASTEST_HZ) if model.slips and rate is None else stretch
             if one is not stretch:
@@ -82,15 +84,22 @@ def read_stretches(
 ) -> tuple[list[Stretch], list[str]]:
     """Read one log as even stretches, with notes. Raises LogError."""
     table = source if isinstance(source, pd.DataFrame) else log.table_of(source, machine)
-    name = "log" if isinstance(source, pd.DataFrame) else str(source)
+    name = _name(source)
     notes = [f"{name}: {line}" for line in table.attrs.get("notes", ())]
-    if not has_time(table, machine) and (merged := merge_own_times(table, machine)) is not None:
+    own_clocks = not has_time(table, machine) or any(s.time_column or s.time_offset for s in machine.sensor)
+    own_clocks &= MERGED not in table.attrs
+    if own_clocks and (merged := merge_own_times([table], machine)) is not None:
         table = merged
     accepted = refusal.accept(table, machine, needs, name)
     stretches, said = place_rows(accepted.table, machine, needs, name, rate)
     used = {line.partition(" row only")[0] for line in said}  # of held channels the note says how they are used
     doubts = [line for line in accepted.doubts if line.partition(" row only")[0] not in used]
     return stretches, [*notes, *accepted.notes, *said, *doubts]
+
+
+def _name(source: str | Path | pd.DataFrame) -> str:
+    """Name a source in messages."""
+    return str(source.attrs.get("source", "log")) if isinstance(source, pd.DataFrame) else str(source)
 
 
 def place_rows(
@@ -114,25 +123,71 @@ def place_rows(
     return long or stretches, said
 
 
-def merge_own_times(table: pd.DataFrame, machine: Machine) -> pd.DataFrame | None:
-    """Merge channels that have time columns of their own, each to the left of its channels, into one time column."""
+def merge_own_times(tables: Sequence[pd.DataFrame], machine: Machine) -> pd.DataFrame | None:
+    """Merge channels that have times of their own into one table on all times; None if they have one clock.
+
+    A channel's clock is the sensor's `time_column`, the machine's, or the time column to the left of it in its table;
+    `time_offset` is added. Cells of a channel that has no reading at a time are blank.
+    """
     used = {c for s in machine.sensor for c in s.columns}
-    clocks = [c for c in table.columns if c not in used and TIME_NAME.fullmatch(str(c))]
-    if len(clocks) < 2:
+    parts = dict[tuple[int, str, float, float], list[str]]()
+    for sensor in machine.sensor:
+        k = next((k for k, table in enumerate(tables) if set(sensor.columns) <= set(table.columns)), None)
+        clock = None if k is None else _clock(tables[k], machine, sensor, used)
+        if k is None or clock is None:
+            continue
+        unit = UNITS[sensor.time_unit or _unit_in_file(tables[k], clock) or machine.time_unit][1]
+        parts.setdefault((k, clock, unit, sensor.time_offset), []).extend(sensor.columns)
+    if len(parts) < 2:
         return None
-    parts, clock = list[pd.DataFrame](), None
-    for name in table.columns:
-        if name in clocks:
-            clock = name
-        elif clock is not None and name in used:
-            one = table[[clock, name]].dropna().rename(columns={clock: machine.time_column})
-            parts.append(one.groupby(machine.time_column, as_index=False).mean(numeric_only=True))
-    if not parts:
-        return None
-    merged = parts[0]
-    for one in parts[1:]:
-        merged = merged.merge(one, on=machine.time_column, how="outer")
+    merged: pd.DataFrame | None = None
+    one_unit = UNITS[machine.time_unit][1]
+    for (k, clock, unit, offset), columns in parts.items():
+        t = absolute_seconds(tables[k][clock], unit) + offset
+        one = pd.DataFrame(
+            {machine.time_column: t / one_unit, **{c: tables[k][c].to_numpy() for c in columns}}
+        ).dropna()
+        one = one.groupby(machine.time_column, as_index=False).mean(numeric_only=True)
+        merged = one if merged is None else merged.merge(one, on=machine.time_column, how="outer")
+    assert merged is not None
     return merged.sort_values(machine.time_column, ignore_index=True)
+
+
+def _clock(table: pd.DataFrame, machine: Machine, sensor: Sensor, used: set[str]) -> str | None:
+    """Find the time column of a sensor in its table."""
+    for name in (sensor.time_column, machine.time_column):
+        if name is not None and name in table.columns:
+            return name
+    before = list(table.columns)[: list(table.columns).index(sensor.column)]
+    clocks = [str(c) for c in before if c not in used and TIME_NAME.fullmatch(str(c))]
+    return clocks[-1] if clocks else None
+
+
+def _unit_in_file(table: pd.DataFrame, clock: str) -> str | None:
+    """Return the unit of a time column that the file states, if it is known."""
+    unit = table.attrs.get("units", {}).get(clock)
+    return unit if unit in TIME_UNITS else None
+
+
+def _joined(sources: Sequence[Source], machine: Machine) -> list[Source]:
+    """Join files that hold some of the machine's columns each, and all of them together, to one log."""
+    files = [s for s in sources if not isinstance(s, Log)]
+    if len(files) < 2:
+        return list(sources)
+    needed = {c for s in machine.sensor if s.kind in NEEDED for c in s.columns}
+    tables = [s if isinstance(s, pd.DataFrame) else log.table_of(s, machine) for s in files]
+    own = [needed & set(table.columns) for table in tables]
+    whole = any(columns == needed for columns in own)
+    if whole or set().union(*own) != needed or any(not columns for columns in own):
+        return list(sources)
+    merged = merge_own_times(tables, machine)
+    if merged is None:
+        return list(sources)
+    names = " and ".join(str(s) for s in files if not isinstance(s, pd.DataFrame))
+    merged.attrs["source"] = names or "log"
+    merged.attrs[MERGED] = True
+    merged.attrs["notes"] = ["channels of several files are put together by their times"]
+    return [*(s for s in sources if isinstance(s, Log)), merged]
 
 
 def slower_to(stretch: Stretch, machine: Machine, rate: float) -> Stretch:

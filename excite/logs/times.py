@@ -64,6 +64,28 @@ def seconds(table: pd.DataFrame, machine: Machine, source: str) -> np.ndarray:
     return found
 
 
+def absolute_seconds(raw: pd.Series, unit: float) -> np.ndarray:
+    """Read a clock's times (N,) [s] with its origin, so that several clocks agree; NaN in blank cells.
+
+    unit [s]: of numbers.
+    """
+    there = raw.notna().to_numpy() & (raw.astype(str).str.strip() != "").to_numpy()
+    found = np.full(len(raw), np.nan)
+    cells = raw[there]
+    if not len(cells):
+        return found
+    number = pd.to_numeric(cells, errors="coerce")
+    origin = 0.0
+    if number.notna().all() and cells.dtype.kind != "M":
+        origin = float(number.iloc[0]) * unit
+    else:
+        first = pd.to_datetime(cells.iloc[0], errors="coerce", utc=True)
+        origin = 0.0 if first is pd.NaT else first.timestamp()
+    parsed = _parse(cells, unit)
+    found[there] = parsed - parsed[0] + origin
+    return found
+
+
 def _date_and_time(table: pd.DataFrame) -> tuple[str, str] | None:
     """Find the names of a date column and a time-of-day column."""
     names = {str(c).strip().lower(): str(c) for c in table.columns}

@@ -9,15 +9,21 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from excite import trajectories
 from excite.identification import SignalComparison, Verification
+from excite.logs import Inspection
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion
 from excite.trajectories import DESIGNED, ComparisonRow
 
 # Okabe-Ito colours, distinct for the colour-blind; line styles are distinct in black and white.
+RECORDED = "0.6"  # grey of readings as recorded
+ONE_COLUMN = 6  # channels of a log that are drawn below each other; more are drawn in two columns
+MIN_SHADE = 0.004  # of a log's duration, that is shaded at least
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
 LINEAR_UP_TO = 5.0  # errors [%] up to which their axis is linear; chosen
@@ -273,21 +279,44 @@ def compare_figure(rows: Sequence[ComparisonRow], title: str) -> Figure:
     return figure
 
 
-def log_figure(signals: Mapping[str, tuple[np.ndarray, np.ndarray, str]], gaps: Sequence[float], title: str) -> Figure:
-    """Plot a log channel by channel over time.
-
-    signals: name -> times (N,) [s], values (N,) [SI], unit. gaps [s]: dashed lines.
-    """
-    count = max(len(signals), 1)
-    figure = Figure(figsize=(10, 0.8 + 1.15 * count), layout="constrained")
+def log_figure(found: Inspection, title: str) -> Figure:
+    """Plot a log channel by channel over time, as recorded and as used: one unit an axis, findings and gaps shaded."""
+    sensors = {s.name: " - ".join(s.columns) for machine, _, _ in found.used[:1] for s in machine.sensors("full")}
+    bad = [(sensors.get(sensor, sensor), span) for sensor, span in found.bad]
+    used = {
+        name: [(first + one.t, one.values[s]) for _, one, first in found.used if s in one.values]
+        for s, name in sensors.items()
+    }
+    count = max(len(found.signals), 1)
+    columns = 1 if count <= ONE_COLUMN else 2
+    rows = -(-count // columns)
+    figure = Figure(figsize=(5.5 + 5 * columns, 1.1 + 1.3 * rows), layout="constrained")
     figure.suptitle(escape_dollar(title), fontsize=11)
-    axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-    for ax, (name, (t, values, unit)) in zip(axes, signals.items(), strict=False):
-        ax.plot(t, values, color=COLOURS[0], linewidth=1)
-        for gap in gaps:
-            ax.axvline(gap, color=COLOURS[1], linewidth=1, linestyle="--")
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False).T.ravel()
+    for ax, (name, (t, values, unit)) in zip(axes, found.signals.items(), strict=False):
+        ax.plot(t, values, ".", color=RECORDED, markersize=2.5, rasterized=True)
+        for at, x in used.get(name, []):
+            ax.plot(at, x, color=COLOURS[0], linewidth=0.9)
+        for channel, (first, last) in bad:
+            if channel == name:
+                width = max(last - first, MIN_SHADE * max(float(np.ptp(t)), 1e-9))
+                middle = (first + last) / 2
+                ax.axvspan(middle - width / 2, middle + width / 2, color=COLOURS[1], alpha=0.35, linewidth=0)
+        for gap in found.gaps:
+            ax.axvline(gap, color="black", linewidth=0.8, linestyle="--")
         ax.set_ylabel(f"{name}\n[{unit}]", fontsize=8)
         ax.tick_params(labelsize=8)
         ax.grid(alpha=0.3)
-    axes[-1].set_xlabel("time [s]" + ("; dashed: gaps" if gaps else ""))
+    for ax in axes[count:]:
+        ax.set_visible(False)
+    for k in (rows - 1, count - 1):
+        axes[k].tick_params(labelbottom=True)
+        axes[k].set_xlabel("time [s]", fontsize=9)
+    handles = {
+        Line2D([], [], color=RECORDED, marker=".", linestyle="", label="as recorded"): True,
+        Line2D([], [], color=COLOURS[0], label="as used"): bool(found.used),
+        Patch(color=COLOURS[1], alpha=0.35, label="something is wrong here"): bool(found.bad),
+        Line2D([], [], color="black", linestyle="--", linewidth=0.8, label="gap"): bool(found.gaps),
+    }
+    figure.legend(handles=[h for h, there in handles.items() if there], loc="outside lower center", ncols=4)
     return figure

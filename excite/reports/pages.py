@@ -30,7 +30,8 @@ CAPTIONS = {
     "verify.png": "Left, the error of every parameter in every simulated run, in per cent of the true value: dots are"
     " runs, diamonds their mean, grey bars the 95 % interval that the method itself predicts. Right, the share of runs"
     " in which the interval holds the truth; it claims 95 %.",
-    "log.png": "Every channel that the machine file knows, in SI units, over time; dashed lines mark gaps.",
+    "log.png": "Every channel that the machine file knows, in SI units, over time: as recorded, and as it is used after"
+    " repair and resampling.",
     "signals.png": "Left, the share of each signal's error that is systematic, the rest being noise. Right, the error"
     " on stretches that were withheld from the fit, in the signal's unit and in per cent of the error without the"
     " findings.",
@@ -136,6 +137,6 @@ def check_log(place: Path, path: Path, machine: str | None, versions: Mapping[st
         "versions": dict(versions),
     }
     if found.signals:
-        figures.save(figures.log_figure(found.signals, found.gaps, str(path)), place / "log.png")
+        figures.save(figures.log_figure(found, str(path)), place / "log.png")
     write_report(place, "log", summary)
     return summary

@@ -2,6 +2,7 @@ from .hydraulics import torque_per_pressure as torque_per_pressure
 from .machine import (
     LOG_CHECKS as LOG_CHECKS,
     MACHINES as MACHINES,
+    TIME_UNITS as TIME_UNITS,
     Body as Body,
     Contact as Contact,
     EffectEntry as EffectEntry,

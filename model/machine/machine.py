@@ -36,6 +36,7 @@ MACHINES = Path(__file__).parents[1] / "machines"
 Index = Annotated[int, Field(strict=True, ge=0, le=99)]
 
 # Checks of a log that a sensor can be left out of (`checks_off`), with what each looks for.
+TIME_UNITS = ("s", "ms", "us", "min")
 LOG_CHECKS = {
     "jumps": "a position that goes further in one row than the joint can: an encoder that was reset, counts that wrap",
     "limits": "readings that the machine's limits rule out: degrees for radians, kN m for N m",
@@ -214,6 +215,9 @@ class Sensor(FileRecord):
 
     `wraps_at`: reading, in the column's unit, after which an encoder begins anew, such as 360 for degrees; it is then
     counted on. `checks_off`: names of LOG_CHECKS that this sensor is left out of.
+
+    `time_column`, `time_unit`: of a sensor that a logger with a clock of its own recorded; `time_offset` [s] is added
+    to its times.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
@@ -233,6 +237,9 @@ class Sensor(FileRecord):
     radius: Positive | None = None
     wraps_at: Annotated[float | None, Field(gt=0, allow_inf_nan=False)] = None
     checks_off: tuple[str, ...] = ()
+    time_column: Annotated[str | None, Field(min_length=1)] = None
+    time_unit: Literal["s", "ms", "us", "min"] | None = None
+    time_offset: Annotated[float, Field(allow_inf_nan=False)] = 0.0
 
     @property
     def resolution(self) -> float | None:

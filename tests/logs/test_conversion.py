@@ -1,0 +1,137 @@
+"""`excite log convert`, logs whose channels come from loggers of their own, and the picture of a check."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from support.commands import Excite
+from support.files import SHARED
+
+from excite import identify
+from excite.logs import prepare
+from excite.model import Model
+from excite.simulation import Motion, measure
+
+RACK = SHARED / "rack_and_pinion"
+
+
+@pytest.fixture(scope="module")
+def table(va12: Model, va12_motion: Motion) -> pd.DataFrame:
+    return measure(va12, va12_motion, seed=2)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_converted_log_gives_the_same_estimate(
+    table: pd.DataFrame, tmp_path: Path, excite: Excite, suffix: str
+) -> None:
+    table.to_csv(tmp_path / "log.csv", index=False)
+    out = tmp_path / f"used{suffix}"
+    code, stdout, _ = excite("log", "convert", tmp_path / "log.csv", "--machine", "va12", "--out", out, "--json")
+    assert code == 0
+    (file,) = json.loads(stdout)["files"]
+    assert (file["path"], file["rows"], file["rate_hz"], file["duration_s"]) == (str(out), 6001, 100, 60)
+    before, after = (identify("va12", path, "iv") for path in (tmp_path / "log.csv", out))
+    assert after.value == pytest.approx(before.value, rel=1e-6)
+
+
+def test_uneven_rows_are_written_even_and_repaired(table: pd.DataFrame, tmp_path: Path, excite: Excite) -> None:
+    rng = np.random.default_rng(0)
+    bad = table.assign(t_s=table["t_s"] + rng.uniform(-2e-3, 2e-3, len(table)))
+    bad.loc[1000, "u1_Nm"] += 4000
+    bad = bad.drop(index=range(3000, 3200))
+    bad.to_csv(tmp_path / "log.csv", index=False)
+    code, stdout, _ = excite(
+        "log", "convert", tmp_path / "log.csv", "--machine", "va12", "--out", tmp_path / "a.csv", "--si"
+    )
+    assert code == 0
+    first, second = (pd.read_csv(tmp_path / f"a-{k}.csv") for k in (1, 2))
+    for one in (first, second):
+        assert np.diff(one["t_s"]) == pytest.approx(0.01, rel=1e-6)
+        assert one.notna().to_numpy().all()
+    assert first["u1 [N m]"].max() < 1.01 * table["u1_Nm"].max()
+    assert "spike" in stdout
+    assert "interpolated at their own times" in " ".join(stdout.split())
+
+
+def test_nothing_is_written_over_its_source(table: pd.DataFrame, tmp_path: Path, excite: Excite) -> None:
+    table.to_csv(tmp_path / "log.csv", index=False)
+    before = (tmp_path / "log.csv").read_bytes()
+    for name, words in (("log.csv", "is what the log is made from"), ("log.xls", "allowed: .csv, .parquet")):
+        code, _, stderr = excite("log", "convert", tmp_path / "log.csv", "--machine", "va12", "--out", tmp_path / name)
+        assert (code, stderr.count("\n")) == (2, 1)
+        assert words in stderr
+    assert (tmp_path / "log.csv").read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
+
+
+def test_two_loggers_are_put_together_by_their_clocks(va12: Model, table: pd.DataFrame) -> None:
+    """One file for torques, one for the rest, with other rates and a later start."""
+    torques = [c for c in table.columns if c.startswith("u")]
+    slow = table.loc[150::2, ["t_s", *torques]]
+    rest = table.drop(columns=torques)
+    ready = prepare(va12, [rest, slow])
+    (one,) = ready.logs
+    assert any("put together by their times" in line for line in ready.notes)
+    at = table["t_s"].to_numpy()[150:]
+    want = np.interp(one.t + at[0], table["t_s"], table["u1_Nm"])
+    assert np.sqrt(np.mean((one.values["u1"] - want) ** 2)) < 60  # its noise is 40 N m
+
+
+@pytest.mark.skipif(not RACK.is_dir(), reason="needs the measurements in ../shared/data/rack_and_pinion")
+def test_a_load_cell_and_a_drive_with_a_clock_each(tmp_path: Path) -> None:
+    """The mass is 25.28 kg by an independent fit of the same two files."""
+    machine = tmp_path / "rack.toml"
+    machine.write_text(RACK_MACHINE, encoding="utf-8")
+    found = identify(str(machine), [RACK / "force_2kHz.csv", RACK / "speed_1500Hz.csv"])
+    assert found.value[0] == pytest.approx(25.28, rel=0.01)
+
+
+RACK_MACHINE = """
+name = "rack"
+title = "Rack and pinion"
+sampling_hz = { value = 1500, source = "data sheet" }
+time_column = "Time"
+time_unit = "ms"
+scale = { u10 = { value = 10, source = "assumed" } }
+[[body]]
+index = 1
+name = "carriage"
+antecedent = "ground"
+joint = "prismatic"
+actuated = true
+alpha = { value = "pi/2", source = "definition" }
+[body.inertia]
+mass = { value = 24.7, source = "published" }
+[body.friction]
+Fv = { value = 50, source = "assumed" }
+Fs = { value = 50, source = "assumed" }
+u0 = { value = 0, source = "assumed" }
+smoothing = { value = 0.005, source = "assumed" }
+[[sensor]]
+name = "v"
+kind = "angle"
+body = 1
+column = "Servo motor speed"
+unit = "m/s"
+factor = { value = -3.3333e-4, source = "published", note = "m/s per rpm" }
+[[sensor]]
+name = "F"
+kind = "torque"
+body = 1
+column = "Force"
+unit = "V"
+factor = { value = -200, source = "published", note = "N/V" }
+time_column = "Channel name"
+time_unit = "s"
+time_offset = 0.004
+[filter]
+source = "assumed"
+cutoff_hz = { value = 30, source = "assumed" }
+order = 2
+decimation = 10
+drop = [10, 10]
+"""
