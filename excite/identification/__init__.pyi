@@ -25,4 +25,5 @@ from .validation import (
     compare_motions as compare_motions,
     compare_torques as compare_torques,
     far_from_nominal as far_from_nominal,
+    validate_torques as validate_torques,
 )

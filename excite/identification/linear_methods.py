@@ -358,7 +358,9 @@ def build_estimate(
     )
 
 
-def _autocorrelation_doubt(blocks: Sequence[Block], solution: Solution, estimate: Estimate, robust: np.ndarray) -> tuple[str, float]:
+def _autocorrelation_doubt(
+    blocks: Sequence[Block], solution: Solution, estimate: Estimate, robust: np.ndarray
+) -> tuple[str, float]:
     """Say by which factor standard deviations by (33) are too small for autocorrelated residuals, "" and 1 if not."""
     kept = list(solution.kept)
     ratio = np.sqrt(np.diag(robust)) / estimate.std[kept]

@@ -38,7 +38,9 @@ def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
             with np.errstate(invalid="ignore"):
                 shift = np.abs(consistent - estimate.value)
                 moved &= shift > MOVED_STDS * estimate.std
-            clear |= bool((shift > np.maximum(CLEAR_STDS * estimate.understated * estimate.std, model.scale))[moved].any())
+            clear |= bool(
+                (shift > np.maximum(CLEAR_STDS * estimate.understated * estimate.std, model.scale))[moved].any()
+            )
         possible &= ~moved
         notes.append("with these values the mass matrix is not positive definite: no machine has them together")
     status = "valid" if not estimate.doubt else "invalid" if clear else "doubtful"

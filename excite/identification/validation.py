@@ -2,30 +2,74 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from excite.identification.estimate import Estimate
-from excite.logs import Log, lowpass, samples
+from excite.identification.noise_propagation import REREADINGS, simulate_rereadings
+from excite.logs import BLOCK, Log, lowpass, samples
 from excite.model import Model
 from excite.model.machine import Filter
 from excite.simulation import Motion, delivered_torques, exact_readings, simulate
+from excite.smoothing import (
+    NotConvergedError,
+    build_state_space,
+    common_sensors,
+    fit_logs,
+    initial_trajectory,
+    prepare_measurements,
+)
 
 FAR_RATIO = 4.0  # ratio to the machine file's value, or its inverse, that is reported; chosen
+NOTABLE_RATIO = 1.25  # of the residual to what is expected, beyond which a signal is not explained; chosen
 FAR_STDS = 3.0  # distance from it that is significant [standard deviations]; chosen
 MAX_NAMED = 4  # parameters in the note; chosen
 
 
 @dataclass(frozen=True)
 class SignalComparison:
-    """Measured and predicted values (m, N) of m signals in their units, over t (N,) [s]."""
+    """Measured and predicted values (m, N) of m signals in their units, over t (N,) [s].
+
+    noise, parameters (m, N): standard deviations of the residual by the sensors' noise, which also disturbs the
+    prediction, and by the parameters' uncertainty; None if unknown.
+    """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     t: np.ndarray
     measured: np.ndarray
     predicted: np.ndarray
+    noise: np.ndarray | None = None
+    parameters: np.ndarray | None = None
+
+    @property
+    def expected(self) -> np.ndarray | None:
+        """Standard deviation (m, N) of the residual if the model is right; None if unknown."""
+        return None if self.noise is None or self.parameters is None else np.hypot(self.noise, self.parameters)
+
+    def share_percent(self, deviation: np.ndarray) -> np.ndarray:
+        """Size of a deviation (m, N) as `percent` gives the residual (m,)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return 100 * np.linalg.norm(deviation, axis=1) / np.linalg.norm(self.measured, axis=1)
+
+    def outside(self) -> list[tuple[str, float, float, float]]:
+        """List signals whose residual is beyond what is expected: name, times [s] of the worst second, ratio in it."""
+        expected = self.expected
+        if expected is None:
+            return []
+        step = float(self.t[1] - self.t[0])
+        width = max(1, min(round(1.0 / step), len(self.t)))
+        found = []
+        for name, e, s in zip(self.names, self.residual, expected, strict=True):
+            if np.linalg.norm(e) <= NOTABLE_RATIO * np.linalg.norm(s):
+                continue
+            kernel = np.ones(width) / width
+            ratio = np.sqrt(np.convolve(e**2, kernel, "valid") / np.convolve(s**2, kernel, "valid"))
+            k = int(np.argmax(ratio))
+            found.append((name, float(self.t[k]), float(self.t[k + width - 1]), float(ratio[k])))
+        return found
 
     @property
     def residual(self) -> np.ndarray:
@@ -47,9 +91,77 @@ class SignalComparison:
 def compare_torques(model: Model, log: Log, estimate: Estimate, filter: Filter | None = None) -> SignalComparison:
     """Predict the torques of a log from its motion and compare them, both low-passed.
 
-    Unidentifiable parameters count as zero. Noisy slips make this test less sensitive than `compare_motions`.
+    Unidentifiable parameters count as zero. Noisy slips make this test less sensitive than `compare_motions`: `noise`
+    says how much of the residual they make, from simulated readings of the same motion, averaged over a second.
     """
     filter = filter or model.machine.filter
+    plain = _filtered_torques(model, log, estimate, filter)
+    first, *again = (
+        _filtered_torques(model, one, estimate, filter).residual
+        for one in simulate_rereadings(model, log, filter, REREADINGS)
+    )
+    width = max(1, round(float(model.machine.sampling_hz)))
+    square = np.mean([(e - first) ** 2 for e in again], axis=0)
+    noise = np.sqrt(scipy.ndimage.uniform_filter1d(square, width, axis=1))
+    return replace(plain, noise=noise, parameters=_parameter_band(model, log, estimate, filter))
+
+
+def validate_torques(model: Model, log: Log, estimate: Estimate, filter: Filter | None = None) -> SignalComparison:
+    """Compare the torques of a log that was not fitted with those that its smoothed motion needs.
+
+    The states are smoothed with the parameters held at the estimate, so the noise of slips does not count as an error.
+    Machines without slips, and logs that these parameters cannot follow, are compared by `compare_torques`.
+    """
+    filter = filter or model.machine.filter
+    if not model.slips or not np.isfinite(estimate.value).all():
+        return compare_torques(model, log, estimate, filter)
+    held = replace(model, nominal=estimate.value)
+    space = build_state_space(held, common_sensors(held, [log]))
+    data = prepare_measurements(space, log)
+    start = [initial_trajectory(space, data, log, filter)]
+    try:
+        every = np.ones(len(held.nominal), bool)
+        fit = fit_logs(space, [data], start, held.nominal, start, 0.0, every)
+    except NotConvergedError:
+        return compare_torques(model, log, estimate, filter)
+    rate = float(model.machine.sampling_hz)
+    impulse = np.zeros(len(log))
+    impulse[len(log) // 2] = 1.0
+    gain = float(np.linalg.norm(lowpass(impulse, rate, filter)))  # of white noise
+    error = lowpass(fit.trajectories[0].sampled_torque_error.T, rate, filter)
+    measured = lowpass(data.torque.T, rate, filter)
+    noise = np.broadcast_to(gain * data.noise.torque[:, None], error.shape)
+    band = _parameter_band(model, log, estimate, filter.model_copy(update={"drop": (0, 0)}))
+    units = tuple(_torque_unit(model, k) for k in model.actuated)
+    return SignalComparison(model.inputs, units, log.t, measured, measured + error, noise, band)
+
+
+def _parameter_band(model: Model, log: Log, estimate: Estimate, filter: Filter) -> np.ndarray:
+    """Standard deviation (n_u, N) of predicted torques by the parameters' uncertainty."""
+    motion = samples(model, log, filter)
+    keep = slice(filter.drop[0], len(log) - filter.drop[1])
+    root = _root(np.nan_to_num(estimate.covariance))
+    band = []
+    for row in model.actuated:
+        parts = []
+        for begin in range(0, motion.q.shape[1], BLOCK):
+            block = slice(begin, begin + BLOCK)
+            W = model.stacked_regressor(*(x[:, block] for x in (motion.q, motion.nu, motion.a, *motion.beside)))
+            parts.append(np.linalg.norm(W[:, row] @ root, axis=1))
+        band.append(np.concatenate(parts)[keep])
+    return np.array(band)
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """R with R R' = covariance, positive semi-definite."""
+    size = np.sqrt(np.maximum(np.diag(covariance), 0))
+    unit = np.where(size > 0, size, 1.0)
+    variance, v = np.linalg.eigh(covariance / np.outer(unit, unit))
+    return np.asarray(unit[:, None] * v * np.sqrt(np.maximum(variance, 0)))
+
+
+def _filtered_torques(model: Model, log: Log, estimate: Estimate, filter: Filter) -> SignalComparison:
+    """Predict low-passed torques and compare them with the measured ones."""
     rate = float(model.machine.sampling_hz)
     motion = samples(model, log, filter)
     p = model.expand @ np.nan_to_num(estimate.value)

@@ -323,8 +323,7 @@ def describe_identify(s: Summary) -> Description:
         )
     remarks = [f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()] + list(s["notes"])
     for check in s["validation"]:
-        errors = ", ".join(f"{n} {v:.1f} %" for n, v in check["torque_error_percent"].items())
-        remarks.append(f"On {check['log']}, which was not fitted, the torque errors are: {errors}.")
+        remarks.append(_describe_validation(check))
     biased = any("bias" in r for r in rows.values())
     table = tuple(
         (
@@ -354,6 +353,23 @@ def describe_identify(s: Summary) -> Description:
     marked = tuple(k for k, r in enumerate(rows.values()) if not r["possible"])
     tables = (Table(caption, names, table, marked, _meaning_index(s), grey=s["status"] != "valid"),)
     return Description(f"Parameters of {s['machine']}", headline, tables, tuple(remarks), s["status"])
+
+
+def _describe_validation(check: Mapping[str, Any]) -> str:
+    """Compare a log's prediction error with what noise and the parameters' uncertainty make of it."""
+    errors = ", ".join(
+        f"{n} {v:.1f} % (noise alone {check['noise_percent'][n]:.1f} %, parameters"
+        f" {check['parameters_percent'][n]:.1f} %)"
+        for n, v in check["torque_error_percent"].items()
+    )
+    text = f"On {check['log']}, which was not fitted, the torque errors are {errors}"
+    if not check["outside"]:
+        return f"{text}: the parameters explain it down to noise."
+    worst = ", ".join(
+        f"{x['signal']} (most from {x['from_s']:.1f} to {x['to_s']:.1f} s, {x['ratio']:.1f} times)"
+        for x in check["outside"]
+    )
+    return f"{text}: more than these explain in {worst}."
 
 
 def _join_some(names: Sequence[str]) -> str:

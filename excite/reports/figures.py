@@ -242,7 +242,10 @@ def comparison_figure(model: Model, c: SignalComparison, title: str) -> Figure:
     for k, (name, unit) in enumerate(zip(c.names, c.units, strict=True)):
         label = f"{name} {places.get(name, '')}".strip()
         _lines(axes[2 * k], c.t, {"measured": c.measured[k], "predicted": c.predicted[k]}, f"{label} [{unit}]")
-        _lines(axes[2 * k + 1], c.t, {"residual": c.residual[k]}, f"residual [{unit}]", legend=False)
+        if c.expected is not None:
+            band = 1.96 * c.expected[k]
+            axes[2 * k + 1].fill_between(c.t, -band, band, color="0.8", linewidth=0, label="95 % if the model is right")
+        _lines(axes[2 * k + 1], c.t, {"residual": c.residual[k]}, f"residual [{unit}]", legend=c.expected is not None)
     axes[-1].set_xlabel("time [s]")
     return figure
 

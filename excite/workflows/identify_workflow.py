@@ -129,11 +129,18 @@ def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:
 
 def _check(model: Model, one: Log, estimate: Estimate, chosen: Filter) -> dict[str, Any]:
     """Predict a log that was not fitted: errors of torques, and of signals by direct simulation."""
-    torques = identification.compare_torques(model, one, estimate, chosen)
+    torques = identification.validate_torques(model, one, estimate, chosen)
     shown: dict[str, Any] = {
         "log": one.source,
         "torque_error_percent": dict(zip(torques.names, torques.percent, strict=True)),
+        "outside": [
+            {"signal": name, "from_s": begin, "to_s": end, "ratio": ratio}
+            for name, begin, end, ratio in torques.outside()
+        ],
     }
+    for key, deviation in (("noise_percent", torques.noise), ("parameters_percent", torques.parameters)):
+        if deviation is not None:
+            shown[key] = dict(zip(torques.names, torques.share_percent(deviation), strict=True))
     try:
         signals = identification.compare_motions(model, one, estimate, chosen)
     except (ValueError, SimulationError) as err:
