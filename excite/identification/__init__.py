@@ -7,6 +7,7 @@
 - `verify` simulates a motion with sensor noise many times and identifies from each log (`Verification`), which shows
   bias, dispersion and coverage of the intervals.
 - `add_bias` estimates the bias of a method on given logs from simulated ones.
+- `compare_logs` tests whether one set of parameters explains several logs, and names what changed (`Agreement`).
 - `compare_torques` and `compare_motions` test an estimate on another log (`SignalComparison`).
 - `prior_from_logs` makes an estimate the prior of the next design.
 - `describe_late_channels`, `far_from_nominal` and `parameters_at_rest` find faults of logs that spoil an estimate.

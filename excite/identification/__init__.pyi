@@ -1,3 +1,4 @@
+from .agreement import Agreement as Agreement, compare_logs as compare_logs
 from .bias import SIGNIFICANT_BIAS as SIGNIFICANT_BIAS
 from .delays import describe_late_channels as describe_late_channels
 from .estimate import Estimate as Estimate

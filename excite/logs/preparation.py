@@ -49,34 +49,50 @@ def prepare(
     that of the slowest log if not given. Raises LogError: file, row and column, what is wrong, what to do.
     """
     machine = model.machine
-    notes = list[str]()
-    stretches = list[tuple[str, Stretch, Machine]]()
-    given = list[Log]()
-    for source in _joined(sources, machine):
-        if isinstance(source, Log):
-            given.append(source)
-            continue
-        found, said = read_stretches(source, machine, needs)
+    given = [one for one in sources if isinstance(one, Log)]
+    files = [one for one in _joined(sources, machine) if not isinstance(one, Log)]
+    read = [_read_limited(source, model, needs, rate) for source in files]
+    rates = [s.rate for stretches, _ in read for s in stretches]
+    rates += [(len(one) - 1) / float(one.t[-1] - one.t[0]) for one in given[:1]]
+    common = rate or min(rates)
+    differs = max(rates) / common - 1 > SAME_RATE
+    if differs:
+        read = [
+            (stretches, said)
+            if all(abs(s.rate / common - 1) < SAME_RATE for s in stretches)
+            else _read_limited(source, model, needs, common)
+            for source, (stretches, said) in zip(files, read, strict=True)
+        ]
+    notes, stretches = list[str](), list[tuple[str, Stretch, Machine]]()
+    for source, (found, said) in zip(files, read, strict=True):
         name = _name(source)
         for stretch in found:
-            one = slower(stretch, machine, FASTEST_HZ) if model.slips and rate is None else stretch
-            if one is not stretch:
-                said.append(f"{name}: {stretch.rate:.4g} Hz is faster than the machine: reduced to {one.rate:.4g} Hz")
             where = name if len(found) == 1 else f"{name} from row {stretch.first_row + 1}"
-            stretches.append((where, one, machine))
+            stretches.append((where, slower_to(stretch, machine, common), machine))
         notes += [f"{line} ({use})" if use else line for line in dict.fromkeys(said)]
-    rates = [s.rate for _, s, _ in stretches]
-    if given:
-        rates.append((len(given[0]) - 1) / float(given[0].t[-1] - given[0].t[0]))
-    common = rate or min(rates)
-    if max(rates) / common - 1 > SAME_RATE:
+    if differs:
         notes.append(f"logs at {common:.6g} to {max(rates):.6g} Hz are brought to {common:.6g} Hz")
-        stretches = [(n, slower_to(s, m, common), m) for n, s, m in stretches]
     at_rate = with_rate(model, common)
     logs = [as_log(stretch, at_rate.machine, needs, name) for name, stretch, _ in stretches]
     return Prepared(
         at_rate, [*given, *(part for one in logs for part in without_rests(one, at_rate.machine, notes))], notes
     )
+
+
+def _read_limited(
+    source: str | Path | pd.DataFrame, model: Model, needs: Sequence[str], rate: float | None
+) -> tuple[list[Stretch], list[str]]:
+    """Read one log as even stretches that are no faster than the machine needs, with notes. Raises LogError."""
+    found, said = read_stretches(source, model.machine, needs, rate)
+    if not model.slips or rate is not None:
+        return found, said
+    thinned = [slower(stretch, model.machine, FASTEST_HZ) for stretch in found]
+    said += [
+        f"{_name(source)}: {old.rate:.4g} Hz is faster than the machine: reduced to {new.rate:.4g} Hz"
+        for old, new in zip(found, thinned, strict=True)
+        if new is not old
+    ]
+    return thinned, said
 
 
 def read_stretches(

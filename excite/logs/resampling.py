@@ -26,6 +26,7 @@ BRIDGED_STEPS = (
     3.5  # usual steps from one reading to the next, up to which what is lost between is interpolated; chosen
 )
 BRIDGED_S = 0.1  # [s] the most of a quarter period of the filter that is bridged as well; chosen
+THINNED = 1.5  # ratio of rates from which a slower one is made by averaging, not by interpolation; chosen
 SHORTEST_STRETCH_S = 2.0  # [s] of a log between two gaps that is worth using; chosen
 ORDINALS = {2: "second", 3: "third", 4: "fourth", 5: "fifth", 6: "sixth", 8: "eighth", 10: "tenth"}
 HELD_ROWS = 0.9  # share of changes of a channel in every n-th row, from which it is taken for held; chosen
@@ -86,7 +87,8 @@ def even_stretches(
         stretch = Stretch(part, float(run.t[0]), own, int(run.rows[0]))
         if rate is None or abs(own / rate - 1) < SAME_RATE:
             return [stretch], notes
-        return [at_rate(stretch, machine, rate)], [f"{source}: resampled from {own:.6g} to {rate:.6g} Hz"]
+        if own > THINNED * rate:
+            return [at_rate(stretch, machine, rate)], [f"{source}: resampled from {own:.6g} to {rate:.6g} Hz"]
     grid = rate or (nominal if abs(own / nominal - 1) < EVEN else own)
     # For filters the step must be even, so a rate close to the log's is as good as any.
     longest = max(BRIDGED_STEPS / own, min(BRIDGED_S, 0.25 / float(machine.filter.cutoff_hz)))
@@ -190,13 +192,13 @@ def at_rate(stretch: Stretch, machine: Machine, rate: float) -> Stretch:
         for name in (c for c in sensor.columns if c in stretch.table.columns):
             x = pd.to_numeric(stretch.table[name]).to_numpy(dtype=float)
             counted = sensor.resolution is not None
-            if factor > 1.5 and not counted:
+            if factor > THINNED and not counted:
                 x = _block_means(x, round(factor))
             at = grid * stretch.rate
             near = np.round(at).astype(int)
             whole = counted and np.abs(at - near).max() < 1e-6
             columns[name] = x[near] if whole else np.interp(grid, t, x)
-    return Stretch(pd.DataFrame(columns), stretch.start, rate, stretch.first_row)
+    return Stretch(pd.DataFrame(columns), stretch.start, rate, stretch.first_row, interpolated=True)
 
 
 def _block_means(x: np.ndarray, width: int) -> np.ndarray:

@@ -10,22 +10,27 @@ from typing import Any
 import numpy as np
 
 from excite import identification, reports
-from excite.errors import SimulationError
-from excite.identification import FILTERS, Estimate, describe_late_channels
+from excite.errors import NoEstimateError, NotIdentifiableError, SimulationError
+from excite.identification import FILTERS, Agreement, Estimate, describe_late_channels
 from excite.logs import Log, examine, prepare
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Filter
+from excite.text import format_p_value
 from excite.workflows import requests
 from excite.workflows.progress import Bar, no_bar
 
 
 @dataclass(frozen=True)
 class IdentifyResult:
-    """An estimate with its notes, the repaired logs it is from, and the filter that was used."""
+    """An estimate with its notes, the repaired logs it is from, and the filter that was used.
+
+    agreement: of several logs, None for one.
+    """
 
     estimate: Estimate
     logs: list[Log]
     filter: Filter
+    agreement: Agreement | None = None
 
 
 def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str = "machine") -> IdentifyResult:
@@ -34,7 +39,15 @@ def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str
     filtering: a name of `FILTERS`. Raises NoEstimateError, LogError.
     """
     chosen, reason = FILTERS[filtering](model, logs)
-    estimate = identification.identify(model, logs, method, chosen)
+    agreement = _compare_sources(model, logs, method, chosen)
+    try:
+        estimate = identification.identify(model, logs, method, chosen)
+    except NoEstimateError as err:
+        if agreement is None or agreement.agree:
+            raise
+        raise NotIdentifiableError(f"{describe_agreement(agreement)}; together: {err}") from None
+    if agreement is not None and not agreement.agree and estimate.status == "valid":
+        estimate = replace(estimate, status="doubtful", doubt="the logs do not agree on the parameters")
     used = [examine(model.machine, one).log for one in logs]
     if model.slips and identification.METHODS[method].biased:
         estimate = identification.add_bias(model, used, estimate, chosen)
@@ -48,7 +61,38 @@ def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str
     first = (reason,) if reason else ()
     notes = (*first, *estimate.notes, *identification.far_from_nominal(model, estimate), *late)
     estimate = identification.add_consistent(model, replace(estimate, notes=notes))
-    return IdentifyResult(estimate, used, chosen)
+    return IdentifyResult(estimate, used, chosen, agreement)
+
+
+def _compare_sources(model: Model, logs: Sequence[Log], method: str, filter: Filter) -> Agreement | None:
+    """Compare the estimates of each log by itself; None for one log, or if one of them gives no estimate."""
+    groups: dict[str, list[Log]] = {}
+    for one in logs:
+        groups.setdefault(one.source.partition(" from row ")[0], []).append(one)
+    if len(groups) < 2:
+        return None
+    try:
+        estimates = [identification.identify(model, group, method, filter) for group in groups.values()]
+    except NoEstimateError:
+        return None
+    return identification.compare_logs(tuple(groups), estimates)
+
+
+def describe_agreement(agreement: Agreement) -> str:
+    """Say whether logs agree on the parameters, and what changed."""
+    if agreement.agree:
+        return f"one set of parameters explains the {len(agreement.logs)} logs (p = {agreement.p_value:.2g})"
+    p = format_p_value(agreement.p_value)
+    p = p if p.startswith("<") else f"= {p}"
+    text = f"the logs do not agree on the parameters (p {p})"
+    if not agreement.explained:
+        return f"{text}, and more than {len(agreement.changed)} of them would have to differ: identify each by itself"
+    changes = "; ".join(
+        f"{c.name} [{c.unit}]: "
+        + ", ".join(f"{v:.4g} +- {s:.2g} in {n}" for n, v, s in zip(agreement.logs, c.value, c.std, strict=True))
+        for c in agreement.changed
+    )
+    return f"{text}; what changed: {changes}. Estimated together these are averages"
 
 
 def identify(
@@ -79,6 +123,7 @@ def identify(
     with bar("identifying"):
         found = identify_from(model, ready.logs, method, filtering)
     read, estimate, chosen = found.logs, found.estimate, found.filter
+    said = [] if found.agreement is None else [describe_agreement(found.agreement)]
     summary = {
         "machine": model.machine.name,
         "logs": [one.source for one in read],
@@ -92,7 +137,8 @@ def identify(
         "relative_error_percent": estimate.relative_error_percent,
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
-        "notes": [*cut, *estimate.notes, *more_notes],
+        "notes": [*said, *cut, *estimate.notes, *more_notes],
+        "agreement": None if found.agreement is None else _agreement(found.agreement),
         "validation": [_check(model, one, estimate, chosen) for one in unfitted],
         "versions": requests.package_versions(),
     }
@@ -105,6 +151,17 @@ def identify(
             reports.save(figure, place / (f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png"))
     reports.write_report(place, "identify", summary)
     return summary
+
+
+def _agreement(agreement: Agreement) -> dict[str, Any]:
+    return {
+        "agree": agreement.agree,
+        "p_value": agreement.p_value,
+        "explained": agreement.explained,
+        "changed": {
+            c.name: {"unit": c.unit, "value": c.value.tolist(), "std": c.std.tolist()} for c in agreement.changed
+        },
+    }
 
 
 def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:

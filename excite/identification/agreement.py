@@ -1,0 +1,111 @@
+"""Whether one set of parameters explains several logs, and which parameters changed between them.
+
+The estimates of the single logs are compared with the one that all share, by their covariances (Wald's test). If they
+differ, the parameters that must differ are found one by one: the one that takes away most of the difference first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from excite.identification.estimate import Estimate
+
+SIGNIFICANCE = 1e-3  # p-value below which logs disagree; chosen
+MAX_CHANGED = 4  # parameters that are named; more have no single cause; chosen
+
+
+@dataclass(frozen=True)
+class ChangedParameter:
+    """A parameter that differs between logs: its value and standard deviation [SI] in each, others being common."""
+
+    name: str
+    unit: str
+    value: np.ndarray
+    std: np.ndarray
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Comparison of logs. p_value: of a difference like theirs if nothing changed. changed: what differs.
+
+    explained: the logs agree apart from what changed.
+    """
+
+    logs: tuple[str, ...]
+    p_value: float
+    changed: tuple[ChangedParameter, ...]
+    explained: bool
+
+    @property
+    def agree(self) -> bool:
+        """Tell if one set of parameters explains all logs."""
+        return self.p_value >= SIGNIFICANCE
+
+
+def compare_logs(names: Sequence[str], estimates: Sequence[Estimate]) -> Agreement | None:
+    """Compare estimates of single logs; None if no parameter is identified in all of them."""
+    known = np.all([np.isfinite(e.value) & np.isfinite(e.std) & (e.std > 0) for e in estimates], axis=0)
+    at = np.flatnonzero(known)
+    if not len(at) or len(estimates) < 2:
+        return None
+    scale = np.max([e.std for e in estimates], axis=0)[at]
+    values = np.array([e.value[at] / scale for e in estimates])
+    information = [_inverse(e.covariance[np.ix_(at, at)] / np.outer(scale, scale)) for e in estimates]
+    changed: list[int] = []
+    first = p = _p_value(values, information, changed)
+    while p < SIGNIFICANCE and len(changed) < min(MAX_CHANGED, len(at)):
+        rest = [k for k in range(len(at)) if k not in changed]
+        changed.append(min(rest, key=lambda k: _misfit(values, information, [*changed, k])[0]))
+        p = _p_value(values, information, changed)
+    found = []
+    if changed:
+        _, x, covariance = _misfit(values, information, changed)
+        std = np.sqrt(np.diag(covariance))
+        n = len(at)
+        for place, k in enumerate(changed):
+            columns = [k if log == 0 else n + (log - 1) * len(changed) + place for log in range(len(estimates))]
+            name, unit = estimates[0].names[at[k]], estimates[0].units[at[k]]
+            found.append(ChangedParameter(name, unit, x[columns] * scale[k], std[columns] * scale[k]))
+    return Agreement(tuple(names), first, tuple(found), p >= SIGNIFICANCE)
+
+
+def _inverse(covariance: np.ndarray) -> np.ndarray:
+    """Inverse of a covariance, without directions that rounding alone determines."""
+    variance, v = np.linalg.eigh((covariance + covariance.T) / 2)
+    return np.asarray((v / np.maximum(variance, 1e-12 * variance.max())) @ v.T)
+
+
+def _p_value(values: np.ndarray, information: Sequence[np.ndarray], changed: Sequence[int]) -> float:
+    logs, n = values.shape
+    freedom = (logs - 1) * (n - len(changed))
+    return float(scipy.stats.chi2.sf(_misfit(values, information, changed)[0], freedom)) if freedom else 1.0
+
+
+def _misfit(
+    values: np.ndarray, information: Sequence[np.ndarray], changed: Sequence[int]
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Fit common parameters, and own values of changed ones in each log, to estimates values (logs, n).
+
+    Returns the misfit, the solution (n values of the first log, then the changed ones of each other log) and its
+    covariance.
+    """
+    logs, n = values.shape
+    count = n + (logs - 1) * len(changed)
+    H, g, design = np.zeros((count, count)), np.zeros(count), []
+    for log in range(logs):
+        D = np.zeros((n, count))
+        D[:, :n] = np.eye(n)
+        for place, k in enumerate(changed if log else ()):
+            D[k, :] = 0.0
+            D[k, n + (log - 1) * len(changed) + place] = 1.0
+        design.append(D)
+        H += D.T @ information[log] @ D
+        g += D.T @ information[log] @ values[log]
+    covariance = _inverse(H)
+    x = covariance @ g
+    left = [v - D @ x for v, D in zip(values, design, strict=True)]
+    return float(sum(e @ P @ e for e, P in zip(left, information, strict=True))), x, covariance
