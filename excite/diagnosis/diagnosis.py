@@ -20,6 +20,7 @@ from excite.diagnosis.fits import (
     MIN_PROCESS_NOISE,
     ExtendedFit,
     fit_machine,
+    fit_machine_that_sticks,
     fit_with_process_noise,
     refit,
     with_true_sensor_noise,
@@ -104,6 +105,11 @@ class Diagnosis:
     stages: tuple[ExtendedFit, ...]
     nearest: NearestEffect | None = None
 
+    @property
+    def sticks(self) -> bool:
+        """Tell if the logs are followed only with friction that sticks near rest."""
+        return self.before.data.measurements[0].extra_torque_noise is not None
+
 
 def diagnose(
     model: Model,
@@ -119,7 +125,7 @@ def diagnose(
     """
     report = progress or (lambda share, what: None)
     report(0.0, "fitting the model")
-    first = before = fit_machine(model.machine, logs, filter, runner)
+    first = before = fit_machine_that_sticks(fit_machine(model.machine, logs, filter, runner), logs, filter, runner)
     chosen = list[Choice]()
     if before.data.noise_inflation > 1:
         report(0.15, "fitting effects with inflated sensor noise")

@@ -202,16 +202,47 @@ def assemble_fit(machine: Machine, data: FitData, fit: Fit, process_noise_fit: F
     return ExtendedFit(machine, data, fit, data.noise_inflation == 1, larger_noise)
 
 
-def fit_machine(machine: Machine, logs: Sequence[Log], filter: Filter, runner: CallRunner = run_in_turn) -> ExtendedFit:
+def fit_machine_that_sticks(
+    plain: ExtendedFit, logs: Sequence[Log], filter: Filter, runner: CallRunner = run_in_turn
+) -> ExtendedFit:
+    """Let friction have either sign where joints are near rest, if the model then follows the logs; else return plain.
+
+    A joint that sticks has any friction up to Fs there, which no formula of friction describes.
+    """
+    model = plain.model
+    if model.slips or (plain.exact and plain.is_close):
+        return plain
+    extra = [identification.friction_near_rest(model, log, filter) for log in logs]
+    if not any(x.any() for x in extra):
+        return plain
+    try:
+        soft = identification.with_soft_friction(model, logs, filter).machine
+        found = fit_machine(soft, logs, filter, runner, extra)
+    except NotConvergedError:
+        return plain
+    return found if found.exact and found.is_close else plain
+
+
+def fit_machine(
+    machine: Machine,
+    logs: Sequence[Log],
+    filter: Filter,
+    runner: CallRunner = run_in_turn,
+    extra_torque_noise: Sequence[np.ndarray] | None = None,
+) -> ExtendedFit:
     """Fit a machine's model to logs, with the shapes of its effects free.
 
     Exact dynamics are given up if they stay LOST_COST_RATIO off after a few passes. Then comes process noise, as little
     as the logs allow: the less it absorbs, the clearer the cause; exact dynamics are tried again from there. If that is
     far from the logs too, sensor noise is inflated. If all fail, `fit_with_process_noise` applies.
 
-    All attempts start at once where there are processes for them. Raises NotConvergedError.
+    All attempts start at once where there are processes for them. extra_torque_noise: see `Measurements`. Raises
+    NotConvergedError.
     """
     data = _prepare(machine, logs, filter)
+    if extra_torque_noise is not None:
+        noisy = zip(data.measurements, extra_torque_noise, strict=True)
+        data = replace(data, measurements=tuple(replace(r, extra_torque_noise=x) for r, x in noisy))
     calls: list[Callable[[], Any]] = [
         partial(_fit_exact_from_start, data),
         partial(fit_reducing_process_noise, machine, data, identification.PROCESS_NOISE_LEVELS[0]),

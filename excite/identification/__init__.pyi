@@ -13,6 +13,7 @@ from .methods import (
     recommend_method as recommend_method,
     require_sensors as require_sensors,
 )
+from .near_rest import friction_near_rest as friction_near_rest, with_soft_friction as with_soft_friction
 from .monte_carlo import (
     Verification as Verification,
     biased_parameters as biased_parameters,

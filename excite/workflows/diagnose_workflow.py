@@ -108,6 +108,8 @@ def diagnose(
 
 def _baseline_note(found: Diagnosis) -> list[str]:
     """Say which model the "before" numbers are of, if the model without the findings can't follow the logs."""
+    if found.sticks:
+        return ["friction sticks: where a joint is near rest, its friction may have any value up to Fs"]
     if found.before.estimated:
         return []
     inflation = found.before.data.noise_inflation
