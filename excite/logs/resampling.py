@@ -131,7 +131,9 @@ def _readings(column: pd.Series, name: str, source: str) -> np.ndarray:
     if column.dtype.kind in "biu":
         return np.ones(len(column), bool)
     number = pd.to_numeric(column, errors="coerce").to_numpy(dtype=float)
-    missing = column.isna().to_numpy() | (column.astype(str).str.strip() == "").to_numpy()
+    missing = column.isna().to_numpy()
+    if column.dtype.kind != "f":  # a column of numbers has no blank text, and to make text of it takes long
+        missing = missing | (column.astype(str).str.strip() == "").to_numpy()
     wrong = ~np.isfinite(number) & ~missing
     if wrong.any():
         k = int(np.argmax(wrong))
