@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from excite.logs.files.common import (
 )
 
 VIRTUAL = (3, 6)  # types of channels that have no bytes
+DEFLATED = (1, 2)  # types of blocks
 
 
 def read_mdf(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
@@ -40,6 +43,7 @@ def read_mdf(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
         refuse_swollen(path, sum(rows * int(size or 0) for rows, size in sizes))
         refuse_huge(path, max((rows for rows, _ in sizes), default=0), 1)
         _refuse_outside(path, mdf)
+        _refuse_other_sizes(path, mdf)
         for index, group in mdf.virtual_groups.items():
             entries = [(None, g, c) for g, found in mdf.included_channels(index)[index].items() for c in found]
             if group.cycles_nr == 0 or not entries:
@@ -79,6 +83,28 @@ def _refuse_outside(path: Path, mdf: Any) -> None:
                 bits = 8 * channel.additional_byte_offset + channel.start_offset + channel.bit_count
             if not 0 < bits <= 8 * record:
                 raise LogError(f"{path}: channel {channel.name} lies outside its record; the file is damaged")
+
+
+def _refuse_other_sizes(path: Path, mdf: Any) -> None:
+    """Raises LogError where a packed block is not as long as it says: asammdf would read behind its end."""
+    from asammdf.blocks.utils import DECOMPRESS_FUNC_MAP
+
+    with path.open("rb") as file:
+        for group in mdf.groups:
+            signals = (group.get_signal_data_blocks(k) for k in range(len(group.signal_data or ())))
+            for block in itertools.chain(group.get_data_blocks(), *signals):
+                for part in (block, getattr(block, "invalidation_block", None)):
+                    if part is None or not part.block_type or not part.original_size:
+                        continue
+                    refuse_swollen(path, part.original_size)
+                    file.seek(part.address)
+                    packed = file.read(part.compressed_size)
+                    if part.block_type in DEFLATED:  # a bounded size: it may be a small block of a billion zeros
+                        size = len(zlib.decompressobj().decompress(packed, part.original_size + 1))
+                    else:
+                        size = len(DECOMPRESS_FUNC_MAP[part.block_type](packed))
+                    if size != part.original_size:
+                        raise LogError(f"{path}: a block of data is not as long as it says; the file is damaged")
 
 
 def _native(values: np.ndarray) -> np.ndarray:
