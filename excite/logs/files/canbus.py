@@ -11,12 +11,13 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
-from excite.logs.files.common import MOST_BYTES, MOST_CELLS, NOTES, UNITS_SAID, lacking, merged, refuse_huge, said
+from excite.logs.files.common import MOST_CELLS, NOTES, UNITS_SAID, lacking, merged, refuse_huge, said
 
 OBJECT = struct.Struct("<4sHHII")  # signature, bytes of the header, its version, bytes of the object, kind
 CONTAINER = struct.Struct("<H6xL4x")  # method of compression, bytes unpacked
 CONTAINER_KIND = 10
 DEFLATE = 2  # method
+MOST_OF_CONTAINER = 100_000_000  # bytes; loggers fill them up to 128 kB; chosen
 DATABASES = (".dbc", ".kcd", ".sym", ".arxml")
 
 
@@ -98,9 +99,11 @@ def _refuse_stuck(path: Path) -> None:
             data = raw[at + OBJECT.size + CONTAINER.size : at + size]
             if method == DEFLATE:
                 try:
-                    data = zlib.decompressobj().decompress(data, MOST_BYTES)
+                    data = zlib.decompressobj().decompress(data, MOST_OF_CONTAINER)
                 except zlib.error:
                     return
+                if len(data) == MOST_OF_CONTAINER:
+                    raise LogError(f"{path}: not a CAN log that can be read: a container unpacks to {len(data)} bytes")
             data, inner = rest + data, 0
             while inner + OBJECT.size <= len(data):
                 inner = data.find(b"LOBJ", inner, inner + 8)

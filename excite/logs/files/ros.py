@@ -80,7 +80,8 @@ def read_mcap(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
         file.seek(-len(MCAP_MAGIC), 2)
         whole = file.read() == MCAP_MAGIC
         file.seek(0)
-        reader = SeekingReader(file) if whole else NonSeekingReader(file)
+        size = path.stat().st_size  # no record is longer, whatever it claims
+        reader = (SeekingReader if whole else NonSeekingReader)(file, record_size_limit=size)
         summary = reader.get_summary() if whole else None
         used = _topics({c.topic for c in summary.channels.values()}, wanted) if summary else None
 
