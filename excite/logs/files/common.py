@@ -25,6 +25,7 @@ UNITS_SAID = "units"  # of a table's attrs: units that the file gives, by column
 OTHER_NAMES = "other_names"  # of a table's attrs: further names of columns -> the column
 UNCLEAR = "unclear"  # of a table's attrs: what is said of columns whose numbers may be read in two ways
 MOST_CELLS = 250_000_000  # numbers of a table, 2 GB: an hour at 1 kHz of 70 columns; chosen
+MOST_COLUMNS = 10_000  # of a table of cells; chosen
 MOST_BYTES = 2_000_000_000  # of unpacked text; chosen
 MOST_PACKED = 1_100  # times that a packed block can unpack to; zlib's most is 1032
 MOST_ELEMENTS = 64  # of an array in a message or a row that become columns of their own: no picture; chosen

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import itertools
 import zipfile
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,19 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs.files import layout
-from excite.logs.files.common import MOST_BYTES, MOST_CELLS, NOTES, OTHER_NAMES, UNITS_SAID, lacking, refuse_huge
+from excite.logs.files.common import (
+    MOST_BYTES,
+    MOST_CELLS,
+    MOST_COLUMNS,
+    NOTES,
+    OTHER_NAMES,
+    UNITS_SAID,
+    lacking,
+    refuse_huge,
+)
 
 BEGIN = 200  # rows in which the header is looked for; chosen
-WIDEST = 16_384  # columns of a sheet: Excel's own limit
+LONGEST = 1_048_576  # rows of a sheet: Excel's own limit
 OBJECT_ROOM = 8  # times the room of a number that a cell takes while it is read; measured
 NOT_BEFORE = datetime.datetime(1899, 12, 30)  # day 0 of Excel
 
@@ -55,7 +65,7 @@ def _sheet(path: Path, sheet: Any) -> pd.DataFrame | None:
     sheet.reset_dimensions()  # what the file says of them may be anything
     lines = sheet.iter_rows(values_only=True)
     begin = list(itertools.islice(lines, BEGIN))
-    rows = [["" if cell is None else str(cell) for cell in line[:WIDEST]] for line in begin]
+    rows = [["" if cell is None else str(cell) for cell in line[:MOST_COLUMNS]] for line in begin]
     at = layout.search([[*cells[: layout.width(cells)], ""] for cells in rows])
     if at is None:
         return None
@@ -63,12 +73,14 @@ def _sheet(path: Path, sheet: Any) -> pd.DataFrame | None:
     cells: list[tuple[Any, ...]] = []
     for line in itertools.chain(begin[at.start :], lines):
         cells.append(tuple(line[:count]) + (None,) * (count - len(line)))
+        if len(cells) > LONGEST:
+            raise LogError(f"{path}: sheet {sheet.title} claims more than {LONGEST} rows; the file is damaged")
         if len(cells) * count > MOST_CELLS // OBJECT_ROOM:
             refuse_huge(path, OBJECT_ROOM * len(cells), count)
     while cells and all(map(_blank, cells[-1])):
         cells.pop()
     names = at.names[:count]
-    twice = [name for name in names if name and names.count(name) > 1]
+    twice = [name for name, times in Counter(names).items() if name and times > 1]
     if twice:
         raise LogError(f"{path}: sheet {sheet.title}, row {at.header + 1}: column {twice[0]} is there twice, keep one")
     table = pd.DataFrame({name: _column([line[k] for line in cells]) for k, name in enumerate(names) if name})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
@@ -61,11 +62,12 @@ def search(rows: Sequence[Sequence[str]], comments: Collection[int] = ()) -> Lay
     comments: rows (from 0) that are comments, without their mark. None where nothing can be the header.
     """
     plain = [k for k in range(len(rows)) if k not in comments and width(rows[k])]
+    data = {k: is_data(rows[k]) for k in plain}
     start = None
     for n, k in enumerate(plain):
-        after = [rows[j] for j in plain[n + 1 : n + 1 + ALIKE]]
-        alike = sum(is_data(cells) and abs(len(cells) - len(rows[k])) <= 1 for cells in after)
-        if is_data(rows[k]) and 2 * alike >= len(after):
+        after = plain[n + 1 : n + 1 + ALIKE]
+        alike = sum(data[j] and abs(len(rows[j]) - len(rows[k])) <= 1 for j in after)
+        if data[k] and 2 * alike >= len(after):
             start = k
             break
     if start is None:
@@ -100,14 +102,16 @@ def beside_header(
     """Take units by column, and other names of columns, from lines of words below and above the header."""
     units: dict[str, str] = {}
     other: dict[str, str] = {}
+    known = set(names)
     best = max(below, key=lambda cells: sum(_unit(c) in UNITS for c in cells), default=None)
     for cells in (*below, *above):
         texts = [cell.strip() for cell in cells]
+        counts = Counter(texts)
         for name, text in zip(names, texts, strict=False):
             unit, word = _unit(text), text.lower().strip(":") in UNIT_WORDS
             if cells is best and unit and not word and (unit in UNITS or len(unit) <= LONGEST_UNIT):
                 units[name] = unit
-            if text and not word and text not in names and texts.count(text) == 1 and unit not in UNITS:
+            if text and not word and text not in known and counts[text] == 1 and unit not in UNITS:
                 other.setdefault(text, name)
     return units, other
 
@@ -115,5 +119,5 @@ def beside_header(
 def without_units(names: Sequence[str]) -> dict[str, str]:
     """Names without a unit in brackets -> the column: theta1 -> theta1 [deg]."""
     bare = [(match.group(1), name) for name in names if (match := BRACKETED.fullmatch(name))]
-    short = [own for own, _ in bare]
-    return {own: name for own, name in bare if own not in names and short.count(own) == 1}
+    counts, known = Counter(own for own, _ in bare), set(names)
+    return {own: name for own, name in bare if own not in known and counts[own] == 1}

@@ -7,6 +7,7 @@ import io
 import re
 import warnings
 import zlib
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs.files import layout
-from excite.logs.files.common import MOST_BYTES, NOTES, OTHER_NAMES, UNCLEAR, UNITS_SAID
+from excite.logs.files.common import MOST_BYTES, MOST_COLUMNS, NOTES, OTHER_NAMES, UNCLEAR, UNITS_SAID
 from excite.logs.files.layout import COMMA, Layout, is_data, is_numeric, is_words
 
 SEPARATORS = ("\t", ";", ",", "|")
@@ -51,7 +52,8 @@ def read_text(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     if comment:
         notes.append(f"line {found.header + 1}: the header was taken from a comment")
     raw = raw[: _whole_rows(path, raw, found, separator, notes)]
-    twice = [name for k, name in enumerate(found.names) if name in found.names[:k]]
+    counts = Counter(found.names)
+    twice = [name for name in counts for _ in range(counts[name] - 1)]
     names: list[str] | None = None
     if comment or twice or separator == BLANKS:
         names = _numbered(found.names)
@@ -76,7 +78,7 @@ def read_text(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
         _refuse_blank_cells(path, table, body)
     if found.names and found.names[-1] == "" and table.iloc[:, -1].isna().all():  # a separator at the end of each line
         table = table.iloc[:, :-1].copy()
-        twice = [name for name in twice if name or found.names.count("") > 2]
+        twice = [name for name in twice if name or counts[""] > 2]
     for name in dict.fromkeys(twice):
         table = _one_of(path, table, name, found, notes)
     unclear: dict[str, str] = {}
@@ -188,7 +190,7 @@ def _utf8(path: Path, raw: bytes) -> bytes:
 def _head(raw: bytes) -> str:
     """Whole lines at the beginning."""
     end = raw.rfind(b"\n", 0, HEAD) if len(raw) > HEAD else -1
-    return (raw[:end] if end >= 0 else raw).decode(errors="replace")
+    return raw[: end if end >= 0 else HEAD].decode(errors="replace")
 
 
 def _offset(raw: bytes, line: int) -> int:
@@ -210,6 +212,8 @@ def _layout(path: Path, lines: list[str]) -> tuple[Layout, str]:
         raise LogError(f"{path}: the file is empty, there is no header with the names of columns")
     separator = BLANKS if _blanks_between(lines, head) else _separator(lines[head])
     header = [name.strip() for name in _row(path, lines, head, separator)]
+    if len(header) > MOST_COLUMNS:
+        raise LogError(f"{path}: not a table: line {head + 1} has {len(header)} cells, more than {MOST_COLUMNS}")
     below = [k for k in range(head + 1, min(len(lines), head + 1 + SEEN)) if lines[k].strip()]
     rows = {k: _row(path, lines, k, separator) for k in below}
     plain = [rows[k] for k in below if not lines[k].lstrip().startswith(COMMENTS)]
@@ -253,6 +257,8 @@ def _searched(lines: list[str]) -> tuple[Layout, str] | None:
         try:
             rows = [_split(line, separator) for line in plain]
         except csv.Error:
+            continue
+        if max(map(len, rows)) > MOST_COLUMNS:
             continue
         found = layout.search(rows, comments)
         if found is None or len(found.names) < 2 or max(map(len, found.names)) > LONGEST:
@@ -319,12 +325,12 @@ def _no_header(path: Path, header: list[str], k: int) -> str:
 def _numbered(names: list[str]) -> list[str]:
     """Names that differ: a name that is there again gets a number."""
     made: dict[str, None] = {}
+    last: Counter[str] = Counter()
     for k, name in enumerate(names):
         own = new = name or f"Unnamed: {k}"
-        n = 0
         while new in made:
-            n += 1
-            new = f"{own}.{n}"
+            last[own] += 1
+            new = f"{own}.{last[own]}"
         made[new] = None
     return list(made)
 
