@@ -1,0 +1,77 @@
+"""Damaged log files of every format, each read in a process that may have 4 GB and 20 s: a table, or one line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support import damage, log_files
+
+from excite.errors import LogError
+from excite.logs import tables
+
+WANTED = ("t_s", "theta1_rad", "u1_Nm", "/joint_states/position[0]", "/motor/torque/data", "Encoder.Angle", "Angle")
+SIZES = [pytest.param(1, id="few"), pytest.param(60, id="many", marks=pytest.mark.slow)]  # files of each format
+
+
+@pytest.fixture(scope="module")
+def child() -> Iterator[damage.Child]:
+    for library in ("rosbags", "mcap", "can", "cantools", "asammdf", "openpyxl", "h5py"):
+        pytest.importorskip(library, reason=f"{library} is not installed")
+    made = damage.Child()
+    yield made
+    made.end()
+
+
+@pytest.mark.parametrize("each", SIZES)
+def test_damaged_files_give_a_table_or_one_line(each: int, child: damage.Child, tmp_path: Path) -> None:
+    seeds = log_files.a_file_of_each_format(tmp_path)
+    for name, k, answer in damage.answers(child, seeds, each * len(seeds), each, wanted=WANTED):
+        assert answer.good, (name, k, answer)
+
+
+@pytest.mark.parametrize("each", SIZES)
+def test_damaged_logs_are_refused_or_prepared_without_nan(each: int, child: damage.Child, tmp_path: Path) -> None:
+    seeds = log_files.logs_of("va12", tmp_path)
+    for name, k, answer in damage.answers(child, seeds, each * len(seeds), each, "va12"):
+        assert answer.good, (name, k, answer)
+
+
+def test_packed_blocks_of_mdf_are_as_long_as_they_say(tmp_path: Path) -> None:
+    """Where they aren't, asammdf reads behind their ends: a crash, or numbers that nobody logged."""
+    asammdf = pytest.importorskip("asammdf", reason="asammdf is not installed (extra mdf)")
+    with asammdf.MDF(log_files.write_mdf(tmp_path)) as mdf:
+        path = Path(mdf.save(tmp_path / "packed.mf4", overwrite=True, compression=2))
+    raw = path.read_bytes()
+    at = raw.index(b"##DZ") + 32  # bytes of the block unpacked
+    size = int.from_bytes(raw[at : at + 8], "little")
+    assert size == len(log_files.T) * 16
+    for wrong, what in ((size + 1, "not as long as it says"), (1 << 32, "far more than the file can hold")):
+        path.write_bytes(raw[:at] + wrong.to_bytes(8, "little") + raw[at + 8 :])
+        with pytest.raises(LogError, match=what):
+            tables.read_table(path)
+
+
+def test_a_line_of_very_many_cells_is_no_header(child: damage.Child, tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("t,u," + "ab," * 1_000_000)
+    answer = child.read(tmp_path / "log.csv")
+    assert answer.kind == "refused"
+    assert "cells, more than 10000" in answer.what
+
+
+def test_a_row_with_a_huge_number_is_refused(child: damage.Child, tmp_path: Path) -> None:
+    """openpyxl gives blank rows up to it."""
+    path = log_files.write_table(log_files.small_table(), tmp_path / "log.xlsx")
+    path.write_bytes(damage.in_zip(path.read_bytes(), lambda xml: xml.replace(b'r="150"', b'r="999999999"')))
+    answer = child.read(path)
+    assert answer.kind == "refused"
+    assert "claims more than 1048576 rows" in answer.what
+
+
+def test_a_container_that_unpacks_to_very_much_is_refused(child: damage.Child, tmp_path: Path) -> None:
+    path = log_files.write_can(tmp_path, ".blf")
+    path.write_bytes(damage.in_blf(path.read_bytes(), lambda data: data + bytes(200_000_000)))
+    answer = child.read(path)
+    assert answer.kind == "refused"
+    assert "a container unpacks to" in answer.what

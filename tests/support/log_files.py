@@ -1,0 +1,271 @@
+"""Log files of every format, written by the formats' own libraries."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+from support.drives import drive
+
+from excite.model import prediction
+from excite.model.machine import load_machine
+from excite.simulation import sensors, simulate
+
+T = np.arange(200) / 100
+ANGLE = np.sin(3 * T)
+TORQUE = 40 * np.cos(3 * T[::4])  # every fourth sample, 1 ms later
+T_TORQUE = T[::4] + 0.001
+NANOSECONDS = 1_795_341_600_000_000_000
+DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: ECU
+BO_ 256 Encoder: 8 ECU
+ SG_ Angle : 0|32@1- (0.000001,0) [-10|10] "rad" ECU
+ SG_ Mode : 32|8@1+ (1,0) [0|255] "" ECU
+BO_ 512 Motor: 8 ECU
+ SG_ Torque : 7|16@0- (0.01,0) [-300|300] "N m" ECU
+VAL_ 256 Mode 0 "off" 1 "on" ;
+"""
+
+
+def write_bag1(path: Path) -> Path:
+    rosbags = pytest.importorskip("rosbags.rosbag1", reason="rosbags is not installed (extra ros)")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with rosbags.Writer(path / "log.bag") as bag:
+        _ros(bag, store, lambda m, name: store.serialize_ros1(m, name), ros1=True)
+    return path / "log.bag"
+
+
+def write_bag2(path: Path) -> Path:
+    rosbags = pytest.importorskip("rosbags.rosbag2", reason="rosbags is not installed (extra ros)")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with rosbags.Writer(path / "bag", version=8) as bag:
+        _ros(bag, store, lambda m, name: bytes(store.serialize_cdr(m, name)), ros1=False)
+    return path / "bag"
+
+
+def _ros(bag, store, raw, ros1: bool) -> None:  # type: ignore[no-untyped-def]
+    kinds = store.types
+    joint, effort = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64"
+    joints, efforts = (bag.add_connection(topic, kind, typestore=store) for topic, kind in TOPICS.items())
+    said = [(t, joints, a) for t, a in zip(T, ANGLE, strict=True)]
+    said += [(t, efforts, u) for t, u in zip(T_TORQUE, TORQUE, strict=True)]
+    for t, connection, value in sorted(said, key=lambda one: one[0]):
+        at = NANOSECONDS + round(1e9 * t)
+        if connection is joints:
+            stamp = kinds["builtin_interfaces/msg/Time"](
+                sec=(at - 2_000_000) // 10**9, nanosec=(at - 2_000_000) % 10**9
+            )
+            head = {"seq": 0} if ros1 else {}
+            header = kinds["std_msgs/msg/Header"](**head, stamp=stamp, frame_id="arm")
+            message = kinds[joint](header, ["hip", "knee"], np.array([value, 2 * value]), np.array([]), np.array([]))
+            bag.write(connection, at, raw(message, joint))
+        else:
+            bag.write(connection, at, raw(kinds[effort](value), effort))
+
+
+TOPICS = {"/joint_states": "sensor_msgs/msg/JointState", "/motor/torque": "std_msgs/msg/Float64"}
+
+
+def write_mcap(path: Path, compressed: bool = True) -> Path:
+    mcap = pytest.importorskip("mcap.writer", reason="mcap is not installed (extra ros)")
+    with (path / "log.mcap").open("wb") as file:
+        kind = mcap.CompressionType.LZ4 if compressed else mcap.CompressionType.NONE
+        writer = mcap.Writer(file, chunk_size=2000, compression=kind)
+        writer.start()
+        schema = writer.register_schema("Any", "jsonschema", b"{}")
+        channels = [writer.register_channel(topic, "json", schema) for topic in ("/joint_states", "/motor/torque")]
+        for t, a in zip(T, ANGLE, strict=True):
+            at = NANOSECONDS + round(1e9 * t)
+            data = json.dumps({"name": ["hip", "knee"], "position": [a, 2 * a]}).encode()
+            writer.add_message(channels[0], at, data, at)
+        for t, u in zip(T_TORQUE, TORQUE, strict=True):
+            at = NANOSECONDS + round(1e9 * t)
+            writer.add_message(channels[1], at, json.dumps({"data": u}).encode(), at)
+        writer.finish()
+    return path / "log.mcap"
+
+
+def write_can(path: Path, suffix: str) -> Path:
+    can = pytest.importorskip("can", reason="python-can is not installed (extra can)")
+    cantools = pytest.importorskip("cantools", reason="cantools is not installed (extra can)")
+    (path / "log.dbc").write_text(DBC)
+    base = cantools.database.load_string(DBC, "dbc")
+    frames = [(t, 256, base.encode_message(256, {"Angle": a, "Mode": 1})) for t, a in zip(T, ANGLE, strict=True)]
+    frames += [(t, 512, base.encode_message(512, {"Torque": u})) for t, u in zip(T_TORQUE, TORQUE, strict=True)]
+    frames += [(0.5, 700, b"unknown")]
+    with can.Logger(str(path / f"log{suffix}")) as log:
+        for t, name, data in sorted(frames):
+            log(can.Message(timestamp=1e6 + t, arbitration_id=name, data=data, is_extended_id=False, channel=0))
+    return path / f"log{suffix}"
+
+
+def write_mdf(path: Path, version: str = "4.10", suffix: str = ".mf4") -> Path:
+    asammdf = pytest.importorskip("asammdf", reason="asammdf is not installed (extra mdf)")
+    with asammdf.MDF(version=version) as mdf:
+        mdf.append([asammdf.Signal(ANGLE, 1000 + T, name="Angle", unit="rad")])
+        counts = np.arange(50, dtype=np.uint16)
+        mdf.append(
+            [
+                asammdf.Signal(TORQUE, 1000 + T_TORQUE, name="Torque", unit="N m"),
+                asammdf.Signal(counts, 1000 + T_TORQUE, name="Counts"),
+            ]
+        )
+        mdf.save(path / f"log{suffix}", overwrite=True)
+    return path / f"log{suffix}"
+
+
+def small_table() -> pd.DataFrame:
+    return pd.DataFrame({"t_s": T, "theta1_rad": ANGLE, "u1_Nm": 40 * ANGLE})
+
+
+def a_file_of_each_format(folder: Path) -> dict[str, Path]:
+    """A file of each format, small, by the format's name."""
+
+    made: dict[str, Path] = {}
+    for name, write in {
+        "ROS 1": write_bag1,
+        "MCAP": write_mcap,
+        "MCAP unpacked": lambda p: write_mcap(p, compressed=False),
+        "BLF": lambda p: write_can(p, ".blf"),
+        "ASC": lambda p: write_can(p, ".asc"),
+        "MDF 4": write_mdf,
+        "MDF 3": lambda p: write_mdf(p, "3.30", ".mdf"),
+    }.items():
+        (folder / name).mkdir()
+        made[name] = write(folder / name)
+    made["DBC"] = made["ASC"].with_suffix(".dbc")
+    (folder / "ROS 2").mkdir()
+    bag = write_bag2(folder / "ROS 2")
+    made |= {"ROS 2": next(bag.glob("*.db3")), "metadata": bag / "metadata.yaml"}
+    for name, suffix in TABLES.items():
+        made[name] = write_table(small_table(), folder / f"{name.replace(' ', '')}{suffix}")
+    return made | _files_with_more_in_them(folder)
+
+
+def _files_with_more_in_them(folder: Path) -> dict[str, Path]:
+    """Files of the formats' rarer parts: packed blocks, text, dates, structs, lists, blank cells."""
+    import asammdf
+    import h5py
+    import scipy.sparse
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin, Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
+    made = {
+        "Parquet plain": folder / "plain.parquet",
+        "Parquet nested": folder / "nested.parquet",
+        "Excel mixed": folder / "mixed.xlsx",
+        "MATLAB packed": folder / "struct.mat",
+        "MATLAB mixed": folder / "mixed.mat",
+        "MATLAB 4": folder / "old.mat",
+        "HDF5 packed": folder / "chunks.h5",
+        "HDF5 mixed": folder / "mixed.h5",
+        "MDF 4 packed": folder / "packed.mf4",
+        "ROS 1 packed": folder / "packed.bag",
+        "text mixed": folder / "mixed.csv",
+    }
+    small_table().to_parquet(made["Parquet plain"], compression=None, index=False)
+    dates = pd.date_range("2026-11-22", periods=len(T), freq="10ms")
+    mixed = small_table().assign(when=dates, word="on", flag=T > 1, gap=np.where(T < 1, T, np.nan))
+    mixed.assign(clock=dates.time).to_excel(made["Excel mixed"], index=False, startrow=2)
+    lists = mixed.assign(
+        imu=[{"gyro": {"z": a}, "ok": True} for a in ANGLE],
+        q=[[a, 2 * a] for a in ANGLE],
+        mode=pd.Categorical(["on", "off"] * 100),
+        count=pd.array([None, *range(199)], dtype="Int64"),
+    )
+    lists.set_index("t_s").to_parquet(made["Parquet nested"], compression="gzip")
+    mixed.to_csv(made["text mixed"], index=False, sep=";", decimal=",", date_format="%d.%m.%Y %H:%M:%S.%f")
+    scipy.io.savemat(made["MATLAB packed"], {"log": {"t": T, "q": ANGLE}, "u": TORQUE}, do_compression=True)
+    cell = np.array([{"Time": T, "Data": ANGLE}, "word"], dtype=object)
+    parts = {"z": T * 1j, "sparse": scipy.sparse.csc_matrix(np.diag(T[:20])), "flag": T > 1, "n": np.arange(200)}
+    structs = np.array([(T, "left"), (ANGLE, "right")], dtype=[("values", object), ("label", object)])
+    scipy.io.savemat(made["MATLAB mixed"], parts | {"cell": cell, "signals": structs, "q": np.outer(T, [1.0, 2])})
+    scipy.io.savemat(made["MATLAB 4"], {"t": T, "q": ANGLE}, format="4")
+    with h5py.File(made["HDF5 packed"], "w") as file:
+        file.create_dataset("log/q", data=ANGLE, chunks=(50,), compression="gzip")
+        file["t"] = T
+    with h5py.File(made["HDF5 mixed"], "w", libver="latest") as file:
+        file["arm/q"] = np.array(list(zip(ANGLE, T, strict=True)), dtype=[("q1", "f8"), ("q2", ">f4")])
+        file["arm/word"] = np.array(["on"] * 200, dtype=h5py.string_dtype())
+        file["arm/t"] = h5py.SoftLink("/t")
+        file.create_dataset("t", data=T, chunks=(64,), maxshape=(None,), shuffle=True, fletcher32=True)
+        file["t"].attrs["unit"] = "s"
+    with asammdf.MDF(write_mdf(folder)) as mdf:
+        mdf.save(made["MDF 4 packed"], overwrite=True, compression=2)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    packed = Writer1(made["ROS 1 packed"])
+    packed.set_compression(Writer1.CompressionFormat.BZ2)
+    with packed as bag:
+        _ros(bag, store, lambda m, name: store.serialize_ros1(m, name), ros1=True)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Writer2(folder / "mcap", version=8, storage_plugin=StoragePlugin.MCAP) as bag:
+        _ros(bag, store, lambda m, name: bytes(store.serialize_cdr(m, name)), ros1=False)
+    return made | {"ROS 2 MCAP": next((folder / "mcap").glob("*.mcap"))}
+
+
+TABLES = {
+    "CSV": ".csv",
+    "TSV": ".tsv",
+    "TXT": ".txt",
+    "gzip": ".csv.gz",
+    "Parquet": ".parquet",
+    "Excel": ".xlsx",
+    "MATLAB": ".mat",
+    "HDF5": ".h5",
+    "MATLAB 7.3": ".mat",
+}
+
+
+def write_table(table: pd.DataFrame, path: Path) -> Path:
+    """Write a table of numbers in the format of a file's name."""
+    columns = {name: table[name].to_numpy() for name in table}
+    if path.name.endswith(".gz"):
+        path.write_bytes(gzip.compress(table.to_csv(index=False).encode(), mtime=0))
+    elif path.suffix == ".csv":
+        table.to_csv(path, index=False)
+    elif path.suffix == ".tsv":
+        table.to_csv(path, index=False, sep="\t", decimal=",")
+    elif path.suffix == ".txt":
+        np.savetxt(path, table.to_numpy(), header=" ".join(table))
+    elif path.suffix == ".parquet":
+        table.to_parquet(path)
+    elif path.suffix == ".xlsx":
+        table.to_excel(path, index=False)
+    elif path.suffix == ".mat" and "7.3" not in path.name:
+        scipy.io.savemat(path, columns)
+    else:
+        import h5py
+
+        with h5py.File(path, "w", userblock_size=512 if path.suffix == ".mat" else 0) as file:
+            for name, values in columns.items():
+                file[name] = values[None, :] if path.suffix == ".mat" else values
+                if path.suffix == ".mat":
+                    file[name].attrs["MATLAB_class"] = np.bytes_(b"double")
+    return path
+
+
+def logs_of(machine: str, folder: Path, seconds: float = 20.0) -> dict[str, Path]:
+    """A log of a machine in every format of tables, by the format's name."""
+    asammdf = pytest.importorskip("asammdf", reason="asammdf is not installed (extra mdf)")
+    model = prediction.build(load_machine(machine))
+    torque = drive(model, seconds, 0, dict.fromkeys(model.inputs, 1200.0))
+    table = sensors.measure(model, simulate(model, torque), seed=2)
+    made = {name: write_table(table, folder / f"{name.replace(' ', '')}{suffix}") for name, suffix in TABLES.items()}
+    time = model.machine.time_column
+    with asammdf.MDF(version="4.10") as mdf:
+        t = table[time].to_numpy()
+        mdf.append([asammdf.Signal(table[n].to_numpy(), t, name=n) for n in table if n != time])
+        mdf.save(folder / "MDF4.mf4", overwrite=True)
+    return made | {"MDF 4": folder / "MDF4.mf4"}
