@@ -108,7 +108,7 @@ class Diagnosis:
     @property
     def sticks(self) -> bool:
         """Tell if the logs are followed only with friction that sticks near rest."""
-        return self.before.data.measurements[0].extra_torque_noise is not None
+        return self.before.data.sticks
 
 
 def diagnose(

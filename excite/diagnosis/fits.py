@@ -71,6 +71,11 @@ class FitData:
         return self.measurements[0].noise_inflation
 
     @property
+    def sticks(self) -> bool:
+        """Tell if friction may have either sign where joints are near rest."""
+        return self.measurements[0].extra_torque_noise is not None
+
+    @property
     def n_readings(self) -> float:
         """Number of readings in all logs: the cost expected of a right model with the true sensor noise."""
         return float(sum(r.used.sum() for r in self.measurements))
@@ -205,12 +210,13 @@ def assemble_fit(machine: Machine, data: FitData, fit: Fit, process_noise_fit: F
 def fit_machine_that_sticks(
     plain: ExtendedFit, logs: Sequence[Log], filter: Filter, runner: CallRunner = run_in_turn
 ) -> ExtendedFit:
-    """Let friction have either sign where joints are near rest, if the model then follows the logs; else return plain.
+    """Let friction have either sign where joints are near rest, if the logs ask for it and are followed then.
 
     A joint that sticks has any friction up to Fs there, which no formula of friction describes.
     """
     model = plain.model
-    if model.slips or (plain.exact and plain.is_close):
+    follows = plain.exact and plain.is_close
+    if model.slips or (follows and not identification.shows_sticking(model, logs, filter, plain.fit)):
         return plain
     extra = [identification.friction_near_rest(model, log, filter) for log in logs]
     if not any(x.any() for x in extra):

@@ -80,6 +80,7 @@ TIE_LIKELIHOOD_RATIO = 10.0  # likelihood ratio; chosen
 TIE_EXCESS_SHARE = 0.3  # share of the excess cost that the best effect leaves; chosen
 TIE_GAIN_SHARE_WITH_NOISE = 0.02  # share of the gain with process noise, which absorbs differences; chosen
 
+TRANSITION = "friction_transition"  # has no meaning where friction near rest is free
 MIN_MAGNITUDE_STDS = 0.3  # standard deviations from zero below which a positive magnitude fell to zero; chosen
 MAX_SIGNATURE_STEP = 2.0  # factor on a trial magnitude up to which its signature holds; chosen
 MIN_SIGNATURE_STEP = 0.3  # the same downwards; chosen
@@ -157,6 +158,8 @@ def _score_new_effects(stage: ExtendedFit, runner: CallRunner) -> tuple[score_te
     known = [e.name for e in stage.model.effects]
     sensors = [s.name for s in stage.data.space.sensors]
     found = score_test.candidates(stage.machine, sensors, _duration(stage.data.logs))
+    if stage.data.sticks:
+        found = [x for x in found if x.placed.effect.name != TRANSITION]
     wanted = [x for x in found if x.name not in known or _has_harmonics(x.placed.effect)]
     scores = _score_along(stage, score_test.renumber_columns(wanted), runner)
     harmonic: dict[str, float] = {}

@@ -4,7 +4,11 @@ from .delays import describe_late_channels as describe_late_channels
 from .estimate import Estimate as Estimate
 from .filter_choice import FILTERS as FILTERS
 from .identifiability import parameters_at_rest as parameters_at_rest
-from .joint import PROCESS_NOISE_LEVELS as PROCESS_NOISE_LEVELS, find_suspect_sensors as find_suspect_sensors
+from .joint import (
+    PROCESS_NOISE_LEVELS as PROCESS_NOISE_LEVELS,
+    find_suspect_sensors as find_suspect_sensors,
+    shows_sticking as shows_sticking,
+)
 from .methods import (
     METHODS as METHODS,
     add_bias as add_bias,
@@ -13,13 +17,13 @@ from .methods import (
     recommend_method as recommend_method,
     require_sensors as require_sensors,
 )
-from .near_rest import friction_near_rest as friction_near_rest, with_soft_friction as with_soft_friction
 from .monte_carlo import (
     Verification as Verification,
     biased_parameters as biased_parameters,
     summarise_runs as summarise_runs,
     verify as verify,
 )
+from .near_rest import friction_near_rest as friction_near_rest, with_soft_friction as with_soft_friction
 from .prior import prior_from_logs as prior_from_logs
 from .status import add_consistent as add_consistent
 from .validation import (

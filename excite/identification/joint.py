@@ -100,7 +100,7 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
             failure = failure or failed
             continue
         suspects = find_suspect_sensors(space, logs, fit)
-        sticks = bool(suspects) or _sticks(model, logs, filter, fit)
+        sticks = bool(suspects) or shows_sticking(model, logs, filter, fit)
         if sticks and failure is None and (sticking := _fit_sticking(model, logs, filter, held_now)):
             return sticking
         if not suspects:
@@ -128,7 +128,7 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     return replace(estimate, doubt=UNEXPLAINED_DOUBT)
 
 
-def _sticks(model: Model, logs: Sequence[Log], filter: Filter, fit: Fit) -> bool:
+def shows_sticking(model: Model, logs: Sequence[Log], filter: Filter, fit: Fit) -> bool:
     """Tell if torque errors of joints near rest are larger than those in motion."""
     near, moving = list[float](), list[float]()
     for log, trajectory, linear in zip(logs, fit.trajectories, fit.linear, strict=True):

@@ -505,7 +505,7 @@ def test_every_log_is_drawn(straight: Model, tmp_path: Path, monkeypatch: pytest
     without = fits.fit_machine(straight.machine, logs, straight.machine.filter)
     beside = replace(without, fit=replace(without.fit, process_noise=1.0))
     loosened = list[fits.ExtendedFit]()
-    monkeypatch.setattr(residuals, "refit_with_process_noise", lambda stage: (loosened.append(stage), beside)[1])
+    monkeypatch.setattr(package, "refit_with_process_noise", lambda stage: (loosened.append(stage), beside)[1])
     for after, asked in ((without, []), (beside, [without, beside])):
         loosened.clear()
         d: Any = SimpleNamespace(before=without, after=after, stages=(after,))

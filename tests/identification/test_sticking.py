@@ -11,7 +11,7 @@ from excite.logs import prepare
 from excite.model import Model
 
 truth = np.array(list(TRUTH.values()))
-RUNS = 6
+RUNS = 5
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def found(emps: Model) -> dict[str, list[Estimate]]:
     """Estimates of some logs by every method that states 95 % intervals."""
     made: dict[str, list[Estimate]] = {}
     for seed in range(RUNS):
-        ready = prepare(emps, [sticking_log(seed)], needed_sensors(emps, "wls"))
+        ready = prepare(emps, [sticking_log(seed, seconds=15.0)], needed_sensors(emps, "wls"))
         for method in ("wls", "tls", "iv", "joint"):
             made.setdefault(method, []).append(identify(ready.model, ready.logs, method))
     return made
@@ -28,7 +28,7 @@ def found(emps: Model) -> dict[str, list[Estimate]]:
 @pytest.mark.parametrize("method", ["wls", "tls", "iv", "joint"])
 def test_intervals_hold_where_friction_sticks(found: dict[str, list[Estimate]], method: str) -> None:
     inside = [(e.interval95[0] <= truth) & (truth <= e.interval95[1]) for e in found[method]]
-    assert np.mean(inside) > 0.85  # 24 intervals: 0.90 is expected to be reached over many
+    assert np.mean(inside) > 0.85  # 20 intervals: 0.90 is expected to be reached over many
     assert all(e.status == "valid" for e in found[method])
     assert all("friction sticks" in " ".join(e.notes) for e in found[method])
 

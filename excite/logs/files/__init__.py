@@ -35,4 +35,6 @@ READERS: dict[str, Reader] = {
     ".blf": _CAN,
     ".asc": _CAN,
 }
+__all__ = ["BAG_FOLDER", "READERS"]
+
 BAG_FOLDER = "metadata.yaml"  # what the folder of a bag of ROS 2 holds
