@@ -14,6 +14,7 @@ import scipy.ndimage
 import scipy.signal
 import scipy.stats
 
+from excite.diagnosis.spectrum import line_ratios
 from excite.logs import Log, white_noise
 from excite.model.machine import Machine, Sensor
 from excite.smoothing import Fit
@@ -168,16 +169,12 @@ def _window_anomalies(
 
 
 def _tone(name: str, x: np.ndarray, rate: float, band: tuple[float, float], margin: float) -> Iterator[Anomaly]:
-    """Find a peak of the periodogram over its surroundings, in a band (shares of the rate).
+    """Find a spectral line in a band (shares of the rate).
 
-    The ordinates of white noise are exponential (Fisher, 1929). margin: factor on the threshold, for spectra not quite
-    flat.
+    margin: factor on the threshold, for spectra not quite flat.
     """
-    f, power = scipy.signal.periodogram(x, rate, detrend="constant")
-    f, power = f[2:], power[2:]
-    around = scipy.ndimage.median_filter(power, SPECTRUM_NEIGHBOURS, mode="reflect") / np.log(2)
-    in_band = (f >= band[0] * rate) & (f <= band[1] * rate)
-    ratio = np.where(in_band, power / np.maximum(around, 1e-30), 0.0)
+    f, ratio, _ = line_ratios(x, rate, "boxcar", SPECTRUM_NEIGHBOURS, skip=2)
+    ratio = np.where((f >= band[0] * rate) & (f <= band[1] * rate), ratio, 0.0)
     limit = float(np.log(len(f) / FALSE_ALARM_PROBABILITY)) * margin
     k = int(np.argmax(ratio))
     if ratio[k] > limit:

@@ -16,6 +16,7 @@ import scipy
 from excite import identification
 from excite.diagnosis.fits import ExtendedFit, refit_all, with_true_sensor_noise
 from excite.diagnosis.parallel import run_in_turn
+from excite.diagnosis.spectrum import line_ratios
 from excite.smoothing import LinearisedLog, advance, differentiate, state_scale
 
 BLOCK_S = 0.25  # length of a block [s] whose mean is the slow error; chosen
@@ -387,12 +388,11 @@ def _spectral_peak(log_residuals: LogResiduals, z: np.ndarray) -> float | None:
     if valid.mean() < 0.5:
         return None
     z = scipy.signal.detrend(np.where(valid, z, 0.0))
-    f, power = scipy.signal.periodogram(z, log_residuals.rate, window="hann")
-    level = scipy.ndimage.median_filter(power, PEAK_NEIGHBOURS, mode="reflect") / np.log(2)
+    f, ratio, level = line_ratios(z, log_residuals.rate, "hann", PEAK_NEIGHBOURS)
     high = (f > MIN_PEAK_HZ) & (level > 0)
     if not high.any():
         return None
-    ratio = np.where(high, power / np.maximum(level, 1e-300), 0.0)
+    ratio = np.where(high, ratio, 0.0)
     k = int(np.argmax(ratio))
     return float(f[k]) if ratio[k] > MIN_PEAK_RATIO + np.log(len(f)) else None
 

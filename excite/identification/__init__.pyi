@@ -20,6 +20,7 @@ from .methods import (
 from .monte_carlo import (
     Verification as Verification,
     biased_parameters as biased_parameters,
+    identify_table as identify_table,
     summarise_runs as summarise_runs,
     verify as verify,
 )

@@ -6,11 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from joblib import Parallel, delayed
 
-from excite import logs, simulation
+from excite import simulation
 from excite.errors import NoEstimateError
 from excite.identification import methods
+from excite.identification.estimate import Estimate
+from excite.logs import prepare
 from excite.model import Model, build_cached
 from excite.simulation import Motion
 
@@ -116,16 +119,24 @@ Found = tuple[np.ndarray, np.ndarray, np.ndarray]
 def _run(
     k: int, true_json: str, assumed_json: str, motion: Motion, method: str, kit: str, seed: int
 ) -> tuple[int, Found | None, str]:
-    model, assumed = build_cached(true_json), build_cached(assumed_json)
-    table = simulation.measure(model, motion, kit=kit, seed=seed)
-    measured = logs.from_table(table, assumed.machine, methods.needed_sensors(assumed, method))
+    table = simulation.measure(build_cached(true_json), motion, kit=kit, seed=seed)
     try:
-        estimate = methods.identify(assumed, [measured], method)
+        estimate = identify_table(build_cached(assumed_json), table, method)
     except NoEstimateError as err:
         return k, None, str(err)
-    if estimate.status == "invalid":
-        return k, None, f"no estimate: {estimate.doubt}, and some values are those of no machine"
     return k, (estimate.value, estimate.std, estimate.interval95), ""
+
+
+def identify_table(model: Model, table: pd.DataFrame, method: str) -> Estimate:
+    """Identify from a simulated log as from a recorded one.
+
+    Raises LogError, and NoEstimateError also for an invalid estimate.
+    """
+    ready = prepare(model, [table], methods.needed_sensors(model, method))
+    estimate = methods.identify(ready.model, ready.logs, method)
+    if estimate.status == "invalid":
+        raise NoEstimateError(f"no estimate: {estimate.doubt}, and some values are those of no machine")
+    return estimate
 
 
 def summarise_runs(verification: Verification) -> dict[str, dict[str, float | str]]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from excite import identification, interrupt, simulation
 from excite.errors import InfeasibleError, LogError, MachineError, NoEstimateError, SimulationError
-from excite.logs import Log, examine, from_table, profile_of
+from excite.logs import Log, examine, prepare, profile_of
 from excite.model import Model, build, build_cached
 from excite.model.machine import Machine, Problem
 from excite.simulation import Motion, simulate
@@ -98,16 +98,13 @@ def _run_steps(batch: RunBatch, seed: int) -> Row:
     table = simulation.measure(build_cached(batch.true), _motion(batch.true, batch.drive), kit=batch.kit, seed=seed)
     row["log_sha256"] = hashlib.sha256(table.to_numpy(float).tobytes()).hexdigest()[:16]
     if steps & {"identify", "verify"}:
-        measured = from_table(table, known.machine, identification.needed_sensors(known, batch.method))
-        estimate = identification.identify(known, [measured], batch.method)
-        if estimate.status == "invalid":
-            raise NoEstimateError(f"no estimate: {estimate.doubt}, and some values are those of no machine")
+        estimate = identification.identify_table(known, table, batch.method)
         arrays = (estimate.value, estimate.std, *estimate.interval95)
         row |= {name: _json_value(array.tolist()) for name, array in zip(ESTIMATE_COLUMNS, arrays, strict=True)}
         row["relative_error_percent"] = _json_value(estimate.relative_error_percent)
     if "diagnose" in steps:
-        needs = identification.needed_sensors(known, "joint")
-        row |= _diagnose(known, [from_table(table, known.machine, needs)])
+        ready = prepare(known, [table], identification.needed_sensors(known, "joint"))
+        row |= _diagnose(ready.model, ready.logs)
     return row
 
 
