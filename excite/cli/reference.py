@@ -250,7 +250,7 @@ def choices_page() -> str:
         ),
         "## Methods",
         "",
-        "Methods of identification: `--method`; by default `joint` if slips are measured, `ols` otherwise.",
+        "Methods of identification: `--method`; by default `joint` if slips are measured, `wls` otherwise.",
         "",
         *_table(
             "method | what it does | effects that it estimates | needs the lateral speed",
