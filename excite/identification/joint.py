@@ -15,6 +15,7 @@ import numpy as np
 
 from excite.errors import NotIdentifiableError
 from excite.identification import identifiability
+from excite.identification.combinations import describe_combinations
 from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Estimate, held_note
 from excite.identification.near_rest import friction_near_rest, with_soft_friction
 from excite.logs import Log, decimate, derivative
@@ -238,11 +239,6 @@ def _build_estimate(
     if fit.unidentifiable.any():
         held = [n for n, yes in zip(model.base.names, fit.unidentifiable, strict=True) if yes]
         notes = (*notes, held_note(held))
-    reasons = {
-        name: "hardly identifiable from this log: only the machine file's value is known"
-        for name, yes in zip(model.base.names, weak, strict=True)
-        if yes
-    }
     W, Y, errors = [], [], []
     for data, trajectory in zip(measurements, fit.trajectories, strict=True):
         q, nu, z, u, a = smoothed_motion(space, data, trajectory, fit.X)
@@ -259,7 +255,14 @@ def _build_estimate(
         Y.append(decimate(measured, filter.decimation))
         errors.append(decimate(error, filter.decimation))
     # Blocks that fit the cache are ten times faster than all rows at once.
-    R = np.linalg.qr(np.concatenate([np.linalg.qr(w, mode="r") for rows in W for w in np.array_split(rows, 40)]), "r")
+    triangles = [np.linalg.qr(w, mode="r") for rows in W for w in np.array_split(rows, 40)]
+    R: np.ndarray = np.asarray(np.linalg.qr(np.concatenate(triangles), mode="r"))
+    names, units, free = model.base.names, model.base.units, np.flatnonzero(~fit.unidentifiable).tolist()
+    reasons = {
+        name: describe_combinations(R, model.scale, names, units, fit.X, fit.covariance, k, [j for j in free if j != k])
+        for k, name in enumerate(names)
+        if weak[k]
+    }
     residual = np.concatenate(errors, axis=1)
     covariance = fit.covariance.copy()
     covariance[weak], covariance[:, weak] = np.nan, np.nan

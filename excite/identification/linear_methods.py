@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 
 from excite.errors import NotIdentifiableError
+from excite.identification.combinations import describe_combinations
 from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Estimate, held_note
 from excite.identification.identifiability import rest_projection
 from excite.identification.least_squares import (
@@ -330,14 +331,16 @@ def build_estimate(
     names, kept = model.base.names, list(solution.kept)
     floor = np.array([float(model.machine.scale.get(s, 0.0)) for s in names])
     scale = np.maximum(np.abs(x), floor)[kept]
-    R = reduce_blocks(blocks).R[:, kept]
+    every = reduce_blocks(blocks).R[:, :-1]
+    R = every[:, kept]
     value = np.full(len(names), np.nan)
     value[kept] = x[kept]
     residuals = np.concatenate([residual(b, x) for b in blocks], axis=1)
+    full = solution.expand(covariance)
     reasons = {
         names[k]: "nothing in this log depends on it"
         if partner is None
-        else f"moves together with {names[partner]} and others in this log"
+        else describe_combinations(every, model.scale, names, model.base.units, x, full, k, kept)
         for k, partner in solution.dependent.items()
     }
     if solution.tied:
@@ -347,7 +350,7 @@ def build_estimate(
         names,
         model.base.units,
         value,
-        solution.expand(covariance),
+        full,
         float(np.linalg.cond(R)),
         float(np.linalg.cond(R * scale)),
         100 * float(np.sqrt(np.mean(residuals**2))) / rms_torque(blocks),

@@ -152,3 +152,17 @@ def test_other_machines_are_told_in_their_own_words(emps: Model) -> None:
     estimate = methods.identify(emps, [log.from_table(table, emps.machine)], "ols")
     told = " ".join([*estimate.unidentifiable.values(), *estimate.notes])
     assert "carriage" in told
+
+
+@pytest.mark.parametrize("method", ["ols", "wls", "joint"])
+def test_what_moves_together_is_named_with_the_combination_that_is_known(emps: Model, method: str) -> None:
+    """Pushed one way only, dry friction and offset are one constant force: 17.23 N on this rig."""
+    t = np.arange(0, 4, 1e-3)
+    motion = simulate(emps, (60 + 40 * np.sin(2 * np.pi * 1.3 * t))[:, None])
+    estimate = methods.identify(emps, [make_log(emps, motion, seed=1)], method)
+    reason = estimate.unidentifiable["offset"]
+    assert "this log shows it only together with others: Fc + offset = " in reason
+    value, deviation = (float(x) for x in reason.split("= ")[1].split(" N;")[0].split(" +- "))
+    truth = float(emps.nominal[2] + emps.nominal[3])
+    assert abs(value - truth) < max(3 * deviation, 0.05)
+    assert "both ways" in reason
