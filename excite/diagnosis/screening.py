@@ -64,6 +64,7 @@ def fit_screened(
     runner: CallRunner,
     max_cost: float = np.inf,
     enough: Callable[[int, ExtendedFit], bool] = lambda k, stage: False,
+    min_beginning_s: float = MIN_BEGINNING_S,
 ) -> Iterator[ExtendedFit | None]:
     """Fit machines with other effects to the logs of a previous fit, side by side; None for each that fails.
 
@@ -71,10 +72,13 @@ def fit_screened(
         With exact dynamics, a fit fails that costs more than max_cost or is LOST_COST_RATIO off; one that is not close
         gets a little process noise if that brings it close or if it does not track the logs.
     enough: tells, by the number of a machine and its fit, that only close fits are of use from there on.
+    min_beginning_s: shortest beginning of a log that is fitted first [s]; none if it is above half of all logs.
 
     Fits whose beginning shows that they will fail are not continued.
     """
-    tests, close_test, at = [_screening_test(previous, process_noise, max_cost)], _test_of_close_fit(previous), 0
+    lengths, at = _beginning_lengths(previous.data, min_beginning_s), 0
+    tests = [_screening_test(previous, lengths, process_noise, max_cost)]
+    close_test = _test_of_close_fit(previous, lengths)
     while at < len(machines):
         calls = [partial(_fit_if_promising, m, previous, tuple(tests), process_noise, max_cost) for m in machines[at:]]
         with closing(runner(calls)) as results:
@@ -87,11 +91,11 @@ def fit_screened(
                     break
 
 
-def _beginning_lengths(data: FitData) -> list[tuple[int, ...]]:
+def _beginning_lengths(data: FitData, min_beginning_s: float) -> list[tuple[int, ...]]:
     """Return possible lengths of the beginning, samples of each log, shortest first; none above half of all samples."""
     rate, lengths = float(data.space.model.machine.sampling_hz), [len(r.used) for r in data.measurements]
     lengths_by_share = (
-        tuple(min(n, max(round(MIN_BEGINNING_S * rate), int(share * n))) for n in lengths) for share in BEGINNING_SHARES
+        tuple(min(n, max(round(min_beginning_s * rate), int(share * n))) for n in lengths) for share in BEGINNING_SHARES
     )
     return [samples for samples in dict.fromkeys(lengths_by_share) if 2 * sum(samples) <= sum(lengths)]
 
@@ -102,14 +106,19 @@ def _cut_data(data: FitData, samples: Sequence[int]) -> FitData:
     return replace(data, measurements=measurements, starts=tuple(map(Trajectory.until, data.starts, samples)))
 
 
-def _screening_test(previous: ExtendedFit, process_noise: float, max_cost: float) -> ScreeningTest | None:
-    """Choose the test that shows early which fits fail; None if no half of the logs shows it."""
+def _screening_test(
+    previous: ExtendedFit, lengths: Sequence[tuple[int, ...]], process_noise: float, max_cost: float
+) -> ScreeningTest | None:
+    """Choose the test that shows early which fits fail; None if no half of the logs shows it.
+
+    lengths: possible lengths of the beginning, samples of each log, shortest first.
+    """
     if process_noise > 0:
-        test = _test_of_close_fit(previous)
+        test = _test_of_close_fit(previous, lengths)
     elif np.isinf(max_cost):
-        test = _test_of_tracking(previous)
+        test = _test_of_tracking(previous, lengths)
     else:
-        test = _test_of_gain(previous, max_cost) if previous.estimated and previous.exact else None
+        test = _test_of_gain(previous, lengths, max_cost) if previous.estimated and previous.exact else None
     if test is None:
         return None
     cost, _ = _fit_beginning(
@@ -118,32 +127,29 @@ def _screening_test(previous: ExtendedFit, process_noise: float, max_cost: float
     return replace(test, cost_without=cost or np.inf)
 
 
-def _test_of_close_fit(previous: ExtendedFit) -> ScreeningTest | None:
+def _test_of_close_fit(previous: ExtendedFit, lengths: Sequence[tuple[int, ...]]) -> ScreeningTest | None:
     """Use the shortest beginning: it must not cost more beyond noise than a close fit of the whole logs may."""
-    samples = next(iter(_beginning_lengths(previous.data)), None)
-    if samples is None:
+    if not lengths:
         return None
     return ScreeningTest(
-        samples,
-        _cut_data(previous.data, samples).n_readings + (smoothing.CLOSE_FIT_COST_RATIO - 1) * previous.data.n_readings,
+        lengths[0],
+        _cut_data(previous.data, lengths[0]).n_readings
+        + (smoothing.CLOSE_FIT_COST_RATIO - 1) * previous.data.n_readings,
     )
 
 
-def _test_of_tracking(previous: ExtendedFit) -> ScreeningTest | None:
+def _test_of_tracking(previous: ExtendedFit, lengths: Sequence[tuple[int, ...]]) -> ScreeningTest | None:
     """Use the shortest beginning on which the model without a further effect is lost, else the shortest."""
-    tests = [
-        ScreeningTest(x, LOST_COST_RATIO * _cut_data(previous.data, x).n_readings, True)
-        for x in _beginning_lengths(previous.data)
-    ]
+    tests = [ScreeningTest(x, LOST_COST_RATIO * _cut_data(previous.data, x).n_readings, True) for x in lengths]
     true_noise = inflate_sensor_noise(previous.data, 1.0)
     return next((x for x in tests if not _passes_screening(true_noise, x, 0.0)), tests[0] if tests else None)
 
 
-def _test_of_gain(previous: ExtendedFit, max_cost: float) -> ScreeningTest | None:
+def _test_of_gain(previous: ExtendedFit, lengths: Sequence[tuple[int, ...]], max_cost: float) -> ScreeningTest | None:
     """Use the shortest beginning with a fair part of the excess cost, which a fit must reduce as well as the whole."""
     part = BEGINNING_GAIN_SHARE * (previous.fit.cost - max_cost) / max(previous.excess_cost, 1e-9)
     squares = [np.square(log.white.E[:, :, 0]).sum(axis=1, dtype=float) for log in previous.fitted_logs]
-    for samples in _beginning_lengths(previous.data):
+    for samples in lengths:
         beginning = _cut_data(previous.data, samples)
         cost = sum(float(x[:n].sum()) for x, n in zip(squares, samples, strict=True))
         if (
