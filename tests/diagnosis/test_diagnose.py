@@ -25,6 +25,7 @@ from excite.diagnosis import (
     fits,
     hold_out,
     magnitude_interval,
+    residual_tests,
     residuals,
     run_forked,
     selection,
@@ -38,6 +39,8 @@ from excite.reports import diagnosis_figures
 from excite.simulation import Motion, sensors, simulate
 from excite.smoothing import gauss_newton
 from excite.workflows import diagnose_workflow
+
+FAINT = "torque_gain@rear_roll=0.01", "torque_ripple@rear_roll=20", "stribeck_friction@rear_roll=9"
 
 
 def test_a_log_too_short_to_hide_stretches_has_no_gain(
@@ -170,34 +173,38 @@ def test_a_second_cause_with_which_exact_dynamics_follow_is_no_flaw_of_the_first
 
 
 @pytest.mark.parametrize(
-    ("names", "verdict"),
+    ("texts", "verdict"),
     [
-        (("torque_gain@rear_roll", "torque_ripple@rear_roll", "stribeck_friction@rear_roll"), "named"),
-        (("torque_gain@rear_roll", *(f"friction_transition@{x}" for x in ("front_roll", "rear_roll", "x"))), "named"),
-        (("ground_slope@machine", "torque_ripple@rear_roll", "stribeck_friction@rear_roll", "torque_gain@x"), "named"),
+        (("torque_gain@rear_roll=0.01", "torque_ripple@rear_roll=20", "stribeck_friction@rear_roll=9"), "named"),
         (
-            ("torque_gain@rear_roll", "torque_ripple@rear_roll", "stribeck_friction@rear_roll", "ground_slope@machine"),
-            "unexplained",
+            (
+                *(f"torque_gain@{x}=0.01" for x in ("front_roll", "rear_roll")),
+                *(f"friction_transition@{x}=0.1" for x in ("front_roll", "rear_roll")),
+            ),
+            "named",
         ),
+        (("ground_slope=0.001", *FAINT), "named"),
+        ((*FAINT, "ground_slope=0.001"), "unexplained"),
     ],
 )
 def test_many_names_are_none(
-    names: tuple[str, ...], verdict: str, straight: Model, monkeypatch: pytest.MonkeyPatch
+    texts: tuple[str, ...], verdict: str, straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What takes four kinds of causes, none of which explains most, is something that isn't known."""
-    stage = calm(straight)
+    clean, chosen = unneeded(straight, *texts)
     gains = {"ground_slope@machine": 1000.0} if verdict == "named" else {}
-    chosen = [selection.Choice(n, stage, gains.get(n, 100.0 + k), 1.0, 200, (), 1.0) for k, n in enumerate(names)]
-    kept = {"fit_machine": stage, "extend_model": (chosen, 0.0), "review_effects": chosen, "drop_unneeded": chosen}
+    chosen = [replace(x, likelihood_ratio=gains.get(x.name, 100.0 + k)) for k, x in enumerate(chosen)]
+    kept = {"fit_machine": clean, "extend_model": (chosen, 0.0), "review_effects": chosen, "drop_unneeded": chosen}
     for name, answer in (*kept.items(), ("drop_weak_effects", (chosen, (), None))):
         monkeypatch.setattr(f"excite.diagnosis.diagnosis.{name}", lambda *asked, answer=answer: answer)
-    monkeypatch.setattr(
-        "excite.diagnosis.diagnosis._make_finding", lambda *asked, **more: SimpleNamespace(tied_with=())
+    found = diagnosis.diagnose(straight, clean.data.logs, straight.machine.filter)
+    names = [x.name for x in chosen]
+    assert (found.verdict, [f"{f.effect}@{f.where}" for f in found.findings]) == (
+        verdict,
+        names if verdict == "named" else [],
     )
-    found = diagnosis.diagnose(straight, stage.data.logs, straight.machine.filter)
-    assert (found.verdict, len(found.findings)) == (verdict, len(names) if verdict == "named" else 0)
     if verdict == "unexplained":
-        assert found.after is stage
+        assert found.after is clean
         assert found.nearest is not None
         assert found.nearest.name == names[-1]
         assert found.nearest.share == pytest.approx(103 / 406)
@@ -594,7 +601,10 @@ def test_a_name_that_is_faint_beside_another_is_none_under_forces(
     loose = fits.refit(placing.with_effects(straight.machine, entry), before, 0.0)
     far = replace(loose, fit=replace(loose.fit, cost=3 * loose.expected_cost))
     chosen = [selection.Choice("rolling_resistance@rear_roll", far, 100.0, 1.0, 100, (), 1.0, loose)]
-    monkeypatch.setattr(diagnosis, "_anomaly_lines", lambda stage: ("theta1: a slow error",) if stage is far else ())
+    odd = residual_tests.Anomaly("theta1", "drift", 1.0, 9.0, None, 2.0)
+    monkeypatch.setattr(
+        diagnosis, "find_anomalies", lambda machine, sensors, one, fit, k: [odd] if fit is far.fit else []
+    )
     names, _, nearest = diagnosis.drop_weak_effects(before, chosen, left)
     assert (bool(names), nearest is None) == (kept, kept)
 
@@ -686,7 +696,8 @@ def test_nothing_is_looked_for_beside_names_where_no_more_could_explain_the_misf
         replace(stage, fit=replace(stage.fit, process_noise=fits.MIN_PROCESS_NOISE)) if named == "with forces" else None
     )
     choice = selection.Choice("ground_slope@machine", far, 1000.0, 1.0, 1, (), 1.0, forced)
-    monkeypatch.setattr(diagnosis, "_anomaly_lines", lambda of: () if named == "nothing odd" else ("a roll that hops",))
+    odd = [] if named == "nothing odd" else [residual_tests.Anomaly("theta1", "jump", 5.0, 5.0, None, 2.0)]
+    monkeypatch.setattr(diagnosis, "find_anomalies", lambda *given: odd)
     asked = list[int]()
     monkeypatch.setattr(selection, "score_effects", lambda *given: (replace(score, likelihood_ratio=promised),))
     monkeypatch.setattr(selection, "choose_effect", lambda *given: asked.append(1))
@@ -751,30 +762,29 @@ def test_where_exact_dynamics_find_no_way_a_known_fit_with_forces_is_gone_on_wit
     sloped = placing.with_effects(straight.machine, slope(straight))
     stage = calm(prediction.build(sloped))
     small, large = (replace(stage, fit=replace(stage.fit, process_noise=d)) for d in (fits.MIN_PROCESS_NOISE, 1.0))
-    made, judged = list[float](), list[fits.ExtendedFit]()
+    made, judged = list[float](), list[gauss_newton.Fit]()
 
     def refitted(machine: Any, of: fits.ExtendedFit, disturbed: float) -> fits.ExtendedFit:
         made.append(disturbed)
         return replace(of, fit=replace(of.fit, process_noise=disturbed))
 
-    def scanned(of: fits.ExtendedFit, *given: Any) -> list[Any]:
-        judged.append(of)
-        return []
+    def scanned(along: Any, fit: gauss_newton.Fit, *given: Any) -> tuple[()]:
+        judged.append(fit)
+        return ()
 
-    scores = [s for s in selection.score_effects(stage, run_in_turn) if s.values["A"] != 0]
-    likely = scores[:1]
-    monkeypatch.setattr(selection, "_refined_shortlist", lambda *given: likely)
-    monkeypatch.setattr(selection, "_fit_candidates", lambda *given: ([], set()))
+    best = next(s for s in selection.score_effects(stage, run_in_turn) if s.values["A"] != 0)
+    scores = [replace(best, likelihood_ratio=1000.0)]
+    monkeypatch.setattr(selection, "refit_all", lambda wishes, *given: [None for _ in wishes])
     monkeypatch.setattr(selection, "refit", refitted)
-    monkeypatch.setattr(selection, "_score_along", scanned)
+    monkeypatch.setattr(selection.score_test, "score_candidates", scanned)
     for loose, again in ((small, False), (large, True), (None, True)):
         made.clear()
         judged.clear()
         before = selection.Choice("ground_slope@machine", stage, 1000.0, 1.0, 1, (), 1.0, loose)
         assert selection.choose_effect(stage, scores, [before], run_in_turn, lambda share, what: None, 0.0) is None
         assert made == ([fits.MIN_PROCESS_NOISE] if again else [])
-        assert [x.fit.process_noise for x in judged] == [fits.MIN_PROCESS_NOISE]
-        assert again or judged == [small]
+        assert [x.process_noise for x in judged if x is not stage.fit] == [fits.MIN_PROCESS_NOISE]
+        assert again or judged[-1] is small.fit
 
 
 @pytest.mark.parametrize(("found", "asked"), [((True, True), 3), ((False, True), 2)])
@@ -783,39 +793,45 @@ def test_where_no_way_to_the_likeliest_cause_is_found_no_others_are_tried(
 ) -> None:
     """By exact dynamics: all are judged with disturbing forces then."""
     stage = calm(straight)
-    likely = selection.score_effects(stage, run_in_turn)
-    likely = list({s.candidate.name: s for s in likely if s.values["A"] != 0}.values())[:3]
-    assert len(likely) == 3
-    wished = list[str]()
+    scores = promising(stage, "ground_slope@machine", "torque_gain@front_roll", "torque_gain@rear_roll")
+    wished, true = list[str](), fits.refit_all
 
     def refits(wishes: Sequence[fits.RefitRequest], *given: Any) -> list[fits.ExtendedFit | None]:
         told = [*found[len(wished) :], True]
         wished.extend(machine.effect[-1].label for machine, _, _ in wishes)
-        return [stage if yes else None for yes, _ in zip(told, wishes, strict=False)]
+        return [x if yes else None for yes, x in zip(told, true(wishes, *given), strict=False)]
 
     monkeypatch.setattr(selection, "refit_all", refits)
-    monkeypatch.setattr(selection, "_is_plausible", lambda name, of: True)
-    monkeypatch.setattr(selection, "_fell_to_zero", lambda name, of: False)
-    selection._fit_candidates(stage, likely, run_in_turn, lambda k: None)
-    assert len(wished) == asked
+    assert selection.choose_effect(stage, scores, (), run_in_turn, lambda share, what: None, 0.0) is None
+    assert wished == [s.candidate.name for s in scores[:asked]]
 
 
-def test_what_a_fit_leads_to_zero_is_no_way_to_a_cause(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither tried nor refused: as if the fit hadn't been found."""
-    stage = calm(straight)
-    likely = [s for s in selection.score_effects(stage, run_in_turn) if s.values["A"] != 0][:1]
-    (name,) = (s.candidate.name for s in likely)
-    monkeypatch.setattr(selection, "refit_all", lambda wishes, *given: [stage])
-    monkeypatch.setattr(selection, "_is_plausible", lambda name, of: True)
-    for zero in (True, False):
-        monkeypatch.setattr(selection, "_fell_to_zero", lambda name, of, zero=zero: zero)
-        tries, refused = selection._fit_candidates(stage, likely, run_in_turn, lambda k: None)
-        assert [s.candidate.name for s, _ in tries] == ([] if zero else [name])
-        assert not refused
-        assert selection._likeliest_not_found(likely, tries, refused) == zero
-        exact, unknown = selection._trials_without_noise([(likely[0], stage)], run_in_turn)
-        assert (len(exact), len(unknown)) == ((0, 1) if zero else (1, 0))
-        assert selection._is_effective(name, stage) != zero
+@pytest.mark.parametrize(("name", "zero"), [("torque_deadband@front_roll", True), ("ground_slope@machine", False)])
+def test_what_a_fit_leads_to_zero_is_no_way_to_a_cause(
+    name: str, zero: bool, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if the fit hadn't been found: judged with forces, with which it stays if it has none without them."""
+    stage, loosened = calm(straight), list[float]()
+    scores = promising(stage, name)
+
+    def refitted(machine: Any, of: fits.ExtendedFit, disturbed: float) -> fits.ExtendedFit:
+        loosened.append(disturbed)
+        return fits.refit(machine, of, disturbed)
+
+    monkeypatch.setattr(selection, "refit", refitted)
+    assert selection.choose_effect(stage, scores, (), run_in_turn, lambda share, what: None, 0.0) is None
+    assert loosened == ([fits.MIN_PROCESS_NOISE] if zero else [])
+    text = "torque_deadband@front_roll=20" if zero else "ground_slope=0.001"
+    extended = placing.with_effects(straight.machine, placing.parse_effect(text, straight.machine, 12.0))
+    loose = fits.refit(extended, stage, 1.0)
+    exact, unknown = selection._trials_without_noise([(scores[0], loose)], run_in_turn)
+    assert (len(exact), len(unknown)) == ((0, 1) if zero else (1, 0))
+
+
+def promising(stage: fits.ExtendedFit, *names: str) -> list[Any]:
+    """The scores of these candidates along a fit, as if each promised much, the first the most."""
+    best = {s.candidate.name: s for s in reversed(selection.score_effects(stage, run_in_turn)) if s.values["A"] != 0}
+    return [replace(best[name], likelihood_ratio=1000.0 - k) for k, name in enumerate(names)]
 
 
 def test_an_amount_at_zero_can_be_written(straight: Model) -> None:
@@ -933,13 +949,12 @@ def test_a_harmonic_is_no_ripple_elsewhere(straight: Model, straight_motion: Mot
     ],
 )
 def test_what_an_effect_must_gain_to_be_worth_a_place(
-    forces: float, near: bool, gained: float, mapped: bool, least: float, monkeypatch: pytest.MonkeyPatch
+    forces: float, near: bool, gained: float, mapped: bool, least: float
 ) -> None:
     """Of an excess of 1e4: a part; where large forces leave much the first must explain what the largest of three does,
     and where the model isn't near the log yet a further one as much. Of what another gained: what its formula is off
     by, the more where that looks at a map of the ground."""
-    monkeypatch.setattr(selection, "_total_wald_statistic", lambda stage: 0.0)
-    known = SimpleNamespace(name="a@b", uses_map=mapped)
+    known = SimpleNamespace(name="a@b", uses_map=mapped, effect=SimpleNamespace(inverse=True))  # no Wald's statistic
     stage: Any = SimpleNamespace(
         model=SimpleNamespace(effects=[known]),
         fit=SimpleNamespace(process_noise=forces),
