@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import operator
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -77,8 +79,11 @@ def test_arrays_come_whole_and_are_ones_own() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
 def test_no_descriptor_stays_open(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(worker: object) -> None:
-        raise MemoryError
+    class Large:
+        """What can be sent, but not received."""
+
+        def __reduce__(self) -> tuple[Any, ...]:
+            return operator.mul, (b"0", sys.maxsize // 2)
 
     def opened() -> list[str]:
         return sorted(os.listdir("/proc/self/fd"))
@@ -88,9 +93,8 @@ def test_no_descriptor_stays_open(monkeypatch: pytest.MonkeyPatch) -> None:
     before = opened()
     assert [x[0] for x in run_forked(calls)] == [0, 1, 2, 3]
     assert opened() == before
-    monkeypatch.setattr(parallel, "_receive", fails)
     with pytest.raises(MemoryError):
-        list(run_forked(calls))
+        list(run_forked([Large, *calls]))
     assert opened() == before
 
 

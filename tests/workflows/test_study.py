@@ -323,18 +323,18 @@ def test_what_can_not_be_had_is_said_and_does_not_end_the_study(
 ) -> None:
     from excite.errors import NotIdentifiableError
 
-    plain = study_runs._run_steps
+    plain = study_runs.simulation.measure
 
-    def moody(work: study_runs.RunBatch, seed: int) -> study_runs.Row:
+    def moody(*given: Any, seed: int, **more: Any) -> pd.DataFrame:
         if seed == int(np.random.SeedSequence(0).generate_state(4)[1]):
             raise NotIdentifiableError("nothing\nmoves")
         if seed == int(np.random.SeedSequence(0).generate_state(4)[2]):
             raise TypeError("a slip of ours")
         if seed == int(np.random.SeedSequence(0).generate_state(4)[3]):
             raise MachineError("no such machine")
-        return plain(work, seed)
+        return plain(*given, seed=seed, **more)
 
-    monkeypatch.setattr(study_runs, "_run_steps", moody)
+    monkeypatch.setattr(study_runs.simulation, "measure", moody)
     summary = study_runner.run_study(tiny(4), tmp_path / "out", jobs=1)
     table = pd.read_parquet(tmp_path / "out" / "runs.parquet")
     assert list(table["status"])[:4] == ["done", "failed", "defect", "failed"]
@@ -597,17 +597,18 @@ def test_ctrl_c_that_casadi_loses_ends_a_run_all_the_same(
     tiny: Callable[..., StudyPlan], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lost_as: Exception | None
 ) -> None:
     """A KeyboardInterrupt within CasADi's calls comes out as another error, or not at all: never a row of the table."""
+    plain = study_runs.simulation.measure
 
-    def lost(*_: object) -> dict[str, object]:
+    def lost(*given: Any, **more: Any) -> pd.DataFrame:
         with contextlib.suppress(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
         if lost_as is not None:
             raise lost_as
-        return {}
+        return plain(*given, **more)
 
     wanted = tiny(2)
     with monkeypatch.context() as patched:
-        patched.setattr(study_runs, "_run_steps", lost)
+        patched.setattr(study_runs.simulation, "measure", lost)
         with pytest.raises(KeyboardInterrupt):
             study_runner.run_study(wanted, tmp_path / "out", jobs=1)
     assert kept_rows(tmp_path / "out") == 0
