@@ -221,7 +221,7 @@ def test_a_phase_that_was_found_the_other_way_round_is_turned(sloping: Path, str
     stage = fits.fit_machine(placing.with_effects(straight.machine, downhill), [one], straight.machine.filter)
     assert dict(zip(stage.model.base.names, stage.fit.X, strict=True))["ground_slope@machine"] < 0
     choice = selection.Choice("ground_slope@machine", stage, 1e4, 1.0, 200, (), 0.5)
-    found = diagnosis._make_finding(choice, stage, 0.0, alone=True)
+    (found,) = diagnosis.conclude(stage, stage, [choice], (), 0.0).findings
     assert found.magnitude == pytest.approx(0.01, rel=0.02)
     assert found.shapes["direction"][0] == pytest.approx(0, abs=0.2)
 
