@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -181,10 +183,13 @@ def test_after_a_log_its_information_is_there(straight: Model, motion: Motion) -
 
 def test_signs_are_known_whatever_a_machine_calls_its_parameters(emps: Model) -> None:
     """Dry friction of the rig is Fc, that of the roller Fs1: neither drives."""
-    wrong = emps.nominal.copy()
-    wrong[emps.base.names.index("Fc")] *= -1
-    assert sequential._is_possible(emps, emps.nominal)
-    assert not sequential._is_possible(emps, wrong)
+    at = emps.base.names.index("Fc")
+    for sign in (1, -1):
+        value = emps.nominal * np.where(np.arange(len(emps.nominal)) == at, sign, 1)
+        found: Any = SimpleNamespace(value=value, covariance=np.diag(emps.scale**2))
+        known = sequential.prior_from_estimate(emps, found)
+        assert known.model.nominal[at] >= 0
+        assert (known.share == 1) == (sign == 1)
 
 
 def test_an_impossible_estimate_is_not_designed_for(straight: Model, motion: Motion) -> None:
