@@ -810,7 +810,7 @@ def test_where_no_way_to_the_likeliest_cause_is_found_no_others_are_tried(
 def test_what_a_fit_leads_to_zero_is_no_way_to_a_cause(
     name: str, zero: bool, straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As if the fit hadn't been found: judged with forces, with which it stays if it has none without them."""
+    """Such a fit counts as not found: candidates are judged with process noise, and keep it."""
     stage, loosened = calm(straight), list[float]()
     scores = promising(stage, name)
 
@@ -829,7 +829,7 @@ def test_what_a_fit_leads_to_zero_is_no_way_to_a_cause(
 
 
 def promising(stage: fits.ExtendedFit, *names: str) -> list[Any]:
-    """The scores of these candidates along a fit, as if each promised much, the first the most."""
+    """Return the scores of candidates along a fit, raised so that each is worth a fit, the first most."""
     best = {s.candidate.name: s for s in reversed(selection.score_effects(stage, run_in_turn)) if s.values["A"] != 0}
     return [replace(best[name], likelihood_ratio=1000.0 - k) for k, name in enumerate(names)]
 

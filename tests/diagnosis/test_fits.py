@@ -485,8 +485,7 @@ def test_steps_within_bounds_are_the_best_there_are(alike: float) -> None:
 
 @pytest.mark.parametrize("scales", [-20, 20])
 def test_a_step_that_was_cut_short_goes_further_when_it_is_told_again(scales: int, straight: Model) -> None:
-    """A fit is found from a torque offset twenty times its scale off: by half of its size in each pass it would be
-    given up on the way."""
+    """A torque offset twenty times its scale off is found. In steps of half its size the fit would be given up."""
     stage = calm(straight)
     p, k = stage.data, stage.model.base.names.index("u10")
     off = scales * stage.model.scale * (np.arange(len(stage.fit.X)) == k)
@@ -572,10 +571,10 @@ def test_beside_a_cause_only_that_is_fitted_whose_beginning_tells_that_it_comes_
     assert {x.pid for x in multiprocessing.active_children()} <= running
 
 
-def test_what_came_near_is_enough_if_it_is_exact_and_no_effect_at_zero(
+def test_only_close_exact_fits_with_a_magnitude_off_zero_are_enough(
     straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A clean log leads a deadband to zero, and a slope of either sign is one."""
+    """A clean log leads a deadband, which must be positive, to zero; a slope may have either sign."""
     stage, asked = calm(straight), list[Callable[[int, stages.ExtendedFit], bool]]()
     scores = {s.candidate.name: s for s in reversed(selection.score_effects(stage, run_in_turn)) if s.values["A"] != 0}
     names = "torque_deadband@front_roll", "ground_slope@machine"
@@ -727,7 +726,7 @@ def test_a_beginning_tells_where_the_model_as_it_is_stays_far_off(
 
 
 def sets_out(stage: stages.ExtendedFit, disturbed: float, onset: float) -> bool:
-    """Whether a slope, with such forces, is fitted to the whole log after a beginning of that many seconds."""
+    """Tell if a slope is fitted to the whole log, with such process noise, after a beginning of `onset` seconds."""
     machine, whole = placing.with_effects(stage.machine, slope(stage.model)), list[int]()
     with pytest.MonkeyPatch.context() as patch:
         true = smoothing.fit_logs
@@ -748,8 +747,11 @@ def beginnings(
     cost: Callable[[int, bool], float | None],
     found: bool,
 ) -> list[int]:
-    """In place of fits to beginnings: what each costs, times its noise, by how many samples it has and whether it is
-    one with a slope, and whether it is found. How many samples were asked for with a slope, one after the other."""
+    """Replace fits to beginnings by scripted ones; return the lengths that are fitted with a slope, in turn.
+
+    cost: by the number of samples, and whether the model has a slope, the cost as a multiple of the noise; None if
+        there is no motion. found: the fits converge.
+    """
     asked = list[int]()
     monkeypatch.setattr(stages.FitData, "n_readings", property(lambda p: float(len(p.measurements[0].used))))
 

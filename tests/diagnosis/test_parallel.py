@@ -80,7 +80,7 @@ def test_arrays_come_whole_and_are_ones_own() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
 def test_no_descriptor_stays_open(monkeypatch: pytest.MonkeyPatch) -> None:
     class Large:
-        """What can be sent, but not received."""
+        """An answer that can be sent, but not received."""
 
         def __reduce__(self) -> tuple[Any, ...]:
             return operator.mul, (b"0", sys.maxsize // 2)

@@ -34,7 +34,7 @@ def driven(seed: int, t: np.ndarray, steps: bool) -> np.ndarray:
 
 
 def torque_anomalies(model: Model, t: np.ndarray, u: np.ndarray) -> list[Anomaly]:
-    """What the readings of a torque show, without a fit of the motion."""
+    """Return the anomalies of a torque's readings alone, without innovations."""
     log: Any = SimpleNamespace(t=t, values={"u1": u})
     fit: Any = SimpleNamespace(linear=[SimpleNamespace(innovations=np.zeros((len(t), 0)))])
     return find_anomalies(model.machine, (), log, fit)
