@@ -106,7 +106,7 @@ def test_dependent_columns_are_named(
     W[:, :, 4] = times * W[:, :, 0]
     estimate = linear_methods.least_squares(straight, W, Y, "ols")
     assert list(estimate.unidentifiable) == [out]
-    assert f"together with {kept} " in estimate.unidentifiable[out]
+    assert f"only together with others: {kept} + " in estimate.unidentifiable[out]
 
 
 def test_nothing_to_identify_is_said(straight: Model) -> None:
