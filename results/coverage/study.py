@@ -28,7 +28,7 @@ import scipy.signal
 
 from excite.errors import NoEstimateError
 from excite.identification import identify
-from excite.identification.joint import BIASED_NOTE, UNEXPLAINED_NOTE
+from excite.identification.joint import BIASED_NOTE
 from excite.logs import log
 from excite.model import Model, build
 from excite.model.machine import Machine, machine as machines
@@ -143,7 +143,7 @@ def run(s: Set, seed: int) -> dict[str, object]:
         "value": [float(f"{x:.9g}") for x in e.value],
         "std": [float(f"{x:.6g}") for x in e.std],
         "interval": [[float(f"{x:.9g}") for x in end] for end in e.interval95],
-        "doubt": UNEXPLAINED_NOTE in e.notes,
+        "doubt": e.status != "valid",
         "drawn": BIASED_NOTE in e.notes,
         "seconds": seconds,
     }
