@@ -123,8 +123,9 @@ def identify(machine: Machine, logs: Source | Sequence[Source], method: str | No
     model = load(machine)
     name = workflows.choose_method(method, model)
     ready = readers.prepare(model, _several(logs), identification.needed_sensors(model, name))
-    estimate = workflows.identify_from(ready.model, ready.logs, name).estimate
-    return replace(estimate, notes=(*ready.notes, *estimate.notes))
+    found = workflows.identify_from(ready.model, ready.logs, name)
+    said = () if found.agreement is None else (workflows.describe_agreement(found.agreement),)
+    return replace(found.estimate, notes=(*said, *ready.notes, *found.estimate.notes))
 
 
 def diagnose(machine: Machine, logs: Source | Sequence[Source]) -> Assessment:

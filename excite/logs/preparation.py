@@ -49,6 +49,7 @@ def prepare(
     that of the slowest log if not given. Raises LogError: file, row and column, what is wrong, what to do.
     """
     machine = model.machine
+    sources = _numbered(sources)
     given = [one for one in sources if isinstance(one, Log)]
     files = [one for one in _joined(sources, machine) if not isinstance(one, Log)]
     read = [_read_limited(source, model, needs, rate) for source in files]
@@ -111,6 +112,19 @@ def read_stretches(
     used = {line.partition(" row only")[0] for line in said}  # of held channels the note says how they are used
     doubts = [line for line in accepted.doubts if line.partition(" row only")[0] not in used]
     return stretches, [*notes, *accepted.notes, *said, *doubts]
+
+
+def _numbered(sources: Sequence[Source]) -> list[Source]:
+    """Name tables without a file log 1, log 2 and so on, if there are several."""
+    named = list[Source]()
+    count = sum(isinstance(s, pd.DataFrame) for s in sources)
+    for k, source in enumerate(sources):
+        if count > 1 and isinstance(source, pd.DataFrame) and "source" not in source.attrs:
+            attrs = {**source.attrs, "source": f"log {k + 1}"}
+            source = source.copy(deep=False)
+            source.attrs = attrs
+        named.append(source)
+    return named
 
 
 def _name(source: str | Path | pd.DataFrame) -> str:

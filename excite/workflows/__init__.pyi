@@ -5,7 +5,11 @@ from .design_request import (
 )
 from .design_workflow import compare as compare, design as design
 from .diagnose_workflow import diagnose as diagnose, diagnose_from as diagnose_from
-from .identify_workflow import identify as identify, identify_from as identify_from
+from .identify_workflow import (
+    describe_agreement as describe_agreement,
+    identify as identify,
+    identify_from as identify_from,
+)
 from .machine_check import check_machine as check_machine
 from .requests import (
     build_model as build_model,

@@ -10,6 +10,7 @@ import pytest
 from support.commands import Excite
 from support.logs import make_log
 
+import excite
 from excite.identification import compare_logs, identify
 from excite.model import Model, build
 from excite.simulation import Motion, measure, simulate
@@ -92,3 +93,9 @@ class _Estimate:
     @property
     def std(self) -> np.ndarray:
         return np.sqrt(np.diag(self.covariance))
+
+
+def test_tables_are_compared_as_files_are(straight: Model, straight_motion: Motion) -> None:
+    tables = [measure(straight, straight_motion, seed=s) for s in (1, 2)]
+    estimate = excite.identify("va12_straight", tables, "tls")
+    assert "one set of parameters explains the 2 logs" in estimate.notes[0]
