@@ -18,6 +18,7 @@ from excite.errors import MachineError
 from excite.model import mechanics
 from excite.model.effects import GroundMap, PlacedEffect, Site, place_effect
 from excite.model.equations import Equations, contact_lines, equations, kinematics
+from excite.model.known_values import KnownValues, known_values
 from excite.model.machine import Machine
 from excite.model.mechanics import independent_columns
 
@@ -113,6 +114,7 @@ class Model:
     read: (q, nu, wheels, u, z, X) -> exact readings of the sensors `reading_names`.
     channels: (t, X) -> gain, offset, delay (n_u,) of the torque sensors.
     fit_sensor_effects, fit_shapes: the arguments of `build`.
+    known: what the machine file calls known of the base parameters.
     """
 
     machine: Machine
@@ -137,6 +139,7 @@ class Model:
     effects: tuple[PlacedEffect, ...]
     fit_sensor_effects: bool
     fit_shapes: bool
+    known: KnownValues
 
     @property
     def plain(self) -> bool:
@@ -331,12 +334,14 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
             raise MachineError(
                 f"{machine.name}: scale.{s}: the nominal value is 0, give a scale > 0 in the machine file"
             )
+    known = known_values(machine, base.names, base.matrix, base.standard, scale)
     if placed:
         magnitudes = _effect_parameters(machine, placed, fit_shapes)
         if not fit_sensor_effects:
             shown = _visible_parameters(equations(machine, (*table, *magnitudes), placed))
             magnitudes = {name: row for name, row in magnitudes.items() if name in shown}
         base = _append_parameters(base, magnitudes)
+        known = known.extended(len(magnitudes))
         nominal = np.concatenate([nominal, [v for v, _, _ in magnitudes.values()]])
         scale = np.concatenate([scale, [size for _, _, size in magnitudes.values()]])
         found = equations(machine, base.standard, placed)
@@ -363,6 +368,7 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
         placed,
         fit_sensor_effects,
         fit_shapes,
+        known,
     )
 
 

@@ -410,8 +410,10 @@ def _score_values(
         inner = form[o, o] + np.eye(fitted_log.n_offsets)
         Z += form[np.ix_(keep, keep)] - form[keep, o] @ np.linalg.solve(inner, form[o, keep])
     own, p = slice(1 + n, None), slice(1, 1 + n)
-    information, cross = Z[p, p] + np.diag(prior), Z[p, own]
+    known = model.known.rows * model.scale
+    information, cross = Z[p, p] + np.diag(prior) + known.T @ known, Z[p, own]
     gradient = Z[p, 0] + prior * (fit.X - model.nominal) / model.scale
+    gradient = gradient + known.T @ (model.known.rows @ fit.X - model.known.values)
     solved = np.linalg.solve(information, np.column_stack([cross, gradient]))
     S = Z[own, own] - cross.T @ solved[:, :-1]
     g = Z[own, 0] - cross.T @ solved[:, -1]

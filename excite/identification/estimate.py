@@ -30,7 +30,8 @@ class Estimate:
     doubt: why the 95 % intervals do not hold, "" if they do. understated: factor by which standard deviations are known
         to be too small. status: valid, doubtful or invalid (see `status.assess`).
     possible (n,): False for values that no machine has. consistent (n,) [SI]: values of the nearest possible machine,
-        if some value is not possible.
+        if some value is not possible. prior_std (n,) [SI]: standard deviations by what the machine file calls known,
+        before any log; NaN for parameters that it does not determine.
     """
 
     method: str
@@ -53,6 +54,7 @@ class Estimate:
     status: str = "valid"
     possible: np.ndarray | None = None
     consistent: np.ndarray | None = None
+    prior_std: np.ndarray | None = None
 
     @property
     def std(self) -> np.ndarray:

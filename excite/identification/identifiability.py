@@ -55,7 +55,7 @@ def add_advice(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Fi
 
 def parameters_at_rest(model: Model, logs: Sequence[Log], filter: Filter, slow: bool) -> np.ndarray:
     """Find the parameters (n_base,) that logs do not identify because part of the machine is at rest."""
-    return np.diag(rest_projection(model, logs, filter, slow)) == 0
+    return (np.diag(rest_projection(model, logs, filter, slow)) == 0) & np.isnan(model.known.std)
 
 
 def rest_projection(

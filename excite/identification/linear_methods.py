@@ -52,7 +52,8 @@ def ols(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     blocks = filtered_blocks(model, logs, filter)
     solution = solve_blocks(blocks, model.scale)
     estimate = estimate_with_white_noise(model, blocks, solution, "ols")
-    doubt, factor = _autocorrelation_doubt(blocks, solution, estimate, sandwich_covariance(model, blocks, solution))
+    robust = sandwich_covariance(model, blocks, solution)
+    doubt, factor = _autocorrelation_doubt(blocks, solution, model.base.names, robust)
     return replace(estimate, doubt=doubt, understated=factor)
 
 
@@ -328,11 +329,15 @@ def build_estimate(
 
     blocks: filtered rows without weights.
     """
-    names, kept = model.base.names, list(solution.kept)
+    names = model.base.names
+    rows = every = reduce_blocks(blocks).R[:, :-1]
+    if model.known:
+        solution, x, covariance = combine_with_known(model, rows, solution, x, covariance)
+        every = np.concatenate([rows, model.known.rows * np.abs(rows).max() / np.abs(model.known.rows).max()])
+    kept = list(solution.kept)
     floor = np.array([float(model.machine.scale.get(s, 0.0)) for s in names])
     scale = np.maximum(np.abs(x), floor)[kept]
-    every = reduce_blocks(blocks).R[:, :-1]
-    R = every[:, kept]
+    R = rows[:, kept]
     value = np.full(len(names), np.nan)
     value[kept] = x[kept]
     residuals = np.concatenate([residual(b, x) for b in blocks], axis=1)
@@ -361,18 +366,46 @@ def build_estimate(
     )
 
 
+def combine_with_known(
+    model: Model, R: np.ndarray, solution: Solution, x: np.ndarray, covariance: np.ndarray
+) -> tuple[Solution, np.ndarray, np.ndarray]:
+    """Combine an estimate with what the machine file calls known; return solution, x and covariance of both together.
+
+    R (rows, n_base): the log's rows or their triangle; solution, x (n_base,), covariance (k, k): of the log alone. The
+    log shows x_kept + F x_tied with that covariance, the known values are further observations, and generalised least
+    squares solves both. What neither shows is left out as before.
+    """
+    kept, tied, n = list(solution.kept), solution.tied, len(x)
+    shown = np.zeros((len(kept), n))
+    shown[range(len(kept)), kept] = 1.0
+    if tied:
+        size = np.linalg.norm(R, axis=0)
+        shares = np.linalg.lstsq(R[:, kept] / size[kept], R[:, tied] / size[tied], rcond=None)[0]
+        shown[:, tied] = shares * size[tied] / size[kept][:, None]
+    std = np.sqrt(np.diag(covariance))
+    root = np.linalg.cholesky(covariance / np.outer(std, std))
+    whitened = scipy.linalg.solve_triangular(root, np.column_stack([shown, shown @ x]) / std[:, None], lower=True)
+    known = np.column_stack([model.known.rows, model.known.values])
+    both = np.concatenate([whitened, known])
+    together = solve(reduce(both[:, :-1], both[:, -1]), scale=model.scale)
+    found, free, held = model.nominal.copy(), list(together.kept), list(together.dependent)
+    found[free] = np.linalg.lstsq(both[:, free], both[:, -1] - both[:, held] @ found[held], rcond=None)[0]
+    return replace(together, rows=solution.rows), found, together.inverse
+
+
 def _autocorrelation_doubt(
-    blocks: Sequence[Block], solution: Solution, estimate: Estimate, robust: np.ndarray
+    blocks: Sequence[Block], solution: Solution, names: Sequence[str], robust: np.ndarray
 ) -> tuple[str, float]:
     """Say by which factor standard deviations by (33) are too small for autocorrelated residuals, "" and 1 if not."""
     kept = list(solution.kept)
-    ratio = np.sqrt(np.diag(robust)) / estimate.std[kept]
+    white = solution.residual_norm**2 / solution.degrees * np.diag(solution.inverse)
+    ratio = np.sqrt(np.diag(robust) / white)
     if not ratio.max() > NOTABLE_STD_RATIO:
         return "", 1.0
     correlation = max((float(np.abs(lag_one_correlation(residual(b, solution.x))).max()) for b in blocks), default=0.0)
     worst = int(np.argmax(ratio))
     doubt = (
         f"residuals are autocorrelated (lag 1: {correlation:.2f}), so standard deviations by (33) are too small by a"
-        f" factor of up to {ratio[worst]:.1f} ({estimate.names[kept[worst]]}): --method wls states what holds"
+        f" factor of up to {ratio[worst]:.1f} ({names[kept[worst]]}): --method wls states what holds"
     )
     return doubt, float(ratio[worst])

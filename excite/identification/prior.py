@@ -15,7 +15,7 @@ from excite.errors import NotIdentifiableError
 from excite.identification.estimate import Estimate
 from excite.identification.methods import identify
 from excite.logs import Log
-from excite.model import Model, required_signs
+from excite.model import Model, nothing_known, required_signs
 
 POSE_COUNT = 181  # poses at which the mass matrix is checked; chosen
 STEP_SHARES = np.linspace(1, 0, 21)  # of the way from the nominal values to the estimate; chosen
@@ -57,7 +57,9 @@ def prior_from_estimate(model: Model, estimate: Estimate) -> PriorKnowledge:
             smallest = [float(model.machine.scale.get(n, 0.0)) for n in model.base.names]
             scale = np.where(np.array(smallest) > 0, smallest, np.abs(nominal))
             scale = np.where(scale > 0, scale, model.scale)
-            return PriorKnowledge(replace(model, nominal=nominal, scale=scale), information, estimate, float(share))
+            # The information includes what the machine file calls known.
+            changed = replace(model, nominal=nominal, scale=scale, known=nothing_known(len(nominal)))
+            return PriorKnowledge(changed, information, estimate, float(share))
     raise NotIdentifiableError("the machine file's own values have no positive definite mass matrix")
 
 

@@ -6,16 +6,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import scipy
 
 from excite.errors import NotConsistentError
 from excite.identification.estimate import Estimate, add_notes
 from excite.logs import Log, samples
 from excite.model import Model, required_signs
 from excite.model.machine import Filter
+from excite.text import format_p_value
 
 CLEAR_STDS = 3.0  # standard deviations beyond the possible that no noise explains; chosen
 MOVED_STDS = 2.0  # shift to the nearest possible machine that makes an inertial value impossible; chosen
 TRIED_POSTURES = 200  # of the logs, in which the mass matrix must be positive definite; chosen
+MIN_TESTED_SHARE = 0.01  # of a known value's variance that the logs must leave for a test of it; chosen
+CONTRADICTION_LEVEL = 1e-3  # of that test; chosen
 INERTIAL_INITIALS = "MXYZ"  # of the names of inertial parameters
 NEVER_NEGATIVE = ("M", "XX", "YY", "ZZ")  # standard inertial parameters that no body has below zero
 CAUSES = "the sign of a torque or angle column, a unit, or a radius in the machine file"
@@ -43,8 +47,37 @@ def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
             )
         possible &= ~moved
         notes.append("with these values the mass matrix is not positive definite: no machine has them together")
-    status = "valid" if not estimate.doubt else "invalid" if clear else "doubtful"
-    return add_notes(replace(estimate, status=status, possible=possible), *notes)
+    doubt = estimate.doubt or _contradiction(model, estimate)
+    status = "valid" if not doubt else "invalid" if clear else "doubtful"
+    estimate = replace(estimate, doubt=doubt, status=status, possible=possible, prior_std=model.known.std)
+    return add_notes(estimate, *notes)
+
+
+def _contradiction(model: Model, estimate: Estimate) -> str:
+    """Say which quantity that the machine file calls known the logs contradict most, "" if none.
+
+    The misfit of the known values has the covariance I - A C A' after the logs, with C the covariance of the estimate
+    (chi-squared test).
+    """
+    known = model.known
+    if not known or not np.isfinite(estimate.value[np.any(known.rows != 0, axis=0)]).all():
+        return ""
+    A = np.where(np.isfinite(estimate.value), known.rows, 0.0)
+    misfit = known.values - A @ np.nan_to_num(estimate.value)
+    left = np.eye(len(misfit)) - A @ np.nan_to_num(estimate.covariance) @ A.T
+    share, axes = np.linalg.eigh((left + left.T) / 2)
+    tested = share > MIN_TESTED_SHARE
+    if not tested.any():
+        return ""
+    square = (axes[:, tested].T @ misfit) ** 2 / share[tested]
+    p_value = float(scipy.stats.chi2.sf(square.sum(), tested.sum()))
+    if p_value >= CONTRADICTION_LEVEL:
+        return ""
+    worst = known.quantities[int(np.argmax(np.abs(known.pull @ misfit)))]
+    return (
+        f"the log contradicts what the machine file calls known, above all {worst} (p-value {format_p_value(p_value)}):"
+        " check that value, or the sensors and lengths that it depends on"
+    )
 
 
 def add_consistent(model: Model, estimate: Estimate) -> Estimate:

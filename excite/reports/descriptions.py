@@ -325,12 +325,14 @@ def describe_identify(s: Summary) -> Description:
     for check in s["validation"]:
         remarks.append(_describe_validation(check))
     biased = any("bias" in r for r in rows.values())
+    prior = any("prior_std" in r for r in rows.values())
     table = tuple(
         (
             n,
             *_meaning(s, n),
             r["unit"],
             *(format_number(r[k], d) for _, k, d in ESTIMATE_COLUMNS),
+            *((format_number(r.get("prior_std"), 3),) if prior else ()),
             *((format_number(r.get("bias"), 3),) if biased else ()),
             *(("" if r["possible"] else "no", format_number(r.get("consistent"), 6)) if impossible else ()),
         )
@@ -341,6 +343,7 @@ def describe_identify(s: Summary) -> Description:
         *_meaning_column(s),
         "unit",
         *(heading for heading, *_ in ESTIMATE_COLUMNS),
+        *(("std known before",) if prior else ()),
         *(("bias of the method",) if biased else ()),
         *(("possible", "nearest possible machine") if impossible else ()),
     )

@@ -26,7 +26,8 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
 
     All noise counts as Gaussian, with the machine file's standard deviations. An encoder gives one reading per count,
     and its edges are off by a tenth of a count at least. A weak prior (300 % of each scale) keeps the standard
-    deviation of a parameter finite that the motion does not excite.
+    deviation of a parameter finite that the motion does not excite. What the machine file calls known adds to the
+    measurements.
 
     X (n_base,): true parameters, the nominal ones by default. Raises ValueError for a sensor without noise or counts.
     """
@@ -55,6 +56,8 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
     )
     assert linear is not None
     information = linear.Z[1:, 1:].copy()
+    known = model.known.rows * model.scale
+    information[: len(X), : len(X)] += known.T @ known
     information[np.diag_indices(len(information))] += np.concatenate(
         [np.full(len(X), PRIOR_STD**-2), np.ones(len(data.offset_sensors))]
     )

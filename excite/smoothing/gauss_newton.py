@@ -539,7 +539,7 @@ def newton_step(
 ) -> tuple[np.ndarray, list[np.ndarray], float, float]:
     """Compute one damped Gauss-Newton step of parameters and offsets, from linearised logs.
 
-    prior (n_base,): information about the nominal values, scaled.
+    prior (n_base,): information about the nominal values, scaled. What the machine file calls known is added to it.
     damping: information added to every parameter; poorly known ones then move little while the others converge.
     fixed (n_base,): parameters that stay at their values, also in the covariance; the others are unbounded then.
 
@@ -556,6 +556,11 @@ def newton_step(
     deviation = (X - space.model.nominal) / space.model.scale
     slope[:n] = prior * deviation
     cost = float(prior @ deviation**2)
+    known, by = space.model.known, space.model.known.rows * space.model.scale
+    misfit = known.rows @ X - known.values
+    information[:n, :n] += by.T @ by
+    slope[:n] += by.T @ misfit
+    cost += float(misfit @ misfit)
     if fixed is not None:
         information[range(n), range(n)] += fixed * HELD_STD**-2
     for log, data, trajectory, own in zip(linear, measurements, trajectories, indices, strict=True):

@@ -81,7 +81,8 @@ def compose_objective(
 
     objective: a name in OBJECTIVES.
     sigma_max [%]: bound on the largest relative standard deviation.
-    prior (n_base, n_base) [1/SI^2]: information from earlier logs.
+    prior (n_base, n_base) [1/SI^2]: information from earlier logs. What the machine file calls known adds to it, but
+        not in a condition number, which is of the regressor.
     machines: possible machines, whose scores are averaged; the model alone by default.
 
     Raises KeyError for an unknown objective and ValueError for a bad prior or sigma_max.
@@ -99,25 +100,35 @@ def compose_objective(
     chosen = OBJECTIVES[objective]
     every = tuple(machines) or (model,)
     known = None if prior is None else prior * model.scale * model.scale[:, None]
+    total = _with_known(model, known)
+    own = known if chosen.shown_as == "cond" else total
     terms = [
         Term(
             objective,
             (m.scale if chosen.of == "eigenvalues" else reference_values(m)) / model.scale,
             int(chosen.weighted),
             1 / len(every),
-            known,
+            own,
         )
         for m in every
     ]
     if sigma_max is not None:
         ceiling = 2 * float(np.log(sigma_max / 100))
         terms += [
-            Term("worst", reference_values(m) / model.scale, 1, CEILING_PRICE / len(every), known, ceiling)
+            Term("worst", reference_values(m) / model.scale, 1, CEILING_PRICE / len(every), total, ceiling)
             for m in every
         ]
     used = sorted({t.block for t in terms})
     terms = [replace(t, block=used.index(t.block)) for t in terms]
     return CompositeObjective(objective, tuple(terms), rows[used], model.scale, sigma_max, known, tuple(machines))
+
+
+def _with_known(model: Model, prior: np.ndarray | None) -> np.ndarray | None:
+    """Add what the machine file calls known to a prior (n_base, n_base), scaled; None if there is neither."""
+    if not model.known:
+        return prior
+    information = model.known.information * np.outer(model.scale, model.scale)
+    return information if prior is None else prior + information
 
 
 # ------------------------------------------------------------------------------------------------ of matrices

@@ -177,6 +177,8 @@ def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:
             "high95": high[k],
             "possible": estimate.possible is None or bool(estimate.possible[k]),
         }
+        if estimate.prior_std is not None and np.isfinite(estimate.prior_std[k]):
+            rows[name]["prior_std"] = estimate.prior_std[k]
         if estimate.consistent is not None:
             rows[name]["consistent"] = estimate.consistent[k]
         if estimate.bias is not None and estimate.bias_std is not None:

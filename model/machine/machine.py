@@ -378,7 +378,10 @@ def _convex(corners: Sequence[tuple[float, float]]) -> bool:
 
 
 class Machine(FileRecord):
-    """A machine file. `locked` coordinates are held at zero."""
+    """A machine file. `locked` coordinates are held at zero.
+
+    known: base parameters known beforehand, such as the whole machine's mass from a weighbridge.
+    """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")]
     title: str
@@ -396,6 +399,7 @@ class Machine(FileRecord):
     problems: dict[str, Problem] = Field({})
     parameter_names: dict[str, str] = Field({})
     scale: dict[str, Positive] = Field({})
+    known: dict[str, Quantity] = Field({})
     effect: tuple[EffectEntry, ...] = ()
 
     def find(self, index: int) -> Body:

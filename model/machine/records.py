@@ -54,6 +54,15 @@ def _finite(value: float) -> float:
     return value
 
 
+def _known(value: Any) -> Any:
+    """Check `known`: true, or a standard deviation above zero. Raises ValueError."""
+    if isinstance(value, bool):
+        return value
+    if not isinstance(value, (int, float)) or not math.isfinite(value) or value <= 0:
+        raise ValueError(f"must be true (known exactly) or a standard deviation > 0 (got {value!r})")
+    return float(value)
+
+
 def _positive(q: Quantity) -> Quantity:
     if not q.value > 0:
         raise ValueError(f"must be > 0 (got {q.value:g})")
@@ -82,12 +91,19 @@ Number = Annotated[float, BeforeValidator(_number), AfterValidator(_finite)]
 Flag = Annotated[bool, Field(strict=True)]
 
 
+Known = Annotated[bool | float, BeforeValidator(_known)]
+
+
 class Quantity(FileRecord):
-    """A value [SI] and its source."""
+    """A value [SI] and its source.
+
+    known: true if the value is exact, or its standard deviation; identification then uses it like a measurement.
+    """
 
     value: Number
     source: Source
     note: str = ""
+    known: Known = False
 
     def __float__(self) -> float:
         return self.value
@@ -100,11 +116,12 @@ Vector3 = tuple[Number, Number, Number]
 
 
 class BodyPoint(FileRecord):
-    """A point [m] in the body's frame."""
+    """A point [m] in the body's frame. known: as of a `Quantity`, of each coordinate."""
 
     value: Vector3
     source: Source
     note: str = ""
+    known: Known = False
 
 
 def error_line(path: Path | str, err: ValidationError, root: type[FileRecord]) -> str:
