@@ -279,6 +279,7 @@ def _common_view(s: SymbolicSample, time: ca.SX) -> SampleView:
         {b.index: effects.large_torque(s.machine, b) for b in s.machine.actuated},
         {b.index: _contact_motion(s, b)[0] for b in s.machine.contacts},
         {b.index: s.frames[b.index].velocity[0] for b in s.machine.body},
+        {b.index: s.frames[b.index].omega[2] for b in s.machine.body},
         time,
     )
 
@@ -293,7 +294,9 @@ def _active_effect(
     if e.uses_map:
         n = effects.MAX_PASSES
         passes = {k: ca.vertcat(*map_inputs[n * i : n * (i + 1)]) for i, k in enumerate(passes)}
-    return ActiveEffect(e, replace(view, z=dict.fromkeys(e.memories, ca.SX(0)) | z, passes=passes), values)
+    radius = next((float(x.radius) for x in s.machine.sensor if x.name == e.sensor and x.radius is not None), 1.0)
+    own = replace(view, z=dict.fromkeys(e.memories, ca.SX(0)) | z, passes=passes, wheel_radius=radius)
+    return ActiveEffect(e, own, values)
 
 
 def _memory_rates(e: ActiveEffect) -> list[ca.SX]:
@@ -410,7 +413,9 @@ def _contact_force(body: Body, soil: Soil, lever: ca.SX, motion: ContactMotion) 
     """Return the generalised force (n_q,) of a contact by virtual power (11)."""
     assert body.contact is not None
     w = soil.wrench(body.contact)
-    return lever.T @ ca.vertcat(w.Sx, w.Sy, -(float(body.contact.radius) + motion.extra_radius) * w.Sx, -w.Tz)
+    Sx, Sy = w.Sx - soil.turned * w.Sy, w.Sy + soil.turned * w.Sx
+    moment = -(float(body.contact.radius) + motion.extra_radius) * w.Sx
+    return lever.T @ ca.vertcat(Sx, Sy, moment, soil.ahead * Sy - w.Tz)
 
 
 def _channels(s: SymbolicSample, acting: Sequence[ActiveEffect], time: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:

@@ -49,7 +49,8 @@ class Finding:
 
     rivals: effects that the cause is tied with, as fitted. p_value: of no effect at all given the others, corrected for
     the number of candidates. shapes: value, standard deviation, unit. likelihood_ratio: 2 delta log L over the
-    dispersion.
+    dispersion. share: of the excess misfit that it explains. kind: cause if the findings explain the logs, correction
+    if something else remains.
     """
 
     effect: str
@@ -61,6 +62,8 @@ class Finding:
     unit: str
     shapes: Mapping[str, tuple[float, float, str]]
     likelihood_ratio: float
+    share: float = 1.0
+    kind: str = "cause"
 
     @property
     def name(self) -> str:
@@ -80,11 +83,15 @@ class Finding:
 
 @dataclass(frozen=True)
 class NearestEffect:
-    """An effect that explains a share of the misfit but is not named, and the parameters that it makes impossible."""
+    """An effect that explains a share of the misfit but is not named.
+
+    impossible: parameters that it makes impossible. reason: why else it is not named.
+    """
 
     name: str
     share: float
     impossible: tuple[str, ...] = ()
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -93,7 +100,8 @@ class Diagnosis:
 
     verdict: clean, named, tied or unexplained. before, after: fits without and with the findings. share: share of the
     excess misfit that they explain. located: lines that describe what is unexplained. stages: fits with the first
-    finding, the first two, and so on. nearest: the effect that explains most, if nothing is named.
+    finding, the first two, and so on. nearest: the effect that explains most, if nothing is named. dropped: effects
+    that explain too little to be causes, as corrections, with the fits with them.
     """
 
     verdict: str
@@ -104,6 +112,7 @@ class Diagnosis:
     located: tuple[str, ...]
     stages: tuple[ExtendedFit, ...]
     nearest: NearestEffect | None = None
+    dropped: tuple[tuple[Finding, ExtendedFit], ...] = ()
 
     @property
     def sticks(self) -> bool:
@@ -136,14 +145,17 @@ def diagnose(
         report(0.15, "fitting effects from initial trajectories")
         before, chosen, tried = selection.choose_from_start(before, runner)
     chosen, next_ratio = extend_model(before, chosen, runner, report)
+    added = chosen
     chosen, anomalies, nearest = drop_weak_effects(before, chosen, next_ratio)
     if not (chosen or (before.exact and before.is_close)):  # a fit with inflated sensor noise has process noise, too
         report(0.85, "fitting less likely effects")
         old = before if before.data.noise_inflation == 1 else fit_with_process_noise(before, runner)
         before, anew = selection.choose_unlikely(first, old, tried if old is first else (), runner)
         if anew or before is not old:
+            added = []  # compared with another fit
             anew, next_ratio = extend_model(before, anew, runner, lambda share, what: report(max(share, 0.85), what))
             nearest = None if before is not old else nearest
+            added = anew
         chosen, anomalies, closer = drop_weak_effects(before, anew, next_ratio)
         nearest = closer or nearest
     if len(chosen) > 1:
@@ -152,9 +164,30 @@ def diagnose(
             before, drop_unneeded(before, review_effects(before, chosen, runner)), next_ratio
         )
     if (largest := _largest_of_patchwork(chosen, anomalies)) is not None:
-        chosen, anomalies, nearest = [], _anomaly_lines(before), largest
+        chosen, anomalies, nearest = [], anomaly_lines(before), largest
     stage = chosen[-1].stage if chosen else before
-    return conclude(before, stage, chosen, anomalies, next_ratio, nearest, runner)
+    found = conclude(before, stage, chosen, anomalies, next_ratio, nearest, runner)
+    return found if found.findings else replace(found, dropped=_corrections(before, added, runner))
+
+
+def _corrections(
+    before: ExtendedFit, added: Sequence[Choice], runner: CallRunner
+) -> tuple[tuple[Finding, ExtendedFit], ...]:
+    """Return effects that were added but explain too little to be causes, each with the fit with it, as corrections.
+
+    The list ends before an effect that makes a parameter impossible.
+    """
+    found = list[tuple[Finding, ExtendedFit]]()
+    for k, x in enumerate(added):
+        if not (before.estimated and x.stage.estimated) or x.stage.impossible:
+            break
+        found.append((_make_finding(x, x.stage, 0.0, k == 0, runner), x.stage))
+    total = sum(x.likelihood_ratio for x in added[: len(found)])
+    total += _unexplained_cost(found[-1][1], ()) if found else 0.0
+    return tuple(
+        (replace(f, share=x.likelihood_ratio / total, kind="correction"), stage)
+        for (f, stage), x in zip(found, added, strict=False)
+    )
 
 
 def extend_model(
@@ -209,7 +242,7 @@ def drop_weak_effects(
     kept, nearest = list(chosen), None
     while True:
         stage = kept[-1].stage if kept else before
-        anomalies = _anomaly_lines(stage)
+        anomalies = anomaly_lines(stage)
         impossible = stage.impossible if kept and stage.estimated else ()
         if not kept or (stage.exact and not anomalies and not impossible):
             break
@@ -222,7 +255,7 @@ def drop_weak_effects(
             process_noise_fit is not None
             and not (impossible or faint)
             and _explained_share(
-                kept[-1].likelihood_ratio, process_noise_fit, anomalies_with_noise := _anomaly_lines(process_noise_fit)
+                kept[-1].likelihood_ratio, process_noise_fit, anomalies_with_noise := anomaly_lines(process_noise_fit)
             )
             >= MIN_EXPLAINED_SHARE
         ):
@@ -375,7 +408,7 @@ def _refit_without(name: str, stage: ExtendedFit) -> ExtendedFit:
         return refit(machine, stage, max(stage.fit.process_noise, MIN_PROCESS_NOISE))
 
 
-def _anomaly_lines(stage: ExtendedFit) -> tuple[str, ...]:
+def anomaly_lines(stage: ExtendedFit) -> tuple[str, ...]:
     """Describe what is left beside noise, a line each, the most striking first."""
     stage = with_true_sensor_noise(stage)
     logs = stage.data.logs
@@ -417,6 +450,10 @@ def conclude(
         share = _explained_share(sum(x.likelihood_ratio for x in chosen), after, anomalies)
         next_ratio = max(next_ratio, _unexplained_cost(after, anomalies))
     findings = tuple(_make_finding(x, after, next_ratio, len(chosen) == 1, runner) for x in chosen)
+    gained = sum(x.likelihood_ratio for x in chosen)
+    findings = tuple(
+        replace(f, share=share * x.likelihood_ratio / gained) for f, x in zip(findings, chosen, strict=True)
+    )
     nearest = None if findings else nearest
     verdict = "clean"
     if findings:
@@ -429,6 +466,8 @@ def conclude(
         verdict = "unexplained"
     if nearest is not None:
         verdict, share = "unexplained", 0.0
+    if verdict == "unexplained":
+        findings = tuple(replace(f, kind="correction") for f in findings)
     stages = tuple(x.stage for x in chosen)
     return Diagnosis(verdict, findings, before, after, share, anomalies, stages, nearest)
 

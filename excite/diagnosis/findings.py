@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -12,8 +12,9 @@ import numpy as np
 import tomli_w
 
 from excite.diagnosis import hold_out, residuals, separating_run
-from excite.diagnosis.diagnosis import Diagnosis, Finding
-from excite.diagnosis.fits import with_true_sensor_noise
+from excite.diagnosis.acceptance import reason_against, widen
+from excite.diagnosis.diagnosis import MIN_EXPLAINED_SHARE, Diagnosis, Finding, NearestEffect, anomaly_lines
+from excite.diagnosis.fits import ExtendedFit, with_true_sensor_noise
 from excite.diagnosis.hold_out import HoldOutErrors, HoldOutGain
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.residuals import InnovationLevel
@@ -44,31 +45,26 @@ class Assessment:
     separating_run: str | None
 
 
-def assess(
-    d: Diagnosis,
-    progress: ProgressCallback | None = None,
-    runner: CallRunner = run_in_turn,
-    extra_calls: Sequence[Callable[[], None]] = (),
-) -> Assessment:
-    """Measure hold-out gains and locate the misfit.
+def assess(d: Diagnosis, progress: ProgressCallback | None = None, runner: CallRunner = run_in_turn) -> Assessment:
+    """Measure hold-out gains, keep the findings that pay for their names, and locate the misfit.
 
-    The gain of a finding is that over the model with the findings before it. extra_calls: calls that are run side by
-    side with the measurement.
+    The gain of a finding is that over the model with the findings before it. If nothing is named, effects that explain
+    too little to be causes are given as corrections, if they pay as well.
     """
     report = progress or (lambda share, what: None)
-    stages = [d.before, *d.stages]
-    calls: list[Callable[[], HoldOutErrors | None]] = [
-        *extra_calls,
-        *(partial(hold_out.hold_out_errors, s) for s in stages),
-    ]
-    done = list[HoldOutErrors | None]()
-    report(0.0, "measuring the gain")
-    for errors in runner(calls):
-        done.append(errors)
-        report(len(done) / (len(calls) + 1), "measuring the gain")
-    held = done[len(extra_calls) :]
-    gains = tuple(hold_out.hold_out_gain(a, b) for a, b in pairwise(held))
-    total_gain = hold_out.hold_out_gain(held[0], held[-1])
+    entries = list(zip(d.findings, d.stages, strict=True)) or list(d.dropped)
+    entries = [(widen(f, stage), stage) for f, stage in entries]
+    stages = [d.before, *(stage for _, stage in entries)]
+    held = _hold_out(stages, False, runner, report)
+    shown = [hold_out.hold_out_torques(stage) for stage in stages]
+    shown = held if None in shown else shown
+    reasons = _reasons_against(entries, held, shown)
+    if any(reasons) and held[0] is not None:  # withhold every part before a name is given up
+        reasons = _reasons_against(entries, _hold_out(stages, True, runner, report), shown)
+    count = next((k for k, reason in enumerate(reasons) if reason), len(entries))
+    d = _with_findings(d, entries[:count], reasons[count] if count < len(entries) else "")
+    gains = tuple(hold_out.hold_out_gain(a, b) for a, b in pairwise(shown[: 1 + count]))
+    total_gain = hold_out.hold_out_gain(shown[0], shown[count])
     before = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.before))
     after = residuals.mean_innovation_levels(residuals.residuals_of_logs(d.after)) if d.stages else before
     located = d.located
@@ -82,6 +78,68 @@ def assess(
         )
     return Assessment(
         d, total_gain, gains, before, after, tuple(dict.fromkeys(located)), separating_run.recommend_run(d)
+    )
+
+
+Entry = tuple[Finding, ExtendedFit]
+
+
+def _hold_out(
+    stages: Sequence[ExtendedFit], every_turn: bool, runner: CallRunner, report: ProgressCallback
+) -> list[HoldOutErrors | None]:
+    """Predict withheld stretches with each model, side by side."""
+    done = list[HoldOutErrors | None]()
+    report(0.0, "measuring the gain")
+    for errors in runner([partial(hold_out.hold_out_errors, s, every_turn) for s in stages]):
+        done.append(errors)
+        report(len(done) / (len(stages) + 1), "measuring the gain")
+    return done
+
+
+def _reasons_against(
+    entries: Sequence[Entry], held: Sequence[HoldOutErrors | None], shown: Sequence[HoldOutErrors | None]
+) -> list[str]:
+    """Say of each finding why it is not given. shown: hold-out errors that people see, by which corrections pay."""
+    return [
+        reason_against(f, s, *(pair if f.kind == "cause" else seen))
+        for (f, s), pair, seen in zip(entries, pairwise(held), pairwise(shown), strict=True)
+    ]
+
+
+def _with_findings(d: Diagnosis, entries: Sequence[Entry], reason: str) -> Diagnosis:
+    """Return the diagnosis with these findings only. reason: why the next one is not given, "" if all are."""
+    findings, stages = tuple(f for f, _ in entries), tuple(stage for _, stage in entries)
+    if stages == d.stages:
+        return replace(d, findings=findings)
+    if d.findings and not findings:  # back to the model without any
+        first = d.findings[0]
+        clean = d.before.exact and d.before.is_close and not anomaly_lines(d.before)
+        verdict = "clean" if clean else "unexplained"
+        nearest = None if clean else NearestEffect(first.name, first.share, (), reason)
+        return replace(
+            d,
+            verdict=verdict,
+            findings=(),
+            stages=(),
+            after=d.before,
+            share=1.0 if clean else 0.0,
+            nearest=nearest,
+            located=anomaly_lines(d.before),
+        )
+    after = stages[-1] if stages else d.before
+    share = sum(f.share for f in findings)
+    left = anomaly_lines(after)
+    verdict = d.verdict if share >= MIN_EXPLAINED_SHARE or not left else "unexplained"
+    kind = "correction" if verdict == "unexplained" else "cause"
+    return replace(
+        d,
+        verdict=verdict,
+        findings=tuple(replace(f, kind=kind) for f in findings),
+        stages=stages,
+        after=after,
+        share=share if findings else d.share,
+        located=left if findings else d.located,
+        nearest=None if findings else d.nearest,
     )
 
 
@@ -116,6 +174,8 @@ def _finding_row(f: Finding, g: HoldOutGain | None) -> dict[str, Any]:
     return {
         "effect": f.effect,
         "where": f.where,
+        "kind": f.kind,
+        "share_percent": 100 * f.share,
         "tied_with": list(f.tied_with),
         "p_value": f.p_value,
         "amount": f.magnitude,
@@ -135,16 +195,15 @@ def _interval_list(g: HoldOutGain | None) -> list[float] | None:
 def signal_table(a: Assessment) -> dict[str, dict[str, Any]]:
     """Tabulate hold-out errors [unit] and the systematic share of the innovations [%] by signal, before and after."""
     rows: dict[str, dict[str, Any]] = {}
-    for name in a.before:
-        rms_before, rms_after, unit = (
-            a.total_gain.signals[name] if a.total_gain and name in a.total_gain.signals else (np.nan, np.nan, "")
-        )
+    shown = a.total_gain.signals if a.total_gain else {}
+    for name in dict.fromkeys([*a.before, *shown]):
+        rms_before, rms_after, unit = shown.get(name, (np.nan, np.nan, ""))
         rows[name] = {
             "unit": unit,
             "rms_before": rms_before,
             "rms_after": rms_after,
-            "systematic_before_percent": a.before[name].systematic_percent,
-            "systematic_after_percent": a.after[name].systematic_percent,
+            "systematic_before_percent": a.before[name].systematic_percent if name in a.before else np.nan,
+            "systematic_after_percent": a.after[name].systematic_percent if name in a.after else np.nan,
         }
     return rows
 
@@ -202,17 +261,22 @@ def answer_text(a: Assessment) -> str:
     if d.verdict == "unexplained":
         text = f"{logs} a misfit that no known effect explains"
         if rows:
-            more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
-            first = describe_place(rows[0]["effect"], rows[0]["where"])
-            text += (
-                f"; {first}{more} would account for {100 * d.share:.0f} % of it, too little to be named as the cause"
+            taken = ", ".join(
+                f"{describe_place(r['effect'], r['where'])} of {format_magnitude(r)} takes {r['share_percent']:.0f} %"
+                for r in rows
             )
+            text += f"; as a correction, {taken} of it"
+            if a.total_gain:
+                change = _describe_change(a.total_gain.percent, a.total_gain.interval)
+                text += f", and the error on withheld stretches is {change}"
         elif d.nearest and (d.nearest.share >= MIN_NEAREST_SHARE or d.nearest.impossible):
             nearest = describe_place(*d.nearest.name.split("@"))
             text += f"; the nearest effect, {nearest}, explains {100 * d.nearest.share:.0f} % of it"
             if d.nearest.impossible:
                 values = ", ".join(d.nearest.impossible)
                 text += f", but then {values}, which no machine has (check the machine's dimensions)"
+            if d.nearest.reason:
+                text += f", but {d.nearest.reason}"
         return text + "."
     remark = ""
     if a.total_gain:
@@ -252,7 +316,7 @@ def machine_file(name: str, machine: Machine, d: Diagnosis) -> str | None:
     For a shipped machine the file holds only what is new; for a machine file it holds everything. Base parameters
     combine several parameters of the file and are left out.
     """
-    if not d.findings or d.verdict == "unexplained":
+    if not d.findings:
         return None
     found = [_effect_table(f) for f in d.findings]
     entries = [*map(_entry_table, machine.effect), *map(_entry_table, found)]

@@ -14,8 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.stats
 
-from excite import smoothing
+from excite import identification, smoothing
+from excite.diagnosis import selection
 from excite.diagnosis.fits import ExtendedFit
+from excite.logs import filtered_regression
+from excite.model import build, effects
+from excite.model.machine import Filter
 from excite.smoothing import Fit, NotConvergedError, predict_readings
 
 STRETCH_S = 2.0  # length of a withheld stretch [s]; chosen
@@ -26,13 +30,19 @@ FALLBACK_PROCESS_NOISE = 0.1, 1.0, 4.0  # levels for a wrong model that finds no
 BOOTSTRAP_DRAWS = 2000  # chosen
 
 
+OF_STRETCHES = "squares", "counts", "turn", "log_likelihood"  # fields with a row for each stretch
+LIKELIHOOD_LEVELS = 0.0, 0.1, 0.3, 1.0, 4.0, 16.0  # of process noise, the best of which a wrong model may have; chosen
+
+
 @dataclass(frozen=True)
 class HoldOutErrors:
     """Prediction errors of a model on withheld stretches.
 
     sensors (m): names and units. squares (stretches, m) [SI squared]: sums of squared errors. counts (stretches, m):
     number of readings. signal_variance (m,): mean variance of a signal within a stretch. noise_variance (m,): variance
-    of a reading. turn (stretches,): stretches of one turn are hidden at once.
+    of a reading. turn (stretches,): stretches of one turn are hidden at once. log_likelihood (stretches,): of the
+    readings of a stretch given all before them, with the parameters of the rest, by level of process noise
+    (stretches, LIKELIHOOD_LEVELS); NaN if there is none.
     """
 
     sensors: tuple[tuple[str, str], ...]
@@ -41,11 +51,12 @@ class HoldOutErrors:
     signal_variance: np.ndarray
     noise_variance: np.ndarray
     turn: np.ndarray
+    log_likelihood: np.ndarray
 
     def of(self, turns: np.ndarray) -> HoldOutErrors:
         """Keep the stretches of some turns only."""
         own = np.isin(self.turn, turns)
-        return replace(self, squares=self.squares[own], counts=self.counts[own], turn=self.turn[own])
+        return replace(self, **{x: getattr(self, x)[own] for x in OF_STRETCHES})
 
     def percent(self, draw: np.ndarray | None = None) -> float:
         """Return the error in per cent of the signals, each weighted by its noise.
@@ -85,8 +96,10 @@ class HoldOutGain:
     signals: Mapping[str, tuple[float, float, str]]
 
 
-def hold_out_errors(stage: ExtendedFit) -> HoldOutErrors | None:
+def hold_out_errors(stage: ExtendedFit, every_turn: bool = False) -> HoldOutErrors | None:
     """Predict withheld stretches of a fit's logs with its model.
+
+    every_turn: withhold every part of the logs once, not WANTED_STRETCHES only.
 
     The machine file's parameters are used if none were estimated. Return None if no fit to the rest is found or the
     logs are too short.
@@ -98,7 +111,7 @@ def hold_out_errors(stage: ExtendedFit) -> HoldOutErrors | None:
     per_turn = sum(len(_stretches(n, rate)) for n in lengths)
     if per_turn == 0:
         return None
-    turns = min(-(-WANTED_STRETCHES // per_turn), MAX_TURNS)
+    turns = MAX_TURNS if every_turn else min(-(-WANTED_STRETCHES // per_turn), MAX_TURNS)
     parts = []
     for turn in range(turns):
         stretches = [_stretches(n, rate, turn / turns) for n in lengths]
@@ -107,9 +120,57 @@ def hold_out_errors(stage: ExtendedFit) -> HoldOutErrors | None:
             parts.append(part)
     if not parts:
         return None
-    squares, counts, turn_of = (np.concatenate([getattr(p, x) for p in parts]) for x in ("squares", "counts", "turn"))
+    whole = {x: np.concatenate([getattr(p, x) for p in parts]) for x in OF_STRETCHES}
     motion, noise = (np.mean([getattr(p, x) for p in parts], axis=0) for x in ("signal_variance", "noise_variance"))
-    return HoldOutErrors(parts[0].sensors, squares, counts, motion, noise, turn_of)
+    return HoldOutErrors(parts[0].sensors, signal_variance=motion, noise_variance=noise, **whole)
+
+
+def hold_out_torques(stage: ExtendedFit, filter: Filter | None = None) -> HoldOutErrors | None:
+    """Predict the torques [N m or N] of withheld stretches by least squares on the other ones.
+
+    What a user of a machine without slips asks of a model, as positions drift in open loop. Every part of the logs is
+    withheld once. Return None for a machine with slips, or with an effect that least squares cannot find.
+    """
+    machine, n_u = stage.machine, len(stage.model.inputs)
+    filter = filter or machine.filter
+    for e in stage.model.effects:
+        machine = effects.with_effects(effects.without_effect(machine, e.name), selection.fitted_entry(stage, e.name))
+    model = build(machine)
+    sensed = any(e.name in model.nonlinear or e.effect.sensor_only for e in model.effects)
+    if model.slips or sensed:
+        return None
+    rows = list(model.actuated)
+    blocks = [(W[rows], Y[rows]) for W, Y in (filtered_regression(model, log, filter) for log in stage.data.logs)]
+    rate = float(machine.sampling_hz) / filter.decimation
+    whole = identification.fit_rows(model, blocks)
+    level = np.sqrt(sum(((Y - W @ whole) ** 2).sum(axis=1) for W, Y in blocks) / sum(Y.shape[1] for _, Y in blocks))
+    weighted = [(W / level[:, None, None], Y / level[:, None]) for W, Y in blocks]
+    squares, counts, motion, turns = [], [], [], []
+    for turn in range(MAX_TURNS):
+        stretches = [_stretches(Y.shape[1], rate, turn / MAX_TURNS) for _, Y in blocks]
+        seen = []
+        for (W, Y), own in zip(weighted, stretches, strict=True):
+            used = np.ones(Y.shape[1], bool)
+            for a, b in own:
+                used[a:b] = False
+            seen.append((W[:, used], Y[:, used]))
+        X = identification.fit_rows(model, seen)
+        for (W, Y), own in zip(blocks, stretches, strict=True):
+            for a, b in own:
+                squares.append(((Y[:, a:b] - W[:, a:b] @ X) ** 2).sum(axis=1))
+                counts.append(np.full(n_u, b - a))
+                motion.append((Y[:, a:b] ** 2).mean(axis=1))
+                turns.append(turn)
+    if not squares:
+        return None
+    names = tuple(
+        next((s.name, machine.si_unit(s)) for s in machine.sensor if s.kind == "torque" and s.body == b.index)
+        for b in machine.actuated
+    )
+    likelihood = np.full((len(squares), 1), np.nan)
+    return HoldOutErrors(
+        names, np.array(squares), np.array(counts), np.mean(motion, axis=0), level**2, np.array(turns), likelihood
+    )
 
 
 def _errors_of_turn(
@@ -157,10 +218,47 @@ def _errors_of_turn(
             counts.append(valid.sum(axis=0))
             motion.append(h[a:b].var(axis=0))
     sensors = tuple((s.name, space.model.machine.si_unit(s)) for s in space.sensors)
-    turn_of = np.full(len(squares), turn)
     return HoldOutErrors(
-        sensors, np.array(squares), np.array(counts), np.mean(motion, axis=0), np.mean(noise, axis=0), turn_of
+        sensors,
+        np.array(squares),
+        np.array(counts),
+        np.mean(motion, axis=0),
+        np.mean(noise, axis=0),
+        np.full(len(squares), turn),
+        _likelihood_of_stretches(stage, rest, stretches),
     )
+
+
+def _likelihood_of_stretches(
+    stage: ExtendedFit, rest: Fit, stretches: Sequence[Sequence[tuple[int, int]]]
+) -> np.ndarray:
+    """Return the log-likelihood (stretches, levels) with the parameters of a fit, for each level of process noise.
+
+    Every reading counts given those before it, by the innovations of a filter along all readings. A model that explains
+    the logs has no process noise.
+    """
+    data = stage.data
+    found = np.full((sum(len(own) for own in stretches), len(LIKELIHOOD_LEVELS)), np.nan)
+    for k, level in enumerate(LIKELIHOOD_LEVELS):
+        if level > 0 and rest.process_noise == 0 and stage.is_close:
+            break
+        try:
+            linear = smoothing.linearise_logs(
+                data.space, data.measurements, rest.trajectories, data.starts, rest.X, level
+            )
+        except np.linalg.LinAlgError:
+            continue
+        if linear is None:
+            continue
+        likelihood = []
+        for x, own in zip(linear, stretches, strict=True):
+            variance = np.ones_like(x.residual)
+            for step in x.filter:
+                variance[step.samples] = step.variance
+            each = -0.5 * (x.innovations**2 + np.log(variance))
+            likelihood += [float(np.nansum(each[a:b])) for a, b in own]
+        found[:, k] = likelihood
+    return found
 
 
 def hold_out_gain(before: HoldOutErrors | None, after: HoldOutErrors | None, seed: int = 0) -> HoldOutGain | None:
@@ -187,6 +285,46 @@ def hold_out_gain(before: HoldOutErrors | None, after: HoldOutErrors | None, see
         interval,
         {name: (rms_before[name][0], rms_after[name][0], rms_before[name][1]) for name in rms_before},
     )
+
+
+@dataclass(frozen=True)
+class PredictiveGain:
+    """Gain in log-likelihood of withheld data, with the lower end of its 95 % interval."""
+
+    total: float
+    low: float
+
+
+def predictive_gain(
+    before: HoldOutErrors | None, after: HoldOutErrors | None, dispersion: float | None
+) -> PredictiveGain | None:
+    """Compare the predictive log-likelihoods of two models on the stretches that both predict; None if there are none.
+
+    dispersion: of a model that explains the logs, its mean squared innovation. A sum of log-likelihood ratios with mean
+    m has the variance 2 m then (Gaussian innovations), however unevenly the stretches show an effect. Without it, the
+    variance is that from stretch to stretch.
+    """
+    if before is None or after is None:
+        return None
+    common = np.intersect1d(before.turn, after.turn)
+    each = _at_best_level(after.of(common)) - _at_best_level(before.of(common))
+    each = each[np.isfinite(each)]
+    n = len(each)
+    if n < 2:
+        return None
+    total = float(each.sum())
+    if dispersion is not None:
+        std, quantile = dispersion * np.sqrt(2 * abs(total)), float(scipy.stats.norm.ppf(0.975))
+    else:
+        std, quantile = np.sqrt(n) * float(each.std(ddof=1)), float(scipy.stats.t.ppf(0.975, n - 1))
+    return PredictiveGain(total, total - quantile * std)
+
+
+def _at_best_level(errors: HoldOutErrors) -> np.ndarray:
+    """Return the log-likelihood (stretches,) with the process noise that suits a model best."""
+    total = errors.log_likelihood.sum(axis=0)
+    best = int(np.nanargmax(total)) if np.isfinite(total).any() else 0
+    return errors.log_likelihood[:, best]
 
 
 def _stretches(samples: int, rate: float, shift: float = 0.0) -> Sequence[tuple[int, int]]:

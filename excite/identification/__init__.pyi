@@ -9,6 +9,7 @@ from .joint import (
     find_suspect_sensors as find_suspect_sensors,
     shows_sticking as shows_sticking,
 )
+from .linear_methods import fit_rows as fit_rows
 from .methods import (
     METHODS as METHODS,
     add_bias as add_bias,

@@ -218,6 +218,19 @@ def least_squares(model: Model, W: np.ndarray, Y: np.ndarray, method: str) -> Es
     return estimate_with_white_noise(model, blocks, solve_blocks(blocks, model.scale), method)
 
 
+def fit_rows(model: Model, blocks: Sequence[Block]) -> np.ndarray:
+    """Solve least squares on rows; return X (n_base,), the machine file's values where the rows do not show them.
+
+    Raises NotIdentifiableError.
+    """
+    solution = solve_blocks(blocks, model.scale)
+    x = restore_tied_parameters(model, blocks, solution, solution.x)
+    shown = [*solution.kept, *solution.tied]
+    found = model.nominal.copy()
+    found[shown] = x[shown]
+    return found
+
+
 def solve_blocks(blocks: Sequence[Block], scale: np.ndarray | None = None) -> Solution:
     """Solve least squares on all rows of all logs, with parameters of size `scale` (n_base,).
 

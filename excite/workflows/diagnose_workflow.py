@@ -85,8 +85,10 @@ def diagnose(
                 model, prepared.logs, prepared.filter, report_share(0.0, DIAGNOSE_SHARE), run_forked
             )
         title = model.machine.title
-        drawings = reports.figure_calls(place, found, title)
-        account = diagnosis.assess(found, report_share(DIAGNOSE_SHARE, 1.0), run_forked, drawings)
+        account = diagnosis.assess(found, report_share(DIAGNOSE_SHARE, 1.0), run_forked)
+        found = account.diagnosis
+        for _ in run_forked(reports.figure_calls(place, found, title)):
+            pass
         text = diagnosis.machine_file(machine, model.machine, found)
         if text is not None:
             (place / MACHINE).write_text(text, encoding="utf-8")

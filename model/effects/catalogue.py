@@ -7,12 +7,14 @@ one entry to `CATALOGUE`. A shape has a default for simulation and a grid of tri
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import pi
 
 import casadi as ca
 
 from excite.model.effects import friction, ground_map, sizes, soil
 from excite.model.effects.effect import Channel, Effect, Memory, SampleView, Shape, Site, Values
+from excite.model.machine import Body
 
 TORQUE_SMOOTHING = 0.004  # share of a joint's large torque over which the torque's sign turns; chosen
 EDGE_TIME = 0.2  # s, duration of the start and end of a temporary effect; chosen
@@ -144,6 +146,12 @@ def _declare(*effects: Effect) -> None:
         CATALOGUE[e.name] = e
 
 
+def _contact_radius(body: Body) -> float:
+    """Return the radius of a contact [m]."""
+    assert body.contact is not None
+    return float(body.contact.radius)
+
+
 _declare(
     # Friction
     Effect(
@@ -173,6 +181,7 @@ _declare(
         },
         extra_trials=friction.bristle_trials,
         torque=friction.stribeck,
+        opposes_motion=True,
         memory={"bent": Memory(friction.bristle_rate, 1.0, form=("bristles", 1.0))},
     ),
     Effect(
@@ -200,6 +209,7 @@ _declare(
         "friction larger where the torque is large, at the same speed",
         "Dohring et al. 1993; Linderoth et al. 2013, load-dependent Coulomb friction",
         sizes.constant(0.05),
+        opposes_motion=True,
         torque=lambda s, k, p: -p["A"] * ca.sqrt(s.u[k] ** 2 + (TORQUE_SMOOTHING * s.large_torque[k]) ** 2) * s.sign(k),
     ),
     Effect(
@@ -622,8 +632,72 @@ _declare(
             ),
             "power": Shape("-", 2.0, (2.0,)),
         },
+        opposes_motion=True,
         torque=_stop_torque,
         extra_trials=_one_sided_stops,
+    ),
+    # Errors of the machine file
+    Effect(
+        "contact_radius",
+        ("contacts",),
+        "m",
+        "the true radius of the contact is A larger than the machine file's",
+        "slip where there is none, with the direction of travel",
+        "Wong, Theory of Ground Vehicles, 4th ed., 2008: rolling radius",
+        sizes.constant(0.002),
+        extra_radius=lambda s, k, p: p["A"],
+        file_value=_contact_radius,
+    ),
+    Effect(
+        "contact_position",
+        ("contacts",),
+        "m",
+        "the contact lies A ahead of its place in the machine file",
+        "a lateral force proportional to the yaw rate",
+        "kinematics of the contact's middle, V_y + A theta'",
+        sizes.constant(0.005),
+        soil=soil.ahead,
+    ),
+    Effect(
+        "contact_alignment",
+        ("contacts",),
+        "rad",
+        "the contact is turned by A about z against its chassis: a skewed axle",
+        "a lateral force with the direction of travel",
+        "Wong, Theory of Ground Vehicles, 4th ed., 2008: toe angle",
+        sizes.constant(0.002),
+        soil=soil.turned,
+    ),
+    Effect(
+        "turning_moment",
+        ("contacts",),
+        "-",
+        "the moment T_z against turning is larger by the factor 1 + A: a contact of another effective width",
+        "a moment against turning",
+        "paper (25)",
+        sizes.constant(0.05),
+        soil=lambda s, k, p, own: replace(own, yaw=(1 + p["A"]) * own.yaw),
+    ),
+    Effect(
+        "encoder_scale",
+        ("contacts",),
+        "-",
+        "the encoder reads 1 + A times the angle: its counts per turn, or a gear",
+        "slip where there is none, proportional to speed",
+        "counts per turn of the encoder's data sheet",
+        sizes.constant(0.001),
+        reading=lambda s, exact, k, p: p["A"] * exact,
+    ),
+    Effect(
+        "measuring_wheel_position",
+        ("wheels",),
+        "m",
+        "the measuring wheel rolls A further to the left than the machine file says",
+        "a difference between the measuring wheels proportional to the yaw rate",
+        "paper (32)",
+        sizes.constant(0.005),
+        memory={"turned": Memory(lambda s, k, p: s.yaw_rate[k], 1e-6)},
+        reading=lambda s, exact, k, p: -p["A"] * s.z["turned"] / s.wheel_radius,
     ),
     # Sensors
     Effect(

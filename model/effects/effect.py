@@ -44,7 +44,11 @@ class ContactMotion:
 
 @dataclass(frozen=True)
 class Soil:
-    """Arguments of a contact's force law: slips, yaw rate [rad/s], Kx, Ky [N], saturations (None: linear)."""
+    """Arguments of a contact's force law: slips, yaw rate [rad/s], Kx, Ky [N], saturations (None: linear).
+
+    ahead [m]: the force acts so far ahead of the contact's place in the machine file. turned [rad]: its axes are turned
+    by so much against its chassis.
+    """
 
     slip: mechanics.Slip
     yaw: ca.SX
@@ -52,6 +56,8 @@ class Soil:
     Ky: ca.SX
     saturation: mechanics.Saturation | None = None
     lateral: mechanics.Saturation | None = None
+    ahead: ca.SX | float = 0.0
+    turned: ca.SX | float = 0.0
 
     def wrench(self, on: Contact) -> mechanics.Wrench:
         """Return forces and moment on a contact."""
@@ -67,7 +73,8 @@ class SampleView:
     friction [N m]: Fv w + Fs sgn w; coulomb [N m]: Fs.
     friction_smoothing [rad/s]: rate over which sgn turns; large_torque [N m]: see `sizes.large_torque`.
     contacts: motion of each contact.
-    forward_speed [m/s]: V_x of a body's origin in its own axes.
+    forward_speed [m/s]: V_x of a body's origin in its own axes. yaw_rate [rad/s]: of a body.
+    wheel_radius [m]: of the measuring wheel that the effect acts on, 1 for others.
     time [s]: since the log began.
     z: memory states of this effect by name; zero for those of a form that it does not have.
     passes (MAX_PASSES,): shares of a contact's width passed over at least 1, 2, ... times (`GroundMap`); zero for an
@@ -83,7 +90,9 @@ class SampleView:
     large_torque: Mapping[int, float]
     contacts: Mapping[int, ContactMotion]
     forward_speed: Mapping[int, ca.SX]
+    yaw_rate: Mapping[int, ca.SX]
     time: ca.SX
+    wheel_radius: float = 1.0
     z: Mapping[str, ca.SX] = field(default_factory=dict)
     passes: Mapping[int, ca.SX] = field(default_factory=dict)
 
@@ -200,6 +209,7 @@ class Effect:
     reading: error of a sensor; channel: of a torque sensor over time.
     recoil: the shape that gives the share of `inertia` due to a load that slides along x and pushes its body back.
     shaking: 0 to 1 over time, while the torque sensor shakes; without shaking something else acts.
+    file_value: the value of the machine file that the magnitude corrects, for an effect that is an error of the file.
     """
 
     name: str
@@ -229,6 +239,7 @@ class Effect:
     map_form: Form | None = None
     timed: bool = False
     angle_only: bool = False
+    file_value: Callable[[Body], float] | None = None
 
     @property
     def sensor_only(self) -> bool:

@@ -71,3 +71,16 @@ def resistance(s: SampleView, k: int, p: Values) -> tuple[ca.SX, ca.SX]:
     """Return forces along and across the contact [N] against its motion along its chassis."""
     r = s.contacts[k]
     return -p["A"] * (1 + p["rise"] * r.Vx**2) * ca.tanh(r.Vx / p["soft"]), ca.SX(0)
+
+
+def ahead(s: SampleView, k: int, p: Values, soil: Soil) -> Soil:
+    """Let a contact lie A ahead of its place: the lateral slip is that there, and the force acts there."""
+    slip = replace(soil.slip, gy=soil.slip.gy + p["A"] * s.contacts[k].yaw / soil.slip.vn)
+    return replace(soil, slip=slip, ahead=p["A"])
+
+
+def turned(s: SampleView, k: int, p: Values, soil: Soil) -> Soil:
+    """Turn a contact by the small angle A against its chassis, slips and forces."""
+    along = s.contacts[k].Vx / soil.slip.vn
+    slip = replace(soil.slip, gx=soil.slip.gx + p["A"] * soil.slip.gy, gy=soil.slip.gy - p["A"] * along)
+    return replace(soil, slip=slip, turned=p["A"])

@@ -1,0 +1,46 @@
+"""Accept a finding that predicts withheld data, is significant beside slow unknown forces and has a possible sign."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from excite.diagnosis.diagnosis import Finding
+from excite.diagnosis.fits import ExtendedFit
+from excite.diagnosis.hold_out import HoldOutErrors, hold_out_gain, predictive_gain
+from excite.diagnosis.slow_forces import allow_slow_forces
+from excite.smoothing import NotConvergedError
+
+MIN_STDS = 2.0  # magnitude over its standard deviation, of a finding; chosen
+
+
+def widen(finding: Finding, stage: ExtendedFit) -> Finding:
+    """Enlarge a magnitude's standard deviation to that beside slow unknown forces, if the fit leaves such."""
+    try:
+        beside = allow_slow_forces(stage)
+    except (np.linalg.LinAlgError, NotConvergedError):
+        return finding
+    k = stage.model.base.names.index(finding.name)
+    shift, std = abs(beside.X[k] - stage.fit.X[k]), beside.std[k]
+    if not np.isfinite(std) or stage.fit.unidentifiable[k]:
+        return finding
+    return replace(finding, magnitude_std=float(max(finding.magnitude_std, np.hypot(std, shift))))
+
+
+def reason_against(
+    finding: Finding, stage: ExtendedFit, before: HoldOutErrors | None, after: HoldOutErrors | None
+) -> str:
+    """Say why a finding is not given, "" if it is."""
+    effect = stage.placed(finding.name).effect
+    if effect.opposes_motion and finding.magnitude < 0:
+        return "its sign is impossible"
+    if not abs(finding.magnitude) > MIN_STDS * finding.magnitude_std:
+        return f"its size is uncertain ({finding.magnitude:.3g} +- {finding.magnitude_std:.2g} {finding.unit})"
+    if finding.kind == "cause":
+        gain = predictive_gain(before, after, stage.dispersion)
+        return "" if gain is None or gain.low > 0 else "it does not predict withheld data better"
+    shown = hold_out_gain(before, after)
+    if shown is None or shown.interval is None:
+        return "no data could be withheld to test it"
+    return "" if shown.interval[0] > 0 else "it does not predict withheld data better"

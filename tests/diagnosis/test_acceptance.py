@@ -1,0 +1,124 @@
+"""A name must pay: on withheld data, beside slow unknown forces, with a possible sign; errors of the file are named."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.files import SHARED
+
+import excite
+from excite.diagnosis import findings, fits, hold_out, selection, slow_forces
+from excite.logs import examine, from_table
+from excite.model import build, effects
+from excite.model.machine import load_machine
+
+R60 = Path(__file__).parents[2] / "results" / "R60_accuracy" / "design" / "profile.csv"
+
+
+def errors(log_likelihood: list[float]) -> hold_out.HoldOutErrors:
+    n = len(log_likelihood)
+    ones = np.ones((n, 1))
+    likelihood = np.array(log_likelihood)[:, None]
+    return hold_out.HoldOutErrors((("q", "rad"),), ones, ones, np.ones(1), np.ones(1), np.zeros(n), likelihood)
+
+
+def test_predictive_gain_of_noise_is_not_above_zero() -> None:
+    rng = np.random.default_rng(0)
+    low = [
+        hold_out.predictive_gain(errors([0.0] * 20), errors(list(rng.normal(-0.1, 1, 20))), None) for _ in range(200)
+    ]
+    assert np.mean([g is not None and g.low > 0 for g in low]) < 0.05
+
+
+def test_one_strong_stretch_counts_if_the_model_explains_the_log() -> None:
+    """An effect that acts once, such as a stop that is touched: its likelihood ratio is no chance."""
+    gained = [0.0] * 19 + [200.0]
+    explained = hold_out.predictive_gain(errors([0.0] * 20), errors(gained), 1.0)
+    scattered = hold_out.predictive_gain(errors([0.0] * 20), errors(gained), None)
+    assert explained is not None
+    assert scattered is not None
+    assert explained.low > 100
+    assert scattered.low < 0
+
+
+def file_with(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "true.toml"
+    path.write_text(f'extends = "va12"\nname = "true"\n{text}')
+    return path
+
+
+@pytest.mark.parametrize(
+    ("wrong", "name", "amount"),
+    [
+        (
+            '[body.rear_axle_frame]\nd = { value = -1.755, source = "measured" }\n',
+            "contact_position@rear_roll",
+            -0.005,
+        ),
+        pytest.param(
+            '[sensor.thetal]\nlateral = { value = 1.255, source = "measured" }\n',
+            "measuring_wheel_position@measuring_wheel_left",
+            0.005,
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            '[body.rear_roll.contact]\nradius = { value = 0.651, source = "measured" }\n',
+            "contact_radius@rear_roll",
+            0.001,
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_a_wrong_length_in_the_machine_file_is_named(tmp_path: Path, wrong: str, name: str, amount: float) -> None:
+    """A roll 1 mm larger looks like a rolling resistance that drives, and like another scale of its encoder."""
+    log = excite.simulate(file_with(tmp_path, wrong), R60, seed=1)
+    d = excite.diagnose("va12", log).diagnosis
+    assert d.verdict in ("named", "tied")
+    (f,) = d.findings
+    assert name in (f.name, *f.tied_with)
+    assert not any("rolling_resistance" in x for x in (f.name, *f.tied_with))
+    if f.name == name:
+        assert abs(f.magnitude - amount) < 2 * f.magnitude_std < 0.2 * abs(amount)
+
+
+def test_slow_forces_leave_a_true_effect_its_significance_and_take_that_of_a_false_one() -> None:
+    """A torque offset that drifts steadily, and a slow unknown torque that a steady drift explains in part."""
+    straight = build(load_machine("va12_straight"))
+    t = np.arange(0, 40, 0.01)
+    torque = np.column_stack([1500 * np.sin(0.5 * t), 1300 * np.sin(0.5 * t + 0.4)])
+    true = excite.simulate(straight, torque, seed=3, effects=["torque_offset_drift@front_roll=1.5"])
+    pulled = torque.copy()
+    pull = 40 * np.cos(2 * np.pi * t / 50)  # not measured
+    pulled[:, 0] += pull
+    false = excite.simulate(straight, pulled, seed=3)
+    false["u1_Nm"] -= pull
+    entry = selection.identified_entry("torque_offset_drift", "front_roll", 1.0, {"slowing": 0.0})
+    extended = effects.with_effects(straight.machine, entry)
+    z = {}
+    for name, table in (("true", true), ("false", false)):
+        log = examine(straight.machine, from_table(table, straight.machine, source=name)).log
+        stage = fits.fit_machine(extended, [log], straight.machine.filter)
+        beside = slow_forces.allow_slow_forces(stage)
+        k = stage.model.base.names.index("torque_offset_drift@front_roll")
+        z[name] = beside.X[k] / beside.std[k], stage.fit.X[k] / stage.fit.std[k]
+    assert z["true"][0] > 0.7 * z["true"][1]
+    assert abs(z["false"][0]) < 0.2 * abs(z["false"][1])
+
+
+@pytest.mark.skipif(not (SHARED / "emps").is_dir(), reason="needs ../shared/data/emps")
+def test_emps_gets_direction_dependent_friction_as_a_correction() -> None:
+    """No effect explains EMPS' log as a whole; viscous friction that depends on the direction predicts forces better.
+
+    Its authors found the same: A. Janot, M. Gautier, M. Brunot, 2019.
+    """
+    a = excite.diagnose("emps", SHARED / "emps" / "DATA_EMPS.mat")
+    summary = findings.summarise(a)
+    assert summary["verdict"] == "unexplained"
+    (f,) = summary["findings"]
+    assert (f["effect"], f["where"], f["kind"]) == ("asymmetric_viscous", "carriage", "correction")
+    assert 20 < f["share_percent"] < 60
+    assert summary["gain_percent"] > 20
+    assert summary["gain_ci95"][0] > 10
+    assert summary["error_after_percent"] < 3.5
+    assert set(summary["signals"]) == {"q1", "u1"}
+    assert summary["located"]
