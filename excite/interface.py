@@ -62,6 +62,7 @@ def design(
     *,
     duration: float | None = None,
     sigma_max: float | None = None,
+    cond_slack: float = 12.0,
     robust: bool = False,
     starts: int = 2,
     seed: int = 0,
@@ -74,6 +75,7 @@ def design(
     objective: a name of `excite.trajectories.OBJECTIVES`.
     duration [s]: length of the drive, if not the problem's.
     sigma_max [%]: bound on the largest attainable standard deviation.
+    cond_slack [%]: with objective cond, by how much cond(Phi) may grow for the most accurate drive; 0 for the lowest.
     robust: design for machines up to 20 % off the nominal one.
     starts, seed: starting guesses and their random seed.
     budget [s]: time after which the search stops.
@@ -85,7 +87,7 @@ def design(
     workflows.require_objective(objective, model.machine)
     workflows.require_positive("sigma_max", sigma_max, "%")
     workflows.require_positive("budget", budget, "s")
-    request = DesignRequest(objective, sigma_max, robust, (), starts, seed, budget)
+    request = DesignRequest(objective, sigma_max, robust, (), starts, seed, budget, cond_slack=cond_slack)
     return workflows.design_from(model, chosen, request, progress).design
 
 

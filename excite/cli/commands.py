@@ -17,6 +17,7 @@ from excite.cli.options import (
     AfterOption,
     BudgetOption,
     CommandWithChoices,
+    CondSlackOption,
     DesignArgument,
     DurationOption,
     JsonOption,
@@ -130,6 +131,7 @@ def design(
     duration: DurationOption = None,
     objective: ObjectiveOption = "cond",
     sigma_max: SigmaMaxOption = None,
+    cond_slack: CondSlackOption = 12.0,
     robust: RobustOption = False,
     after: AfterOption = None,
     between: Annotated[
@@ -163,7 +165,9 @@ def design(
     if phase_min != 3.0 and not driver:
         raise UsageError("--phase-min needs --driver as well")
     earlier, pair = tuple(after or ()), tuple(between or ())
-    request = DesignRequest(objective, sigma_max, robust, earlier, starts, seed, budget, pair, driver, phase_min)
+    request = DesignRequest(
+        objective, sigma_max, robust, earlier, starts, seed, budget, pair, driver, phase_min, cond_slack
+    )
     out = out or Path(f"results/design-{workflows.machine_stem(machine)}")
     with _result(out, json, partial(terminal.show, "design"), [*_machine_file(machine), *(after or [])]) as (
         place,
@@ -230,6 +234,7 @@ def run(
     duration: DurationOption = None,
     objective: ObjectiveOption = "cond",
     sigma_max: SigmaMaxOption = None,
+    cond_slack: CondSlackOption = 12.0,
     robust: RobustOption = False,
     starts: StartsOption = 2,
     seed: SeedOption = 0,
@@ -257,7 +262,7 @@ def run(
     with _result(out, json, describe, _machine_file(machine)) as (place, summary):
         designed = place / "design"
         designed.mkdir()
-        request = DesignRequest(objective, sigma_max, robust, (), starts, seed, budget)
+        request = DesignRequest(objective, sigma_max, robust, (), starts, seed, budget, cond_slack=cond_slack)
         first = workflows.design(designed, machine, problem, duration, request, terminal.bar)
         if not first["complete"] and budget is None:
             raise KeyboardInterrupt

@@ -69,6 +69,15 @@ ObjectiveOption = Annotated[
     str, typer.Option("--objective", help="property of the drive to minimise", autocompletion=names("objective"))
 ]
 StartsOption = Annotated[int, typer.Option("--starts", min=1, help="number of starting guesses of the search")]
+CondSlackOption = Annotated[
+    float,
+    typer.Option(
+        "--cond-slack",
+        min=0,
+        help="with objective cond: find the most accurate drive whose cond(Phi) is at most this many per cent above the"
+        " lowest one; 0 for the lowest",
+    ),
+]
 SigmaMaxOption = Annotated[
     float | None,
     typer.Option(

@@ -110,6 +110,13 @@ def describe_design(s: Summary) -> Description:
     remarks = [
         f"Condition number of Phi {s['cond_phi']:.4g}, of W {s['cond_w']:.4g}; best start {s['cond_phi_start']:.4g}."
     ]
+    lowest = s.get("lowest_cond")
+    if lowest:
+        remarks.append(
+            f"The lowest cond(Phi) found is {lowest['cond_phi']:.4g}, with {lowest['worst_parameter']} to"
+            f" {format_percent(lowest['worst_percent'])}; this drive is the most accurate one within"
+            f" {s['cond_slack_percent']:g} % of it (`--cond-slack 0` gives the other)."
+        )
     if not s["complete"]:
         remarks.append("Cut short: this is the best drive so far, more time may find a better one.")
     if s.get("advice"):

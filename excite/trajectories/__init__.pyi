@@ -6,6 +6,7 @@ from .baselines import (
     compare as compare,
 )
 from .composite_objective import (
+    COND_MAX as COND_MAX,
     CompositeObjective as CompositeObjective,
     calibrate_surrogates as calibrate_surrogates,
     compose_objective as compose_objective,

@@ -30,6 +30,7 @@ from excite.trajectories.objective import (
 CEILING_PRICE = 30.0  # price of a log variance above a ceiling, per unit; chosen
 CEILING_WIDTH = 0.01  # log variance over which that hinge is rounded; chosen
 SIGMA_MAX = "sigma-max"  # name of the ceiling among the violations of a drive
+COND_MAX = "cond-max"  # the same of a largest condition number
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,8 @@ class CompositeObjective:
 
     row_weights (n_blocks, n_rows) [1/SI]: factors of the regressor's rows. scale (n_base,) [SI]. sigma_max [%]: bound
     on the Cramer-Rao standard deviation of the least accurate parameter. prior (n_base, n_base), in the scale.
-    machines: machines that the drive is for, one term each; empty for the nominal machine alone.
+    machines: machines that the drive is for, one term each; empty for the nominal machine alone. cond_max: bound on
+    cond(Phi).
     """
 
     name: str
@@ -68,6 +70,7 @@ class CompositeObjective:
     sigma_max: float | None = None
     prior: np.ndarray | None = None
     machines: tuple[Model, ...] = ()
+    cond_max: float | None = None
 
 
 def compose_objective(
@@ -76,6 +79,7 @@ def compose_objective(
     sigma_max: float | None = None,
     prior: np.ndarray | None = None,
     machines: Sequence[Model] = (),
+    cond_max: float | None = None,
 ) -> CompositeObjective:
     """Build the objective of a design from a name and the requirements beside it.
 
@@ -84,6 +88,7 @@ def compose_objective(
     prior (n_base, n_base) [1/SI^2]: information from earlier logs. What the machine file calls known adds to it, but
         not in a condition number, which is of the regressor.
     machines: possible machines, whose scores are averaged; the model alone by default.
+    cond_max: bound on cond(Phi).
 
     Raises KeyError for an unknown objective and ValueError for a bad prior or sigma_max.
     """
@@ -118,9 +123,14 @@ def compose_objective(
             Term("worst", reference_values(m) / model.scale, 1, CEILING_PRICE / len(every), total, ceiling)
             for m in every
         ]
+    if cond_max is not None:
+        ceiling = 2 * float(np.log(cond_max))
+        terms += [Term("cond", m.scale / model.scale, 0, CEILING_PRICE / len(every), known, ceiling) for m in every]
     used = sorted({t.block for t in terms})
     terms = [replace(t, block=used.index(t.block)) for t in terms]
-    return CompositeObjective(objective, tuple(terms), rows[used], model.scale, sigma_max, known, tuple(machines))
+    return CompositeObjective(
+        objective, tuple(terms), rows[used], model.scale, sigma_max, known, tuple(machines), cond_max
+    )
 
 
 def _with_known(model: Model, prior: np.ndarray | None) -> np.ndarray | None:

@@ -18,7 +18,7 @@ from excite.model.machine import Machine, Problem
 from excite.simulation import Motion, simulate, track_motion
 from excite.trajectories import composite_objective, interior_point, objective as objectives
 from excite.trajectories.collocation import Transcription, solve_states, transcribe
-from excite.trajectories.composite_objective import SIGMA_MAX, CompositeObjective
+from excite.trajectories.composite_objective import COND_MAX, SIGMA_MAX, CompositeObjective
 from excite.trajectories.excitation import Manoeuvre, knot_times, multisine, scale_torques
 from excite.trajectories.limits import (
     REST_POSITION,
@@ -354,7 +354,7 @@ def _run_stage(
                 replace(state, surrogate_ratio=careful),
                 composite_objective.calibrate_surrogates(objective, careful),
             )
-    wanted = composite_objective.lower_ceilings(wanted, margins.get(SIGMA_MAX, 0.0))
+    wanted = composite_objective.lower_ceilings(wanted, max(margins.get(x, 0.0) for x in (SIGMA_MAX, COND_MAX)))
     times = knot_times(problem, stage.coarse)
     intervals = len(times) - 1
     softer = widen_transitions(model, stage.friction, stage.slip)
@@ -487,6 +487,8 @@ def evaluate_drive(
     judged = composite_objective.score_motions(objective, motions)
     if objective.sigma_max is not None:
         violations[SIGMA_MAX] = max(0.0, judged.worst_percent / objective.sigma_max - 1)
+    if objective.cond_max is not None:
+        violations[COND_MAX] = max(0.0, objectives.cond_phi(model, motion) / objective.cond_max - 1)
     return ScoredDrive(drive, start, judged.score, violations), motion
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from excite import identification, logs, operator, simulation, text as wording, trajectories
-from excite.errors import MachineError
+from excite.errors import InfeasibleError, MachineError
 from excite.model import Model, build, effects
 from excite.model.machine import EffectEntry, Problem
 from excite.operator import PhasedDrive
@@ -39,6 +39,7 @@ class DesignRequest:
     budget_s [s]: time after which the search stops.
     between: two effects, NAME[@WHERE]=MAGNITUDE, that the drive must separate.
     driver: design for people, in phases of phase_min_s [s] or more.
+    cond_slack [%]: with objective cond, by how much cond(Phi) may grow for the most accurate drive; 0 for the lowest.
     """
 
     objective: str = "cond"
@@ -51,6 +52,13 @@ class DesignRequest:
     between: tuple[str, ...] = ()
     driver: bool = False
     phase_min_s: float = 3.0
+    cond_slack: float = 12.0
+
+    @property
+    def second_step(self) -> bool:
+        """True if the drive of lowest cond(Phi) is made more accurate within `cond_slack`."""
+        plain = self.sigma_max is None and not (self.robust or self.between or self.driver)
+        return self.objective == "cond" and self.cond_slack > 0 and plain
 
 
 @dataclass(frozen=True)
@@ -59,12 +67,14 @@ class DesignResult:
 
     model: with `after`, its nominal values are the estimate from the logs.
     phased: the phases of a design for people; `design` is then the motion of a steady driver.
+    first: the drive of lowest cond(Phi), if `design` is the most accurate one near it.
     """
 
     model: Model
     aim: CompositeObjective
     design: Design
     phased: PhasedDrive | None = None
+    first: Design | None = None
 
 
 def add_rival_effects(model: Model, between: tuple[str, ...], duration: float) -> Model:
@@ -129,9 +139,11 @@ def design_from(
     )
     aim = trajectories.compose_objective(model, request.objective, request.sigma_max, prior, machines)
     if not request.driver:
-        return DesignResult(
-            model, aim, design(model, problem, aim, request.starts, request.seed, request.budget_s, progress)
-        )
+        budget = request.budget_s if not request.second_step or request.budget_s is None else request.budget_s / 2
+        lowest = design(model, problem, aim, request.starts, request.seed, budget, progress)
+        if not request.second_step:
+            return DesignResult(model, aim, lowest)
+        return _make_accurate(model, problem, request, aim, lowest, prior, budget, progress)
     begin = time.time()
     half = None if request.budget_s is None else request.budget_s / 2
     free = design(model, problem, aim, request.starts, request.seed, half, progress)
@@ -143,6 +155,35 @@ def design_from(
         model, problem, aim, free.motion, request.phase_min_s, request.seed, out_of_time, progress
     )
     return DesignResult(model, aim, operator.as_design(model, problem, free, made), made)
+
+
+def _make_accurate(
+    model: Model,
+    problem: Problem,
+    request: DesignRequest,
+    aim: CompositeObjective,
+    lowest: Design,
+    prior: np.ndarray | None,
+    budget: float | None,
+    progress: Callable[[int, int, float], None] | None,
+) -> DesignResult:
+    """Find the most accurate drive (worst parameter) whose cond(Phi) is within `cond_slack` of the lowest one."""
+    cond_max = (1 + request.cond_slack / 100) * lowest.cond_phi
+    near = trajectories.compose_objective(model, "worst", prior=prior, cond_max=cond_max)
+    try:
+        accurate = design(model, problem, near, 0, request.seed, budget, None, [lowest.manoeuvre])
+    except (InfeasibleError, KeyboardInterrupt):
+        return DesignResult(model, aim, lowest)
+    complete = lowest.complete and accurate.complete
+    found = replace(
+        accurate,
+        objective=lowest.objective,
+        cond_phi_start=lowest.cond_phi_start,
+        scores=lowest.scores,
+        complete=complete,
+        violations={n: v for n, v in accurate.violations.items() if n != trajectories.COND_MAX},
+    )
+    return DesignResult(model, aim, found, first=lowest)
 
 
 def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, Any]:
@@ -168,6 +209,16 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
         "starts": request.starts,
         "seed": request.seed,
     }
+    if result.first is not None:
+        first = trajectories.sigma_percent(result.aim, result.model, result.first.motion)
+        summary["cond_slack_percent"] = request.cond_slack
+        summary["lowest_cond"] = {
+            "cond_phi": result.first.cond_phi,
+            "cond_w": result.first.cond_w,
+            "worst_parameter": names[int(np.argmax(first))],
+            "worst_percent": float(first.max()),
+            "median_percent": float(np.median(first)),
+        }
     if result.phased is not None:
         summary["driver"] = _by_hand(request, result.aim, result.phased)
     if request.sigma_max is not None:

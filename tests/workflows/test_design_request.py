@@ -51,6 +51,23 @@ def test_a_design_says_score_and_accuracy(excite: Excite, tmp_path: Path) -> Non
     assert (summary["advice"] is not None) == (spread.max() > POOR_PERCENT)
 
 
+def test_condition_number_then_accuracy(excite: Excite, tmp_path: Path) -> None:
+    """The lowest cond(Phi) first, then the most accurate drive near it; `--cond-slack 0` stops after the first."""
+    options = "va12_straight", "--duration", 12, "--starts", 1, "--seed", 3, "--json"
+    told = {}
+    for slack in (0, 12):
+        code, shown, err = excite("design", *options, "--cond-slack", slack, "--out", tmp_path / str(slack))
+        assert code == 0, err
+        told[slack] = json.loads(shown)
+    lowest = told[12]["lowest_cond"]
+    assert "lowest_cond" not in told[0]
+    assert lowest["cond_phi"] == pytest.approx(told[0]["cond_phi"], rel=1e-9)
+    assert lowest["worst_percent"] == pytest.approx(told[0]["worst_percent"], rel=1e-9)
+    assert told[12]["cond_phi"] <= 1.12 * lowest["cond_phi"] * 1.001
+    assert told[12]["worst_percent"] < 0.7 * lowest["worst_percent"]
+    assert told[12]["max_violation"] <= 1e-3
+
+
 def test_after_a_log_the_next_drive_is_for_the_estimated_machine(
     excite: Excite, straight: Model, straight_motion: Motion, tmp_path: Path
 ) -> None:
