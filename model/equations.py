@@ -25,6 +25,7 @@ class SymbolicSample:
     q, nu, a, u, p, wheels: coordinates, velocities, accelerations, torques, standard parameters, measuring wheels.
     at, rate: coordinates and velocities by name, zero for locked ones. by_name: standard parameters.
     frames: motion of each body; gravity (3,) in the root's axes; heading of the root [rad].
+    sign: sgn of each joint's rate in its dry friction, by index of the body.
     """
 
     machine: Machine
@@ -40,6 +41,7 @@ class SymbolicSample:
     frames: dict[int, mechanics.Frame]
     gravity: ca.SX
     heading: ca.SX
+    sign: dict[int, ca.SX]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -102,8 +104,13 @@ class SignatureFunctions:
     n_map_inputs: int
 
 
-def symbolic_sample(machine: Machine, standard: tuple[str, ...]) -> SymbolicSample:
-    """Make the symbols of one sample; standard: names of the standard parameters."""
+def symbolic_sample(
+    machine: Machine, standard: tuple[str, ...], sign: Mapping[int, ca.SX] | None = None
+) -> SymbolicSample:
+    """Make the symbols of one sample; standard: names of the standard parameters.
+
+    sign: sgn of joints' rates by index of the body; smoothed over the rate of the machine file where it is not given.
+    """
     names = machine.coordinates
     n = len(names)
     q, nu, a = ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
@@ -114,6 +121,11 @@ def symbolic_sample(machine: Machine, standard: tuple[str, ...]) -> SymbolicSamp
     accel = full | dict(zip(names, ca.vertsplit(a), strict=True))
     heading = at[machine.body[0].coordinates[2]] if machine.planar else ca.SX(0)
     gravity = mechanics.rot_z(-heading) @ ca.DM(machine.gravity)
+    smoothed = {
+        b.index: ca.tanh(rate[b.coordinates[0]] / float(b.friction.smoothing))
+        for b in machine.body
+        if b.friction is not None
+    }
     return SymbolicSample(
         machine,
         q,
@@ -128,7 +140,21 @@ def symbolic_sample(machine: Machine, standard: tuple[str, ...]) -> SymbolicSamp
         mechanics.body_motions(machine, at, rate, accel, gravity),
         gravity,
         heading,
+        smoothed | dict(sign or {}),
     )
+
+
+def signed_balance(machine: Machine, standard: tuple[str, ...], placed: Sequence[PlacedEffect]) -> ca.Function:
+    """Build the balance (q, nu, a, p, u, z, sign) with sgn of the joints' rates as an argument.
+
+    sign (n_rubbing,): in the order of `Machine.rubbing`. A machine without effects takes no u and z.
+    """
+    sign = ca.SX.sym("sign", len(machine.rubbing))
+    given = dict(zip([b.index for b in machine.rubbing], ca.vertsplit(sign), strict=True))
+    s = symbolic_sample(machine, standard, given)
+    _, _, z, acting = _active_effects(s, placed)
+    beside = [s.u, z] if placed else []
+    return ca.Function("signed_balance", [s.q, s.nu, s.a, s.p, *beside, sign], [_balance(s, acting)[0]])
 
 
 def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[PlacedEffect]) -> Equations:
@@ -276,6 +302,7 @@ def _common_view(s: SymbolicSample, time: ca.SX) -> SampleView:
         {b.index: _friction_torque(s, b) for b in rubbing},
         {b.index: s.by_name[f"Fs{b.index}"] for b in rubbing},
         {b.index: float(b.friction.smoothing) for b in rubbing if b.friction is not None},
+        s.sign,
         {b.index: effects.large_torque(s.machine, b) for b in s.machine.actuated},
         {b.index: _contact_motion(s, b)[0] for b in s.machine.contacts},
         {b.index: s.frames[b.index].velocity[0] for b in s.machine.body},
@@ -306,9 +333,8 @@ def _memory_rates(e: ActiveEffect) -> list[ca.SX]:
 
 def _friction_torque(s: SymbolicSample, body: Body) -> ca.SX:
     """Return Fv w + Fs sgn w [N m] of a joint."""
-    assert body.friction is not None
     w, k = s.rate[body.coordinates[0]], body.index
-    return s.by_name[f"Fv{k}"] * w + s.by_name[f"Fs{k}"] * ca.tanh(w / float(body.friction.smoothing))
+    return s.by_name[f"Fv{k}"] * w + s.by_name[f"Fs{k}"] * s.sign[k]
 
 
 def _balance(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, dict[str, ca.SX]]:

@@ -17,8 +17,8 @@ import numpy as np
 from excite.errors import MachineError
 from excite.model import mechanics
 from excite.model.effects import GroundMap, PlacedEffect, Site, place_effect
-from excite.model.equations import Equations, contact_lines, equations, kinematics
 from excite.model.known_values import KnownValues, known_values
+from excite.model.equations import Equations, contact_lines, equations, kinematics, signed_balance
 from excite.model.machine import Machine
 from excite.model.mechanics import independent_columns
 
@@ -198,6 +198,16 @@ class Model:
         """Indices of the actuated coordinates, one per input."""
         return tuple(self.coordinates.index(b.coordinates[0]) for b in self.machine.actuated)
 
+    @cached_property
+    def rubbing(self) -> tuple[int, ...]:
+        """Indices of the coordinates whose joints have dry friction, in the order of `Machine.rubbing`."""
+        return tuple(self.coordinates.index(b.coordinates[0]) for b in self.machine.rubbing)
+
+    @cached_property
+    def signed_balance(self) -> ca.Function:
+        """(q, nu, a, p, u, z, sign) -> Y (n_q,): `balance` with sgn (n_rubbing,) of the joints' rates given."""
+        return signed_balance(self.machine, self.base.standard, self.effects)
+
     @property
     def expand(self) -> np.ndarray:
         """The base parameters' `expand` (n_standard, n_base)."""
@@ -258,27 +268,55 @@ class Model:
         D, _, _ = ca.ldl(self.equations(q, nu, X)[0])
         return ca.Function("pivots", [q, X], [D], ["q", "X"], ["D"])
 
-    def accelerate(self, q: ca.SX, nu: ca.SX, u: ca.SX, X: ca.SX | ca.DM, z: ca.SX | None = None) -> ca.SX:
-        """Return the acceleration as an expression; numbers for X make the graph smaller and faster."""
-        M, bias = self.equations(q, nu, X, u, z)
+    def accelerate(
+        self,
+        q: ca.SX,
+        nu: ca.SX,
+        u: ca.SX,
+        X: ca.SX | ca.DM,
+        z: ca.SX | None = None,
+        sign: ca.SX | None = None,
+        slips: ca.SX | None = None,
+    ) -> ca.SX:
+        """Return the acceleration as an expression; numbers for X make the graph smaller and faster.
+
+        sign (n_rubbing,): as in `equations`. slips (n_rubbing,): 0 for joints held at rest, 1 for all others.
+        """
+        M, bias = self.equations(q, nu, X, u, z, sign)
         drive = ca.SX(len(self.coordinates), 1)
         for k, row in enumerate(self.actuated):
             drive[row] = u[k]
+        force = drive - bias
+        if slips is not None:
+            free = ca.SX.ones(len(self.coordinates))
+            for k, row in enumerate(self.rubbing):
+                free[row] = slips[k]
+            M, force = M * (free @ free.T) + ca.diag(1 - free), force * free
         D, L, order = ca.ldl(M)
-        return ca.ldl_solve(drive - bias, D, L, order)
+        return ca.ldl_solve(force, D, L, order)
 
     def equations(
-        self, q: ca.SX, nu: ca.SX, X: ca.SX | ca.DM, u: ca.SX | None = None, z: ca.SX | None = None
+        self,
+        q: ca.SX,
+        nu: ca.SX,
+        X: ca.SX | ca.DM,
+        u: ca.SX | None = None,
+        z: ca.SX | None = None,
+        sign: ca.SX | None = None,
     ) -> tuple[ca.SX, ca.SX]:
         """Return mass matrix (n_q, n_q) and bias (n_q,): M a + bias = u, the delivered torques [N m].
 
-        u and z matter to effects only; they are zero by default.
+        u and z matter to effects only; they are zero by default. sign (n_rubbing,): sgn of the joints' rates in dry
+        friction, smoothed by default.
         """
         p = ca.mtimes(ca.sparsify(ca.DM(self.expand)), X)
         a = ca.SX.sym("a", len(self.coordinates))
         none = (ca.SX.zeros(len(self.inputs)), ca.SX.zeros(len(self.memory)))
         beside = () if self.plain else (none[0] if u is None else u, none[1] if z is None else z)
-        return ca.jacobian(self.balance(q, nu, a, p, *beside), a), self.balance(q, nu, 0, p, *beside)
+        balance = self.balance
+        if sign is not None:
+            balance, beside = self.signed_balance, (*beside, sign)
+        return ca.jacobian(balance(q, nu, a, p, *beside), a), balance(q, nu, 0, p, *beside)
 
     def effect_symbols(self) -> tuple[ca.SX, ...]:
         """Return symbols of the further arguments (u, z) of a model with effects, () of a plain one."""

@@ -182,6 +182,7 @@ _declare(
         extra_trials=friction.bristle_trials,
         torque=friction.stribeck,
         opposes_motion=True,
+        unsticking=("bristles", 1.0),
         memory={"bent": Memory(friction.bristle_rate, 1.0, form=("bristles", 1.0))},
     ),
     Effect(
@@ -200,6 +201,7 @@ _declare(
         grid=(1.0, 3.0, -1.0, -3.0),
         extra_trials=lambda site: [{"A": 0.05, "slow": 0.5}, {"A": 0.05, "slow": -0.5}],
         torque=friction.transition,
+        unsticking=True,
     ),
     Effect(
         "load_dependent_friction",

@@ -71,7 +71,8 @@ class SampleView:
     q [rad], w [rad/s]: angle and rate of a joint.
     u [N m]: delivered torque, before gain, offset and delay of its sensor.
     friction [N m]: Fv w + Fs sgn w; coulomb [N m]: Fs.
-    friction_smoothing [rad/s]: rate over which sgn turns; large_torque [N m]: see `sizes.large_torque`.
+    friction_smoothing [rad/s]: rate over which sgn turns; sgn: sgn of a joint's rate in its friction.
+    large_torque [N m]: see `sizes.large_torque`.
     contacts: motion of each contact.
     forward_speed [m/s]: V_x of a body's origin in its own axes. yaw_rate [rad/s]: of a body.
     wheel_radius [m]: of the measuring wheel that the effect acts on, 1 for others.
@@ -87,6 +88,7 @@ class SampleView:
     friction: Mapping[int, ca.SX]
     coulomb: Mapping[int, ca.SX]
     friction_smoothing: Mapping[int, float]
+    sgn: Mapping[int, ca.SX]
     large_torque: Mapping[int, float]
     contacts: Mapping[int, ContactMotion]
     forward_speed: Mapping[int, ca.SX]
@@ -97,8 +99,8 @@ class SampleView:
     passes: Mapping[int, ca.SX] = field(default_factory=dict)
 
     def sign(self, k: int) -> ca.SX:
-        """Return sgn of a joint's rate, smoothed as in its friction."""
-        return ca.tanh(self.w[k] / self.friction_smoothing[k])
+        """Return sgn of a joint's rate as in its friction: smoothed, or set-valued."""
+        return self.sgn[k]
 
     def others(self, k: int) -> list[int]:
         """Return the other driven contacts."""
@@ -202,6 +204,7 @@ class Effect:
     angle_only: a reading error of angle sensors, not of rate sensors.
     memory: states that the effect adds.
     map_form: the form in which it uses a map of the ground.
+    unsticking: the form in which it replaces the joint's dry friction by a law that never sticks; True for all.
 
     Hooks take the sample, the body they act on and the values A and shapes, and return what the effect adds:
     torque [N m]; extra_radius [m], which all effects see; soil; push: forces [N] along and across a contact;
@@ -237,6 +240,7 @@ class Effect:
     shaking: Callable[[ca.SX, Values], ca.SX] | None = None
     memory: Mapping[str, Memory] = field(default_factory=dict)
     map_form: Form | None = None
+    unsticking: Form | bool = False
     timed: bool = False
     angle_only: bool = False
     file_value: Callable[[Body], float] | None = None
@@ -301,6 +305,12 @@ class PlacedEffect:
     def uses_map(self) -> bool:
         """True if its form here uses a map of the ground."""
         return self.effect.map_form is not None and self._in_form(self.effect.map_form)
+
+    @property
+    def unsticking(self) -> bool:
+        """True if its form here replaces the joint's dry friction by a law that never sticks."""
+        form = self.effect.unsticking
+        return form if isinstance(form, bool) else self._in_form(form)
 
     def shaking(self, t: np.ndarray) -> np.ndarray:
         """Return how much the effect shakes a torque sensor (N,), 0 to 1, at times t (N,) [s]."""

@@ -20,10 +20,9 @@ MIN_TYPICAL_FRICTION = 1e-5  # N m, friction below this is no reference for othe
 def allowed_places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...], str | None]]:
     """Return the places where a machine may have an effect: name -> (indices of bodies, name of sensor)."""
     driven = list(machine.actuated)
-    rubbing = [b for b in machine.body if b.friction is not None and b.coordinates[0] in machine.coordinates]
     pulling = [b for b in driven if b.contact is not None]
     together = machine.contacts if effect.soil else pulling
-    each = {"joints": rubbing, "drives": driven, "contacts": machine.contacts, "driven_contacts": pulling}
+    each = {"joints": list(machine.rubbing), "drives": driven, "contacts": machine.contacts, "driven_contacts": pulling}
     if machine.planar:
         each["articulation"] = [b for b in driven if b.contact is None]
     sensors = [s for s in machine.sensors("full") if not (effect.angle_only and s.is_rate)]

@@ -91,6 +91,7 @@ class Inertia(FileRecord):
 class Friction(FileRecord):
     """Joint friction U = ... + Fv q' + Fs tanh(q'/smoothing), and the torque sensor's offset u0 (28).
 
+    Simulation can take sgn(q'), set-valued at rest, in place of the tanh.
     Units of a revolute joint [N m s], [N m], [N m], smoothing [rad/s]; of a prismatic one [N s/m], [N], [N], [m/s].
     """
 
@@ -423,6 +424,11 @@ class Machine(FileRecord):
     def actuated(self) -> tuple[Body, ...]:
         """Actuated bodies whose coordinate is free."""
         return tuple(b for b in self.body if b.actuated and b.coordinates[0] not in self.locked)
+
+    @property
+    def rubbing(self) -> tuple[Body, ...]:
+        """Bodies with dry friction whose coordinate is free."""
+        return tuple(b for b in self.body if b.friction is not None and b.coordinates[0] not in self.locked)
 
     @property
     def contacts(self) -> tuple[Body, ...]:
