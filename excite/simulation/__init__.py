@@ -1,8 +1,9 @@
 """Simulation: motions from torques or from a driver, and the logs that sensors make of them.
 
-`simulate` integrates a model under given torques and returns a `Motion`; `respond` does so under feedback. `follow`
-puts a person at the levers, a `Driver` with preview, delay and slow errors. `measure` turns a motion into the log of a
-sensor kit (`KITS`) with quantisation, noise and offsets; `exact_readings` leaves these out. `measured_torques` and
+`simulate` integrates a model under given torques and returns a `Motion`; `respond` does so under feedback. Dry friction
+follows one of `FRICTION_LAWS`: smoothed at reversals, or set-valued, so that joints stick. `follow` puts a person at
+the levers, a `Driver` with preview, delay and slow errors. `measure` turns a motion into the log of a sensor kit
+(`KITS`) with quantisation, noise and offsets; `exact_readings` leaves these out. `measured_torques` and
 `delivered_torques` convert between the motors' torques and the readings of their channels.
 
 For robust design, `perturbed_machines` draws machines around the nominal one, and `track_motion` simulates how each

@@ -1,5 +1,11 @@
 from .driver import STEADY_DRIVER as STEADY_DRIVER, Driver as Driver, follow as follow, left_turn_sign as left_turn_sign
-from .integrator import Motion as Motion, effect_inputs as effect_inputs, respond as respond, simulate as simulate
+from .integrator import (
+    FRICTION_LAWS as FRICTION_LAWS,
+    Motion as Motion,
+    effect_inputs as effect_inputs,
+    respond as respond,
+    simulate as simulate,
+)
 from .rosenbrock import (
     A_ROWS as A_ROWS,
     C_ROWS as C_ROWS,

@@ -2,7 +2,8 @@
 
 The contact is stiff near standstill (about 1500 1/s). A Rosenbrock method (RODAS, order 4(3), Hairer and Wanner,
 "Solving Ordinary Differential Equations II", IV.7) takes a whole sample in one step with the exact Jacobian, and splits
-it where its error estimate asks for it: at reversals, where friction and slip turn sharply.
+it where its error estimate asks for it: at reversals, where friction and slip turn sharply. Dry friction is smoothed
+or set-valued (`dry_friction`): then steps end where a joint sticks, breaks away or reverses.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ import numpy as np
 
 from excite.errors import SimulationError
 from excite.model import Model
+from excite.simulation.dry_friction import DryFriction
 from excite.simulation.rosenbrock import A_ROWS, C_ROWS, GAMMA, STAGE_TIMES, TIME_DERIVATIVE_WEIGHTS, lu, lu_solve
 
+FRICTION_LAWS = ("smoothed", "set-valued")
 TOLERANCE = 3e-7  # error of one step relative to each state's size; chosen for 1e-6 over 60 s
 MIN_STATE_SCALE = 0.1  # added to a state's size in the error estimate [SI]; chosen
 MIN_STEP_SHARE = 1e-7  # share of a sample below which a step is not split further; chosen
@@ -52,13 +55,17 @@ def simulate(
     X: np.ndarray | None = None,
     q0: np.ndarray | None = None,
     nu0: np.ndarray | None = None,
+    friction: str = "smoothed",
 ) -> Motion:
     """Simulate the motion under torques (N, n_u) [N m] at the machine's sampling rate, linear between samples.
 
     X (n_base,): base parameters, nominal by default; q0, nu0 (n_q,): the start, at rest at zero by default.
+    friction: a name of FRICTION_LAWS. "smoothed": Fs tanh(w / smoothing), as designs and identification assume.
+    "set-valued": Fs sgn(w), and up to Fs at rest, so that joints stick; w is then exactly zero.
     Relative error below 1e-6 over 60 s.
-    Raises SimulationError for a motion that diverges or a mass matrix that is not positive definite, ValueError for
-    torques of the wrong shape.
+    Raises SimulationError for a motion that diverges, a mass matrix that is not positive definite or dry friction that
+    is negative; MachineError for an effect whose friction can't stick; ValueError for torques of the wrong shape or an
+    unknown friction.
     """
     torque = np.ascontiguousarray(torque, float)
     n_u = len(model.inputs)
@@ -66,7 +73,7 @@ def simulate(
         raise ValueError(f"torque: needs shape (N >= 2, {n_u}) for {', '.join(model.inputs)}, got {torque.shape}")
     if not np.isfinite(torque).all():
         raise ValueError(f"torque: not a finite number in row {int(np.argmin(np.isfinite(torque).all(axis=1)))}")
-    return respond(model, len(torque), lambda k, state: torque[k], X, q0, nu0)
+    return respond(model, len(torque), lambda k, state: torque[k], X, q0, nu0, friction)
 
 
 def respond(
@@ -76,22 +83,26 @@ def respond(
     X: np.ndarray | None = None,
     q0: np.ndarray | None = None,
     nu0: np.ndarray | None = None,
+    friction: str = "smoothed",
 ) -> Motion:
     """Simulate the motion under feedback: torque(k, state) gives the torques (n_u,) [N m] at sample k.
 
     The state (q, nu, angles of the measuring wheels) is that of sample k - 1, for k = 0 the initial one. Other
     arguments and errors are those of `simulate`.
     """
+    if friction not in FRICTION_LAWS:
+        raise ValueError(f"friction: {friction} is unknown, allowed: {', '.join(FRICTION_LAWS)}")
     parameters = np.ascontiguousarray(model.nominal if X is None else X, float)
     n_u, n_q = len(model.inputs), len(model.coordinates)
     rate = float(model.machine.sampling_hz)
-    step, n_w = _step_function(model)
+    sticking = DryFriction(model, parameters) if friction == "set-valued" and model.rubbing else None
+    step, n_w = _step_function(model, sticking is not None)
     state = np.zeros(2 * n_q + n_w + len(model.memory))
     state[:n_q] = 0.0 if q0 is None else q0
     state[n_q : 2 * n_q] = 0.0 if nu0 is None else nu0
     state[2 * n_q + n_w :] = model.initial_memory
     driven = np.empty((samples, n_u))
-    history = _integrate(step, state, driven, torque, parameters, 1.0 / rate, _map_updater(model))
+    history = _integrate(step, state, driven, torque, parameters, 1.0 / rate, _map_updater(model), sticking)
     finite = np.isfinite(history).all(axis=1)  # the maximum norm of the error can miss a NaN
     if not finite.all():
         raise SimulationError(
@@ -107,7 +118,10 @@ def respond(
             " must be physically possible, check the parameters"
         )
     beside = () if model.plain else (memory.T,)
-    a = model.acceleration(q.T, nu.T, driven.T, *beside, parameters).full().T
+    if sticking is None:
+        a = model.acceleration(q.T, nu.T, driven.T, *beside, parameters).full().T
+    else:
+        a = sticking.accelerations(history, driven)
     return Motion(np.arange(samples) / rate, q, nu, a, driven, wheels, memory)
 
 
@@ -119,23 +133,32 @@ def _integrate(
     parameters: np.ndarray,
     sample: float,
     look: Callable[[np.ndarray], None],
+    sticking: DryFriction | None,
 ) -> np.ndarray:
     """Integrate with step control and return the states (N, n); fills `driven` (N, n_u) with the torques.
 
-    look: updates the map inputs in a state, once per sample.
+    look: updates the map inputs in a state, once per sample. sticking: ends steps at the events of dry friction.
     """
     look(state)
     start, end, error = state.copy(), np.zeros_like(state), np.zeros(1)
     left, slope, length = np.zeros(driven.shape[1]), np.zeros(driven.shape[1]), np.zeros(1)
     buffer, advance = step.buffer()
-    for k, array in enumerate((start, left, slope, length, parameters)):
+    for k, array in enumerate((start, left, slope, length, parameters if sticking is None else sticking.parameters)):
         buffer.set_arg(k, array.data)
     buffer.set_res(0, end.data)
     buffer.set_res(1, error.data)
     history = np.empty((len(driven), len(state)))
     history[0] = state
     driven[0] = torque(0, state)
+    if sticking is not None:
+        sticking.begin(start, driven[0])
     share = 1.0
+
+    def attempt(seconds: float) -> np.ndarray:
+        length[0] = seconds
+        advance()
+        return left + slope * seconds
+
     for k in range(len(driven) - 1):
         driven[k + 1] = torque(k + 1, history[k])
         left[:] = driven[k]
@@ -150,7 +173,10 @@ def _integrate(
             length[0] = share * sample
             advance()
             e = float(error[0])
+            tried = share
             if e <= 1.0:
+                if sticking is not None:
+                    share *= sticking.end_step(attempt, start, end, left + slope * length[0], float(length[0]))
                 done += share
                 start[:] = end
             elif share < MIN_STEP_SHARE or not (np.isfinite(e) or share > 1e-3):
@@ -159,8 +185,10 @@ def _integrate(
                     f" state {np.array2string(start, precision=3)}:"
                     " check the torques and that the masses and inertias are positive"
                 )
-            share *= min(4.0, max(0.1, 0.9 * (e + 1e-12) ** -0.25)) if np.isfinite(e) else 0.1
+            share = tried * min(4.0, max(0.1, 0.9 * (e + 1e-12) ** -0.25)) if np.isfinite(e) else 0.1
         look(start)
+        if sticking is not None:
+            sticking.end_sample()
         history[k + 1] = start
         share = max(share, 1e-3)
     return history
@@ -179,8 +207,10 @@ def _map_updater(model: Model) -> Callable[[np.ndarray], None]:
 
 
 @lru_cache(maxsize=8)
-def _step_function(model: Model) -> tuple[ca.Function, int]:
+def _step_function(model: Model, set_valued: bool) -> tuple[ca.Function, int]:
     """Build one step (state, u, du/dt, h, X) -> state after h, error over tolerance; and count the measuring wheels.
+
+    set_valued: behind X come `sign` and `slips` of `Model.accelerate`, which hold for the step.
 
     The Rosenbrock method takes the speeds, the memory states and the coordinates that forces depend on. The others
     (pose, angles of contacts and measuring wheels) are integrals of these, by the Hermite quadrature
@@ -188,12 +218,14 @@ def _step_function(model: Model) -> tuple[ca.Function, int]:
     """
     n_q, n_u = len(model.coordinates), len(model.inputs)
     q, nu, _ = model.symbols()
-    u, X, z = ca.SX.sym("u", n_u), ca.SX.sym("X", len(model.base.names)), ca.SX.sym("z", len(model.memory))
+    u, z = ca.SX.sym("u", n_u), ca.SX.sym("z", len(model.memory))
+    base, modes = ca.SX.sym("X", len(model.base.names)), ca.SX.sym("modes", 2 * len(model.rubbing) * set_valued)
+    X = ca.vertcat(base, modes)
     dq, _, wheels, *_ = model.kinematics(q, nu)
     n_w = wheels.numel()
     state = ca.vertcat(q, nu, ca.SX.sym("w", n_w), z)
-    a = model.accelerate(q, nu, u, X, z)
-    rhs = ca.vertcat(dq, a, wheels, model.flow(q, nu, u, z, X))
+    a = model.accelerate(q, nu, u, base, z, *(ca.vertsplit(modes, len(model.rubbing)) if set_valued else ()))
+    rhs = ca.vertcat(dq, a, wheels, model.flow(q, nu, u, z, base))
     core = [k for k, c in enumerate(model.coordinates) if c in model.active_coordinates] + list(range(n_q, 2 * n_q))
     core += range(2 * n_q + n_w, state.numel() - len(model.map_inputs))
     rest = [k for k in range(2 * n_q + n_w) if k not in core]

@@ -32,7 +32,7 @@ def sticking_log(
         force[k] = float(np.clip(wanted, -150.0, 150.0))
         for part in (np.arange(SUBSTEPS) + 0.5) / SUBSTEPS:
             u = force[k - 1] + part * (force[k] - force[k - 1])
-            x, v = _step(x, v, u - offset, dt / SUBSTEPS, M, Fv, Fc)
+            x, v = advance(x, v, u - offset, dt / SUBSTEPS, M, Fv, Fc)
         position[k] = x
     measured = force + force_noise * rng.standard_normal(n)
     return pd.DataFrame({"t": t, "qm": position + position_noise * rng.standard_normal(n), "vir": measured / GAIN})
@@ -46,8 +46,8 @@ def _reference(t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.asarray(x * fade * fade * (3 - 2 * fade))
 
 
-def _step(x: float, v: float, u: float, dt: float, M: float, Fv: float, Fc: float) -> tuple[float, float]:
-    """Position and speed after a time under a constant force u, with friction that is exactly set-valued."""
+def advance(x: float, v: float, u: float, dt: float, M: float, Fv: float, Fc: float) -> tuple[float, float]:
+    """Return position and speed after a time under a constant force u, with friction that is exactly set-valued."""
     left = dt
     while left > 0:
         if v == 0.0:
