@@ -99,6 +99,7 @@ def simulate(
     noise: bool = True,
     kit: str = "full",
     effects: Sequence[str] = (),
+    friction: str = "smoothed",
 ) -> pd.DataFrame:
     """Drive a machine in simulation and return the log that its sensors would write.
 
@@ -106,13 +107,16 @@ def simulate(
     noise: False for exact signals.
     kit: a name of `excite.simulation.KITS`.
     effects: effects that the model lacks, NAME[@WHERE]=MAGNITUDE each.
-    Raises LogError for a profile, MachineError for an effect, SimulationError for a motion that can't be integrated.
+    friction: a name of `excite.simulation.FRICTION_LAWS`; with "set-valued", joints stick.
+    Raises LogError for a profile, MachineError for an effect, SimulationError for a motion that can't be integrated,
+    UsageError for an unknown kit or friction.
     """
     model = load(machine)
     workflows.require_known("kit", kit, simulation.KITS)
+    workflows.require_known("friction", friction, simulation.FRICTION_LAWS)
     torque, q0, nu0 = _torques(model, drive)
     true = workflows.with_effects(model, effects, len(torque))
-    motion = simulation.simulate(true, torque, q0=q0, nu0=nu0)
+    motion = simulation.simulate(true, torque, q0=q0, nu0=nu0, friction=friction)
     return simulation.measure(true, motion, kit=kit, seed=seed, noise=noise)
 
 

@@ -353,6 +353,14 @@ def simulate(
             autocompletion=options.names("effect"),
         ),
     ] = None,
+    friction: Annotated[
+        str,
+        typer.Option(
+            "--friction",
+            help="dry friction near standstill, smoothed over a rate or exact, so that joints stick",
+            autocompletion=options.names("friction"),
+        ),
+    ] = "smoothed",
     json: JsonOption = False,
 ) -> None:
     """Simulate a drive and write the log that the sensors would write.
@@ -366,6 +374,7 @@ def simulate(
     if noise not in ("on", "off"):
         raise UsageError(f"--noise: {noise} is unknown, allowed: on, off")
     workflows.require_known("--kit", kit, simulation.KITS)
+    workflows.require_known("--friction", friction, simulation.FRICTION_LAWS)
     workflows.require_known("--out: ending", out.suffix.lower(), tuple(TABLE_WRITERS))
     model = workflows.build_model(machine)
     if out.resolve() in [path.resolve() for path in (profile, *_machine_file(machine))]:
@@ -374,7 +383,7 @@ def simulate(
     nominal, model = model, workflows.with_effects(model, effect or (), len(torque))
     doubts = [f"--effect {line}" for line in workflows.doubtful_effects(nominal, model)]
     with output.new_file(out) as path:
-        motion = drive(model, torque, q0=q0, nu0=nu0)
+        motion = drive(model, torque, q0=q0, nu0=nu0, friction=friction)
         table = simulation.measure(model, motion, kit=kit, seed=seed, noise=noise == "on")
         TABLE_WRITERS[out.suffix.lower()](table, path)
     summary = {
@@ -387,6 +396,7 @@ def simulate(
         "kit": kit,
         "noise": noise,
         "effects": effect or [],
+        "friction": friction,
         "doubts": doubts,
         "seed": seed,
     }

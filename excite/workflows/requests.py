@@ -69,6 +69,7 @@ CHOICES = {
     "method": ("excite.identification", "METHODS"),
     "against": ("excite.trajectories", "BASELINES"),
     "kit": ("excite.simulation", "KITS"),
+    "friction": ("excite.simulation", "FRICTION_LAWS"),
     "effect": ("excite.model.effects", "CATALOGUE"),
 }
 MAX_LISTED = 12  # names that the help of an option lists; chosen

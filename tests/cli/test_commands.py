@@ -10,10 +10,13 @@ import time
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from support.commands import Excite
 
+import excite as package
+from excite.errors import UsageError
 from excite.logs import profile as profiles
 from excite.model import Model
 from excite.simulation import Motion
@@ -116,6 +119,25 @@ def test_same_seed_same_bytes(profile: Path, tmp_path: Path, excite: Excite) -> 
     assert logs[0] == logs[1] != logs[2]
 
 
+def test_simulated_joints_stick_on_request(profile: Path, tmp_path: Path, excite: Excite) -> None:
+    """Command and function write the same log, in which rolls rest; by default they never quite do."""
+    logs = {}
+    for friction in ("set-valued", "smoothed"):
+        out = tmp_path / f"{friction}.csv"
+        code, stdout, stderr = excite(
+            *("simulate", "va12_straight", profile, "--noise", "off", "--friction", friction, "--out", out, "--json")
+        )
+        assert (code, stderr) == (0, "")
+        assert json.loads(stdout)["friction"] == friction
+        logs[friction] = pd.read_csv(out)
+    table = package.simulate("va12_straight", profile, noise=False, friction="set-valued")
+    np.testing.assert_allclose(logs["set-valued"].to_numpy(), table.to_numpy(), atol=1e-6)
+    still = {name: int((log["theta1_rad"].diff()[1:] == 0).sum()) for name, log in logs.items()}
+    assert still["set-valued"] > 10 > still["smoothed"]
+    with pytest.raises(UsageError, match="friction: sticky is unknown, allowed: smoothed, set-valued"):
+        package.simulate("va12_straight", profile, friction="sticky")
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -137,6 +159,17 @@ def test_same_seed_same_bytes(profile: Path, tmp_path: Path, excite: Excite) -> 
         (["simulate", "va12_straight", "PROFILE", "--out", "log.csv", "--noise", "loud"], ["loud", "on, off"]),
         (["simulate", "va12_straight", "PROFILE", "--out", "log.doc"], [".doc", ".csv"]),
         (["simulate", "va12_straight", "PROFILE", "--out", "log.csv", "--kit", "gold"], ["gold", "paper, full"]),
+        (
+            ["simulate", "va12_straight", "PROFILE", "--out", "log.csv", "--friction", "dry"],
+            ["--friction", "smoothed, set-valued"],
+        ),
+        (
+            [
+                *("simulate", "va12_straight", "PROFILE", "--out", "log.csv", "--friction", "set-valued"),
+                *("--effect", "friction_transition@front_roll=0.5"),
+            ],
+            ["friction_transition@front_roll", "never sticks"],
+        ),
         (["simulate", "va12_straight", "PROFILE"], ["--out"]),
         (["simulate", "va12", "PROFILE", "--out", "log.csv"], ["u2_Nm", "va12"]),
         (["identify", "va12"], ["LOG"]),
