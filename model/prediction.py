@@ -17,8 +17,8 @@ import numpy as np
 from excite.errors import MachineError
 from excite.model import mechanics
 from excite.model.effects import GroundMap, PlacedEffect, Site, place_effect
-from excite.model.known_values import KnownValues, known_values
 from excite.model.equations import Equations, contact_lines, equations, kinematics, signed_balance
+from excite.model.known_values import KnownValues, known_values
 from excite.model.machine import Machine
 from excite.model.mechanics import independent_columns
 
