@@ -37,6 +37,7 @@ class Method:
     effects: Literal["none", "linear", "any"] = "none"
     simulates: bool = False
     biased: bool = False
+    optimistic: bool = False
 
 
 def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Filter | None = None) -> Estimate:
@@ -67,6 +68,9 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
                 f"{repaired[0].source}: the equations of {method} are singular along this log: check the sign and unit"
                 " of every column, and that the machine moves"
             ) from None
+    if METHODS[method].optimistic and model.slips and not estimate.doubt:
+        doubt = f"slips from real encoders are noisy, and the intervals of {method} are too narrow then: use joint"
+        estimate = replace(estimate, doubt=doubt)
     estimate = assess(model, repaired, estimate, filter)
     return add_notes(estimate, *(note for e in examined for note in e.notes), *doubts)
 
@@ -160,8 +164,8 @@ def restrict_to_possible(plain: Estimator) -> Estimator:
 LINEAR_METHODS: dict[str, Method] = {
     "ols": Method(ols, effects="linear", biased=True),
     "wls": Method(wls, biased=True),
-    "iv": Method(iv, simulates=True),
-    "tls": Method(tls),
+    "iv": Method(iv, simulates=True, optimistic=True),
+    "tls": Method(tls, optimistic=True),
 }
 METHODS: dict[str, Method] = {
     **LINEAR_METHODS,

@@ -475,18 +475,26 @@ def _find_unidentifiable(
     unidentifiable: np.ndarray,
     covariance: np.ndarray,
 ) -> np.ndarray:
-    """Find the parameters (n_base,) whose standard deviation exceeds their size if all but `held` are free.
+    """Find the parameters (n_base,) to hold, besides `held`, so that no other's standard deviation exceeds its size.
 
-    covariance: of a step with `unidentifiable` held. The size is that of the estimate or the scale, whichever is
-    larger, as the machine file's value may be far too small.
+    The one that exceeds its size most is held first, then the next given that: of parameters that the logs show only
+    together, such as dry friction and offset in one direction, one is held. covariance: of a step with `unidentifiable`
+    held. The size is that of the estimate or the scale, whichever is larger, as the machine file's value may be far too
+    small.
     """
     if (unidentifiable != held).any():
         covariance, *_ = newton_step(
             space, measurements, linear, trajectories, X, prior_information(space.model, held, X), 0.0
         )
-    sigma = np.sqrt(np.diag(covariance))[: len(X)]
-    found: np.ndarray = held | (sigma > MAX_IDENTIFIABLE_STD * np.maximum(np.abs(X) / space.model.scale, 1.0))
-    return found
+    size = np.maximum(np.abs(X) / space.model.scale, 1.0)
+    found, left = held.copy(), covariance[: len(X), : len(X)].copy()
+    while True:
+        excess = np.where(found, 0.0, np.sqrt(np.maximum(np.diag(left), 0.0)) / size)
+        k = int(np.argmax(excess))
+        if not excess[k] > MAX_IDENTIFIABLE_STD:
+            return found
+        found[k] = True
+        left -= np.outer(left[:, k], left[k]) / left[k, k]
 
 
 def _stagnates(steps: Sequence[float], costs: Sequence[float]) -> bool:
