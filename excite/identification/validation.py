@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
 
 from excite.identification.estimate import Estimate
-from excite.identification.noise_propagation import REREADINGS, simulate_rereadings
-from excite.logs import BLOCK, Log, lowpass, samples
+from excite.identification.noise_propagation import REREADINGS, measure_again, simulate_rereadings
+from excite.logs import BLOCK, Log, lowpass, samples, white_noise
 from excite.model import Model
 from excite.model.machine import Filter
 from excite.simulation import Motion, delivered_torques, exact_readings, simulate
 from excite.smoothing import (
+    Measurements,
     NotConvergedError,
+    StateSpace,
+    Trajectory,
+    apply_step,
     build_state_space,
     common_sensors,
     fit_logs,
     initial_trajectory,
+    linearise_logs,
     prepare_measurements,
+    torque_sensor,
 )
 
 FAR_RATIO = 4.0  # ratio to the machine file's value, or its inverse, that is reported; chosen
@@ -33,7 +40,8 @@ class SignalComparison:
     """Measured and predicted values (m, N) of m signals in their units, over t (N,) [s].
 
     noise, parameters (m, N): standard deviations of the residual by the sensors' noise, which also disturbs the
-    prediction, and by the parameters' uncertainty; None if unknown.
+    prediction, and by the parameters' uncertainty; None if unknown. prediction_noise (m, N): standard deviation of the
+    prediction alone by the sensors' noise, None if not computed.
     """
 
     names: tuple[str, ...]
@@ -43,6 +51,7 @@ class SignalComparison:
     predicted: np.ndarray
     noise: np.ndarray | None = None
     parameters: np.ndarray | None = None
+    prediction_noise: np.ndarray | None = None
 
     @property
     def expected(self) -> np.ndarray | None:
@@ -97,50 +106,123 @@ def compare_torques(model: Model, log: Log, estimate: Estimate, filter: Filter |
     filter = filter or model.machine.filter
     plain = _filtered_torques(model, log, estimate, filter)
     first, *again = (
-        _filtered_torques(model, one, estimate, filter).residual
-        for one in simulate_rereadings(model, log, filter, REREADINGS)
+        _filtered_torques(model, one, estimate, filter) for one in simulate_rereadings(model, log, filter, REREADINGS)
     )
+    return replace(
+        plain,
+        noise=_local_rms(model, [c.residual - first.residual for c in again]),
+        parameters=_parameter_band(model, log, estimate, filter),
+        prediction_noise=_local_rms(model, [c.predicted - first.predicted for c in again]),
+    )
+
+
+def _local_rms(model: Model, errors: Sequence[np.ndarray]) -> np.ndarray:
+    """Root mean square (m, N) of repeated errors (m, N) within a second."""
     width = max(1, round(float(model.machine.sampling_hz)))
-    square = np.mean([(e - first) ** 2 for e in again], axis=0)
-    noise = np.sqrt(scipy.ndimage.uniform_filter1d(square, width, axis=1))
-    return replace(plain, noise=noise, parameters=_parameter_band(model, log, estimate, filter))
+    square = np.mean(np.square(errors), axis=0)
+    return np.sqrt(np.maximum(scipy.ndimage.uniform_filter1d(square, width, axis=1), 0.0))
 
 
-def validate_torques(model: Model, log: Log, estimate: Estimate, filter: Filter | None = None) -> SignalComparison:
+def validate_torques(
+    model: Model, log: Log, estimate: Estimate, filter: Filter | None = None, prediction_noise: bool = False
+) -> SignalComparison:
     """Compare the torques of a log that was not fitted with those that its smoothed motion needs.
 
     The states are smoothed with the parameters held at the estimate, so the noise of slips does not count as an error.
     Machines without slips, and logs that these parameters cannot follow, are compared by `compare_torques`.
+    prediction_noise: smooth simulated readings of the smoothed motion as well, which gives the noise of the prediction,
+    and that of the residual as the smoother leaves it; without, the residual's noise is the torque sensor's, an upper
+    bound.
     """
     filter = filter or model.machine.filter
     if not model.slips or not np.isfinite(estimate.value).all():
         return compare_torques(model, log, estimate, filter)
     held = replace(model, nominal=estimate.value)
     space = build_state_space(held, common_sensors(held, [log]))
-    data = prepare_measurements(space, log)
-    start = [initial_trajectory(space, data, log, filter)]
     try:
-        every = np.ones(len(held.nominal), bool)
-        fit = fit_logs(space, [data], start, held.nominal, start, 0.0, every)
+        data, start, trajectory = _smooth(space, log, filter)
+        band = _smoothed_parameter_band(space, data, start, trajectory, estimate.covariance, filter)
+        errors = _smoothing_errors(space, log, data, trajectory, filter) if prediction_noise else None
     except NotConvergedError:
         return compare_torques(model, log, estimate, filter)
     rate = float(model.machine.sampling_hz)
     impulse = np.zeros(len(log))
     impulse[len(log) // 2] = 1.0
     gain = float(np.linalg.norm(lowpass(impulse, rate, filter)))  # of white noise
-    error = lowpass(fit.trajectories[0].sampled_torque_error.T, rate, filter)
+    error = lowpass(trajectory.sampled_torque_error.T, rate, filter)
     measured = lowpass(data.torque.T, rate, filter)
-    noise = np.broadcast_to(gain * data.noise.torque[:, None], error.shape)
-    band = _parameter_band(model, log, estimate, filter.model_copy(update={"drop": (0, 0)}))
+    noise, own = errors or (np.broadcast_to(gain * data.noise.torque[:, None], error.shape), None)
     units = tuple(_torque_unit(model, k) for k in model.actuated)
-    return SignalComparison(model.inputs, units, log.t, measured, measured + error, noise, band)
+    return SignalComparison(model.inputs, units, log.t, measured, measured + error, noise, band, own)
+
+
+def _smooth(space: StateSpace, log: Log, filter: Filter) -> tuple[Measurements, Trajectory, Trajectory]:
+    """Smooth the states of a log with all parameters held; return start and result. Raises NotConvergedError."""
+    data, X = prepare_measurements(space, log), space.model.nominal
+    start = initial_trajectory(space, data, log, filter)
+    fit = fit_logs(space, [data], [start], X, [start], 0.0, np.ones(len(X), bool))
+    return data, start, fit.trajectories[0]
+
+
+def _smoothed_parameter_band(
+    space: StateSpace,
+    data: Measurements,
+    start: Trajectory,
+    trajectory: Trajectory,
+    covariance: np.ndarray,
+    filter: Filter,
+) -> np.ndarray:
+    """Standard deviation (n_u, N) of smoothed, low-passed torques by the parameters' uncertainty.
+
+    Each independent step of the parameters moves the most likely states, to first order, and with them the torques.
+    Unlike `_parameter_band` it has neither the noise of slips nor the ends of the filter. Raises NotConvergedError.
+    """
+    X = space.model.nominal
+    linear = linearise_logs(space, [data], [trajectory], [start], X, 0.0)
+    if linear is None:
+        raise NotConvergedError("the smoothed motion can't be linearised")
+    n, Z, rate = len(X), linear[0].chain.Z[1:, 1:], float(space.model.machine.sampling_hz)
+    offsets = -np.linalg.pinv(Z[n:, n:]) @ Z[n:, :n]  # most likely offsets of the encoders for a step of parameters
+    still = apply_step(space, data, trajectory, linear[0], np.zeros(len(Z))).sampled_torque_error
+    variance = np.zeros_like(still.T)
+    for step in (covariance_root(covariance) / space.model.scale[:, None]).T:
+        if step.any():
+            moved = apply_step(space, data, trajectory, linear[0], np.concatenate([step, offsets @ step]))
+            variance += lowpass((moved.sampled_torque_error - still).T, rate, filter) ** 2
+    return np.sqrt(variance)
+
+
+def _smoothing_errors(
+    space: StateSpace, log: Log, data: Measurements, trajectory: Trajectory, filter: Filter
+) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations (n_u, N) of residual and prediction, low-passed, from simulated readings of a motion.
+
+    Each of REREADINGS logs that the sensors would read along the trajectory is smoothed, and compared with the
+    trajectory. Raises NotConvergedError.
+    """
+    model, rng = space.model, np.random.default_rng(0)
+    u = space.delivered_torques(data.torque, model.nominal)[0] + trajectory.sampled_torque_error
+    true = data.torque + trajectory.sampled_torque_error
+    reading = space.readings(trajectory.state, space.inputs(u, trajectory.ground_inputs), model.nominal)[0]
+    exact = {sensor.name: reading[:, j, 0] for j, sensor in enumerate(space.sensors)}
+    exact |= {torque_sensor(model, b.index).name: true[:, k] for k, b in enumerate(model.machine.actuated)}
+    present = [s for s in model.machine.sensors("full") if s.name in exact]
+    level = {s.name: white_noise(log.values[s.name]) for s in present}
+    rate = float(model.machine.sampling_hz)
+    residual, prediction = list[np.ndarray](), list[np.ndarray]()
+    for _ in range(REREADINGS):
+        values = {s.name: measure_again(s, exact[s.name], level[s.name], rng) for s in present}
+        again, _, smoothed = _smooth(space, Log(log.source, log.t, values), filter)
+        residual.append(lowpass(smoothed.sampled_torque_error.T, rate, filter))
+        prediction.append(lowpass((again.torque + smoothed.sampled_torque_error - true).T, rate, filter))
+    return _local_rms(model, residual), _local_rms(model, prediction)
 
 
 def _parameter_band(model: Model, log: Log, estimate: Estimate, filter: Filter) -> np.ndarray:
     """Standard deviation (n_u, N) of predicted torques by the parameters' uncertainty."""
     motion = samples(model, log, filter)
     keep = slice(filter.drop[0], len(log) - filter.drop[1])
-    root = _root(np.nan_to_num(estimate.covariance))
+    root = covariance_root(np.nan_to_num(estimate.covariance))
     band = []
     for row in model.actuated:
         parts = []
@@ -152,8 +234,8 @@ def _parameter_band(model: Model, log: Log, estimate: Estimate, filter: Filter) 
     return np.array(band)
 
 
-def _root(covariance: np.ndarray) -> np.ndarray:
-    """R with R R' = covariance, positive semi-definite."""
+def covariance_root(covariance: np.ndarray) -> np.ndarray:
+    """Return R (n, n) with R R' = covariance, positive semi-definite: columns are independent steps of one sigma."""
     size = np.sqrt(np.maximum(np.diag(covariance), 0))
     unit = np.where(size > 0, size, 1.0)
     variance, v = np.linalg.eigh(covariance / np.outer(unit, unit))

@@ -11,6 +11,7 @@ from .gauss_newton import (
     SUFFICIENT_STEP as SUFFICIENT_STEP,
     Fit as Fit,
     NotConvergedError as NotConvergedError,
+    apply_step as apply_step,
     covariance_in_si as covariance_in_si,
     fit_logs as fit_logs,
     linearise_log as linearise_log,
