@@ -47,6 +47,10 @@ class DesignFolderError(InputError):
     """A folder that holds no design, or a damaged one."""
 
 
+class EstimateFolderError(InputError):
+    """A folder that holds no estimate, or a damaged one."""
+
+
 class UndrivableError(InputError):
     """A design that no person can follow."""
 

@@ -30,8 +30,8 @@ REQUEST_KEYS = (
 )  # entries of a summary that say how a result was made
 # names of the files that the program writes into a result folder
 OWN_NAMES = re.compile(
-    r"summary\.json|machine\.(json|toml)|(profile|phases)\.csv|README\.md|[a-z0-9-]+\.(png|pdf|html|md)|design|verify|next"
-    r"|drives|runs\.parquet|study\.json|machines"
+    r"summary\.json|machine\.(json|toml)|(profile|phases|covariance|prediction)\.csv|README\.md"
+    r"|[a-z0-9-]+\.(png|pdf|html|md)|design|verify|next|drives|runs\.parquet|study\.json|machines"
 )
 
 

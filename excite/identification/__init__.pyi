@@ -26,7 +26,13 @@ from .monte_carlo import (
     verify as verify,
 )
 from .near_rest import friction_near_rest as friction_near_rest, with_soft_friction as with_soft_friction
+from .prediction import Prediction as Prediction, predict_motion as predict_motion, predict_torques as predict_torques
 from .prior import prior_from_logs as prior_from_logs
+from .saved_estimate import (
+    SavedEstimate as SavedEstimate,
+    read_estimate as read_estimate,
+    write_estimate as write_estimate,
+)
 from .status import add_consistent as add_consistent
 from .validation import (
     SignalComparison as SignalComparison,

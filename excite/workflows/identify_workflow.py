@@ -109,7 +109,7 @@ def identify(
     machine: a shipped name or a path. method: None for the recommended one. filtering: a name of `FILTERS`.
     validate: logs that are not fitted, only predicted. Raises LogError, NoEstimateError, UsageError.
     """
-    model = requests.build_model(machine)
+    as_in_file = model = requests.build_model(machine)
     method = requests.choose_method(method, model)
     needs = identification.needed_sensors(model, method)
     ready = prepare(model, logs, needs)
@@ -135,6 +135,7 @@ def identify(
         "cond_w": estimate.cond_w,
         "cond_phi": estimate.cond_phi,
         "relative_error_percent": estimate.relative_error_percent,
+        "degrees": estimate.degrees,
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
         "notes": [*said, *cut, *estimate.notes, *more_notes],
@@ -142,6 +143,7 @@ def identify(
         "validation": [_check(model, one, estimate, chosen) for one in unfitted],
         "versions": requests.package_versions(),
     }
+    identification.write_estimate(place, as_in_file, estimate)
     for kind, several in (("fit", read), ("validation", unfitted)):
         for k, one in enumerate(several):
             title = f"{model.machine.title}: {one.source}"
