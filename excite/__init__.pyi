@@ -5,6 +5,7 @@ from .interface import (
     diagnose as diagnose,
     identify as identify,
     load as load,
+    predict as predict,
     read_log as read_log,
     simulate as simulate,
     verify as verify,

@@ -18,8 +18,8 @@ import pandas as pd
 from excite import identification, logs as readers, model as models, simulation, trajectories, workflows
 from excite.diagnosis import Assessment
 from excite.errors import LogError
-from excite.identification import Estimate, Verification
-from excite.logs import Log
+from excite.identification import Estimate, Prediction, Verification
+from excite.logs import Log, PlannedDrive
 from excite.model import Model
 from excite.model.machine import load_machine
 from excite.simulation import Motion
@@ -134,6 +134,19 @@ def identify(machine: Machine, logs: Source | Sequence[Source], method: str | No
     return replace(found.estimate, notes=(*said, *ready.notes, *found.estimate.notes))
 
 
+def predict(machine: Machine, estimate: Estimate, target: Source | Drive) -> Prediction:
+    """Predict signals along another log or drive, with 95 % bands from the estimate's covariance.
+
+    target: a log gives the torque of every drive along the motion that it shows, compared with the readings; a profile
+    or any other drive as in `simulate` gives the motion under its torques, in open loop. A table is a profile if it
+    has the columns of one.
+    Raises NoEstimateError for an invalid estimate, LogError for an unusable target, SimulationError if the estimate is
+    no machine that can be simulated.
+    """
+    model = load(machine)
+    return workflows.predict_from(model, estimate, _target(model, target)).prediction
+
+
 def diagnose(machine: Machine, logs: Source | Sequence[Source]) -> Assessment:
     """Find what the model of a machine gets wrong along logs: named causes, their magnitudes, the gain of each.
 
@@ -189,6 +202,19 @@ def compare(
 
 def _several(logs: Source | Sequence[Source]) -> list[Source]:
     return [logs] if isinstance(logs, str | Path | pd.DataFrame | Log) else list(logs)
+
+
+def _target(model: Model, target: Source | Drive) -> Source | PlannedDrive:
+    """Return what a prediction is along: a log or profile as it is, any other drive with its planned motion."""
+    if isinstance(target, np.ndarray):
+        rest = np.zeros(len(model.coordinates))
+        return PlannedDrive(target, rest, rest)
+    if isinstance(target, Design | Motion):
+        motion = target.motion if isinstance(target, Design) else target
+        return PlannedDrive(motion.u, motion.q[0], motion.nu[0], motion.q, motion.nu)
+    if isinstance(target, str | Path) and (Path(target) / "profile.csv").is_file():
+        return Path(target) / "profile.csv"
+    return target
 
 
 def _torques(model: Model, drive: Drive) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:

@@ -438,6 +438,32 @@ def identify(
 
 
 @app.command()
+def predict(
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="folder that `excite identify` wrote")],
+    target: Annotated[
+        Path,
+        typer.Argument(metavar="TARGET", help="a log, or a profile.csv (its columns tell), or a design's folder"),
+    ],
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Predict signals along another log or profile, with 95 % bands.
+
+    Along a log: the torque of every drive, and where the readings leave it. Along a profile: the motion under its
+    torques.
+
+    Example: excite predict results/identify-va12 results/design-va12/profile.csv
+    """
+    from excite.identification import read_estimate
+
+    name = read_estimate(result).model.machine.name
+    out = out or Path(f"results/predict-{name}")
+    target = target / "profile.csv" if (target / "profile.csv").is_file() else target
+    with _result(out, json, partial(terminal.show, "predict"), [result, target]) as (place, summary):
+        summary |= workflows.predict(place, result, target, terminal.bar)
+
+
+@app.command()
 def diagnose(
     machine: MachineArgument,
     logs: LogsArgument,

@@ -9,7 +9,8 @@
 - `add_bias` estimates the bias of a method on given logs from simulated ones.
 - `compare_logs` tests whether one set of parameters explains several logs, and names what changed (`Agreement`).
 - `compare_torques` and `compare_motions` test an estimate on another log (`SignalComparison`).
-- `write_estimate` and `read_estimate` keep an estimate in a folder.
+- `predict_torques` and `predict_motion` predict signals along a log or a profile, with 95 % bands (`Prediction`);
+  `write_estimate` and `read_estimate` keep an estimate in a folder for that.
 - `prior_from_logs` makes an estimate the prior of the next design.
 - `describe_late_channels`, `far_from_nominal` and `parameters_at_rest` find faults of logs that spoil an estimate.
 """

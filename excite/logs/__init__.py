@@ -6,8 +6,8 @@ and returns checked `Log` records with the model at their rate (`preparation`). 
 rows that are even already, such as simulated ones.
 
 `inspect` lists everything that is wrong or doubtful in a log; `examine` repairs spikes and notes drop-outs before an
-estimate. `regression` and `samples` give the filtered, decimated rows of the linear methods; `read_profile` and
-`profile_of` read and write drives.
+estimate. `regression` and `samples` give the filtered, decimated rows of the linear methods; `read_profile`,
+`read_drive` and `profile_of` read and write drives, `is_profile` tells one from a log.
 """
 
 import lazy_loader

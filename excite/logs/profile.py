@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -44,13 +45,49 @@ def motion_columns(model: Model) -> list[tuple[str, str]]:
     return names
 
 
+@dataclass(frozen=True)
+class PlannedDrive:
+    """A profile: torques (N, n_u) [N m] to deliver, the state q0, nu0 (n_q,) that it starts from.
+
+    q, nu (N, n_q): the motion that is expected, None if the profile has not all of its columns.
+    """
+
+    torque: np.ndarray
+    q0: np.ndarray
+    nu0: np.ndarray
+    q: np.ndarray | None = None
+    nu: np.ndarray | None = None
+
+
+def is_profile(source: str | Path | pd.DataFrame, model: Model) -> bool:
+    """Tell a profile from a log by its columns: all speeds of the expected motion, or no angle that a sensor reads.
+
+    Raises LogError for a file that can't be read.
+    """
+    machine = model.machine
+    angles = {c for s in machine.sensors("full") if s.kind in ("angle", "wheel") for c in s.columns}
+    wanted = [machine.time_column, *(c for s in machine.sensors("full") for c in s.columns)]
+    table = source if isinstance(source, pd.DataFrame) else tables.read_table(source, wanted)
+    have = set(tables.with_names(table, wanted).columns)
+    return {rate for _, rate in motion_columns(model)} <= have or not angles & have
+
+
 def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Torques (N, n_u) [N m] of a profile and the state (n_q,), (n_q,) it starts from, zero where it gives none.
 
     Raises LogError as for a log.
     """
-    table = tables.read_table(path)
-    source = str(path)
+    drive = read_drive(path, model)
+    return drive.torque, drive.q0, drive.nu0
+
+
+def read_drive(source: str | Path | pd.DataFrame, model: Model) -> PlannedDrive:
+    """Read a profile with the motion that is expected; its first state is zero where it gives none.
+
+    Raises LogError as for a log.
+    """
+    table = source if isinstance(source, pd.DataFrame) else tables.read_table(source)
+    source = str(table.attrs.get("source", "profile")) if isinstance(source, pd.DataFrame) else str(source)
     needed = ["t_s", *(torque_column(model, n) for n in model.inputs)]
     missing = [c for c in needed if c not in table.columns]
     alien = [c for c in table.columns if re.fullmatch(r"u\d+_Nm?", str(c)) and c not in needed]
@@ -74,10 +111,12 @@ def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray
                 f"{source}: column {needed[k + 1]}: up to {top:.3g}, more than ten times the drive's limit"
                 f" {float(limit):g}; is the unit right?"
             )
-    start, speed = np.zeros(len(model.coordinates)), np.zeros(len(model.coordinates))
-    for k, (place, rate_column) in enumerate(motion_columns(model)):
-        if place in table.columns:
-            start[k] = numbers(table, place, source)[0]
-        if rate_column in table.columns:
-            speed[k] = numbers(table, rate_column, source)[0]
-    return torque, start, speed
+    columns = motion_columns(model)
+    given = {c: numbers(table, c, source) for pair in columns for c in pair if c in table.columns}
+    start, speed = (
+        np.array([given[c][0] if c in given else 0.0 for c in names]) for names in zip(*columns, strict=True)
+    )
+    if len(given) < 2 * len(columns):
+        return PlannedDrive(torque, start, speed)
+    q, nu = (np.column_stack([given[c] for c in names]) for names in zip(*columns, strict=True))
+    return PlannedDrive(torque, start, speed, q, nu)

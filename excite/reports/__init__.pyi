@@ -12,6 +12,7 @@ from .figures import (
     comparison_figure as comparison_figure,
     design_figure as design_figure,
     escape_dollar as escape_dollar,
+    prediction_figure as prediction_figure,
     save as save,
     sigma_figure as sigma_figure,
     verify_figure as verify_figure,

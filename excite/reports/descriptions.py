@@ -382,6 +382,90 @@ def _describe_validation(check: Mapping[str, Any]) -> str:
     return f"{text}: more than these explain in {worst}."
 
 
+def describe_predict(s: Summary) -> Description:
+    """Describe a prediction: width of the bands, where a log leaves them, what an open-loop motion is worth."""
+    rows = s["signals"]
+    judged = {n: r for n, r in rows.items() if not r["free"]}
+    share = {n: 100 * r["rms_band"] / r["rms"] for n, r in judged.items() if r["rms"] > 0}
+    worst = max(share, key=lambda n: share[n], default=None)
+    within = (
+        "to be zero"
+        if worst is None
+        else f"to +- {format_percent(float(np.median(list(share.values()))))} (half the 95 % band, of the signal's rms;"
+        f" median, worst {worst}, {format_percent(share[worst])})"
+    )
+    if s["along"] == "log":
+        headline = f"Along {s['target']} the drive torques are predicted {within}; {_describe_outside(s)}."
+        basis = (
+            "A log shows the motion, so the torques follow from it by inverse dynamics, low-passed as the readings are."
+            " The band is that of the true torque: the parameters' uncertainty, and the sensors' noise in the motion. A"
+            " reading adds the noise of its own sensor."
+        )
+    else:
+        planned = any(r["unit"] in FORCES for r in rows.values())
+        what = "the motion, and the torques that the planned motion needs, are" if planned else "the motion is"
+        headline = f"Under the torques of {s['target']} {what} predicted {within}."
+        basis = (
+            "A profile gives the torques, so the motion is simulated in open loop. The band is that of the parameters'"
+            " uncertainty, to first order."
+        )
+    remarks = [basis]
+    free = {n: r for n, r in rows.items() if r["free"]}
+    if free:
+        ends = ", ".join(f"{n} +- {format_number(r['at_end'], 2)} {r['unit']}" for n, r in free.items())
+        remarks.append(
+            f"No force depends on these positions, so errors of speed add up in them: at the end {ends}. They are no"
+            " fair measure of a model, speeds are."
+        )
+    if s["assumed"]:
+        remarks.append(
+            "Not identified, so taken from the machine file, with an error that is in no band:"
+            f" {', '.join(s['assumed'])}."
+        )
+    if s["status"] == "doubtful":
+        headline = f"The 95 % bands do not hold, as the estimate is doubtful: {s['doubt']}. {headline}"
+    log = s["along"] == "log"
+    table = tuple(
+        (
+            n,
+            r["unit"],
+            *(format_number(r[k], 3) for k in ("rms", "rms_band")),
+            *((format_number(r["rms_parameters"], 3), format_number(r["rms_noise"], 3)) if log else ()),
+            format_number(r["at_end"], 3),
+            *((format_number(100 * r["share_outside"], 2),) if log else ()),
+        )
+        for n, r in rows.items()
+    )
+    columns = (
+        *("signal", "unit", "rms", "95 % band +-"),
+        *(("by parameters", "by noise") if log else ()),
+        "band at the end +-",
+        *(("readings outside %",) if log else ()),
+    )
+    caption = "Predicted signals: root mean square over time of each, and of half its 95 % band."
+    if free:
+        caption += " Positions in which errors add up are set off."
+    marked = tuple(k for k, r in enumerate(rows.values()) if r["free"])
+    tables = (Table(caption, columns, table, marked, grey=s["status"] != "valid"),)
+    return Description(f"Prediction for {s['machine']}", headline, tables, (*remarks, *s["notes"]), s["status"])
+
+
+FORCES = ("N m", "N")
+
+
+def _describe_outside(s: Summary) -> str:
+    """Say where the readings of a log leave the prediction."""
+    share = 100 * float(np.mean([r["share_outside"] for r in s["signals"].values()]))
+    text = f"{format_percent(share)} of the readings are outside their 95 % band (5 % if the model is right)"
+    if not s["outside"]:
+        return text
+    worst = ", ".join(
+        f"{x['signal']} (most from {x['from_s']:.1f} to {x['to_s']:.1f} s, {x['ratio']:.1f} times)"
+        for x in s["outside"]
+    )
+    return f"{text}, and more than noise and parameters explain in {worst}"
+
+
 def _join_some(names: Sequence[str]) -> str:
     """Join the first names, and count the others."""
     shown = ", ".join(names[:MAX_NAMES])
@@ -603,6 +687,7 @@ DESCRIPTIONS: dict[str, Callable[[Summary], Description]] = {
     "compare": describe_compare,
     "verify": describe_verify,
     "identify": describe_identify,
+    "predict": describe_predict,
     "log": describe_log,
     "machine": describe_machine,
     "diagnose": describe_diagnose,

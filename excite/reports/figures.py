@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from excite import trajectories
-from excite.identification import SignalComparison, Verification
+from excite.identification import Prediction, SignalComparison, Verification
 from excite.logs import Inspection
 from excite.model import Model
 from excite.model.machine import Problem
@@ -27,6 +28,7 @@ MIN_SHADE = 0.004  # of a log's duration, that is shaded at least
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
 LINEAR_UP_TO = 5.0  # errors [%] up to which their axis is linear; chosen
+UNIT_OF_COLUMN = re.compile(r"_(Nm|N|(rad|m)(_s)?)$")  # at the end of a profile's columns
 TICKED_DECADES = 3  # of a logarithmic axis, up to which it has ticks between powers of ten; chosen
 
 
@@ -248,6 +250,52 @@ def comparison_figure(model: Model, c: SignalComparison, title: str) -> Figure:
         _lines(axes[2 * k + 1], c.t, {"residual": c.residual[k]}, f"residual [{unit}]", legend=c.expected is not None)
     axes[-1].set_xlabel("time [s]")
     return figure
+
+
+def prediction_figure(p: Prediction, title: str) -> Figure:
+    """Plot each predicted signal with its 95 % band, and the band alone below, about the residual along a log.
+
+    Torques take the whole width; a motion has a column of speeds and one of positions.
+    """
+    forces = [k for k, unit in enumerate(p.units) if unit in ("N m", "N")]
+    motion = [k for k in range(len(p.names)) if k not in forces]
+    half = len(motion) // 2
+    rows = [[k] for k in forces] + [[motion[k], motion[half + k]] for k in range(half)]
+    figure = Figure(figsize=(12 if motion else 10, 0.8 + 3.0 * len(rows)), layout="constrained")
+    figure.suptitle(escape_dollar(title), fontsize=11)
+    grid = figure.add_gridspec(2 * len(rows), 2, height_ratios=(2, 1) * len(rows))
+    for i, row in enumerate(rows):
+        for j, k in enumerate(row):
+            column = slice(None) if len(row) == 1 else j
+            above = figure.add_subplot(grid[2 * i, column])
+            below = figure.add_subplot(grid[2 * i + 1, column], sharex=above)
+            above.tick_params(labelbottom=False)
+            _predicted(above, below, p, k)
+            if i == len(rows) - 1:
+                below.set_xlabel("time [s]")
+    return figure
+
+
+def _predicted(above: Axes, below: Axes, p: Prediction, k: int) -> None:
+    """Plot the k-th signal of a prediction with its band above; below the band alone, or the residual in it."""
+    unit, added = p.units[k], " (adds up)" if p.names[k] in p.free else ""
+    above.fill_between(p.t, p.value[k] - p.band[k], p.value[k] + p.band[k], color=COLOURS[4], alpha=0.5, linewidth=0)
+    curves = {"predicted": p.value[k]}
+    if p.measured is not None:
+        curves = {"measured": p.measured[k], **curves}
+    _lines(above, p.t, curves, f"{UNIT_OF_COLUMN.sub('', p.names[k])} [{unit}]{added}", legend=len(curves) > 1)
+    below.grid(alpha=0.3)
+    if p.measured is None or p.reading_band is None or p.outside is None:
+        below.fill_between(p.t, -p.band[k], p.band[k], color=COLOURS[4], alpha=0.5, linewidth=0)
+        below.set_ylabel(f"95 % band\n[{unit}]")
+        return
+    residual, outside = p.measured[k] - p.value[k], p.outside[k]
+    below.fill_between(p.t, -p.reading_band[k], p.reading_band[k], color="0.8", linewidth=0, label="95 % of readings")
+    below.fill_between(p.t, -p.band[k], p.band[k], color=COLOURS[4], alpha=0.5, linewidth=0, label="95 % band of truth")
+    below.plot(p.t, residual, color=COLOURS[0], linewidth=1.0, label="measured - predicted")
+    below.plot(p.t[outside], residual[outside], ".", color=COLOURS[1], markersize=3, label="outside")
+    below.set_ylabel(f"residual\n[{unit}]")
+    below.legend(loc="lower right", bbox_to_anchor=(1, 0.98), fontsize=8, ncols=4, frameon=False, borderpad=0)
 
 
 def compare_figure(rows: Sequence[ComparisonRow], title: str) -> Figure:

@@ -35,6 +35,8 @@ CAPTIONS = {
     "signals.png": "Left, the share of each signal's error that is systematic, the rest being noise. Right, the error"
     " on stretches that were withheld from the fit, in the signal's unit and in per cent of the error without the"
     " findings.",
+    "prediction.png": "Predicted signals over time, each with the 95 % band of the true signal shaded. Below each the"
+    " band alone; along a log the residual in it, and in grey where 95 % of the readings are if the model is right.",
     "compare.png": "Drives side by side: condition number of Phi, and attainable standard deviation of the worst"
     " parameter [%]; hatched drives break a limit that their label names.",
     "machine.png": "The machine from above: dots its centres of mass, green its measuring wheels, dashed with every"
@@ -83,8 +85,8 @@ def write_report(place: Path, kind: str, summary: Summary) -> None:
 def provenance(summary: Summary) -> dict[str, str]:
     """Return how a result was made: command, machine, settings, seed, time, versions."""
     rows = {"command": shlex.join(["excite", *sys.argv[1:]])}
-    names = ("machine", "problem", "objective", "method", "kit", "runs", "samples", "starts", "design", "duration_s")
-    for key in (*names, "budget_s", "seed", "wall_s"):
+    names = ("machine", "problem", "objective", "method", "kit", "runs", "samples", "starts", "design", "estimate")
+    for key in (*names, "target", "duration_s", "budget_s", "seed", "wall_s"):
         value = summary.get(key)
         if value is not None:
             name, unit = (key[:-2], " s") if key.endswith("_s") else (key, "")

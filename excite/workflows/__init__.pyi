@@ -11,6 +11,7 @@ from .identify_workflow import (
     identify_from as identify_from,
 )
 from .machine_check import check_machine as check_machine
+from .predict_workflow import predict as predict, predict_from as predict_from
 from .requests import (
     build_model as build_model,
     choices as choices,

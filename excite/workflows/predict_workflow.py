@@ -1,0 +1,103 @@
+"""`excite predict`: from an estimate and a log or profile to predicted signals with 95 % bands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from excite import identification, reports
+from excite.errors import NoEstimateError
+from excite.identification import Estimate, Prediction
+from excite.logs import Log, PlannedDrive, examine, is_profile, prepare, read_drive
+from excite.model import Model
+from excite.workflows import requests
+from excite.workflows.progress import Bar, no_bar
+
+Target = str | Path | pd.DataFrame | Log | PlannedDrive
+
+
+@dataclass(frozen=True)
+class PredictResult:
+    """A prediction, with notes on the log that it is along. along: `log` or `profile`."""
+
+    prediction: Prediction
+    along: str
+    notes: tuple[str, ...] = ()
+
+
+def predict_from(model: Model, estimate: Estimate, target: Target) -> PredictResult:
+    """Predict the torques along a log, or the motion along a profile; the columns decide which of them a table is.
+
+    Raises NoEstimateError for an invalid estimate, LogError for an unusable target, SimulationError if the estimate is
+    no machine that can be simulated.
+    """
+    if estimate.status == "invalid":
+        raise NoEstimateError(f"nothing is predicted, as the estimate is invalid: {estimate.doubt}")
+    if isinstance(target, PlannedDrive):
+        return PredictResult(identification.predict_motion(model, target, estimate), "profile")
+    if not isinstance(target, Log) and is_profile(target, model):
+        return PredictResult(identification.predict_motion(model, read_drive(target, model), estimate), "profile")
+    ready = prepare(model, [target], identification.needed_sensors(model, "joint"))
+    examined = [examine(ready.model.machine, one) for one in ready.logs]
+    notes = (*ready.notes, *(line for e in examined for line in (*e.notes, *e.doubts)))
+    found = identification.predict_torques(ready.model, [e.log for e in examined], estimate)
+    return PredictResult(found, "log", notes)
+
+
+def predict(place: Path, result: Path, target: Path, bar: Bar = no_bar) -> dict[str, Any]:
+    """Predict signals along a log or profile from the folder of an estimate, into a folder; return the summary.
+
+    Raises EstimateFolderError, and what `predict_from` raises.
+    """
+    saved = identification.read_estimate(result)
+    with bar("predicting"):
+        found = predict_from(saved.model, saved.estimate, target)
+    summary = {
+        "machine": saved.model.machine.name,
+        "estimate": str(result),
+        "target": str(target),
+        "along": found.along,
+        "status": saved.estimate.status,
+        "doubt": saved.estimate.doubt,
+        "method": saved.estimate.method,
+        "duration_s": float(found.prediction.t[-1]),
+        "signals": _signals(found.prediction),
+        "outside": [
+            {"signal": name, "from_s": begin, "to_s": end, "ratio": ratio}
+            for name, begin, end, ratio in found.prediction.worst
+        ],
+        "assumed": list(found.prediction.assumed),
+        "notes": list(found.notes),
+        "versions": requests.package_versions(),
+    }
+    found.prediction.table.to_csv(place / "prediction.csv", index=False)
+    title = f"{saved.model.machine.title}: {target}"
+    reports.save(reports.prediction_figure(found.prediction, title), place / "prediction.png")
+    reports.write_report(place, "predict", summary)
+    return summary
+
+
+def _signals(p: Prediction) -> dict[str, dict[str, Any]]:
+    """Summarise each signal: root mean squares of its value and of half its 95 % band, the band at the end."""
+    rows: dict[str, dict[str, Any]] = {}
+    for k, name in enumerate(p.names):
+        rows[name] = {
+            "unit": p.units[k],
+            "rms": _rms(p.value[k]),
+            "rms_band": _rms(p.band[k]),
+            "rms_parameters": _rms(p.parameters[k]),
+            "rms_noise": _rms(p.noise[k]),
+            "at_end": float(p.band[k, -1]),
+            "free": name in p.free,
+        }
+        if p.outside is not None:
+            rows[name]["share_outside"] = float(p.outside[k].mean())
+    return rows
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))
