@@ -74,12 +74,15 @@ def _estimate(summary: dict[str, Any], covariance: pd.DataFrame) -> Estimate:
     names = tuple(rows)
     if tuple(covariance.columns) != names or tuple(covariance.index) != names:
         raise ValueError("names differ")
+    spread = covariance.to_numpy(float)
+    if np.isinf(spread).any() or not np.allclose(spread, spread.T, equal_nan=True):
+        raise ValueError("no covariance")
     return Estimate(
         str(summary["method"]),
         names,
         tuple(str(r["unit"]) for r in rows.values()),
         np.array([r["value"] for r in rows.values()], float),
-        covariance.to_numpy(float),
+        spread,
         float(summary["cond_w"]),
         float(summary["cond_phi"]),
         float(summary["relative_error_percent"]),

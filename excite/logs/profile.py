@@ -60,7 +60,7 @@ class PlannedDrive:
 
 
 def is_profile(source: str | Path | pd.DataFrame, model: Model) -> bool:
-    """Tell a profile from a log by its columns: all speeds of the expected motion, or no angle that a sensor reads.
+    """Tell a profile from a log by its columns: all speeds of the expected motion, or torques without angles.
 
     Raises LogError for a file that can't be read.
     """
@@ -69,7 +69,8 @@ def is_profile(source: str | Path | pd.DataFrame, model: Model) -> bool:
     wanted = [machine.time_column, *(c for s in machine.sensors("full") for c in s.columns)]
     table = source if isinstance(source, pd.DataFrame) else tables.read_table(source, wanted)
     have = set(tables.with_names(table, wanted).columns)
-    return {rate for _, rate in motion_columns(model)} <= have or not angles & have
+    torques = {torque_column(model, n) for n in model.inputs}
+    return {rate for _, rate in motion_columns(model)} <= have or (torques <= have and not angles & have)
 
 
 def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from excite import identification, reports
-from excite.errors import NoEstimateError
+from excite.errors import NoEstimateError, UsageError
 from excite.identification import Estimate, Prediction
 from excite.logs import Log, PlannedDrive, examine, is_profile, prepare, read_drive
 from excite.model import Model
@@ -32,9 +32,14 @@ class PredictResult:
 def predict_from(model: Model, estimate: Estimate, target: Target) -> PredictResult:
     """Predict the torques along a log, or the motion along a profile; the columns decide which of them a table is.
 
-    Raises NoEstimateError for an invalid estimate, LogError for an unusable target, SimulationError if the estimate is
-    no machine that can be simulated.
+    Raises NoEstimateError for an invalid estimate, UsageError for one of another machine, LogError for an unusable
+    target, SimulationError if the estimate is no machine that can be simulated.
     """
+    if estimate.names != model.base.names:
+        raise UsageError(
+            f"the estimate has the parameters {', '.join(estimate.names)}, {model.machine.name} has"
+            f" {', '.join(model.base.names)}: give the machine that it was identified for"
+        )
     if estimate.status == "invalid":
         raise NoEstimateError(f"nothing is predicted, as the estimate is invalid: {estimate.doubt}")
     if isinstance(target, PlannedDrive):
