@@ -91,7 +91,13 @@ def test_tutorial_runs_as_it_is_written(tmp_path: Path, monkeypatch: pytest.Monk
         else:
             subprocess.run(["bash", "-c", shell + text], check=True, env=ENVIRONMENT, timeout=600)
     files = "design/report.html cab/sheet.pdf cab/driver.html checked/log.png found/report.html my_logger.toml"
-    for written in (*files.split(), "diagnosed/report.html", "two/runs.parquet"):
+    for written in (
+        *files.split(),
+        "along_log/prediction.csv",
+        "along_drive/prediction.png",
+        "diagnosed/report.html",
+        "two/runs.parquet",
+    ):
         assert (tmp_path / written).is_file()
 
 

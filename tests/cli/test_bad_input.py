@@ -13,6 +13,7 @@ import math
 import random
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -33,6 +34,7 @@ import scipy.io
 from hypothesis import given, settings, strategies as st
 from support.commands import Excite
 
+from excite import workflows
 from excite.errors import (
     DesignFolderError,
     InfeasibleError,
@@ -248,6 +250,8 @@ def ground(tmp_path_factory: pytest.TempPathFactory, straight: Model) -> dict[st
     table.to_parquet(place / "log.parquet", index=False)
     scipy.io.savemat(place / "log.mat", {c: table[c].to_numpy()[:, None] for c in table})
     profile = profiles.profile_of(straight, motion).to_csv(index=False)
+    (place / "found").mkdir()
+    workflows.identify(place / "found", "va12_straight", [place / "log.parquet"], "ols")
     design = place / "design"
     design.mkdir()
     (design / "profile.csv").write_text(profile)
@@ -267,6 +271,7 @@ def ground(tmp_path_factory: pytest.TempPathFactory, straight: Model) -> dict[st
         "mat": (place / "log.mat").read_bytes(),
         "profile": profile,
         "design": design,
+        "found": place / "found",
         "study": study,
         "machines": [(machine.MACHINES / f"{n}.toml").read_text() for n in ("va12", "emps", "va12_straight")],
     }
@@ -492,6 +497,8 @@ GOOD = [
     "simulate va12_straight profile.csv --seed 3 --out made.csv",
     "simulate va12_straight profile.csv --noise off --effect ground_slope=0.001 --out made.parquet",
     "identify va12_straight log.csv --method ols --out made",
+    "predict found profile.csv --out made",
+    "predict found log.csv --out made",
     "verify design --runs 1 --method ols --kit full --out made",
     "design va12_straight --duration 8 --starts 1 --out made",
     "run va12_straight --duration 8 --starts 1 --runs 1 --out made",
@@ -533,9 +540,8 @@ def laid_out(ground: dict[str, Any], place: Path) -> set[str]:
     rng = random.Random(0)
     (place / "spoilt.csv").write_bytes(spoilt_csv(ground["csv"], rng))
     (place / "spoilt.toml").write_text('extends = "va12_straight"\ntitle = "a $\\\\frac{$ <b>&"\nname = "odd"\n')
-    (place / "design").mkdir()
-    for path in ground["design"].iterdir():
-        (place / "design" / path.name).write_bytes(path.read_bytes())
+    for name in ("design", "found"):
+        shutil.copytree(ground[name], place / name)
     return {p.name for p in place.iterdir()}
 
 
@@ -552,7 +558,7 @@ def test_command_lines(
 
     Searches and studies are cut out: what is tested is what leads to them.
     """
-    from excite import diagnosis, identification, operator, trajectories, workflows
+    from excite import diagnosis, identification, operator, trajectories
     from excite.workflows import design_request
 
     def cut(*_: Any, **__: Any) -> Any:
