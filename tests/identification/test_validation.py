@@ -116,3 +116,16 @@ def test_noise_says_how_much_of_a_filtered_error_it_makes(va12: Model, va12_moti
     assert c.noise is not None
     assert c.share_percent(c.noise) == pytest.approx(c.percent, rel=0.35)
     assert c.percent.max() > 4
+
+
+def test_band_of_smoothed_torques_is_what_other_parameters_predict(straight: Model, other: Log) -> None:
+    """A step of all parameters that share one error: the log smoothed with them on either side of the estimate."""
+    names, units, n = straight.base.names, straight.base.units, len(straight.nominal)
+    step = 0.005 * straight.nominal * np.resize([1, -1, 1], n)
+    one = Estimate("joint", names, units, straight.nominal, np.outer(step, step), 1, 1, 1, np.empty((0, 0)), 99, {}, ())
+    low, high = (validate_torques(straight, other, replace(one, value=one.value + s * step)) for s in (-1, 1))
+    found = validate_torques(straight, other, one)
+    assert found.parameters is not None
+    expected = np.abs(high.predicted - low.predicted) / 2
+    error = np.linalg.norm(found.parameters - expected, axis=1) / np.linalg.norm(expected, axis=1)
+    assert (error < 0.05).all(), error
