@@ -398,8 +398,8 @@ def describe_predict(s: Summary) -> Description:
         headline = f"Along {s['target']} the drive torques are predicted {within}; {_describe_outside(s)}."
         basis = (
             "A log shows the motion, so the torques follow from it by inverse dynamics, low-passed as the readings are."
-            " The band is that of the true torque: the parameters' uncertainty, and the sensors' noise in the motion. A"
-            " reading adds the noise of its own sensor."
+            " The band is that of the true torque if the model is right: the parameters' uncertainty, and the sensors'"
+            " noise in the motion. A reading adds the noise of its own sensor."
         )
     else:
         planned = any(r["unit"] in FORCES for r in rows.values())
@@ -407,7 +407,7 @@ def describe_predict(s: Summary) -> Description:
         headline = f"Under the torques of {s['target']} {what} predicted {within}."
         basis = (
             "A profile gives the torques, so the motion is simulated in open loop. The band is that of the parameters'"
-            " uncertainty, to first order."
+            " uncertainty, to first order, if the model is right."
         )
     remarks = [basis]
     free = {n: r for n, r in rows.items() if r["free"]}
@@ -463,7 +463,7 @@ def _describe_outside(s: Summary) -> str:
         f"{x['signal']} (most from {x['from_s']:.1f} to {x['to_s']:.1f} s, {x['ratio']:.1f} times)"
         for x in s["outside"]
     )
-    return f"{text}, and more than noise and parameters explain in {worst}"
+    return f"{text}. The model lacks something in {worst}: the band does not hold there, `excite diagnose` finds causes"
 
 
 def _join_some(names: Sequence[str]) -> str:
