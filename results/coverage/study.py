@@ -254,7 +254,7 @@ EDGES = """
 S40 goes one way, so only starting and stopping separate dry friction from the torque offset. The information is in the
 times of single encoder edges. The smoother assumes that an edge has a standard deviation of at least 0.1 counts, the
 division error of a good encoder. Simulated encoders have perfect edges, so the stated intervals of Fs and u0 are about
-1.3 times too wide ([1999](../1999)).
+1.3 times too wide ([S40](../S40): dispersion 6.4 %, stated 8.3 % for Fs1).
 """
 
 
