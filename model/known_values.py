@@ -19,7 +19,7 @@ from excite.errors import MachineError
 from excite.model.machine import Body, Machine, Quantity
 from excite.model.mechanics import standard_inertia
 
-EXACT_SHARE = 1e-5  # standard deviation of an exact quantity relative to the scale, for conditioning; chosen
+EXACT_SHARE = 1e-4  # standard deviation of an exact quantity relative to the scale, for conditioning; chosen
 NULL_TOLERANCE = 1e-9  # relative size below which a quantity leaves a combination unchanged; chosen
 INERTIA_KEYS = ("XX", "XY", "XZ", "YY", "YZ", "ZZ")
 FRICTION_KEYS = {"Fv": "Fv{}", "Fs": "Fs{}", "u0": "u{}0"}

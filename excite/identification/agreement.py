@@ -47,7 +47,14 @@ class Agreement:
 
 
 def compare_logs(names: Sequence[str], estimates: Sequence[Estimate]) -> Agreement | None:
-    """Compare estimates of single logs; None if no parameter is identified in all of them."""
+    """Compare estimates of single logs; None if the comparison would mislead.
+
+    That is if intervals do not hold by the method itself, or if the logs leave different parameters unidentified: the
+    others depend on the values at which these are held. None as well if no parameter is identified in all logs.
+    """
+    held = {frozenset(e.unidentifiable) for e in estimates}
+    if len(held) > 1 or any(e.understated > 1 for e in estimates):
+        return None
     known = np.all([np.isfinite(e.value) & np.isfinite(e.std) & (e.std > 0) for e in estimates], axis=0)
     at = np.flatnonzero(known)
     if not len(at) or len(estimates) < 2:

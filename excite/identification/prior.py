@@ -40,7 +40,10 @@ def prior_from_logs(model: Model, logs: Sequence[Log]) -> PriorKnowledge:
 
     Raises NotIdentifiableError if the logs give no possible machine, and what `identify` raises.
     """
-    return prior_from_estimate(model, identify(model, logs, "joint"))
+    estimate = identify(model, logs, "joint")
+    if estimate.status == "invalid":
+        raise NotIdentifiableError(f"the logs give no estimate: {estimate.doubt}")
+    return prior_from_estimate(model, estimate)
 
 
 def prior_from_estimate(model: Model, estimate: Estimate) -> PriorKnowledge:

@@ -18,7 +18,7 @@ from excite.text import format_p_value
 CLEAR_STDS = 3.0  # standard deviations beyond the possible that no noise explains; chosen
 MOVED_STDS = 2.0  # shift to the nearest possible machine that makes an inertial value impossible; chosen
 TRIED_POSTURES = 200  # of the logs, in which the mass matrix must be positive definite; chosen
-MIN_TESTED_SHARE = 0.01  # of a known value's variance that the logs must leave for a test of it; chosen
+MIN_TESTED_SHARE = 1e-6  # of a known value's variance that the logs must leave for a test of it, above rounding; chosen
 CONTRADICTION_LEVEL = 1e-3  # of that test; chosen
 INERTIAL_INITIALS = "MXYZ"  # of the names of inertial parameters
 NEVER_NEGATIVE = ("M", "XX", "YY", "ZZ")  # standard inertial parameters that no body has below zero
@@ -28,7 +28,7 @@ CAUSES = "the sign of a torque or angle column, a unit, or a radius in the machi
 def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter) -> Estimate:
     """Give an estimate its status, and mark values that no machine has.
 
-    Status: `valid`; `doubtful` if the 95 % intervals do not hold, `doubt` says why; `invalid` if besides some value is
+    Status: `valid`; `doubtful` if the 95 % intervals do not hold, `doubt` says why; `invalid` if some value is
     impossible by far, beyond its standard deviation and by the size that the machine file gives: then there is no
     estimate.
     """
@@ -48,7 +48,9 @@ def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
         possible &= ~moved
         notes.append("with these values the mass matrix is not positive definite: no machine has them together")
     doubt = estimate.doubt or _contradiction(model, estimate)
-    status = "valid" if not doubt else "invalid" if clear else "doubtful"
+    if clear and not doubt:
+        doubt = f"values that no machine has: check {CAUSES}"
+    status = "invalid" if clear else "doubtful" if doubt else "valid"
     estimate = replace(estimate, doubt=doubt, status=status, possible=possible, prior_std=model.known.std)
     return add_notes(estimate, *notes)
 

@@ -32,6 +32,7 @@ from excite.smoothing import (
 FAR_RATIO = 4.0  # ratio to the machine file's value, or its inverse, that is reported; chosen
 NOTABLE_RATIO = 1.25  # of the residual to what is expected, beyond which a signal is not explained; chosen
 FAR_STDS = 3.0  # distance from it that is significant [standard deviations]; chosen
+SETTLING_PERIODS = 6.0  # of the cut-off at either end, in which the filter's transient is no error; measured on EMPS
 MAX_NAMED = 4  # parameters in the note; chosen
 
 
@@ -100,8 +101,9 @@ class SignalComparison:
 def compare_torques(model: Model, log: Log, estimate: Estimate, filter: Filter | None = None) -> SignalComparison:
     """Predict the torques of a log from its motion and compare them, both low-passed.
 
-    Unidentifiable parameters count as zero. Noisy slips make this test less sensitive than `compare_motions`: `noise`
-    says how much of the residual they make, from simulated readings of the same motion, averaged over a second.
+    Unidentifiable parameters have the machine file's values. Noisy slips make this test less sensitive than
+    `compare_motions`: `noise` says how much of the residual they make, from simulated readings of the same motion,
+    averaged over a second.
     """
     filter = filter or model.machine.filter
     plain = _filtered_torques(model, log, estimate, filter)
@@ -114,6 +116,13 @@ def compare_torques(model: Model, log: Log, estimate: Estimate, filter: Filter |
         parameters=_parameter_band(model, log, estimate, filter),
         prediction_noise=_local_rms(model, [c.predicted - first.predicted for c in again]),
     )
+
+
+def _settled(log: Log, filter: Filter, rate: float) -> slice:
+    """Return the samples beyond the filter's transients at both ends, or those that it keeps of a short log."""
+    settling = round(SETTLING_PERIODS * rate / float(filter.cutoff_hz))
+    settling = settling if 4 * settling <= len(log) else 0
+    return slice(max(filter.drop[0], settling), len(log) - max(filter.drop[1], settling))
 
 
 def _local_rms(model: Model, errors: Sequence[np.ndarray]) -> np.ndarray:
@@ -221,7 +230,7 @@ def _smoothing_errors(
 def _parameter_band(model: Model, log: Log, estimate: Estimate, filter: Filter) -> np.ndarray:
     """Standard deviation (n_u, N) of predicted torques by the parameters' uncertainty."""
     motion = samples(model, log, filter)
-    keep = slice(filter.drop[0], len(log) - filter.drop[1])
+    keep = _settled(log, filter, float(model.machine.sampling_hz))
     root = covariance_root(np.nan_to_num(estimate.covariance))
     band = []
     for row in model.actuated:
@@ -251,7 +260,7 @@ def _filtered_torques(model: Model, log: Log, estimate: Estimate, filter: Filter
     rows = list(model.actuated)
     predicted = model.predict(motion.q, motion.nu, motion.a, p, *motion.beside).full()[rows]
     units = tuple(_torque_unit(model, k) for k in rows)
-    keep = slice(filter.drop[0], len(log) - filter.drop[1])
+    keep = _settled(log, filter, rate)
     measured, predicted = lowpass(motion.Y[rows], rate, filter), lowpass(predicted, rate, filter)
     return SignalComparison(model.inputs, units, log.t[keep], measured[:, keep], predicted[:, keep])
 

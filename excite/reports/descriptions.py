@@ -318,17 +318,26 @@ def describe_identify(s: Summary) -> Description:
         headline = f"{headline[:-1]}; {_join_some(impossible)} {have} that no machine has."
     if s["status"] == "invalid":
         reason = f", and {_join_some(impossible)} would have values that no machine has" if impossible else ""
-        headline = (
-            f"No estimate: the model does not explain {logs} (prediction error {error} of what was measured){reason}."
-        )
-    elif off:
+        headline = f"No estimate from {logs} (prediction error {error} of what was measured){reason}: {s['doubt']}."
+    elif off and s["status"] == "valid":
         most = max(off, key=lambda n: off[n])
         headline = (
             f"From {logs}, {s['method']} identifies {count}, {len(off)} of them wrong by more than it says: on"
             f" simulated logs like this by up to {format_percent(100 * off[most])} ({most}); the prediction error is"
             f" {error} of what was measured."
         )
-    remarks = [f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()] + list(s["notes"])
+    wrong: tuple[str, ...] = ()
+    if off and s["status"] == "doubtful":
+        most = max(off, key=lambda n: off[n])
+        wrong = (
+            f"On simulated logs like this {s['method']} is wrong by up to {format_percent(100 * off[most])} ({most}),"
+            f" in {len(off)} parameters by more than it says.",
+        )
+    remarks = [
+        *wrong,
+        *(f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()),
+        *dict.fromkeys(s["notes"]),
+    ]
     for check in s["validation"]:
         remarks.append(_describe_validation(check))
     biased = any("bias" in r for r in rows.values())
@@ -374,7 +383,7 @@ def _describe_validation(check: Mapping[str, Any]) -> str:
     )
     text = f"On {check['log']}, which was not fitted, the torque errors are {errors}"
     if not check["outside"]:
-        return f"{text}: the parameters explain it down to noise."
+        return f"{text}: the rest is within noise and the parameters' uncertainty."
     worst = ", ".join(
         f"{x['signal']} (most from {x['from_s']:.1f} to {x['to_s']:.1f} s, {x['ratio']:.1f} times)"
         for x in check["outside"]

@@ -89,6 +89,7 @@ class _Estimate:
         self.value, self.covariance = value, covariance
         self.names = tuple(f"p{k}" for k in range(len(value)))
         self.units = ("",) * len(value)
+        self.unidentifiable, self.understated = dict[str, str](), 1.0
 
     @property
     def std(self) -> np.ndarray:
