@@ -189,6 +189,32 @@ def local_model(
     return LocalModel(total, slope, factor)
 
 
+def exact_derivatives(
+    objective: CompositeObjective,
+    A: Sequence[np.ndarray] | np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    sharpness: float,
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return value, slope (n,) and Hessian (n, n) in the entries A_b[rows, columns] of all information matrices."""
+    n_a = len(rows)
+    total, slope, hessian = 0.0, np.zeros(len(A) * n_a), np.zeros((len(A) * n_a, len(A) * n_a))
+    for term in objective.terms:
+        x, g, H = objectives.exact_derivatives(
+            term.objective, _accumulated(term, A[term.block]), rows, columns, sharpness
+        )
+        own = slice(term.block * n_a, (term.block + 1) * n_a)
+        by = term.column_scale[rows] * term.column_scale[columns]
+        g, H = by * g, by[:, None] * H * by
+        push, bend = 1.0, 0.0
+        if term.ceiling is not None:
+            x, push, bend = _smooth_hinge(x - term.ceiling)
+        total += term.weight * x
+        slope[own] += term.weight * push * g
+        hessian[own, own] += term.weight * (push * H + bend * np.outer(g, g))
+    return total, slope, hessian
+
+
 def _accumulated(term: Term, A: np.ndarray) -> np.ndarray:
     """Return J = D (A + prior) D."""
     J = A if term.prior is None else A + term.prior

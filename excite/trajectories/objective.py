@@ -159,27 +159,58 @@ def local_model(objective: str, A: np.ndarray, rows: np.ndarray, columns: np.nda
     Variances v_i = c_i[i], C = A^-1: d2F[H, H] = sum_i 2 F_i c_i' H C H c_i + sum_ij F_ij (c_i' H c_i) (c_j' H c_j).
     """
     if OBJECTIVES[objective].of == "variances":
-        return _local_model_of_variances(objective, A, rows, columns, sharpness)
+        value, slope, curvature = _derivatives_of_variances(objective, A, rows, columns, sharpness)
+        return LocalModel(value, slope, factor_positive_part(curvature))
     n = len(A)
     x, V = np.linalg.eigh(A)
-    out = _derivatives(objective, n)(x, sharpness)
-    g, H = out[1].full().ravel(), out[2].full()
-    E = np.einsum("li,lj->lij", V[rows], V[columns])
-    E = np.where((rows != columns)[:, None, None], E + E.transpose(0, 2, 1), E)
+    value, g, H, E, ratio = _spectral_derivatives(objective, x, V, rows, columns, sharpness)
     slope = np.einsum("lii,i->l", E, g)
     e, U = np.linalg.eigh(x[:, None] * H * x)
     root = (U * np.sqrt(np.maximum(e, 0))).T / x
     i, j = np.triu_indices(n, 1)
+    factor = np.vstack([root @ np.einsum("lii->il", E), np.sqrt(2 * np.maximum(ratio, 0))[:, None] * E[:, i, j].T])
+    return LocalModel(value, slope, factor_positive_part(factor.T @ factor))
+
+
+def _spectral_derivatives(
+    objective: str, x: np.ndarray, V: np.ndarray, rows: np.ndarray, columns: np.ndarray, sharpness: float
+) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return value, slope and Hessian in the eigenvalues x, unit entries in the axes of V, and difference quotients.
+
+    Entries E (n_a, n, n); quotients (F_i - F_j) / (x_i - x_j) (n (n - 1) / 2,) of the pairs i < j.
+    """
+    n = len(x)
+    out = _derivatives(objective, n)(x, sharpness)
+    g, H = out[1].full().ravel(), out[2].full()
+    E = np.einsum("li,lj->lij", V[rows], V[columns])
+    E = np.where((rows != columns)[:, None, None], E + E.transpose(0, 2, 1), E)
+    i, j = np.triu_indices(n, 1)
     gap = x[j] - x[i]
     close = gap < 1e-7 * x[j]
     ratio = np.where(close, H[j, j] - H[i, j], (g[j] - g[i]) / np.where(close, 1, gap))
-    factor = np.vstack([root @ np.einsum("lii->il", E), np.sqrt(2 * np.maximum(ratio, 0))[:, None] * E[:, i, j].T])
-    return LocalModel(float(out[0]), slope, factor_positive_part(factor.T @ factor))
+    return float(out[0]), g, H, E, ratio
 
 
-def _local_model_of_variances(
+def exact_derivatives(
     objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, sharpness: float
-) -> LocalModel:
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return value, slope (n_a,) and Hessian (n_a, n_a) of an objective in the entries A[rows, columns].
+
+    The formulas of `local_model` without dropping negative curvature. Raises LinAlgError for a singular A.
+    """
+    if OBJECTIVES[objective].of == "variances":
+        return _derivatives_of_variances(objective, A, rows, columns, sharpness)
+    n = len(A)
+    x, V = np.linalg.eigh(A)
+    value, g, H, E, ratio = _spectral_derivatives(objective, x, V, rows, columns, sharpness)
+    own = np.einsum("lii->li", E)
+    pairs = E[:, *np.triu_indices(n, 1)]
+    return value, own @ g, own @ H @ own.T + (pairs * (2 * ratio)) @ pairs.T
+
+
+def _derivatives_of_variances(
+    objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, sharpness: float
+) -> tuple[float, np.ndarray, np.ndarray]:
     C = np.linalg.inv(A)
     out = _derivatives(objective, len(A))(np.diag(C), sharpness)
     g, H = out[1].full().ravel(), out[2].full()
@@ -192,7 +223,7 @@ def _local_model_of_variances(
         off = rows != columns
         np.add.at(moved, (np.flatnonzero(off), columns[off]), C[rows[off], i])
         curvature += 2 * weight * moved @ C @ moved.T
-    return LocalModel(float(out[0]), -through @ g, factor_positive_part(curvature))
+    return float(out[0]), -through @ g, curvature
 
 
 def factor_positive_part(matrix: np.ndarray) -> np.ndarray:
