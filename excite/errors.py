@@ -75,6 +75,10 @@ class CollocationError(FailedError):
     """Newton's method found no solution of an interval's collocation equations."""
 
 
+class SolverError(FailedError):
+    """A solver ended without an optimum."""
+
+
 class InfeasibleError(ExciteError, ValueError):
     """No drive keeps every limit.
 

@@ -67,6 +67,7 @@ def design(
     starts: int = 2,
     seed: int = 0,
     budget: float | None = None,
+    solver: str = "own",
     progress: Callable[[int, int, float], None] | None = None,
 ) -> Design:
     """Design a test drive that makes the parameters of a machine identifiable.
@@ -79,15 +80,20 @@ def design(
     robust: design for machines up to 20 % off the nominal one.
     starts, seed: starting guesses and their random seed.
     budget [s]: time after which the search stops.
+    solver: a name of `excite.trajectories.SOLVERS`: `own`, or `ipopt` for a check.
     progress(done, total, best score): called during the search.
-    Raises InfeasibleError with the limit that can't be kept, UsageError for an unknown name.
+    Raises InfeasibleError with the limit that can't be kept, SolverError if the solver finds no optimum, UsageError for
+    an unknown name.
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
     _, chosen = workflows.choose_problem(model.machine, problem, duration)
     workflows.require_objective(objective, model.machine)
+    workflows.require_known("solver", solver, tuple(trajectories.SOLVERS))
     workflows.require_positive("sigma_max", sigma_max, "%")
     workflows.require_positive("budget", budget, "s")
-    request = DesignRequest(objective, sigma_max, robust, (), starts, seed, budget, cond_slack=cond_slack)
+    request = DesignRequest(
+        objective, sigma_max, robust, (), starts, seed, budget, cond_slack=cond_slack, solver=solver
+    )
     return workflows.design_from(model, chosen, request, progress).design
 
 

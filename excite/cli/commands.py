@@ -32,6 +32,7 @@ from excite.cli.options import (
     RunsOption,
     SeedOption,
     SigmaMaxOption,
+    SolverOption,
     StartsOption,
 )
 from excite.errors import UsageError
@@ -147,6 +148,7 @@ def design(
     starts: StartsOption = 2,
     seed: SeedOption = 0,
     budget: BudgetOption = None,
+    solver: SolverOption = "own",
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -166,7 +168,7 @@ def design(
         raise UsageError("--phase-min needs --driver as well")
     earlier, pair = tuple(after or ()), tuple(between or ())
     request = DesignRequest(
-        objective, sigma_max, robust, earlier, starts, seed, budget, pair, driver, phase_min, cond_slack
+        objective, sigma_max, robust, earlier, starts, seed, budget, pair, driver, phase_min, cond_slack, solver
     )
     out = out or Path(f"results/design-{workflows.machine_stem(machine)}")
     with _result(out, json, partial(terminal.show, "design"), [*_machine_file(machine), *(after or [])]) as (

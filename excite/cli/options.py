@@ -68,6 +68,12 @@ DurationOption = Annotated[
 ObjectiveOption = Annotated[
     str, typer.Option("--objective", help="property of the drive to minimise", autocompletion=names("objective"))
 ]
+SolverOption = Annotated[
+    str,
+    typer.Option(
+        "--solver", help="solver of the search, `ipopt` for a check by another one", autocompletion=names("solver")
+    ),
+]
 StartsOption = Annotated[int, typer.Option("--starts", min=1, help="number of starting guesses of the search")]
 CondSlackOption = Annotated[
     float,

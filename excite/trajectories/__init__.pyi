@@ -17,6 +17,7 @@ from .composite_objective import (
     sigma_percent as sigma_percent,
     surrogate_ratio as surrogate_ratio,
 )
+from .continuation import SOLVERS as SOLVERS
 from .excitation import Manoeuvre as Manoeuvre, multisine as multisine, scale_torques as scale_torques
 from .limits import (
     LIMITS as LIMITS,

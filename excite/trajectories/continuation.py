@@ -16,7 +16,7 @@ from excite.errors import CollocationError, SimulationError
 from excite.model import Model
 from excite.model.machine import Machine, Problem
 from excite.simulation import Motion, simulate, track_motion
-from excite.trajectories import composite_objective, interior_point, objective as objectives
+from excite.trajectories import composite_objective, interior_point, ipopt, objective as objectives
 from excite.trajectories.collocation import Transcription, solve_states, transcribe
 from excite.trajectories.composite_objective import COND_MAX, SIGMA_MAX, CompositeObjective
 from excite.trajectories.excitation import Manoeuvre, knot_times, multisine, scale_torques
@@ -114,6 +114,7 @@ class SearchState:
     start_pose (n_q,): start coordinates, once limits of the lane matter.
     travel_direction (N,): +-1 at the machine's samples, if reversals are limited.
     surrogate_ratio (n_base,): correction of the surrogates of variances in the last stage.
+    solver: a name in SOLVERS. iterations: of the solver, in all stages. failure: why its last solve found no optimum.
     complete: False if the search was cut short.
     """
 
@@ -128,6 +129,9 @@ class SearchState:
     start_pose: np.ndarray | None = None
     travel_direction: np.ndarray | None = None
     surrogate_ratio: np.ndarray | None = None
+    solver: str = "own"
+    iterations: int = 0
+    failure: str | None = None
     complete: bool = False
 
 
@@ -142,7 +146,7 @@ def selection_score(c: ScoredDrive) -> float:
 
 
 def start_from_multisine(
-    model: Model, problem: Problem, objective: CompositeObjective, number: int, seed: int
+    model: Model, problem: Problem, objective: CompositeObjective, number: int, seed: int, solver: str = "own"
 ) -> SearchState:
     """Start from a random multisine, as large as the limits on the motion allow."""
     largest = multisine(model, problem, seed, top=0.5)
@@ -166,11 +170,12 @@ def start_from_multisine(
         motion,
         motion.t,
         travel_direction=travel_direction,
+        solver=solver,
     )
 
 
 def start_from_drive(
-    model: Model, problem: Problem, objective: CompositeObjective, number: int, drive: Manoeuvre
+    model: Model, problem: Problem, objective: CompositeObjective, number: int, drive: Manoeuvre, solver: str = "own"
 ) -> SearchState:
     """Start the last stages from a given drive.
 
@@ -191,6 +196,7 @@ def start_from_drive(
         motion.t,
         start_pose=start_pose,
         travel_direction=travel_direction,
+        solver=solver,
     )
 
 
@@ -220,11 +226,11 @@ def run_stages(
     should_stop: Callable[[], bool],
     report: StateReport = lambda state: None,
 ) -> SearchState:
-    """Take a start through stages until `should_stop`; `report` is called after each."""
+    """Take a start through stages until `should_stop` or a stage has no optimum; `report` is called after each."""
     if objective.sigma_max is not None:
         plan = [one for stage in plan for one in (stage.split_levels() if stage.friction == 1 else [stage])]
     for stage in plan:
-        if should_stop():
+        if should_stop() or state.failure is not None:
             break
         moved = _run_stage(model, problem, objective, state, stage, {}, should_stop)
         if moved is None:
@@ -249,7 +255,7 @@ def refine(
         return state
     for _ in range(MAX_REFINES):
         before = state.best
-        if should_stop():
+        if should_stop() or state.failure is not None:
             break
         state = _run_stage(model, problem, objective, state, REFINE_STAGE, {}, should_stop) or state
         report(state)
@@ -269,7 +275,7 @@ def repair(
     margins: dict[str, float] = {}
     state = bring_to_rest(model, problem, objective, state, should_stop)
     for _ in range(MAX_REPAIRS + len(objective.machines)):
-        if state.latest.feasible or should_stop():
+        if state.latest.feasible or should_stop() or state.failure is not None:
             break
         for name, excess in state.latest.violations.items():
             if excess > 0.3 * TOLERANCE:
@@ -406,26 +412,19 @@ def _run_stage(
         interior_point.BarrierLevel(p, stage.barrier / 3**i, stage.patience / p, stage.iterations)
         for i, p in enumerate(sharpness)
     )
-    kept = not fresh
+    asked = 0
+
+    def count_and_stop() -> bool:  # every solver asks after each of its iterations
+        nonlocal asked
+        asked += 1
+        return should_stop()
+
     try:
-        if kept:
-            point = interior_point.initial_iterate(tr, task, start, Z, U, stage.barrier, 1e-3)
-            point, values = interior_point.minimise(tr, task, point, levels, should_stop)
-            kept = interior_point.infeasibility(values, point) < MAX_INFEASIBILITY
-        if not kept:  # first find the nearest torques that keep every limit and end at rest
-            near = replace(task, objective=None, goal_weight=1.0, goal=U)
-            point = interior_point.initial_iterate(tr, near, start, Z, U, 1e-3, 0.05)
-            point, _ = interior_point.minimise(
-                tr, near, point, (interior_point.BarrierLevel(1.0, 1e-3, 1e-3, 40),), should_stop
-            )
-            point = interior_point.initial_iterate(
-                tr, task, point.start, point.Z, point.U, max(stage.barrier, 1e-4), 0.05
-            )
-            point, _ = interior_point.minimise(tr, task, point, levels, should_stop)
+        solution = SOLVERS[state.solver](tr, task, start, Z, U, levels, fresh, count_and_stop)
     except np.linalg.LinAlgError:  # singular information: the machine hardly moves
         return None
     try:
-        found, motion = evaluate_drive(model, problem, objective, Manoeuvre(times, point.U * tr.torque_scale))
+        found, motion = evaluate_drive(model, problem, objective, Manoeuvre(times, solution.U * tr.torque_scale))
     except SimulationError:
         return None
     return replace(
@@ -434,8 +433,84 @@ def _run_stage(
         best=min(state.best, found, key=rank),
         motion=motion,
         times=nodes.ravel(),
-        node_states=point.Z.reshape(-1, tr.n_z),
+        node_states=solution.Z.reshape(-1, tr.n_z),
+        iterations=state.iterations + asked,
+        failure=solution.failure,
     )
+
+
+@dataclass(frozen=True)
+class StageSolution:
+    """What a solver found in a stage: states Z (K, J, n_z) and torques U (K + 1, n_u), scaled.
+
+    failure: why this is no optimum, if the solver can tell.
+    """
+
+    Z: np.ndarray
+    U: np.ndarray
+    failure: str | None = None
+
+
+Solver = Callable[
+    [
+        Transcription,
+        interior_point.Subproblem,
+        np.ndarray,
+        np.ndarray,
+        np.ndarray,
+        tuple[interior_point.BarrierLevel, ...],
+        bool,
+        Callable[[], bool],
+    ],
+    StageSolution,
+]
+
+
+def _solve_own(
+    tr: Transcription,
+    task: interior_point.Subproblem,
+    start: np.ndarray,
+    Z: np.ndarray,
+    U: np.ndarray,
+    levels: tuple[interior_point.BarrierLevel, ...],
+    fresh: bool,
+    should_stop: Callable[[], bool],
+) -> StageSolution:
+    """Solve a stage by `interior_point`; a fresh start first moves to torques that keep every limit and end at rest."""
+    barrier = levels[0].barrier
+    if not fresh:
+        point = interior_point.initial_iterate(tr, task, start, Z, U, barrier, 1e-3)
+        point, values = interior_point.minimise(tr, task, point, levels, should_stop)
+        fresh = interior_point.infeasibility(values, point) >= MAX_INFEASIBILITY
+    if fresh:
+        near = replace(task, objective=None, goal_weight=1.0, goal=U)
+        point = interior_point.initial_iterate(tr, near, start, Z, U, 1e-3, 0.05)
+        point, _ = interior_point.minimise(
+            tr, near, point, (interior_point.BarrierLevel(1.0, 1e-3, 1e-3, 40),), should_stop
+        )
+        point = interior_point.initial_iterate(tr, task, point.start, point.Z, point.U, max(barrier, 1e-4), 0.05)
+        point, _ = interior_point.minimise(tr, task, point, levels, should_stop)
+    return StageSolution(point.Z, point.U)
+
+
+def _solve_with_ipopt(
+    tr: Transcription,
+    task: interior_point.Subproblem,
+    start: np.ndarray,
+    Z: np.ndarray,
+    U: np.ndarray,
+    levels: tuple[interior_point.BarrierLevel, ...],
+    fresh: bool,
+    should_stop: Callable[[], bool],
+) -> StageSolution:
+    """Solve a stage by Ipopt."""
+    found = ipopt.minimise(tr, task, start, Z, U, levels, should_stop)
+    if found.converged or found.status == ipopt.STOPPED:
+        return StageSolution(found.Z, found.U)
+    return StageSolution(found.Z, found.U, f"{found.status} after {found.iterations} iterations")
+
+
+SOLVERS: dict[str, Solver] = {"own": _solve_own, "ipopt": _solve_with_ipopt}
 
 
 def _damped_ratio(ratio: np.ndarray, before: np.ndarray | None) -> np.ndarray:

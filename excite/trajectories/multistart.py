@@ -21,7 +21,7 @@ from typing import Any
 import joblib
 import numpy as np
 
-from excite.errors import InfeasibleError
+from excite.errors import InfeasibleError, SolverError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion, simulate
@@ -30,6 +30,7 @@ from excite.trajectories import composite_objective, objective as objectives
 from excite.trajectories.composite_objective import SIGMA_MAX, CompositeObjective
 from excite.trajectories.continuation import (
     SCREENING_STAGES,
+    SOLVERS,
     STAGES,
     ScoredDrive,
     SearchState,
@@ -53,7 +54,8 @@ class Design:
 
     cond_phi, cond_w: condition numbers over every sample of `motion`. cond_phi_start: of the best random start.
     violations: excess by limit, as a fraction of its range, 0 where kept. scores: the objective of every start as
-    reported, inf for an infeasible one. complete: False if interrupted or cut short by the budget.
+    reported, inf for an infeasible one. complete: False if interrupted or cut short by the budget. solver: a name in
+    SOLVERS; iterations: of the solver, from the start that won to this drive.
     """
 
     objective: str
@@ -66,6 +68,8 @@ class Design:
     max_violation: float
     scores: tuple[float, ...]
     complete: bool
+    solver: str = "own"
+    iterations: int = 0
 
 
 def design(
@@ -77,6 +81,7 @@ def design(
     budget_s: float | None = None,
     progress: Report | None = None,
     warm: Sequence[Manoeuvre] = (),
+    solver: str = "own",
 ) -> Design:
     """Design an excitation trajectory: the best of several random starts.
 
@@ -86,11 +91,15 @@ def design(
         so too, and raises KeyboardInterrupt if there is no such drive yet.
     progress(done, total, best score): called as stages finish.
     warm: drives that start at the last stages; `starts` may then be 0.
+    solver: a name in SOLVERS.
 
     The same seed gives the same design unless the search is cut short.
 
-    Raises InfeasibleError with the limit and its excess, KeyError for an unknown objective.
+    Raises InfeasibleError with the limit and its excess, SolverError if the solver ended without an optimum from every
+    start, KeyError for an unknown objective or solver.
     """
+    if solver not in SOLVERS:
+        raise KeyError(f"no solver {solver}, allowed: {', '.join(SOLVERS)}")
     composite = composite_objective.compose_objective(model, objective) if isinstance(objective, str) else objective
     if starts < (0 if warm else 1):
         raise ValueError(f"starts must be at least 1, got {starts}")
@@ -115,18 +124,20 @@ def design(
                     if state is not None:
                         states[state.number] = state
 
-        gather(call(model, problem, composite, k, g, None, half, stop) for k, g in enumerate(guesses))
-        ranked = sorted(states.values(), key=lambda t: (t.number < starts, selection_score(t.latest), t.number))
+        gather(call(model, problem, composite, solver, k, g, None, half, stop) for k, g in enumerate(guesses))
+        ranked = sorted(states.values(), key=lambda t: (t.number < starts, *_screening_order(t)))
         chosen = ranked[:kept]
-        gather(call(model, problem, composite, t.number, 0, t, deadline, stop) for t in chosen)
+        gather(call(model, problem, composite, solver, t.number, 0, t, deadline, stop) for t in chosen)
         interrupted = stop.exists()
     if not states:
         raise KeyboardInterrupt
-    best = min(states.values(), key=lambda t: (*rank(t.best), t.number))
+    best = min(states.values(), key=lambda t: (t.failure is not None, *rank(t.best), t.number))
     complete = len(states) == len(guesses) and all(states[t.number].complete for t in chosen)
+    if not best.best.feasible and interrupted:
+        raise KeyboardInterrupt
+    if best.failure is not None:
+        raise _no_optimum(solver, best, len(guesses))
     if not best.best.feasible:
-        if interrupted:
-            raise KeyboardInterrupt
         raise _infeasible(composite, best.best, complete)
     drive = best.best
     motion = simulate(model, drive.manoeuvre.sample(float(model.machine.sampling_hz)), q0=drive.start)
@@ -141,6 +152,8 @@ def design(
         drive.excess,
         tuple(_score(composite, states[k].best) if k in states else float("inf") for k in range(len(guesses))),
         complete,
+        solver,
+        best.iterations,
     )
 
 
@@ -157,6 +170,22 @@ def _ignore_killed_workers(stop: Path) -> Iterator[None]:
 def process_count() -> int:
     """Return the number of parallel processes: one per core, two at least."""
     return max(2, os.cpu_count() or 1)
+
+
+def _screening_order(state: SearchState) -> tuple[bool, float, int]:
+    """Order screened starts: those whose solver found its optima first, then by score and excess."""
+    return state.failure is not None, selection_score(state.latest), state.number
+
+
+def _no_optimum(solver: str, best: SearchState, starts: int) -> SolverError:
+    """Build the error of a solver that ended without an optimum from every start."""
+    name = max(best.latest.violations, key=lambda limit: best.latest.violations[limit])
+    excess = best.latest.excess
+    where = f", where {name} is exceeded by {100 * excess:.2g} % of its range" if not best.latest.feasible else ""
+    return SolverError(
+        f"{solver} found no optimum from any of the starts ({starts}), the best ended with {best.failure}{where};"
+        " give more starts or another seed, or take the other solver"
+    )
 
 
 def _infeasible(objective: CompositeObjective, best: ScoredDrive, complete: bool) -> InfeasibleError:
@@ -233,6 +262,7 @@ def _run_start(
     model: Model,
     problem: Problem,
     objective: CompositeObjective,
+    solver: str,
     number: int,
     guess: int | Manoeuvre,
     state: SearchState | None,
@@ -259,12 +289,12 @@ def _run_start(
         if number > 0 and should_stop():
             return None
         if isinstance(guess, Manoeuvre):
-            return start_from_drive(model, problem, objective, number, guess)
+            return start_from_drive(model, problem, objective, number, guess, solver)
         return run_stages(
             model,
             problem,
             objective,
-            start_from_multisine(model, problem, objective, number, guess),
+            start_from_multisine(model, problem, objective, number, guess, solver),
             STAGES[:SCREENING_STAGES],
             should_stop,
             report_stage,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from excite import identification, logs, operator, simulation, text as wording, trajectories
-from excite.errors import InfeasibleError, MachineError
+from excite.errors import InfeasibleError, MachineError, SolverError
 from excite.model import Model, build, effects
 from excite.model.machine import EffectEntry, Problem
 from excite.operator import PhasedDrive
@@ -40,6 +40,7 @@ class DesignRequest:
     between: two effects, NAME[@WHERE]=MAGNITUDE, that the drive must separate.
     driver: design for people, in phases of phase_min_s [s] or more.
     cond_slack [%]: with objective cond, by how much cond(Phi) may grow for the most accurate drive; 0 for the lowest.
+    solver: a name of `SOLVERS`.
     """
 
     objective: str = "cond"
@@ -53,6 +54,7 @@ class DesignRequest:
     driver: bool = False
     phase_min_s: float = 3.0
     cond_slack: float = 12.0
+    solver: str = "own"
 
     @property
     def second_step(self) -> bool:
@@ -140,13 +142,13 @@ def design_from(
     aim = trajectories.compose_objective(model, request.objective, request.sigma_max, prior, machines)
     if not request.driver:
         budget = request.budget_s if not request.second_step or request.budget_s is None else request.budget_s / 2
-        lowest = design(model, problem, aim, request.starts, request.seed, budget, progress)
+        lowest = design(model, problem, aim, request.starts, request.seed, budget, progress, solver=request.solver)
         if not request.second_step:
             return DesignResult(model, aim, lowest)
         return _make_accurate(model, problem, request, aim, lowest, prior, budget, progress)
     begin = time.time()
     half = None if request.budget_s is None else request.budget_s / 2
-    free = design(model, problem, aim, request.starts, request.seed, half, progress)
+    free = design(model, problem, aim, request.starts, request.seed, half, progress, solver=request.solver)
 
     def out_of_time() -> bool:
         return request.budget_s is not None and time.time() > begin + request.budget_s
@@ -171,8 +173,8 @@ def _make_accurate(
     cond_max = (1 + request.cond_slack / 100) * lowest.cond_phi
     near = trajectories.compose_objective(model, "worst", prior=prior, cond_max=cond_max)
     try:
-        accurate = design(model, problem, near, 0, request.seed, budget, None, [lowest.manoeuvre])
-    except (InfeasibleError, KeyboardInterrupt):
+        accurate = design(model, problem, near, 0, request.seed, budget, None, [lowest.manoeuvre], request.solver)
+    except (InfeasibleError, SolverError, KeyboardInterrupt):
         return DesignResult(model, aim, lowest)
     complete = lowest.complete and accurate.complete
     found = replace(
@@ -208,6 +210,8 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
         "scores": list(drive.scores),
         "starts": request.starts,
         "seed": request.seed,
+        "solver": drive.solver,
+        "iterations": drive.iterations,
     }
     if result.first is not None:
         first = trajectories.sigma_percent(result.aim, result.model, result.first.motion)

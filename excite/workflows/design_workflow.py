@@ -33,6 +33,7 @@ def design(
     if request.between:
         model = design_request.add_rival_effects(model, request.between, float(chosen.duration_s))
     requests.require_objective(request.objective, model.machine)
+    requests.require_known("--solver", request.solver, tuple(trajectories.SOLVERS))
     requests.require_positive("--budget", request.budget_s, "s")
     requests.require_positive("--sigma-max", request.sigma_max, "%")
     return design_model(place, model, name, chosen, request, bar)

@@ -66,6 +66,7 @@ def choose_method(name: str | None, model: Model, kit: str | None = None) -> str
 # Package and table of each option that takes a name: help, shell completion and errors read the names from there.
 CHOICES = {
     "objective": ("excite.trajectories", "OBJECTIVES"),
+    "solver": ("excite.trajectories", "SOLVERS"),
     "method": ("excite.identification", "METHODS"),
     "against": ("excite.trajectories", "BASELINES"),
     "kit": ("excite.simulation", "KITS"),
