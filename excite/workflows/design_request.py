@@ -182,6 +182,7 @@ def _make_accurate(
         objective=lowest.objective,
         cond_phi_start=lowest.cond_phi_start,
         scores=lowest.scores,
+        iterations=lowest.iterations + accurate.iterations,
         complete=complete,
         violations={n: v for n, v in accurate.violations.items() if n != trajectories.COND_MAX},
     )
