@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 import scipy
 
+from excite.errors import LogError
 from excite.logs.log import Log
 from excite.model import Model
 from excite.model.machine import Filter, Sensor
@@ -200,7 +201,16 @@ def _planar_speed(model: Model, wheels: list[tuple[Sensor, np.ndarray]], nu: np.
 
 
 def lowpass(x: np.ndarray, rate: float, filter: Filter) -> np.ndarray:
-    """Zero-phase low-pass Butterworth (forward and backward), the ends continued by 3 x order reflected samples."""
+    """Zero-phase low-pass Butterworth (forward and backward), the ends continued by 3 x order reflected samples.
+
+    Raises LogError for a sampling rate that is too low for the filter.
+    """
+    if float(filter.cutoff_hz) >= rate / 2:
+        cutoff = float(filter.cutoff_hz)
+        raise LogError(
+            f"the log is sampled at {rate:g} Hz, and the filter's cutoff_hz = {cutoff:g} needs more than {2 * cutoff:g}"
+            " Hz: write a lower cutoff_hz under [filter] in the machine file"
+        )
     b, a = scipy.signal.butter(filter.order, float(filter.cutoff_hz) / (rate / 2))
     return np.asarray(scipy.signal.filtfilt(b, a, x, padlen=3 * filter.order))
 

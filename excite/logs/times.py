@@ -33,6 +33,7 @@ SECONDS_BY_WORD = {
 }
 NUMBER_AND_UNIT = re.compile(r"\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*([a-zµ]+)\s*")
 CLOCK = re.compile(r"\s*([+-]?)(?:(\d+)\s+days?,?\s*)?\+?(\d+):(\d{1,2})(?::(\d{1,2}))?(?:[.,:](\d+))?\s*")
+FIRST_YEAR, LAST_YEAR = 1678, 2261  # whose nanoseconds fit 64 bits
 
 
 def has_time(table: pd.DataFrame, machine: Machine) -> bool:
@@ -114,10 +115,11 @@ def _parse(raw: pd.Series, unit_s: float) -> np.ndarray:
     number = pd.to_numeric(raw, errors="coerce").to_numpy(dtype=float)
     if np.isfinite(number).any() or raw.dtype.kind not in "OTU":
         return number * unit_s
-    text = raw.astype(str).str.strip()
-    for parse in (_with_unit, _clock, _dates):
+    text = raw.fillna("").astype(str).str.strip()
+    filled = np.flatnonzero((text != "").to_numpy())
+    for parse in (_with_unit, _clock, _dates) if len(filled) else ():
         found = parse(text)
-        if np.isfinite(found[0]):
+        if np.isfinite(found[filled[0]]):
             return found
     return np.full(len(raw), np.nan)
 
@@ -136,7 +138,7 @@ def _with_unit(text: pd.Series) -> np.ndarray:
 
 def _clock(text: pd.Series) -> np.ndarray:
     """Cells such as "10:00:00.010", "10:00:00:010" or "0 days 00:00:00.010000"; "mm:ss.fff" has two parts."""
-    if not CLOCK.fullmatch(text.iloc[0]):
+    if not CLOCK.fullmatch(text[text != ""].iloc[0]):
         return np.full(len(text), np.nan)
     parts = text.str.extract(f"^{CLOCK.pattern}$")
     first, second, third = (pd.to_numeric(parts[k], errors="coerce").to_numpy(dtype=float) for k in (2, 3, 4))
@@ -150,12 +152,13 @@ def _clock(text: pd.Series) -> np.ndarray:
 def _dates(text: pd.Series) -> np.ndarray:
     """Dates: ISO 8601 in all its forms, with the day first where there are points, or what pandas recognises."""
     text = text.str.replace(r"(:\d{2}),(\d)", r"\1.\2", regex=True)
-    dotted = bool(re.match(r"\d{1,2}\.\d{1,2}\.\d{2,4}", text.iloc[0]))
+    dotted = bool(re.match(r"\d{1,2}\.\d{1,2}\.\d{2,4}", text[text != ""].iloc[0]))
     best = np.full(len(text), np.nan)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a format that pandas has to guess
         for how in ({"format": "ISO8601"}, {"format": "mixed", "dayfirst": dotted}):
             parsed = pd.to_datetime(text, errors="coerce", utc=True, **how)
+            parsed = parsed.where(parsed.dt.year.between(FIRST_YEAR, LAST_YEAR))
             found = _since_first(parsed.astype("datetime64[ns, UTC]").astype("int64"), parsed.isna())
             if np.isfinite(found).sum() > np.isfinite(best).sum():
                 best = found

@@ -11,7 +11,7 @@ import difflib
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator, model_validator
@@ -36,7 +36,8 @@ MACHINES = Path(__file__).parents[1] / "machines"
 Index = Annotated[int, Field(strict=True, ge=0, le=99)]
 
 # Checks of a log that a sensor can be left out of (`checks_off`), with what each looks for.
-TIME_UNITS = ("s", "ms", "us", "min")
+TimeUnit = Literal["s", "ms", "us", "ns", "min", "day"]
+TIME_UNITS = get_args(TimeUnit)
 LOG_CHECKS = {
     "jumps": "a position that goes further in one row than the joint can: an encoder that was reset, counts that wrap",
     "limits": "readings that the machine's limits rule out: degrees for radians, kN m for N m",
@@ -239,7 +240,7 @@ class Sensor(FileRecord):
     wraps_at: Annotated[float | None, Field(gt=0, allow_inf_nan=False)] = None
     checks_off: tuple[str, ...] = ()
     time_column: Annotated[str | None, Field(min_length=1)] = None
-    time_unit: Literal["s", "ms", "us", "min"] | None = None
+    time_unit: TimeUnit | None = None
     time_offset: Annotated[float, Field(allow_inf_nan=False)] = 0.0
 
     @property
@@ -389,7 +390,7 @@ class Machine(FileRecord):
     reference: str = ""
     sampling_hz: Positive
     time_column: str = "t_s"
-    time_unit: Literal["s", "ms", "us", "min"] = "s"
+    time_unit: TimeUnit = "s"
     gravity: Vector3 = (0.0, 0.0, -9.81)
     power_limit: Positive | None = None
     locked: tuple[str, ...] = ()

@@ -1,0 +1,54 @@
+"""Odd clocks and rates: read rightly, or refused in one line."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from support.commands import Excite
+
+N = 3000
+
+
+def rig_log() -> pd.DataFrame:
+    """A log of the machine `emps` at 1 kHz."""
+    t = np.arange(N) / 1000
+    return pd.DataFrame({"t": t, "qm": 0.05 * np.sin(4 * t), "vir": np.cos(4 * t) + 0.01 * np.sin(90 * t)})
+
+
+def identify(excite: Excite, tmp_path: Path, table: pd.DataFrame, machine: str | Path = "emps") -> tuple[int, str]:
+    path = tmp_path / "log.csv"
+    table.to_csv(path, index=False)
+    code, _, err = excite("identify", machine, path, "--out", tmp_path / "out")
+    return code, err
+
+
+def test_rate_too_low_for_the_filter_is_said(excite: Excite, tmp_path: Path) -> None:
+    code, err = identify(excite, tmp_path, rig_log()[::10])
+    assert code == 2
+    assert "sampled at 100 Hz, and the filter's cutoff_hz = 100 needs more than 200 Hz" in " ".join(err.split())
+
+
+def test_first_time_that_is_blank_is_named(excite: Excite, tmp_path: Path) -> None:
+    table = rig_log()
+    table["t"] = pd.to_datetime(table.t, unit="s", origin="2026-11-26").dt.strftime("%Y-%m-%dT%H:%M:%S.%f")
+    table.loc[0, "t"] = ""
+    code, err = identify(excite, tmp_path, table)
+    assert (code, "column t" in err) == (2, True)
+
+
+def test_quoted_decimal_commas_are_no_dates(excite: Excite, tmp_path: Path) -> None:
+    table = rig_log().map(lambda x: f"{x:.9f}".replace(".", ","))
+    code, err = identify(excite, tmp_path, table)
+    assert code == 2
+    assert "not a finite number" in err
+
+
+@pytest.mark.parametrize(("unit", "per_second"), [("ns", 1e9), ("day", 1 / 86400)])
+def test_advised_time_units_are_allowed(excite: Excite, tmp_path: Path, unit: str, per_second: float) -> None:
+    machine = tmp_path / "own.toml"
+    machine.write_text(f'extends = "emps"\nname = "own"\ntime_unit = "{unit}"\n')
+    table = rig_log()
+    table["t"] = table.t * per_second
+    code, err = identify(excite, tmp_path, table, machine)
+    assert code != 2, err
