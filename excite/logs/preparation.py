@@ -24,6 +24,7 @@ FASTEST_HZ = 150.0  # rate [Hz] beyond which a rolling machine tells nothing mor
 REST_S = 5.0  # [s] of standing still that is left out; chosen
 REST_MARGIN_S = 0.3  # [s] of a rest that stays with the motion before and after it; chosen
 
+MIN_RISING_SHARE = 0.5  # of a clock's steps; coarse clocks repeat themselves, temperatures fall as often; chosen
 MERGED = "merged"  # of a table's attrs: channels are on one clock already
 TIME_NAME = re.compile(r"(?i)(t|time|timestamp)([_ ].*)?|.*[_ ](t|time|timestamp)([_ ].*)?")
 
@@ -189,8 +190,15 @@ def _clock(table: pd.DataFrame, machine: Machine, sensor: Sensor, used: set[str]
         if name is not None and name in table.columns:
             return name
     before = list(table.columns)[: list(table.columns).index(sensor.column)]
-    clocks = [str(c) for c in before if c not in used and TIME_NAME.fullmatch(str(c))]
+    named = [str(c) for c in before if c not in used and TIME_NAME.fullmatch(str(c))]
+    clocks = [c for c in named if _rises(table[c])]
     return clocks[-1] if clocks else None
+
+
+def _rises(column: pd.Series) -> bool:
+    """Tell if a column could be a clock: nearly all of its numbers are larger than those before; text may be."""
+    values = pd.to_numeric(column, errors="coerce").dropna().to_numpy(dtype=float)
+    return len(values) < 2 or float(np.mean(np.diff(values) > 0)) > MIN_RISING_SHARE
 
 
 def _unit_in_file(table: pd.DataFrame, clock: str) -> str | None:

@@ -111,6 +111,6 @@ def _note(sensor: Sensor, machine: Machine, rows: np.ndarray, size: float, sourc
 
 
 def moves(machine: Machine, log: Log) -> bool:
-    """Tell if any angle goes further than a count or two; taken for granted where one isn't counted."""
+    """Tell if any angle goes further than a count or two, or changes at all where it isn't counted."""
     turning = [s for s in machine.sensors("full") if s.kind in ("angle", "wheel") and s.name in log.values]
-    return any(s.resolution is None or np.ptp(log.values[s.name]) > 2.5 * s.resolution for s in turning)
+    return any(np.ptp(log.values[s.name]) > 2.5 * (s.resolution or 0.0) for s in turning)

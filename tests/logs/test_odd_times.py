@@ -52,3 +52,17 @@ def test_advised_time_units_are_allowed(excite: Excite, tmp_path: Path, unit: st
     table["t"] = table.t * per_second
     code, err = identify(excite, tmp_path, table, machine)
     assert code != 2, err
+
+
+def test_an_angle_that_never_changes_gives_no_estimate(excite: Excite, tmp_path: Path) -> None:
+    code, err = identify(excite, tmp_path, rig_log().assign(qm=0.1))
+    assert code == 1
+    assert "no angle ever changes" in err
+
+
+def test_a_unit_in_brackets_that_is_not_the_machines_is_said(excite: Excite, tmp_path: Path) -> None:
+    table = rig_log().rename(columns={"qm": "qm [mm]"})
+    path = tmp_path / "log.csv"
+    table.to_csv(path, index=False)
+    _, out, err = excite("log", "check", path, "--machine", "emps", "--out", tmp_path / "out")
+    assert "the file says mm in column qm, the machine file m" in " ".join((out + err).split())

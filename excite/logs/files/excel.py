@@ -84,7 +84,10 @@ def _sheet(path: Path, sheet: Any) -> pd.DataFrame | None:
     if twice:
         raise LogError(f"{path}: sheet {sheet.title}, row {at.header + 1}: column {twice[0]} is there twice, keep one")
     table = pd.DataFrame({name: _column([line[k] for line in cells]) for k, name in enumerate(names) if name})
-    table.attrs |= {UNITS_SAID: at.units, OTHER_NAMES: layout.without_units(names) | at.other}
+    table.attrs |= {
+        UNITS_SAID: layout.bracketed_units(names) | at.units,
+        OTHER_NAMES: layout.without_units(names) | at.other,
+    }
     return table
 
 

@@ -116,6 +116,12 @@ def beside_header(
     return units, other
 
 
+def bracketed_units(names: Sequence[str]) -> dict[str, str]:
+    """Known units in brackets behind names, by column: theta1 [deg] -> deg."""
+    matches = {name: BRACKETED.fullmatch(name) for name in names}
+    return {name: m.group(2) for name, m in matches.items() if m is not None and m.group(2) in UNITS}
+
+
 def without_units(names: Sequence[str]) -> dict[str, str]:
     """Names without a unit in brackets -> the column: theta1 -> theta1 [deg]."""
     bare = [(match.group(1), name) for name in names if (match := BRACKETED.fullmatch(name))]

@@ -87,7 +87,12 @@ def read_text(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
             table[name], unclear[name] = _without_commas(table[name], comma)
         table[name] = _dates(table[name])
     other = layout.without_units(found.names) | found.other
-    table.attrs |= {UNITS_SAID: found.units, UNCLEAR: unclear, OTHER_NAMES: other, NOTES: notes}
+    table.attrs |= {
+        UNITS_SAID: layout.bracketed_units(found.names) | found.units,
+        UNCLEAR: unclear,
+        OTHER_NAMES: other,
+        NOTES: notes,
+    }
     return table
 
 
