@@ -59,8 +59,9 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     repaired, filter = [e.log for e in examined], filter or model.machine.filter
     if not any(v.any() for log in repaired for v in log.values.values()):
         raise NotIdentifiableError(f"{repaired[0].source}: every signal is zero: is the log empty of measurements?")
-    angles = [s.name for s in model.machine.sensors("full") if s.kind == "angle"]
-    if not any(np.ptp(log.values[n]) > 0 for log in repaired for n in angles if n in log.values):
+    angles = [s for s in model.machine.sensors("full") if s.kind == "angle"]
+    changes = (np.ptp(log.values[s.name]) > 0 for log in repaired for s in angles if s.name in log.values)
+    if all(s.resolution is None for s in angles) and not any(changes):  # counts may stand still, readings never do
         raise NotIdentifiableError(f"{repaired[0].source}: no angle ever changes: is its sensor connected?")
     doubts = [line for e in examined for line in e.doubts]
     with doubts_in_errors(doubts):
