@@ -174,8 +174,10 @@ def _make_accurate(
     near = trajectories.compose_objective(model, "worst", prior=prior, cond_max=cond_max)
     try:
         accurate = design(model, problem, near, 0, request.seed, budget, None, [lowest.manoeuvre], request.solver)
-    except (InfeasibleError, SolverError, KeyboardInterrupt):
+    except (InfeasibleError, SolverError):
         return DesignResult(model, aim, lowest)
+    except KeyboardInterrupt:
+        return DesignResult(model, aim, replace(lowest, complete=False))
     complete = lowest.complete and accurate.complete
     found = replace(
         accurate,

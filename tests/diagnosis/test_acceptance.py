@@ -105,6 +105,7 @@ def test_slow_forces_leave_a_true_effect_its_significance_and_take_that_of_a_fal
     assert abs(z["false"][0]) < 0.2 * abs(z["false"][1])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (SHARED / "emps").is_dir(), reason="needs ../shared/data/emps")
 def test_emps_gets_direction_dependent_friction_as_a_correction() -> None:
     """No effect explains EMPS' log as a whole; viscous friction that depends on the direction predicts forces better.

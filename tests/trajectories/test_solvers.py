@@ -162,7 +162,7 @@ def test_an_unknown_solver_names_the_known_ones() -> None:
 
 def test_an_interrupted_solve_leaves_no_half_written_folder(tmp_path: Path) -> None:
     out = tmp_path / "design"
-    command = [sys.executable, "-m", "excite", "design", "va12_straight", "--solver", "ipopt", "--starts", "1"]
+    command = [sys.executable, "-m", "excite", "design", "va12", "--solver", "ipopt", "--starts", "1"]
     with subprocess.Popen([*command, "--out", out], stderr=subprocess.PIPE, text=True) as run:
         time.sleep(6)  # in the first stage, no drive within the limits yet
         run.send_signal(signal.SIGINT)
