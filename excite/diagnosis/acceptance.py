@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from excite.diagnosis.diagnosis import Finding
+from excite.diagnosis.diagnosis import Finding, std_given_shapes
 from excite.diagnosis.fits import ExtendedFit
 from excite.diagnosis.hold_out import HoldOutErrors, hold_out_gain, predictive_gain
 from excite.diagnosis.slow_forces import allow_slow_forces
 from excite.smoothing import NotConvergedError
 
-MIN_STDS = 2.0  # magnitude over its standard deviation, of a finding; chosen
+MIN_STDS = 2.0  # magnitude over its standard deviation given the shapes, of a finding; chosen
 
 
 def widen(finding: Finding, stage: ExtendedFit) -> Finding:
@@ -25,7 +25,12 @@ def widen(finding: Finding, stage: ExtendedFit) -> Finding:
     shift, std = abs(beside.X[k] - stage.fit.X[k]), beside.std[k]
     if not np.isfinite(std) or stage.fit.unidentifiable[k]:
         return finding
-    return replace(finding, magnitude_std=float(max(finding.magnitude_std, np.hypot(std, shift))))
+    at_shapes = std_given_shapes(finding.name, stage.model, beside.covariance)
+    return replace(
+        finding,
+        magnitude_std=float(max(finding.magnitude_std, np.hypot(std, shift))),
+        std_at_shapes=float(max(finding.std_at_shapes, np.hypot(at_shapes, shift))),
+    )
 
 
 def reason_against(
@@ -35,7 +40,7 @@ def reason_against(
     effect = stage.placed(finding.name).effect
     if effect.opposes_motion and finding.magnitude < 0:
         return "its sign is impossible"
-    if not abs(finding.magnitude) > MIN_STDS * finding.magnitude_std:
+    if not abs(finding.magnitude) > MIN_STDS * finding.std_at_shapes:
         return f"its size is uncertain ({finding.magnitude:.3g} +- {finding.magnitude_std:.2g} {finding.unit})"
     if finding.kind == "cause":
         gain = predictive_gain(before, after, stage.dispersion)

@@ -50,7 +50,8 @@ class Finding:
     rivals: effects that the cause is tied with, as fitted. p_value: of no effect at all given the others, corrected for
     the number of candidates. shapes: value, standard deviation, unit. likelihood_ratio: 2 delta log L over the
     dispersion. share: of the excess misfit that it explains. kind: cause if the findings explain the logs, correction
-    if something else remains.
+    if something else remains. std_at_shapes: standard deviation of the magnitude if the shapes are those found, which
+    tells if there is such an effect at all.
     """
 
     effect: str
@@ -64,6 +65,7 @@ class Finding:
     likelihood_ratio: float
     share: float = 1.0
     kind: str = "cause"
+    std_at_shapes: float = 0.0
 
     @property
     def name(self) -> str:
@@ -501,7 +503,9 @@ def _make_finding(
     std = after.fit.std * after.std_inflation
     values = dict(zip(after.model.base.names, zip(after.fit.X, std, strict=True), strict=True))
     amount, sure = values[placed.name]
+    at_shapes = after.std_inflation * std_given_shapes(placed.name, after.model, after.fit.covariance)
     formula = FORMULA_STD_FACTOR * amount * np.sqrt(next_ratio / max(choice.likelihood_ratio, next_ratio, 1.0))
+    at_shapes = float(np.linalg.norm([at_shapes, FORMULA_STD_SHARE * amount, formula]))
     sure = float(
         np.linalg.norm(
             [
@@ -538,4 +542,16 @@ def _make_finding(
         placed.effect.unit,
         shapes,
         gain,
+        std_at_shapes=at_shapes,
     )
+
+
+def std_given_shapes(name: str, model: Model, covariance: np.ndarray) -> float:
+    """Return the standard deviation of an effect's magnitude given its shapes, from a covariance (n_base, n_base)."""
+    names = model.base.names
+    own = [names.index(name), *(k for k, n in enumerate(names) if n.startswith(f"{name}."))]
+    block = covariance[np.ix_(own, own)]
+    size = np.sqrt(np.diag(block))
+    if not (np.isfinite(size).all() and (size > 0).all()):
+        return float(size[0])
+    return float(size[0] / np.sqrt(np.linalg.inv(block / np.outer(size, size))[0, 0]))

@@ -25,12 +25,17 @@ MIN_SIZE = 1e-6  # of a force, of the size that equals noise, below which it is 
 class SlowForces:
     """Parameters of a fit if slow unknown forces are allowed beside its model.
 
-    X, std (n_base,) [SI]. size (n_rows,) [N m or N]: rms of the unknown force of each row: driven joints first.
+    X (n_base,), covariance (n_base, n_base) [SI]. size (n_rows,) [N m or N]: rms of the unknown force of each row,
+    driven joints first.
     """
 
     X: np.ndarray
-    std: np.ndarray
+    covariance: np.ndarray
     size: np.ndarray
+
+    @property
+    def std(self) -> np.ndarray:
+        return np.sqrt(np.diag(self.covariance))
 
 
 def allow_slow_forces(stage: ExtendedFit) -> SlowForces:
@@ -69,10 +74,10 @@ def allow_slow_forces(stage: ExtendedFit) -> SlowForces:
             square += np.bincount(r, mean**2, n_rows)
             determined += np.bincount(r, np.maximum(1 - variance * a, 0.0), n_rows)
         size = np.maximum(np.sqrt(square / determined), MIN_SIZE)
-    std = np.sqrt(np.diag(covariance)) * model.scale
     unit = np.array([np.median(np.concatenate(scales)[np.concatenate(rows) == k]) for k in range(n_rows)])
     count = np.bincount(np.concatenate(rows), minlength=n_rows)
-    return SlowForces(fit.X + step * model.scale, std, size * unit * np.sqrt(count / len(forms) / 2))
+    in_si = covariance * np.outer(model.scale, model.scale)
+    return SlowForces(fit.X + step * model.scale, in_si, size * unit * np.sqrt(count / len(forms) / 2))
 
 
 def _marginal_form(fitted_log: FittedLog, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
