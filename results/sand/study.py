@@ -61,7 +61,7 @@ def force(names: Sequence[str]) -> tuple[ca.Function, list[str], np.ndarray]:
     larger = ca.fmax(V, rim)
     soil = Soil(contact.Slip((V - rim) / larger, ca.SX(0), larger), ca.SX(0), p[0], ca.SX(-1))
     none: dict[int, ca.SX] = {}
-    scene = SampleView(none, none, none, none, {}, {}, {}, {1: rolling}, none, ca.SX(0))
+    scene = SampleView(none, none, none, none, none, {}, none, {}, {1: rolling}, none, none, ca.SX(0))
     pushed = ca.SX(0)
     for k, name in enumerate(names):
         effect = CATALOGUE[name]
