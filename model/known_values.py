@@ -1,4 +1,4 @@
-"""What is known of a machine's parameters beforehand: a weighed mass, an inertia from CAD, an offset of zero.
+"""Values known of a machine's parameters beforehand: a weighed mass, an inertia from CAD, an offset of zero.
 
 Any quantity of the machine file may be `known`, exactly or with a standard deviation. Each one that is not known is
 free; the combinations of base parameters that no free quantity changes are then known. They enter every estimate as
@@ -42,10 +42,10 @@ class KnownValues:
     def __bool__(self) -> bool:
         return bool(len(self.values))
 
-    @property
-    def information(self) -> np.ndarray:
-        """Information (n_base, n_base) [1/SI^2] about the base parameters."""
-        return np.asarray(self.rows.T @ self.rows)
+    def information(self, scale: np.ndarray) -> np.ndarray:
+        """Return the information (n_base, n_base) about the base parameters over their scale (n_base,) [SI]."""
+        by = self.rows * scale
+        return np.asarray(by.T @ by)
 
     @cached_property
     def std(self) -> np.ndarray:
@@ -71,24 +71,27 @@ def nothing_known(n_base: int) -> KnownValues:
 
 
 def known_values(
-    machine: Machine, names: Sequence[str], matrix: np.ndarray, standard: Sequence[str], scale: np.ndarray
+    machine: Machine,
+    names: Sequence[str],
+    matrix: np.ndarray,
+    standard: Sequence[str],
+    nominal: np.ndarray,
+    scale: np.ndarray,
 ) -> KnownValues:
     """Collect what a machine file calls known.
 
-    names (n_base), matrix (n_base, n_standard), scale (n_base,): of the base parameters; standard: names of the
-    standard parameters. Products of quantities are linearised at the file's values. Raises MachineError for a known
+    names (n_base), matrix (n_base, n_standard), nominal, scale (n_base,): of the base parameters; standard: names of
+    the standard parameters. Products of quantities are linearised at the file's values. Raises MachineError for a known
     base parameter that the machine doesn't have.
     """
     free, known, found = [], [], []
-    nominal = np.zeros(len(standard))
     for body in machine.body:
-        for name, quantity_known, slope, value in _quantities(machine, body):
-            column = np.array([slope.get(s, 0.0) for s in standard])
-            nominal += np.array([value.get(s, 0.0) for s in standard])
+        for name, quantity_known, slope in _quantities(body):
+            column = matrix @ np.array([slope.get(s, 0.0) for s in standard]) / scale
             if not quantity_known:
-                free.append(matrix @ column / scale)
+                free.append(column)
             else:
-                known.append(matrix @ column / scale)
+                known.append(column)
                 found.append((name, 0.0 if quantity_known is True else float(quantity_known)))
     rows, values, pulls = [], [], []
     if known:
@@ -103,13 +106,13 @@ def known_values(
         own[np.abs(own) < NULL_TOLERANCE * np.abs(own).max(axis=1, keepdims=True)] = 0.0  # rounding
         own /= scale
         rows.append(own)
-        values.append(own @ (matrix @ nominal))
+        values.append(own @ nominal)
         pulls.append(scipy.linalg.solve_triangular(root, G * std, lower=True).T)
     for name, quantity in machine.known.items():
         if name not in names:
             raise MachineError(f"{machine.name}: known.{name}: no base parameter, allowed: {', '.join(names)}")
         k = list(names).index(name)
-        std_k = EXACT_SHARE * scale[k] if quantity.known in (True, False) else float(quantity.known)
+        std_k = EXACT_SHARE * scale[k] if isinstance(quantity.known, bool) else float(quantity.known)
         row = np.eye(len(names))[k : k + 1] / std_k
         rows.append(row)
         values.append(row[:, k] * quantity.value)
@@ -132,10 +135,10 @@ def _unchanged(changes: np.ndarray) -> np.ndarray:
     return scipy.linalg.null_space(moving, rcond=NULL_TOLERANCE) if len(moving) else np.eye(changes.shape[1])
 
 
-def _quantities(machine: Machine, body: Body) -> Iterator[tuple[str, bool | float, Slopes, Slopes]]:
+def _quantities(body: Body) -> Iterator[tuple[str, bool | float, Slopes]]:
     """Yield the quantities of a body that its standard parameters depend on.
 
-    Each is name in the file, `known`, derivative of the standard parameters by it, and the values that it gives alone.
+    Each is name in the file, `known`, and derivative of the standard parameters by it.
     """
     k, where = body.index, f"body.{body.name}"
     for table, keys in ((body.friction, FRICTION_KEYS), (body.contact, CONTACT_KEYS)):
@@ -143,18 +146,13 @@ def _quantities(machine: Machine, body: Body) -> Iterator[tuple[str, bool | floa
             if table is not None:
                 quantity: Quantity = getattr(table, key)
                 part = "friction" if table is body.friction else "contact"
-                name = form.format(k)
-                yield f"{where}.{part}.{key}", quantity.known, {name: 1.0}, {name: quantity.value}
+                yield f"{where}.{part}.{key}", quantity.known, {form.format(k): 1.0}
     if body.inertia is None:
         return
-    every = standard_inertia(body)
-    first = True
     for key in ("mass", "com.x", "com.y", "com.z", *INERTIA_KEYS):
         if body.inertia.axisymmetric and key not in ("mass", "XX", "ZZ"):
             continue
-        known, slope = _inertia_slope(body, key)
-        yield f"{where}.inertia.{key}", known, slope, every if first else {}
-        first = False
+        yield f"{where}.inertia.{key}", *_inertia_slope(body, key)
 
 
 def _inertia_slope(body: Body, key: str) -> tuple[bool | float, Slopes]:

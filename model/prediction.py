@@ -372,7 +372,7 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
             raise MachineError(
                 f"{machine.name}: scale.{s}: the nominal value is 0, give a scale > 0 in the machine file"
             )
-    known = known_values(machine, base.names, base.matrix, base.standard, scale)
+    known = known_values(machine, base.names, base.matrix, base.standard, nominal, scale)
     if placed:
         magnitudes = _effect_parameters(machine, placed, fit_shapes)
         if not fit_sensor_effects:

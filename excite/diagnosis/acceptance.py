@@ -10,7 +10,6 @@ from excite.diagnosis.diagnosis import Finding, std_given_shapes
 from excite.diagnosis.fits import ExtendedFit
 from excite.diagnosis.hold_out import HoldOutErrors, hold_out_gain, predictive_gain
 from excite.diagnosis.slow_forces import allow_slow_forces
-from excite.smoothing import NotConvergedError
 
 MIN_STDS = 2.0  # magnitude over its standard deviation given the shapes, of a finding; chosen
 
@@ -19,10 +18,10 @@ def widen(finding: Finding, stage: ExtendedFit) -> Finding:
     """Enlarge a magnitude's standard deviation to that beside slow unknown forces, if the fit leaves such."""
     try:
         beside = allow_slow_forces(stage)
-    except (np.linalg.LinAlgError, NotConvergedError):
+    except np.linalg.LinAlgError:
         return finding
     k = stage.model.base.names.index(finding.name)
-    shift, std = abs(beside.X[k] - stage.fit.X[k]), beside.std[k]
+    shift, std = abs(beside.X[k] - stage.fit.X[k]), np.sqrt(beside.covariance[k, k])
     if not np.isfinite(std) or stage.fit.unidentifiable[k]:
         return finding
     at_shapes = std_given_shapes(finding.name, stage.model, beside.covariance)

@@ -154,7 +154,6 @@ def diagnose(
         old = before if before.data.noise_inflation == 1 else fit_with_process_noise(before, runner)
         before, anew = selection.choose_unlikely(first, old, tried if old is first else (), runner)
         if anew or before is not old:
-            added = []  # compared with another fit
             anew, next_ratio = extend_model(before, anew, runner, lambda share, what: report(max(share, 0.85), what))
             nearest = None if before is not old else nearest
             added = anew

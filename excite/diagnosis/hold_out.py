@@ -19,7 +19,6 @@ from excite.diagnosis import selection
 from excite.diagnosis.fits import ExtendedFit
 from excite.logs import filtered_regression
 from excite.model import build, effects
-from excite.model.machine import Filter
 from excite.smoothing import Fit, NotConvergedError, predict_readings
 
 STRETCH_S = 2.0  # length of a withheld stretch [s]; chosen
@@ -125,14 +124,14 @@ def hold_out_errors(stage: ExtendedFit, every_turn: bool = False) -> HoldOutErro
     return HoldOutErrors(parts[0].sensors, signal_variance=motion, noise_variance=noise, **whole)
 
 
-def hold_out_torques(stage: ExtendedFit, filter: Filter | None = None) -> HoldOutErrors | None:
+def hold_out_torques(stage: ExtendedFit) -> HoldOutErrors | None:
     """Predict the torques [N m or N] of withheld stretches by least squares on the other ones.
 
     What a user of a machine without slips asks of a model, as positions drift in open loop. Every part of the logs is
     withheld once. Return None for a machine with slips, or with an effect that least squares cannot find.
     """
     machine, n_u = stage.machine, len(stage.model.inputs)
-    filter = filter or machine.filter
+    filter = machine.filter
     for e in stage.model.effects:
         machine = effects.with_effects(effects.without_effect(machine, e.name), selection.fitted_entry(stage, e.name))
     model = build(machine)

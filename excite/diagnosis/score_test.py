@@ -396,24 +396,24 @@ def score_candidates(
 ScoreValues = tuple[float, dict[str, float], float]  # likelihood ratio, values and unabsorbed share of a score
 
 
+def without_offsets(form: np.ndarray, n: int, n_offsets: int) -> np.ndarray:
+    """Marginalise the encoder offsets, which belong to one log, behind data and n parameters in a quadratic form."""
+    o, keep = slice(1 + n, 1 + n + n_offsets), np.r_[0 : 1 + n, 1 + n + n_offsets : len(form)]
+    inner = form[o, o] + np.eye(n_offsets)
+    return np.asarray(form[np.ix_(keep, keep)] - form[keep, o] @ np.linalg.solve(inner, form[o, keep]))
+
+
 def _score_values(
     along: Sequence[FittedLog], fit: smoothing.Fit, found: Sequence[Candidate]
 ) -> list[ScoreValues | None]:
     """Return the score of each candidate beside the parameters alone; None if nothing shows it."""
     total, n = sum(len(x.columns) for x in found), len(fit.X)
-    model, prior = along[0].space.model, fit.prior
     Z = np.zeros((1 + n + total, 1 + n + total))
     for fitted_log in along:
-        form = SignatureColumns(fitted_log, found).products()
-        # Encoder offsets belong to one log: marginalise them.
-        o, keep = slice(1 + n, 1 + n + fitted_log.n_offsets), np.r_[0 : 1 + n, 1 + n + fitted_log.n_offsets : len(form)]
-        inner = form[o, o] + np.eye(fitted_log.n_offsets)
-        Z += form[np.ix_(keep, keep)] - form[keep, o] @ np.linalg.solve(inner, form[o, keep])
+        Z += without_offsets(SignatureColumns(fitted_log, found).products(), n, fitted_log.n_offsets)
     own, p = slice(1 + n, None), slice(1, 1 + n)
-    known = model.known.rows * model.scale
-    information, cross = Z[p, p] + np.diag(prior) + known.T @ known, Z[p, own]
-    gradient = Z[p, 0] + prior * (fit.X - model.nominal) / model.scale
-    gradient = gradient + known.T @ (model.known.rows @ fit.X - model.known.values)
+    prior, slope, _ = smoothing.prior_terms(along[0].space.model, fit.prior, fit.X)
+    information, cross, gradient = Z[p, p] + prior, Z[p, own], Z[p, 0] + slope
     solved = np.linalg.solve(information, np.column_stack([cross, gradient]))
     S = Z[own, own] - cross.T @ solved[:, :-1]
     g = Z[own, 0] - cross.T @ solved[:, -1]

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from excite.diagnosis.fits import ExtendedFit, with_true_sensor_noise
-from excite.diagnosis.score_test import FittedLog
-from excite.smoothing import whiten_signatures
+from excite.diagnosis.score_test import FittedLog, without_offsets
+from excite.smoothing import prior_terms, whiten_signatures
 
 SHORTEST_PERIOD_S = 10.0  # of a slow force [s]; chosen: longer than a manoeuvre
 PASSES = 60  # of the iteration for the sizes; chosen
@@ -23,19 +23,10 @@ MIN_SIZE = 1e-6  # of a force, of the size that equals noise, below which it is 
 
 @dataclass(frozen=True)
 class SlowForces:
-    """Parameters of a fit if slow unknown forces are allowed beside its model.
-
-    X (n_base,), covariance (n_base, n_base) [SI]. size (n_rows,) [N m or N]: rms of the unknown force of each row,
-    driven joints first.
-    """
+    """Parameters X (n_base,) and covariance (n_base, n_base) [SI] of a fit beside slow unknown forces."""
 
     X: np.ndarray
     covariance: np.ndarray
-    size: np.ndarray
-
-    @property
-    def std(self) -> np.ndarray:
-        return np.sqrt(np.diag(self.covariance))
 
 
 def allow_slow_forces(stage: ExtendedFit) -> SlowForces:
@@ -43,23 +34,15 @@ def allow_slow_forces(stage: ExtendedFit) -> SlowForces:
     stage = with_true_sensor_noise(stage)
     fit, model = stage.fit, stage.model
     n = len(fit.X)
-    known = model.known.rows * model.scale
-    prior = np.diag(fit.prior) + known.T @ known
-    gradient = fit.prior * (fit.X - model.nominal) / model.scale
-    gradient += known.T @ (model.known.rows @ fit.X - model.known.values)
-    forms, rows, scales = [], list[np.ndarray](), list[np.ndarray]()
-    for fitted_log in stage.fitted_logs:
-        form, row, scale = _marginal_form(fitted_log, n)
-        forms.append(form)
-        rows.append(row)
-        scales.append(scale)
+    prior, slope, _ = prior_terms(model, fit.prior, fit.X)
+    forms, rows = zip(*(_marginal_form(fitted_log, n) for fitted_log in stage.fitted_logs), strict=True)
     n_rows = 1 + max(int(r.max()) for r in rows)
     size = np.ones(n_rows)  # [units in which a coefficient of 1 equals its noise]
     p = slice(1, 1 + n)
     for _ in range(PASSES):
         precision = [1 / np.maximum(size[r], MIN_SIZE) ** 2 for r in rows]
         inverses = [np.linalg.inv(Z[1 + n :, 1 + n :] + np.diag(a)) for Z, a in zip(forms, precision, strict=True)]
-        information, g = prior.copy(), gradient.copy()
+        information, g = prior.copy(), slope.copy()
         for Z, B in zip(forms, inverses, strict=True):
             cross = Z[p, 1 + n :]
             information += Z[p, p] - cross @ B @ cross.T
@@ -74,16 +57,13 @@ def allow_slow_forces(stage: ExtendedFit) -> SlowForces:
             square += np.bincount(r, mean**2, n_rows)
             determined += np.bincount(r, np.maximum(1 - variance * a, 0.0), n_rows)
         size = np.maximum(np.sqrt(square / determined), MIN_SIZE)
-    unit = np.array([np.median(np.concatenate(scales)[np.concatenate(rows) == k]) for k in range(n_rows)])
-    count = np.bincount(np.concatenate(rows), minlength=n_rows)
-    in_si = covariance * np.outer(model.scale, model.scale)
-    return SlowForces(fit.X + step * model.scale, in_si, size * unit * np.sqrt(count / len(forms) / 2))
+    return SlowForces(fit.X + step * model.scale, covariance * np.outer(model.scale, model.scale))
 
 
-def _marginal_form(fitted_log: FittedLog, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _marginal_form(fitted_log: FittedLog, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the quadratic form of one log in [1, parameters, slow forces], its encoder offsets integrated out.
 
-    Also the row (c,) of each slow force, and its scale (c,): the amplitude [N m or N] whose information is one.
+    The c slow forces are scaled so that those of a row have the information one on average. Also the row (c,) of each.
     """
     linear, slopes = fitted_log.linear, fitted_log.slopes
     N, n_rows = len(fitted_log.t), slopes.shape[2]
@@ -106,10 +86,8 @@ def _marginal_form(fitted_log: FittedLog, n: int) -> tuple[np.ndarray, np.ndarra
     for at, E in whiten_signatures(linear, fitted_log.white, along):
         both = np.concatenate([E0[at], E], axis=2).reshape(-1, len(form)).astype(float)
         form += both.T @ both
-    o, keep = slice(1 + n, 1 + n + fitted_log.n_offsets), np.r_[0 : 1 + n, 1 + n + fitted_log.n_offsets : len(form)]
-    inner = form[o, o] + np.eye(fitted_log.n_offsets)
-    Z = form[np.ix_(keep, keep)] - form[keep, o] @ np.linalg.solve(inner, form[o, keep])
+    Z = without_offsets(form, n, fitted_log.n_offsets)
     information = np.array([np.mean(np.diag(Z)[1 + n :][row == k]) for k in range(n_rows)])
     scale = 1 / np.sqrt(np.maximum(information, 1e-300))[row]
     by = np.concatenate([np.ones(1 + n), scale])
-    return Z * np.outer(by, by), row, scale
+    return Z * np.outer(by, by), row

@@ -17,6 +17,7 @@ from .gauss_newton import (
     linearise_log as linearise_log,
     linearise_logs as linearise_logs,
     prior_information as prior_information,
+    prior_terms as prior_terms,
     state_scale as state_scale,
 )
 from .innovations import (

@@ -56,8 +56,7 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
     )
     assert linear is not None
     information = linear.Z[1:, 1:].copy()
-    known = model.known.rows * model.scale
-    information[: len(X), : len(X)] += known.T @ known
+    information[: len(X), : len(X)] += model.known.information(model.scale)
     information[np.diag_indices(len(information))] += np.concatenate(
         [np.full(len(X), PRIOR_STD**-2), np.ones(len(data.offset_sensors))]
     )

@@ -134,6 +134,20 @@ def prior_information(model: Model, held: np.ndarray, X: np.ndarray) -> np.ndarr
     return np.where(held, HELD_STD**-2, np.maximum(from_file * np.abs(X) / model.scale, PRIOR_STD) ** -2)
 
 
+def prior_terms(model: Model, prior: np.ndarray, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return information (n_base, n_base), slope (n_base,) and cost at X (n_base,) without any log, scaled.
+
+    They are those of `prior` (n_base,), about the nominal values, and of what the machine file calls known.
+    """
+    deviation, known = (X - model.nominal) / model.scale, model.known
+    misfit = known.rows @ X - known.values
+    return (
+        np.diag(prior) + known.information(model.scale),
+        prior * deviation + (known.rows * model.scale).T @ misfit,
+        float(prior @ deviation**2 + misfit @ misfit),
+    )
+
+
 def linearise_log(
     space: StateSpace,
     data: Measurements,
@@ -560,15 +574,7 @@ def newton_step(
     n, indices = len(X), parameter_indices(space, measurements)
     size = n + sum(len(data.offset_sensors) for data in measurements)
     information, slope = np.zeros((size, size)), np.zeros(size)
-    information[range(n), range(n)] = prior
-    deviation = (X - space.model.nominal) / space.model.scale
-    slope[:n] = prior * deviation
-    cost = float(prior @ deviation**2)
-    known, by = space.model.known, space.model.known.rows * space.model.scale
-    misfit = known.rows @ X - known.values
-    information[:n, :n] += by.T @ by
-    slope[:n] += by.T @ misfit
-    cost += float(misfit @ misfit)
+    information[:n, :n], slope[:n], cost = prior_terms(space.model, prior, X)
     if fixed is not None:
         information[range(n), range(n)] += fixed * HELD_STD**-2
     for log, data, trajectory, own in zip(linear, measurements, trajectories, indices, strict=True):

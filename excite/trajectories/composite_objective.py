@@ -137,7 +137,7 @@ def _with_known(model: Model, prior: np.ndarray | None) -> np.ndarray | None:
     """Add what the machine file calls known to a prior (n_base, n_base), scaled; None if there is neither."""
     if not model.known:
         return prior
-    information = model.known.information * np.outer(model.scale, model.scale)
+    information = model.known.information(model.scale)
     return information if prior is None else prior + information
 
 

@@ -145,7 +145,7 @@ def design_from(
         lowest = design(model, problem, aim, request.starts, request.seed, budget, progress, solver=request.solver)
         if not request.second_step:
             return DesignResult(model, aim, lowest)
-        return _make_accurate(model, problem, request, aim, lowest, prior, budget, progress)
+        return _make_accurate(model, problem, request, aim, lowest, prior, budget)
     begin = time.time()
     half = None if request.budget_s is None else request.budget_s / 2
     free = design(model, problem, aim, request.starts, request.seed, half, progress, solver=request.solver)
@@ -167,7 +167,6 @@ def _make_accurate(
     lowest: Design,
     prior: np.ndarray | None,
     budget: float | None,
-    progress: Callable[[int, int, float], None] | None,
 ) -> DesignResult:
     """Find the most accurate drive (worst parameter) whose cond(Phi) is within `cond_slack` of the lowest one."""
     cond_max = (1 + request.cond_slack / 100) * lowest.cond_phi

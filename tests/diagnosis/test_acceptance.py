@@ -100,7 +100,7 @@ def test_slow_forces_leave_a_true_effect_its_significance_and_take_that_of_a_fal
         stage = fits.fit_machine(extended, [log], straight.machine.filter)
         beside = slow_forces.allow_slow_forces(stage)
         k = stage.model.base.names.index("torque_offset_drift@front_roll")
-        z[name] = beside.X[k] / beside.std[k], stage.fit.X[k] / stage.fit.std[k]
+        z[name] = beside.X[k] / np.sqrt(beside.covariance[k, k]), stage.fit.X[k] / stage.fit.std[k]
     assert z["true"][0] > 0.7 * z["true"][1]
     assert abs(z["false"][0]) < 0.2 * abs(z["false"][1])
 

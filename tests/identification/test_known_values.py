@@ -101,6 +101,12 @@ def test_unknown_quantities_leave_their_combinations_free(tmp_path: Path) -> Non
     assert found["MY2"] == pytest.approx(0.10 * 10, rel=0.02)
 
 
+def test_deviation_of_one_is_no_flag(tmp_path: Path) -> None:
+    """In Python 1.0 == True, which stands for an exact value."""
+    model = model_of(tmp_path, '[known]\nM = { value = 95, source = "measured", known = 1.0 }\n')
+    assert model.known.std[0] == pytest.approx(1.0)
+
+
 def test_weighed_machine_is_known_as_a_base_parameter(tmp_path: Path) -> None:
     model = model_of(tmp_path, '[known]\nM = { value = 11010, source = "measured", known = 20 }\n', "va12")
     k = model.base.names.index("M")

@@ -56,7 +56,7 @@ def estimate(straight: Model, straight_motion: Motion) -> Estimate:
 
 
 def true_torques(model: Model, motion: Motion) -> np.ndarray:
-    """What torque sensors without noise would read, low-passed (n_u, N)."""
+    """Compute the low-passed readings (n_u, N) of torque sensors without noise."""
     exact = exact_readings(model, motion)
     each = np.array([exact[s.name] for s in model.machine.sensors("full") if s.kind == "torque"])
     return lowpass(each, float(model.machine.sampling_hz), model.machine.filter)

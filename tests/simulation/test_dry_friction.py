@@ -23,13 +23,13 @@ def sticking(model: Model, torque: np.ndarray, *args: object, **how: np.ndarray)
 
 
 def resampled(model: Model, rate: float) -> Model:
-    """The same machine at another sampling rate [Hz]."""
+    """Change the sampling rate [Hz] of a machine."""
     hz = model.machine.sampling_hz.model_copy(update={"value": float(rate)})
     return build(model.machine.model_copy(update={"sampling_hz": hz}))
 
 
 def sharper(model: Model, factor: float) -> Model:
-    """The same machine with friction smoothed over `factor` times the rate."""
+    """Smooth the friction of a machine over `factor` times the rate."""
     bodies = []
     for b in model.machine.body:
         if b.friction is not None:
