@@ -71,7 +71,7 @@ def nearest_possible(model: Model, estimate: Estimate) -> Estimate:
 def constrained_estimate(model: Model, estimate: Estimate, blocks: Sequence[Block]) -> Estimate:
     """Return the nearest possible estimate, with residual and relative error of the filtered rows at its values."""
     found = nearest_possible(model, estimate)
-    x = np.where(np.isnan(found.value), model.nominal, found.value)
+    x = found.value_or(model.nominal)
     e = np.concatenate([residual(b, x) for b in blocks], axis=1)
     return replace(found, residual=e, relative_error_percent=100 * float(np.sqrt(np.mean(e**2))) / rms_torque(blocks))
 

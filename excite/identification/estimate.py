@@ -56,6 +56,10 @@ class Estimate:
     consistent: np.ndarray | None = None
     prior_std: np.ndarray | None = None
 
+    def value_or(self, nominal: np.ndarray) -> np.ndarray:
+        """Return the values (n,), those of the machine file for unidentified parameters; nominal (n,) [SI]."""
+        return np.where(np.isfinite(self.value), self.value, nominal)
+
     @property
     def std(self) -> np.ndarray:
         """Standard deviations (n,) [SI]."""

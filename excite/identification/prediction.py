@@ -155,8 +155,7 @@ def _complete(model: Model, estimate: Estimate) -> tuple[Estimate, tuple[str, ..
     known = np.isfinite(estimate.value)
     covariance = np.where(np.outer(known, known), np.nan_to_num(estimate.covariance), 0.0)
     assumed = tuple(n for n, k in zip(estimate.names, known, strict=True) if not k)
-    value = np.where(known, estimate.value, model.nominal)
-    return replace(estimate, value=value, covariance=covariance), assumed
+    return replace(estimate, value=estimate.value_or(model.nominal), covariance=covariance), assumed
 
 
 def _propagate(

@@ -53,7 +53,7 @@ def prior_from_estimate(model: Model, estimate: Estimate) -> PriorKnowledge:
     block = np.ix_(identified, identified)
     scales = np.outer(model.scale[identified], model.scale[identified])
     information[block] = np.linalg.inv(estimate.covariance[block] / scales) / scales
-    X = np.where(identified, estimate.value, model.nominal)
+    X = estimate.value_or(model.nominal)
     for share in STEP_SHARES:
         nominal = model.nominal + float(share) * (X - model.nominal)
         if _is_possible(model, nominal):

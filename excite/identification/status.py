@@ -117,7 +117,7 @@ def _is_positive_definite(model: Model, logs: Sequence[Log], estimate: Estimate,
     """Tell if the mass matrix is positive definite along the logs; unidentifiable values are the machine file's."""
     if not model.plain:
         return True
-    X = np.where(np.isfinite(estimate.value), estimate.value, model.nominal)
+    X = estimate.value_or(model.nominal)
     for log in logs:
         q = samples(model, log, filter).q
         at = np.linspace(0, q.shape[1] - 1, min(TRIED_POSTURES, q.shape[1])).astype(int)

@@ -255,8 +255,7 @@ def _filtered_torques(model: Model, log: Log, estimate: Estimate, filter: Filter
     """Predict low-passed torques and compare them with the measured ones."""
     rate = float(model.machine.sampling_hz)
     motion = samples(model, log, filter)
-    held = np.isnan(estimate.value)  # at the machine file's values
-    p = model.expand @ np.where(held, model.nominal, estimate.value)
+    p = model.expand @ estimate.value_or(model.nominal)
     rows = list(model.actuated)
     predicted = model.predict(motion.q, motion.nu, motion.a, p, *motion.beside).full()[rows]
     units = tuple(_torque_unit(model, k) for k in rows)

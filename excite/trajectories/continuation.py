@@ -420,7 +420,7 @@ def _run_stage(
         return should_stop()
 
     try:
-        solution = SOLVERS[state.solver](tr, task, start, Z, U, levels, fresh, count_and_stop)
+        solution = SOLVERS[state.solver](StageProgram(tr, task, start, Z, U, levels, fresh), count_and_stop)
     except np.linalg.LinAlgError:  # singular information: the machine hardly moves
         return None
     try:
@@ -440,8 +440,24 @@ def _run_stage(
 
 
 @dataclass(frozen=True)
+class StageProgram:
+    """Program of a stage: start (n_z,), states Z (K, J, n_z) and torques U (K + 1, n_u) to begin with, scaled.
+
+    levels: of sharpness and barrier, in turn. fresh: no stage before has found torques that keep the limits.
+    """
+
+    tr: Transcription
+    task: interior_point.Subproblem
+    start: np.ndarray
+    Z: np.ndarray
+    U: np.ndarray
+    levels: tuple[interior_point.BarrierLevel, ...]
+    fresh: bool
+
+
+@dataclass(frozen=True)
 class StageSolution:
-    """What a solver found in a stage: states Z (K, J, n_z) and torques U (K + 1, n_u), scaled.
+    """Solution of a stage: states Z (K, J, n_z) and torques U (K + 1, n_u), scaled.
 
     failure: why this is no optimum, if the solver can tell.
     """
@@ -451,33 +467,13 @@ class StageSolution:
     failure: str | None = None
 
 
-Solver = Callable[
-    [
-        Transcription,
-        interior_point.Subproblem,
-        np.ndarray,
-        np.ndarray,
-        np.ndarray,
-        tuple[interior_point.BarrierLevel, ...],
-        bool,
-        Callable[[], bool],
-    ],
-    StageSolution,
-]
+Solver = Callable[[StageProgram, Callable[[], bool]], StageSolution]
 
 
-def _solve_own(
-    tr: Transcription,
-    task: interior_point.Subproblem,
-    start: np.ndarray,
-    Z: np.ndarray,
-    U: np.ndarray,
-    levels: tuple[interior_point.BarrierLevel, ...],
-    fresh: bool,
-    should_stop: Callable[[], bool],
-) -> StageSolution:
+def _solve_own(program: StageProgram, should_stop: Callable[[], bool]) -> StageSolution:
     """Solve a stage by `interior_point`; a fresh start first moves to torques that keep every limit and end at rest."""
-    barrier = levels[0].barrier
+    tr, task, start, Z, U = program.tr, program.task, program.start, program.Z, program.U
+    levels, fresh, barrier = program.levels, program.fresh, program.levels[0].barrier
     if not fresh:
         point = interior_point.initial_iterate(tr, task, start, Z, U, barrier, 1e-3)
         point, values = interior_point.minimise(tr, task, point, levels, should_stop)
@@ -493,18 +489,10 @@ def _solve_own(
     return StageSolution(point.Z, point.U)
 
 
-def _solve_with_ipopt(
-    tr: Transcription,
-    task: interior_point.Subproblem,
-    start: np.ndarray,
-    Z: np.ndarray,
-    U: np.ndarray,
-    levels: tuple[interior_point.BarrierLevel, ...],
-    fresh: bool,
-    should_stop: Callable[[], bool],
-) -> StageSolution:
+def _solve_with_ipopt(program: StageProgram, should_stop: Callable[[], bool]) -> StageSolution:
     """Solve a stage by Ipopt."""
-    found = ipopt.minimise(tr, task, start, Z, U, levels, should_stop)
+    p = program
+    found = ipopt.minimise(p.tr, p.task, p.start, p.Z, p.U, p.levels, should_stop)
     if found.converged or found.status == ipopt.STOPPED:
         return StageSolution(found.Z, found.U)
     return StageSolution(found.Z, found.U, f"{found.status} after {found.iterations} iterations")
