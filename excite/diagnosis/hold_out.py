@@ -98,10 +98,8 @@ class HoldOutGain:
 def hold_out_errors(stage: ExtendedFit, every_turn: bool = False) -> HoldOutErrors | None:
     """Predict withheld stretches of a fit's logs with its model.
 
-    every_turn: withhold every part of the logs once, not WANTED_STRETCHES only.
-
-    The machine file's parameters are used if none were estimated. Return None if no fit to the rest is found or the
-    logs are too short.
+    every_turn: withhold every part of the logs once, not WANTED_STRETCHES only. The machine file's parameters are used
+    if none were estimated. Return None if no fit to the rest is found or the logs are too short.
     """
     data, fit = stage.data, stage.fit
     held = data.held | fit.unidentifiable if stage.estimated or data.noise_inflation > 1 else np.ones_like(data.held)
@@ -130,17 +128,18 @@ def hold_out_torques(stage: ExtendedFit) -> HoldOutErrors | None:
     What a user of a machine without slips asks of a model, as positions drift in open loop. Every part of the logs is
     withheld once. Return None for a machine with slips, or with an effect that least squares cannot find.
     """
+    if stage.model.slips:
+        return None
     machine, n_u = stage.machine, len(stage.model.inputs)
-    filter = machine.filter
     for e in stage.model.effects:
         machine = effects.with_effects(effects.without_effect(machine, e.name), selection.fitted_entry(stage, e.name))
     model = build(machine)
-    sensed = any(e.name in model.nonlinear or e.effect.sensor_only for e in model.effects)
-    if model.slips or sensed:
+    if any(e.name in model.nonlinear or e.effect.sensor_only for e in model.effects):
         return None
     rows = list(model.actuated)
-    blocks = [(W[rows], Y[rows]) for W, Y in (filtered_regression(model, log, filter) for log in stage.data.logs)]
-    rate = float(machine.sampling_hz) / filter.decimation
+    filtered = (filtered_regression(model, log, machine.filter) for log in stage.data.logs)
+    blocks = [(W[rows], Y[rows]) for W, Y in filtered]
+    rate = float(machine.sampling_hz) / machine.filter.decimation
     whole = identification.fit_rows(model, blocks)
     level = np.sqrt(sum(((Y - W @ whole) ** 2).sum(axis=1) for W, Y in blocks) / sum(Y.shape[1] for _, Y in blocks))
     weighted = [(W / level[:, None, None], Y / level[:, None]) for W, Y in blocks]
@@ -241,12 +240,7 @@ def _likelihood_of_stretches(
     for k, level in enumerate(LIKELIHOOD_LEVELS):
         if level > 0 and rest.process_noise == 0 and stage.is_close:
             break
-        try:
-            linear = smoothing.linearise_logs(
-                data.space, data.measurements, rest.trajectories, data.starts, rest.X, level
-            )
-        except np.linalg.LinAlgError:
-            continue
+        linear = smoothing.linearise_logs(data.space, data.measurements, rest.trajectories, data.starts, rest.X, level)
         if linear is None:
             continue
         likelihood = []

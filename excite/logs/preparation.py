@@ -196,7 +196,7 @@ def _clock(table: pd.DataFrame, machine: Machine, sensor: Sensor, used: set[str]
 
 
 def _rises(column: pd.Series) -> bool:
-    """Tell if a column could be a clock: nearly all of its numbers are larger than those before; text may be."""
+    """Tell if a column could be a clock: most of its numbers are larger than the one before; text may be a clock."""
     values = pd.to_numeric(column, errors="coerce").dropna().to_numpy(dtype=float)
     return len(values) < 2 or float(np.mean(np.diff(values) > 0)) > MIN_RISING_SHARE
 

@@ -319,15 +319,8 @@ def describe_identify(s: Summary) -> Description:
     if s["status"] == "invalid":
         reason = f", and {_join_some(impossible)} would have values that no machine has" if impossible else ""
         headline = f"No estimate from {logs} (prediction error {error} of what was measured){reason}: {s['doubt']}."
-    elif off and s["status"] == "valid":
-        most = max(off, key=lambda n: off[n])
-        headline = (
-            f"From {logs}, {s['method']} identifies {count}, {len(off)} of them wrong by more than it says: on"
-            f" simulated logs like this by up to {format_percent(100 * off[most])} ({most}); the prediction error is"
-            f" {error} of what was measured."
-        )
     wrong: tuple[str, ...] = ()
-    if off and s["status"] == "doubtful":
+    if off and s["status"] != "invalid":
         most = max(off, key=lambda n: off[n])
         wrong = (
             f"On simulated logs like this {s['method']} is wrong by up to {format_percent(100 * off[most])} ({most}),"
@@ -384,11 +377,14 @@ def _describe_validation(check: Mapping[str, Any]) -> str:
     text = f"On {check['log']}, which was not fitted, the torque errors are {errors}"
     if not check["outside"]:
         return f"{text}: the rest is within noise and the parameters' uncertainty."
-    worst = ", ".join(
-        f"{x['signal']} (most from {x['from_s']:.1f} to {x['to_s']:.1f} s, {x['ratio']:.1f} times)"
-        for x in check["outside"]
+    return f"{text}: more than these explain in {_worst_seconds(check['outside'])}."
+
+
+def _worst_seconds(outside: Sequence[Mapping[str, Any]]) -> str:
+    """List signals that leave their band, each with the second in which it does most."""
+    return ", ".join(
+        f"{x['signal']} (most from {x['from_s']:.1f} to {x['to_s']:.1f} s, {x['ratio']:.1f} times)" for x in outside
     )
-    return f"{text}: more than these explain in {worst}."
 
 
 def describe_predict(s: Summary) -> Description:
@@ -468,10 +464,7 @@ def _describe_outside(s: Summary) -> str:
     text = f"{format_percent(share)} of the readings are outside their 95 % band (5 % if the model is right)"
     if not s["outside"]:
         return text
-    worst = ", ".join(
-        f"{x['signal']} (most from {x['from_s']:.1f} to {x['to_s']:.1f} s, {x['ratio']:.1f} times)"
-        for x in s["outside"]
-    )
+    worst = _worst_seconds(s["outside"])
     return f"{text}. The model lacks something in {worst}: the band does not hold there, `excite diagnose` finds causes"
 
 
