@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from support.drives import drive
 
 from excite.errors import InfeasibleError
-from excite.identification import methods, prior as sequential
+from excite.identification import Estimate, methods, prior as sequential
 from excite.logs import log
 from excite.model import Model
 from excite.model.machine import Problem
@@ -186,7 +184,10 @@ def test_signs_are_known_whatever_a_machine_calls_its_parameters(emps: Model) ->
     at = emps.base.names.index("Fc")
     for sign in (1, -1):
         value = emps.nominal * np.where(np.arange(len(emps.nominal)) == at, sign, 1)
-        found: Any = SimpleNamespace(value=value, covariance=np.diag(emps.scale**2))
+        covariance = np.diag(emps.scale**2)
+        found = Estimate(
+            "ols", emps.base.names, emps.base.units, value, covariance, 1, 1, 1, np.empty((0, 0)), 99, {}, ()
+        )
         known = sequential.prior_from_estimate(emps, found)
         assert known.model.nominal[at] >= 0
         assert (known.share == 1) == (sign == 1)
