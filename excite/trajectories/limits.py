@@ -26,6 +26,7 @@ REVERSALS_LIMIT = "reversals"
 HEADINGS = 361  # headings tried on the lane, half a degree apart in a box; chosen
 TOP_SPEED_FACTOR = 1.2  # top speed over rim speed, with slip; chosen
 DEFAULT_TOP_SPEED = 10.0  # m/s, without a limit on rim speed; chosen
+SLIP_ROUNDING = 0.05  # of the slip limit: what it shows without slip, as a share of the limit; chosen
 POWER_SMOOTHING = 1e-3  # of the power limit: rounding of |u q'|; chosen
 
 
@@ -119,14 +120,17 @@ def _rim_speed(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[Bou
 
 
 def _slip(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
-    """Both slips of a contact, `slip_limit`: the range in which the soil law is linear."""
-    slips = model.kinematics(s.q, s.nu)[1]
-    bodies = {str(b.index): b for b in model.machine.contacts}
-    for k, name in enumerate(model.slips):
-        body = bodies[name[2:]]
+    """Resultant slip at both edges of a contact, `slip_limit`: the range in which the soil law is linear.
+
+    |g| is replaced by sqrt((1 - r^2) |g|^2 + r^2 limit^2), r = SLIP_ROUNDING: smooth at rest, exact at the limit.
+    """
+    slips = model.edge_slips(s.q, s.nu)
+    for k, (index, edge) in enumerate(model.edges):
+        body = model.machine.find(index)
         if body.contact is not None and body.contact.slip_limit is not None:
             high = float(body.contact.slip_limit)
-            yield f"slip {name[:2]} {body.where}", slips[k], -high, high, "-"
+            square = (1 - SLIP_ROUNDING**2) * ca.sumsqr(slips[:, k]) + (SLIP_ROUNDING * high) ** 2
+            yield f"slip {body.where} {edge}".rstrip(), ca.sqrt(square), -np.inf, high, "-"
 
 
 def _power(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
