@@ -31,6 +31,7 @@ class Estimate:
         to be too small. status: valid, doubtful or invalid (see `status.assess`).
     possible (n,): False for values that no machine has. consistent (n,) [SI]: values of the nearest possible machine,
         if some value is not possible.
+    share_outside_law: of the logs' samples in which a contact slips more than its linear law allows, None if unknown.
     """
 
     method: str
@@ -53,6 +54,7 @@ class Estimate:
     status: str = "valid"
     possible: np.ndarray | None = None
     consistent: np.ndarray | None = None
+    share_outside_law: float | None = None
 
     @property
     def std(self) -> np.ndarray:

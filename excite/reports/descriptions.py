@@ -77,6 +77,16 @@ def as_sentence(text: str) -> str:
     return text if text.endswith((".", "!", "?", ":")) else f"{text}."
 
 
+def describe_outside_law(share: float | None) -> tuple[str, ...]:
+    """Return a remark on the share of samples that lie outside the linear soil law, none if there are no such."""
+    if not share:
+        return ()
+    return (
+        f"In {format_percent(100 * share)} of the samples a contact slips more than its slip_limit, up to which the"
+        " linear soil law holds: real ground gives less force there than the model says.",
+    )
+
+
 def _meaning_column(s: Summary) -> tuple[str, ...]:
     """Heading of the column that explains parameters, if the summary does."""
     return ("what it is",) if s.get("meanings") else ()
@@ -110,6 +120,7 @@ def describe_design(s: Summary) -> Description:
     remarks = [
         f"Condition number of Phi {s['cond_phi']:.4g}, of W {s['cond_w']:.4g}; best start {s['cond_phi_start']:.4g}."
     ]
+    remarks += describe_outside_law(s.get("share_outside_law"))
     if not s["complete"]:
         remarks.append("Cut short: this is the best drive so far, more time may find a better one.")
     if s.get("advice"):
@@ -244,6 +255,7 @@ def describe_verify(s: Summary) -> Description:
         " cases."
     )
     remarks = [f"Biased, the intervals do not hold: {', '.join(s['biased'])}."] if s["biased"] else []
+    remarks += describe_outside_law(s.get("share_outside_law"))
     if s["failed"]:
         remarks.append(f"{s['failed']} runs gave no estimate.")
     table = tuple(
@@ -322,6 +334,7 @@ def describe_identify(s: Summary) -> Description:
             f" {error} of what was measured."
         )
     remarks = [f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()] + list(s["notes"])
+    remarks += describe_outside_law(s.get("share_outside_law"))
     for check in s["validation"]:
         remarks.append(_describe_validation(check))
     biased = any("bias" in r for r in rows.values())

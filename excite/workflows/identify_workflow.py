@@ -135,6 +135,7 @@ def identify(
         "cond_w": estimate.cond_w,
         "cond_phi": estimate.cond_phi,
         "relative_error_percent": estimate.relative_error_percent,
+        "share_outside_law": estimate.share_outside_law,
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
         "notes": [*said, *cut, *estimate.notes, *more_notes],
