@@ -6,8 +6,8 @@
     log = excite.simulate("va12_straight", drive, seed=1)   # what the sensors would write, as a DataFrame
     estimate = excite.identify("va12_straight", log)        # parameters with 95 % intervals
 
-`load` and `read_log` give the records that these work on, `verify` and `compare` judge drives, `diagnose` finds what
-the model gets wrong. Everything else is in the packages: `excite.model`, `simulation`, `logs`, `smoothing`,
+`load` and `read_log` give the records that these work on, `score`, `verify` and `compare` judge drives, `diagnose`
+finds what the model gets wrong. Everything else is in the packages: `excite.model`, `simulation`, `logs`, `smoothing`,
 `identification`, `trajectories`, `diagnosis`, `reports`, `operator`, `workflows`, `cli`, each importing from those
 before it only.
 """

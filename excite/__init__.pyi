@@ -6,6 +6,7 @@ from .interface import (
     identify as identify,
     load as load,
     read_log as read_log,
+    score as score,
     simulate as simulate,
     verify as verify,
 )

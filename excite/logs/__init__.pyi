@@ -19,6 +19,11 @@ from .inspection import Inspection as Inspection, guess_machine as guess_machine
 from .log import Log as Log, from_table as from_table, read_log as read_log, table_of as table_of
 from .plausibility import doubts_in_errors as doubts_in_errors
 from .preparation import Prepared as Prepared, prepare as prepare, read_stretches as read_stretches
-from .profile import profile_of as profile_of, read_profile as read_profile, torque_column as torque_column
+from .profile import (
+    profile_of as profile_of,
+    read_drive as read_drive,
+    read_profile as read_profile,
+    torque_column as torque_column,
+)
 from .repair import NEEDED as NEEDED, examine as examine, moves as moves
 from .tables import read_table as read_table

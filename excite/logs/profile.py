@@ -10,9 +10,11 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs import tables
-from excite.logs.log import check_time, columns_of, numbers
+from excite.logs.log import OFF_RATE, check_time, columns_of, numbers
 from excite.model import Model
 from excite.simulation import Motion
+
+SLOWEST_HZ = 0.5  # rate of a profile's rows below which its time is taken for wrong; chosen
 
 
 def profile_of(model: Model, motion: Motion) -> pd.DataFrame:
@@ -49,13 +51,42 @@ def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray
 
     Raises LogError as for a log.
     """
+    return _torques_and_start(tables.read_table(path), str(path), model, any_rate=False)
+
+
+def read_drive(
+    path: str | Path, model: Model, any_rate: bool = True
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    """Read a profile as `read_profile` does, with None for a start that it does not give: the drive may begin anywhere
+    on the lane.
+
+    any_rate: take rows at another rate than the machine's as knots, between which torques are linear. Raises LogError.
+    """
     table = tables.read_table(path)
-    source = str(path)
+    torque, start, speed = _torques_and_start(table, str(path), model, any_rate)
+    pose = model.machine.body[0].coordinates if model.machine.planar else ()
+    placed = start.any() or any(
+        place in table.columns
+        for c, (place, _) in zip(model.coordinates, motion_columns(model), strict=True)
+        if c in pose
+    )
+    return torque, start if placed or not pose else None, speed
+
+
+def _torques_and_start(
+    table: pd.DataFrame, source: str, model: Model, any_rate: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     needed = ["t_s", *(torque_column(model, n) for n in model.inputs)]
     missing = [c for c in needed if c not in table.columns]
     alien = [c for c in table.columns if re.fullmatch(r"u\d+_Nm?", str(c)) and c not in needed]
     if alien and not missing:
         raise LogError(f"{source}: column {alien[0]}: {model.machine.name} has no such drive; is it another's profile?")
+    moved = [c for names in motion_columns(model) for c in names if c in table.columns]
+    if missing and moved and not any(c in table.columns for c in needed[1:]):
+        raise LogError(
+            f"{source}: has a motion ({moved[0]}) but no torques: a drive is what the motors deliver over time, add the"
+            f" columns {', '.join(needed[1:])}"
+        )
     if missing:
         raise LogError(
             f"{source}: no column {', '.join(missing)}, {columns_of(table)}; is this a profile of {model.machine.name}?"
@@ -64,7 +95,14 @@ def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray
     if len(t) < 2:
         raise LogError(f"{source}: only {len(t)} row, a profile needs at least 2")
     rate = float(model.machine.sampling_hz)
-    check_time(t, rate, "t_s", source)
+    usual = 1 / float(np.median(np.diff(t))) if (np.diff(t) > 0).all() else rate
+    if usual < SLOWEST_HZ or 0 < (t[-1] - t[0]) * rate < 1:
+        raise LogError(
+            f"{source}: column t_s: {len(t)} rows {1 / usual:.4g} s apart; a profile lasts more than {1 / rate:g} s,"
+            f" with rows at most {1 / SLOWEST_HZ:g} s apart: is the time in seconds?"
+        )
+    own = usual if any_rate and abs(usual / rate - 1) > OFF_RATE else rate
+    check_time(t, own, "t_s", source)
     torque = np.column_stack([numbers(table, c, source) for c in needed[1:]])
     for k, name in enumerate(model.inputs):
         limit = model.machine.find(int(name[1:])).limit.torque
@@ -74,6 +112,9 @@ def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray
                 f"{source}: column {needed[k + 1]}: up to {top:.3g}, more than ten times the drive's limit"
                 f" {float(limit):g}; is the unit right?"
             )
+    if own != rate:
+        grid = t[0] + np.arange(round((t[-1] - t[0]) * rate) + 1) / rate
+        torque = np.column_stack([np.interp(grid, t, x) for x in torque.T])
     start, speed = np.zeros(len(model.coordinates)), np.zeros(len(model.coordinates))
     for k, (place, rate_column) in enumerate(motion_columns(model)):
         if place in table.columns:

@@ -267,12 +267,14 @@ def compare_figure(rows: Sequence[ComparisonRow], title: str) -> Figure:
     for ax, x, label in zip(
         axes, values, ("cond(Phi)", "worst parameter: attainable standard deviation [%]"), strict=True
     ):
+        finite = [value for value in x if np.isfinite(value)] or [1.0]
         for y, (r, value) in enumerate(zip(rows, x, strict=True)):
             ours, hatch = r.name == DESIGNED, "" if r.breaks is None else "///"
-            ax.barh(y, value, height=0.65, color=COLOURS[1 if ours else 0], edgecolor="black", hatch=hatch)
-            ax.annotate(f"{value:.3g}", (value, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8)
+            width = min(value, 2 * max(finite))
+            ax.barh(y, width, height=0.65, color=COLOURS[1 if ours else 0], edgecolor="black", hatch=hatch)
+            ax.annotate(f"{value:.3g}", (width, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8)
         ax.set_xscale("log")
-        ax.set_xlim(min(x) / 2, max(x) * 2)
+        ax.set_xlim(min(finite) / 2, max(finite) * 2)
         ax.xaxis.set_major_formatter("{x:g}")
         ax.xaxis.set_minor_formatter("")
         ax.set_xlabel(label)

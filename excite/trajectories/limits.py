@@ -15,7 +15,7 @@ import scipy
 
 from excite.model import Model
 from excite.model.machine import Problem
-from excite.simulation import Motion
+from excite.simulation import Motion, simulate
 
 REST_SPEED = 0.02  # m/s, speed that counts as rest at the ends; problem R60
 REST_RATE = 0.01  # rad/s, the same for rates of rotation; problem R60
@@ -23,6 +23,7 @@ REST_POSITION = 0.01  # rad or m, position that counts as centred at the ends; p
 TOLERANCE = 1e-3  # share of a limit's range that the fresh simulation may exceed; problem R60
 TRAVEL_LIMIT = "travel"
 REVERSALS_LIMIT = "reversals"
+DURATION_LIMIT = "duration"
 HEADINGS = 361  # headings tried on the lane, half a degree apart in a box; chosen
 TOP_SPEED_FACTOR = 1.2  # top speed over rim speed, with slip; chosen
 DEFAULT_TOP_SPEED = 10.0  # m/s, without a limit on rim speed; chosen
@@ -396,6 +397,16 @@ def place_on_lane(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
     if heading in axes:
         start[axes[heading]] += turn
     return start
+
+
+def simulate_on_lane(model: Model, problem: Problem, torque: np.ndarray, nu0: np.ndarray | None = None) -> Motion:
+    """Simulate torques (N, n_u) [N m] from where the drive lies on the lane as well as possible.
+
+    nu0 (n_q,): velocities at the start, rest by default. Raises SimulationError.
+    """
+    motion = simulate(model, torque, nu0=nu0)
+    start = place_on_lane(model, problem, motion)
+    return motion if np.array_equal(start, motion.q[0]) else simulate(model, torque, q0=start, nu0=nu0)
 
 
 def _fit_box(problem: Problem, path: np.ndarray) -> tuple[float, np.ndarray]:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
+from support.commands import Excite
 
+import excite as program
+from excite.logs import profile_of
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion, outside_law, resultant_slips, share_outside_law, simulate
@@ -68,3 +73,16 @@ def test_a_design_keeps_its_edges_within_the_law(va12: Model, monkeypatch: pytes
     assert 0.1 < largest_slip() <= 0.15 * 1.001
     monkeypatch.setitem(LIMITS, "slip", LimitKind(_middles))
     assert largest_slip() > 0.2
+
+
+def test_the_share_outside_the_law_is_told(excite: Excite, va12: Model, tmp_path: Path) -> None:
+    """By a simulation, and by an identification from its log."""
+    motion = steer_at_standstill(va12)
+    share = share_outside_law(va12, motion)
+    profile_of(va12, motion).to_csv(tmp_path / "p.csv", index=False)
+    asked = ("simulate", "va12", tmp_path / "p.csv", "--noise", "off", "--out", tmp_path / "log.csv")
+    _, stdout, _ = excite(*asked)
+    assert f"In {100 * share:.2g} % of the samples a contact slips more" in stdout
+    assert json.loads(excite(*asked, "--json")[1])["share_outside_law"] == share
+    log = program.read_log(va12, tmp_path / "log.csv")
+    assert program.identify(va12, log, "ols").share_outside_law == pytest.approx(share, abs=0.03)
