@@ -7,6 +7,7 @@ from .interface import (
     load as load,
     predict as predict,
     read_log as read_log,
+    score as score,
     simulate as simulate,
     verify as verify,
 )

@@ -23,7 +23,7 @@ from excite.logs import Log, PlannedDrive
 from excite.model import Model
 from excite.model.machine import load_machine
 from excite.simulation import Motion
-from excite.trajectories import Comparison, Design
+from excite.trajectories import Comparison, Design, Score
 from excite.workflows import DesignRequest
 
 __version__ = version("excite")
@@ -184,6 +184,20 @@ def verify(
     return identification.verify(model, motion, name, kit, runs, seed)
 
 
+def score(machine: Machine, drive: Drive, problem: str | None = None) -> Score:
+    """Judge any drive as a design: condition numbers, attainable accuracy, limits, on a fresh simulation.
+
+    drive: as in `simulate`; one that gives no pose is placed on the lane as a design is. problem: a design problem of
+    the machine file, its default one if not given.
+    Raises LogError for a profile, MachineError for sensors of unknown noise, UsageError for an unknown problem,
+    SimulationError for a motion that can't be integrated.
+    """
+    model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
+    _, chosen = workflows.choose_problem(model.machine, problem, None)
+    workflows.require_noise_figures(model)
+    return trajectories.score(model, chosen, *_torques(model, drive, any_rate=True))
+
+
 def compare(
     machine: Machine,
     problem: str | None = None,
@@ -195,15 +209,15 @@ def compare(
 ) -> Comparison:
     """Compare the designed drive with the usual ones on the same problem, limits and time.
 
-    against: names of `excite.trajectories.BASELINES`, all of them if not given. samples: drives of every random kind.
+    against: names of `excite.trajectories.BASELINES` and profiles (.csv) of your own; all the usual drives if not
+    given. samples: drives of every random kind.
     Raises UsageError for an unknown name, MachineError for sensors of unknown noise.
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
     _, chosen = workflows.choose_problem(model.machine, problem, None)
     workflows.require_noise_figures(model)
-    for usual in against:
-        workflows.require_known("against", usual, tuple(trajectories.BASELINES))
-    return trajectories.compare(model, chosen, samples, seed, budget, None, against)
+    usual, own = workflows.read_rivals("against", against, model, chosen)
+    return trajectories.compare(model, chosen, samples, seed, budget, None, usual, own)
 
 
 def _several(logs: Source | Sequence[Source]) -> list[Source]:
@@ -223,8 +237,13 @@ def _target(model: Model, target: Source | Drive) -> Source | PlannedDrive:
     return target
 
 
-def _torques(model: Model, drive: Drive) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Return the torques (N, n_u) [N m] of a drive and the state at its start."""
+def _torques(
+    model: Model, drive: Drive, any_rate: bool = False
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Return the torques (N, n_u) [N m] of a drive and the state at its start, None if it may begin anywhere.
+
+    any_rate: as for `excite.logs.read_drive`.
+    """
     if isinstance(drive, np.ndarray):
         return drive, None, None
     if isinstance(drive, Design):
@@ -232,7 +251,8 @@ def _torques(model: Model, drive: Drive) -> tuple[np.ndarray, np.ndarray | None,
     if isinstance(drive, Motion):
         return drive.u, drive.q[0], drive.nu[0]
     path = Path(drive)
-    return readers.read_profile(path / "profile.csv" if path.is_dir() else path, model)
+    planned = readers.read_drive(path / "profile.csv" if path.is_dir() else path, model, any_rate)
+    return planned.torque, planned.start if any_rate else planned.q0, planned.nu0
 
 
 def _motion(model: Model, drive: Drive) -> Motion:

@@ -499,6 +499,17 @@ def contact_lines(s: SymbolicSample) -> ca.Function:
     return ca.Function("axles", [s.q], [ca.densify(ca.horzcat(*found, ca.SX(4, 0)))], ["q"], ["axles"])
 
 
+def edge_slips(s: SymbolicSample) -> tuple[tuple[tuple[int, str], ...], ca.Function]:
+    """Return places (body, edge) of the contacts, and the function (q, nu) -> slips g_x, g_y there (2, n_places)."""
+    found: dict[tuple[int, str], ca.SX] = {}
+    for body in s.machine.contacts:
+        motion = _contact_motion(s, body)[0]
+        across = mechanics.slips_across(motion.contact, motion.slip, motion.yaw)
+        found |= {(body.index, place): g for place, g in across.items()}
+    slips = ca.densify(ca.horzcat(*found.values(), ca.SX(2, 0)))
+    return tuple(found), ca.Function("edge_slips", [s.q, s.nu], [slips], ["q", "nu"], ["slips"])
+
+
 def kinematics(s: SymbolicSample, slips: Mapping[str, ca.SX]) -> ca.Function:
     """Build (q, nu) -> dq, slips, wheel rates; position on the ground, velocity and angular velocity of each body."""
     machine, at, rate, frames, nu = s.machine, s.at, s.rate, s.frames, s.nu

@@ -17,7 +17,7 @@ import numpy as np
 from excite.errors import MachineError
 from excite.model import mechanics
 from excite.model.effects import GroundMap, PlacedEffect, Site, place_effect
-from excite.model.equations import Equations, contact_lines, equations, kinematics, signed_balance
+from excite.model.equations import Equations, contact_lines, edge_slips, equations, kinematics, signed_balance
 from excite.model.known_values import KnownValues, known_values
 from excite.model.machine import Machine
 from excite.model.mechanics import independent_columns
@@ -108,6 +108,8 @@ class Model:
     predict: (q, nu, a, p, u, z) -> Y (n_q,), p the standard parameters; standard_regressor: its Jacobian to p.
     balance: as predict, but the torques delivered, without gain, offset and delay of the torque sensors.
     kinematics: (q, nu) -> dq, slips, wheel rates, and per body position, velocity and angular velocity.
+    edge_slips: (q, nu) -> slips g_x, g_y (2, n_places) at `edges`: body and edge "left" or "right" of each contact, or
+        "" for a contact that slips alike all over. The resultant is largest there.
     nonlinear: standard parameters in which the prediction is not linear.
     flow: (q, nu, u, z, X) -> dz. It is zero for the last ones of z, `map_inputs`, which `new_ground_map` gives at every
         sample; contact_lines: q -> ground position and width vector of the contacts.
@@ -127,6 +129,8 @@ class Model:
     predict: ca.Function
     standard_regressor: ca.Function
     kinematics: ca.Function
+    edges: tuple[tuple[int, str], ...]
+    edge_slips: ca.Function
     nonlinear: tuple[str, ...]
     balance: ca.Function
     flow: ca.Function
@@ -394,6 +398,7 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
         found.predict,
         found.standard_regressor,
         kinematics(found.sample, found.slips),
+        *edge_slips(found.sample),
         found.nonlinear,
         found.balance,
         _as_base_function(found.flow, base),

@@ -211,7 +211,7 @@ def compare(
         list[str] | None,
         typer.Option(
             "--against",
-            help="usual drive to compare with (repeatable); all by default",
+            help="usual drive or profile (.csv) of your own to compare with (repeatable); all usual ones by default",
             autocompletion=options.names("against"),
         ),
     ] = None,
@@ -223,10 +223,34 @@ def compare(
     """Compare the designed drive with usual ones.
 
     All have the same problem, limits and computing time.
+
+    Example: excite compare va12 --against multisine --against my.csv
     """
     out = out or Path(f"results/compare-{workflows.machine_stem(machine)}")
-    with _result(out, json, partial(terminal.show, "compare"), _machine_file(machine)) as (place, summary):
+    inputs = [*_machine_file(machine), *(Path(name) for name in against or () if Path(name).suffix)]
+    with _result(out, json, partial(terminal.show, "compare"), inputs) as (place, summary):
         summary |= workflows.compare(place, machine, problem, samples, tuple(against or ()), seed, budget, terminal.bar)
+
+
+@app.command()
+def score(
+    machine: MachineArgument,
+    profile: Annotated[
+        Path, typer.Argument(metavar="PROFILE.csv", help="torques over time, as in a design's profile.csv")
+    ],
+    problem: ProblemOption = None,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Judge any drive as a design is: attainable accuracy, condition numbers, limits.
+
+    Its torques are simulated afresh. `excite verify` takes the folder as it takes a design.
+
+    Example: excite score va12 my.csv
+    """
+    out = out or Path(f"results/score-{workflows.machine_stem(machine)}")
+    with _result(out, json, partial(terminal.show, "score"), [*_machine_file(machine), profile]) as (place, summary):
+        summary |= workflows.score(place, machine, profile, problem)
 
 
 @app.command(cls=CommandWithChoices)
@@ -369,8 +393,8 @@ def simulate(
 
     Example: excite simulate va12 results/design-va12/profile.csv --out log.csv
     """
-    from excite import output, simulation
-    from excite.logs import read_profile
+    from excite import output, reports, simulation
+    from excite.logs import read_drive
     from excite.simulation import simulate as drive
 
     if noise not in ("on", "off"):
@@ -381,11 +405,11 @@ def simulate(
     model = workflows.build_model(machine)
     if out.resolve() in [path.resolve() for path in (profile, *_machine_file(machine))]:
         raise UsageError(f"--out {out}: is what the log is made from, choose another file")
-    torque, q0, nu0 = read_profile(profile, model)
-    nominal, model = model, workflows.with_effects(model, effect or (), len(torque))
+    planned = read_drive(profile, model)
+    nominal, model = model, workflows.with_effects(model, effect or (), len(planned.torque))
     doubts = [f"--effect {line}" for line in workflows.doubtful_effects(nominal, model)]
     with output.new_file(out) as path:
-        motion = drive(model, torque, q0=q0, nu0=nu0, friction=friction)
+        motion = drive(model, planned.torque, q0=planned.start, nu0=planned.nu0, friction=friction)
         table = simulation.measure(model, motion, kit=kit, seed=seed, noise=noise == "on")
         TABLE_WRITERS[out.suffix.lower()](table, path)
     summary = {
@@ -400,13 +424,15 @@ def simulate(
         "effects": effect or [],
         "friction": friction,
         "doubts": doubts,
+        "violations": workflows.judge_limits(model, motion, placed=planned.placed),
+        "share_outside_law": simulation.share_outside_law(model, motion),
         "seed": seed,
     }
     if json:
         terminal.show_json(summary)
     else:
         terminal.say(f"{out}: {len(table)} rows, {motion.t[-1]:g} s, columns {', '.join(table.columns)}")
-        for line in doubts:
+        for line in (*doubts, *reports.describe_drive_faults(summary)):
             terminal.say(line)
 
 

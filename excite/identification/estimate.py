@@ -32,6 +32,7 @@ class Estimate:
     possible (n,): False for values that no machine has. consistent (n,) [SI]: values of the nearest possible machine,
         if some value is not possible. prior_std (n,) [SI]: standard deviations by what the machine file calls known,
         before any log; NaN for parameters that it does not determine.
+    share_outside_law: of the logs' samples in which a contact slips more than its linear law allows, None if unknown.
     """
 
     method: str
@@ -55,6 +56,7 @@ class Estimate:
     possible: np.ndarray | None = None
     consistent: np.ndarray | None = None
     prior_std: np.ndarray | None = None
+    share_outside_law: float | None = None
 
     def value_or(self, nominal: np.ndarray) -> np.ndarray:
         """Return the values (n,), those of the machine file for unidentified parameters; nominal (n,) [SI]."""

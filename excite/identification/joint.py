@@ -21,6 +21,7 @@ from excite.identification.near_rest import friction_near_rest, with_soft_fricti
 from excite.logs import Log, decimate, derivative
 from excite.model import Model
 from excite.model.machine import Filter
+from excite.simulation import outside_law
 from excite.smoothing import (
     MAX_IDENTIFIABLE_STD,
     Fit,
@@ -239,9 +240,10 @@ def _build_estimate(
     if fit.unidentifiable.any():
         held = [n for n, yes in zip(model.base.names, fit.unidentifiable, strict=True) if yes]
         notes = (*notes, held_note(held))
-    W, Y, errors = [], [], []
+    W, Y, errors, outside = [], [], [], []
     for data, trajectory in zip(measurements, fit.trajectories, strict=True):
         q, nu, z, u, a = smoothed_motion(space, data, trajectory, fit.X)
+        outside.append(outside_law(model, q, nu))
         effect_inputs = () if model.plain else (u.T, z.T)
         plain_with_noise = fit.process_noise > 0 and model.plain
         if plain_with_noise:  # accelerations by process noise are not the model's
@@ -284,6 +286,7 @@ def _build_estimate(
         reasons,
         notes,
         one_sided_std=None if one_sided is None else np.where(weak, np.nan, one_sided),
+        share_outside_law=float(np.concatenate(outside).mean()),
     )
 
 

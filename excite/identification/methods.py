@@ -19,9 +19,10 @@ from excite.identification.joint import joint
 from excite.identification.linear_methods import filtered_blocks, ols, tls, wls
 from excite.identification.output_error import oe
 from excite.identification.status import assess
-from excite.logs import NEEDED, Log, doubts_in_errors, examine
+from excite.logs import NEEDED, Log, doubts_in_errors, examine, samples, unmeasured
 from excite.model import Model
 from excite.model.machine import Filter
+from excite.simulation import outside_law
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,17 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
         doubt = f"slips from real encoders are noisy, and the intervals of {method} are too narrow then: use joint"
         estimate = replace(estimate, doubt=doubt)
     estimate = assess(model, repaired, estimate, filter)
+    if estimate.share_outside_law is None:
+        estimate = replace(estimate, share_outside_law=_share_outside_law(model, repaired, filter))
     return add_notes(estimate, *(note for e in examined for note in e.notes), *doubts)
+
+
+def _share_outside_law(model: Model, logs: Sequence[Log], filter: Filter) -> float | None:
+    """Return the share of filtered samples outside the linear soil law; None if a speed is not measured."""
+    if any(unmeasured(model, log) for log in logs):
+        return None
+    motions = [samples(model, log, filter) for log in logs]
+    return float(np.concatenate([outside_law(model, s.q.T, s.nu.T) for s in motions]).mean())
 
 
 def require_sensors(model: Model) -> None:

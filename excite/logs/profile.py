@@ -11,9 +11,11 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs import tables
-from excite.logs.log import check_time, columns_of, numbers
+from excite.logs.log import OFF_RATE, check_time, columns_of, numbers
 from excite.model import Model
 from excite.simulation import Motion
+
+SLOWEST_HZ = 0.5  # rate of a profile's rows below which its time is taken for wrong; chosen
 
 
 def profile_of(model: Model, motion: Motion) -> pd.DataFrame:
@@ -50,6 +52,7 @@ class PlannedDrive:
     """A profile: torques (N, n_u) [N m] to deliver, the state q0, nu0 (n_q,) that it starts from.
 
     q, nu (N, n_q): the motion that is expected, None if the profile has not all of its columns.
+    placed: False if the profile does not say where on the lane it begins.
     """
 
     torque: np.ndarray
@@ -57,6 +60,12 @@ class PlannedDrive:
     nu0: np.ndarray
     q: np.ndarray | None = None
     nu: np.ndarray | None = None
+    placed: bool = True
+
+    @property
+    def start(self) -> np.ndarray | None:
+        """The pose (n_q,) that it starts from, None if the drive may begin anywhere on the lane."""
+        return self.q0 if self.placed else None
 
 
 def is_profile(source: str | Path | pd.DataFrame, model: Model) -> bool:
@@ -82,9 +91,10 @@ def read_profile(path: str | Path, model: Model) -> tuple[np.ndarray, np.ndarray
     return drive.torque, drive.q0, drive.nu0
 
 
-def read_drive(source: str | Path | pd.DataFrame, model: Model) -> PlannedDrive:
+def read_drive(source: str | Path | pd.DataFrame, model: Model, any_rate: bool = False) -> PlannedDrive:
     """Read a profile with the motion that is expected; its first state is zero where it gives none.
 
+    any_rate: take rows at another rate than the machine's as knots, between which every column is linear.
     Raises LogError as for a log.
     """
     table = source if isinstance(source, pd.DataFrame) else tables.read_table(source)
@@ -94,6 +104,12 @@ def read_drive(source: str | Path | pd.DataFrame, model: Model) -> PlannedDrive:
     alien = [c for c in table.columns if re.fullmatch(r"u\d+_Nm?", str(c)) and c not in needed]
     if alien and not missing:
         raise LogError(f"{source}: column {alien[0]}: {model.machine.name} has no such drive; is it another's profile?")
+    moved = [c for names in motion_columns(model) for c in names if c in table.columns]
+    if missing and moved and not any(c in table.columns for c in needed[1:]):
+        raise LogError(
+            f"{source}: has a motion ({moved[0]}) but no torques: a drive is what the motors deliver over time, add the"
+            f" columns {', '.join(needed[1:])}"
+        )
     if missing:
         raise LogError(
             f"{source}: no column {', '.join(missing)}, {columns_of(table)}; is this a profile of {model.machine.name}?"
@@ -102,7 +118,14 @@ def read_drive(source: str | Path | pd.DataFrame, model: Model) -> PlannedDrive:
     if len(t) < 2:
         raise LogError(f"{source}: only {len(t)} row, a profile needs at least 2")
     rate = float(model.machine.sampling_hz)
-    check_time(t, rate, "t_s", source)
+    usual = 1 / float(np.median(np.diff(t))) if (np.diff(t) > 0).all() else rate
+    if usual < SLOWEST_HZ or 0 < (t[-1] - t[0]) * rate < 1:
+        raise LogError(
+            f"{source}: column t_s: {len(t)} rows {1 / usual:.4g} s apart; a profile lasts more than {1 / rate:g} s,"
+            f" with rows at most {1 / SLOWEST_HZ:g} s apart: is the time in seconds?"
+        )
+    own = usual if any_rate and abs(usual / rate - 1) > OFF_RATE else rate
+    check_time(t, own, "t_s", source)
     torque = np.column_stack([numbers(table, c, source) for c in needed[1:]])
     for k, name in enumerate(model.inputs):
         limit = model.machine.find(int(name[1:])).limit.torque
@@ -114,10 +137,20 @@ def read_drive(source: str | Path | pd.DataFrame, model: Model) -> PlannedDrive:
             )
     columns = motion_columns(model)
     given = {c: numbers(table, c, source) for pair in columns for c in pair if c in table.columns}
+    if own != rate:
+        grid = t[0] + np.arange(round((t[-1] - t[0]) * rate) + 1) / rate
+        torque = np.column_stack([np.interp(grid, t, x) for x in torque.T])
+        given = {c: np.interp(grid, t, x) for c, x in given.items()}
     start, speed = (
         np.array([given[c][0] if c in given else 0.0 for c in names]) for names in zip(*columns, strict=True)
     )
+    pose = model.machine.body[0].coordinates if model.machine.planar else ()
+    placed = (
+        not pose
+        or start.any()
+        or any(place in given for c, (place, _) in zip(model.coordinates, columns, strict=True) if c in pose)
+    )
     if len(given) < 2 * len(columns):
-        return PlannedDrive(torque, start, speed)
+        return PlannedDrive(torque, start, speed, placed=bool(placed))
     q, nu = (np.column_stack([given[c] for c in names]) for names in zip(*columns, strict=True))
     return PlannedDrive(torque, start, speed, q, nu)

@@ -3,6 +3,7 @@ from .descriptions import (
     Table as Table,
     as_sentence as as_sentence,
     describe as describe,
+    describe_drive_faults as describe_drive_faults,
     format_sum as format_sum,
 )
 from .diagnosis_figures import figure_calls as figure_calls, signals_figure as signals_figure

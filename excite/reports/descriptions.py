@@ -11,6 +11,7 @@ import numpy as np
 
 from excite import trajectories
 from excite.identification import SIGNIFICANT_BIAS
+from excite.smoothing import MAX_IDENTIFIABLE_STD
 from excite.text import first_lines, format_number, format_p_value, format_percent
 from excite.trajectories import TOLERANCE
 
@@ -19,6 +20,7 @@ Summary = Mapping[str, Any]
 WORD = re.compile(r"a|[a-z]{3,},?")  # a word that a sentence may begin with in a capital letter; a name stays as it is
 NUMBER = re.compile(r"[<≤]?\s*[-+−]?\d")
 MAX_CELLS = 200  # cells of a study in a table; chosen
+MAX_CONDITION = 1e15  # condition number that is infinite but for rounding
 SHOWN_VIOLATION = 5e-6  # of a limit's range: smaller ones round to 0.000 %
 
 
@@ -77,6 +79,30 @@ def as_sentence(text: str) -> str:
     return text if text.endswith((".", "!", "?", ":")) else f"{text}."
 
 
+def describe_outside_law(share: float | None) -> tuple[str, ...]:
+    """Return a remark on the share of samples that lie outside the linear soil law, none if there are no such."""
+    if not share:
+        return ()
+    return (
+        f"In {format_percent(100 * share)} of the samples a contact slips more than its slip_limit, up to which the"
+        " linear soil law holds: real ground gives less force there than the model says.",
+    )
+
+
+def describe_violations(violations: Mapping[str, float]) -> str:
+    """Name the limits that are exceeded by more than the tolerance, the worst first, "" if there is none."""
+    over = sorted(((v, n) for n, v in violations.items() if v > TOLERANCE), reverse=True)
+    shown = ", ".join(f"{n} by {format_percent(100 * v)}" for v, n in over[:MAX_NAMES])
+    rest = f" and {len(over) - MAX_NAMES} more" if len(over) > MAX_NAMES else ""
+    return f"{shown}{rest} of the range" if over else ""
+
+
+def describe_drive_faults(s: Summary) -> tuple[str, ...]:
+    """Return a line on the limits that a simulated drive breaks, and one on its samples outside the soil law."""
+    over = describe_violations(s["violations"])
+    return (*((f"limits broken: {over}",) if over else ()), *describe_outside_law(s["share_outside_law"]))
+
+
 def _meaning_column(s: Summary) -> tuple[str, ...]:
     """Heading of the column that explains parameters, if the summary does."""
     return ("what it is",) if s.get("meanings") else ()
@@ -117,15 +143,12 @@ def describe_design(s: Summary) -> Description:
             f" {format_percent(lowest['worst_percent'])}; this drive is the most accurate one within"
             f" {s['cond_slack_percent']:g} % of it (`--cond-slack 0` gives the other)."
         )
+    remarks += describe_outside_law(s.get("share_outside_law"))
     if not s["complete"]:
         remarks.append("Cut short: this is the best drive so far, more time may find a better one.")
     if s.get("advice"):
         remarks.append(s["advice"])
-    ordered = sorted(sigma.items(), key=lambda x: -x[1])
-    rows = tuple((name, *_meaning(s, name), format_number(value, 3)) for name, value in ordered)
-    names = ("parameter", *_meaning_column(s), "%")
-    caption = "Attainable standard deviation of each parameter, the worst first."
-    tables = [Table(caption, names, rows, optional=_meaning_index(s))]
+    tables = [_sigma_table(s)]
     if s.get("driver"):
         by_hand_remarks, by_hand_tables = _describe_by_hand(s)
         remarks = [*by_hand_remarks, *remarks]
@@ -136,14 +159,48 @@ def describe_design(s: Summary) -> Description:
             " keep of it, `excite design --driver` designs for people from the start."
         )
     if s.get("violations"):
-        over = tuple(
-            (name, f"{100 * value:.3f}") for name, value in s["violations"].items() if value >= SHOWN_VIOLATION
-        )
-        if over:
-            tables.append(Table("Limits that are exceeded, in per cent of their range.", ("limit", "%"), over))
+        tables += _violations_table(s)
     return Description(
         f"Test drive for {s['machine']}, problem {s['problem']}", headline, tuple(tables), tuple(remarks)
     )
+
+
+def describe_score(s: Summary) -> Description:
+    """Describe a drive that is judged as a design: attainable accuracy, limits, condition numbers."""
+    sigma = s["sigma_percent"]
+    hidden = [n for n, v in sigma.items() if v > 100 * MAX_IDENTIFIABLE_STD]
+    shown = f"identify every parameter to {format_percent(s['worst_percent'])} or better"
+    if hidden:
+        shown = f"do not show {len(hidden)} of {len(sigma)} parameters ({_join_some(hidden)})"
+    over = describe_violations(s["violations"])
+    limits = f"limits broken: {over}" if over else "every limit is kept"
+    headline = (
+        f"These {s['duration_s']:g} s {shown} (one standard deviation, Cramer-Rao bound; worst {s['worst_parameter']},"
+        f" median {format_percent(s['median_percent'])}); {limits}."
+    )
+    remarks = (
+        f"Condition number of Phi {_condition(s['cond_phi'])}, of W {_condition(s['cond_w'])}.",
+        *describe_outside_law(s["share_outside_law"]),
+    )
+    tables = (_sigma_table(s), *_violations_table(s))
+    return Description(f"Score of {s['profile']} on {s['machine']}, problem {s['problem']}", headline, tables, remarks)
+
+
+def _condition(value: float | None) -> str:
+    return "infinite" if value is None or value > MAX_CONDITION else f"{value:.4g}"
+
+
+def _sigma_table(s: Summary) -> Table:
+    ordered = sorted(s["sigma_percent"].items(), key=lambda x: -x[1])
+    rows = tuple((name, *_meaning(s, name), format_number(value, 3)) for name, value in ordered)
+    caption = "Attainable standard deviation of each parameter, the worst first."
+    return Table(caption, ("parameter", *_meaning_column(s), "%"), rows, optional=_meaning_index(s))
+
+
+def _violations_table(s: Summary) -> tuple[Table, ...]:
+    """Return the table of the limits that are exceeded, none if every limit is kept."""
+    over = tuple((name, f"{100 * value:.3f}") for name, value in s["violations"].items() if value >= SHOWN_VIOLATION)
+    return (Table("Limits that are exceeded, in per cent of their range.", ("limit", "%"), over),) if over else ()
 
 
 WAYS_OF_DRIVING = {
@@ -196,10 +253,17 @@ def describe_drive(s: Summary) -> Description:
 
 def describe_compare(s: Summary) -> Description:
     """Describe a comparison of the designed drive with usual ones."""
-    ratio = s["ratio_equal_time"]
+    ratio, own = s["ratio_equal_time"], [d for d in s["designs"] if d.get("own")]
     kept = [d for d in s["designs"] if d["breaks"] is None]
     best = min(kept, key=lambda d: d["cond_phi"]) if kept else None
-    if ratio is None or not np.isfinite(ratio):
+    if own and len(own) == len(s["designs"]) - 1:
+        designed = s["designs"][0]
+        headline = f"The designed drive has cond(Phi) {designed['cond_phi']:.4g}; " + "; ".join(
+            f"{d['name']} has {_condition(d['cond_phi'])}"
+            + ("" if d["breaks"] is None else f" and breaks {_broken_limit(d)}")
+            for d in own
+        )
+    elif ratio is None or not np.isfinite(ratio):
         headline = "No usual drive found in the same time keeps every limit; the designed one does."
     else:
         word = "lower" if ratio > 1 else "higher"
@@ -217,9 +281,9 @@ def describe_compare(s: Summary) -> Description:
             d["name"],
             *(format_number(d[k], 4) for k in ("cond_phi", "cond_w", "worst_std_percent", "median_std_percent")),
             f"{d['kept']}/{d['samples']}",
-            "-" if d["breaks"] is None else f"{d['breaks']} by {format_percent(100 * d['max_violation'])}",
-            f"{d['wall_s']:.1f}",
-            f"not in {d['wall_s']:.0f}" if d["equal_score_s"] is None else f"{d['equal_score_s']:.0f}",
+            _broken_limit(d),
+            "-" if d.get("own") else f"{d['wall_s']:.1f}",
+            _equal_score(d),
         )
         for d in s["designs"]
     )
@@ -231,6 +295,16 @@ def describe_compare(s: Summary) -> Description:
     ours = tuple(k for k, d in enumerate(s["designs"]) if d["name"].startswith("designed"))
     table = Table(caption, (*names, "as good in s"), rows, ours, (2, 7, 8))
     return Description(f"Drives compared for {s['machine']}, problem {s['problem']}", headline, (table,), remarks)
+
+
+def _equal_score(d: Mapping[str, Any]) -> str:
+    if d.get("own"):
+        return "-"
+    return f"not in {d['wall_s']:.0f}" if d["equal_score_s"] is None else f"{d['equal_score_s']:.0f}"
+
+
+def _broken_limit(d: Mapping[str, Any]) -> str:
+    return "-" if d["breaks"] is None else f"{d['breaks']} by {format_percent(100 * d['max_violation'])}"
 
 
 # ------------------------------------------------------------------------------------------------ parameters
@@ -251,6 +325,7 @@ def describe_verify(s: Summary) -> Description:
         " cases."
     )
     remarks = [f"Biased, the intervals do not hold: {', '.join(s['biased'])}."] if s["biased"] else []
+    remarks += describe_outside_law(s.get("share_outside_law"))
     if s["failed"]:
         remarks.append(f"{s['failed']} runs gave no estimate.")
     table = tuple(
@@ -330,6 +405,7 @@ def describe_identify(s: Summary) -> Description:
         *wrong,
         *(f"{name} can't be identified: {reason}." for name, reason in s["reasons"].items()),
         *dict.fromkeys(s["notes"]),
+        *describe_outside_law(s.get("share_outside_law")),
     ]
     for check in s["validation"]:
         remarks.append(_describe_validation(check))
@@ -686,6 +762,7 @@ def _cell_error(row: Mapping[str, Any]) -> str:
 DESCRIPTIONS: dict[str, Callable[[Summary], Description]] = {
     "design": describe_design,
     "drive": describe_drive,
+    "score": describe_score,
     "compare": describe_compare,
     "verify": describe_verify,
     "identify": describe_identify,

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from excite import trajectories
+from excite import simulation, trajectories
 from excite.identification import Prediction, SignalComparison, Verification
 from excite.logs import Inspection
 from excite.model import Model
@@ -72,8 +72,11 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
     """Plot a drive: torques, speeds, joint angles and slips over time, the path, and the used share of each limit."""
     machine, t = model.machine, motion.t
     moving = [b for b in machine.actuated if b.limit.position is not None]
-    slips = model.kinematics(motion.q.T, motion.nu.T)[1].full()
-    panels = 2 + bool(moving) + bool(len(slips))
+    slips: dict[str, np.ndarray] = {}
+    for (index, _), x in zip(model.edges, simulation.resultant_slips(model, motion.q, motion.nu).T, strict=True):
+        name = machine.find(index).where.replace("_", " ")
+        slips[name] = np.maximum(slips.get(name, x), x)
+    panels = 2 + bool(moving) + bool(slips)
     figure = Figure(figsize=(11.5, 2.3 * max(panels, 3) + 0.6), layout="constrained")
     halves = figure.subfigures(1, 2, width_ratios=(1.7, 1))
     assert isinstance(halves, np.ndarray)
@@ -112,11 +115,11 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
         _lines(axes[row], t, angles, "angle [rad]")
         _bound(axes[row], max(float(b.limit.position) for b in moving if b.limit.position is not None))
         row += 1
-    if len(slips):
-        _lines(axes[row], t, dict(zip(model.slips, slips, strict=True)), "slip [-]")
+    if slips:
+        _lines(axes[row], t, slips, "largest slip [-]")
         allowed = [float(b.contact.slip_limit) for b in machine.contacts if b.contact and b.contact.slip_limit]
         if allowed:
-            _bound(axes[row], max(allowed))
+            axes[row].axhline(max(allowed), color="black", linewidth=0.8, linestyle=(0, (2, 3)))
     axes[-1].set_xlabel("time [s]")
 
     use = limit_use(model, problem, motion)
@@ -312,12 +315,14 @@ def compare_figure(rows: Sequence[ComparisonRow], title: str) -> Figure:
     for ax, x, label in zip(
         axes, values, ("cond(Phi)", "worst parameter: attainable standard deviation [%]"), strict=True
     ):
+        finite = [value for value in x if np.isfinite(value)] or [1.0]
         for y, (r, value) in enumerate(zip(rows, x, strict=True)):
             ours, hatch = r.name == DESIGNED, "" if r.breaks is None else "///"
-            ax.barh(y, value, height=0.65, color=COLOURS[1 if ours else 0], edgecolor="black", hatch=hatch)
-            ax.annotate(f"{value:.3g}", (value, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8)
+            width = min(value, 2 * max(finite))
+            ax.barh(y, width, height=0.65, color=COLOURS[1 if ours else 0], edgecolor="black", hatch=hatch)
+            ax.annotate(f"{value:.3g}", (width, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8)
         ax.set_xscale("log")
-        ax.set_xlim(min(x) / 2, max(x) * 2)
+        ax.set_xlim(min(finite) / 2, max(finite) * 2)
         ax.xaxis.set_major_formatter("{x:g}")
         ax.xaxis.set_minor_formatter("")
         ax.set_xlabel(label)

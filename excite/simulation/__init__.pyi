@@ -24,3 +24,8 @@ from .sensors import (
     measure as measure,
     measured_torques as measured_torques,
 )
+from .slip import (
+    outside_law as outside_law,
+    resultant_slips as resultant_slips,
+    share_outside_law as share_outside_law,
+)

@@ -6,6 +6,7 @@
   accuracy to reach, information from earlier logs, or several possible machines (`CompositeObjective`).
 - LIMITS holds the limits of a motion; `check_limits` gives the excess over each.
 - `compare` sets a design against the usual drives in BASELINES: multisines, Fourier series, a hand-made drive.
+- `score` judges any drive as a design is (`Score`): condition numbers, attainable accuracy, excess over every limit.
 - `read_design` reads the folder of a design back (`SavedDesign`).
 - The module `bound` computes how low cond(Phi) can be at best.
 

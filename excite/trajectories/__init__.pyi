@@ -20,6 +20,7 @@ from .composite_objective import (
 from .continuation import SOLVERS as SOLVERS
 from .excitation import Manoeuvre as Manoeuvre, multisine as multisine, scale_torques as scale_torques
 from .limits import (
+    DURATION_LIMIT as DURATION_LIMIT,
     LIMITS as LIMITS,
     MOTION_LIMITS as MOTION_LIMITS,
     REST_POSITION as REST_POSITION,
@@ -33,6 +34,7 @@ from .limits import (
     place_on_lane as place_on_lane,
     rest_tolerances as rest_tolerances,
     resting_coordinates as resting_coordinates,
+    simulate_on_lane as simulate_on_lane,
     stack_limits as stack_limits,
 )
 from .multistart import Design as Design, design as design, process_count as process_count
@@ -50,3 +52,4 @@ from .saved_design import (
     read_design as read_design,
     read_design_summary as read_design_summary,
 )
+from .scoring import Score as Score, score as score, score_motion as score_motion

@@ -15,17 +15,17 @@ took, then treated in the same way. Work is shared among all processes; one opti
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
 
 import casadi as ca
 import joblib
 import numpy as np
 import scipy
 
-from excite import smoothing
 from excite.errors import CollocationError, SimulationError
 from excite.model import Model, mechanics
 from excite.model.machine import Body, Problem
@@ -54,6 +54,7 @@ from excite.trajectories.limits import (
     sample_symbols,
 )
 from excite.trajectories.multistart import design, process_count
+from excite.trajectories.scoring import Score, score
 
 SLOW_TOP = 0.08  # Hz, highest frequency of slow multisines; chosen
 SCALE_STEP = 0.9  # ratio of successive torque scales; chosen
@@ -86,6 +87,7 @@ class ComparisonRow:
     worst_std_percent, median_std_percent: of the Cramer-Rao bound, kit `full`. breaks: the limit exceeded by more than
     the tolerance, or None. kept, samples: drives of this kind that keep every limit, out of all. wall_s [s]: for all of
     them, in parallel. equal_s [s]: until a feasible one reaches the design's cond(Phi), None if none does.
+    own: True for a drive of the user's own.
     """
 
     name: str
@@ -101,6 +103,7 @@ class ComparisonRow:
     samples: int
     wall_s: float
     equal_s: float | None
+    own: bool = False
 
 
 @dataclass(frozen=True)
@@ -441,17 +444,19 @@ def compare(
     budget_s: float | None = None,
     progress: Progress | None = None,
     baselines: Sequence[str] = (),
+    own: Mapping[str, Score] = MappingProxyType({}),
 ) -> Comparison:
     """Compare a designed drive with usual ones on one problem.
 
     samples: drives of every random kind.
     budget_s [s]: time of the design; optimised usual drives get as long as it took.
     progress(done, total, lowest cond(Phi) so far).
-    baselines: names in BASELINES, all by default.
+    baselines: names in BASELINES, all by default if there is no drive of one's own.
+    own: scores by name of drives to set beside them, as they are.
 
     Raises InfeasibleError if the design finds no drive, KeyError for an unknown name, KeyboardInterrupt on Ctrl-C.
     """
-    baselines = tuple(dict.fromkeys(baselines)) or tuple(BASELINES)
+    baselines = tuple(dict.fromkeys(baselines)) or (() if own else tuple(BASELINES))
     for name in baselines:
         if name not in BASELINES:
             raise KeyError(f"no usual drive {name}, allowed: {', '.join(BASELINES)}")
@@ -465,7 +470,8 @@ def compare(
     best = ScoredDrive(
         designed.manoeuvre, designed.motion.q[0], 2 * float(np.log(designed.cond_phi)), designed.violations
     )
-    rows = [_row(model, DESIGNED, best, 1, 1, wall, wall)]
+    rows = [_row(model, problem, DESIGNED, best, 1, 1, wall, wall)]
+    rows += [_own_row(name, found) for name, found in own.items()]
     lowest = designed.cond_phi
     if progress is not None:
         progress(1, total, lowest)
@@ -485,7 +491,7 @@ def compare(
     found.sort(key=lambda s: s.number)
     in_time = [np.inf]
     for name in baselines:
-        rows += _rows(model, name, [s for s in found if s.kind == name], designed.cond_phi)
+        rows += _rows(model, problem, name, [s for s in found if s.kind == name], designed.cond_phi)
         in_time += _scores_in_time([s for s in found if s.kind == name], wall)
     return Comparison(tuple(rows), min(in_time) / designed.cond_phi)
 
@@ -521,12 +527,15 @@ def _time_to_equal_score(samples: Sequence[_BaselineDrive], cond_phi: float) -> 
     return None
 
 
-def _rows(model: Model, name: str, samples: Sequence[_BaselineDrive], designed: float) -> list[ComparisonRow]:
+def _rows(
+    model: Model, problem: Problem, name: str, samples: Sequence[_BaselineDrive], designed: float
+) -> list[ComparisonRow]:
     """Return the row of a kind, or the best and the median of a random kind."""
     ranked = sorted(samples, key=_drive_rank)
     row = partial(
         _row,
         model,
+        problem,
         kept=sum(s.found.feasible for s in samples),
         samples=len(samples),
         equal_s=_time_to_equal_score(samples, designed),
@@ -542,21 +551,39 @@ def _rows(model: Model, name: str, samples: Sequence[_BaselineDrive], designed: 
 
 
 def _row(
-    model: Model, name: str, c: ScoredDrive, kept: int, samples: int, wall_s: float, equal_s: float | None
+    model: Model,
+    problem: Problem,
+    name: str,
+    c: ScoredDrive,
+    kept: int,
+    samples: int,
+    wall_s: float,
+    equal_s: float | None,
 ) -> ComparisonRow:
-    motion = simulate(model, c.manoeuvre.sample(float(model.machine.sampling_hz)), q0=c.start)
-    spread = objective.relative_std_percent(model, smoothing.cramer_rao(model, motion))
-    breaks = None if c.feasible else max(c.violations, key=lambda limit: c.violations[limit])
+    judged = score(model, problem, c.manoeuvre.sample(float(model.machine.sampling_hz)), c.start)
+    return _judged_row(name, c.manoeuvre, judged, kept, samples, wall_s, equal_s)
+
+
+def _own_row(name: str, judged: Score) -> ComparisonRow:
+    kept = int(judged.max_violation <= TOLERANCE)
+    row = _judged_row(name, Manoeuvre(judged.motion.t, judged.motion.u), judged, kept, 1, 0.0, None)
+    return replace(row, own=True)
+
+
+def _judged_row(
+    name: str, drive: Manoeuvre, judged: Score, kept: int, samples: int, wall_s: float, equal_s: float | None
+) -> ComparisonRow:
+    over = judged.violations
     return ComparisonRow(
         name,
-        c.manoeuvre,
-        c.start,
-        objective.cond_phi(model, motion),
-        objective.cond_w(model, motion),
-        float(spread.max()),
-        float(np.median(spread)),
-        c.excess,
-        breaks,
+        drive,
+        judged.motion.q[0],
+        judged.cond_phi,
+        judged.cond_w,
+        judged.worst_percent,
+        judged.median_percent,
+        judged.max_violation,
+        max(over, key=lambda limit: over[limit]) if judged.max_violation > TOLERANCE else None,
         kept,
         samples,
         wall_s,

@@ -32,9 +32,9 @@ from excite.trajectories.limits import (
     keeps_motion_limits,
     lane_excess,
     machine_limits,
-    place_on_lane,
     rest_tolerances,
     resting_coordinates,
+    simulate_on_lane,
     travel_directions,
 )
 
@@ -536,11 +536,7 @@ def evaluate_drive(
 
     Other machines of the objective follow its motion, and their limits count too, except lane and rest.
     """
-    torque = drive.sample(float(model.machine.sampling_hz))
-    motion = simulate(model, torque)
-    start = place_on_lane(model, problem, motion)
-    if not np.array_equal(start, motion.q[0]):
-        motion = simulate(model, torque, q0=start)
+    motion = simulate_on_lane(model, problem, drive.sample(float(model.machine.sampling_hz)))
     violations = check_limits(model, problem, motion)
     motions = [(model, motion), *((m, track_motion(m, model, motion)) for m in objective.machines[1:])]
     for m, other in motions[1:]:  # lane and rest are left to the driver
@@ -552,7 +548,7 @@ def evaluate_drive(
         violations[SIGMA_MAX] = max(0.0, judged.worst_percent / objective.sigma_max - 1)
     if objective.cond_max is not None:
         violations[COND_MAX] = max(0.0, objectives.cond_phi(model, motion) / objective.cond_max - 1)
-    return ScoredDrive(drive, start, judged.score, violations), motion
+    return ScoredDrive(drive, motion.q[0], judged.score, violations), motion
 
 
 def rest_band_factor(friction: float) -> float:

@@ -15,7 +15,7 @@ import scipy
 
 from excite.model import Model
 from excite.model.machine import Problem
-from excite.simulation import Motion
+from excite.simulation import Motion, simulate
 
 REST_SPEED = 0.02  # m/s, speed that counts as rest at the ends; problem R60
 REST_RATE = 0.01  # rad/s, the same for rates of rotation; problem R60
@@ -23,9 +23,11 @@ REST_POSITION = 0.01  # rad or m, position that counts as centred at the ends; p
 TOLERANCE = 1e-3  # share of a limit's range that the fresh simulation may exceed; problem R60
 TRAVEL_LIMIT = "travel"
 REVERSALS_LIMIT = "reversals"
+DURATION_LIMIT = "duration"
 HEADINGS = 361  # headings tried on the lane, half a degree apart in a box; chosen
 TOP_SPEED_FACTOR = 1.2  # top speed over rim speed, with slip; chosen
 DEFAULT_TOP_SPEED = 10.0  # m/s, without a limit on rim speed; chosen
+SLIP_ROUNDING = 0.05  # of the slip limit: what it shows without slip, as a share of the limit; chosen
 POWER_SMOOTHING = 1e-3  # of the power limit: rounding of |u q'|; chosen
 
 
@@ -119,14 +121,17 @@ def _rim_speed(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[Bou
 
 
 def _slip(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
-    """Both slips of a contact, `slip_limit`: the range in which the soil law is linear."""
-    slips = model.kinematics(s.q, s.nu)[1]
-    bodies = {str(b.index): b for b in model.machine.contacts}
-    for k, name in enumerate(model.slips):
-        body = bodies[name[2:]]
+    """Resultant slip at both edges of a contact, `slip_limit`: the range in which the soil law is linear.
+
+    |g| is replaced by sqrt((1 - r^2) |g|^2 + r^2 limit^2), r = SLIP_ROUNDING: smooth at rest, exact at the limit.
+    """
+    slips = model.edge_slips(s.q, s.nu)
+    for k, (index, edge) in enumerate(model.edges):
+        body = model.machine.find(index)
         if body.contact is not None and body.contact.slip_limit is not None:
             high = float(body.contact.slip_limit)
-            yield f"slip {name[:2]} {body.where}", slips[k], -high, high, "-"
+            square = (1 - SLIP_ROUNDING**2) * ca.sumsqr(slips[:, k]) + (SLIP_ROUNDING * high) ** 2
+            yield f"slip {body.where} {edge}".rstrip(), ca.sqrt(square), -np.inf, high, "-"
 
 
 def _power(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
@@ -392,6 +397,16 @@ def place_on_lane(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
     if heading in axes:
         start[axes[heading]] += turn
     return start
+
+
+def simulate_on_lane(model: Model, problem: Problem, torque: np.ndarray, nu0: np.ndarray | None = None) -> Motion:
+    """Simulate torques (N, n_u) [N m] from where the drive lies on the lane as well as possible.
+
+    nu0 (n_q,): velocities at the start, rest by default. Raises SimulationError.
+    """
+    motion = simulate(model, torque, nu0=nu0)
+    start = place_on_lane(model, problem, motion)
+    return motion if np.array_equal(start, motion.q[0]) else simulate(model, torque, q0=start, nu0=nu0)
 
 
 def _fit_box(problem: Problem, path: np.ndarray) -> tuple[float, np.ndarray]:

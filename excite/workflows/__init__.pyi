@@ -3,7 +3,7 @@ from .design_request import (
     design_from as design_from,
     require_noise_figures as require_noise_figures,
 )
-from .design_workflow import compare as compare, design as design
+from .design_workflow import compare as compare, design as design, read_rivals as read_rivals
 from .diagnose_workflow import diagnose as diagnose, diagnose_from as diagnose_from
 from .identify_workflow import (
     describe_agreement as describe_agreement,
@@ -24,6 +24,7 @@ from .requests import (
     require_objective as require_objective,
     require_positive as require_positive,
 )
+from .score_workflow import judge_limits as judge_limits, score as score
 from .simulate_workflow import doubtful_effects as doubtful_effects, with_effects as with_effects
 from .study_plan import Study as Study, read_study as read_study
 from .study_runner import run_study as run_study

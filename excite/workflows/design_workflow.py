@@ -11,10 +11,11 @@ import numpy as np
 import pandas as pd
 
 from excite import reports, trajectories
-from excite.errors import MachineError
-from excite.logs import profile_of, torque_column
+from excite.errors import MachineError, UsageError
+from excite.logs import profile_of, read_drive, torque_column
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Problem
+from excite.trajectories import Score
 from excite.workflows import design_request, requests
 from excite.workflows.design_request import DesignRequest
 from excite.workflows.progress import Bar, no_bar
@@ -71,6 +72,24 @@ def design_model(
     return summary
 
 
+def read_rivals(
+    option: str, against: Sequence[str], model: Model, problem: Problem
+) -> tuple[tuple[str, ...], dict[str, Score]]:
+    """Split what a design is compared with into names of `BASELINES`, and scores of profiles by their files' names.
+
+    option: as an error begins. Raises UsageError for an unknown name or two files of one name, LogError.
+    """
+    usual = tuple(name for name in against if not Path(name).suffix)
+    files = [Path(name) for name in against if Path(name).suffix]
+    for name in usual:
+        requests.require_known(option, name, tuple(trajectories.BASELINES))
+    twice = sorted({f.name for f in files if [g.name for g in files].count(f.name) > 1})
+    if twice:
+        raise UsageError(f"{option}: two files are called {twice[0]}, rename one: a row is named after its file")
+    drives = {f.name: read_drive(f, model, any_rate=True) for f in files}
+    return usual, {n: trajectories.score(model, problem, d.torque, d.start, d.nu0) for n, d in drives.items()}
+
+
 def compare(
     place: Path,
     machine: str,
@@ -83,22 +102,23 @@ def compare(
 ) -> dict[str, Any]:
     """Compare the designed drive with usual ones into a folder; return the summary.
 
-    samples: drives of each random kind. against: names of `BASELINES`, all of them if empty. budget [s].
-    Raises UsageError, MachineError.
+    samples: drives of each random kind. against: names of `BASELINES` and profiles of one's own, all of the former if
+    empty. budget [s].
+    Raises UsageError, MachineError, LogError.
     """
     model = requests.build_model(machine, fit_sensor_effects=False)
     name, chosen = requests.choose_problem(model.machine, problem, None)
     design_request.require_noise_figures(model)
     requests.require_positive("--budget", budget, "s")
-    for usual in against:
-        requests.require_known("--against", usual, tuple(trajectories.BASELINES))
+    usual, own = read_rivals("--against", against, model, chosen)
     with bar("comparing") as advance:
-        result = trajectories.compare(model, chosen, samples, seed, budget, advance, against)
+        result = trajectories.compare(model, chosen, samples, seed, budget, advance, usual, own)
     columns = ["t_s", *(torque_column(model, u) for u in model.inputs)]
     (place / "drives").mkdir()
     designs = []
     for row in result.rows:
-        knots = f"drives/{row.name.replace(',', '').replace(' ', '-')}.csv"
+        file = row.name.replace(",", "").replace(" ", "-").removesuffix(".csv")
+        knots = f"drives/{'own-' if row.own else ''}{file}.csv"
         table = pd.DataFrame([[t, *u] for t, u in zip(row.manoeuvre.times, row.manoeuvre.torque, strict=True)])
         table.to_csv(place / knots, index=False, header=columns, float_format="%.12g")
         designs.append(
@@ -115,6 +135,7 @@ def compare(
                 "wall_s": row.wall_s,
                 "equal_score_s": row.equal_s,
                 "knots": knots,
+                "own": row.own,
                 "start": dict(zip(model.coordinates, row.start, strict=True)),
             }
         )

@@ -136,6 +136,7 @@ def identify(
         "cond_phi": estimate.cond_phi,
         "relative_error_percent": estimate.relative_error_percent,
         "degrees": estimate.degrees,
+        "share_outside_law": estimate.share_outside_law,
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
         "notes": [*said, *cut, *estimate.notes, *more_notes],

@@ -53,6 +53,7 @@ def verify(
         "seed": seed,
         "failed": len(result.failures),
         "failures": result.failures,
+        "share_outside_law": simulation.share_outside_law(model, motion),
         "parameters": parameters,
         "meanings": parameter_descriptions(model),
         "biased": identification.biased_parameters(parameters),

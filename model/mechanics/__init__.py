@@ -5,7 +5,8 @@ behind it (backward recursion), linear in the standard inertial parameters `INER
 `body_poses` give the geometry, `standard_inertia` and `inertial_vector` the parameters of a body.
 
 `slip` and `wrench` are the contact law of the paper, linear (24, 25) or with a `Saturation` such as the exponential one
-(18). `independent_columns` finds the independent columns of a regressor.
+(18). `slips_across` gives the slips at the edges of a contact, where the linear law ends first. `independent_columns`
+finds the independent columns of a regressor.
 """
 
 import lazy_loader

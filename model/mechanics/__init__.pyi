@@ -4,6 +4,7 @@ from .contact import (
     Wrench as Wrench,
     rim_speed as rim_speed,
     slip as slip,
+    slips_across as slips_across,
     wrench as wrench,
 )
 from .rank import independent_columns as independent_columns

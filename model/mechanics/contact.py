@@ -73,6 +73,22 @@ def slip(contact: Contact, Vx: ca.SX, Vy: ca.SX, spin: ca.SX, extra_radius: ca.S
     return Slip((Vx - at_ground) / vn, Vy / vn, vn)
 
 
+def longitudinal_slip(s: Slip, yaw_rate: ca.SX | float, y: ca.SX | float) -> ca.SX:
+    """Return g_x at y [m] to the left of the contact's middle (17); yaw_rate [rad/s]: of its chassis."""
+    return s.gx - y * yaw_rate / s.vn
+
+
+def slips_across(contact: Contact, s: Slip, yaw_rate: ca.SX) -> dict[str, ca.SX]:
+    """Return (g_x, g_y) at the places of a contact that slip most, by place: its right and left edge.
+
+    |g|^2 is a convex function of y, so the middle never slips more than both edges. A contact without width, or whose
+    chassis cannot turn, slips alike all over: its place is the middle.
+    """
+    edge = float(contact.width) / 2
+    at = {"": 0.0} if edge == 0 or yaw_rate.is_zero() else {"right": -edge, "left": edge}
+    return {place: ca.vertcat(longitudinal_slip(s, yaw_rate, y), s.gy) for place, y in at.items()}
+
+
 def wrench(
     contact: Contact,
     s: Slip,
@@ -94,8 +110,8 @@ def wrench(
         return Wrench(Kx * s.gx, Ky * s.gy, linear_Tz)
     Sx, Sy, Tz = ca.SX(0), ca.SX(0), ca.SX(0)
     for y, dy in _width_points(contact, s, saturation.by_strip * yaw_rate):
-        gx = s.gx - y * yaw_rate / s.vn
-        share = saturation.share(s.gx - saturation.by_strip * y * yaw_rate / s.vn, s.gy) * dy
+        gx = longitudinal_slip(s, yaw_rate, y)
+        share = saturation.share(longitudinal_slip(s, saturation.by_strip * yaw_rate, y), s.gy) * dy
         Sx += Kx * gx * share
         Sy += Ky * s.gy * share
         Tz += Kx * gx * y * share

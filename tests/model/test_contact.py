@@ -180,6 +180,34 @@ def test_slips_are_the_contracts(va12: Model) -> None:
             assert got[row : row + 2, k] == pytest.approx([gx, gy], rel=1e-12, abs=1e-13)
 
 
+def test_edges_slip_as_their_own_points_move(va12: Model) -> None:
+    """(17) at y = -L_c/2 and L_c/2: the edge's own forward speed counts, and no place between them slips more."""
+    q, nu = states(100, seed=4)
+    assert va12.edges == ((1, "right"), (1, "left"), (4, "right"), (4, "left"))
+    got = va12.edge_slips(q, nu).full().reshape(2, 100, 4)
+    for k in range(100):
+        for place, (roll, _) in enumerate(va12.edges):
+            m = motion(roll, q[4, k], nu[:, k])
+
+            def slip_at(y: float, m: Motion = m) -> tuple[float, float]:
+                vn = math.hypot(RC * m.spin, V_EPS)
+                return (m.Vx - y * m.yaw - RC * m.spin) / vn, m.Vy / vn
+
+            assert got[:, k, place] == pytest.approx(slip_at((-1) ** (place + 1) * LC / 2), rel=1e-12, abs=1e-13)
+            edges = np.hypot(*got[:, k, 2 * (place // 2) : 2 * (place // 2) + 2]).max()
+            assert all(math.hypot(*slip_at(y)) <= edges * (1 + 1e-12) for y in np.linspace(-LC / 2, LC / 2, 21))
+
+
+def test_contacts_that_slip_alike_all_over_have_one_place(va12: Model, straight: Model) -> None:
+    assert straight.edges == ((1, ""), (4, ""))
+    thin = build(with_contacts(load_machine("va12"), width=quantity(0.0)))
+    assert thin.edges == ((1, ""), (4, ""))
+    q, nu = states(20, seed=4)
+    np.testing.assert_array_equal(
+        thin.edge_slips(q, nu).full().reshape(2, 20, 2).transpose(2, 0, 1).reshape(4, 20), thin.kinematics(q, nu)[1]
+    )
+
+
 def test_pure_rolling_forward_has_no_longitudinal_force(va12: Model) -> None:
     """V_x = R_c theta': the spin is about +y of the chassis."""
     nu = np.array([1.3, 0.0, 0.0, 1.3 / RC, 0.0, 1.3 / RC])

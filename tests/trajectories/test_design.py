@@ -229,7 +229,7 @@ def test_limits_are_named_and_scaled(roller: Model) -> None:
     names = [g.name for g in every]
     assert len(set(names)) == len(names) == 19
     assert {"torque u2", "torque rate u4", "position articulation", "rate articulation", "power"} <= set(names)
-    assert {"slip gy rear_roll", "rim speed front_roll", "lane y rear_roll"} <= set(names)
+    assert {"slip rear_roll left", "slip front_roll right", "rim speed front_roll", "lane y rear_roll"} <= set(names)
 
 
 def test_check_measures_the_excess(straight: Model) -> None:

@@ -1,0 +1,63 @@
+"""`excite score`: any trajectory judged as a design is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from excite import reports, trajectories
+from excite.logs import profile_of, read_drive
+from excite.model import Model, parameter_descriptions
+from excite.simulation import Motion
+from excite.workflows import design_request, requests
+
+
+def score(place: Path, machine: str, profile: Path, problem: str | None) -> dict[str, Any]:
+    """Judge a profile as a design into a folder; return the summary.
+
+    machine: a shipped name or a path. problem: None for the machine's own. The folder can be verified as a design can.
+    Raises UsageError, MachineError, LogError, SimulationError.
+    """
+    model = requests.build_model(machine, fit_sensor_effects=False)
+    name, chosen = requests.choose_problem(model.machine, problem, None)
+    design_request.require_noise_figures(model)
+    drive = read_drive(profile, model, any_rate=True)
+    found = trajectories.score(model, chosen, drive.torque, drive.start, drive.nu0)
+    profile_of(model, found.motion).to_csv(place / "profile.csv", index=False)
+    (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    summary: dict[str, Any] = {
+        "machine": model.machine.name,
+        "problem": name,
+        "profile": str(profile),
+        "duration_s": float(found.motion.t[-1]),
+        "cond_phi": found.cond_phi,
+        "cond_w": found.cond_w,
+        "sigma_percent": found.sigma_percent,
+        "worst_parameter": found.worst_parameter,
+        "worst_percent": found.worst_percent,
+        "median_percent": found.median_percent,
+        "max_violation": found.max_violation,
+        "violations": found.violations,
+        "share_outside_law": found.share_outside_law,
+        "meanings": parameter_descriptions(model),
+        "versions": requests.package_versions(),
+    }
+    title = f"{model.machine.title}: {name}, {profile.name}"
+    reports.save(reports.design_figure(model, chosen, found.motion, title), place / "design.png")
+    reports.save(reports.sigma_figure(found.sigma_percent, title), place / "sigma.png")
+    reports.write_report(place, "score", summary)
+    return summary
+
+
+def judge_limits(model: Model, motion: Motion, placed: bool) -> Mapping[str, float]:
+    """Return the excess of a motion over every limit of the machine's own problem, none if it has no problem.
+
+    placed: whether the start pose is the drive's own; else the drive is placed on the lane as a design is.
+    """
+    if model.machine.problem is None:
+        return {}
+    problem = model.machine.problems[model.machine.problem]
+    if not placed:
+        motion = trajectories.simulate_on_lane(model, problem, motion.u, motion.nu[0])
+    return trajectories.check_limits(model, problem, motion)
