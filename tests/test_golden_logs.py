@@ -20,7 +20,7 @@ HIDDEN = {
 }
 
 
-@pytest.mark.parametrize("name", GOLDEN)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n != "clean" else ()) for n in GOLDEN])
 def test_golden_log(name: str) -> None:
     """Values to a thousandth of their deviation: other processors differ in rounding."""
     effects, seed = HIDDEN[name]

@@ -196,6 +196,7 @@ def test_the_last_machine_is_known_by_its_file_alone() -> None:
             assert not words & own, path
 
 
+@pytest.mark.slow
 def test_a_machine_of_another_kind_is_one_file(excite: Excite, tmp_path: Path) -> None:
     """The last machine's table under names that nothing has ever heard of, from check to the cab, by the commands."""
     text = (machine.MACHINES / f"{LAST}.toml").read_text(encoding="utf-8")

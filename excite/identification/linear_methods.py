@@ -92,7 +92,7 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     over rows, comes from simulated readings of the filtered log. With the smallest l in [W Y]'[W Y] v = l C v, the
     estimate solves (W'W - l C_WW) X = W'Y - l C_WY. It is consistent for any size of the noise if C has the right shape
     (Van Huffel and Vandewalle, "The total least squares problem", 1991, ch. 10). Raises NotIdentifiableError if no
-    signal has noise.
+    signal has noise, or if the noise hides every parameter.
     """
     every = filtered_blocks(model, logs, filter)
     moving, notes = rows_in_motion(model, logs, filter, every)
@@ -126,6 +126,10 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     level = 1 / float(mu[-1])
     bread = np.linalg.inv(R[:, :-1].T @ R[:, :-1] - level * C[:-1, :-1])
     covariance = robust_covariance(model, bread, whitened, x, kept)
+    if (np.sqrt(np.diag(covariance)) > np.abs(x[kept])).all():
+        raise NotIdentifiableError(
+            "tls: noise in the regressor hides every parameter, as slips from encoders do: use another method"
+        )
     note = f"tls: misfit {np.sqrt(level):.2f} times what the sensors' noise and counts explain"
     x = restore_tied_parameters(model, blocks, first, x)
     return build_estimate(

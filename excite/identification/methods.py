@@ -86,8 +86,11 @@ def _share_outside_law(model: Model, logs: Sequence[Log], filter: Filter) -> flo
     """Return the share of filtered samples outside the linear soil law; None if a speed is not measured."""
     if any(unmeasured(model, log) for log in logs):
         return None
-    motions = [samples(model, log, filter) for log in logs]
-    return float(np.concatenate([outside_law(model, s.q.T, s.nu.T) for s in motions]).mean())
+    outside = []
+    for log in logs:  # one at a time, for the memory's sake
+        motion = samples(model, log, filter)
+        outside.append(outside_law(model, motion.q.T, motion.nu.T))
+    return float(np.concatenate(outside).mean())
 
 
 def require_sensors(model: Model) -> None:

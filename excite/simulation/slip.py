@@ -7,6 +7,8 @@ import numpy as np
 from excite.model import Model
 from excite.simulation.integrator import Motion
 
+BATCH = 8192  # samples evaluated at a time
+
 
 def resultant_slips(model: Model, q: np.ndarray, nu: np.ndarray) -> np.ndarray:
     """Return the resultant slips |g| (N, n_edges) [-] at the model's `edges`; q, nu (N, n_q)."""
@@ -25,7 +27,12 @@ def outside_law(model: Model, q: np.ndarray, nu: np.ndarray) -> np.ndarray:
         float(c.slip_limit) if c is not None and c.slip_limit is not None and c.law == "linear" else np.inf
         for c in contacts
     ]
-    return np.asarray((resultant_slips(model, q, nu) > np.array(limits)).any(axis=1))
+    return np.concatenate(
+        [
+            (resultant_slips(model, q[k : k + BATCH], nu[k : k + BATCH]) > np.array(limits)).any(axis=1)
+            for k in range(0, len(q), BATCH)
+        ]
+    )
 
 
 def share_outside_law(model: Model, motion: Motion) -> float:

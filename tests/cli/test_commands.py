@@ -43,6 +43,7 @@ def test_without_a_command_help_is_shown(excite: Excite) -> None:
         assert command in stdout
 
 
+@pytest.mark.slow
 def test_a_result_that_is_replaced_is_said(excite: Excite, tmp_path: Path) -> None:
     asked = ("design", "va12_straight", "--duration", 12, "--starts", 1, "--out", tmp_path / "d")
     _, first, _ = excite(*asked, "--seed", 3)

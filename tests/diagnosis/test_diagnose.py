@@ -100,6 +100,7 @@ def test_one_stretch_tells_no_interval() -> None:
     assert (made.percent, made.interval) == (pytest.approx(50.0), None)
 
 
+@pytest.mark.slow
 def test_a_slope_from_log_to_extended_machine(
     sloping: Path, straight: Model, straight_motion: Motion, tmp_path: Path, excite: Excite
 ) -> None:
@@ -134,6 +135,7 @@ def test_a_slope_from_log_to_extended_machine(
     assert np.abs(right.q - again.q).max() < 0.05 * np.abs(wrong.q - again.q).max()
 
 
+@pytest.mark.slow
 def test_where_nothing_promises_anything_effects_begin_anew(
     sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -153,6 +155,7 @@ def test_where_nothing_promises_anything_effects_begin_anew(
     assert diagnosis.diagnose(straight, [one], straight.machine.filter).verdict == "unexplained"
 
 
+@pytest.mark.slow
 def test_a_second_cause_with_which_exact_dynamics_follow_is_no_flaw_of_the_first(
     straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -277,6 +280,7 @@ def test_a_machine_that_stands_shows_no_cause(straight: Model, tmp_path: Path, e
     assert not (tmp_path / "a").exists()
 
 
+@pytest.mark.slow
 def test_a_drive_is_designed_for_what_is_tied(straight: Model, tmp_path: Path) -> None:
     """From its log both amounts can be told, each beside the other whatever its shape; a sensor's flaw is passed over,
     and without a problem to design for there is none."""
@@ -459,6 +463,7 @@ def test_what_gets_a_name_is_no_chance(straight: Model, straight_motion: Motion)
         assert diagnosis.conclude(stage, stage, chosen, (), 0.0).findings[0].p_value <= selection.MAX_P_VALUE * 1.000001
 
 
+@pytest.mark.slow
 def test_an_amount_is_as_unsure_as_shapes_that_a_log_hardly_tells(straight: Model) -> None:
     """Of a soil that one way of three metres has hardly packed: how much of it is to come nothing tells, while about a
     short way that a pass takes its deviation says that all of it has."""
@@ -507,6 +512,7 @@ def test_a_figure_says_that_nothing_could_be_withheld() -> None:
         assert any("no fit to the rest" in text.get_text() for text in right.texts) != shown
 
 
+@pytest.mark.slow
 def test_every_log_is_drawn(straight: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Forces that only the one model needs are shown for the other too."""
     logs = [make_log(straight, gentle(straight, 6.0), seed=k) for k in (3, 4)]
@@ -562,6 +568,7 @@ def test_the_usual_range_of_a_shape(va12: Model) -> None:
     assert 0 < low < high
 
 
+@pytest.mark.slow
 def test_what_no_machine_has_is_no_name(straight: Model, straight_motion: Motion) -> None:
     """Friction that drives, by whatever name the file calls it, or a resistance that pushes: unexplained, with what
     comes nearest and why it is none; as plain as it may be otherwise, and with nothing left that is odd."""
@@ -610,6 +617,7 @@ def test_a_name_that_is_faint_beside_another_is_none_under_forces(
     assert (bool(names), nearest is None) == (kept, kept)
 
 
+@pytest.mark.slow
 def test_a_vibration_shakes_a_sensor_in_one_log_at_least(straight: Model) -> None:
     """A log too short to tell says nothing either way."""
     entry = placing.parse_effect("vibration_on@rear_roll=0.3", straight.machine, 20.0)
@@ -981,6 +989,7 @@ def unfit(monkeypatch: pytest.MonkeyPatch, refused: Callable[[Any, int], bool], 
     monkeypatch.setattr(smoothing, "fit_logs", found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("refused", "followed"),
     [(1, fits.SENSOR_NOISE_INFLATIONS[0]), (fits.SENSOR_NOISE_INFLATIONS[0], fits.SENSOR_NOISE_INFLATIONS[1])],

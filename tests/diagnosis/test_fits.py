@@ -494,6 +494,7 @@ def test_a_step_that_was_cut_short_goes_further_when_it_is_told_again(scales: in
     assert (np.abs(found.X - stage.fit.X - off) < stage.fit.std).all()
 
 
+@pytest.mark.slow
 def test_the_whole_log_is_fitted_where_its_beginning_can_be(
     sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -534,6 +535,7 @@ def test_the_whole_log_is_fitted_where_its_beginning_can_be(
             assert forces[0] == 1.0
 
 
+@pytest.mark.slow
 def test_beside_a_cause_only_that_is_fitted_whose_beginning_tells_that_it_comes_as_near(
     straight: Model, straight_motion: Motion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -911,6 +913,7 @@ def test_who_gains_too_little_with_coarse_sensors_is_given_up(
     assert stage.data.noise_inflation > 1
 
 
+@pytest.mark.slow
 def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where forces leave much a candidate is fitted as long as it comes to half of what it must gain, and where those
     that were fitted first gained that, the others as long as they come to half of what these did."""

@@ -67,6 +67,7 @@ def test_what_cannot_be_told() -> None:
     assert is_shaking(driven(0, t, False), there, 20) is None
 
 
+@pytest.mark.slow
 def test_noise_alone_is_no_burst() -> None:
     """Of 3000 torque channels of two minutes a third of one is allowed a line. Median squares are no normal variables:
     thresholds for such ones gave two."""

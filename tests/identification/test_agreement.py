@@ -28,6 +28,7 @@ def softer(model: Model, share: float) -> Model:
     return build(machine.model_copy(update={"body": tuple(bodies)}))
 
 
+@pytest.mark.slow
 def test_logs_of_one_machine_agree(straight: Model, straight_motion: Motion) -> None:
     """The level of the test holds: p-values of agreeing logs are spread over 0 to 1."""
     found = [identify(straight, [make_log(straight, straight_motion, seed=s)], "joint") for s in range(12)]

@@ -26,6 +26,7 @@ def test_a_machine_at_rest_is_told_to_drive_and_steer(va12: Model) -> None:
     assert "theta2" in reasons["Fv2"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["ols", "wls", "tls", "iv", "oe", "ols+consistent"])
 def test_noise_of_a_machine_at_rest_is_no_motion(va12: Model, method: str) -> None:
     """Offsets are all that it shows; the sensors' noise says nothing of its mass."""
@@ -56,6 +57,7 @@ def one_way(va12: Model) -> log.Log:
     return braked(va12, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["ols", "wls", "tls", "oe"])
 def test_a_parameter_hardly_there_does_not_stand_for_what_the_log_shows(va12: Model, method: str) -> None:
     """With the articulation a milliradian off straight MX2 is a thousandth of MY2 in every row."""
@@ -79,6 +81,7 @@ def test_what_is_held_is_reckoned_with(va12: Model, method: str) -> None:
     assert abs(change[at("M")]) < 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["wls", "iv", "joint"])
 def test_what_moves_together_beside_a_joint_at_rest_is_held_alone(va12: Model, one_way: log.Log, method: str) -> None:
     """Driving one way dry friction and offset are one constant: the machine file says how much of it is the offset, and

@@ -61,6 +61,7 @@ def test_known_offset_makes_dry_friction_identifiable(tmp_path: Path, one_way: p
     assert np.isfinite(found.prior_std).tolist() == [False, False, False, True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "tls+consistent"])
 def test_known_mass_is_averaged_by_its_accuracy(tmp_path: Path, both_ways: pd.DataFrame, method: str) -> None:
     """As sure as the log and two standard deviations off: the result lies half way, 1 / sqrt(2) as uncertain."""

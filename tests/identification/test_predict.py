@@ -75,6 +75,7 @@ def covered(model: Model, fitted: Motion, target: Motion, seed: int) -> tuple[fl
     return float(torque.mean()), float(1 - along_log.outside.mean()), float(motion.mean())
 
 
+@pytest.mark.slow
 def test_bands_hold_the_truth_on_a_rig(rig: Model) -> None:
     """Torques along a log, and along a drive the torque that the motion needs, speed and position."""
     fitted, target = swing(rig, 0.8, 1.7), swing(rig, 0.6, 2.1)
@@ -83,6 +84,7 @@ def test_bands_hold_the_truth_on_a_rig(rig: Model) -> None:
     assert (shares <= 0.99).all(), shares
 
 
+@pytest.mark.slow
 def test_bands_hold_the_truth_on_a_roller(straight: Model, straight_motion: Motion, other: Motion) -> None:
     shares = np.mean([covered(straight, straight_motion, other, seed) for seed in range(SEEDS)], axis=0)
     assert (shares >= 0.90).all(), shares
@@ -211,6 +213,7 @@ def test_what_is_saved_is_the_estimate(place: Path, straight: Model, straight_mo
     assert saved.estimate.quantile95 == pytest.approx(made.quantile95)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["log.csv", "profile.csv"])
 def test_the_command_writes_summary_table_and_figure(target: str, place: Path, tmp_path: Path, excite: Excite) -> None:
     out = tmp_path / "p"

@@ -20,6 +20,7 @@ def table(va12: Model, va12_motion: Motion) -> pd.DataFrame:
     return measure(va12, va12_motion, seed=2)
 
 
+@pytest.mark.slow
 def test_a_turned_torque_gives_no_estimate(table: pd.DataFrame, tmp_path: Path, excite: Excite) -> None:
     """The headline says so, the exit code is 1, no value is printed, the report greys them out."""
     table.assign(u4_Nm=-table["u4_Nm"]).to_csv(tmp_path / "log.csv", index=False)
@@ -45,6 +46,7 @@ def test_a_good_log_is_valid(va12: Model, table: pd.DataFrame) -> None:
     assert estimate.possible.all()
 
 
+@pytest.mark.slow
 def test_a_pull_that_nobody_knows_leaves_doubt(va12: Model, table: pd.DataFrame, tmp_path: Path) -> None:
     pulled = table.assign(u1_Nm=table["u1_Nm"] + 60.0 * (table["t_s"] > 30))
     ready = prepare(va12, [pulled], needed_sensors(va12, "joint"))

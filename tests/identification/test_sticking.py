@@ -25,6 +25,7 @@ def found(emps: Model) -> dict[str, list[Estimate]]:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["wls", "tls", "iv", "joint"])
 def test_intervals_hold_where_friction_sticks(found: dict[str, list[Estimate]], method: str) -> None:
     inside = [(e.interval95[0] <= truth) & (truth <= e.interval95[1]) for e in found[method]]
@@ -33,6 +34,7 @@ def test_intervals_hold_where_friction_sticks(found: dict[str, list[Estimate]], 
     assert all("friction sticks" in " ".join(e.notes) for e in found[method])
 
 
+@pytest.mark.slow
 def test_rows_near_rest_bias_nothing(found: dict[str, list[Estimate]]) -> None:
     """Least squares on all rows is off by 0.3 % of Fv and 0.2 % of Fc on these logs."""
     for method, most in (("wls", 0.1), ("joint", 0.02)):
@@ -40,6 +42,7 @@ def test_rows_near_rest_bias_nothing(found: dict[str, list[Estimate]]) -> None:
         assert np.abs(error[:3]).max() < most
 
 
+@pytest.mark.slow
 def test_joint_smoothing_is_the_most_accurate(found: dict[str, list[Estimate]]) -> None:
     rms = {m: np.sqrt(np.mean([(e.value / truth - 1) ** 2 for e in made], axis=0)) for m, made in found.items()}
     assert (rms["joint"][:3] < rms["wls"][:3]).all()

@@ -98,6 +98,7 @@ def test_emps_in_closed_loop(emps: Model, emps_data: Path) -> None:
     assert error["force"] == pytest.approx(5.848, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_right_estimate_explains_another_log_down_to_noise(va12: Model, va12_motion: Motion) -> None:
     """Whose filtered torque error is 4 to 72 % by the noise of slips alone; a wrong torque gain stays visible."""
     one, other = (make_log(va12, va12_motion, seed=seed) for seed in (1, 2))

@@ -24,6 +24,7 @@ def table(va12: Model, va12_motion: Motion) -> pd.DataFrame:
     return measure(va12, va12_motion, seed=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_converted_log_gives_the_same_estimate(
     table: pd.DataFrame, tmp_path: Path, excite: Excite, suffix: str

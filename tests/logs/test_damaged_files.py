@@ -24,6 +24,7 @@ def child() -> Iterator[damage.Child]:
     made.end()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("each", SIZES)
 def test_damaged_files_give_a_table_or_one_line(each: int, child: damage.Child, tmp_path: Path) -> None:
     seeds = log_files.a_file_of_each_format(tmp_path)

@@ -189,6 +189,7 @@ def test_profile_has_the_contracts_columns(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MENDED)
 def test_what_can_be_mended_is_read_with_a_note(name: str, table: pd.DataFrame, tmp_path: Path, excite: Excite) -> None:
     make, words = MENDED[name]

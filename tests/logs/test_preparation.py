@@ -59,6 +59,7 @@ def test_gaps_beside_which_too_little_is_left(straight: Model, table: pd.DataFra
     assert any("used are 1 of 2 stretches" in note for note in ready.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [20, 300, 900])
 def test_a_gap_is_a_gap_wherever_it_is(straight: Model, lost: int) -> None:
     """What a joint does while nothing is seen is neither too fast for it nor a speed."""
@@ -81,6 +82,7 @@ def test_identify_reports_the_cut(excite: Excite, table: pd.DataFrame, tmp_path:
     assert any("1 gap: used are 2 of 2 stretches" in note for note in summary["notes"])
 
 
+@pytest.mark.slow
 def test_a_gap_in_a_log_to_validate_with(excite: Excite, table: pd.DataFrame, tmp_path: Path) -> None:
     """The stretches beside it are predicted, each as a log of its own."""
     table.to_csv(tmp_path / "whole.csv", index=False)

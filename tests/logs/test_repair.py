@@ -158,6 +158,7 @@ def test_early_channels_of_the_whole_machine(va12: Model, va12_motion: Motion) -
     assert not found["u4"].significant
 
 
+@pytest.mark.slow
 def test_noise_of_slips_is_no_delay(va12: Model) -> None:
     """Along R60 slips are small: what their noise leaves in the rows seems 15 ms early, in every log. It hides a part
     of 80 ms that a channel is late."""

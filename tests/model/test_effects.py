@@ -771,6 +771,7 @@ def test_at_a_towed_contact_prediction_is_dynamics(effect: Effect) -> None:
 # ------------------------------------------------------------------------------------------------ noise is no effect
 
 
+@pytest.mark.slow
 def test_noise_of_torques_is_no_gain_and_no_delay() -> None:
     """Along a drive that asks little of the articulation, whose torque sensor's noise is a good part of its reading:
     taken from noisy torques, what a gain or a delay would do follows that noise (z of 5.7, gain of 27 on this log)."""

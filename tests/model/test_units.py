@@ -332,6 +332,7 @@ noise = {{ value = 0.005, source = "assumed" }}
 )
 
 
+@pytest.mark.slow
 def test_rates_identify_as_well_as_the_bound_says(tmp_path: Path, va12_motion: Motion) -> None:
     """Rolls and measuring wheels logged in rpm: joint smoothing takes them for the rates that they are, so its errors
     are as large as it says, and as the Cramer-Rao bound of such sensors does. A rate summed up to an angle whose noise

@@ -242,6 +242,7 @@ def test_several_joints_are_followed_by_one_person(name: str) -> None:
         assert np.mean((got >= low) & (got <= high)) > 0.9
 
 
+@pytest.mark.slow
 def test_a_design_with_two_steered_joints_is_sheet_and_page(excite: Excite, tmp_path: Path) -> None:
     """By the real commands, from a design to what goes into the cab."""
     code, _, err = excite("design", "tandem", "--duration", 8, "--starts", 1, "--budget", 30, "--out", tmp_path / "d")

@@ -153,6 +153,7 @@ def test_what_the_driver_reads(open_page: Callable[..., Tab]) -> None:
     assert tab.text("#action").startswith("hold 4.3 km/h")
 
 
+@pytest.mark.slow
 def test_the_driver_reads_every_joint(open_page: Callable[..., Tab], two_html: str, tmp_path: Path) -> None:
     """Targets, words, what a log of the machine's own columns shows, and the score, joint by joint."""
     tab = open_page(text=two_html)
@@ -217,6 +218,7 @@ def test_start_pause_and_repeat_by_touch_and_key(open_page: Callable[..., Tab]) 
     assert tab.page.get_attribute("#sound", "aria-pressed") == "false"
 
 
+@pytest.mark.slow
 def test_real_time_is_kept(open_page: Callable[..., Tab]) -> None:
     """Against this process's own clock: what is painted is the time within 50 ms, after seconds as at the start."""
     tab = open_page(fake=False)
@@ -234,6 +236,7 @@ def test_real_time_is_kept(open_page: Callable[..., Tab]) -> None:
     assert float(np.median(lags)) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["va12", "tandem"])
 @pytest.mark.parametrize("size", [(844, 390), (667, 375), (1280, 800), (390, 844)])
 def test_everything_fits_and_is_big(
@@ -289,6 +292,7 @@ def followed(va12: Model) -> pd.DataFrame:
     return sensors.measure(va12, ground.follow_trace(va12, TRACE, None, 4), seed=1)
 
 
+@pytest.mark.slow
 def test_a_log_is_replayed_and_scored(
     open_page: Callable[..., Tab], va12: Model, followed: pd.DataFrame, tmp_path: Path
 ) -> None:

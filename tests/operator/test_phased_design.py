@@ -96,6 +96,7 @@ def test_a_machine_without_wheels_has_nobody_to_drive_it(emps: Model, va12: Mode
         phased_design.check_phase_length(emps, va12.machine.problems["R60"], 3.0)
 
 
+@pytest.mark.slow
 def test_the_command_designs_for_people_and_says_what_they_keep(
     excite: Excite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

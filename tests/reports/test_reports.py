@@ -129,6 +129,7 @@ def test_compare_says_which_way() -> None:
     assert "No usual drive" in describe("compare", summary | {"ratio_equal_time": None}).headline
 
 
+@pytest.mark.slow
 def test_identify_reports_what_was_found(
     excite: Excite, straight: Model, straight_motion: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -150,6 +151,7 @@ def test_identify_reports_what_was_found(
     assert code == 0  # a folder with a report in it is ours and may be replaced
 
 
+@pytest.mark.slow
 def test_what_a_method_errs_by_comes_first(excite: Excite, tmp_path: Path) -> None:
     """Least squares on the drive of lowest condition number: small deviations, a mass of a fifteenth."""
     profile = Path(__file__).parents[2] / "results" / "S40" / "design" / "profile.csv"

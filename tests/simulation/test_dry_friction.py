@@ -224,6 +224,7 @@ def test_joints_that_are_alike_break_away_together() -> None:
     assert (w[t > 0.5] > 0).all()
 
 
+@pytest.mark.slow
 def test_energy_balance_of_the_roller(va12: Model) -> None:
     """Kinetic energy = work of the motors - friction (Fv w^2 + Fs |w|) + work of the contacts (11, 17)."""
     model = resampled(va12, 2000)
@@ -264,6 +265,7 @@ def test_smoothed_friction_tends_to_the_set_valued(straight: Model) -> None:
     assert far[-1] < 1e-3
 
 
+@pytest.mark.slow
 def test_accuracy_does_not_depend_on_the_samples(va12: Model) -> None:
     """Events are located within a step: the same torques in ten times as many samples move the roller the same way."""
     torque = drive(va12, 20, 3, {"u1": 900, "u2": 3000, "u4": 900})

@@ -39,6 +39,7 @@ def worst(a: np.ndarray, b: np.ndarray) -> float:
     return float((np.abs(a - b).max(axis=0) / np.abs(b).max(axis=0)).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "duration"), [("va12", 8), ("va12_straight", 8)])
 def test_motion_agrees_with_a_tight_integration(name: str, duration: float) -> None:
     model = prediction.build(machine.load_machine(name))

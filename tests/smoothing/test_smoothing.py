@@ -205,6 +205,7 @@ def test_where_samples_lead_and_how_that_moves(va12: Model) -> None:
         assert (rms < 0.2 * np.maximum(typical, np.abs(a).max())).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kit", ["full", "paper"])
 def test_exact_signals_give_exact_parameters(va12: Model, kit: str) -> None:
     X = perturbed(va12, 1)
@@ -230,6 +231,7 @@ def errors(
     return np.array(z), np.array(percent), np.array(over)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("drive", "kit"), [("energetic", "full"), ("human", "paper")])
 def test_errors_are_as_large_as_it_says(va12: Model, drive: str, kit: str) -> None:
     z, percent, over = errors(va12, drive, kit, range(2))
@@ -311,6 +313,7 @@ def test_without_steering_the_hidden_parameters_are_named(va12: Model, kit: str)
     assert np.sqrt(np.mean(((estimate.value - X) / estimate.std)[seen] ** 2)) < 1.6
 
 
+@pytest.mark.slow
 def test_two_logs_know_more_than_one(va12: Model) -> None:
     X = perturbed(va12, 4)
     logs = [measured(va12, simulate(va12, energetic(30, size), X), X, "full", k) for k, size in enumerate((1.0, 0.8))]
@@ -339,6 +342,7 @@ def undisturbed(va12: Model) -> np.ndarray:
     return identify(va12, [measured(va12, simulate(va12, energetic(), X), X)], "joint").std
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("nature", "amount"), [(sloping, 0.0005), (sloping, 0.002), (worn, 0.001)], ids=["slight", "slope", "wheel"]
 )
@@ -357,6 +361,7 @@ def test_what_the_model_does_not_know_is_seen_in_the_innovations(
     assert np.median(np.abs(estimate.value - X) / np.maximum(np.abs(X), va12.scale)) < 0.03
 
 
+@pytest.mark.slow
 def test_an_estimate_that_is_drawn_in_says_so(va12: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the unbiased way finds nothing, as on logs that hardly show anything: the steadier answer, and a note."""
     exact = joint.fit_logs
@@ -431,6 +436,7 @@ def design(name: str) -> np.ndarray:
     return table[["u1_Nm", "u2_Nm", "u4_Nm"]].to_numpy()
 
 
+@pytest.mark.slow
 def test_the_likelihood_is_followed_where_a_drive_shows_little(va12: Model) -> None:
     """Below and above one parameter, as wide as a fit says that starts anew with that parameter held there."""
     log = measured(va12, simulate(va12, design("R60")), va12.nominal, seed=8)
@@ -466,6 +472,7 @@ def test_the_likelihood_is_followed_where_a_drive_shows_little(va12: Model) -> N
     assert low[k] / high[k] == pytest.approx(widths[0] / widths[1], rel=0.2)
 
 
+@pytest.mark.slow
 def test_the_likelihood_is_followed_beside_an_amount_at_its_end(va12: Model) -> None:
     """As it is without the effect: what the logs would like best below zero has no say there."""
     log = measured(va12, simulate(va12, design("R60")), va12.nominal, seed=8)
@@ -483,6 +490,7 @@ def test_the_likelihood_is_followed_beside_an_amount_at_its_end(va12: Model) -> 
     np.testing.assert_allclose(told[1], told[0], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_what_counting_does_to_an_estimate_is_foreseen(straight: Model) -> None:
     """Estimates from one motion, exact but that counts begin anywhere, scatter as said, not as from white noise."""
     motion = simulate(straight, energetic(30)[:, [0, 2]])

@@ -17,7 +17,7 @@ import pandas as pd
 from support import plant
 from support.causes import CAUSES, hide
 from support.plant import Machine, Motion, Scene, System
-from support.surprises import SURPRISES, surprise
+from support.surprises import LISTED_AS, SURPRISES, surprise
 
 KINDS = ("nothing", "cause", "surprise", "pair")
 # Cases are drawn by a name's place here and stay what they were when causes are added: these come last.
@@ -124,9 +124,10 @@ class Score:
     `outcome`: "clean" (found nothing), "unexplained", "right" (the name and the place, nothing else), "tied" (the
     right one among several that are named together), "place" (the right name at another place), "more" (the right one
     and wrong ones besides), "wrong". With nothing hidden anything but "clean" is "wrong"; a surprise may be "clean",
-    "unexplained" or "wrong"; of a pair "part" is one of the two and nothing wrong. `named`: first finding as
-    effect@where, or the verdict. `tie`: how many were named together with it. `amount_in`: whether the amount is inside
-    its 95 % interval; `amount_error` relative; `gain`: per cent; `gain_sure`: whether its interval is above zero.
+    "unexplained" or "wrong", or "tied" where the catalogue has it by another name; of a pair "part" is one of the two
+    and nothing wrong. `named`: first finding as effect@where, or the verdict. `tie`: how many were named together with
+    it. `amount_in`: whether the amount is inside its 95 % interval; `amount_error` relative; `gain`: per cent;
+    `gain_sure`: whether its interval is above zero.
     None where there is nothing to judge.
     """
 
@@ -149,6 +150,10 @@ def score(one: Case, summary: Mapping[str, Any]) -> Score:
     if verdict == "clean" or (verdict == "unexplained" and not names):
         fine = one.kind != "nothing" or verdict == "clean"
         return Score(str(verdict) if fine else "wrong", first)
+    listed = {LISTED_AS[h.name] for h in one.hidden if h.name in LISTED_AS}
+    if listed:
+        told = [{label.split("@")[0] for label in tie} & listed for tie in ties]
+        return Score("tied" if any(told) and all(told) else "wrong", first, len(ties[0]) - 1)
     if one.kind in ("nothing", "surprise"):
         # a partial name with the rest declared unexplained is still a name that somebody would act on
         return Score("wrong", first, len(ties[0]) - 1)

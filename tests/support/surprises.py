@@ -180,6 +180,9 @@ SURPRISES: dict[str, Callable[[Scene, float, DRAW], None]] = {
     )
 }
 
+# What is in the catalogue by another name: the roll's radius in the machine file is wrong.
+LISTED_AS = {"worn_roll": "contact_radius"}
+
 
 def surprise(scene: Scene, name: str, size: float, seed: int) -> None:
     """Puts one of `SURPRISES` into a scene, of a size between 0 and 1; the rest is drawn from the seed."""

@@ -102,6 +102,7 @@ def test_what_cannot_be_brought_inside_says_what_it_breaks(straight: Model, prob
     assert max(found.violations, key=lambda name: found.violations[name]).startswith("lane x")
 
 
+@pytest.mark.slow
 def test_a_drive_that_ends_far_from_rest_is_brought_inside(va12: Model) -> None:
     whole = va12.machine.problems["R60"]
     wish = multisine(va12, whole, 2)
@@ -165,6 +166,7 @@ def test_an_unknown_kind_is_refused(straight: Model, problem: Problem) -> None:
         compare(straight, problem, baselines=("waltz",))
 
 
+@pytest.mark.slow
 def test_the_command_writes_drives_that_score_what_it_says(tmp_path: Path, excite: Excite, straight: Model) -> None:
     out = tmp_path / "compared"
     usual = ("--against", "chirp", "--against", "hand-made")

@@ -103,6 +103,7 @@ def fresh_check(model: Model, problem: Problem, d: Design) -> None:
     assert d.cond_w == pytest.approx(np.linalg.cond(W), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_answer_holds_when_simulated_by_another_integrator(straight: Model, quick: Design) -> None:
     fresh_check(straight, shorter(straight, 12.0), quick)
     assert quick.max_violation <= TOLERANCE
@@ -172,6 +173,7 @@ def test_an_unknown_objective_is_refused(straight: Model) -> None:
         design(straight, shorter(straight, 12.0), objective="best")
 
 
+@pytest.mark.slow
 def test_an_infeasible_problem_names_the_limit(straight: Model) -> None:
     """The roll centres are 3.2 m apart: no drive fits a lane of 2 m."""
     with pytest.raises(InfeasibleError, match="lane x") as caught:

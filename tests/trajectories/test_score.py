@@ -162,6 +162,7 @@ def test_wrong_names_are_refused(excite: Excite, tmp_path: Path) -> None:
         assert stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_drive_of_ones_own_is_a_row_of_the_comparison(straight: Model, tmp_path: Path, excite: Excite) -> None:
     table_of(straight, pulses(40, 2000, 1800)).to_csv(tmp_path / "my.csv", index=False)
     own = program.score("va12_straight", tmp_path / "my.csv")

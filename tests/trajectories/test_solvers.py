@@ -105,6 +105,7 @@ def test_derivatives_of_the_program(rig: Model) -> None:
     np.testing.assert_allclose(H, slopes(lagrangian_slope, x, 1e-6), atol=1e-6 * np.abs(H).max())
 
 
+@pytest.mark.slow
 def test_both_solvers_find_the_same_optimum(rig: Model) -> None:
     """Two programs, two codes: condition numbers within 0.1 %, limits kept in a fresh simulation of either."""
     make = partial(excite.design, rig, starts=1)
@@ -160,6 +161,7 @@ def test_an_unknown_solver_names_the_known_ones() -> None:
         excite.design(RIG, solver="newton")
 
 
+@pytest.mark.slow
 def test_an_interrupted_solve_leaves_no_half_written_folder(tmp_path: Path) -> None:
     out = tmp_path / "design"
     command = [sys.executable, "-m", "excite", "design", "va12", "--solver", "ipopt", "--starts", "1"]

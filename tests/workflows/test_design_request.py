@@ -35,6 +35,7 @@ def test_advice_names_what_to_do() -> None:
         assert "cond(Phi) says nothing" not in said
 
 
+@pytest.mark.slow
 def test_a_design_says_score_and_accuracy(excite: Excite, tmp_path: Path) -> None:
     out = tmp_path / "d"
     code, shown, err = excite(
@@ -68,6 +69,7 @@ def test_condition_number_then_accuracy(excite: Excite, tmp_path: Path) -> None:
     assert told[12]["max_violation"] <= 1e-3
 
 
+@pytest.mark.slow
 def test_after_a_log_the_next_drive_is_for_the_estimated_machine(
     excite: Excite, straight: Model, straight_motion: Motion, tmp_path: Path
 ) -> None:
@@ -93,6 +95,7 @@ def test_after_a_log_the_next_drive_is_for_the_estimated_machine(
     assert "without --after" in err
 
 
+@pytest.mark.slow
 def test_what_sits_in_a_sensor_is_no_part_of_a_design_that_is_read_back(excite: Excite, tmp_path: Path) -> None:
     """A machine file with a wheel of another radius, a design after a log: its summary tells the radius nothing."""
     own, path, out = tmp_path / "own.toml", tmp_path / "log.csv", tmp_path / "d"

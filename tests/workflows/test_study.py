@@ -343,6 +343,7 @@ def test_what_can_not_be_had_is_said_and_does_not_end_the_study(
     assert (summary["done"], summary["failed"], summary["defects"]) == (2, 4, 2)
 
 
+@pytest.mark.slow
 def test_designs_are_made_once_and_can_be_verified(
     tmp_path: Path, excite: Excite, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -402,6 +403,7 @@ def test_a_drive_is_designed_for_what_drives_show(monkeypatch: pytest.MonkeyPatc
 # ------------------------------------------------------------------------------------------------ interrupted
 
 
+@pytest.mark.slow
 def test_the_table_does_not_depend_on_the_workers(tiny: Callable[..., StudyPlan], tmp_path: Path) -> None:
     for jobs in (1, 2):
         study_runner.run_study(tiny(3), tmp_path / f"out{jobs}", jobs=jobs)
@@ -845,7 +847,8 @@ class Dask:
         file.unlink(missing_ok=True)
         started = self._start("scheduler", "--port", "0", "--scheduler-file", file.name, "--host", "127.0.0.1")
         begin = time.monotonic()
-        while not file.exists() and time.monotonic() - begin < 60:
+        # the file is there before it is written
+        while not (file.exists() and file.read_text().endswith("}")) and time.monotonic() - begin < 60:
             time.sleep(0.1)
         self.address = str(json.loads(file.read_text())["address"])
         return started
