@@ -1,5 +1,12 @@
+from .curves import Curve as Curve
 from .diagnosis import Diagnosis as Diagnosis, diagnose as diagnose
-from .findings import Assessment as Assessment, assess as assess, machine_file as machine_file, summarise as summarise
+from .findings import (
+    Assessment as Assessment,
+    assess as assess,
+    explain as explain,
+    machine_file as machine_file,
+    summarise as summarise,
+)
 from .parallel import run_forked as run_forked
 from .residuals import (
     BLOCK_S as BLOCK_S,
@@ -13,3 +20,4 @@ from .residuals import (
     residuals_of_logs as residuals_of_logs,
 )
 from .separating_run import RivalPair as RivalPair, rival_pairs as rival_pairs
+from .torque_regression import TorqueDiagnosis as TorqueDiagnosis

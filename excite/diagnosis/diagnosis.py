@@ -97,6 +97,18 @@ class NearestEffect:
 
 
 @dataclass(frozen=True)
+class ParameterChange:
+    """A base parameter [unit] and its standard deviation without and with the findings."""
+
+    name: str
+    unit: str
+    before: float
+    std_before: float
+    after: float
+    std_after: float
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """Verdict and findings of a diagnosis.
 
@@ -115,6 +127,28 @@ class Diagnosis:
     stages: tuple[ExtendedFit, ...]
     nearest: NearestEffect | None = None
     dropped: tuple[tuple[Finding, ExtendedFit], ...] = ()
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the logs."""
+        return tuple(log.source for log in self.before.data.logs)
+
+    @property
+    def exact(self) -> tuple[bool, bool]:
+        """Tell if the logs are followed with exact dynamics, without and with the findings."""
+        return self.before.exact, self.after.exact
+
+    @property
+    def parameters(self) -> list[ParameterChange]:
+        """Base parameters; without a standard deviation before if no model without the findings followed the logs."""
+        after = dict(
+            zip(self.after.model.base.names, zip(self.after.fit.X, self.after.fit.std, strict=True), strict=True)
+        )
+        base, fit, known = self.before.model.base, self.before.fit, self.before.estimated
+        return [
+            ParameterChange(name, unit, value, std if known else float("nan"), *after[name])
+            for name, unit, value, std in zip(base.names, base.units, fit.X, fit.std, strict=True)
+        ]
 
     @property
     def sticks(self) -> bool:

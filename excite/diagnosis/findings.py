@@ -11,19 +11,25 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from excite.diagnosis import hold_out, residuals, separating_run
+from excite.diagnosis import hold_out, residuals, separating_run, torque_regression
 from excite.diagnosis.acceptance import reason_against, widen
-from excite.diagnosis.diagnosis import MIN_EXPLAINED_SHARE, Diagnosis, Finding, NearestEffect, anomaly_lines
+from excite.diagnosis.diagnosis import MIN_EXPLAINED_SHARE, Diagnosis, Finding, NearestEffect, anomaly_lines, diagnose
 from excite.diagnosis.fits import ExtendedFit, with_true_sensor_noise
 from excite.diagnosis.hold_out import HoldOutErrors, HoldOutGain
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.residuals import InnovationLevel
 from excite.diagnosis.selection import ProgressCallback
-from excite.model.machine import EffectEntry, Machine, shipped_machines
+from excite.diagnosis.torque_regression import TorqueDiagnosis
+from excite.errors import NoEstimateError
+from excite.logs import Log
+from excite.model import Model
+from excite.model.machine import EffectEntry, Filter, Machine, shipped_machines
 
 MACHINE_FILE_DIGITS = 8  # significant digits of magnitudes in a machine file; chosen
 FIRST_ANOMALY_LINES = 3  # lines about anomalies that precede all others; chosen
 MIN_NEAREST_SHARE = 0.05  # share of the misfit above which the nearest effect is mentioned; chosen
+MAX_FOLLOWED_JOINTS = 3  # driven joints of a machine without slips whose motion is followed in open loop; chosen
+DIAGNOSE_SHARE = 0.8  # of the progress; gains take the rest; chosen
 FULL_EXPLANATION_SHARE = 0.9  # share of the misfit below which the answer gives it; chosen
 
 
@@ -36,7 +42,7 @@ class Assessment:
     separating_run: the run that would separate tied causes.
     """
 
-    diagnosis: Diagnosis
+    diagnosis: Diagnosis | TorqueDiagnosis
     total_gain: HoldOutGain | None
     gains: tuple[HoldOutGain | None, ...]
     before: Mapping[str, InnovationLevel]
@@ -143,6 +149,56 @@ def _with_findings(d: Diagnosis, entries: Sequence[Entry], reason: str) -> Diagn
     )
 
 
+def explain(
+    model: Model,
+    logs: Sequence[Log],
+    filter: Filter,
+    progress: ProgressCallback | None = None,
+    runner: CallRunner = run_in_turn,
+) -> Assessment:
+    """Diagnose logs by joint smoothing, or by regression on the torques where that says more.
+
+    Joint smoothing needs a motion that is followed in open loop. For a machine without slips, regression takes its
+    place where there are more than MAX_FOLLOWED_JOINTS driven joints, where smoothing finds no estimate, or where it
+    explains nothing and the corrections of regression gain more. Raises NoEstimateError.
+    """
+    report = progress or (lambda share, what: None)
+    by_torques = not model.slips and model.plain
+
+    def regress() -> Assessment:
+        return assess_torques(*torque_regression.diagnose_torques(model, logs, filter, report))
+
+    if by_torques and len(model.actuated) > MAX_FOLLOWED_JOINTS:
+        return regress()
+    try:
+        found = diagnose(model, logs, filter, lambda share, what: report(DIAGNOSE_SHARE * share, what), runner)
+    except NoEstimateError:
+        if not by_torques:
+            raise
+        return regress()
+    account = assess(found, lambda share, what: report(DIAGNOSE_SHARE + (1 - DIAGNOSE_SHARE) * share, what), runner)
+    if not (by_torques and account.diagnosis.verdict == "unexplained"):
+        return account
+    other = regress()
+    gain = account.total_gain.percent if account.total_gain and account.diagnosis.findings else 0.0
+    found_more = other.diagnosis.findings and other.total_gain is not None and other.total_gain.percent > gain
+    return other if found_more else account
+
+
+def assess_torques(d: TorqueDiagnosis, errors: Sequence[HoldOutErrors]) -> Assessment:
+    """Give a diagnosis by regression its gains, and each torque's error beside its noise."""
+    rows = list(d.after.model.actuated)
+    before, after = (
+        {
+            name: InnovationLevel(float(ratio**2), float(ratio**2))
+            for (name, _), ratio in zip(errors[0].sensors, fit.level[rows] / fit.lowest[rows], strict=True)
+        }
+        for fit in (d.before, d.after)
+    )
+    gains = tuple(hold_out.hold_out_gain(a, b) for a, b in pairwise(errors))
+    return Assessment(d, hold_out.hold_out_gain(errors[0], errors[-1]), gains, before, after, d.located, None)
+
+
 def summarise(a: Assessment) -> dict[str, Any]:
     """Return the summary of `excite diagnose`, ready for JSON."""
     d = a.diagnosis
@@ -166,7 +222,7 @@ def summarise(a: Assessment) -> dict[str, Any]:
         if d.nearest
         else None,
         "parameters": parameter_table(d),
-        "exact": {"before": d.before.exact, "after": d.after.exact},
+        "exact": dict(zip(("before", "after"), d.exact, strict=True)),
     }
 
 
@@ -208,28 +264,19 @@ def signal_table(a: Assessment) -> dict[str, dict[str, Any]]:
     return rows
 
 
-def parameter_table(d: Diagnosis) -> dict[str, dict[str, Any]]:
-    """Tabulate base parameters and standard deviations before and after; `moved` is in standard deviations before.
-
-    There is no standard deviation before if no model without the findings followed the logs.
-    """
-    after = dict(zip(d.after.model.base.names, zip(d.after.fit.X, d.after.fit.std, strict=True), strict=True))
-    rows = {}
-    model = d.before.model
-    for name, unit, value, std in zip(
-        model.base.names, model.base.units, d.before.fit.X, d.before.fit.std, strict=True
-    ):
-        new, new_std = after[name]
-        std = std if d.before.estimated else float("nan")
-        rows[name] = {
-            "unit": unit,
-            "before": value,
-            "std_before": std,
-            "after": new,
-            "std_after": new_std,
-            "moved": (new - value) / std if std > 0 else None,
+def parameter_table(d: Diagnosis | TorqueDiagnosis) -> dict[str, dict[str, Any]]:
+    """Tabulate base parameters before and after; `moved` is in standard deviations before."""
+    return {
+        p.name: {
+            "unit": p.unit,
+            "before": p.before,
+            "std_before": p.std_before,
+            "after": p.after,
+            "std_after": p.std_after,
+            "moved": (p.after - p.before) / p.std_before if p.std_before > 0 else None,
         }
-    return rows
+        for p in d.parameters
+    }
 
 
 def describe_place(effect: str, where: str) -> str:
@@ -250,7 +297,7 @@ def format_magnitude(row: Mapping[str, Any]) -> str:
 def answer_text(a: Assessment) -> str:
     """Return the diagnosis in a sentence or two."""
     d = a.diagnosis
-    logs = "The log shows" if len(d.before.data.logs) == 1 else "The logs show"
+    logs = "The log shows" if len(d.sources) == 1 else "The logs show"
     if d.verdict == "clean":
         return f"{logs} nothing that the model lacks: the residuals are noise."
     rows = [_finding_row(f, g) for f, g in zip(d.findings, a.gains, strict=True)]
@@ -310,7 +357,7 @@ def _describe_change(percent: float, interval: tuple[float, float] | None) -> st
 # ------------------------------------------------------------------------------------------------ machine file
 
 
-def machine_file(name: str, machine: Machine, d: Diagnosis) -> str | None:
+def machine_file(name: str, machine: Machine, d: Diagnosis | TorqueDiagnosis) -> str | None:
     """Return the machine with the findings as a TOML file; None if nothing is named.
 
     For a shipped machine the file holds only what is new; for a machine file it holds everything. Base parameters
@@ -325,7 +372,7 @@ def machine_file(name: str, machine: Machine, d: Diagnosis) -> str | None:
     else:
         content = machine.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
         content.pop("effect", None)
-    logs = ", ".join(x.source for x in d.before.data.logs)
+    logs = ", ".join(d.sources)
     head = [
         f"# {machine.title}, with what `excite diagnose` found in {logs}.",
         *(f"# {f.name} could as well be {' or '.join(f.tied_with)}." for f in d.findings if f.tied_with),

@@ -19,6 +19,7 @@ from excite.diagnosis import selection
 from excite.diagnosis.fits import ExtendedFit
 from excite.logs import filtered_regression
 from excite.model import build, effects
+from excite.model.machine import Machine
 from excite.smoothing import Fit, NotConvergedError, predict_readings
 
 STRETCH_S = 2.0  # length of a withheld stretch [s]; chosen
@@ -161,13 +162,18 @@ def hold_out_torques(stage: ExtendedFit) -> HoldOutErrors | None:
                 turns.append(turn)
     if not squares:
         return None
-    names = tuple(
-        next((s.name, machine.si_unit(s)) for s in machine.sensor if s.kind == "torque" and s.body == b.index)
-        for b in machine.actuated
-    )
+    names = torque_names(machine)
     likelihood = np.full((len(squares), 1), np.nan)
     return HoldOutErrors(
         names, np.array(squares), np.array(counts), np.mean(motion, axis=0), level**2, np.array(turns), likelihood
+    )
+
+
+def torque_names(machine: Machine) -> tuple[tuple[str, str], ...]:
+    """Return name and unit of the torque sensor of every actuated joint."""
+    return tuple(
+        next((s.name, machine.si_unit(s)) for s in machine.sensor if s.kind == "torque" and s.body == b.index)
+        for b in machine.actuated
     )
 
 

@@ -9,7 +9,11 @@ from .joint import (
     find_suspect_sensors as find_suspect_sensors,
     shows_sticking as shows_sticking,
 )
-from .linear_methods import fit_rows as fit_rows
+from .linear_methods import (
+    filtered_blocks as filtered_blocks,
+    fit_rows as fit_rows,
+    solve_blocks as solve_blocks,
+)
 from .methods import (
     METHODS as METHODS,
     add_bias as add_bias,
@@ -25,7 +29,12 @@ from .monte_carlo import (
     summarise_runs as summarise_runs,
     verify as verify,
 )
-from .near_rest import friction_near_rest as friction_near_rest, with_soft_friction as with_soft_friction
+from .near_rest import (
+    friction_near_rest as friction_near_rest,
+    moving_rows as moving_rows,
+    with_soft_friction as with_soft_friction,
+)
+from .noise_propagation import row_errors as row_errors, row_levels as row_levels
 from .prediction import Prediction as Prediction, predict_motion as predict_motion, predict_torques as predict_torques
 from .prior import prior_from_logs as prior_from_logs
 from .saved_estimate import (

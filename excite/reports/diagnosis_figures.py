@@ -13,8 +13,9 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from excite import diagnosis
-from excite.diagnosis import Diagnosis, LogResiduals
+from excite.diagnosis import Diagnosis, LogResiduals, TorqueDiagnosis
 from excite.reports.figures import COLOURS, escape_dollar, save
+from excite.reports.torque_figures import torque_figure_calls
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 MAX_ROWS = 3  # torques and forces in a figure; chosen
@@ -29,8 +30,13 @@ CLEAR_STRENGTH = 4.0  # strength of a dependence from which its panel gets a thi
 MAX_INNOVATION = 30.0  # mean square of innovations at which the colours end; chosen
 
 
-def figure_calls(place: Path, d: Diagnosis, title: str) -> list[Callable[[], None]]:
-    """Return independent calls that draw misfit.png and when.png of each log into the folder of a diagnosis."""
+def figure_calls(place: Path, d: Diagnosis | TorqueDiagnosis, title: str) -> list[Callable[[], None]]:
+    """Return independent calls that draw the figures of a diagnosis into its folder.
+
+    misfit.png and when.png of each log; misfit.png and, where there are curves, curves.png of one by regression.
+    """
+    if isinstance(d, TorqueDiagnosis):
+        return torque_figure_calls(place, d, title)
     return [partial(_draw, place, d, title, kind) for kind in ("misfit", "when")]
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from excite import diagnosis, identification, reports
-from excite.diagnosis import Assessment, Diagnosis, RivalPair, run_forked
+from excite.diagnosis import Assessment, Diagnosis, RivalPair, TorqueDiagnosis, run_forked
 from excite.errors import InfeasibleError, MachineError, NotIdentifiableError, SimulationError
 from excite.identification import FILTERS
 from excite.logs import Log, doubts_in_errors, examine, moves, prepare
@@ -21,7 +21,6 @@ from excite.workflows.progress import Bar, no_bar
 
 MACHINE = "machine.toml"
 NEXT = "next"  # folder of the drive that separates tied causes
-DIAGNOSE_SHARE = 0.8  # of the progress bar; gains and figures take the rest; chosen
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,7 @@ def diagnose_from(model: Model, logs: Sequence[Log], filtering: str = "machine")
     """
     prepared = _prepare_logs(model, logs, filtering)
     with doubts_in_errors(prepared.doubts):
-        found = diagnosis.diagnose(model, prepared.logs, prepared.filter, runner=run_forked)
-    return diagnosis.assess(found, runner=run_forked)
+        return diagnosis.explain(model, prepared.logs, prepared.filter, runner=run_forked)
 
 
 def diagnose(
@@ -73,20 +71,16 @@ def diagnose(
     model = requests.build_model(machine)
     with bar("diagnosing") as advance:
 
-        def report_share(begin: float, end: float) -> Callable[[float, str], None]:
-            return lambda share, what: advance(round(1000 * (begin + share * (end - begin))), 1000, None)
+        def report(share: float, what: str) -> None:
+            advance(round(1000 * share), 1000, None)
 
         needs = identification.needed_sensors(model, "joint")
         ready = prepare(model, logs, needs)
         model, notes = ready.model, ready.notes
         prepared = _prepare_logs(model, ready.logs, filtering)
         with doubts_in_errors(prepared.doubts):
-            found = diagnosis.diagnose(
-                model, prepared.logs, prepared.filter, report_share(0.0, DIAGNOSE_SHARE), run_forked
-            )
-        title = model.machine.title
-        account = diagnosis.assess(found, report_share(DIAGNOSE_SHARE, 1.0), run_forked)
-        found = account.diagnosis
+            account = diagnosis.explain(model, prepared.logs, prepared.filter, report, run_forked)
+        title, found = model.machine.title, account.diagnosis
         for _ in run_forked(reports.figure_calls(place, found, title)):
             pass
         text = diagnosis.machine_file(machine, model.machine, found)
@@ -101,15 +95,18 @@ def diagnose(
             "notes": [*notes, *prepared.notes, *_baseline_note(found)],
             "versions": requests.package_versions(),
         }
-        reports.save(reports.signals_figure(summary["signals"], bool(found.stages), title), place / "signals.png")
-    tied = diagnosis.rival_pairs(found)
+        reports.save(reports.signals_figure(summary["signals"], bool(found.findings), title), place / "signals.png")
+    tied = diagnosis.rival_pairs(found) if isinstance(found, Diagnosis) else ()
     summary["separating_drive"] = separating_drive(place, model.machine, tied, design_next, bar)
     reports.write_report(place, "diagnose", summary)
     return summary
 
 
-def _baseline_note(found: Diagnosis) -> list[str]:
+def _baseline_note(found: Diagnosis | TorqueDiagnosis) -> list[str]:
     """Say which model the "before" numbers are of, if the model without the findings can't follow the logs."""
+    if not isinstance(found, Diagnosis):
+        tried = [f"tried and not given: {'; '.join(found.rejected)}"] if found.rejected else []
+        return ["the torques are explained along the measured motion, by regression", *tried]
     if found.sticks:
         return ["friction sticks: where a joint is near rest, its friction may have any value up to Fs"]
     if found.before.estimated:

@@ -1,0 +1,243 @@
+"""Fits of parameters and effects to torques: weighted least squares, and the same with whitened residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from excite.diagnosis.hold_out import HoldOutErrors, torque_names
+from excite.diagnosis.torque_rows import STRETCHES, TorqueRows
+from excite.model import Model
+from excite.model.effects import PlacedEffect
+
+Form = Callable[[np.ndarray, TorqueRows], np.ndarray]
+LAGS = 8  # order of the autoregression of the residuals; chosen
+LEVEL_PASSES = 4  # of the iteration for the rows' levels; chosen
+WHITE_SHARE = (
+    0.01  # of the residual variance taken for white noise, as the low-pass leaves none at high frequency; chosen
+)
+FOLDS = 5  # parts that are withheld in turn; chosen
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """An effect, or a smooth curve, as columns of the regression.
+
+    columns: torques (n_rows, n, width) for each log; for an effect one, and a coefficient of 1 stands for the magnitude
+    of `placed`. slopes: of the column by relative changes of the shapes (and of a magnitude that does not scale it),
+    (n_rows, n, m), for the shapes `free`. chi2: of the effect, when it was added.
+    """
+
+    placed: PlacedEffect | None
+    columns: list[np.ndarray]
+    slopes: list[np.ndarray]
+    free: tuple[str, ...] = ()
+    chi2: float = 0.0
+
+    @property
+    def name(self) -> str:
+        return self.effect.name
+
+    @property
+    def effect(self) -> PlacedEffect:
+        assert self.placed is not None
+        return self.placed
+
+    @property
+    def width(self) -> int:
+        return self.columns[0].shape[2]
+
+
+class TorqueFit:
+    """Parameters and effects fitted to rows: weighted least squares, and the same with whitened residuals.
+
+    kept: numbers of the base parameters that the rows show. lowest (n_rows,): noise of the rows [N m or N].
+    """
+
+    def __init__(
+        self, model: Model, rows: Sequence[TorqueRows], kept: Sequence[int], lowest: np.ndarray, terms: Sequence[Term]
+    ) -> None:
+        self.model, self.rows, self.kept, self.lowest, self.terms = model, rows, list(kept), lowest, tuple(terms)
+        self.design = [
+            np.concatenate([r.W[:, :, self.kept], *(t.columns[k] for t in terms)], axis=2) for k, r in enumerate(rows)
+        ]
+        self.level = np.maximum(self._level([r.Y for r in rows]), lowest)
+        for _ in range(LEVEL_PASSES):
+            self.x = self._solve(self._weight)
+            self.residual = [r.Y - A @ self.x for r, A in zip(rows, self.design, strict=True)]
+            self.level = np.maximum(self._level(self.residual), lowest)
+        self.autoregression = self._autoregression()
+        self.whitened_x = self._solve(self._whiten)
+
+    def without(self, term: Term) -> TorqueFit:
+        return self.with_terms([t for t in self.terms if t is not term])
+
+    def with_terms(self, terms: Sequence[Term]) -> TorqueFit:
+        return TorqueFit(self.model, self.rows, self.kept, self.lowest, terms)
+
+    def _level(self, errors: Sequence[np.ndarray]) -> np.ndarray:
+        """Root mean square (n_rows,) of the rows in motion."""
+        square = sum((e**2 * r.used).sum(axis=1) for e, r in zip(errors, self.rows, strict=True))
+        return np.sqrt(square / np.maximum(sum(r.used.sum(axis=1) for r in self.rows), 1))
+
+    def _autoregression(self) -> np.ndarray:
+        """Filters (n_rows, lags + 1) that turn the residuals of each row into white noise of variance 1."""
+        filters = np.zeros((len(self.level), LAGS + 1))
+        for k, level in enumerate(self.level):
+            past, now = [], []
+            for e, r in zip(self.residual, self.rows, strict=True):
+                lagged = _lagged(e[k])[_whole(r.used[k])]
+                past.append(lagged[:, 1:])
+                now.append(lagged[:, 0])
+            P, y = np.concatenate(past), np.concatenate(now)
+            ridge = np.sqrt(WHITE_SHARE * len(y)) * level * np.eye(LAGS)
+            a = np.linalg.lstsq(np.concatenate([P, ridge]), np.append(y, np.zeros(LAGS)), rcond=None)[0]
+            size = np.sqrt(np.mean((y - P @ a) ** 2)) if len(y) else level
+            filters[k] = np.append(1.0, -a) / max(size, 1e-3 * self.lowest[k], 1e-12)
+        return filters
+
+    def _weight(self, values: np.ndarray, r: TorqueRows) -> np.ndarray:
+        """Rows in motion over their level, (n, ...) from (n_rows, n, ...)."""
+        each = values / self.level.reshape(-1, *[1] * (values.ndim - 1))
+        return np.concatenate([v[used] for v, used in zip(each, r.used, strict=True)])
+
+    def _whiten(self, values: np.ndarray, r: TorqueRows) -> np.ndarray:
+        """Innovations of rows in motion, (n, ...) from (n_rows, n, ...)."""
+        return np.concatenate(
+            [
+                np.tensordot(_lagged(v)[_whole(used)], f, axes=(1, 0))
+                for v, used, f in zip(values, r.used, self.autoregression, strict=True)
+            ]
+        )
+
+    def stretches(self, whitened: bool) -> np.ndarray:
+        """Number (N,) of the stretch of every row that counts, all logs after each other."""
+
+        def of(r: TorqueRows) -> list[np.ndarray]:
+            if whitened:
+                return [r.stretch[LAGS:][_whole(used)] for used in r.used]
+            return [r.stretch[used] for used in r.used]
+
+        return np.concatenate([np.concatenate(of(r)) + k * STRETCHES for k, r in enumerate(self.rows)])
+
+    def _solve(self, form: Form, left_out: np.ndarray | None = None) -> np.ndarray:
+        A = np.concatenate([form(d, r) for d, r in zip(self.design, self.rows, strict=True)])
+        b = np.concatenate([form(r.Y, r) for r in self.rows])
+        if left_out is not None:
+            A, b = A[~left_out], b[~left_out]
+        return solve(A, b)
+
+    def whiten_all(self, values: Sequence[np.ndarray]) -> np.ndarray:
+        """Innovations (N, ...) of values (n_rows, n, ...) of each log."""
+        return np.concatenate([self._whiten(v, r) for v, r in zip(values, self.rows, strict=True)])
+
+    def weight_all(self, values: Sequence[np.ndarray]) -> np.ndarray:
+        """Weighted rows (N, ...) of values (n_rows, n, ...) of each log."""
+        return np.concatenate([self._weight(v, r) for v, r in zip(values, self.rows, strict=True)])
+
+    @cached_property
+    def innovations(self) -> np.ndarray:
+        """Whitened residuals (N,)."""
+        errors = [r.Y - A @ self.whitened_x for r, A in zip(self.rows, self.design, strict=True)]
+        return self.whiten_all(errors)
+
+    @cached_property
+    def basis(self) -> np.ndarray:
+        """Orthonormal basis (N, k) of the whitened columns."""
+        return np.linalg.qr(normalise(self.whiten_all(self.design)))[0]
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """Covariance (k + m, k + m) of x and of the shapes by the scatter from stretch to stretch."""
+        slopes = [
+            np.concatenate([A, *(t.slopes[k] * self.x[self.columns_of(t)][0] for t in self.terms)], axis=2)
+            for k, A in enumerate(self.design)
+        ]
+        A, e, stretch = self.weight_all(slopes), self.weight_all(self.residual), self.stretches(False)
+        size = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
+        A = A / size
+        bread = np.linalg.pinv(A.T @ A, hermitian=True)
+        scores = np.array([A[stretch == c].T @ e[stretch == c] for c in np.unique(stretch)])
+        meat = scores.T @ scores * len(scores) / max(len(scores) - 1, 1)
+        white = bread * float(e @ e) / max(len(e) - len(bread), 1)
+        robust = bread @ meat @ bread
+        grow = np.sqrt(np.maximum(np.diag(robust) / np.maximum(np.diag(white), 1e-300), 1.0))
+        return white * np.outer(grow, grow) / np.outer(size, size)
+
+    def columns_of(self, term: Term) -> slice:
+        """Columns of a term in the design."""
+        k = self.terms.index(term)
+        first = len(self.kept) + sum(t.width for t in self.terms[:k])
+        return slice(first, first + term.width)
+
+    def coefficient(self, term: Term) -> tuple[float, float]:
+        """Coefficient of an effect and its standard deviation, which includes how far the whitened fit is off."""
+        k = self.columns_of(term).start
+        return float(self.x[k]), float(np.hypot(np.sqrt(self.covariance[k, k]), self.x[k] - self.whitened_x[k]))
+
+    def shape_stds(self, term: Term) -> dict[str, float]:
+        """Standard deviations of a term's free shapes, relative to their values."""
+        k = self.terms.index(term)
+        first = self.design[0].shape[2] + sum(len(t.free) for t in self.terms[:k])
+        return {n: float(np.sqrt(self.covariance[first + i, first + i])) for i, n in enumerate(term.free)}
+
+    def hold_out(self, like: TorqueFit) -> tuple[np.ndarray, HoldOutErrors]:
+        """Predict every fifth stretch from the others.
+
+        like: whitens the rows. Return the log-likelihood (stretches,) of the innovations, and the torque errors.
+        """
+        A, b, group = like.whiten_all(self.design), like.whiten_all([r.Y for r in self.rows]), self.stretches(True)
+        V, y, plain = self.weight_all(self.design), self.weight_all([r.Y for r in self.rows]), self.stretches(False)
+        names = np.unique(plain)
+        likelihood = np.zeros(len(names))
+        n_rows = len(self.level)
+        squares, counts, motion = (np.zeros((len(names), n_rows)) for _ in range(3))
+        for turn in range(FOLDS):
+            x = solve(A[group % FOLDS != turn], b[group % FOLDS != turn])
+            w = solve(V[plain % FOLDS != turn], y[plain % FOLDS != turn])
+            for c, name in enumerate(names):
+                if name % FOLDS != turn:
+                    continue
+                own = group == name
+                likelihood[c] = -0.5 * float(((b[own] - A[own] @ x) ** 2).sum())
+                k = int(name) // STRETCHES
+                r, inside = self.rows[k], self.rows[k].stretch == name % STRETCHES
+                error = (r.Y - self.design[k] @ w) * r.used
+                squares[c] = (error[:, inside] ** 2).sum(axis=1)
+                counts[c] = r.used[:, inside].sum(axis=1)
+                motion[c] = ((r.Y * r.used)[:, inside] ** 2).sum(axis=1) / np.maximum(counts[c], 1)
+        rows = list(self.model.actuated)
+        shown = HoldOutErrors(
+            torque_names(self.model.machine),
+            squares[:, rows],
+            counts[:, rows],
+            motion[:, rows].mean(axis=0),
+            self.level[rows] ** 2,
+            np.zeros(len(names), int),
+            np.full((len(names), 1), np.nan),
+        )
+        return likelihood, shown
+
+
+def solve(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Solve least squares with columns of any size."""
+    size = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
+    return np.asarray(np.linalg.lstsq(A / size, b, rcond=1e-10)[0] / size)
+
+
+def normalise(A: np.ndarray) -> np.ndarray:
+    return np.asarray(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300))
+
+
+def _lagged(v: np.ndarray) -> np.ndarray:
+    """Return every value with those before it, (n - lags, lags + 1, ...) from (n, ...)."""
+    p = LAGS
+    return np.stack([v[p - k : len(v) - k] for k in range(p + 1)], axis=1)
+
+
+def _whole(used: np.ndarray) -> np.ndarray:
+    """Find the rows that count with all rows before them, (n - lags,) from (n,); as indices behind the first lags."""
+    return np.asarray(_lagged(used).all(axis=1))

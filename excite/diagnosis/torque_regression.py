@@ -1,0 +1,184 @@
+"""Diagnose a machine without slips from the torques of its joints, by regression along the measured motion.
+
+Real robots and rigs rarely follow their model in open loop, and then there is no smoothed motion whose innovations
+could be tested. Their torques are linear in the parameters along the measured motion, and stay so with effects of the
+catalogue as further columns. What the model leaves is correlated over time, so rows are whitened by an autoregression
+of the residuals (C. C. Cochrane and G. H. Orcutt, J. American Statistical Association 44, 1949), a column is tested by
+a score test whose variance is that from stretch to stretch (K.-Y. Liang and S. L. Zeger, Biometrika 73, 1986), and
+columns compete by their Bayesian information (G. Schwarz, Annals of Statistics 6, 1978), which pays for their number.
+A column is kept only if it predicts stretches that it was not fitted to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.stats
+
+from excite import identification
+from excite.diagnosis.curves import Curve, find_curves
+from excite.diagnosis.diagnosis import Finding, NearestEffect, ParameterChange
+from excite.diagnosis.hold_out import HoldOutErrors, torque_names
+from excite.diagnosis.score_test import Candidate
+from excite.diagnosis.selection import ProgressCallback, identified_entry
+from excite.diagnosis.torque_fit import Term, TorqueFit
+from excite.diagnosis.torque_rows import torque_rows
+from excite.diagnosis.torque_search import SETTINGS, Search, reason_against
+from excite.logs import Log
+from excite.model import Model
+from excite.model.machine import EffectEntry, Filter
+
+MIN_LEVEL = 1e-6  # smallest noise of a row, of the torques' size; chosen
+
+
+@dataclass(frozen=True)
+class TorqueDiagnosis:
+    """What regression on the torques finds; the fields that it shares with `Diagnosis` mean the same.
+
+    curves: smooth functions of one signal that predict what no effect explains. rejected: effects that were tried, each
+    with the reason why it is not given.
+    """
+
+    verdict: str
+    findings: tuple[Finding, ...]
+    before: TorqueFit
+    after: TorqueFit
+    share: float
+    located: tuple[str, ...]
+    curves: tuple[Curve, ...]
+    rejected: tuple[str, ...] = ()
+    nearest: NearestEffect | None = None
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        return tuple(r.log.source for r in self.after.rows)
+
+    @property
+    def torques(self) -> tuple[tuple[str, str], ...]:
+        """Name and unit of every torque sensor."""
+        return torque_names(self.after.model.machine)
+
+    @property
+    def exact(self) -> tuple[bool, bool]:
+        return _explains(self.before), _explains(self.after)
+
+    @property
+    def parameters(self) -> list[ParameterChange]:
+        model, shown = self.before.model, []
+        for f in (self.before, self.after):
+            value, std = model.nominal.copy(), np.full(len(model.nominal), np.inf)
+            n = len(f.kept)
+            value[f.kept], std[f.kept] = f.x[:n], np.sqrt(np.diag(f.covariance)[:n])
+            shown.append((value, std))
+        (old, old_std), (new, new_std) = shown
+        return [
+            ParameterChange(*row)
+            for row in zip(model.base.names, model.base.units, old, old_std, new, new_std, strict=True)
+        ]
+
+
+def _explains(fit: TorqueFit) -> bool:
+    """Tell if a fit leaves no more than the sensors' noise."""
+    rows = list(fit.model.actuated)
+    return bool((fit.level[rows] <= SETTINGS.noise_ratio * fit.lowest[rows]).all())
+
+
+def diagnose_torques(
+    model: Model, logs: Sequence[Log], filter: Filter, report: ProgressCallback | None = None
+) -> tuple[TorqueDiagnosis, list[HoldOutErrors]]:
+    """Diagnose the torques of a machine without slips and without effects.
+
+    Return the errors on withheld stretches without findings, with the first, the first two, ... as well. Raises
+    NotIdentifiableError.
+    """
+    report = report or (lambda share, what: None)
+    report(0.05, "fitting the torques")
+    rows = torque_rows(model, logs, filter)
+    blocks = [(r.W, r.Y) for r in rows]
+    lowest = identification.row_levels([identification.row_errors(model, x, filter, 1) for x in logs], model.nominal)
+    lowest = np.maximum(lowest, MIN_LEVEL * np.sqrt(np.mean(np.concatenate([r.Y**2 for r in rows], axis=1))))
+    before = TorqueFit(model, rows, identification.solve_blocks(blocks, model.scale).kept, lowest, [])
+    search = Search(model, rows, filter, identification.fit_rows(model, blocks))
+    after, reasons = search.extend(before, report)
+    stages = [before.with_terms(after.terms[:k]) for k in range(len(after.terms))] + [after]
+    errors = [stage.hold_out(before)[1] for stage in stages]
+    explained = _explains(after)
+    total = _excess(before)
+    findings = []
+    for old, new, term in zip(stages, stages[1:], after.terms, strict=False):
+        share = (_excess(old) - _excess(new)) / total if total > 0 else 1.0
+        findings.append(_finding(search, after, term, share, "cause" if explained else "correction"))
+    verdict = "unexplained"
+    if explained:
+        tied = any(f.rivals for f in findings)
+        verdict = "clean" if not findings else "tied" if tied else "named"
+    curves = [] if explained else find_curves(after, search.torques, report)
+    located = [] if explained else [*_what_is_left(after), *map(str, curves)]
+    share = 1.0 if explained else sum(f.share for f in findings)
+    return TorqueDiagnosis(
+        verdict, tuple(findings), before, after, share, tuple(located), tuple(curves), tuple(reasons)
+    ), errors
+
+
+def _excess(fit: TorqueFit) -> float:
+    """Sum of squares of the torques' errors beyond the noise, in units of the noise."""
+    rows = list(fit.model.actuated)
+    return float(np.maximum((fit.level[rows] / fit.lowest[rows]) ** 2 - 1, 0).sum())
+
+
+def _finding(search: Search, fit: TorqueFit, term: Term, share: float, kind: str) -> Finding:
+    """Report an effect with its rivals."""
+    placed = term.effect
+    c, std = fit.coefficient(term)
+    relative = fit.shape_stds(term)
+    magnitude = placed.values["A"] / c if placed.effect.inverse else placed.values["A"] * c
+    size = abs(magnitude) * (np.hypot(std / c, relative["A"]) if "A" in relative else abs(std / c))
+    shapes = {
+        n: (placed.values[n], abs(placed.values[n]) * relative.get(n, 0.0), s.unit) for n, s in placed.shapes.items()
+    }
+    k = 1 + len(relative)
+    return Finding(
+        placed.effect.name,
+        placed.where,
+        _rivals(search, fit, term),
+        float(min(1.0, len(search.names) * scipy.stats.chi2.sf(term.chi2, k))),
+        float(magnitude),
+        float(size),
+        placed.effect.unit,
+        shapes,
+        term.chi2,
+        share,
+        kind,
+        float(size),
+    )
+
+
+def _rivals(search: Search, fit: TorqueFit, term: Term) -> tuple[EffectEntry, ...]:
+    """Return effects that explain the torques about as well as a term does beside the others."""
+    rest = fit.without(term)
+    own = search.test(rest, [Candidate(term.effect, (0,))], term.columns)[0]
+    found = []
+    for x in search.finalists(rest):
+        placed = x.candidate.placed
+        if placed.name != term.name and x.log_odds > own.log_odds - np.log(SETTINGS.tie_odds):
+            new = rest.with_terms([*rest.terms, search.term(x)])
+            if not reason_against(rest, new, new.terms[-1]):
+                values = {n: placed.values[n] for n in placed.shapes}
+                found.append(
+                    identified_entry(placed.effect.name, placed.where, x.coefficient * placed.values["A"], values)
+                )
+    return tuple(found)
+
+
+def _what_is_left(fit: TorqueFit) -> list[str]:
+    """Say of each torque what is left beside noise, the largest first."""
+    rows = list(fit.model.actuated)
+    ratio = fit.level[rows] / fit.lowest[rows]
+    names = torque_names(fit.model.machine)
+    return [
+        f"{names[k][0]}: {fit.level[rows[k]]:.3g} {names[k][1]} are left, {ratio[k]:.2g} times its noise"
+        for k in np.argsort(-ratio)
+        if ratio[k] > SETTINGS.noise_ratio
+    ]

@@ -1,0 +1,102 @@
+"""Figures of a diagnosis by regression: errors of the torques, and the curves that they follow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from excite.diagnosis import Curve, TorqueDiagnosis
+from excite.reports.figures import COLOURS, escape_dollar, save
+
+BEFORE, AFTER = COLOURS[1], COLOURS[0]
+MAX_TORQUES = 4  # with the largest errors, in the figure; chosen
+BINS = 40  # of time or speed in a panel; chosen
+MAX_COLUMNS = 3  # curves side by side; chosen
+
+
+def torque_figure_calls(place: Path, d: TorqueDiagnosis, title: str) -> list[Callable[[], None]]:
+    """Return independent calls that draw misfit.png and, where there are curves, curves.png."""
+    calls = [partial(_save, misfit_of_torques, d, title, place / "misfit.png")]
+    return [*calls, partial(_save, curves_figure, d, title, place / "curves.png")] if d.curves else list(calls)
+
+
+def _save(draw: Callable[[TorqueDiagnosis, str], Figure], d: TorqueDiagnosis, title: str, place: Path) -> None:
+    save(draw(d, title), place)
+
+
+def misfit_of_torques(d: TorqueDiagnosis, title: str) -> Figure:
+    """Plot the error of each torque over time, and against the speed of its joint, without and with the findings."""
+    model, before, after = d.after.model, d.before, d.after
+    names = d.torques
+    rows = list(model.actuated)
+    order = sorted(range(len(rows)), key=lambda k: -before.level[rows[k]] / before.lowest[rows[k]])[:MAX_TORQUES]
+    figure = Figure(figsize=(10.0, 0.9 + 2.0 * len(order)), layout="constrained")
+    axes = figure.subplots(len(order), 2, squeeze=False)
+    for (over_time, over_speed), k in zip(axes, order, strict=True):
+        name, unit = names[k]
+        row, body = rows[k], model.machine.actuated[k]
+        turns = body.joint == "revolute"
+        for fit, colour, label in ((before, BEFORE, "without findings"), (after, AFTER, "with findings")):
+            if fit is after and not d.findings:
+                continue
+            start = 0.0
+            for log, r in enumerate(fit.rows):
+                t = r.t[r.at]
+                at, size = _means(t, fit.residual[log][row] ** 2, r.used[row])
+                over_time.plot(start + at, np.sqrt(size), color=colour, label=label if log == 0 else None)
+                start += t[-1]
+            speed = np.concatenate([r.nu[r.at, row] for r in fit.rows])
+            error = np.concatenate([e[row] for e in fit.residual])
+            used = np.concatenate([r.used[row] for r in fit.rows])
+            at, mean = _means(speed, error, used)
+            over_speed.plot(at, mean, ".-", color=colour, label=label)
+        over_time.axhline(after.lowest[row], color="0.5", linestyle="--", label="sensors' noise")
+        over_speed.axhline(0.0, color="0.5", linewidth=0.8)
+        over_time.set_ylabel(escape_dollar(f"rms error of {name} [{unit}]"))
+        over_time.set_ylim(bottom=0.0)
+        over_speed.set_ylabel(escape_dollar(f"mean error of {name} [{unit}]"))
+        over_speed.set_xlabel(escape_dollar(f"speed of {body.where.replace('_', ' ')} [{'rad/s' if turns else 'm/s'}]"))
+    for axis in axes[-1, :1]:
+        axis.set_xlabel("time [s]" if len(d.sources) == 1 else "time, one log after the other [s]")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    figure.suptitle(escape_dollar(f"{title}: errors of the torques along the measured motion"))
+    return figure
+
+
+def _means(x: np.ndarray, y: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean of y in bins with equally many samples x."""
+    x, y = x[used], y[used]
+    order = np.argsort(x, kind="stable")
+    parts = [part for part in np.array_split(order, min(BINS, len(order))) if len(part)]
+    return np.array([x[p].mean() for p in parts]), np.array([y[p].mean() for p in parts])
+
+
+def curves_figure(d: TorqueDiagnosis, title: str) -> Figure:
+    """Plot the torque that each joint lacks as a function of one signal, with its 95 % band."""
+    columns = min(MAX_COLUMNS, len(d.curves))
+    lines = -(-len(d.curves) // columns)
+    figure = Figure(figsize=(3.6 * columns + 0.4, 2.8 * lines + 0.5), layout="constrained")
+    axes = figure.subplots(lines, columns, squeeze=False).ravel()
+    for axis, curve in zip(axes, d.curves, strict=False):
+        _draw_curve(axis, curve)
+    for axis in axes[len(d.curves) :]:
+        axis.set_axis_off()
+    figure.suptitle(escape_dollar(f"{title}: torque that the model lacks, mean and 95 % band"))
+    return figure
+
+
+def _draw_curve(axis: Axes, curve: Curve) -> None:
+    (row, unit), (signal, of) = curve.row, curve.signal
+    axis.fill_between(
+        curve.at, curve.value - 1.96 * curve.std, curve.value + 1.96 * curve.std, color=AFTER, alpha=0.25, linewidth=0
+    )
+    axis.plot(curve.at, curve.value, color=AFTER)
+    axis.axhline(0.0, color="0.5", linewidth=0.8)
+    axis.set_xlabel(escape_dollar(f"{signal.removeprefix('the ').replace('_', ' ')} [{of}]"))
+    axis.set_ylabel(escape_dollar(f"missing in {row} [{unit}]"))
