@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,12 +13,9 @@ from excite.diagnosis.torque_rows import STRETCHES, TorqueRows
 from excite.model import Model
 from excite.model.effects import PlacedEffect
 
-Form = Callable[[np.ndarray, TorqueRows], np.ndarray]
 LAGS = 8  # order of the autoregression of the residuals; chosen
 LEVEL_PASSES = 4  # of the iteration for the rows' levels; chosen
-WHITE_SHARE = (
-    0.01  # of the residual variance taken for white noise, as the low-pass leaves none at high frequency; chosen
-)
+WHITE_SHARE = 0.01  # of the residuals taken for white noise, as a low-pass leaves none at high frequency; chosen
 FOLDS = 5  # parts that are withheld in turn; chosen
 
 
@@ -65,18 +62,26 @@ class TorqueFit:
             np.concatenate([r.W[:, :, self.kept], *(t.columns[k] for t in terms)], axis=2) for k, r in enumerate(rows)
         ]
         self.level = np.maximum(self._level([r.Y for r in rows]), lowest)
+        each = [self._triangle_of_row(k) for k in range(len(lowest))]
         for _ in range(LEVEL_PASSES):
-            self.x = self._solve(self._weight)
+            self.x = solve(np.concatenate([R / level for R, level in zip(each, self.level, strict=True)]))
             self.residual = [r.Y - A @ self.x for r, A in zip(rows, self.design, strict=True)]
             self.level = np.maximum(self._level(self.residual), lowest)
         self.autoregression = self._autoregression()
-        self.whitened_x = self._solve(self._whiten)
+        self._predicted: dict[int, tuple[np.ndarray, HoldOutErrors]] = {}
 
     def without(self, term: Term) -> TorqueFit:
         return self.with_terms([t for t in self.terms if t is not term])
 
     def with_terms(self, terms: Sequence[Term]) -> TorqueFit:
         return TorqueFit(self.model, self.rows, self.kept, self.lowest, terms)
+
+    def _triangle_of_row(self, k: int) -> np.ndarray:
+        """Triangle of [design, torque] of one row in motion."""
+        own = [
+            np.column_stack([A[k][r.used[k]], r.Y[k][r.used[k]]]) for A, r in zip(self.design, self.rows, strict=True)
+        ]
+        return triangle(np.concatenate(own))
 
     def _level(self, errors: Sequence[np.ndarray]) -> np.ndarray:
         """Root mean square (n_rows,) of the rows in motion."""
@@ -108,7 +113,7 @@ class TorqueFit:
         """Innovations of rows in motion, (n, ...) from (n_rows, n, ...)."""
         return np.concatenate(
             [
-                np.tensordot(_lagged(v)[_whole(used)], f, axes=(1, 0))
+                sum(a * v[LAGS - k : len(v) - k] for k, a in enumerate(f))[_whole(used)]
                 for v, used, f in zip(values, r.used, self.autoregression, strict=True)
             ]
         )
@@ -123,13 +128,6 @@ class TorqueFit:
 
         return np.concatenate([np.concatenate(of(r)) + k * STRETCHES for k, r in enumerate(self.rows)])
 
-    def _solve(self, form: Form, left_out: np.ndarray | None = None) -> np.ndarray:
-        A = np.concatenate([form(d, r) for d, r in zip(self.design, self.rows, strict=True)])
-        b = np.concatenate([form(r.Y, r) for r in self.rows])
-        if left_out is not None:
-            A, b = A[~left_out], b[~left_out]
-        return solve(A, b)
-
     def whiten_all(self, values: Sequence[np.ndarray]) -> np.ndarray:
         """Innovations (N, ...) of values (n_rows, n, ...) of each log."""
         return np.concatenate([self._whiten(v, r) for v, r in zip(values, self.rows, strict=True)])
@@ -139,15 +137,33 @@ class TorqueFit:
         return np.concatenate([self._weight(v, r) for v, r in zip(values, self.rows, strict=True)])
 
     @cached_property
+    def _whitened_parameters(self) -> np.ndarray:
+        """Whitened columns (N, k) of the parameters."""
+        return self.whiten_all([r.W[:, :, self.kept] for r in self.rows])
+
+    @cached_property
+    def _whitened_torques(self) -> np.ndarray:
+        return self.whiten_all([r.Y for r in self.rows])
+
+    def _whitened_design(self, like: TorqueFit) -> np.ndarray:
+        """Columns (N, k) of this fit, whitened like another one."""
+        beside = [like.whiten_all(t.columns) for t in self.terms]
+        return np.concatenate([like._whitened_parameters, *beside], axis=1)
+
+    @cached_property
+    def whitened_x(self) -> np.ndarray:
+        """Coefficients (k,) of whitened rows."""
+        return solve(triangle(np.column_stack([self._whitened_design(self), self._whitened_torques])))
+
+    @cached_property
     def innovations(self) -> np.ndarray:
         """Whitened residuals (N,)."""
-        errors = [r.Y - A @ self.whitened_x for r, A in zip(self.rows, self.design, strict=True)]
-        return self.whiten_all(errors)
+        return self._whitened_torques - self._whitened_design(self) @ self.whitened_x
 
     @cached_property
     def basis(self) -> np.ndarray:
         """Orthonormal basis (N, k) of the whitened columns."""
-        return np.linalg.qr(normalise(self.whiten_all(self.design)))[0]
+        return np.linalg.qr(normalise(self._whitened_design(self)))[0]
 
     @cached_property
     def covariance(self) -> np.ndarray:
@@ -189,20 +205,28 @@ class TorqueFit:
 
         like: whitens the rows. Return the log-likelihood (stretches,) of the innovations, and the torque errors.
         """
-        A, b, group = like.whiten_all(self.design), like.whiten_all([r.Y for r in self.rows]), self.stretches(True)
-        V, y, plain = self.weight_all(self.design), self.weight_all([r.Y for r in self.rows]), self.stretches(False)
+        if id(like) not in self._predicted:
+            self._predicted[id(like)] = self._hold_out(like)
+        return self._predicted[id(like)]
+
+    def _hold_out(self, like: TorqueFit) -> tuple[np.ndarray, HoldOutErrors]:
+        A = np.column_stack([self._whitened_design(like), like._whitened_torques])
+        V = np.column_stack([self.weight_all(self.design), self.weight_all([r.Y for r in self.rows])])
+        group, plain = self.stretches(True), self.stretches(False)
+        parts = [
+            [triangle(M[number % FOLDS == turn]) for turn in range(FOLDS)] for M, number in ((A, group), (V, plain))
+        ]
         names = np.unique(plain)
         likelihood = np.zeros(len(names))
         n_rows = len(self.level)
         squares, counts, motion = (np.zeros((len(names), n_rows)) for _ in range(3))
         for turn in range(FOLDS):
-            x = solve(A[group % FOLDS != turn], b[group % FOLDS != turn])
-            w = solve(V[plain % FOLDS != turn], y[plain % FOLDS != turn])
+            x, w = (solve(np.concatenate([R for k, R in enumerate(own) if k != turn])) for own in parts)
             for c, name in enumerate(names):
                 if name % FOLDS != turn:
                     continue
                 own = group == name
-                likelihood[c] = -0.5 * float(((b[own] - A[own] @ x) ** 2).sum())
+                likelihood[c] = -0.5 * float(((A[own, -1] - A[own, :-1] @ x) ** 2).sum())
                 k = int(name) // STRETCHES
                 r, inside = self.rows[k], self.rows[k].stretch == name % STRETCHES
                 error = (r.Y - self.design[k] @ w) * r.used
@@ -222,10 +246,16 @@ class TorqueFit:
         return likelihood, shown
 
 
-def solve(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Solve least squares with columns of any size."""
+def triangle(rows: np.ndarray) -> np.ndarray:
+    """Reduce rows (N, k) to a triangle with the same products of columns."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def solve(rows: np.ndarray) -> np.ndarray:
+    """Solve least squares (k,) from rows or a triangle of [A, b], with columns of any size."""
+    A = rows[:, :-1]
     size = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-    return np.asarray(np.linalg.lstsq(A / size, b, rcond=1e-10)[0] / size)
+    return np.asarray(np.linalg.lstsq(A / size, rows[:, -1], rcond=1e-10)[0] / size)
 
 
 def normalise(A: np.ndarray) -> np.ndarray:
