@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,10 +11,11 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs import log, refusal
+from excite.logs.clocks import is_clock
 from excite.logs.log import Log
 from excite.logs.repair import NEEDED
 from excite.logs.resampling import SAME_RATE, Stretch, at_rate, even_stretches, slower
-from excite.logs.time_axis import order_rows
+from excite.logs.time_axis import Run, order_rows
 from excite.logs.times import absolute_seconds, has_time, seconds
 from excite.model import Model
 from excite.model.machine import TIME_UNITS, UNITS, Machine, Sensor
@@ -24,9 +24,7 @@ FASTEST_HZ = 150.0  # rate [Hz] beyond which a rolling machine tells nothing mor
 REST_S = 5.0  # [s] of standing still that is left out; chosen
 REST_MARGIN_S = 0.3  # [s] of a rest that stays with the motion before and after it; chosen
 
-MIN_RISING_SHARE = 0.5  # of a clock's steps; coarse clocks repeat themselves, temperatures fall as often; chosen
 MERGED = "merged"  # of a table's attrs: channels are on one clock already
-TIME_NAME = re.compile(r"(?i)(t|time|timestamp)([_ ].*)?|.*[_ ](t|time|timestamp)([_ ].*)?")
 
 Source = str | Path | pd.DataFrame | Log
 
@@ -112,7 +110,8 @@ def read_stretches(
     stretches, said = place_rows(accepted.table, machine, needs, name, rate)
     used = {line.partition(" row only")[0] for line in said}  # of held channels the note says how they are used
     doubts = [line for line in accepted.doubts if line.partition(" row only")[0] not in used]
-    return stretches, [*notes, *accepted.notes, *said, *doubts]
+    doubtful = [replace(stretch, doubts=accepted.grave) for stretch in stretches]
+    return doubtful, [*notes, *accepted.notes, *said, *doubts]
 
 
 def _numbered(sources: Sequence[Source]) -> list[Source]:
@@ -141,7 +140,7 @@ def place_rows(
     t = seconds(table, machine, name)
     if line := log.too_short(len(t), machine):
         raise LogError(f"{name}: {line}")
-    runs, said = order_rows(t, table, machine.time_column, name)
+    runs, said = _ordered(t, table, machine, machine.time_column, UNITS[machine.time_unit][1], name)
     stretches = list[Stretch]()
     for run in runs:
         found, more = even_stretches(table, run, machine, name, rate)
@@ -152,6 +151,15 @@ def place_rows(
     if long and len(long) < len(stretches):
         said.append(f"{name}: {len(stretches) - len(long)} stretches of less than {least} rows are left out")
     return long or stretches, said
+
+
+def _ordered(
+    t: np.ndarray, table: pd.DataFrame, machine: Machine, column: str, unit: float, source: str
+) -> tuple[list[Run], list[str]]:
+    """Order rows of a machine's channels with times t (N,) [s] of a clock, as `order_rows` does."""
+    turning = [s.column for s in machine.sensor if s.kind in ("angle", "wheel") and not s.is_rate]
+    positions = [c for c in turning if c in table.columns]
+    return order_rows(t, table, column, source, positions, 1 / float(machine.sampling_hz), unit)
 
 
 def merge_own_times(tables: Sequence[pd.DataFrame], machine: Machine) -> pd.DataFrame | None:
@@ -189,16 +197,9 @@ def _clock(table: pd.DataFrame, machine: Machine, sensor: Sensor, used: set[str]
     for name in (sensor.time_column, machine.time_column):
         if name is not None and name in table.columns:
             return name
-    before = list(table.columns)[: list(table.columns).index(sensor.column)]
-    named = [str(c) for c in before if c not in used and TIME_NAME.fullmatch(str(c))]
-    clocks = [c for c in named if _rises(table[c])]
-    return clocks[-1] if clocks else None
-
-
-def _rises(column: pd.Series) -> bool:
-    """Tell if a column could be a clock: most of its numbers are larger than the one before; text may be a clock."""
-    values = pd.to_numeric(column, errors="coerce").dropna().to_numpy(dtype=float)
-    return len(values) < 2 or float(np.mean(np.diff(values) > 0)) > MIN_RISING_SHARE
+    before = map(str, list(table.columns)[: list(table.columns).index(sensor.column)])
+    found = [c for c in before if c not in used and is_clock(c, table[c], table.attrs.get("units", {}).get(c))]
+    return found[-1] if found else None
 
 
 def _unit_in_file(table: pd.DataFrame, clock: str) -> str | None:
@@ -255,7 +256,7 @@ def as_log(stretch: Stretch, machine: Machine, needs: Sequence[str], source: str
     made = log.from_table(table, machine, needs, source, np.arange(len(table)) / stretch.rate)
     edges = {s.name: s.gain * stretch.edges[s.column] for s in machine.sensors("full") if s.column in stretch.edges}
     sampled = {s.name: stretch.sampled[s.column] for s in machine.sensors("full") if s.column in stretch.sampled}
-    return replace(made, interpolated=stretch.interpolated, sampled=sampled, edges=edges)
+    return replace(made, interpolated=stretch.interpolated, sampled=sampled, edges=edges, doubts=stretch.doubts)
 
 
 def without_rests(one: Log, machine: Machine, notes: list[str]) -> list[Log]:

@@ -22,16 +22,21 @@ from excite.model.machine import UNITS, Machine
 
 T = TypeVar("T")
 
+GRAVE = ("clocks", "slow")  # checks whose doubts, as those of units, make an estimate doubtful
 CLOSE = 0.05  # of a unit's size, when a wrong rate of sampling is taken for time in that unit
 
 
 @dataclass(frozen=True)
 class Accepted:
-    """A table without faults, repaired, with what was done to it and what is doubtful about it."""
+    """A table without faults, repaired, with what was done to it and what is doubtful about it.
+
+    grave: those doubts that make an estimate doubtful.
+    """
 
     table: pd.DataFrame
     notes: tuple[str, ...]
     doubts: tuple[str, ...]
+    grave: tuple[str, ...] = ()
 
 
 def accept(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> Accepted:
@@ -61,7 +66,8 @@ def accept(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sou
     clean, notes = mended(table, record, source)
     bridged = [f"{source}: {f.text}" for f in seen if f.check == "dropouts" and f.kind == "remark"]
     units = [f"{source}: {line}" for line in unit_doubts(table, machine)[0]]
-    return Accepted(clean, (*notes, *bridged), (*units, *doubtful))
+    grave = [f"{source}: {f.text}" for f in seen if f.kind == "doubt" and f.check in GRAVE]
+    return Accepted(clean, (*notes, *bridged), (*units, *doubtful), (*units, *grave))
 
 
 def unit_doubts(table: pd.DataFrame, machine: Machine) -> tuple[list[str], list[str]]:
