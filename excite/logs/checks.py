@@ -19,7 +19,7 @@ from excite.logs import clocks, log
 from excite.logs.log import Log
 from excite.logs.plausibility import RATES, against, as_speed, is_speed, own_file, rated_speed, unchanging
 from excite.logs.resampling import BRIDGED_STEPS, held_every
-from excite.logs.times import has_time, seconds
+from excite.logs.times import date_and_time, has_time, seconds
 from excite.model.machine import TURN, Machine, Sensor
 
 SHOWN = 3  # places named of what is there many times
@@ -84,12 +84,17 @@ class Finding:
 
 @dataclass(frozen=True)
 class Record:
-    """A machine's channels by sensor name, as recorded; clocks: other clocks' times (N,) at rows with times t (N,)."""
+    """A machine's channels by sensor name, as recorded.
+
+    clocks: times (N,) of clocks that nothing uses, by column, at rows with times t (N,) [s]. one_origin: those of them
+    that may be shifted against the machine's.
+    """
 
     machine: Machine
     channels: dict[str, Channel]
     t: np.ndarray = field(default_factory=lambda: np.empty(0))
     clocks: dict[str, np.ndarray] = field(default_factory=dict)
+    one_origin: frozenset[str] = frozenset()
 
     def of(self, check: str) -> list[Channel]:
         """Channels that a check looks at."""
@@ -108,7 +113,7 @@ def record_of(table: pd.DataFrame, machine: Machine) -> tuple[Record, dict[str, 
     if t is None or not 1 / WRONG_RATE < usual_step(t) * nominal < WRONG_RATE:
         t, others = np.arange(len(table)) / nominal, {}  # times in another unit say nothing of the readings
     else:
-        others = clocks.other_clocks(table, log.columns_known(machine))
+        others = clocks.other_clocks(table, log.columns_known(machine) | set(date_and_time(table) or ()))
     for sensor in machine.sensors("full"):
         needed = log.columns_read(sensor, machine)
         if not set(needed) <= set(table.columns):
@@ -126,7 +131,9 @@ def record_of(table: pd.DataFrame, machine: Machine) -> tuple[Record, dict[str, 
         rows = np.flatnonzero(there)
         part = table if there.all() else table.iloc[rows].set_axis(range(len(rows)))
         channels[sensor.name] = Channel(sensor, t[rows], log.values_of(sensor, machine, part, ""), rows)
-    return Record(machine, channels, t, others), unread
+    used = {c for s in machine.sensor for c in s.columns}
+    own = frozenset(c for c in others if clocks.between_channels(table, c, machine.time_column, used))
+    return Record(machine, channels, t, others, own), unread
 
 
 def record_of_log(machine: Machine, one: Log) -> Record:
@@ -357,7 +364,7 @@ def _own_step(c: Channel) -> float:
 def disagreeing_clocks(record: Record) -> Iterator[Finding]:
     """Find clocks beside the machine's that run otherwise."""
     for column, t in record.clocks.items():
-        if line := clocks.disagreement(record.t, t, record.machine.time_column, column):
+        if line := clocks.disagreement(record.t, t, record.machine.time_column, column, column in record.one_origin):
             yield Finding("clocks", "doubt", "", line)
 
 

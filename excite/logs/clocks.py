@@ -30,6 +30,7 @@ ROUNDED_SHARE = 0.02  # of a step: finer rounding does no harm; chosen
 ROUNDED_MOST = 0.9  # of a step: a clock that is coarser has rows that share a stamp; chosen
 HALF_DAY_S = 43200.0  # [s] of a clock with twelve hours
 COUNTER_BITS = (16, 24, 32)  # of counters of ticks
+TICKS_S = (1e-3, 1e-6, 1e-7, 1e-9)  # [s] of such counters
 SEAM_STEPS = 3.5  # usual steps to the row after a clock begins anew; chosen
 DECADES = range(10)  # decimals [s] to which stamps are rounded
 
@@ -43,7 +44,7 @@ def is_clock(name: str, column: pd.Series, unit: str | None = None) -> bool:
         return False
     values = pd.to_numeric(column, errors="coerce").dropna().to_numpy(dtype=float)
     if len(values) < 2:
-        return column.notna().any()
+        return bool(column.notna().any())
     steps = np.diff(values)
     if float(np.mean(steps > 0)) <= MIN_RISING_SHARE:
         return False
@@ -62,7 +63,7 @@ def other_clocks(table: pd.DataFrame, used: Collection[str]) -> dict[str, np.nda
     for name in map(str, table.columns):
         if name in used or not TIME_NAME.fullmatch(name) or not is_clock(name, table[name], units.get(name)):
             continue
-        unit = units.get(name)
+        unit = units.get(name, "")
         try:
             t = absolute_seconds(table[name], UNITS[unit][1] if unit in TIME_UNITS else 1.0)
         except (LogError, ValueError, TypeError, OverflowError):
@@ -72,12 +73,22 @@ def other_clocks(table: pd.DataFrame, used: Collection[str]) -> dict[str, np.nda
     return found
 
 
-def disagreement(t: np.ndarray, other: np.ndarray, name: str, column: str) -> str:
+def between_channels(table: pd.DataFrame, clock: str, time_column: str, channels: Collection[str]) -> bool:
+    """Tell if a second clock stands as one of loggers that each write a clock and channels: some on either side of
+    it, and the machine's clock has numbers that count from an origin of its own."""
+    names = list(map(str, table.columns))
+    if time_column not in names or not pd.api.types.is_numeric_dtype(table[time_column]):
+        return False
+    at = names.index(clock)
+    return any(c in channels for c in names[:at]) and any(c in channels for c in names[at:])
+
+
+def disagreement(t: np.ndarray, other: np.ndarray, name: str, column: str, one_origin: bool) -> str:
     """Return a line for a clock `column` with times other (N,) that runs otherwise than the times t (N,) [s] of
     `name`, "" where they agree within a row or a tick.
 
-    The unit of the other clock is the one in which both last about as long. A shift by more than the log lasts is
-    another origin, which says nothing.
+    The unit of the other clock is the one in which both last about as long. one_origin: a shift counts as well, unless
+    it is longer than the log.
     """
     there = np.isfinite(other)
     t, other = t[there], other[there]
@@ -98,7 +109,7 @@ def disagreement(t: np.ndarray, other: np.ndarray, name: str, column: str) -> st
             f" {lasts:.4g} s: {advice}"
         )
     shift = (low + high) / 2
-    if least < abs(shift) < lasts:
+    if one_origin and least < abs(shift) < lasts:
         where = "ahead of" if shift > 0 else "behind"
         return (
             f"column {column}: a second clock, {abs(shift):.3g} s {where} column {name}: was it that of some channels?"
@@ -181,7 +192,8 @@ def _even_grid(t: np.ndarray, step: float, rounding: float) -> np.ndarray | None
             if k[-1] <= k[0]:
                 return None
             even, (step, start) = _line(k, t[:n])
-        if step <= 0 or np.ptp(t[:n] - even) > ROUNDED * rounding or (np.diff(k) < 1).any():
+        apart = np.diff(k)
+        if step <= 0 or np.ptp(t[:n] - even) > ROUNDED * rounding or apart.min() < 1 or np.median(apart) > 1:
             return None
         if n == len(t):
             return even
@@ -196,7 +208,8 @@ def period_of(t: np.ndarray, unit: float) -> float:
     steps = np.diff(t)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     back = steps[steps < 0]
-    for period in sorted({1.0, 60.0, HALF_DAY_S, *(2.0**bits * unit for bits in COUNTER_BITS)}):
+    counters = {2.0**bits * tick for bits in COUNTER_BITS for tick in (unit, *TICKS_S)}
+    for period in sorted({1.0, 60.0, HALF_DAY_S, *counters}):
         ahead = back + period
         if usual > 0 and np.ptp(t) < period and (ahead > 0).all() and (ahead <= SEAM_STEPS * usual).all():
             return period

@@ -143,9 +143,9 @@ def _unrounded(run: Run, positions: np.ndarray, nominal_step: float, source: str
             return run
         times.append(found[0])
         rounding = max(rounding, found[1])
-    rate = (len(times[0]) - 1) / float(times[0][-1] - times[0][0])
+    rate = 1 / float(np.median(np.diff(times[0])))
     notes.append(
-        f"{source}: times are rounded to {1e3 * rounding:.3g} ms: an even clock of {rate:.6g} Hz explains all of them"
+        f"{source}: times are rounded to {1e3 * rounding:.3g} ms: an even clock of {rate:.5g} Hz explains all of them"
         " and is used"
     )
     return Run(run.rows, np.concatenate(times))
