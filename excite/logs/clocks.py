@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Collection
 
@@ -92,12 +93,21 @@ def disagreement(t: np.ndarray, other: np.ndarray, name: str, column: str, one_o
     """
     there = np.isfinite(other)
     t, other = t[there], other[there]
-    if len(t) < 2 or (np.diff(t) < 0).any() or np.ptp(t) <= 0 or np.ptp(other) <= 0:
+    edges = [0, *(int(k) + 1 for k in np.flatnonzero(np.diff(t) < 0)), len(t)]
+    first, last = max(itertools.pairwise(edges), key=lambda ends: ends[1] - ends[0])
+    t, other = t[first:last], other[first:last]
+    if len(t) < 2:
         return ""
-    ratio = np.ptp(t) / np.ptp(other)
+    steps = np.diff(other)
+    rise = float(steps[steps > 0].sum())
+    if np.ptp(t) <= 0 or rise <= 0:
+        return ""
+    ratio = np.ptp(t) / rise
     unit = min(CLOCK_UNITS_S, key=lambda one: abs(np.log(ratio / one)))
     if abs(np.log(ratio / unit)) > np.log(SAME_SCALE):
         return ""
+    if (steps < 0).any() and (period := period_of(unit * other, unit)):
+        other = np.concatenate([[other[0]], other[0] + np.cumsum(steps + (steps < 0) * period / unit)])
     ahead = unit * other - t
     least = max(_tick(t), _tick(unit * other))
     low, high = (float(x) for x in np.quantile(ahead, (OUTLIERS, 1 - OUTLIERS)))

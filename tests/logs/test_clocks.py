@@ -63,9 +63,10 @@ def test_a_second_clock_that_drifts_makes_an_estimate_doubtful(emps: Model, tabl
         lambda t: t + 1000,
         lambda t: np.floor(t * 20) / 20,
         lambda t: np.round(1e3 * t),
+        lambda t: np.round(1e3 * t) % 1000,
         lambda t: (pd.Timestamp("2026-11-22") + pd.to_timedelta(t, unit="s")).dt.strftime("%Y-%m-%dT%H:%M:%S.%f"),
     ],
-    ids=["another origin", "coarse", "ms", "dates"],
+    ids=["another origin", "coarse", "ms", "ms of a second", "dates"],
 )
 def test_a_second_clock_that_agrees_is_no_doubt(
     emps: Model, table: pd.DataFrame, clock: Callable[[pd.Series], pd.Series]
@@ -88,6 +89,12 @@ def anew(table: pd.DataFrame) -> np.ndarray:
     t = table["t"].to_numpy().copy()
     t[2000:] -= t[2000]
     return t
+
+
+def test_a_second_clock_that_begins_anew_is_a_doubt(emps: Model, table: pd.DataFrame) -> None:
+    for other in (table, table.assign(t=table["t"] + 5).iloc[:1500]):  # also where the machine's does so somewhere
+        logs = prepare(emps, [pd.concat([table.assign(time=anew(table)), other.assign(time=other["t"])])], NEEDS).logs
+        assert "column time: a second clock, whose lead over column t changes by 2 s in" in logs[0].doubts[0]
 
 
 def test_a_clock_of_one_logger_that_begins_anew_is_refused(emps: Model, table: pd.DataFrame, tmp_path: Path) -> None:
