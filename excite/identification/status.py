@@ -47,7 +47,11 @@ def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
             )
         possible &= ~moved
         notes.append("with these values the mass matrix is not positive definite: no machine has them together")
-    doubt = estimate.doubt or _contradiction(model, estimate)
+    doubt = (
+        estimate.doubt
+        or _contradiction(model, estimate)
+        or "; ".join(dict.fromkeys(d for one in logs for d in one.doubts))
+    )
     if clear and not doubt:
         doubt = f"values that no machine has: check {CAUSES}"
     status = "invalid" if clear else "doubtful" if doubt else "valid"

@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
-from excite.logs import log
+from excite.logs import clocks, log
 from excite.logs.log import Log
 from excite.logs.plausibility import RATES, against, as_speed, is_speed, own_file, rated_speed, unchanging
-from excite.logs.resampling import BRIDGED_STEPS
-from excite.logs.times import has_time, seconds
+from excite.logs.resampling import BRIDGED_STEPS, held_every
+from excite.logs.times import date_and_time, has_time, seconds
 from excite.model.machine import TURN, Machine, Sensor
 
 SHOWN = 3  # places named of what is there many times
@@ -46,6 +46,10 @@ STEPS = 8.0  # counts, likewise
 CHATTER = 3.0  # times the 99 % quantile of what a channel does otherwise, below which a reading is chatter; chosen
 WRONG_RATE = 50.0  # times the machine file's rate or a part of it: time in another unit; chosen
 MANY = 0.005  # share of a channel's samples that may be repaired; chosen
+FEW = 20  # readings that do not say how fast a channel is; chosen
+SLOWER = 1.5  # times the step of the fastest channel, from which one is slower; chosen
+CUTOFFS = 10.0  # times the filter's cutoff at which a channel follows what the filter passes; chosen
+FILTERED = ("angle", "torque", "wheel", "lateral_speed")  # kinds of sensor whose readings an estimate rests on
 ORDINALS = ("", "", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
 
 
@@ -80,10 +84,17 @@ class Finding:
 
 @dataclass(frozen=True)
 class Record:
-    """A machine's channels by sensor name, as recorded."""
+    """A machine's channels by sensor name, as recorded.
+
+    clocks: times (N,) of clocks that nothing uses, by column, at rows with times t (N,) [s]. one_origin: those of them
+    that may be shifted against the machine's.
+    """
 
     machine: Machine
     channels: dict[str, Channel]
+    t: np.ndarray = field(default_factory=lambda: np.empty(0))
+    clocks: dict[str, np.ndarray] = field(default_factory=dict)
+    one_origin: frozenset[str] = frozenset()
 
     def of(self, check: str) -> list[Channel]:
         """Channels that a check looks at."""
@@ -100,7 +111,9 @@ def record_of(table: pd.DataFrame, machine: Machine) -> tuple[Record, dict[str, 
     except LogError:
         t = None
     if t is None or not 1 / WRONG_RATE < usual_step(t) * nominal < WRONG_RATE:
-        t = np.arange(len(table)) / nominal  # times in another unit say nothing of the readings
+        t, others = np.arange(len(table)) / nominal, {}  # times in another unit say nothing of the readings
+    else:
+        others = clocks.other_clocks(table, log.columns_known(machine) | set(date_and_time(table) or ()))
     for sensor in machine.sensors("full"):
         needed = log.columns_read(sensor, machine)
         if not set(needed) <= set(table.columns):
@@ -118,7 +131,9 @@ def record_of(table: pd.DataFrame, machine: Machine) -> tuple[Record, dict[str, 
         rows = np.flatnonzero(there)
         part = table if there.all() else table.iloc[rows].set_axis(range(len(rows)))
         channels[sensor.name] = Channel(sensor, t[rows], log.values_of(sensor, machine, part, ""), rows)
-    return Record(machine, channels), unread
+    used = {c for s in machine.sensor for c in s.columns}
+    own = frozenset(c for c in others if clocks.between_channels(table, c, machine.time_column, used))
+    return Record(machine, channels, t, others, own), unread
 
 
 def record_of_log(machine: Machine, one: Log) -> Record:
@@ -316,6 +331,41 @@ def held(record: Record) -> Iterator[Finding]:
         which = ORDINALS[n] if n < len(ORDINALS) else f"{n}th"
         text = f"{c.name}: changes in every {which} row only: a {rate:.3g} Hz signal that is held"
         yield Finding("held", "doubt", c.sensor.name, text)
+
+
+def slow(record: Record) -> Iterator[Finding]:
+    """Find channels that are recorded slower than others, and too slow for the filter's cutoff."""
+    steps = {c.sensor.name: _own_step(c) for c in record.channels.values() if len(c.x) >= FEW}
+    cutoff = float(record.machine.filter.cutoff_hz)
+    for c in record.of("slow"):
+        if c.sensor.kind not in FILTERED or c.sensor.name not in steps:
+            continue
+        rate = 1 / steps[c.sensor.name]
+        if steps[c.sensor.name] < SLOWER * min(steps.values()) or rate >= CUTOFFS * cutoff:
+            continue
+        text = f"{c.name}: sampled at {rate:.3g} Hz, and the filter's cutoff_hz = {cutoff:g} needs more than"
+        if rate <= 2 * cutoff:
+            text = (
+                f"{text} {2 * cutoff:g} Hz: record it faster, or write a lower cutoff_hz under [filter] in"
+                f" {own_file(record.machine)}"
+            )
+            yield Finding("slow", "fault", c.sensor.name, text)
+        else:
+            text = f"{text} {CUTOFFS * cutoff:g} Hz to be free of errors between readings"
+            yield Finding("slow", "doubt", c.sensor.name, text)
+
+
+def _own_step(c: Channel) -> float:
+    """The usual step [s] between readings of a channel, of new ones if it is held."""
+    every = held_every(c.x) if c.sensor.resolution is None else 1
+    return every * usual_step(c.t)
+
+
+def disagreeing_clocks(record: Record) -> Iterator[Finding]:
+    """Find clocks beside the machine's that run otherwise."""
+    for column, t in record.clocks.items():
+        if line := clocks.disagreement(record.t, t, record.machine.time_column, column, column in record.one_origin):
+            yield Finding("clocks", "doubt", "", line)
 
 
 def opposed(record: Record) -> Iterator[Finding]:
@@ -521,6 +571,8 @@ CHECKS: tuple[Callable[[Record], Iterator[Finding]], ...] = (
     spikes,
     dropouts,
     held,
+    slow,
+    disagreeing_clocks,
     opposed,
     constant,
     ends_of_range,

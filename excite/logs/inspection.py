@@ -11,7 +11,7 @@ from excite.logs import log
 from excite.logs.checks import Record, findings, record_of
 from excite.logs.log import Log
 from excite.logs.plausibility import doubts
-from excite.logs.preparation import as_log, at_rate_of, merge_own_times, place_rows
+from excite.logs.preparation import as_log, at_rate_of, on_one_clock, place_rows
 from excite.logs.refusal import caught, lookalike, stray_rows, unit_doubts, wrong_time_unit
 from excite.logs.repair import NEEDED, mended
 from excite.logs.resampling import BRIDGED_STEPS
@@ -88,8 +88,10 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         lines.append("no shipped machine has these columns: name yours with --machine to have them checked")
         return Inspection(source, None, len(table), np.nan, np.nan, columns, (), (), tuple(lines), {}, ())
     faults, remarks = lines, []
-    if not has_time(table, machine) and (merged := merge_own_times([table], machine)) is not None:
-        table = merged
+    unmerged = list[str]()
+    merged = caught(lambda: on_one_clock(table, machine, ""), unmerged)
+    faults += unmerged
+    table = table if merged is None else merged
     unwrapped = caught(lambda: log.unwrapped(table, machine), None)
     table = table if unwrapped is None else unwrapped
     record, unread = record_of(table, machine)
@@ -121,7 +123,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         used = _as_used(table, record, machine, {*bad, *unread}, faults, remarks)
         for with_rate, one, _ in () if faults else used:
             doubtful += doubts(with_rate, one.values, one.interpolated)
-    unknown = [c.name for c in columns if not c.what]
+    unknown = [c.name for c in columns if not c.what and c.name not in log.columns_known(machine)]
     if unknown:
         remarks.append(f"not used: {', '.join(unknown)}")
     t = np.empty(0) if t is None else t

@@ -27,7 +27,8 @@ class Log:
 
     interpolated: rows were uneven and are readings between those of the file. sampled: by sensor name the rows (N,) at
     which a channel was read, if not in all; the readings between are interpolated. edges: by encoder (N,) the edges
-    that it passed, moved to the rows' times, NaN where it passed none; for rows that were uneven.
+    that it passed, moved to the rows' times, NaN where it passed none; for rows that were uneven. doubts: why an
+    estimate from it is doubtful.
     """
 
     source: str
@@ -36,6 +37,7 @@ class Log:
     interpolated: bool = False
     sampled: dict[str, np.ndarray] = field(default_factory=dict)
     edges: dict[str, np.ndarray] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
 
     def read_in(self, sensor: str) -> np.ndarray:
         """Rows (N,) in which a sensor was read."""
@@ -153,6 +155,12 @@ def columns_read(sensor: Sensor, machine: Machine) -> tuple[str, ...]:
         return sensor.columns
     angles = [s.column for s in machine.sensor if s.kind == "angle" and s.body == sensor.body]
     return (*sensor.columns, *angles[:1])
+
+
+def columns_known(machine: Machine) -> frozenset[str]:
+    """Columns that a machine file names."""
+    own = {c for s in machine.sensor for c in (*s.columns, s.time_column) if c is not None}
+    return frozenset({machine.time_column, *own})
 
 
 def cells_of(table: pd.DataFrame, column: str, source: str) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,11 +12,14 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs import log, refusal
+from excite.logs.clocks import is_clock
+from excite.logs.files.common import UNCLEAR, UNITS_SAID, UNITS_UNKNOWN
+from excite.logs.files.layout import known_unit
 from excite.logs.log import Log
 from excite.logs.repair import NEEDED
 from excite.logs.resampling import SAME_RATE, Stretch, at_rate, even_stretches, slower
-from excite.logs.time_axis import order_rows
-from excite.logs.times import absolute_seconds, has_time, seconds
+from excite.logs.time_axis import Run, order_rows
+from excite.logs.times import absolute_seconds, has_time, refuse_swapped_dates, seconds
 from excite.model import Model
 from excite.model.machine import TIME_UNITS, UNITS, Machine, Sensor
 
@@ -24,9 +27,10 @@ FASTEST_HZ = 150.0  # rate [Hz] beyond which a rolling machine tells nothing mor
 REST_S = 5.0  # [s] of standing still that is left out; chosen
 REST_MARGIN_S = 0.3  # [s] of a rest that stays with the motion before and after it; chosen
 
-MIN_RISING_SHARE = 0.5  # of a clock's steps; coarse clocks repeat themselves, temperatures fall as often; chosen
+DIGITS = 9  # decimals [s] of times by which those of two clocks are the same
+SCALES = (1e3, 1e6, 1e9)  # by which the units of two clocks may differ
+ALIKE_SPANS = 0.2  # by which the spans of two clocks of one log may differ; chosen
 MERGED = "merged"  # of a table's attrs: channels are on one clock already
-TIME_NAME = re.compile(r"(?i)(t|time|timestamp)([_ ].*)?|.*[_ ](t|time|timestamp)([_ ].*)?")
 
 Source = str | Path | pd.DataFrame | Log
 
@@ -103,16 +107,14 @@ def read_stretches(
     """Read one log as even stretches, with notes. Raises LogError."""
     table = source if isinstance(source, pd.DataFrame) else log.table_of(source, machine)
     name = _name(source)
+    table = on_one_clock(table, machine, name)
     notes = [f"{name}: {line}" for line in table.attrs.get("notes", ())]
-    own_clocks = not has_time(table, machine) or any(s.time_column or s.time_offset for s in machine.sensor)
-    own_clocks &= MERGED not in table.attrs
-    if own_clocks and (merged := merge_own_times([table], machine)) is not None:
-        table = merged
     accepted = refusal.accept(table, machine, needs, name)
     stretches, said = place_rows(accepted.table, machine, needs, name, rate)
     used = {line.partition(" row only")[0] for line in said}  # of held channels the note says how they are used
     doubts = [line for line in accepted.doubts if line.partition(" row only")[0] not in used]
-    return stretches, [*notes, *accepted.notes, *said, *doubts]
+    doubtful = [replace(stretch, doubts=accepted.grave) for stretch in stretches]
+    return doubtful, [*notes, *accepted.notes, *said, *doubts]
 
 
 def _numbered(sources: Sequence[Source]) -> list[Source]:
@@ -141,7 +143,7 @@ def place_rows(
     t = seconds(table, machine, name)
     if line := log.too_short(len(t), machine):
         raise LogError(f"{name}: {line}")
-    runs, said = order_rows(t, table, machine.time_column, name)
+    runs, said = _ordered(t, table, machine, machine.time_column, UNITS[machine.time_unit][1], name)
     stretches = list[Stretch]()
     for run in runs:
         found, more = even_stretches(table, run, machine, name, rate)
@@ -154,34 +156,102 @@ def place_rows(
     return long or stretches, said
 
 
-def merge_own_times(tables: Sequence[pd.DataFrame], machine: Machine) -> pd.DataFrame | None:
-    """Merge channels that have times of their own into one table on all times; None if they have one clock.
+def _ordered(
+    t: np.ndarray, table: pd.DataFrame, machine: Machine, column: str, unit: float, source: str
+) -> tuple[list[Run], list[str]]:
+    """Order rows of a machine's channels with times t (N,) [s] of a clock, as `order_rows` does."""
+    turning = [s.column for s in machine.sensor if s.kind in ("angle", "wheel") and not s.is_rate]
+    positions = [c for c in turning if c in table.columns]
+    return order_rows(t, table, column, source, positions, 1 / float(machine.sampling_hz), unit)
+
+
+def on_one_clock(table: pd.DataFrame, machine: Machine, source: str) -> pd.DataFrame:
+    """Return a table with its channels on the machine's clock, if some have one of their own. Raises LogError."""
+    own_clocks = not has_time(table, machine) or any(s.time_column or s.time_offset for s in machine.sensor)
+    if MERGED in table.attrs or not own_clocks:
+        return table
+    merged = merge_own_times([table], machine, [source])
+    if merged is None:
+        return table
+    notes = [*table.attrs.get("notes", ()), *(n.removeprefix(f"{source}: ") for n in merged.attrs["notes"])]
+    merged.attrs = {**table.attrs, **merged.attrs, "notes": notes}
+    return merged
+
+
+def merge_own_times(tables: Sequence[pd.DataFrame], machine: Machine, sources: Sequence[str]) -> pd.DataFrame | None:
+    """Merge channels that have times of their own into one table on all times; None if all are on the machine's clock.
 
     A channel's clock is the sensor's `time_column`, the machine's, or the time column to the left of it in its table;
-    `time_offset` is added. Cells of a channel that has no reading at a time are blank.
+    `time_offset` is added. Cells of a channel that has no reading at a time are blank. sources: names of the tables in
+    messages. Raises LogError for a clock that begins anew or lasts a thousand times as long as another.
     """
     used = {c for s in machine.sensor for c in s.columns}
-    parts = dict[tuple[int, str, float, float], list[str]]()
+    parts = dict[tuple[int, str, str, float], list[str]]()
     for sensor in machine.sensor:
         k = next((k for k, table in enumerate(tables) if set(sensor.columns) <= set(table.columns)), None)
         clock = None if k is None else _clock(tables[k], machine, sensor, used)
         if k is None or clock is None:
             continue
-        unit = UNITS[sensor.time_unit or _unit_in_file(tables[k], clock) or machine.time_unit][1]
+        unit = sensor.time_unit or _unit_in_file(tables[k], clock) or machine.time_unit
         parts.setdefault((k, clock, unit, sensor.time_offset), []).extend(sensor.columns)
-    if len(parts) < 2:
+    if len(parts) < 2 and not any(clock in {s.time_column for s in machine.sensor} for _, clock, _, _ in parts):
         return None
     merged: pd.DataFrame | None = None
     one_unit = UNITS[machine.time_unit][1]
+    notes = list[str]()
+    spans = dict[str, float]()
     for (k, clock, unit, offset), columns in parts.items():
-        t = absolute_seconds(tables[k][clock], unit) + offset
-        one = pd.DataFrame(
-            {machine.time_column: t / one_unit, **{c: tables[k][c].to_numpy() for c in columns}}
-        ).dropna()
-        one = one.groupby(machine.time_column, as_index=False).mean(numeric_only=True)
+        t, one = _channels_in_order(tables[k], machine, clock, UNITS[unit][1], columns, sources[k], notes)
+        spans[f"{sources[k]}: column {clock}"] = float(np.ptp(t)) if len(t) else 0.0
+        one.insert(0, machine.time_column, np.round(t + offset, DIGITS) / one_unit)
         merged = one if merged is None else merged.merge(one, on=machine.time_column, how="outer")
+    _refuse_other_scale(spans)
     assert merged is not None
-    return merged.sort_values(machine.time_column, ignore_index=True)
+    merged = merged.sort_values(machine.time_column, ignore_index=True)
+    merged.attrs["notes"] = list(dict.fromkeys(notes))
+    for key in (UNITS_SAID, UNITS_UNKNOWN, UNCLEAR):
+        said = {c: v for table in tables for c, v in table.attrs.get(key, {}).items()}
+        merged.attrs[key] = {c: v for c, v in said.items() if c in used}
+    return merged
+
+
+def _channels_in_order(
+    table: pd.DataFrame,
+    machine: Machine,
+    clock: str,
+    unit: float,
+    columns: list[str],
+    source: str,
+    notes: list[str],
+) -> tuple[np.ndarray, pd.DataFrame]:
+    """Times (N,) [s] of channels with a clock of their own and their readings, in order. Raises LogError."""
+    t = absolute_seconds(table[clock], unit)
+    there = np.isfinite(t) & table[columns].notna().all(axis=1).to_numpy()
+    rows = np.flatnonzero(there)
+    refuse_swapped_dates(table.loc[there, clock], t[there], clock, source)
+    part = table.loc[there, columns].reset_index(drop=True)
+    runs, said = _ordered(t[there], part, machine, clock, unit, source) if len(rows) else ([], [])
+    if len(runs) > 1:
+        anew = ", ".join(str(rows[run.rows[0]] + 1) for run in runs[1:])
+        raise LogError(
+            f"{source}: row {anew}, column {clock}: time begins anew, and nobody knows where that is on the other"
+            " clocks; give the rows before and after as logs of their own"
+        )
+    notes += said
+    if not runs:
+        return np.empty(0), part
+    return runs[0].t, part.iloc[runs[0].rows].reset_index(drop=True)
+
+
+def _refuse_other_scale(spans: dict[str, float]) -> None:
+    """Raise LogError where a clock lasts as long as another if its numbers are in another unit. spans [s]: by clock."""
+    for (one, lasts), (other, longer) in itertools.permutations(spans.items(), 2):
+        near = [unit for unit in SCALES if lasts > 0 and abs(longer / lasts / unit - 1) < ALIKE_SPANS]
+        if near:
+            raise LogError(
+                f"{other}: lasts {longer:.4g} s, {near[0]:g} times as long as {one.rpartition(': ')[2]}: is it in"
+                " another unit? then write time_unit for its sensors in the machine file"
+            )
 
 
 def _clock(table: pd.DataFrame, machine: Machine, sensor: Sensor, used: set[str]) -> str | None:
@@ -189,21 +259,14 @@ def _clock(table: pd.DataFrame, machine: Machine, sensor: Sensor, used: set[str]
     for name in (sensor.time_column, machine.time_column):
         if name is not None and name in table.columns:
             return name
-    before = list(table.columns)[: list(table.columns).index(sensor.column)]
-    named = [str(c) for c in before if c not in used and TIME_NAME.fullmatch(str(c))]
-    clocks = [c for c in named if _rises(table[c])]
-    return clocks[-1] if clocks else None
-
-
-def _rises(column: pd.Series) -> bool:
-    """Tell if a column could be a clock: most of its numbers are larger than the one before; text may be a clock."""
-    values = pd.to_numeric(column, errors="coerce").dropna().to_numpy(dtype=float)
-    return len(values) < 2 or float(np.mean(np.diff(values) > 0)) > MIN_RISING_SHARE
+    before = map(str, list(table.columns)[: list(table.columns).index(sensor.column)])
+    found = [c for c in before if c not in used and is_clock(c, table[c], table.attrs.get(UNITS_SAID, {}).get(c))]
+    return found[-1] if found else None
 
 
 def _unit_in_file(table: pd.DataFrame, clock: str) -> str | None:
     """Return the unit of a time column that the file states, if it is known."""
-    unit = table.attrs.get("units", {}).get(clock)
+    unit = known_unit(table.attrs.get(UNITS_SAID, {}).get(clock, ""))
     return unit if unit in TIME_UNITS else None
 
 
@@ -218,13 +281,19 @@ def _joined(sources: Sequence[Source], machine: Machine) -> list[Source]:
     whole = any(columns == needed for columns in own)
     if whole or set().union(*own) != needed or any(not columns for columns in own):
         return list(sources)
-    merged = merge_own_times(tables, machine)
+    merged = merge_own_times(tables, machine, [_name(s) for s in files])
     if merged is None:
         return list(sources)
     names = " and ".join(str(s) for s in files if not isinstance(s, pd.DataFrame))
     merged.attrs["source"] = names or "log"
     merged.attrs[MERGED] = True
-    merged.attrs["notes"] = ["channels of several files are put together by their times"]
+    said = [
+        f"{_name(s)}: {line}" for s, table in zip(files, tables, strict=True) for line in table.attrs.get("notes", ())
+    ]
+    merged.attrs["notes"] = [
+        "channels of several files are put together by their times",
+        *dict.fromkeys([*said, *merged.attrs["notes"]]),
+    ]
     return [*(s for s in sources if isinstance(s, Log)), merged]
 
 
@@ -255,7 +324,7 @@ def as_log(stretch: Stretch, machine: Machine, needs: Sequence[str], source: str
     made = log.from_table(table, machine, needs, source, np.arange(len(table)) / stretch.rate)
     edges = {s.name: s.gain * stretch.edges[s.column] for s in machine.sensors("full") if s.column in stretch.edges}
     sampled = {s.name: stretch.sampled[s.column] for s in machine.sensors("full") if s.column in stretch.sampled}
-    return replace(made, interpolated=stretch.interpolated, sampled=sampled, edges=edges)
+    return replace(made, interpolated=stretch.interpolated, sampled=sampled, edges=edges, doubts=stretch.doubts)
 
 
 def without_rests(one: Log, machine: Machine, notes: list[str]) -> list[Log]:

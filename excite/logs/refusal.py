@@ -14,6 +14,8 @@ import pandas as pd
 from excite.errors import LogError
 from excite.logs import log
 from excite.logs.checks import Finding, findings, record_of, refuse
+from excite.logs.files.common import UNITS_UNKNOWN
+from excite.logs.files.layout import known_unit
 from excite.logs.plausibility import own_file
 from excite.logs.repair import mended
 from excite.logs.tables import COMMENTS
@@ -22,16 +24,23 @@ from excite.model.machine import UNITS, Machine
 
 T = TypeVar("T")
 
+GRAVE = ("clocks", "slow")  # checks whose doubts, as those of units, make an estimate doubtful
+NO_UNIT = ("-", "1", "n/a", "na", "none", "raw")  # written where a unit would be; compared without case
+PREFIXES = "numkMG"  # of units: nano to giga
 CLOSE = 0.05  # of a unit's size, when a wrong rate of sampling is taken for time in that unit
 
 
 @dataclass(frozen=True)
 class Accepted:
-    """A table without faults, repaired, with what was done to it and what is doubtful about it."""
+    """A table without faults, repaired, with what was done to it and what is doubtful about it.
+
+    grave: those doubts that make an estimate doubtful.
+    """
 
     table: pd.DataFrame
     notes: tuple[str, ...]
     doubts: tuple[str, ...]
+    grave: tuple[str, ...] = ()
 
 
 def accept(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log") -> Accepted:
@@ -60,8 +69,11 @@ def accept(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sou
     doubtful = refuse([*cells, *seen], source)
     clean, notes = mended(table, record, source)
     bridged = [f"{source}: {f.text}" for f in seen if f.check == "dropouts" and f.kind == "remark"]
-    units = [f"{source}: {line}" for line in unit_doubts(table, machine)[0]]
-    return Accepted(clean, (*notes, *bridged), (*units, *doubtful))
+    differ, unheard = unit_doubts(table, machine)
+    units = [f"{source}: {line}" for line in differ]
+    notes = (*notes, *(f"{source}: {line}" for line in unheard))
+    grave = [f"{source}: {f.text}" for f in seen if f.kind == "doubt" and f.check in GRAVE]
+    return Accepted(clean, (*notes, *bridged), (*units, *doubtful), (*units, *grave))
 
 
 def unit_doubts(table: pd.DataFrame, machine: Machine) -> tuple[list[str], list[str]]:
@@ -74,17 +86,31 @@ def unit_doubts(table: pd.DataFrame, machine: Machine) -> tuple[list[str], list[
             quantity, size = "", abs(float(sensor.factor))
         own |= dict.fromkeys(sensor.columns, (sensor.unit, quantity, size))
     differ, unknown = [], []
-    for name, unit in said.items():
-        if name not in own or unit in (own[name][0], "-"):
+    for name, text in said.items():
+        unit = known_unit(text)
+        if name not in own or own[name][0] in (text, unit) or text == "-":
             continue
         named, quantity, size = own[name]
-        if unit not in UNITS:
-            unknown.append(f"{unit} for {name}")
+        if not unit:
+            unknown.append(f"{text} for {name}")
         elif not np.isclose(UNITS[unit][1], size, rtol=1e-6, atol=0) or quantity not in ("", UNITS[unit][0]):
             line = f'{"time_unit" if name == machine.time_column else "unit"} = "{unit}"'
             mend = f"if the file is right, write {line} in {own_file(machine)}"
             what = mend if quantity == UNITS[unit][0] else "which is right?"
             differ.append(f"the file says {unit} in column {name}, the machine file {named}: {what}")
+    bracketed: dict[str, str] = table.attrs.get(UNITS_UNKNOWN, {})
+    for name, text in bracketed.items():
+        unit = text[1:-1].strip()
+        if name not in own or name.endswith(text) or unit.lower() in (own[name][0].lower(), *NO_UNIT):
+            continue  # a machine file that has the name with its brackets knows of it
+        named = own[name][0]
+        if any(one[:1] in PREFIXES and one[1:] == other for one, other in ((unit, named), (named, unit))):
+            differ.append(f"the file says {unit} in column {name}, the machine file {named}: which is right?")
+        elif text[0] == "[":
+            differ.append(
+                f"the file says {unit} in column {name}, which is not a known unit, the machine file {named}: which is"
+                " right?"
+            )
     listed = f"the line below the header is taken for units, which are not known: {', '.join(unknown)}"
     return differ, [listed] if unknown else []
 

@@ -21,6 +21,7 @@ from excite.logs.time_axis import Run
 from excite.model.machine import Machine, Sensor
 
 EVEN = 0.02  # relative deviation of a step from the usual one up to which rows are even; chosen
+DRIFTED = 0.5  # of a step by which even rows may leave an even clock; chosen
 SAME_RATE = 1e-4  # relative deviation of two rates of sampling that count as one: 0.1 deviation of a mass; chosen
 BRIDGED_STEPS = (
     3.5  # usual steps from one reading to the next, up to which what is lost between is interpolated; chosen
@@ -34,7 +35,10 @@ HELD_ROWS = 0.9  # share of changes of a channel in every n-th row, from which i
 
 @dataclass(frozen=True)
 class Stretch:
-    """Even rows: a table in the machine's columns without times, its first row's time [s], and the rate [Hz]."""
+    """Even rows: a table in the machine's columns without times, its first row's time [s], and the rate [Hz].
+
+    doubts: why an estimate from it is doubtful.
+    """
 
     table: pd.DataFrame
     start: float
@@ -43,6 +47,7 @@ class Stretch:
     interpolated: bool = False
     sampled: dict[str, np.ndarray] = field(default_factory=dict)
     edges: dict[str, np.ndarray] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
 
 
 def used_sensors(table: pd.DataFrame, machine: Machine) -> list[Sensor]:
@@ -79,9 +84,8 @@ def even_stretches(
         if not rows.any():
             raise LogError(f"{source}: column {name}: there is no number in it; leave the column out")
     nominal, own = float(machine.sampling_hz), _usual_rate(run.t, there)
-    dt = np.diff(run.t)
     whole = all(rows.all() for rows in there.values())
-    if whole and _is_even(dt, own):
+    if whole and _is_even(run.t, own):
         own = (len(run.t) - 1) / float(run.t[-1] - run.t[0])
         own = nominal if abs(own / nominal - 1) < SAME_RATE else own
         stretch = Stretch(part, float(run.t[0]), own, int(run.rows[0]))
@@ -162,8 +166,15 @@ def _usual_rate(t: np.ndarray, there: dict[str, np.ndarray]) -> float:
     return 1 / min(steps) if steps and min(steps) > 0 else np.nan
 
 
-def _is_even(dt: np.ndarray, rate: float) -> bool:
-    return bool(len(dt)) and bool(np.abs(dt * rate - 1).max() <= EVEN)
+def _is_even(t: np.ndarray, rate: float) -> bool:
+    """Tell if times (N,) [s] are even steps, which also stay along an even clock."""
+    return len(t) > 1 and bool(np.abs(np.diff(t) * rate - 1).max() <= EVEN) and not _drifts(t)
+
+
+def _drifts(t: np.ndarray) -> bool:
+    """Tell if times (N,) [s] leave the even clock from the first to the last of them."""
+    step = float(t[-1] - t[0]) / (len(t) - 1)
+    return bool(np.abs(t - t[0] - step * np.arange(len(t))).max() > DRIFTED * step)
 
 
 def _holes(t: np.ndarray, longest: float) -> list[tuple[float, float]]:
@@ -200,7 +211,9 @@ def at_rate(stretch: Stretch, machine: Machine, rate: float) -> Stretch:
             near = np.round(at).astype(int)
             whole = counted and np.abs(at - near).max() < 1e-6
             columns[name] = x[near] if whole else np.interp(grid, t, x)
-    return Stretch(pd.DataFrame(columns), stretch.start, rate, stretch.first_row, interpolated=True)
+    return Stretch(
+        pd.DataFrame(columns), stretch.start, rate, stretch.first_row, interpolated=True, doubts=stretch.doubts
+    )
 
 
 def _block_means(x: np.ndarray, width: int) -> np.ndarray:
@@ -267,10 +280,12 @@ def _notes(
     elif sparse:
         notes.append(f"{source}: {sparse} empty {'cell' if sparse == 1 else 'cells'}, interpolated")
     even = np.abs(wide / step - np.round(wide / step)).max() < 5 * EVEN if len(wide) else True
-    if not even:
+    drifting = not lost and not sparse and len(spans) == 1 and _drifts(t)
+    if not even or drifting:
         low, high = 1e3 * float(np.quantile(dt, 0.01)), 1e3 * float(np.quantile(dt, 0.99))
+        slow = ", and the steps drift" if even else ""
         notes.append(
-            f"{source}: rows are {low:.3g} to {high:.3g} ms apart, interpolated at their own times onto"
+            f"{source}: rows are {low:.3g} to {high:.3g} ms apart{slow}, interpolated at their own times onto"
             f" {1e3 / grid:.4g} ms"
         )
     elif lost and not sparse:
@@ -283,6 +298,7 @@ def _notes(
             f" between, {used:.4g} of {last - first:.4g} s"
         )
     whole = float(t[-1] - t[0])
-    if last - first < 0.99 * whole:
+    longest = max((_usual_step(t[rows]) for rows in there.values()), default=0.0)
+    if whole - (last - first) > min(0.01 * whole, BRIDGED_STEPS * longest):
         notes.append(f"{source}: not all channels last as long: used are {last - first:.4g} of {whole:.4g} s")
     return notes

@@ -9,7 +9,7 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs.files import BAG_FOLDER, READERS
-from excite.logs.files.common import NOTES, OTHER_NAMES, TIMESTAMPS, UNCLEAR as UNCLEAR, UNITS_SAID
+from excite.logs.files.common import NOTES, OTHER_NAMES, TIMESTAMPS, UNCLEAR as UNCLEAR, UNITS_SAID, UNITS_UNKNOWN
 from excite.logs.files.text import COMMENTS as COMMENTS
 
 MDF_TIME = TIMESTAMPS
@@ -35,7 +35,7 @@ def read_table(path: str | Path, wanted: Iterable[str] = ()) -> pd.DataFrame:
     table = reader(path, frozenset(wanted))
     if table.empty:
         raise LogError(f"{path}: no rows of data")
-    for key, none in ((UNITS_SAID, {}), (NOTES, []), (OTHER_NAMES, {}), (UNCLEAR, {})):
+    for key, none in ((UNITS_SAID, {}), (UNITS_UNKNOWN, {}), (NOTES, []), (OTHER_NAMES, {}), (UNCLEAR, {})):
         table.attrs.setdefault(key, none)
     return table
 
@@ -60,7 +60,7 @@ def with_names(table: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
         return table
     attrs = dict(table.attrs)
     table = table.rename(columns=renamed)
-    for key in (UNITS_SAID, UNCLEAR):
+    for key in (UNITS_SAID, UNITS_UNKNOWN, UNCLEAR):
         attrs[key] = {renamed.get(c, c): v for c, v in attrs.get(key, {}).items()}
     attrs[OTHER_NAMES] = {own: renamed.get(c, c) for own, c in other.items()} | renamed
     table.attrs = attrs

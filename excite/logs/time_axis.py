@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
+from excite.logs.clocks import goes_on, period_of, unrounded
 from excite.logs.times import DAY_S
 
 HOUR_S = 3600.0  # [s] by which a clock is set for summer time
 SLACK_STEPS = 20.0  # steps by which a clock's jump may differ from a whole day or hour; chosen
 MIN_RUN_ROWS = 20  # rows that a part of a log must have to be a log of its own; chosen
+SHOWN = 3  # rows named of what is there many times
+GAP_STEPS = 10.0  # usual steps to the next row, from which a clock may have stood between; chosen
 SORTED_EVEN = 0.05  # relative deviation of steps up to which sorted rows count as even; chosen
 
 
@@ -24,11 +28,22 @@ class Run:
     t: np.ndarray
 
 
-def order_rows(t: np.ndarray, table: pd.DataFrame, column: str, source: str) -> tuple[list[Run], list[str]]:
+def order_rows(
+    t: np.ndarray,
+    table: pd.DataFrame,
+    column: str,
+    source: str,
+    positions: Sequence[str] = (),
+    nominal_step: float = 0.0,
+    unit: float = 1.0,
+) -> tuple[list[Run], list[str]]:
     """Bring rows with times t (N,) [s] into runs of increasing time, with a note for each thing that was done.
 
-    A time of day past midnight and a clock set back an hour are read on; rows that repeat the one before are dropped;
-    a clock coarser than the rows is replaced by even steps along it; where time begins anew a new run begins.
+    A time of day past midnight, a clock set back an hour and a counter that begins anew while positions move on are
+    read on; rows that repeat the one before are dropped; a clock coarser than the rows, or rounded, is replaced by even
+    steps along it; where time begins anew a new run begins.
+
+    positions: columns of positions. nominal_step [s]: of the machine file. unit [s]: of the clock's numbers.
     Raises LogError where the order can't be known.
     """
     rows, notes = np.arange(len(t)), list[str]()
@@ -39,6 +54,12 @@ def order_rows(t: np.ndarray, table: pd.DataFrame, column: str, source: str) -> 
         for k in np.flatnonzero(np.abs(np.diff(t) + span) <= SLACK_STEPS * step):
             t[k + 1 :] += span
             notes.append(f"{source}: row {k + 2}, column {column}: {what}, read on")
+    known = _numbers(table, positions)
+    back = np.flatnonzero(np.diff(t) < 0) + 1
+    if len(back) and (period := period_of(t, unit)) and goes_on(known, back):
+        t += period * np.searchsorted(back, rows, side="right")
+        where = ", ".join(str(k + 1) for k in back[:SHOWN]) + (", ..." if len(back) > SHOWN else "")
+        notes.append(f"{source}: row {where}, column {column}: the clock begins anew every {period:.6g} s, read on")
     repeated = np.flatnonzero(np.diff(t) == 0) + 1
     if len(repeated):
         before = table.iloc[repeated - 1].reset_index(drop=True)
@@ -52,7 +73,14 @@ def order_rows(t: np.ndarray, table: pd.DataFrame, column: str, source: str) -> 
             )
             notes.append(f"{source}: {which}, the copies are left out")
     runs = _split(rows, t, column, source, notes)
-    return [_even_ticks(run, column, source, notes) for run in runs], notes
+    runs = [_even_ticks(run, column, source, notes) for run in runs]
+    return [_unrounded(run, known, nominal_step, source, notes) for run in runs], notes
+
+
+def _numbers(table: pd.DataFrame, columns: Sequence[str]) -> np.ndarray:
+    """Numbers (N, p) of columns."""
+    found = [pd.to_numeric(table[c], errors="coerce").to_numpy(dtype=float) for c in columns]
+    return np.column_stack(found) if found else np.empty((len(table), 0))
 
 
 def _split(rows: np.ndarray, t: np.ndarray, column: str, source: str, notes: list[str]) -> list[Run]:
@@ -99,3 +127,25 @@ def _even_ticks(run: Run, column: str, source: str, notes: list[str]) -> Run:
         f" clock ticks every {tick:.3g} s, the rows are taken to be {slope:.4g} s apart"
     )
     return Run(run.rows, start + slope * k)
+
+
+def _unrounded(run: Run, positions: np.ndarray, nominal_step: float, source: str, notes: list[str]) -> Run:
+    """A run whose stamps are those of an even clock, but rounded, at that clock's times, between one gap and the
+    next."""
+    steps = np.diff(run.t)
+    usual = float(np.mean(steps)) if len(steps) else 0.0
+    usual = float(np.mean(steps[steps <= GAP_STEPS * usual])) if usual > 0 else 0.0
+    gaps = np.flatnonzero(steps > GAP_STEPS * usual) + 1
+    parts, times, rounding = np.split(np.arange(len(run.t)), gaps), list[np.ndarray](), 0.0
+    for part in parts:
+        found = unrounded(run.t[part], nominal_step, positions[run.rows[part]])
+        if found is None:
+            return run
+        times.append(found[0])
+        rounding = max(rounding, found[1])
+    rate = 1 / float(np.median(np.diff(times[0])))
+    notes.append(
+        f"{source}: times are rounded to {1e3 * rounding:.3g} ms: an even clock of {rate:.5g} Hz explains all of them"
+        " and is used"
+    )
+    return Run(run.rows, np.concatenate(times))

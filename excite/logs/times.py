@@ -33,12 +33,15 @@ SECONDS_BY_WORD = {
 }
 NUMBER_AND_UNIT = re.compile(r"\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)\s*([a-zµ]+)\s*")
 CLOCK = re.compile(r"\s*([+-]?)(?:(\d+)\s+days?,?\s*)?\+?(\d+):(\d{1,2})(?::(\d{1,2}))?(?:[.,:](\d+))?\s*")
+DAY_MONTH = re.compile(r"(\d{1,2})([-./])(\d{1,2})[-./]\d{2,4}(?!\d)")  # 22/11/2026
+MONTHS = 12
+DAYS_PER_MONTH = 30.4  # [day]
 FIRST_YEAR, LAST_YEAR = 1678, 2261  # whose nanoseconds fit 64 bits
 
 
 def has_time(table: pd.DataFrame, machine: Machine) -> bool:
     """Tell if a table has the machine's time column, or a date and a time of day in two columns."""
-    return machine.time_column in table.columns or _date_and_time(table) is not None
+    return machine.time_column in table.columns or date_and_time(table) is not None
 
 
 def seconds(table: pd.DataFrame, machine: Machine, source: str) -> np.ndarray:
@@ -47,7 +50,7 @@ def seconds(table: pd.DataFrame, machine: Machine, source: str) -> np.ndarray:
     Numbers are in the machine file's `time_unit`. Raises LogError with the first cell that is not understood.
     """
     name = machine.time_column
-    pair = _date_and_time(table)
+    pair = date_and_time(table)
     if pair is not None and (name not in table.columns or name in pair):
         raw = table[pair[0]].astype(str).str.strip() + " " + table[pair[1]].astype(str).str.strip()
     else:
@@ -62,6 +65,7 @@ def seconds(table: pd.DataFrame, machine: Machine, source: str) -> np.ndarray:
         more = f"; {int(bad.sum())} such cells in this column" if bad.sum() > 1 else ""
         advice = "cut the row" if empty else "write seconds, or ISO 8601 (2026-11-22T10:00:00.010)"
         raise LogError(f"{source}: row {k + 1}, column {name}: {what}{more}; {advice}")
+    refuse_swapped_dates(raw, found, name, source)
     return found
 
 
@@ -87,7 +91,7 @@ def absolute_seconds(raw: pd.Series, unit: float) -> np.ndarray:
     return found
 
 
-def _date_and_time(table: pd.DataFrame) -> tuple[str, str] | None:
+def date_and_time(table: pd.DataFrame) -> tuple[str, str] | None:
     """Find the names of a date column and a time-of-day column."""
     names = {str(c).strip().lower(): str(c) for c in table.columns}
     if "date" not in names or "time" not in names:
@@ -150,18 +154,76 @@ def _clock(text: pd.Series) -> np.ndarray:
 
 
 def _dates(text: pd.Series) -> np.ndarray:
-    """Dates: ISO 8601 in all its forms, with the day first where there are points, or what pandas recognises."""
+    """Times (N,) [s] of dates from the first one, NaN where a cell is none."""
+    parsed = _datetimes(text)
+    return _since_first(parsed.astype("datetime64[ns, UTC]").astype("int64"), parsed.isna())
+
+
+def _datetimes(text: pd.Series) -> pd.Series:
+    """Dates: ISO 8601 in all its forms, with the day first where `_day_first` says so, or what pandas recognises."""
     text = text.str.replace(r"(:\d{2}),(\d)", r"\1.\2", regex=True)
-    dotted = bool(re.match(r"\d{1,2}\.\d{1,2}\.\d{2,4}", text[text != ""].iloc[0]))
-    best = np.full(len(text), np.nan)
+    best = pd.Series(pd.NaT, text.index, dtype="datetime64[ns, UTC]")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a format that pandas has to guess
-        for how in ({"format": "ISO8601"}, {"format": "mixed", "dayfirst": dotted}):
+        for how in ({"format": "ISO8601"}, {"format": "mixed", "dayfirst": _day_first(text)}):
             parsed = pd.to_datetime(text, errors="coerce", utc=True, **how)
             parsed = parsed.where(parsed.dt.year.between(FIRST_YEAR, LAST_YEAR))
-            found = _since_first(parsed.astype("datetime64[ns, UTC]").astype("int64"), parsed.isna())
-            if np.isfinite(found).sum() > np.isfinite(best).sum():
-                best = found
-            if np.isfinite(best).all():
+            if parsed.notna().sum() > best.notna().sum():
+                best = parsed
+            if best.notna().all():
                 break
     return best
+
+
+def _day_first(text: pd.Series) -> bool:
+    """Tell if dates such as 3/4/2026 have the day first: one day has no month of its number, or they have points, or
+    then all of them are nearer to each other."""
+    first, second, separator = _day_and_month(text)
+    if not len(first) or (first > MONTHS).any() or (second > MONTHS).any():
+        return bool((first > MONTHS).any())
+    if separator == ".":
+        return True
+    return bool(np.ptp(first + DAYS_PER_MONTH * second) < np.ptp(second + DAYS_PER_MONTH * first))
+
+
+def _day_and_month(text: pd.Series) -> tuple[np.ndarray, np.ndarray, str]:
+    """The two numbers (M,) before the year of dates that end with it, and what is between, "" where there is none."""
+    if not DAY_MONTH.match(text[text != ""].iloc[0] if (text != "").any() else ""):
+        return np.empty(0), np.empty(0), ""
+    parts = text.str.extract(DAY_MONTH).dropna()
+    return parts[0].to_numpy(dtype=float), parts[2].to_numpy(dtype=float), str(parts[1].iloc[0])
+
+
+def refuse_swapped_dates(raw: pd.Series, t: np.ndarray, column: str, source: str) -> None:
+    """Raise LogError where day and month are swapped in some of the dates behind times t (N,) [s]."""
+    is_text = raw.dtype.kind in "OTU"
+    far = np.flatnonzero(np.abs(np.diff(t)) >= DAY_S)
+    if not len(far) or not (is_text or raw.dtype.kind == "M" or isinstance(raw.dtype, pd.DatetimeTZDtype)):
+        return
+    advice = "write all dates alike, best as 2026-11-22"
+    text = raw.astype(str).str.strip()
+    if is_text:
+        if pd.to_numeric(text, errors="coerce").notna().any():
+            return
+        first, second, _ = _day_and_month(text)
+        if (first > MONTHS).any() and (second > MONTHS).any():
+            a, b = sorted((int(np.argmax(first > MONTHS)), int(np.argmax(second > MONTHS))))
+            raise LogError(
+                f"{source}: rows {a + 1} and {b + 1}, column {column}: dates with the day first and with the month"
+                f" first ({text.iloc[a][:30]}, {text.iloc[b][:30]}); {advice}"
+            )
+    dates = _datetimes(text)
+    for k in far:
+        before, after = dates.iloc[k], dates.iloc[k + 1]
+        if pd.isna(before) or pd.isna(after):
+            continue
+        if any(abs((b - a).total_seconds()) < DAY_S for a, b in ((_swapped(before), after), (before, _swapped(after)))):
+            raise LogError(
+                f"{source}: row {k + 2}, column {column}: the date goes from {before:%Y-%m-%d} to {after:%Y-%m-%d}: are"
+                f" day and month swapped in one of them? {advice}"
+            )
+
+
+def _swapped(date: pd.Timestamp) -> pd.Timestamp:
+    """A date with day and month swapped, as it is where that is none."""
+    return date.replace(month=date.day, day=date.month) if date.day <= MONTHS else date

@@ -45,6 +45,7 @@ LOG_CHECKS = {
     "spikes": "single readings far from their neighbours, which are repaired",
     "dropouts": "readings that stand still while the machine moves",
     "held": "readings that change in every n-th row only",
+    "slow": "readings that are too far apart for the filter's cutoff",
     "constant": "a channel that never changes",
     "range": "readings that stand at the end of their range",
     "counts": "steps that are not whole counts",

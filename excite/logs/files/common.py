@@ -22,8 +22,10 @@ Reader = Callable[[Path, frozenset[str]], pd.DataFrame]  # of a file, and names 
 TIMESTAMPS = "timestamps"  # column of time [s] from the first sample on, of formats that name none
 NOTES = "notes"  # of a table's attrs: what reading it left out or took for what
 UNITS_SAID = "units"  # of a table's attrs: units that the file gives, by column
+UNITS_UNKNOWN = "units_unknown"  # of a table's attrs: what else the file gives as a unit in brackets, by column
 OTHER_NAMES = "other_names"  # of a table's attrs: further names of columns -> the column
 UNCLEAR = "unclear"  # of a table's attrs: what is said of columns whose numbers may be read in two ways
+LATE_S = 1.0  # [s] by which a message may be late; a clock that goes back further begins anew; chosen
 MOST_CELLS = 250_000_000  # numbers of a table, 2 GB: an hour at 1 kHz of 70 columns; chosen
 MOST_COLUMNS = 10_000  # of a table of cells; chosen
 MOST_BYTES = 2_000_000_000  # of unpacked text; chosen
@@ -137,6 +139,12 @@ def merged(path: Path, groups: Sequence[tuple[np.ndarray, Mapping[str, np.ndarra
     notes, nths = [], []
     for k, (t, columns) in enumerate(joined):
         if (np.diff(t) < 0).any():
+            last = int(np.argmin(np.diff(t)))
+            if (back := t[last] - t[last + 1]) > LATE_S:
+                raise LogError(
+                    f"{path}: the times of {next(iter(columns), 'a group')} go back by {back:.4g} s after sample"
+                    f" {last + 1}: its clock begins anew there; cut the file into logs of their own"
+                )
             notes.append(f"the times of {next(iter(columns), 'a group')} go back, its samples were put in order")
             order = np.argsort(t, kind="stable")
             joined[k] = t[order], {name: values[order] for name, values in columns.items()}

@@ -21,6 +21,7 @@ from excite.logs.files.common import (
     NOTES,
     OTHER_NAMES,
     UNITS_SAID,
+    UNITS_UNKNOWN,
     lacking,
     refuse_huge,
 )
@@ -50,7 +51,7 @@ def read_excel(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
             has = len(wanted & {*map(str, table.columns), *table.attrs[OTHER_NAMES]})
             if has > most:
                 best, most = table, has
-                best.attrs[NOTES] = [f"read from sheet {sheet.title}"] if count > 1 else []
+                best.attrs[NOTES] += [f"read from sheet {sheet.title}"] if count > 1 else []
             if has == len(wanted):
                 break
     finally:
@@ -85,6 +86,8 @@ def _sheet(path: Path, sheet: Any) -> pd.DataFrame | None:
         raise LogError(f"{path}: sheet {sheet.title}, row {at.header + 1}: column {twice[0]} is there twice, keep one")
     table = pd.DataFrame({name: _column([line[k] for line in cells]) for k, name in enumerate(names) if name})
     table.attrs |= {
+        NOTES: layout.left_out([cells if any(map(str.strip, cells)) else [] for cells in rows], at),
+        UNITS_UNKNOWN: layout.unknown_units(names),
         UNITS_SAID: layout.bracketed_units(names) | at.units,
         OTHER_NAMES: layout.without_units(names) | at.other,
     }

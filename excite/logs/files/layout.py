@@ -12,6 +12,34 @@ from excite.model.machine import UNITS
 COMMA = re.compile(r"\s*[+-]?(?:\d*|\d{1,3}(?:\.\d{3})+),\d+(?:[eE][+-]?\d+)?\s*")  # perhaps with points: 1.238,5
 UNIT_WORDS = ("unit", "units", "einheit", "einheiten")  # what stands before a line of units
 BRACKETED = re.compile(r"(.*?\S)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]")  # theta1 [deg]
+UNIT_LIKE = re.compile(r"[^\W\d_][^\W_]{0,11}([ */^.-][^\W_]{1,6}){0,2}|[%\u2030]")  # no number of an element, no name
+SPELLINGS = {
+    "radian": "rad",
+    "radians": "rad",
+    "degree": "deg",
+    "degrees": "deg",
+    "rad/sec": "rad/s",
+    "deg/sec": "deg/s",
+    "u/min": "rpm",
+    "r/min": "rpm",
+    "rev/min": "rpm",
+    "hz": "Hz",
+    "meter": "m",
+    "metre": "m",
+    "m/sec": "m/s",
+    "kph": "km/h",
+    "kmh": "km/h",
+    "n m": "N m",
+    "kn m": "kN m",
+    "sec": "s",
+    "secs": "s",
+    "second": "s",
+    "seconds": "s",
+    "msec": "ms",
+    "usec": "us",
+    "days": "day",
+}  # of units; written without case
+WORD_LINES = 2  # lines of units and of other names below a header
 LONGEST_UNIT = 12  # characters; what is longer is a name; chosen
 ALIKE = 5  # rows below the first one of data that are looked at as well; chosen
 
@@ -96,6 +124,16 @@ def _are_units(cells: Sequence[str]) -> bool:
     return cells[0].lower().strip(":") in UNIT_WORDS or any(_unit(cell) in UNITS for cell in cells)
 
 
+def left_out(rows: Sequence[Sequence[str]], found: Layout) -> list[str]:
+    """Say which rows between the header and the first one of data are left out: they hold numbers, or are more than
+    lines of units and of other names would be."""
+    between = [k for k in range(found.header + 1, min(found.start, len(rows))) if rows[k]]
+    if len(between) <= WORD_LINES and not any(is_numeric(cell) for k in between for cell in rows[k]):
+        return []
+    lines = f"line {between[0] + 1}" if len(between) == 1 else f"lines {between[0] + 1} to {between[-1] + 1}"
+    return [f"{lines}: no row of data yet, left out"]
+
+
 def beside_header(
     names: Sequence[str], below: Sequence[Sequence[str]], above: Sequence[Sequence[str]] = ()
 ) -> tuple[dict[str, str], dict[str, str]]:
@@ -116,10 +154,29 @@ def beside_header(
     return units, other
 
 
+def known_unit(text: str) -> str:
+    """The unit that a text means in any usual spelling, as UNITS has it; "" where none is meant."""
+    plain = text.strip()
+    if plain in UNITS:
+        return plain
+    plain = re.sub(r"\s*[\u00b7\u22c5*.\u2219-]\s*", " ", plain).replace("\u03bc", "u").replace("\u00b5", "u")
+    return next((u for u in (plain, SPELLINGS.get(plain.lower(), "")) if u in UNITS), "")
+
+
 def bracketed_units(names: Sequence[str]) -> dict[str, str]:
     """Known units in brackets behind names, by column: theta1 [deg] -> deg."""
     matches = {name: BRACKETED.fullmatch(name) for name in names}
-    return {name: m.group(2) for name, m in matches.items() if m is not None and m.group(2) in UNITS}
+    return {name: unit for name, m in matches.items() if m is not None and (unit := known_unit(m.group(2)))}
+
+
+def unknown_units(names: Sequence[str]) -> dict[str, str]:
+    """What stands in brackets behind names and is no known unit, by column, with its brackets: vir [mV] -> [mV]."""
+    matches = {name: BRACKETED.fullmatch(name) for name in names}
+    return {
+        name: name[m.end(1) :].strip()
+        for name, m in matches.items()
+        if m is not None and not known_unit(m.group(2)) and UNIT_LIKE.fullmatch(m.group(2))
+    }
 
 
 def without_units(names: Sequence[str]) -> dict[str, str]:

@@ -15,7 +15,7 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs.files import layout
-from excite.logs.files.common import MOST_BYTES, MOST_COLUMNS, NOTES, OTHER_NAMES, UNCLEAR, UNITS_SAID
+from excite.logs.files.common import MOST_BYTES, MOST_COLUMNS, NOTES, OTHER_NAMES, UNCLEAR, UNITS_SAID, UNITS_UNKNOWN
 from excite.logs.files.layout import COMMA, Layout, is_data, is_numeric, is_words
 
 SEPARATORS = ("\t", ";", ",", "|")
@@ -51,6 +51,11 @@ def read_text(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
     comment = lines[found.header].lstrip().startswith(COMMENTS)
     if comment:
         notes.append(f"line {found.header + 1}: the header was taken from a comment")
+    below = range(found.header + 1, found.start)
+    cells = {k: _row(path, lines, k, separator) for k in below if lines[k].strip()}
+    comments = {k for k, c in cells.items() if lines[k].lstrip().startswith(COMMENTS) and len(c) < len(found.names)}
+    rows = [cells[k] if k in cells and k not in comments else [] for k in range(found.start)]
+    notes += layout.left_out(rows, found)
     raw = raw[: _whole_rows(path, raw, found, separator, notes)]
     counts = Counter(found.names)
     twice = [name for name in counts for _ in range(counts[name] - 1)]
@@ -88,6 +93,7 @@ def read_text(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
         table[name] = _dates(table[name])
     other = layout.without_units(found.names) | found.other
     table.attrs |= {
+        UNITS_UNKNOWN: layout.unknown_units(found.names),
         UNITS_SAID: layout.bracketed_units(found.names) | found.units,
         UNCLEAR: unclear,
         OTHER_NAMES: other,
