@@ -28,11 +28,12 @@ CAUSES = "the sign of a torque or angle column, a unit, or a radius in the machi
 def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter) -> Estimate:
     """Give an estimate its status, and mark values that no machine has.
 
-    Status: `valid`; `doubtful` if the 95 % intervals do not hold, `doubt` says why; `invalid` if some value is
-    impossible by far, beyond its standard deviation and by the size that the machine file gives: then there is no
-    estimate.
+    Status: `valid`; `doubtful` if the 95 % intervals do not hold, `doubt` says why; `invalid` if some value has a sign
+    that no machine has, beyond its standard deviation and by the size that the machine file gives: then there is no
+    estimate. Values that are impossible only together, by as much, leave it doubtful.
     """
     possible, clear = _signs_hold(model, estimate)
+    together = ""
     definite = _is_positive_definite(model, logs, estimate, filter)
     notes = [_note(estimate, int(k)) for k in np.flatnonzero(~possible)]
     if not definite:
@@ -42,13 +43,16 @@ def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
             with np.errstate(invalid="ignore"):
                 shift = np.abs(consistent - estimate.value)
                 moved &= shift > MOVED_STDS * estimate.std
-            clear |= bool(
-                (shift > np.maximum(CLEAR_STDS * estimate.understated * estimate.std, model.scale))[moved].any()
-            )
+            far = shift > np.maximum(CLEAR_STDS * estimate.understated * estimate.std, model.scale)
+            if far[moved].any():
+                together = (
+                    "the mass matrix is not positive definite, by more than noise explains: the model lacks something"
+                )
         possible &= ~moved
         notes.append("with these values the mass matrix is not positive definite: no machine has them together")
     doubt = (
         estimate.doubt
+        or together
         or _contradiction(model, estimate)
         or "; ".join(dict.fromkeys(d for one in logs for d in one.doubts))
     )

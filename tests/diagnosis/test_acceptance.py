@@ -4,10 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.files import SHARED
 
 import excite
-from excite.diagnosis import findings, fits, hold_out, selection, slow_forces
+from excite.diagnosis import fits, hold_out, selection, slow_forces
 from excite.logs import examine, from_table
 from excite.model import build, effects
 from excite.model.machine import load_machine
@@ -103,23 +102,3 @@ def test_slow_forces_leave_a_true_effect_its_significance_and_take_that_of_a_fal
         z[name] = beside.X[k] / np.sqrt(beside.covariance[k, k]), stage.fit.X[k] / stage.fit.std[k]
     assert z["true"][0] > 0.7 * z["true"][1]
     assert abs(z["false"][0]) < 0.2 * abs(z["false"][1])
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not (SHARED / "emps").is_dir(), reason="needs ../shared/data/emps")
-def test_emps_gets_direction_dependent_friction_as_a_correction() -> None:
-    """No effect explains EMPS' log as a whole; viscous friction that depends on the direction predicts forces better.
-
-    Its authors found the same: A. Janot, M. Gautier, M. Brunot, 2019.
-    """
-    a = excite.diagnose("emps", SHARED / "emps" / "DATA_EMPS.mat")
-    summary = findings.summarise(a)
-    assert summary["verdict"] == "unexplained"
-    (f,) = summary["findings"]
-    assert (f["effect"], f["where"], f["kind"]) == ("asymmetric_viscous", "carriage", "correction")
-    assert 20 < f["share_percent"] < 60
-    assert summary["gain_percent"] > 20
-    assert summary["gain_ci95"][0] > 10
-    assert summary["error_after_percent"] < 3.5
-    assert set(summary["signals"]) == {"q1", "u1"}
-    assert summary["located"]
