@@ -550,8 +550,7 @@ def _make_finding(
         )
     )
     shapes = {
-        s: (*values.get(f"{placed.name}.{s}", (placed.values[s], 0.0)), shape.unit)
-        for s, shape in placed.shapes.items()
+        s: (*values.get(f"{placed.name}.{s}", (placed.values[s], 0.0)), placed.shape_unit(s)) for s in placed.shapes
     }
     if amount < 0 and (circular := [s for s, shape in placed.shapes.items() if shape.circular]):
         # A negative magnitude is a positive one half a turn on.
@@ -572,7 +571,7 @@ def _make_finding(
         p,
         float(amount),
         float(sure),
-        placed.effect.unit,
+        placed.unit,
         shapes,
         gain,
         std_at_shapes=at_shapes,

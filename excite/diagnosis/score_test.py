@@ -99,7 +99,7 @@ def candidates(machine: Machine, sensors: Sequence[str], duration: float) -> lis
                 continue
             site = Site.of(machine, bodies, duration)
             for values, width in _trial_values(effect, site):
-                placed = PlacedEffect(effect, where, bodies, sensor, values)
+                placed = PlacedEffect(effect, where, bodies, sensor, values, effects.is_straight(machine, bodies))
                 found.append(Candidate(placed, tuple(range(columns, columns + width))))
                 columns += width
     return found
@@ -142,7 +142,7 @@ def refine_candidates(
         site = Site.of(machine, placed.bodies, duration)
         for values in _nearby_values(placed, site, reach):
             width = len(score.candidate.columns)
-            own = PlacedEffect(placed.effect, placed.where, placed.bodies, placed.sensor, values)
+            own = replace(placed, values=values)
             found.append(Candidate(own, tuple(range(columns, columns + width))))
             columns += width
     return found
@@ -259,7 +259,7 @@ class SignatureColumns:
             for turn in range(len(x.columns)):
                 shift = dict.fromkeys(circular, turn * np.pi / 2)
                 values = {**x.placed.values, **shift}
-                every.append(PlacedEffect(x.placed.effect, x.placed.where, x.placed.bodies, x.placed.sensor, values))
+                every.append(replace(x.placed, values=values))
         standard = tuple(n for n in model.base.standard if "@" not in n)
         functions = signatures(model.machine, standard, every)
         self.force, self.reading = BatchedFunction(functions.force, (7,)), BatchedFunction(functions.reading, (7,))

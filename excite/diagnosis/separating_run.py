@@ -158,7 +158,8 @@ def _placed_effect(stage: ExtendedFit, name: str) -> PlacedEffect:
     log = stage.data.logs[0]
     site = Site.of(stage.machine, bodies, float(log.t[-1] - log.t[0]))
     shapes = {n: s.default * s.size(site) for n, s in effect.shapes.items()}
-    return PlacedEffect(effect, where, bodies, sensor, {"A": effect.typical_magnitude(site), **shapes})
+    values = {"A": effect.typical_magnitude(site), **shapes}
+    return PlacedEffect(effect, where, bodies, sensor, values, effects.is_straight(site.machine, bodies))
 
 
 def _longest_motion(stage: ExtendedFit) -> SampledMotion:

@@ -136,7 +136,7 @@ def _finding(search: Search, fit: TorqueFit, term: Term, share: float, kind: str
     magnitude = placed.values["A"] / c if placed.effect.inverse else placed.values["A"] * c
     size = abs(magnitude) * (np.hypot(std / c, relative["A"]) if "A" in relative else abs(std / c))
     shapes = {
-        n: (placed.values[n], abs(placed.values[n]) * relative.get(n, 0.0), s.unit) for n, s in placed.shapes.items()
+        n: (placed.values[n], abs(placed.values[n]) * relative.get(n, 0.0), placed.shape_unit(n)) for n in placed.shapes
     }
     k = 1 + len(relative)
     return Finding(
@@ -146,7 +146,7 @@ def _finding(search: Search, fit: TorqueFit, term: Term, share: float, kind: str
         float(min(1.0, len(search.names) * scipy.stats.chi2.sf(term.chi2, k))),
         float(magnitude),
         float(size),
-        placed.effect.unit,
+        placed.unit,
         shapes,
         term.chi2,
         share,

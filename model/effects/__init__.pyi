@@ -14,6 +14,7 @@ from .effect import (
 from .ground_map import MAX_PASSES as MAX_PASSES, GroundMap as GroundMap
 from .placing import (
     allowed_places as allowed_places,
+    is_straight as is_straight,
     parse_effect as parse_effect,
     payload_body as payload_body,
     payload_change as payload_change,

@@ -11,6 +11,16 @@ import numpy as np
 from excite.model import mechanics
 from excite.model.machine import Body, Contact, Machine
 
+OF_STRAIGHT_JOINTS = {
+    "N m": "N",
+    "N m s": "N s/m",
+    "N m s2": "N s2/m2",
+    "N m/s": "N/s",
+    "N m/rad": "N/m",
+    "rad": "m",
+    "rad/s": "m/s",
+    "rad/(N m)": "m/N",
+}  # units of a sliding joint for those of one that turns
 DEFAULT_DURATION = 60.0  # s, length of a log if none is given; chosen
 Values = Mapping[str, ca.SX]  # magnitude "A" and shapes by name
 Form = tuple[str, float]  # name of a shape that selects one form of an effect, and its value
@@ -256,13 +266,29 @@ class Effect:
 
 @dataclass(frozen=True)
 class PlacedEffect:
-    """An effect at a place: the bodies it acts on, the sensor it sits in, values of "A" and shapes [unit]."""
+    """An effect at a place: the bodies it acts on, the sensor it sits in, values of "A" and shapes [unit].
+
+    straight: it acts on a sliding joint, whose angles are positions and whose torques are forces.
+    """
 
     effect: Effect
     where: str
     bodies: tuple[int, ...]
     sensor: str | None
     values: Mapping[str, float]
+    straight: bool = False
+
+    @property
+    def unit(self) -> str:
+        """Unit of the magnitude at its place."""
+        return self._unit_here(self.effect.unit)
+
+    def shape_unit(self, name: str) -> str:
+        """Unit of a shape at its place."""
+        return self._unit_here(self.effect.shapes[name].unit)
+
+    def _unit_here(self, unit: str) -> str:
+        return OF_STRAIGHT_JOINTS.get(unit, unit) if self.straight else unit
 
     @property
     def name(self) -> str:
@@ -272,8 +298,8 @@ class PlacedEffect:
     @property
     def parameters(self) -> dict[str, tuple[str, str]]:
         """Key of the value and unit, by name of the model's parameter: magnitude first, then shapes."""
-        named = {self.name: ("A", self.effect.unit)}
-        return named | {f"{self.name}.{s}": (s, shape.unit) for s, shape in self.shapes.items()}
+        named = {self.name: ("A", self.unit)}
+        return named | {f"{self.name}.{s}": (s, self.shape_unit(s)) for s in self.shapes}
 
     @property
     def shapes(self) -> dict[str, Shape]:

@@ -103,6 +103,11 @@ def without_effect(machine: Machine, name: str) -> Machine:
     return machine.model_copy(update={"effect": rest})
 
 
+def is_straight(machine: Machine, bodies: Sequence[int]) -> bool:
+    """Tell if an effect on these bodies acts on a sliding joint."""
+    return machine.find(bodies[0]).joint == "prismatic"
+
+
 def shapes_possible(machine: Machine, effect: PlacedEffect) -> bool:
     """True if all shapes are in their ranges (`Shape.within`)."""
     site = Site.of(machine, effect.bodies)
@@ -114,8 +119,8 @@ def size_warning(machine: Machine, effect: PlacedEffect) -> str | None:
     """Return a warning if an effect is far larger than typical at its place, else None."""
     typical, magnitude = effect.effect.typical_magnitude(Site.of(machine, effect.bodies)), effect.values["A"]
     large, small = (typical, abs(magnitude)) if effect.effect.inverse else (abs(magnitude), typical)
-    unit = effect.effect.unit
-    if large < SUSPICIOUS_RATIO * small or (typical < MIN_TYPICAL_FRICTION and unit.startswith("N m")):
+    unit = effect.unit
+    if large < SUSPICIOUS_RATIO * small or (typical < MIN_TYPICAL_FRICTION and unit.startswith("N")):
         return None
     much = f"{magnitude:g} {unit}".removesuffix(" -")
     return f"{effect.name}: {much}, usual are about {typical:.1g}: in another unit?"
@@ -158,7 +163,7 @@ def place_effect(machine: Machine, entry: EffectEntry, duration: float = DEFAULT
             raise MachineError(
                 f"{machine.name}: effect {entry.name}: shape {name} must be one of {options} (got {values[name]:g})"
             )
-    made = PlacedEffect(effect, where, bodies, sensor, values)
+    made = PlacedEffect(effect, where, bodies, sensor, values, is_straight(machine, bodies))
     for name, shape in made.shapes.items():
         stated = (
             name in entry.shape and entry.shape[name].source != "identified"
