@@ -98,6 +98,7 @@ def _machine_file(machine: str) -> list[Path]:
 @app.command()
 def machines(json: JsonOption = False) -> None:
     """List the machines that come with excite."""
+    from excite import reports
     from excite.model import build
     from excite.model.machine import load_machine, shipped_machines
 
@@ -119,7 +120,7 @@ def machines(json: JsonOption = False) -> None:
     if json:
         terminal.show_json({"machines": rows})
         return
-    table = terminal.table("machine", "what it is", "problem", "parameters")
+    table = reports.text_table("machine", "what it is", "problem", "parameters")
     for row in rows:
         table.add_row(row["machine"], row["title"], row["problem"] or "-", str(len(row["parameters"])))
     terminal.say(table)

@@ -582,7 +582,7 @@ def describe_log(s: Summary) -> Description:
     )
     names = ("column", "what it is", "unit", "lowest", "highest", "bad cells")
     tables = (Table("Columns as the file has them.", names, rows),)
-    return Description(f"The log {name}", headline, tables, _check_remarks(s))
+    return Description(f"Check of {name}", headline, tables, _check_remarks(s))
 
 
 MACHINE_COLUMNS = ("parameter", "what it is", "stands for", "value", "unit", "random drives: std %")
