@@ -36,6 +36,7 @@ from excite.cli.options import (
     StartsOption,
 )
 from excite.errors import UsageError
+from excite.text import format_number
 
 app = typer.Typer(
     name="excite",
@@ -591,7 +592,10 @@ def convert_log(
         terminal.show_json({"machine": model.machine.name, "log": str(path), "files": files, "notes": notes})
         return
     for one in files:
-        terminal.say(f"{one['path']}: {one['rows']} rows, {one['duration_s']:.4g} s at {one['rate_hz']:.4g} Hz")
+        terminal.say(
+            f"{one['path']}: {one['rows']} rows, {format_number(one['duration_s'], 4)} s at"
+            f" {format_number(one['rate_hz'], 4)} Hz"
+        )
     for line in notes:
         terminal.say(f"- {line}")
 

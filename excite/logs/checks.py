@@ -21,6 +21,7 @@ from excite.logs.plausibility import RATES, against, as_speed, is_speed, own_fil
 from excite.logs.resampling import BRIDGED_STEPS, held_every
 from excite.logs.times import date_and_time, has_time, seconds
 from excite.model.machine import TURN, Machine, Sensor
+from excite.text import format_number
 
 SHOWN = 3  # places named of what is there many times
 STUCK = 50  # equal extreme readings in a row that look like the end of a range; chosen
@@ -210,15 +211,17 @@ def jumps(record: Record) -> Iterator[Finding]:
                 who = f"the machine {turns} {by}at most" if rated is not None else "it moves elsewhere by at most"
                 i = int(far[0])
                 text = (
-                    f"row {c.row(i + 1)}, {c.name}: jumps by {abs(c.x[i + 1] - c.x[i]):.3g} {unit} in one sample, {who}"
-                    f" {most:.2g} {unit} in it{_more(c, far[1:] + 1)}: an encoder that was reset? cut the log there"
+                    f"row {c.row(i + 1)}, {c.name}: jumps by {format_number(abs(c.x[i + 1] - c.x[i]), 3)} {unit} in"
+                    f" one sample, {who} {format_number(most, 2)} {unit} in it{_more(c, far[1:] + 1)}: an encoder that"
+                    " was reset? cut the log there"
                 )
             yield Finding("jumps", "fault", s.name, text, spans)
         else:
             i = int(k[np.argmax(lead[k])])
             text = (
-                f"row {c.row(i + 1)}, {c.name}: moves by {step[i]:.2g} {unit} in one sample, by {beside[i]:.2g} {unit}"
-                f" beside it{_more(c, k[k != i] + 1)}: an encoder that slipped, or a lost row?"
+                f"row {c.row(i + 1)}, {c.name}: moves by {format_number(step[i], 2)} {unit} in one sample, by"
+                f" {format_number(beside[i], 2)} {unit} beside it{_more(c, k[k != i] + 1)}: an encoder that slipped,"
+                " or a lost row?"
             )
             yield Finding("jumps", "doubt", s.name, text, spans)
 
@@ -257,7 +260,7 @@ def _wraps(c: Channel, size: np.ndarray, far: np.ndarray, machine: Machine) -> s
         return ""  # a single jump over any range: a reset
     unit, times = machine.si_unit(c.sensor), "" if len(far) == 1 else f", {len(far)} times"
     return (
-        f"row {c.row(int(far[0]) + 1)}, {c.name}: jumps by {back[0]:.3g} {unit} in one sample{times}:"
+        f"row {c.row(int(far[0]) + 1)}, {c.name}: jumps by {format_number(back[0], 3)} {unit} in one sample{times}:"
         f" counts that wrap? write wraps_at = {period / one:.7g} for it in {own_file(machine)}, or unwrap it"
     )
 
@@ -329,7 +332,7 @@ def held(record: Record) -> Iterator[Finding]:
             continue
         rate = 1 / (float(np.mean(apart[near])) * usual_step(c.t))
         which = ORDINALS[n] if n < len(ORDINALS) else f"{n}th"
-        text = f"{c.name}: changes in every {which} row only: a {rate:.3g} Hz signal that is held"
+        text = f"{c.name}: changes in every {which} row only: a {format_number(rate, 3)} Hz signal that is held"
         yield Finding("held", "doubt", c.sensor.name, text)
 
 

@@ -22,6 +22,7 @@ from excite.logs.checks import (
 from excite.logs.log import Log
 from excite.logs.plausibility import doubts
 from excite.model.machine import Machine, Sensor
+from excite.text import format_number
 
 NEEDED = ("angle", "torque", "wheel")  # kinds of sensor that no method does without
 
@@ -105,8 +106,8 @@ def _note(sensor: Sensor, machine: Machine, rows: np.ndarray, size: float, sourc
     """What is said of spikes in rows (from 0) that were replaced."""
     shown = ", ".join(str(r + 1) for r in rows[:5]) + (", ..." if len(rows) > 5 else "")
     return (
-        f"{source}: column {sensor.column}: {len(rows)} spike{'s' if len(rows) > 1 else ''} of up to {size:.3g}"
-        f" {machine.si_unit(sensor)} replaced by the mean of the neighbours (row {shown})"
+        f"{source}: column {sensor.column}: {len(rows)} spike{'s' if len(rows) > 1 else ''} of up to"
+        f" {format_number(size, 3)} {machine.si_unit(sensor)} replaced by the mean of the neighbours (row {shown})"
     )
 
 

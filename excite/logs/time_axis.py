@@ -11,6 +11,7 @@ import pandas as pd
 from excite.errors import LogError
 from excite.logs.clocks import goes_on, period_of, unrounded
 from excite.logs.times import DAY_S
+from excite.text import format_number
 
 HOUR_S = 3600.0  # [s] by which a clock is set for summer time
 SLACK_STEPS = 20.0  # steps by which a clock's jump may differ from a whole day or hour; chosen
@@ -124,7 +125,7 @@ def _even_ticks(run: Run, column: str, source: str, notes: list[str]) -> Run:
         )
     notes.append(
         f"{source}: {shared} {'row shares its' if shared == 1 else 'rows share their'} time with the row before: the"
-        f" clock ticks every {tick:.3g} s, the rows are taken to be {slope:.4g} s apart"
+        f" clock ticks every {format_number(tick, 3)} s, the rows are taken to be {format_number(slope, 4)} s apart"
     )
     return Run(run.rows, start + slope * k)
 

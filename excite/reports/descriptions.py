@@ -12,7 +12,7 @@ import numpy as np
 from excite import trajectories
 from excite.identification import SIGNIFICANT_BIAS
 from excite.smoothing import MAX_IDENTIFIABLE_STD
-from excite.text import first_lines, format_number, format_p_value, format_percent
+from excite.text import first_lines, format_number, format_p_value, format_percent, format_rounded
 from excite.trajectories import TOLERANCE
 
 Summary = Mapping[str, Any]
@@ -134,13 +134,14 @@ def describe_design(s: Summary) -> Description:
         f" {format_percent(np.median(list(sigma.values())))}); {limits}."
     )
     remarks = [
-        f"Condition number of Phi {s['cond_phi']:.4g}, of W {s['cond_w']:.4g}; best start {s['cond_phi_start']:.4g}."
+        f"Condition number of Phi {format_number(s['cond_phi'], 4)}, of W {format_number(s['cond_w'], 4)}; best start"
+        f" {format_number(s['cond_phi_start'], 4)}."
     ]
     lowest = s.get("lowest_cond")
     if lowest:
         remarks.append(
-            f"The lowest cond(Phi) found is {lowest['cond_phi']:.4g}, with {lowest['worst_parameter']} to"
-            f" {format_percent(lowest['worst_percent'])}; this drive is the most accurate one within"
+            f"The lowest cond(Phi) found is {format_number(lowest['cond_phi'], 4)}, with {lowest['worst_parameter']}"
+            f" to {format_percent(lowest['worst_percent'])}; this drive is the most accurate one within"
             f" {s['cond_slack_percent']:g} % of it (`--cond-slack 0` gives the other)."
         )
     remarks += describe_outside_law(s.get("share_outside_law"))
@@ -187,7 +188,7 @@ def describe_score(s: Summary) -> Description:
 
 
 def _condition(value: float | None) -> str:
-    return "infinite" if value is None or value > MAX_CONDITION else f"{value:.4g}"
+    return "infinite" if value is None or value > MAX_CONDITION else f"{format_number(value, 4)}"
 
 
 def _sigma_table(s: Summary) -> Table:
@@ -217,10 +218,11 @@ def _describe_by_hand(s: Summary) -> tuple[list[str], list[Table]]:
     over = ", ".join(f"{name} by {format_percent(100 * value)}" for name, value in d["limits_broken"].items())
     value = trajectories.describe_value(s["objective"], hand["score"])
     remarks = [
-        f"In people's hands these {len(d['phases'])} phases give {value}, torques played back {free['score']:.4g}; the"
-        f" worst parameter is identified to {format_percent(hand['worst_percent'])} ({hand['worst_parameter']}) instead"
-        f" of {format_percent(free['worst_percent'])}, the median one to {format_percent(hand['median_percent'])}"
-        f" instead of {format_percent(free['median_percent'])}.",
+        f"In people's hands these {len(d['phases'])} phases give {value}, torques played back"
+        f" {format_number(free['score'], 4)}; the worst parameter is identified to"
+        f" {format_percent(hand['worst_percent'])} ({hand['worst_parameter']}) instead of"
+        f" {format_percent(free['worst_percent'])}, the median one to {format_percent(hand['median_percent'])} instead"
+        f" of {format_percent(free['median_percent'])}.",
         f"In the hands of {d['people']} simulated people these limits are exceeded: {over} of their range."
         if over
         else f"In the hands of {d['people']} simulated people every limit is kept.",
@@ -258,7 +260,7 @@ def describe_compare(s: Summary) -> Description:
     best = min(kept, key=lambda d: d["cond_phi"]) if kept else None
     if own and len(own) == len(s["designs"]) - 1:
         designed = s["designs"][0]
-        headline = f"The designed drive has cond(Phi) {designed['cond_phi']:.4g}; " + "; ".join(
+        headline = f"The designed drive has cond(Phi) {format_number(designed['cond_phi'], 4)}; " + "; ".join(
             f"{d['name']} has {_condition(d['cond_phi'])}"
             + ("" if d["breaks"] is None else f" and breaks {_broken_limit(d)}")
             for d in own
@@ -268,11 +270,11 @@ def describe_compare(s: Summary) -> Description:
     else:
         word = "lower" if ratio > 1 else "higher"
         headline = (
-            f"In the same time the designed drive reaches a condition number {max(ratio, 1 / ratio):.2g} times {word}"
-            " than the best usual one."
+            f"In the same time the designed drive reaches a condition number {format_number(max(ratio, 1 / ratio), 2)}"
+            f" times {word} than the best usual one."
         )
     remarks = (
-        (f"Lowest among those that keep every limit: {best['name']}, cond(Phi) {best['cond_phi']:.4g}.",)
+        (f"Lowest among those that keep every limit: {best['name']}, cond(Phi) {format_number(best['cond_phi'], 4)}.",)
         if best
         else ()
     )
@@ -350,13 +352,18 @@ def describe_verify(s: Summary) -> Description:
 
 
 MAX_NAMES = 4  # parameters that a headline names
-ESTIMATE_COLUMNS = (  # of a parameter: heading, key, digits
-    ("value", "value", 6),
-    ("std", "std", 3),
-    ("std %", "std_percent", 3),
-    ("95 % from", "low95", 6),
-    ("to", "high95", 6),
+ESTIMATE_COLUMNS = (  # of a parameter: heading, key
+    ("value", "value"),
+    ("std", "std"),
+    ("std %", "std_percent"),
+    ("95 % from", "low95"),
+    ("to", "high95"),
 )
+
+
+def _estimate_cell(row: Mapping[str, Any], key: str) -> str:
+    """Format a number of a parameter: one in its unit to the decimals of its standard deviation, or in per cent."""
+    return format_number(row[key], 2) if key.endswith("percent") else format_rounded(row[key], row["std"])
 
 
 def describe_identify(s: Summary) -> Description:
@@ -416,10 +423,10 @@ def describe_identify(s: Summary) -> Description:
             n,
             *_meaning(s, n),
             r["unit"],
-            *(format_number(r[k], d) for _, k, d in ESTIMATE_COLUMNS),
-            *((format_number(r.get("prior_std"), 3),) if prior else ()),
-            *((format_number(r.get("bias"), 3),) if biased else ()),
-            *(("" if r["possible"] else "no", format_number(r.get("consistent"), 6)) if impossible else ()),
+            *(_estimate_cell(r, k) for _, k in ESTIMATE_COLUMNS),
+            *((format_number(r.get("prior_std"), 2),) if prior else ()),
+            *((format_rounded(r.get("bias"), r["std"], 3),) if biased else ()),
+            *(("" if r["possible"] else "no", format_rounded(r.get("consistent"), r["std"])) if impossible else ()),
         )
         for n, r in rows.items()
     )
@@ -427,12 +434,12 @@ def describe_identify(s: Summary) -> Description:
         "parameter",
         *_meaning_column(s),
         "unit",
-        *(heading for heading, *_ in ESTIMATE_COLUMNS),
+        *(heading for heading, _ in ESTIMATE_COLUMNS),
         *(("std known before",) if prior else ()),
         *(("bias of the method",) if biased else ()),
         *(("possible", "nearest possible machine") if impossible else ()),
     )
-    conds = f"cond(W) {s['cond_w']:.4g}, cond(Phi) {s['cond_phi']:.4g}"
+    conds = f"cond(W) {format_number(s['cond_w'], 4)}, cond(Phi) {format_number(s['cond_phi'], 4)}"
     caption = f"Parameters with one standard deviation and 95 % interval, method {s['method']}; {conds}."
     if s["status"] == "invalid":
         caption = (
@@ -562,7 +569,9 @@ def _is_biased(row: Mapping[str, Any]) -> bool:
 def describe_log(s: Summary) -> Description:
     """Describe a log: whether it is usable, its columns, its faults."""
     faults, name = s["faults"], s["log"]
-    span = f"{s['rows']} rows" + (f", {s['duration_s']:.4g} s at {s['rate_hz']:.4g} Hz" if s["rate_hz"] else "")
+    span = f"{s['rows']} rows" + (
+        f", {format_number(s['duration_s'], 4)} s at {format_number(s['rate_hz'], 4)} Hz" if s["rate_hz"] else ""
+    )
     if s["machine"] is None:
         headline = f"{name} is a table of {span}; no machine was named that it could be checked against."
     elif faults:
@@ -616,7 +625,7 @@ def format_sum(parts: Mapping[str, float]) -> str:
     text = ""
     for name, c in parts.items():
         text += ("-" if not text else " - ") if c < 0 else " + " if text else ""
-        text += name if abs(abs(c) - 1) < 1e-9 else f"{abs(c):.4g} {name}"
+        text += name if abs(abs(c) - 1) < 1e-9 else f"{format_number(abs(c), 4)} {name}"
     return text
 
 
@@ -669,8 +678,9 @@ def describe_diagnose(s: Summary) -> Description:
             (
                 n,
                 r["unit"],
-                *(format_number(r[k], 6) for k in ("before", "after")),
-                *(format_number(r[k], 2) for k in ("std_before", "std_after", "moved")),
+                *(format_rounded(r[k], r[f"std_{k}"]) for k in ("before", "after")),
+                *(format_rounded(r[k], r[k], 2) for k in ("std_before", "std_after")),
+                format_number(r["moved"], 2),
             )
             for n, r in s["parameters"].items()
         )
@@ -684,8 +694,8 @@ def _table_of_findings(findings: Sequence[Mapping[str, Any]]) -> Table:
     rows = tuple(
         (
             f"{f['effect']}@{f['where']}",
-            format_number(f["amount"], 5),
-            format_number(f["amount_std"], 2),
+            format_rounded(f["amount"], f["amount_std"], 5),
+            format_rounded(f["amount_std"], f["amount_std"], 2),
             f["unit"],
             "; ".join(f"{n} {format_number(x['value'], 4)} {x['unit']}" for n, x in f["shapes"].items()) or "-",
             format_p_value(f["p_value"]),

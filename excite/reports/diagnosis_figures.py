@@ -16,6 +16,7 @@ from excite import diagnosis
 from excite.diagnosis import Diagnosis, LogResiduals, TorqueDiagnosis
 from excite.reports.figures import COLOURS, escape_dollar, save
 from excite.reports.torque_figures import torque_figure_calls
+from excite.text import format_number
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 MAX_ROWS = 3  # torques and forces in a figure; chosen
@@ -208,7 +209,7 @@ def signals_figure(signals: Mapping[str, Mapping[str, Any]], found: bool, title:
         for y, value, n in zip(places + shift, rms, names, strict=True):
             if np.isfinite(value):
                 right.annotate(
-                    f"{value:.3g} {signals[n]['unit']}",
+                    f"{format_number(value, 3)} {signals[n]['unit']}",
                     (0, y),
                     xytext=(4, 0),
                     textcoords="offset points",

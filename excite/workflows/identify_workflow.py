@@ -18,7 +18,7 @@ from excite.logs import Log, Prepared, examine, prepare
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Filter
 from excite.reports import Account
-from excite.text import format_p_value
+from excite.text import format_number, format_p_value, format_uncertain
 from excite.workflows import requests
 from excite.workflows.progress import Bar, no_bar
 
@@ -84,15 +84,19 @@ def _compare_sources(model: Model, logs: Sequence[Log], method: str, filter: Fil
 def describe_agreement(agreement: Agreement) -> str:
     """Say whether logs agree on the parameters, and what changed."""
     if agreement.agree:
-        return f"one set of parameters explains the {len(agreement.logs)} logs (p = {agreement.p_value:.2g})"
+        return (
+            f"one set of parameters explains the {len(agreement.logs)} logs (p = {format_number(agreement.p_value, 2)})"
+        )
     p = format_p_value(agreement.p_value)
     p = p if p.startswith("<") else f"= {p}"
     text = f"the logs do not agree on the parameters (p {p})"
     if not agreement.explained:
         return f"{text}, and more than {len(agreement.changed)} of them would have to differ: identify each by itself"
     changes = "; ".join(
-        f"{c.name} [{c.unit}]: "
-        + ", ".join(f"{v:.4g} +- {s:.2g} in {n}" for n, v, s in zip(agreement.logs, c.value, c.std, strict=True))
+        f"{c.name}: "
+        + ", ".join(
+            f"{format_uncertain(v, s, c.unit)} in {n}" for n, v, s in zip(agreement.logs, c.value, c.std, strict=True)
+        )
         for c in agreement.changed
     )
     return f"{text}; what changed: {changes}. Estimated together these are averages"
