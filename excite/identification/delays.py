@@ -96,7 +96,7 @@ def describe_late_channels(
         if not d.significant or not (precise or X is not None):
             continue
         direction = f"{'late' if d.value > 0 else 'early'} against the motion"
-        magnitude = f"{abs(d.value) * 1e3:.1f} +- {format_number(d.std * 1e3, 1)} ms"
+        magnitude = f"{abs(d.value) * 1e3:.1f} ms (+-{format_number(d.std * 1e3, 1)} ms)"
         line = (
             f"{d.name} is {magnitude} {direction}: shift the channel, or run `excite diagnose`"
             if precise

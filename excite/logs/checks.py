@@ -21,7 +21,7 @@ from excite.logs.plausibility import RATES, against, as_speed, is_speed, own_fil
 from excite.logs.resampling import BRIDGED_STEPS, held_every
 from excite.logs.times import date_and_time, has_time, seconds
 from excite.model.machine import TURN, Machine, Sensor
-from excite.text import format_number
+from excite.text import count, format_number
 
 SHOWN = 3  # places named of what is there many times
 STUCK = 50  # equal extreme readings in a row that look like the end of a range; chosen
@@ -401,7 +401,7 @@ def ends_of_range(record: Record) -> Iterator[Finding]:
             if runs:
                 rows = max(b - a + 1 for a, b in runs)
                 spans = tuple((float(c.t[a]), float(c.t[b])) for a, b in runs)
-                text = f"{c.name}: stands at its {word} value for {rows} rows: the end of its range?"
+                text = f"{c.name}: stands at its {word} value for {count(rows, 'row')}: the end of its range?"
                 yield Finding("range", "remark", c.sensor.name, text, spans)
 
 
@@ -414,10 +414,12 @@ def spikes(record: Record) -> Iterator[Finding]:
         spans = tuple((float(c.t[i]), float(c.t[i])) for i in k)
         where = f"{'the first ' if len(k) > 1 else ''}in row {c.row(int(k[0]))}"
         if too_many(k, c):
-            text = f"{c.name}: {len(k)} spikes of a single sample, {where}; too many to repair, check the channel"
+            text = (
+                f"{c.name}: {count(len(k), 'spike')} of a single sample, {where}; too many to repair, check the channel"
+            )
             yield Finding("spikes", "fault", c.sensor.name, text, spans)
         else:
-            text = f"{c.name}: {len(k)} spike{'s' if len(k) > 1 else ''} of a single row, {where}"
+            text = f"{c.name}: {count(len(k), 'spike')} of a single row, {where}"
             yield Finding("spikes", "remark", c.sensor.name, text, spans)
 
 
@@ -479,7 +481,7 @@ def dropouts(record: Record) -> Iterator[Finding]:
         fatal = _counts_on(c.sensor) or worst[1] - worst[0] > LONG
         first, last = found[0] if _counts_on(c.sensor) else worst
         at = f"from row {c.row(first)} to {c.row(last)} ({c.t[first]:.2f} s to {c.t[last]:.2f} s)"
-        text = f"{c.name}: {len(found)} drop-out{'s' if len(found) > 1 else ''}, the reading stands still {at}"
+        text = f"{c.name}: {count(len(found), 'drop-out')}, the reading stands still {at}"
         if not fatal:
             text += ": what is in between counts as measured"
         elif last == len(c.x) - 1:

@@ -15,7 +15,7 @@ from excite.logs.plausibility import rated_speed
 from excite.logs.tables import MDF_TIME, UNCLEAR
 from excite.logs.times import has_time, seconds
 from excite.model.machine import UNITS, Machine, Sensor, load_machine, shipped_machines, torque_per_pressure
-from excite.text import format_number
+from excite.text import count, format_number
 
 SHORTEST = 100  # samples: below this no filter and no estimate makes sense
 OFF_RATE = 0.02  # by which the usual rate of sampling may differ from the machine file's
@@ -208,7 +208,7 @@ def fewest_rows(machine: Machine) -> int:
 def too_short(rows: int, machine: Machine) -> str:
     """Return a line for a log of too few rows, "" otherwise."""
     least = fewest_rows(machine)
-    return f"only {rows} rows, at least {least} are needed: is the file complete?" if rows < least else ""
+    return f"only {count(rows, 'row')}, at least {least} are needed: is the file complete?" if rows < least else ""
 
 
 def check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:

@@ -22,7 +22,7 @@ from excite.logs.time_axis import Run, order_rows
 from excite.logs.times import absolute_seconds, has_time, refuse_swapped_dates, seconds
 from excite.model import Model
 from excite.model.machine import TIME_UNITS, UNITS, Machine, Sensor
-from excite.text import format_number
+from excite.text import count, format_number
 
 FASTEST_HZ = 150.0  # rate [Hz] beyond which a rolling machine tells nothing more: its slips relax within tens of ms
 REST_S = 5.0  # [s] of standing still that is left out; chosen
@@ -157,7 +157,9 @@ def place_rows(
     least = log.fewest_rows(machine)
     long = [s for s in stretches if len(s.table) >= least]
     if long and len(long) < len(stretches):
-        said.append(f"{name}: {len(stretches) - len(long)} stretches of less than {least} rows are left out")
+        short = f"of less than {least} rows"
+        left_out = count(len(stretches) - len(long), f"stretch {short} is", f"stretches {short} are")
+        said.append(f"{name}: {left_out} left out")
     return long or stretches, said
 
 

@@ -14,7 +14,7 @@ from excite.logs import tables
 from excite.logs.log import OFF_RATE, check_time, columns_of, numbers
 from excite.model import Model
 from excite.simulation import Motion
-from excite.text import format_number
+from excite.text import count, format_number
 
 SLOWEST_HZ = 0.5  # rate of a profile's rows below which its time is taken for wrong; chosen
 
@@ -117,7 +117,7 @@ def read_drive(source: str | Path | pd.DataFrame, model: Model, any_rate: bool =
         )
     t = numbers(table, "t_s", source)
     if len(t) < 2:
-        raise LogError(f"{source}: only {len(t)} row, a profile needs at least 2")
+        raise LogError(f"{source}: only {count(len(t), 'row')}, a profile needs at least 2")
     rate = float(model.machine.sampling_hz)
     usual = 1 / float(np.median(np.diff(t))) if (np.diff(t) > 0).all() else rate
     if usual < SLOWEST_HZ or 0 < (t[-1] - t[0]) * rate < 1:

@@ -19,7 +19,7 @@ from excite.errors import LogError
 from excite.logs.grid import edges as encoder_edges, on_grid
 from excite.logs.time_axis import Run
 from excite.model.machine import Machine, Sensor
-from excite.text import format_number
+from excite.text import count, format_number
 
 EVEN = 0.02  # relative deviation of a step from the usual one up to which rows are even; chosen
 DRIFTED = 0.5  # of a step by which even rows may leave an even clock; chosen
@@ -284,7 +284,7 @@ def _notes(
             f"{source}: channels with times of their own ({listed}), each interpolated onto {format_number(grid, 4)} Hz"
         )
     elif sparse:
-        notes.append(f"{source}: {sparse} empty {'cell' if sparse == 1 else 'cells'}, interpolated")
+        notes.append(f"{source}: {count(sparse, 'empty cell')}, interpolated")
     even = np.abs(wide / step - np.round(wide / step)).max() < 5 * EVEN if len(wide) else True
     drifting = not lost and not sparse and len(spans) == 1 and _drifts(t)
     if not even or drifting:
@@ -295,13 +295,13 @@ def _notes(
             f" their own times onto {format_number(1e3 / grid, 4)} ms"
         )
     elif lost and not sparse:
-        notes.append(f"{source}: rows are lost in {lost} {'place' if lost == 1 else 'places'}, interpolated")
+        notes.append(f"{source}: rows are lost in {count(lost, 'place')}, interpolated")
     if len(spans) > 1:
         gaps = len(spans) - 1
         used = sum(b - a for a, b in kept)
         notes.append(
-            f"{source}: {gaps} {'gap' if gaps == 1 else 'gaps'}: used are {len(kept)} of {len(spans)} stretches"
-            f" between, {format_number(used, 4)} of {format_number(last - first, 4)} s"
+            f"{source}: {count(gaps, 'gap')}: used are {len(kept)} of {len(spans)} stretches between,"
+            f" {format_number(used, 4)} of {format_number(last - first, 4)} s"
         )
     whole = float(t[-1] - t[0])
     longest = max((_usual_step(t[rows]) for rows in there.values()), default=0.0)

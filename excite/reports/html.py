@@ -79,6 +79,6 @@ def result_fragment(description: Description) -> str:
             title=description.title,
             answer=description.headline,
             tables=[one for one in description.tables if shown or not one.grey],
-            remarks=description.remarks,
+            remarks=description.closing,
         )
     )

@@ -65,7 +65,7 @@ def write_page(place: Path, kind: str, summary: Summary, command: str | None = N
         pictures,
         description.tables,
         provenance(summary, command),
-        description.remarks,
+        description.closing,
         description.status,
     )
     (place / REPORT).write_text(text, encoding="utf-8")

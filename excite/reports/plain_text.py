@@ -17,7 +17,7 @@ PIPE_WIDTH = 200  # columns of a line in a pipe or file, which has no width; cho
 
 
 def text_parts(description: Description, console: Console, whole: str) -> Iterator[object]:
-    """Yield the lines and tables of a description: title, headline, tables, remarks.
+    """Yield the lines and tables of a description: title, headline, tables, remarks, verdict.
 
     whole: where a table is that is left out or cut here.
     """
@@ -32,6 +32,8 @@ def text_parts(description: Description, console: Console, whole: str) -> Iterat
             yield f"... and {len(one.rows) - MAX_ROWS} rows more, see {whole}"
     for remark in description.remarks:
         yield f"- {as_sentence(remark)}"
+    if description.verdict:
+        yield description.closing[-1]
 
 
 def render(description: Description) -> str:

@@ -109,7 +109,7 @@ class Shown:
     def save(self, folder: str | Path) -> Path:
         """Write the files that the command writes, into a folder that is complete or not there. Raises FolderError."""
         out = Path(folder)
-        with output.new_folder(out) as place:
+        with output.new_folder(out, "folder") as place:
             self.account.write(place, f"excite.{CALLS.get(self.account.kind, self.account.kind)}(...) in Python")
         return out
 

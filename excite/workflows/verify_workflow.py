@@ -12,6 +12,7 @@ from excite.identification import Verification
 from excite.model import Model, parameter_descriptions
 from excite.reports import Account
 from excite.simulation import Motion
+from excite.text import count
 from excite.workflows import requests
 from excite.workflows.progress import Bar, no_bar
 
@@ -45,7 +46,7 @@ def verify(
             model, motion, method, kit, runs, seed, progress=lambda done, total: advance(done, total, None)
         )
     if len(result.failures) == runs:
-        raise NotIdentifiableError(f"all {runs} runs failed, the first one: {result.failures[0]}")
+        raise NotIdentifiableError(f"all {count(runs, 'run')} failed, the first one: {result.failures[0]}")
     return verify_account(model, motion, result, seed, str(shown_as or design_dir), made.summary.get("problem")).write(
         place
     )
@@ -73,7 +74,7 @@ def verify_account(
         "biased": identification.biased_parameters(parameters),
         "versions": requests.package_versions(),
     }
-    title = f"{model.machine.title}: {runs} simulated runs, {result.method}, kit {result.kit}"
+    title = f"{model.machine.title}: {count(runs, 'simulated run')}, {result.method}, kit {result.kit}"
     return Account(
         "verify",
         summary,

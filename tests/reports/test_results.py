@@ -23,7 +23,7 @@ import excite as ex
 from excite import trajectories, workflows
 from excite.errors import FolderError, UsageError
 from excite.model import Model
-from excite.reports import Shown, ShownDesign
+from excite.reports import Shown, ShownDesign, describe
 from excite.simulation import Motion
 from excite.workflows.design_request import DesignResult
 
@@ -190,3 +190,33 @@ def test_importing_is_lazy() -> None:
     heavy = ("numpy", "pandas", "casadi", "matplotlib", "rich")
     code = f"import sys, excite; print([m for m in {heavy} if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict"),
+    [
+        ({}, "doubtful, values may be off by more than their intervals say; `excite diagnose` looks for the cause."),
+        ({"status": "valid"}, "valid, the 95 % intervals hold; every parameter is known to "),
+        ({"status": "valid", "unidentifiable": ["Q"]}, "valid except for Q;"),
+        ({"status": "invalid"}, "there is no estimate"),
+    ],
+)
+def test_an_estimate_ends_with_a_verdict(results: dict[str, Shown], change: dict[str, object], verdict: str) -> None:
+    one = results["identify"]
+    if not change:
+        assert repr(one).splitlines()[-1].startswith(f"Verdict: {verdict}")
+        assert "Verdict: " in (one._repr_html_() or "")
+    possible = {n: r | {"possible": True} for n, r in one.summary["parameters"].items()}
+    assert describe("identify", one.summary | {"parameters": possible} | change).verdict.startswith(verdict)
+
+
+def test_a_verification_ends_with_a_verdict(results: dict[str, Shown]) -> None:
+    """Intervals that miss too often for chance are named; those of a biased parameter too."""
+    summary = results["verify"].summary | {"runs": 50, "failed": 0, "biased": []}
+    held = {n: r | {"coverage95": 0.94, "rms_percent": 3.0} for n, r in summary["parameters"].items()}
+    fine = describe("verify", summary | {"parameters": held})
+    assert fine.verdict.startswith("the drive shows every parameter to 3 % or better, and the 95 % intervals hold")
+    missed = held | {"M": held["M"] | {"coverage95": 0.7}}
+    wrong = describe("verify", summary | {"parameters": missed, "biased": ["Fs1"]})
+    assert wrong.verdict.endswith("but the 95 % intervals of Fs1, M do not hold.")
+    assert "test day tells." in describe("verify", summary | {"parameters": held, "runs": 1}).verdict

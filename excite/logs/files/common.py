@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
+from excite.text import count
 
 Reader = Callable[[Path, frozenset[str]], pd.DataFrame]  # of a file, and names of the columns that are wanted
 
@@ -94,8 +95,8 @@ def refuse_huge(path: Path, rows: int, columns: int) -> None:
     """Raises LogError where a file claims more than fits into memory."""
     if rows * max(columns, 1) > MOST_CELLS:
         raise LogError(
-            f"{path}: claims {rows} rows of {columns} columns, more than the {MOST_CELLS} numbers that are read; is the"
-            " file damaged? otherwise cut it into shorter logs"
+            f"{path}: claims {count(rows, 'row')} of {count(columns, 'column')}, more than the {MOST_CELLS} numbers"
+            " that are read; is the file damaged? otherwise cut it into shorter logs"
         )
 
 
