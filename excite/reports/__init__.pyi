@@ -6,7 +6,11 @@ from .descriptions import (
     describe_drive_faults as describe_drive_faults,
     format_sum as format_sum,
 )
-from .diagnosis_figures import figure_calls as figure_calls, signals_figure as signals_figure
+from .diagnosis_figures import (
+    figure_calls as figure_calls,
+    figures_by_file as figures_by_file,
+    signals_figure as signals_figure,
+)
 from .figures import (
     COLOURS as COLOURS,
     compare_figure as compare_figure,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Self
 
@@ -28,7 +28,8 @@ class Account:
     """All that is told of a result.
 
     kind: as `describe` takes it. summary: content of summary.json. figures: each by its file name, the main one first.
-    files: each writes other files into a folder. frame: the numbers as a table, with units in `attrs["units"]`.
+    files: each writes other files into a folder. drawn: figures among these files.
+    frame: the numbers as a table, with units in `attrs["units"]`.
     """
 
     kind: str
@@ -36,6 +37,7 @@ class Account:
     figures: Mapping[str, Callable[[], Figure]]
     frame: Callable[[], pd.DataFrame]
     files: Sequence[Callable[[Path], object]] = ()
+    drawn: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
 
     def write(self, place: Path, command: str | None = None) -> dict[str, Any]:
         """Fill a folder with files, figures, report.html and summary.json; return the summary.
@@ -56,7 +58,7 @@ class Shown:
     @classmethod
     def of(cls, result: Any, account: Callable[[], Account]) -> Self:
         """Return a result that has an account of itself, which is computed when it is first asked for."""
-        made = cls(**{field.name: getattr(result, field.name) for field in fields(result)})
+        made = cls(**{f.name: getattr(result, f.name) for f in fields(result)})
         made.__dict__["_make_account"] = account
         return made
 
@@ -98,7 +100,8 @@ class Shown:
 
     def plot(self, name: str | None = None) -> Figure:
         """Return a figure of the report: the main one, or that of a name such as "sigma". Raises UsageError."""
-        drawn = {file.removesuffix(".png"): draw for file, draw in self.account.figures.items()}
+        every = {**self.account.figures, **self.account.drawn}
+        drawn = {file.removesuffix(".png"): draw for file, draw in every.items()}
         if not drawn:
             raise UsageError(f"{type(self).__name__}: has no figure")
         name = name or next(iter(drawn))

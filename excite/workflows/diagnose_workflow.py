@@ -128,6 +128,7 @@ def diagnose_account(machine: str, ready: Prepared, found: DiagnoseResult, drive
         {"signals.png": partial(reports.signals_figure, summary["signals"], bool(d.findings), title)},
         partial(reports.rows_frame, rows, "finding"),
         (partial(_write_diagnosis, d, title, text),),
+        reports.figures_by_file(d, title),
     )
 
 
