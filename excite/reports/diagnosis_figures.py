@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from excite import diagnosis
 from excite.diagnosis import Diagnosis, LogResiduals, TorqueDiagnosis
 from excite.reports.figures import COLOURS, escape_dollar, save
-from excite.reports.torque_figures import torque_figure_calls
+from excite.reports.torque_figures import torque_figure_calls, torque_figures_by_file
 from excite.text import format_number
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
@@ -41,8 +41,10 @@ def figure_calls(place: Path, d: Diagnosis | TorqueDiagnosis, title: str) -> lis
     return [partial(_draw, place, d, title, kind) for kind in ("misfit", "when")]
 
 
-def figures_by_file(d: Diagnosis, title: str) -> dict[str, Callable[[], Figure]]:
+def figures_by_file(d: Diagnosis | TorqueDiagnosis, title: str) -> dict[str, Callable[[], Figure]]:
     """Return for each file that `figure_calls` writes what draws it alone."""
+    if isinstance(d, TorqueDiagnosis):
+        return torque_figures_by_file(d, title)
     n = len(d.before.data.logs)
     return {_file(kind, k, n): partial(_one, d, title, kind, k) for kind in ("misfit", "when") for k in range(n)}
 
