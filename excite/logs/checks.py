@@ -346,7 +346,9 @@ def slow(record: Record) -> Iterator[Finding]:
         rate = 1 / steps[c.sensor.name]
         if steps[c.sensor.name] < SLOWER * min(steps.values()) or rate >= CUTOFFS * cutoff:
             continue
-        text = f"{c.name}: sampled at {rate:.3g} Hz, and the filter's cutoff_hz = {cutoff:g} needs more than"
+        text = (
+            f"{c.name}: sampled at {format_number(rate, 3)} Hz, and the filter's cutoff_hz = {cutoff:g} needs more than"
+        )
         if rate <= 2 * cutoff:
             text = (
                 f"{text} {2 * cutoff:g} Hz: record it faster, or write a lower cutoff_hz under [filter] in"

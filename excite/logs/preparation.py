@@ -256,8 +256,8 @@ def _refuse_other_scale(spans: dict[str, float]) -> None:
         near = [unit for unit in SCALES if lasts > 0 and abs(longer / lasts / unit - 1) < ALIKE_SPANS]
         if near:
             raise LogError(
-                f"{other}: lasts {longer:.4g} s, {near[0]:g} times as long as {one.rpartition(': ')[2]}: is it in"
-                " another unit? then write time_unit for its sensors in the machine file"
+                f"{other}: lasts {format_number(longer, 4)} s, {near[0]:g} times as long as {one.rpartition(': ')[2]}:"
+                " is it in another unit? then write time_unit for its sensors in the machine file"
             )
 
 

@@ -60,7 +60,9 @@ def order_rows(
     if len(back) and (period := period_of(t, unit)) and goes_on(known, back):
         t += period * np.searchsorted(back, rows, side="right")
         where = ", ".join(str(k + 1) for k in back[:SHOWN]) + (", ..." if len(back) > SHOWN else "")
-        notes.append(f"{source}: row {where}, column {column}: the clock begins anew every {period:.6g} s, read on")
+        notes.append(
+            f"{source}: row {where}, column {column}: the clock begins anew every {format_number(period, 6)} s, read on"
+        )
     repeated = np.flatnonzero(np.diff(t) == 0) + 1
     if len(repeated):
         before = table.iloc[repeated - 1].reset_index(drop=True)
@@ -149,7 +151,7 @@ def _unrounded(run: Run, positions: np.ndarray, nominal_step: float, source: str
         rounding = max(rounding, found[1])
     rate = 1 / float(np.median(np.diff(times[0])))
     notes.append(
-        f"{source}: times are rounded to {1e3 * rounding:.3g} ms: an even clock of {rate:.5g} Hz explains all of them"
-        " and is used"
+        f"{source}: times are rounded to {format_number(1e3 * rounding, 3)} ms: an even clock of"
+        f" {format_number(rate, 5)} Hz explains all of them and is used"
     )
     return Run(run.rows, np.concatenate(times))

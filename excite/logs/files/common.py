@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
-from excite.text import count
+from excite.text import count, format_number
 
 Reader = Callable[[Path, frozenset[str]], pd.DataFrame]  # of a file, and names of the columns that are wanted
 
@@ -143,8 +143,8 @@ def merged(path: Path, groups: Sequence[tuple[np.ndarray, Mapping[str, np.ndarra
             last = int(np.argmin(np.diff(t)))
             if (back := t[last] - t[last + 1]) > LATE_S:
                 raise LogError(
-                    f"{path}: the times of {next(iter(columns), 'a group')} go back by {back:.4g} s after sample"
-                    f" {last + 1}: its clock begins anew there; cut the file into logs of their own"
+                    f"{path}: the times of {next(iter(columns), 'a group')} go back by {format_number(back, 4)} s"
+                    f" after sample {last + 1}: its clock begins anew there; cut the file into logs of their own"
                 )
             notes.append(f"the times of {next(iter(columns), 'a group')} go back, its samples were put in order")
             order = np.argsort(t, kind="stable")
