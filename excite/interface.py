@@ -3,28 +3,51 @@
 A machine is given by its name, its file or a model; a problem by name; a log as a path, a pandas DataFrame in the
 machine's columns, or a `Log`; a drive as a profile, a design folder, a `Design` or a `Motion`. Defaults are those of
 the command of the same name.
+
+A result prints as its command prints it, in a notebook too. `to_frame()` gives its numbers as a DataFrame with units in
+`attrs["units"]`, `plot()` the figure of its report, `save(folder)` the files of the command (`excite.reports.Shown`).
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from excite import identification, logs as readers, model as models, simulation, trajectories, workflows
-from excite.diagnosis import Assessment
+from excite import (
+    identification,
+    logs as readers,
+    model as models,
+    reports,
+    simulation,
+    trajectories,
+    workflows,
+)
 from excite.errors import LogError
-from excite.identification import Estimate, Prediction, Verification
-from excite.logs import Log, PlannedDrive
+from excite.identification import Estimate
+from excite.logs import Log, PlannedDrive, Prepared
 from excite.model import Model
 from excite.model.machine import load_machine
+from excite.reports import (
+    Account,
+    ShownAssessment,
+    ShownComparison,
+    ShownDesign,
+    ShownEstimate,
+    ShownLog,
+    ShownPrediction,
+    ShownScore,
+    ShownVerification,
+)
 from excite.simulation import Motion
-from excite.trajectories import Comparison, Design, Score
-from excite.workflows import DesignRequest
+from excite.trajectories import Design
+from excite.workflows import DesignRequest, DiagnoseResult
 
 __version__ = version("excite")
 
@@ -42,7 +65,7 @@ def load(machine: Machine) -> Model:
     return machine if isinstance(machine, Model) else models.build(load_machine(machine))
 
 
-def read_log(machine: Machine, source: Source) -> Log:
+def read_log(machine: Machine, source: Source) -> ShownLog:
     """Read and check a log of a machine.
 
     source: a file (.csv, .txt, .parquet, .mat, .mf4) or a DataFrame in the machine's columns.
@@ -52,7 +75,7 @@ def read_log(machine: Machine, source: Source) -> Log:
     found = readers.prepare(model, [source]).logs
     if len(found) > 1:
         raise LogError(f"{found[0].source}: has gaps or rests, which make it {len(found)} logs: give it as it is")
-    return found[0]
+    return ShownLog.of(found[0], partial(_log_account, model, source))
 
 
 def design(
@@ -69,7 +92,7 @@ def design(
     budget: float | None = None,
     solver: str = "own",
     progress: Callable[[int, int, float], None] | None = None,
-) -> Design:
+) -> ShownDesign:
     """Design a test drive that makes the parameters of a machine identifiable.
 
     problem: a design problem of the machine file, its default one if not given.
@@ -86,7 +109,7 @@ def design(
     an unknown name.
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
-    _, chosen = workflows.choose_problem(model.machine, problem, duration)
+    name, chosen = workflows.choose_problem(model.machine, problem, duration)
     workflows.require_objective(objective, model.machine)
     workflows.require_known("solver", solver, tuple(trajectories.SOLVERS))
     workflows.require_positive("sigma_max", sigma_max, "%")
@@ -94,7 +117,10 @@ def design(
     request = DesignRequest(
         objective, sigma_max, robust, (), starts, seed, budget, cond_slack=cond_slack, solver=solver
     )
-    return workflows.design_from(model, chosen, request, progress).design
+    begin = time.perf_counter()
+    found = workflows.design_from(model, chosen, request, progress)
+    wall_s = time.perf_counter() - begin
+    return ShownDesign.of(found.design, partial(workflows.design_account, found, name, chosen, request, wall_s))
 
 
 def simulate(
@@ -107,7 +133,7 @@ def simulate(
     effects: Sequence[str] = (),
     friction: str = "smoothed",
 ) -> pd.DataFrame:
-    """Drive a machine in simulation and return the log that its sensors would write.
+    """Drive a machine in simulation and return the log that its sensors would write, units in `attrs["units"]`.
 
     drive: a profile (.csv), a design folder, a design, a motion, or torques (N, n_u) [N m] from rest.
     noise: False for exact signals.
@@ -123,10 +149,10 @@ def simulate(
     torque, q0, nu0 = _torques(model, drive)
     true = workflows.with_effects(model, effects, len(torque))
     motion = simulation.simulate(true, torque, q0=q0, nu0=nu0, friction=friction)
-    return simulation.measure(true, motion, kit=kit, seed=seed, noise=noise)
+    return reports.log_frame(simulation.measure(true, motion, kit=kit, seed=seed, noise=noise), true.machine)
 
 
-def identify(machine: Machine, logs: Source | Sequence[Source], method: str | None = None) -> Estimate:
+def identify(machine: Machine, logs: Source | Sequence[Source], method: str | None = None) -> ShownEstimate:
     """Estimate the parameters of a machine, with uncertainty, from one log or several.
 
     method: a name of `excite.identification.METHODS`, the one recommended for the machine if not given.
@@ -137,10 +163,11 @@ def identify(machine: Machine, logs: Source | Sequence[Source], method: str | No
     ready = readers.prepare(model, _several(logs), identification.needed_sensors(model, name))
     found = workflows.identify_from(ready.model, ready.logs, name)
     said = () if found.agreement is None else (workflows.describe_agreement(found.agreement),)
-    return replace(found.estimate, notes=(*said, *ready.notes, *found.estimate.notes))
+    noted = replace(found.estimate, notes=(*said, *ready.notes, *found.estimate.notes))
+    return ShownEstimate.of(noted, partial(workflows.identify_account, model, ready, found))
 
 
-def predict(machine: Machine, estimate: Estimate, target: Source | Drive) -> Prediction:
+def predict(machine: Machine, estimate: Estimate, target: Source | Drive) -> ShownPrediction:
     """Predict signals along another log or drive, with 95 % bands from the estimate's covariance.
 
     target: a log gives the torque of every drive along the motion that it shows, compared with the readings; a profile
@@ -150,17 +177,22 @@ def predict(machine: Machine, estimate: Estimate, target: Source | Drive) -> Pre
     no machine that can be simulated.
     """
     model = load(machine)
-    return workflows.predict_from(model, estimate, _target(model, target)).prediction
+    found = workflows.predict_from(model, estimate, _target(model, target))
+    called = _called(target, "the log" if found.along == "log" else "the drive")
+    account = partial(workflows.predict_account, model, estimate, found, f"by {estimate.method}", called)
+    return ShownPrediction.of(found.prediction, account)
 
 
-def diagnose(machine: Machine, logs: Source | Sequence[Source]) -> Assessment:
+def diagnose(machine: Machine, logs: Source | Sequence[Source]) -> ShownAssessment:
     """Find what the model of a machine gets wrong along logs: named causes, their magnitudes, the gain of each.
 
     Raises LogError for an unusable log, NoEstimateError if nothing can be fitted.
     """
     model = load(machine)
     ready = readers.prepare(model, _several(logs), identification.needed_sensors(model, "joint"))
-    return workflows.diagnose_from(ready.model, ready.logs)
+    found = workflows.diagnose_from(ready.model, ready.logs)
+    name = model.machine.name if isinstance(machine, Model) else str(machine)
+    return ShownAssessment.of(found.assessment, partial(_diagnose_account, name, ready, found))
 
 
 def verify(
@@ -171,7 +203,7 @@ def verify(
     method: str | None = None,
     kit: str = "full",
     seed: int = 0,
-) -> Verification:
+) -> ShownVerification:
     """Simulate a drive with sensor flaws and identify from it, many times.
 
     drive: as in `simulate`. runs: simulated test days. The verification gives each parameter's bias, dispersion,
@@ -181,10 +213,12 @@ def verify(
     workflows.require_known("kit", kit, simulation.KITS)
     name = workflows.choose_method(method, model, kit)
     motion = drive if isinstance(drive, Motion) else _motion(model, drive)
-    return identification.verify(model, motion, name, kit, runs, seed)
+    found = identification.verify(model, motion, name, kit, runs, seed)
+    called = _called(drive, "the drive")
+    return ShownVerification.of(found, partial(workflows.verify_account, model, motion, found, seed, called))
 
 
-def score(machine: Machine, drive: Drive, problem: str | None = None) -> Score:
+def score(machine: Machine, drive: Drive, problem: str | None = None) -> ShownScore:
     """Judge any drive as a design: condition numbers, attainable accuracy, limits, on a fresh simulation.
 
     drive: as in `simulate`; one that gives no pose is placed on the lane as a design is. problem: a design problem of
@@ -193,9 +227,11 @@ def score(machine: Machine, drive: Drive, problem: str | None = None) -> Score:
     SimulationError for a motion that can't be integrated.
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
-    _, chosen = workflows.choose_problem(model.machine, problem, None)
+    name, chosen = workflows.choose_problem(model.machine, problem, None)
     workflows.require_noise_figures(model)
-    return trajectories.score(model, chosen, *_torques(model, drive, any_rate=True))
+    found = trajectories.score(model, chosen, *_torques(model, drive, any_rate=True))
+    called = _called(drive, "the drive")
+    return ShownScore.of(found, partial(workflows.score_account, model, name, chosen, found, called))
 
 
 def compare(
@@ -206,7 +242,7 @@ def compare(
     samples: int = 20,
     seed: int = 0,
     budget: float | None = None,
-) -> Comparison:
+) -> ShownComparison:
     """Compare the designed drive with the usual ones on the same problem, limits and time.
 
     against: names of `excite.trajectories.BASELINES` and profiles (.csv) of your own; all the usual drives if not
@@ -214,10 +250,31 @@ def compare(
     Raises UsageError for an unknown name, MachineError for sensors of unknown noise.
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
-    _, chosen = workflows.choose_problem(model.machine, problem, None)
+    name, chosen = workflows.choose_problem(model.machine, problem, None)
     workflows.require_noise_figures(model)
     usual, own = workflows.read_rivals("against", against, model, chosen)
-    return trajectories.compare(model, chosen, samples, seed, budget, None, usual, own)
+    found = trajectories.compare(model, chosen, samples, seed, budget, None, usual, own)
+    return ShownComparison.of(found, partial(workflows.compare_account, model, name, found, samples, seed, budget))
+
+
+def _called(given: object, otherwise: str) -> str:
+    """Return what a log or drive is called: its path, or a word for one that has none."""
+    return str(given) if isinstance(given, str | Path) else otherwise
+
+
+def _log_account(model: Model, source: Source) -> Account:
+    machine = model.machine
+    if isinstance(source, Log):
+        table = readers.table_from(machine, source)
+    else:
+        table = source if isinstance(source, pd.DataFrame) else readers.table_of(source, machine)
+    name = source.source if isinstance(source, Log) else _called(source, "the table")
+    return reports.log_account(table, machine, name, workflows.package_versions())
+
+
+def _diagnose_account(machine: str, ready: Prepared, found: DiagnoseResult) -> Account:
+    drive = workflows.separating_drive(Path(), ready.model.machine, workflows.rivals(found), design_next=False)
+    return workflows.diagnose_account(machine, ready, found, drive)
 
 
 def _several(logs: Source | Sequence[Source]) -> list[Source]:

@@ -40,24 +40,25 @@ def write_summary(place: Path, summary: Any) -> None:
     (place / SUMMARY).write_text(to_json(summary), encoding="utf-8")
 
 
-def check_out_folder(out: Path, inputs: Iterable[Path] = ()) -> None:
+def check_out_folder(out: Path, inputs: Iterable[Path] = (), option: str = "--out") -> None:
     """Check before the work that `out` can be written at its end. Raises FolderError.
 
     An empty folder may be replaced, and a result folder with only the program's own files and none of the `inputs`.
+    option: what the user gives the folder by.
     """
     if out.is_file():
-        raise FolderError(f"{out}: is a file, --out needs a folder")
+        raise FolderError(f"{out}: is a file, give a folder")
     place = out.resolve()
     if place == Path.cwd() or place in Path.cwd().parents:
-        raise FolderError(f"{out}: is the current folder or one above it, choose another --out")
+        raise FolderError(f"{out}: is the current folder or one above it, choose another {option}")
     for path in inputs:
         if place == path.resolve() or place in path.resolve().parents:
-            raise FolderError(f"{out}: contains the input {path}, choose another --out")
+            raise FolderError(f"{out}: contains the input {path}, choose another {option}")
     if out.is_dir():
         foreign = [p.name for p in out.iterdir() if not OWN_NAMES.fullmatch(p.name)]
         if foreign or (any(out.iterdir()) and not (out / SUMMARY).is_file()):
             what = foreign[0] if foreign else "something else"
-            raise FolderError(f"{out}: exists and holds {what}, choose another --out")
+            raise FolderError(f"{out}: exists and holds {what}, choose another {option}")
         if not os.access(out, os.W_OK):
             raise FolderError(f"{out}: can't be replaced, no permission to write")
     _check_writable(out)
@@ -98,12 +99,12 @@ def _check_writable(out: Path) -> None:
 
 
 @contextmanager
-def new_folder(out: Path) -> Iterator[Path]:
+def new_folder(out: Path, option: str = "--out") -> Iterator[Path]:
     """Yield a folder to fill that becomes `out` if the block succeeds, and is removed if it fails.
 
-    A killed run leaves only a hidden folder next to `out`. Raises FolderError.
+    A killed run leaves only a hidden folder next to `out`. option: as in `check_out_folder`. Raises FolderError.
     """
-    check_out_folder(out)
+    check_out_folder(out, option=option)
     made = _make_parents(out)
     partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
     try:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from numbers import Integral, Real
 
+STD_DIGITS = 2  # significant digits of a standard deviation; chosen
+MAX_DIGITS = 8  # of a value with a tiny standard deviation; chosen
 MAX_LINES = 8  # lines printed of a longer list; chosen
 
 
@@ -16,12 +20,37 @@ def first_lines(lines: Sequence[str]) -> list[str]:
 
 def format_number(value: object, digits: int = 4) -> str:
     """Format a number to some significant digits, a missing one as a dash; below a million without exponent."""
-    if value is None or (isinstance(value, float) and value != value):
+    if value is None or value != value:
         return "-"
-    if not isinstance(value, float):
+    if not isinstance(value, Real) or isinstance(value, Integral):
         return str(value)
-    text = f"{value:.{digits}g}"
-    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
+    text = f"{float(value):.{digits}g}"
+    return f"{float(text):.0f}" if "e+" in text and abs(float(value)) < 1e6 else text
+
+
+def format_rounded(value: float | None, std: float | None, digits: int = 6) -> str:
+    """Format a value to the decimals that its standard deviation gives it; to some digits without such a deviation."""
+    if value is None or std is None or not (math.isfinite(value) and math.isfinite(std) and std > 0):
+        return format_number(value, digits)
+    decimals = STD_DIGITS - 1 - math.floor(math.log10(float(f"{std:.{STD_DIGITS}g}")))
+    value = round(float(value), decimals) + 0.0  # no negative zero
+    size = math.floor(math.log10(max(abs(value), std)))
+    if size < -4 or size >= 6:
+        return f"{value:.{min(max(size + decimals, STD_DIGITS - 1), MAX_DIGITS)}e}"
+    return f"{value:.{min(max(decimals, 0), MAX_DIGITS)}f}"
+
+
+def format_uncertain(value: float, std: float, unit: str = "") -> str:
+    """Format a value with its standard deviation and unit, such as "0.0200 +- 0.0010 rad"; "-" is no unit."""
+    tail = "" if unit in ("", "-") else f" {unit}"
+    if not (math.isfinite(std) and std > 0):
+        return f"{format_number(value)}{tail}"
+    return f"{format_rounded(value, std)} +- {format_rounded(std, std)}{tail}"
+
+
+def count(n: int, one: str, many: str = "") -> str:
+    """Count things: "1 row", "3 rows"; many: a plural that is not one with an s."""
+    return f"{n} {one if n == 1 else many or f'{one}s'}"
 
 
 def format_percent(value: float, digits: int = 2) -> str:

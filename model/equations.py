@@ -16,6 +16,7 @@ from excite.errors import MachineError
 from excite.model import effects, mechanics
 from excite.model.effects import ContactMotion, PlacedEffect, SampleView, Soil, Values
 from excite.model.machine import Body, Machine
+from excite.text import format_number
 
 
 @dataclass(frozen=True)
@@ -209,8 +210,8 @@ def _check_axis(machine: Machine, body: Body) -> None:
     if abs(axis[1] - 1) > 1e-9 or abs(upright - 1) > 1e-9:
         raise MachineError(
             f"{machine.name}: body {body.name}: contact: must turn about y of an upright chassis, so that motion"
-            f' forward map_inputs forward (alpha = "-pi/2", gamma 0); its axis there is ({axis[0]:.2g}, {axis[1]:.2g},'
-            f" {axis[2]:.2g})"
+            f' forward map_inputs forward (alpha = "-pi/2", gamma 0); its axis there is ({format_number(axis[0], 2)},'
+            f" {format_number(axis[1], 2)}, {format_number(axis[2], 2)})"
         )
 
 

@@ -19,6 +19,7 @@ import pytest
 import typer
 from support.commands import Excite
 
+import excite as interface
 from excite import output
 from excite.cli import app, reference, reference_html
 from excite.model.effects import catalogue
@@ -110,6 +111,39 @@ def test_readme_lines_of_python_run(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     text = text.replace("starts=2", "starts=1, duration=30")
     exec(compile(text, "README.md", "exec"), names)
     assert len(names["estimate"].names) == 22
+
+
+def test_every_public_function_has_an_example() -> None:
+    """A section of its own in docs/python.md, whose code calls it."""
+    _, *sections = (ROOT / "docs" / "python.md").read_text(encoding="utf-8").split("\n## ")
+    codes = {text.partition("\n")[0]: "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)) for text in sections}
+    functions = [name for name in interface.__all__ if name != "__version__"]
+    for name in functions:
+        assert f"excite.{name}(" in codes[name]
+        compile(codes[name], "python.md", "exec")
+    assert set(codes) - {*functions} == {"Results", "Errors"}
+
+
+@pytest.mark.slow
+def test_examples_in_python_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What the page says that they print differs in numbers at most."""
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    printed, shown = "", 0
+    for language, text in blocks(ROOT / "docs" / "python.md"):
+        if language == "python":
+            exec(compile(text, "python.md", "exec"), names)
+            printed = capsys.readouterr().out
+        else:
+            words, said = (re.findall(r"[^\W\d_]{3,}", x) for x in (text, printed))
+            assert (language, words) == ("text", said)
+            shown += 1
+    assert shown
+    assert {f.name for f in tmp_path.iterdir()} == {"design", "sines.png", "log.csv", "misfit.png", "diagnosed"}
+    assert (tmp_path / "diagnosed" / "machine.toml").is_file()
+    assert len(names["estimate"].names) == 11
 
 
 def test_every_effect_is_in_its_page() -> None:

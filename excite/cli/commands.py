@@ -36,6 +36,7 @@ from excite.cli.options import (
     StartsOption,
 )
 from excite.errors import UsageError
+from excite.text import count, format_number
 
 app = typer.Typer(
     name="excite",
@@ -83,7 +84,7 @@ def _result(
     output.check_out_folder(out, inputs)
     before = output.describe_result(out)
     if before is not None and not json:
-        terminal.say(f"{out}/ will be replaced, it holds the result of {before}; --out FOLDER keeps both")
+        terminal.say(f"{out}/ will be replaced, it holds the result of {before}; to keep it, give another --out")
     summary: dict[str, Any] = {}
     with output.new_folder(out) as place:
         yield place, summary
@@ -98,6 +99,7 @@ def _machine_file(machine: str) -> list[Path]:
 @app.command()
 def machines(json: JsonOption = False) -> None:
     """List the machines that come with excite."""
+    from excite import reports
     from excite.model import build
     from excite.model.machine import load_machine, shipped_machines
 
@@ -119,7 +121,7 @@ def machines(json: JsonOption = False) -> None:
     if json:
         terminal.show_json({"machines": rows})
         return
-    table = terminal.table("machine", "what it is", "problem", "parameters")
+    table = reports.text_table("machine", "what it is", "problem", "parameters")
     for row in rows:
         table.add_row(row["machine"], row["title"], row["problem"] or "-", str(len(row["parameters"])))
     terminal.say(table)
@@ -431,7 +433,7 @@ def simulate(
     if json:
         terminal.show_json(summary)
     else:
-        terminal.say(f"{out}: {len(table)} rows, {motion.t[-1]:g} s, columns {', '.join(table.columns)}")
+        terminal.say(f"{out}: {count(len(table), 'row')}, {motion.t[-1]:g} s, columns {', '.join(table.columns)}")
         for line in (*doubts, *reports.describe_drive_faults(summary)):
             terminal.say(line)
 
@@ -582,7 +584,7 @@ def convert_log(
     for table, file in zip(tables, paths, strict=True):
         with output.new_file(file) as part:
             TABLE_WRITERS[out.suffix.lower()](table, part)
-    files = [
+    files: list[dict[str, Any]] = [
         {"path": str(file), "rows": len(table), "rate_hz": rate, "duration_s": (len(table) - 1) / rate}
         for table, file in zip(tables, paths, strict=True)
     ]
@@ -590,7 +592,10 @@ def convert_log(
         terminal.show_json({"machine": model.machine.name, "log": str(path), "files": files, "notes": notes})
         return
     for one in files:
-        terminal.say(f"{one['path']}: {one['rows']} rows, {one['duration_s']:.4g} s at {one['rate_hz']:.4g} Hz")
+        terminal.say(
+            f"{one['path']}: {count(one['rows'], 'row')}, {format_number(one['duration_s'], 4)} s at"
+            f" {format_number(one['rate_hz'], 4)} Hz"
+        )
     for line in notes:
         terminal.say(f"- {line}")
 

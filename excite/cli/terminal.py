@@ -7,16 +7,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from excite import reports
 
-if TYPE_CHECKING:
-    from excite.reports import Table
-
-MAX_ROWS = 40  # of a table on the terminal; chosen
-MIN_WORD_WIDTH = 4  # of a column of words on a narrow terminal; chosen
-PIPE_WIDTH = 200  # columns of a line in a pipe or file, which has no width; chosen
 LINE_INTERVAL_S = 30.0  # between lines of progress where there is no terminal; chosen
 INTERRUPTED = 130  # exit code of Ctrl-C, as shells have it
 MIN_RUNS_FOR_ESTIMATE = 10  # runs before the time left is estimated; chosen
@@ -30,7 +24,7 @@ def say(thing: object) -> None:
     if console.is_terminal:
         console.print(thing)
     else:  # whole lines and whole tables
-        Console(highlight=False, markup=False, width=PIPE_WIDTH).print(thing, soft_wrap=True)
+        Console(highlight=False, markup=False, width=reports.PIPE_WIDTH).print(thing, soft_wrap=True)
 
 
 def show_json(summary: Mapping[str, Any]) -> None:
@@ -42,18 +36,10 @@ def show_json(summary: Mapping[str, Any]) -> None:
 
 def show(kind: str, summary: Mapping[str, Any]) -> None:
     """Print the description of a summary: title, headline, tables, remarks."""
-    description = reports.describe(kind, summary)
-    say(f"{description.title}\n{reports.as_sentence(description.headline)}")
-    for one in description.tables:
-        if one.grey and description.status == "invalid":
-            say(f"\n{one.caption} See {reports.REPORT}.")
-            continue
-        say(f"\n{one.caption}")
-        say(_fitted_table(one))
-        if len(one.rows) > MAX_ROWS:
-            say(f"... and {len(one.rows) - MAX_ROWS} rows more, see {reports.REPORT}")
-    for remark in description.remarks:
-        say(f"- {reports.as_sentence(remark)}")
+    from rich.console import Console
+
+    for one in reports.text_parts(reports.describe(kind, summary), Console(), reports.REPORT):
+        say(one)
 
 
 def finish(summary: dict[str, Any], out: Path, json: bool, describe: Callable[[dict[str, Any]], None]) -> None:
@@ -70,48 +56,6 @@ def fail(message: str, code: int) -> NoReturn:
     shown = "".join(c if c.isprintable() else "?" for c in message)  # names from files can't steer the terminal
     sys.stderr.write(f"excite: {shown}\n")
     sys.exit(code)
-
-
-def table(*names: str, words: tuple[int, ...] = (0,)) -> Any:
-    """Return an empty table with these columns; `words` (indices) are aligned left and may wrap."""
-    from rich import box
-    from rich.table import Table
-
-    made = Table(box=box.SIMPLE_HEAD)
-    for k, name in enumerate(names):
-        made.add_column(
-            name,
-            justify="left" if k in words else "right",
-            no_wrap=k not in words,
-            min_width=MIN_WORD_WIDTH if k in words else None,
-        )
-    return made
-
-
-def _fitted_table(described: Table) -> Any:
-    """Return a table for the terminal; a narrow one gets stacked headings and no optional columns."""
-    from rich.console import Console
-
-    console = Console()
-    every = tuple(range(len(described.columns)))
-    needed = tuple(k for k in every if k not in described.optional)
-    made = _rich_table(described, every, stacked=False)
-    if not console.is_terminal:
-        return made
-    for columns, stacked in ((every, False), (every, True), (needed, False), (needed, True)):
-        made = _rich_table(described, columns, stacked)
-        if console.measure(made, options=console.options.update(max_width=PIPE_WIDTH)).maximum <= console.width:
-            break
-    return made
-
-
-def _rich_table(described: Table, columns: tuple[int, ...], stacked: bool) -> Any:
-    words = tuple(place for place, k in enumerate(columns) if k in described.text_columns)
-    names = [described.columns[k].replace(" ", "\n") if stacked else described.columns[k] for k in columns]
-    made = table(*names, words=words)
-    for k, row in enumerate(described.rows[:MAX_ROWS]):
-        made.add_row(*(row[i] for i in columns), style="bold" if k in described.marked else None)
-    return made
 
 
 Advance = Callable[[int, int, float | None], None]

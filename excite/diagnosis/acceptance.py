@@ -10,6 +10,7 @@ from excite.diagnosis.diagnosis import Finding, std_given_shapes
 from excite.diagnosis.fits import ExtendedFit
 from excite.diagnosis.hold_out import HoldOutErrors, hold_out_gain, predictive_gain
 from excite.diagnosis.slow_forces import allow_slow_forces
+from excite.text import format_uncertain
 
 MIN_STDS = 2.0  # magnitude over its standard deviation given the shapes, of a finding; chosen
 
@@ -40,7 +41,8 @@ def reason_against(
     if effect.opposes_motion and finding.magnitude < 0:
         return "its sign is impossible"
     if not abs(finding.magnitude) > MIN_STDS * finding.std_at_shapes:
-        return f"its size is uncertain ({finding.magnitude:.3g} +- {finding.magnitude_std:.2g} {finding.unit})"
+        amount = format_uncertain(finding.magnitude, finding.magnitude_std, finding.unit)
+        return f"its size is uncertain ({amount})"
     if finding.kind == "cause":
         gain = predictive_gain(before, after, stage.dispersion)
         return "" if gain is None or gain.low > 0 else "it does not predict withheld data better"

@@ -12,6 +12,7 @@ from excite.diagnosis.hold_out import HoldOutErrors, hold_out_gain, torque_names
 from excite.diagnosis.selection import ProgressCallback
 from excite.diagnosis.torque_fit import Term, TorqueFit, normalise
 from excite.diagnosis.torque_search import MIN_UNABSORBED_SHARE, predicts_better
+from excite.text import format_number, format_percent, format_uncertain
 
 FUNCTIONS = 8  # B-splines of a curve; chosen
 FINALIST_CURVES = 3  # signals of a torque that are tried on withheld stretches; chosen
@@ -39,11 +40,13 @@ class Curve:
         low, high = int(np.argmin(self.value)), int(np.argmax(self.value))
         (row, unit), (signal, of) = self.row, self.signal
         ends = " to ".join(
-            f"{self.value[k]:.3g} +- {self.std[k]:.1g} {unit} at {self.at[k]:.3g} {of}" for k in sorted((low, high))
+            f"{format_uncertain(self.value[k], self.std[k], unit)} at {format_number(self.at[k], 3)} {of}"
+            for k in sorted((low, high))
         )
         return (
             f"{row} lacks a torque that depends on {signal}: {ends}; with this curve its error on withheld stretches is"
-            f" {self.percent:.2g} % smaller (95 %: {self.interval[0]:.2g} to {self.interval[1]:.2g} %)"
+            f" {format_percent(self.percent)} smaller (95 %: {format_number(self.interval[0], 2)} to"
+            f" {format_percent(self.interval[1])})"
         )
 
 

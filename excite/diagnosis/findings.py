@@ -24,6 +24,7 @@ from excite.errors import NoEstimateError
 from excite.logs import Log
 from excite.model import Model
 from excite.model.machine import EffectEntry, Filter, Machine, shipped_machines
+from excite.text import format_number, format_uncertain
 
 MACHINE_FILE_DIGITS = 8  # significant digits of magnitudes in a machine file; chosen
 FIRST_ANOMALY_LINES = 3  # lines about anomalies that precede all others; chosen
@@ -286,12 +287,7 @@ def describe_place(effect: str, where: str) -> str:
 
 def format_magnitude(row: Mapping[str, Any]) -> str:
     """Format a magnitude with its standard deviation, to its significant digits."""
-    value, std = float(row["amount"]), float(row["amount_std"])
-    unit = "" if row["unit"] == "-" else f" {row['unit']}"
-    if not (np.isfinite(std) and std > 0):
-        return f"{value:.4g}{unit}"
-    digits = int(np.clip(np.floor(np.log10(max(abs(value), std))) - np.floor(np.log10(std)) + 2, 2, 8))
-    return f"{value:.{digits}g} ± {std:.2g}{unit}"
+    return format_uncertain(float(row["amount"]), float(row["amount_std"]), row["unit"])
 
 
 def answer_text(a: Assessment) -> str:
@@ -347,11 +343,11 @@ def answer_text(a: Assessment) -> str:
 
 def _describe_change(percent: float, interval: tuple[float, float] | None) -> str:
     if interval is None:
-        return f"{abs(percent):.2g} % {'smaller' if percent >= 0 else 'larger'}"
+        return f"{format_number(abs(percent), 2)} % {'smaller' if percent >= 0 else 'larger'}"
     low, high = interval
     if percent >= 0:
-        return f"{percent:.2g} % smaller (95 %: {low:.2g} to {high:.2g} %)"
-    return f"{-percent:.2g} % larger (95 %: {-high:.2g} to {-low:.2g} %)"
+        return f"{format_number(percent, 2)} % smaller (95 %: {format_number(low, 2)} to {format_number(high, 2)} %)"
+    return f"{format_number(-percent, 2)} % larger (95 %: {format_number(-high, 2)} to {format_number(-low, 2)} %)"
 
 
 # ------------------------------------------------------------------------------------------------ machine file

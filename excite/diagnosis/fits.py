@@ -37,6 +37,7 @@ from excite.smoothing import (
     prepare_measurements,
     transfer_trajectory,
 )
+from excite.text import format_number
 
 # Cost: twice the negative log-likelihood. A right model's cost is about the number of readings.
 MIN_COST_GAIN_OF_CLOSE_FIT = 100.0  # cost by which an unconverged fit must beat a close one to be continued; chosen
@@ -182,7 +183,7 @@ class ExtendedFit:
             alone = np.count_nonzero(base.matrix[k]) == 1
             sign = required.get(base.standard[base.independent[k]], 0.0) if alone else 0.0
             if sign * fit.X[k] < -margin[k]:
-                found.append(f"{name} = {fit.X[k]:.4g} {unit}")
+                found.append(f"{name} = {format_number(fit.X[k], 4)} {unit}")
         return tuple(found)
 
     @property

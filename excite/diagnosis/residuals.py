@@ -18,6 +18,7 @@ from excite.diagnosis.fits import ExtendedFit, refit_all, with_true_sensor_noise
 from excite.diagnosis.parallel import run_in_turn
 from excite.diagnosis.spectrum import line_ratios
 from excite.smoothing import LinearisedLog, advance, differentiate, state_scale
+from excite.text import format_number
 
 BLOCK_S = 0.25  # length of a block [s] whose mean is the slow error; chosen
 N_BINS = 24  # bins of a quantity; chosen
@@ -307,7 +308,7 @@ def locate_misfit(stage: ExtendedFit) -> tuple[str, ...]:
             ]
             peak = _spectral_peak(log_residuals, z)
             if peak is not None:
-                parts.append(f"a peak at {peak:.3g} Hz")
+                parts.append(f"a peak at {format_number(peak, 3)} Hz")
             lines.append(
                 (f"{log_residuals.source}: " if len(stage.data.logs) > 1 else "") + f"{name}: {'; '.join(parts)}"
             )
@@ -315,7 +316,10 @@ def locate_misfit(stage: ExtendedFit) -> tuple[str, ...]:
             peak = _spectral_peak(log_residuals, y)
             if peak is not None:
                 size_y = float(np.std(y))
-                lines.append(f"{label}: {size_y:.3g} {unit} missing (rms), with a peak at {peak:.3g} Hz")
+                lines.append(
+                    f"{label}: {format_number(size_y, 3)} {unit} missing (rms), with a peak at"
+                    f" {format_number(peak, 3)} Hz"
+                )
     return tuple(lines)
 
 
@@ -345,11 +349,13 @@ def _concentrations(log_residuals: LogResiduals, z: np.ndarray) -> list[str]:
             if sample_share < MIN_RANGE_SHARE and name != "time":
                 continue
             if share >= CONCENTRATED_EXCESS and sample_share <= CONCENTRATED_SAMPLES:
-                where = f"{name}{label} from {low:.3g} to {high:.3g} {unit}".removesuffix(" -")
+                where = f"{name}{label} from {format_number(low, 3)} to {format_number(high, 3)} {unit}".removesuffix(
+                    " -"
+                )
                 found.append(
                     (
                         share / sample_share,
-                        f"{100 * share:.0f} % of it at {where}, {100 * sample_share:.2g} % of the log",
+                        f"{100 * share:.0f} % of it at {where}, {format_number(100 * sample_share, 2)} % of the log",
                     )
                 )
     found.sort(reverse=True)

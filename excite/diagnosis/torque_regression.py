@@ -29,6 +29,7 @@ from excite.diagnosis.torque_search import SETTINGS, Search, reason_against
 from excite.logs import Log
 from excite.model import Model
 from excite.model.machine import EffectEntry, Filter
+from excite.text import format_number
 
 MIN_LEVEL = 1e-6  # smallest noise of a row, of the torques' size; chosen
 
@@ -178,7 +179,8 @@ def _what_is_left(fit: TorqueFit) -> list[str]:
     ratio = fit.level[rows] / fit.lowest[rows]
     names = torque_names(fit.model.machine)
     return [
-        f"{names[k][0]}: {fit.level[rows[k]]:.3g} {names[k][1]} are left, {ratio[k]:.2g} times its noise"
+        f"{names[k][0]}: {format_number(fit.level[rows[k]], 3)} {names[k][1]} are left, {format_number(ratio[k], 2)}"
+        " times its noise"
         for k in np.argsort(-ratio)
         if ratio[k] > SETTINGS.noise_ratio
     ]

@@ -17,7 +17,7 @@ from excite.logs import Log, Samples, lowpass, samples, white_noise
 from excite.model import Model
 from excite.model.machine import Filter
 from excite.simulation import Motion, exact_readings, respond
-from excite.text import format_number, format_percent
+from excite.text import format_percent
 
 RUNS = 8  # simulated logs; chosen
 HOLD_TIME = 1.0  # time constant of the pull towards the log's joint speeds [s]; chosen
@@ -91,7 +91,7 @@ def _describe_bias(model: Model, estimate: Estimate, bias: np.ndarray, std: np.n
     order = [k for k in np.argsort(-np.abs(bias) / size) if notable[k]]
     listed = ", ".join(
         f"{estimate.names[k]} {'+' if bias[k] > 0 else ''}{format_percent(100 * bias[k] / size[k])}"
-        f" (+-{format_number(float(100 * std[k] / size[k]), 1)})"
+        f" +- {format_percent(float(100 * std[k] / size[k]), 1)}"
         for k in order
     )
     return (

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from excite.text import format_number, format_uncertain
+
 ZERO_SHARE = 1e-6  # size of a column, relative to the largest one, without effect; chosen
 MEMBER_SHARE = 0.05  # of a dropped column that a member explains at least; chosen
 MAX_MEMBERS = 4  # that are named; chosen
@@ -43,9 +45,9 @@ def describe_combinations(
         j = kept[i]
         factor = float(share[i] * size[k] / size[j] * scale[j] / scale[k])
         sign = "+" if factor > 0 else "-"
-        times = "" if abs(abs(factor) - 1) < 1e-3 else f"{abs(factor):.3g} "
+        times = "" if abs(abs(factor) - 1) < 1e-3 else f"{format_number(abs(factor), 3)} "
         value = x[j] + factor * x[k]
         std = np.sqrt(max(known[j, j] + 2 * factor * known[j, k] + factor**2 * known[k, k], 0.0))
-        parts.append(f"{names[j]} {sign} {times}{names[k]} = {value:.4g} +- {std:.2g} {units[j]}")
+        parts.append(f"{names[j]} {sign} {times}{names[k]} = {format_uncertain(value, std, units[j])}")
     more = f" and {len(members) - MAX_MEMBERS} more" if len(members) > MAX_MEMBERS else ""
     return f"this log shows it only together with others: {'; '.join(parts)}{more}"

@@ -14,6 +14,7 @@ from excite.identification.validation import simulate_open_loop
 from excite.logs import Log, decimate, derivative, from_table, lowpass, regression, samples
 from excite.model import Model
 from excite.model.machine import Filter
+from excite.text import format_number
 
 SIGNIFICANT_DELAY = 4.0  # smallest delay that is reported [standard deviations]; chosen
 PRECISE_STD = 2e-3  # larger standard deviations mean that slip noise hides part of a delay [s]; chosen
@@ -95,7 +96,7 @@ def describe_late_channels(
         if not d.significant or not (precise or X is not None):
             continue
         direction = f"{'late' if d.value > 0 else 'early'} against the motion"
-        magnitude = f"{abs(d.value) * 1e3:.1f} ms (+-{d.std * 1e3:.1g})"
+        magnitude = f"{abs(d.value) * 1e3:.1f} ms (+-{format_number(d.std * 1e3, 1)} ms)"
         line = (
             f"{d.name} is {magnitude} {direction}: shift the channel, or run `excite diagnose`"
             if precise

@@ -10,6 +10,7 @@ import scipy
 from excite.logs import Log
 from excite.model import Model
 from excite.model.machine import Filter
+from excite.text import format_number
 
 FLOOR_RATIO = 4.0  # power over the noise floor up to which a spectrum counts as noise; chosen
 PASSED_SHARE = 0.8  # share of the Nyquist frequency that decimation passes (see `decimate`)
@@ -52,10 +53,11 @@ def choose_from_spectra(model: Model, logs: Sequence[Log]) -> tuple[Filter, str]
     quantity = machine.filter.cutoff_hz.model_copy(
         update={"value": cutoff, "source": "measured", "note": f"{fastest} sinks into its noise floor there"}
     )
-    listed = ", ".join(f"{name} {f:.2g}" for name, f in edges.items())
+    listed = ", ".join(f"{name} {format_number(f, 2)}" for name, f in edges.items())
     reason = (
-        f"filter: cut-off {cutoff:.2g} Hz, where {fastest}, the liveliest signal, sinks into its sensor's noise floor"
-        f" (Hz: {listed}); one row in {factor} kept, which passes {PASSED_SHARE * rate / 2 / factor:.2g} Hz"
+        f"filter: cut-off {format_number(cutoff, 2)} Hz, where {fastest}, the liveliest signal, sinks into its"
+        f" sensor's noise floor (Hz: {listed}); one row in {factor} kept, which passes"
+        f" {format_number(PASSED_SHARE * rate / 2 / factor, 2)} Hz"
     )
     return machine.filter.model_copy(update={"cutoff_hz": quantity, "decimation": factor}), reason
 

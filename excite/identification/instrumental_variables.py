@@ -33,6 +33,7 @@ from excite.logs import Log, Samples, lowpass, regression, samples, unmeasured
 from excite.model import Model
 from excite.model.machine import Filter
 from excite.simulation import simulate
+from excite.text import format_number
 
 OBSERVER_TIME = 4.0  # time constant of the observer [s]; chosen
 MAX_PASSES = 30  # of the iteration; chosen
@@ -99,7 +100,8 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     worst = kept[int(np.argmax(ratio))]
     raise NotIdentifiableError(
         f"iv: no estimate reproduces itself after {MAX_PASSES} passes, {model.base.names[worst]} still moves by"
-        f" {abs(step[worst]):.3g}: start from better values in the machine file, or record a drive with more excitation"
+        f" {format_number(abs(step[worst]), 3)}: start from better values in the machine file, or record a drive with"
+        " more excitation"
     )
 
 

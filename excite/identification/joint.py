@@ -39,6 +39,7 @@ from excite.smoothing import (
     quantify_uncertainty,
     smoothed_motion,
 )
+from excite.text import format_number
 
 # Largest step of an estimate whose iteration ran out of passes [standard deviations]; chosen.
 ACCEPTED_STEP = 0.1
@@ -168,8 +169,8 @@ def _fit_sticking(model: Model, logs: Sequence[Log], filter: Filter, held: np.nd
         return None
     share = float(np.mean([np.mean(x > 0) for x in extra]))
     note = (
-        f"friction sticks in this log: in the {100 * share:.2g} % of it in which a joint is near rest, the friction may"
-        " have any value up to Fs"
+        f"friction sticks in this log: in the {format_number(100 * share, 2)} % of it in which a joint is near rest,"
+        " the friction may have any value up to Fs"
     )
     notes = (*describe_noise(space, measurements), *bias_notes, *flat_notes, note)
     return _build_estimate(space, measurements, fit, filter, notes, one_sided)

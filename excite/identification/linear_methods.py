@@ -34,6 +34,7 @@ from excite.identification.noise_propagation import (
 from excite.logs import Log, filtered_regression, samples
 from excite.model import Model
 from excite.model.machine import Filter
+from excite.text import count, format_number
 
 MAX_REWEIGHTINGS = 30  # of the iteration for weights; chosen
 SETTLED_WEIGHTS = 1e-4  # relative change of the weights that ends it; chosen
@@ -183,8 +184,8 @@ def rows_in_motion(
         return every, ()
     worst = int(np.argmax(np.abs(shift)))
     note = (
-        f"friction sticks in this log: {100 * share:.2g} % of the rows are of joints near rest and are left out; they"
-        f" would move {model.base.names[kept[worst]]} by {abs(shift[worst]):.0f} standard deviations"
+        f"friction sticks in this log: {format_number(100 * share, 2)} % of the rows are of joints near rest and are"
+        f" left out; they would move {model.base.names[kept[worst]]} by {abs(shift[worst]):.0f} standard deviations"
     )
     return moving, (note,)
 
@@ -248,7 +249,9 @@ def solve_blocks(blocks: Sequence[Block], scale: np.ndarray | None = None) -> So
     if not any((Y != 0).any() for _, Y in blocks):
         raise NotIdentifiableError("every torque is zero all along: are their sensors connected?")
     if rows <= n_base:
-        raise NotIdentifiableError(f"{rows} filtered rows for {n_base} parameters: the log is too short")
+        raise NotIdentifiableError(
+            f"{count(rows, 'filtered row')} for {count(n_base, 'parameter')}: the log is too short"
+        )
     solution = solve(reduce_blocks(blocks), scale=scale)
     if not solution.kept:
         raise NotIdentifiableError(NOTHING_MOVES_MESSAGE)

@@ -22,6 +22,7 @@ from excite.model import Model
 from excite.model.machine import Filter
 from excite.simulation import simulate
 from excite.smoothing import StateSpace, build_state_space
+from excite.text import format_number
 
 SEGMENT_DURATION = 5.0  # of a segment with its own first state [s]; chosen
 INITIAL_STATE_STD = (
@@ -107,8 +108,8 @@ def oe(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     largest_step, x, responses = best
     if largest_step > ACCEPTABLE_STEP:
         raise NotIdentifiableError(
-            f"oe: not converged in {MAX_PASSES} passes (smallest step {largest_step:.2g} standard deviations): start"
-            " from better values in the machine file, or use another method"
+            f"oe: not converged in {MAX_PASSES} passes (smallest step {format_number(largest_step, 2)} standard"
+            " deviations): start from better values in the machine file, or use another method"
         )
     level = np.maximum(np.sqrt(_mean_square_residual(responses)), sensor_noise)
     _, _, covariance = _gauss_newton_step(responses, level, torque_noise, sensor_noise, kept)

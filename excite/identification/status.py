@@ -13,7 +13,7 @@ from excite.identification.estimate import Estimate, add_notes
 from excite.logs import Log, samples
 from excite.model import Model, required_signs
 from excite.model.machine import Filter
-from excite.text import format_p_value
+from excite.text import format_number, format_p_value
 
 CLEAR_STDS = 3.0  # standard deviations beyond the possible that no noise explains; chosen
 MOVED_STDS = 2.0  # shift to the nearest possible machine that makes an inertial value impossible; chosen
@@ -147,7 +147,10 @@ def _nearest(model: Model, estimate: Estimate) -> np.ndarray | None:
 def _note(estimate: Estimate, k: int) -> str:
     """Say of an impossible value what usually causes it."""
     value, std, unit = estimate.value[k], estimate.std[k], estimate.units[k]
-    text = f"{estimate.names[k]} = {value:.4g} {unit}: no machine has such a value"
+    text = f"{estimate.names[k]} = {format_number(value, 4)} {unit}: no machine has such a value"
     if abs(value) > CLEAR_STDS * std:
         return f"{text}; usual causes are {CAUSES}"
-    return f"{text}; with +- {std:.2g} {unit} a possible one is within its uncertainty: the log excites it poorly"
+    return (
+        f"{text}; with +- {format_number(std, 2)} {unit} a possible one is within its uncertainty: the log excites it"
+        " poorly"
+    )

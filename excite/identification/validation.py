@@ -28,6 +28,7 @@ from excite.smoothing import (
     prepare_measurements,
     torque_sensor,
 )
+from excite.text import format_number
 
 FAR_RATIO = 4.0  # ratio to the machine file's value, or its inverse, that is reported; chosen
 NOTABLE_RATIO = 1.25  # of the residual to what is expected, beyond which a signal is not explained; chosen
@@ -284,7 +285,10 @@ def far_from_nominal(model: Model, estimate: Estimate) -> tuple[str, ...]:
     if not far:
         return ()
     worst = sorted(far, key=lambda k: -abs(np.log(max(ratio[k], 1e-12))))[:MAX_NAMED]
-    listed = ", ".join(f"{estimate.names[k]} {estimate.value[k]:.4g} ({nominal[k]:.4g})" for k in worst)
+    listed = ", ".join(
+        f"{estimate.names[k]} {format_number(estimate.value[k])} ({format_number(nominal[k])}) {estimate.units[k]}"
+        for k in worst
+    )
     rest = f" and {len(far) - len(worst)} more" if len(far) > len(worst) else ""
     return (
         f"{estimate.method}: far from the machine file's values (in brackets): {listed}{rest}; check columns, units and"

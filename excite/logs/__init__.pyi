@@ -1,4 +1,4 @@
-from .conversion import convert as convert
+from .conversion import convert as convert, table_from as table_from
 from .filtered import (
     BLOCK as BLOCK,
     Samples as Samples,

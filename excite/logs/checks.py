@@ -21,6 +21,7 @@ from excite.logs.plausibility import RATES, against, as_speed, is_speed, own_fil
 from excite.logs.resampling import BRIDGED_STEPS, held_every
 from excite.logs.times import date_and_time, has_time, seconds
 from excite.model.machine import TURN, Machine, Sensor
+from excite.text import count, format_number
 
 SHOWN = 3  # places named of what is there many times
 STUCK = 50  # equal extreme readings in a row that look like the end of a range; chosen
@@ -210,15 +211,17 @@ def jumps(record: Record) -> Iterator[Finding]:
                 who = f"the machine {turns} {by}at most" if rated is not None else "it moves elsewhere by at most"
                 i = int(far[0])
                 text = (
-                    f"row {c.row(i + 1)}, {c.name}: jumps by {abs(c.x[i + 1] - c.x[i]):.3g} {unit} in one sample, {who}"
-                    f" {most:.2g} {unit} in it{_more(c, far[1:] + 1)}: an encoder that was reset? cut the log there"
+                    f"row {c.row(i + 1)}, {c.name}: jumps by {format_number(abs(c.x[i + 1] - c.x[i]), 3)} {unit} in"
+                    f" one sample, {who} {format_number(most, 2)} {unit} in it{_more(c, far[1:] + 1)}: an encoder that"
+                    " was reset? cut the log there"
                 )
             yield Finding("jumps", "fault", s.name, text, spans)
         else:
             i = int(k[np.argmax(lead[k])])
             text = (
-                f"row {c.row(i + 1)}, {c.name}: moves by {step[i]:.2g} {unit} in one sample, by {beside[i]:.2g} {unit}"
-                f" beside it{_more(c, k[k != i] + 1)}: an encoder that slipped, or a lost row?"
+                f"row {c.row(i + 1)}, {c.name}: moves by {format_number(step[i], 2)} {unit} in one sample, by"
+                f" {format_number(beside[i], 2)} {unit} beside it{_more(c, k[k != i] + 1)}: an encoder that slipped,"
+                " or a lost row?"
             )
             yield Finding("jumps", "doubt", s.name, text, spans)
 
@@ -257,7 +260,7 @@ def _wraps(c: Channel, size: np.ndarray, far: np.ndarray, machine: Machine) -> s
         return ""  # a single jump over any range: a reset
     unit, times = machine.si_unit(c.sensor), "" if len(far) == 1 else f", {len(far)} times"
     return (
-        f"row {c.row(int(far[0]) + 1)}, {c.name}: jumps by {back[0]:.3g} {unit} in one sample{times}:"
+        f"row {c.row(int(far[0]) + 1)}, {c.name}: jumps by {format_number(back[0], 3)} {unit} in one sample{times}:"
         f" counts that wrap? write wraps_at = {period / one:.7g} for it in {own_file(machine)}, or unwrap it"
     )
 
@@ -329,7 +332,7 @@ def held(record: Record) -> Iterator[Finding]:
             continue
         rate = 1 / (float(np.mean(apart[near])) * usual_step(c.t))
         which = ORDINALS[n] if n < len(ORDINALS) else f"{n}th"
-        text = f"{c.name}: changes in every {which} row only: a {rate:.3g} Hz signal that is held"
+        text = f"{c.name}: changes in every {which} row only: a {format_number(rate, 3)} Hz signal that is held"
         yield Finding("held", "doubt", c.sensor.name, text)
 
 
@@ -343,7 +346,9 @@ def slow(record: Record) -> Iterator[Finding]:
         rate = 1 / steps[c.sensor.name]
         if steps[c.sensor.name] < SLOWER * min(steps.values()) or rate >= CUTOFFS * cutoff:
             continue
-        text = f"{c.name}: sampled at {rate:.3g} Hz, and the filter's cutoff_hz = {cutoff:g} needs more than"
+        text = (
+            f"{c.name}: sampled at {format_number(rate, 3)} Hz, and the filter's cutoff_hz = {cutoff:g} needs more than"
+        )
         if rate <= 2 * cutoff:
             text = (
                 f"{text} {2 * cutoff:g} Hz: record it faster, or write a lower cutoff_hz under [filter] in"
@@ -398,7 +403,7 @@ def ends_of_range(record: Record) -> Iterator[Finding]:
             if runs:
                 rows = max(b - a + 1 for a, b in runs)
                 spans = tuple((float(c.t[a]), float(c.t[b])) for a, b in runs)
-                text = f"{c.name}: stands at its {word} value for {rows} rows: the end of its range?"
+                text = f"{c.name}: stands at its {word} value for {count(rows, 'row')}: the end of its range?"
                 yield Finding("range", "remark", c.sensor.name, text, spans)
 
 
@@ -411,10 +416,12 @@ def spikes(record: Record) -> Iterator[Finding]:
         spans = tuple((float(c.t[i]), float(c.t[i])) for i in k)
         where = f"{'the first ' if len(k) > 1 else ''}in row {c.row(int(k[0]))}"
         if too_many(k, c):
-            text = f"{c.name}: {len(k)} spikes of a single sample, {where}; too many to repair, check the channel"
+            text = (
+                f"{c.name}: {count(len(k), 'spike')} of a single sample, {where}; too many to repair, check the channel"
+            )
             yield Finding("spikes", "fault", c.sensor.name, text, spans)
         else:
-            text = f"{c.name}: {len(k)} spike{'s' if len(k) > 1 else ''} of a single row, {where}"
+            text = f"{c.name}: {count(len(k), 'spike')} of a single row, {where}"
             yield Finding("spikes", "remark", c.sensor.name, text, spans)
 
 
@@ -476,7 +483,7 @@ def dropouts(record: Record) -> Iterator[Finding]:
         fatal = _counts_on(c.sensor) or worst[1] - worst[0] > LONG
         first, last = found[0] if _counts_on(c.sensor) else worst
         at = f"from row {c.row(first)} to {c.row(last)} ({c.t[first]:.2f} s to {c.t[last]:.2f} s)"
-        text = f"{c.name}: {len(found)} drop-out{'s' if len(found) > 1 else ''}, the reading stands still {at}"
+        text = f"{c.name}: {count(len(found), 'drop-out')}, the reading stands still {at}"
         if not fatal:
             text += ": what is in between counts as measured"
         elif last == len(c.x) - 1:

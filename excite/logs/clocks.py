@@ -12,6 +12,7 @@ import pandas as pd
 from excite.errors import LogError
 from excite.logs.times import absolute_seconds
 from excite.model.machine import TIME_UNITS, UNITS
+from excite.text import format_number
 
 TIME_NAME = re.compile(r"(?i)(.*[^a-z])?(t|.*time|timestamps?|stamp|clock)([^a-z].*)?")
 TIME_WORD = re.compile(r"(?i).*(time|stamp|clock).*")
@@ -115,15 +116,15 @@ def disagreement(t: np.ndarray, other: np.ndarray, name: str, column: str, one_o
     advice = f"which is right? name it as time_column in the machine file, or leave column {column} out"
     if high - low > least:
         return (
-            f"column {column}: a second clock, whose lead over column {name} changes by {high - low:.3g} s in"
-            f" {lasts:.4g} s: {advice}"
+            f"column {column}: a second clock, whose lead over column {name} changes by {format_number(high - low, 3)}"
+            f" s in {format_number(lasts, 4)} s: {advice}"
         )
     shift = (low + high) / 2
     if one_origin and least < abs(shift) < lasts:
         where = "ahead of" if shift > 0 else "behind"
         return (
-            f"column {column}: a second clock, {abs(shift):.3g} s {where} column {name}: was it that of some channels?"
-            f" then write time_column for them in the machine file, or leave column {column} out"
+            f"column {column}: a second clock, {format_number(abs(shift), 3)} s {where} column {name}: was it that of"
+            f" some channels? then write time_column for them in the machine file, or leave column {column} out"
         )
     return ""
 

@@ -27,12 +27,12 @@ def convert(model: Model, path: str | Path, si: bool = False) -> tuple[list[pd.D
     for one in ready.logs:
         found = examine(machine, one)
         notes += [*found.notes, *found.doubts]
-        tables.append(_table(machine, found.log, si))
+        tables.append(table_from(machine, found.log, si))
     return tables, float(machine.sampling_hz), list(dict.fromkeys(notes))
 
 
-def _table(machine: Machine, log: Log, si: bool) -> pd.DataFrame:
-    """Build the table of a log."""
+def table_from(machine: Machine, log: Log, si: bool = False) -> pd.DataFrame:
+    """Build the table of a log; columns as in `convert`."""
     columns = {"t_s": log.t} if si else {machine.time_column: log.t / UNITS[machine.time_unit][1]}
     for sensor in machine.sensors("full"):
         if sensor.name not in log.values:

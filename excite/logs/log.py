@@ -15,6 +15,7 @@ from excite.logs.plausibility import rated_speed
 from excite.logs.tables import MDF_TIME, UNCLEAR
 from excite.logs.times import has_time, seconds
 from excite.model.machine import UNITS, Machine, Sensor, load_machine, shipped_machines, torque_per_pressure
+from excite.text import count, format_number
 
 SHORTEST = 100  # samples: below this no filter and no estimate makes sense
 OFF_RATE = 0.02  # by which the usual rate of sampling may differ from the machine file's
@@ -95,8 +96,8 @@ def from_table(
             moved = values_of(s, machine, table, source)
             if np.ptp(moved) > 0.05:
                 raise LogError(
-                    f"{source}: column {s.column}: moves by {np.ptp(moved):.2g} {machine.si_unit(s)}, {machine.name}"
-                    " holds it still; is this a log of another machine?"
+                    f"{source}: column {s.column}: moves by {format_number(np.ptp(moved), 2)} {machine.si_unit(s)},"
+                    f" {machine.name} holds it still; is this a log of another machine?"
                 )
     return Log(source, np.arange(len(t)) / rate if given is None else t, values)
 
@@ -207,7 +208,7 @@ def fewest_rows(machine: Machine) -> int:
 def too_short(rows: int, machine: Machine) -> str:
     """Return a line for a log of too few rows, "" otherwise."""
     least = fewest_rows(machine)
-    return f"only {rows} rows, at least {least} are needed: is the file complete?" if rows < least else ""
+    return f"only {count(rows, 'row')}, at least {least} are needed: is the file complete?" if rows < least else ""
 
 
 def check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
@@ -222,15 +223,15 @@ def check_time(t: np.ndarray, rate: float, column: str, source: str) -> None:
     typical = float(np.median(dt))
     if abs(typical * rate - 1) > OFF_RATE:
         raise LogError(
-            f"{source}: column {column}: sampled at {1 / typical:.4g} Hz, the machine file says {rate:g} Hz;"
-            " resample the log or correct sampling_hz"
+            f"{source}: column {column}: sampled at {format_number(1 / typical, 4)} Hz, the machine file says {rate:g}"
+            " Hz; resample the log or correct sampling_hz"
         )
     jump = np.abs(dt * rate - 1) > GAP - 1
     if jump.any():
         k = int(np.argmax(jump))
         raise LogError(
-            f"{source}: row {k + 2}, column {column}: a gap of {dt[k]:.4g} s (from {t[k]:g} s to {t[k + 1]:g} s) where"
-            f" {1 / rate:g} s is expected; give the stretches before and after as two logs"
+            f"{source}: row {k + 2}, column {column}: a gap of {format_number(dt[k], 4)} s (from {t[k]:g} s to"
+            f" {t[k + 1]:g} s) where {1 / rate:g} s is expected; give the stretches before and after as two logs"
         )
     drift = (t[-1] - t[0]) * rate / (len(t) - 1)
     if abs(drift - 1) > 0.01:
@@ -247,8 +248,8 @@ def check_values(sensor: Sensor, values: np.ndarray, rate: float, machine: Machi
         k = int(np.argmax(step))
         if step[k] > 2.0:
             raise LogError(
-                f"{source}: row {k + 2}, column {sensor.column}: the angle jumps by {step[k]:.3g} rad in one sample;"
-                " unwrap it (encoder angles are counted on) or cut the log there"
+                f"{source}: row {k + 2}, column {sensor.column}: the angle jumps by {format_number(step[k], 3)} rad in"
+                " one sample; unwrap it (encoder angles are counted on) or cut the log there"
             )
     if "limits" not in sensor.checks_off:
         check_limits(sensor, values, rate, machine, source)
@@ -261,8 +262,8 @@ def check_limits(sensor: Sensor, values: np.ndarray, rate: float, machine: Machi
         fastest, usual = rated_speed(sensor, machine), float(np.percentile(np.abs(values), 99))
         if fastest is not None and usual > 3 * fastest:
             raise LogError(
-                f"{source}: column {sensor.column}: turns at {usual:.3g} rad/s, the machine allows {fastest:.3g} rad/s;"
-                f" is the unit {sensor.unit} right?"
+                f"{source}: column {sensor.column}: turns at {format_number(usual, 3)} rad/s, the machine allows"
+                f" {format_number(fastest, 3)} rad/s; is the unit {sensor.unit} right?"
             )
         return
     if sensor.kind == "angle" and body.joint == "revolute":
@@ -270,21 +271,21 @@ def check_limits(sensor: Sensor, values: np.ndarray, rate: float, machine: Machi
         fastest, usual = rated_speed(sensor, machine), float(np.percentile(step, 99)) * rate
         if fastest is not None and step.max() * rate > 5 * fastest and usual > 3 * fastest:
             raise LogError(
-                f"{source}: column {sensor.column}: turns at {usual:.3g} rad/s, the machine allows {fastest:.3g} rad/s;"
-                " is the column in degrees?"
+                f"{source}: column {sensor.column}: turns at {format_number(usual, 3)} rad/s, the machine allows"
+                f" {format_number(fastest, 3)} rad/s; is the column in degrees?"
             )
         limit = body.limit.position
         if limit is not None and np.abs(values).max() > 3 * float(limit):
             raise LogError(
-                f"{source}: column {sensor.column}: up to {np.abs(values).max():.3g} rad, the machine allows"
-                f" {float(limit):g} rad; is the column in degrees?"
+                f"{source}: column {sensor.column}: up to {format_number(np.abs(values).max(), 3)} rad, the machine"
+                f" allows {float(limit):g} rad; is the column in degrees?"
             )
     if sensor.kind == "torque" and body.limit.torque is not None:
         top, most = float(np.abs(values).max()), float(body.limit.torque)
         if top > 10 * most:
             raise LogError(
-                f"{source}: column {sensor.column}: up to {top:.3g}, more than ten times the drive's limit {most:g};"
-                " is the unit right?"
+                f"{source}: column {sensor.column}: up to {format_number(top, 3)}, more than ten times the drive's"
+                f" limit {most:g}; is the unit right?"
             )
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from excite.errors import NoEstimateError
 from excite.model import mechanics
 from excite.model.machine import Body, Machine, Sensor, shipped_machines
+from excite.text import format_number
 
 SPAN = 0.5  # s: half of what accelerations and torques are taken over, so that counts and noise don't matter
 LEAST = 10  # independent spans that a sign is judged by
@@ -397,8 +398,9 @@ def _counts(sensor: Sensor, machine: Machine, values: np.ndarray) -> str:
     least, turn = float(np.quantile(steps, 0.01)), float(sensor.counts_per_turn or 0)
     if _whole(steps / least, off * min(1, 1 / least)) and abs(least - 1) > ONE:
         return (
-            f"column {sensor.column}: moves in steps of {least:.3g} counts of {turn:g} per turn: is it filtered or"
-            f" rounded, or is it counts_per_turn = {round(turn / least)}? then write that for it in {own_file(machine)}"
+            f"column {sensor.column}: moves in steps of {format_number(least, 3)} counts of {turn:g} per turn: is it"
+            f" filtered or rounded, or is it counts_per_turn = {round(turn / least)}? then write that for it in"
+            f" {own_file(machine)}"
         )
     if _whole(steps, off):
         return ""
@@ -417,7 +419,10 @@ def _scale(sensor: Sensor, body: Body, machine: Machine, torque: np.ndarray) -> 
     if body.limit.torque is None:
         return ""
     top, most, name = float(np.abs(torque).max()), float(body.limit.torque), " - ".join(sensor.columns)
-    said = f"column {name}: the largest torque is {top:.3g} {machine.si_unit(sensor)}, the drive's limit {most:g}"
+    said = (
+        f"column {name}: the largest torque is {format_number(top, 3)} {machine.si_unit(sensor)}, the drive's limit"
+        f" {most:g}"
+    )
     if 0 < top < SMALL * most:
         larger = THOUSAND.get(sensor.unit) if sensor.factor is None else None
         if larger is None:

@@ -22,6 +22,7 @@ from excite.logs.time_axis import Run, order_rows
 from excite.logs.times import absolute_seconds, has_time, refuse_swapped_dates, seconds
 from excite.model import Model
 from excite.model.machine import TIME_UNITS, UNITS, Machine, Sensor
+from excite.text import count, format_number
 
 FASTEST_HZ = 150.0  # rate [Hz] beyond which a rolling machine tells nothing more: its slips relax within tens of ms
 REST_S = 5.0  # [s] of standing still that is left out; chosen
@@ -77,7 +78,10 @@ def prepare(
             stretches.append((where, slower_to(stretch, machine, common), machine))
         notes += [f"{line} ({use})" if use else line for line in dict.fromkeys(said)]
     if differs:
-        notes.append(f"logs at {common:.6g} to {max(rates):.6g} Hz are brought to {common:.6g} Hz")
+        notes.append(
+            f"logs at {format_number(common, 6)} to {format_number(max(rates), 6)} Hz are brought to"
+            f" {format_number(common, 6)} Hz"
+        )
     at_rate = with_rate(model, common)
     logs = [as_log(stretch, at_rate.machine, needs, name) for name, stretch, _ in stretches]
     return Prepared(
@@ -94,7 +98,8 @@ def _read_limited(
         return found, said
     thinned = [slower(stretch, model.machine, FASTEST_HZ) for stretch in found]
     said += [
-        f"{_name(source)}: {old.rate:.4g} Hz is faster than the machine: reduced to {new.rate:.4g} Hz"
+        f"{_name(source)}: {format_number(old.rate, 4)} Hz is faster than the machine: reduced to"
+        f" {format_number(new.rate, 4)} Hz"
         for old, new in zip(found, thinned, strict=True)
         if new is not old
     ]
@@ -152,7 +157,9 @@ def place_rows(
     least = log.fewest_rows(machine)
     long = [s for s in stretches if len(s.table) >= least]
     if long and len(long) < len(stretches):
-        said.append(f"{name}: {len(stretches) - len(long)} stretches of less than {least} rows are left out")
+        short = f"of less than {least} rows"
+        left_out = count(len(stretches) - len(long), f"stretch {short} is", f"stretches {short} are")
+        said.append(f"{name}: {left_out} left out")
     return long or stretches, said
 
 
@@ -249,8 +256,8 @@ def _refuse_other_scale(spans: dict[str, float]) -> None:
         near = [unit for unit in SCALES if lasts > 0 and abs(longer / lasts / unit - 1) < ALIKE_SPANS]
         if near:
             raise LogError(
-                f"{other}: lasts {longer:.4g} s, {near[0]:g} times as long as {one.rpartition(': ')[2]}: is it in"
-                " another unit? then write time_unit for its sensors in the machine file"
+                f"{other}: lasts {format_number(longer, 4)} s, {near[0]:g} times as long as {one.rpartition(': ')[2]}:"
+                " is it in another unit? then write time_unit for its sensors in the machine file"
             )
 
 
@@ -354,7 +361,9 @@ def without_rests(one: Log, machine: Machine, notes: list[str]) -> list[Log]:
     if not parts:
         return [one]
     used = sum(b - a for a, b in parts) / rate
-    notes.append(f"{one.source}: the machine stands still for {(end / rate) - used:.4g} s, which is left out")
+    notes.append(
+        f"{one.source}: the machine stands still for {format_number((end / rate) - used, 4)} s, which is left out"
+    )
     return [
         replace(
             one,

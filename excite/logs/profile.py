@@ -14,6 +14,7 @@ from excite.logs import tables
 from excite.logs.log import OFF_RATE, check_time, columns_of, numbers
 from excite.model import Model
 from excite.simulation import Motion
+from excite.text import count, format_number
 
 SLOWEST_HZ = 0.5  # rate of a profile's rows below which its time is taken for wrong; chosen
 
@@ -116,13 +117,13 @@ def read_drive(source: str | Path | pd.DataFrame, model: Model, any_rate: bool =
         )
     t = numbers(table, "t_s", source)
     if len(t) < 2:
-        raise LogError(f"{source}: only {len(t)} row, a profile needs at least 2")
+        raise LogError(f"{source}: only {count(len(t), 'row')}, a profile needs at least 2")
     rate = float(model.machine.sampling_hz)
     usual = 1 / float(np.median(np.diff(t))) if (np.diff(t) > 0).all() else rate
     if usual < SLOWEST_HZ or 0 < (t[-1] - t[0]) * rate < 1:
         raise LogError(
-            f"{source}: column t_s: {len(t)} rows {1 / usual:.4g} s apart; a profile lasts more than {1 / rate:g} s,"
-            f" with rows at most {1 / SLOWEST_HZ:g} s apart: is the time in seconds?"
+            f"{source}: column t_s: {len(t)} rows {format_number(1 / usual, 4)} s apart; a profile lasts more than"
+            f" {1 / rate:g} s, with rows at most {1 / SLOWEST_HZ:g} s apart: is the time in seconds?"
         )
     own = usual if any_rate and abs(usual / rate - 1) > OFF_RATE else rate
     check_time(t, own, "t_s", source)
@@ -132,8 +133,8 @@ def read_drive(source: str | Path | pd.DataFrame, model: Model, any_rate: bool =
         top = float(np.abs(torque[:, k]).max())
         if limit is not None and top > 10 * float(limit):
             raise LogError(
-                f"{source}: column {needed[k + 1]}: up to {top:.3g}, more than ten times the drive's limit"
-                f" {float(limit):g}; is the unit right?"
+                f"{source}: column {needed[k + 1]}: up to {format_number(top, 3)}, more than ten times the drive's"
+                f" limit {float(limit):g}; is the unit right?"
             )
     columns = motion_columns(model)
     given = {c: numbers(table, c, source) for pair in columns for c in pair if c in table.columns}

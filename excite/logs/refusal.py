@@ -21,6 +21,7 @@ from excite.logs.repair import mended
 from excite.logs.tables import COMMENTS
 from excite.logs.times import has_time, seconds
 from excite.model.machine import UNITS, Machine
+from excite.text import format_number
 
 T = TypeVar("T")
 
@@ -125,8 +126,8 @@ def wrong_time_unit(t: np.ndarray, machine: Machine) -> str:
         if unit != machine.time_unit and abs(typical * rate * ratio - 1) <= CLOSE:
             line = f'time_unit = "{unit}"'
             return (
-                f"column {machine.time_column}: sampled at {1 / typical:.4g} Hz, the machine file says {rate:g} Hz:"
-                f" is it in {unit}? then write {line} in {own_file(machine)}"
+                f"column {machine.time_column}: sampled at {format_number(1 / typical, 4)} Hz, the machine file says"
+                f" {rate:g} Hz: is it in {unit}? then write {line} in {own_file(machine)}"
             )
     return ""
 

@@ -22,6 +22,7 @@ from excite.logs.checks import (
 from excite.logs.log import Log
 from excite.logs.plausibility import doubts
 from excite.model.machine import Machine, Sensor
+from excite.text import count, format_number
 
 NEEDED = ("angle", "torque", "wheel")  # kinds of sensor that no method does without
 
@@ -58,8 +59,8 @@ def examine(machine: Machine, log: Log) -> Examination:
         sensor, rows = c.sensor, spikes_of(c)
         if too_many(rows, c):
             doubtful.append(
-                f"{log.source}: column {sensor.column}: {len(rows)} readings are off what their neighbours and their"
-                " times say, left as they are: were they taken at these times?"
+                f"{log.source}: column {sensor.column}: {count(len(rows), 'reading is', 'readings are')} off what"
+                " their neighbours and their times say, left as they are: were they taken at these times?"
             )
         elif len(rows):
             mean = _mean_of_neighbours(c, rows)
@@ -105,7 +106,7 @@ def _note(sensor: Sensor, machine: Machine, rows: np.ndarray, size: float, sourc
     """What is said of spikes in rows (from 0) that were replaced."""
     shown = ", ".join(str(r + 1) for r in rows[:5]) + (", ..." if len(rows) > 5 else "")
     return (
-        f"{source}: column {sensor.column}: {len(rows)} spike{'s' if len(rows) > 1 else ''} of up to {size:.3g}"
+        f"{source}: column {sensor.column}: {count(len(rows), 'spike')} of up to {format_number(size, 3)}"
         f" {machine.si_unit(sensor)} replaced by the mean of the neighbours (row {shown})"
     )
 

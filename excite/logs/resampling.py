@@ -19,6 +19,7 @@ from excite.errors import LogError
 from excite.logs.grid import edges as encoder_edges, on_grid
 from excite.logs.time_axis import Run
 from excite.model.machine import Machine, Sensor
+from excite.text import count, format_number
 
 EVEN = 0.02  # relative deviation of a step from the usual one up to which rows are even; chosen
 DRIFTED = 0.5  # of a step by which even rows may leave an even clock; chosen
@@ -78,7 +79,8 @@ def even_stretches(
             there[name] &= change
             notes.append(
                 f"{source}: column {name}: changes in every {ordinal(every)} row only: a"
-                f" {own_rate(run.t) / every:.3g} Hz signal that is held, used at the rows where it changes"
+                f" {format_number(own_rate(run.t) / every, 3)} Hz signal that is held, used at the rows where it"
+                " changes"
             )
     for name, rows in there.items():
         if not rows.any():
@@ -92,7 +94,9 @@ def even_stretches(
         if rate is None or abs(own / rate - 1) < SAME_RATE:
             return [stretch], notes
         if own > THINNED * rate:
-            return [at_rate(stretch, machine, rate)], [f"{source}: resampled from {own:.6g} to {rate:.6g} Hz"]
+            return [at_rate(stretch, machine, rate)], [
+                f"{source}: resampled from {format_number(own, 6)} to {format_number(rate, 6)} Hz"
+            ]
     grid = rate or (nominal if abs(own / nominal - 1) < EVEN else own)
     # For filters the step must be even, so a rate close to the log's is as good as any.
     longest = max(BRIDGED_STEPS / own, min(BRIDGED_S, 0.25 / float(machine.filter.cutoff_hz)))
@@ -271,34 +275,39 @@ def _notes(
     rates: dict[str, list[str]] = {}
     for name, rows in there.items():
         usual = _usual_step(t[rows])
-        rates.setdefault(f"{1 / usual:.3g} Hz" if usual > 0 else "one reading", []).append(name)
+        rates.setdefault(f"{format_number(1 / usual, 3)} Hz" if usual > 0 else "one reading", []).append(name)
     lost = int((wide > 1.5 * step).sum())
     sparse = sum(int((~rows).sum()) for rows in there.values())
     if len(rates) > 1 and sparse:
         listed = "; ".join(f"{', '.join(names)} at {rate}" for rate, names in rates.items())
-        notes.append(f"{source}: channels with times of their own ({listed}), each interpolated onto {grid:.4g} Hz")
+        notes.append(
+            f"{source}: channels with times of their own ({listed}), each interpolated onto {format_number(grid, 4)} Hz"
+        )
     elif sparse:
-        notes.append(f"{source}: {sparse} empty {'cell' if sparse == 1 else 'cells'}, interpolated")
+        notes.append(f"{source}: {count(sparse, 'empty cell')}, interpolated")
     even = np.abs(wide / step - np.round(wide / step)).max() < 5 * EVEN if len(wide) else True
     drifting = not lost and not sparse and len(spans) == 1 and _drifts(t)
     if not even or drifting:
         low, high = 1e3 * float(np.quantile(dt, 0.01)), 1e3 * float(np.quantile(dt, 0.99))
         slow = ", and the steps drift" if even else ""
         notes.append(
-            f"{source}: rows are {low:.3g} to {high:.3g} ms apart{slow}, interpolated at their own times onto"
-            f" {1e3 / grid:.4g} ms"
+            f"{source}: rows are {format_number(low, 3)} to {format_number(high, 3)} ms apart{slow}, interpolated at"
+            f" their own times onto {format_number(1e3 / grid, 4)} ms"
         )
     elif lost and not sparse:
-        notes.append(f"{source}: rows are lost in {lost} {'place' if lost == 1 else 'places'}, interpolated")
+        notes.append(f"{source}: rows are lost in {count(lost, 'place')}, interpolated")
     if len(spans) > 1:
         gaps = len(spans) - 1
         used = sum(b - a for a, b in kept)
         notes.append(
-            f"{source}: {gaps} {'gap' if gaps == 1 else 'gaps'}: used are {len(kept)} of {len(spans)} stretches"
-            f" between, {used:.4g} of {last - first:.4g} s"
+            f"{source}: {count(gaps, 'gap')}: used are {len(kept)} of {len(spans)} stretches between,"
+            f" {format_number(used, 4)} of {format_number(last - first, 4)} s"
         )
     whole = float(t[-1] - t[0])
     longest = max((_usual_step(t[rows]) for rows in there.values()), default=0.0)
     if whole - (last - first) > min(0.01 * whole, BRIDGED_STEPS * longest):
-        notes.append(f"{source}: not all channels last as long: used are {last - first:.4g} of {whole:.4g} s")
+        notes.append(
+            f"{source}: not all channels last as long: used are {format_number(last - first, 4)} of"
+            f" {format_number(whole, 4)} s"
+        )
     return notes

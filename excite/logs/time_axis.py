@@ -11,6 +11,7 @@ import pandas as pd
 from excite.errors import LogError
 from excite.logs.clocks import goes_on, period_of, unrounded
 from excite.logs.times import DAY_S
+from excite.text import count, format_number
 
 HOUR_S = 3600.0  # [s] by which a clock is set for summer time
 SLACK_STEPS = 20.0  # steps by which a clock's jump may differ from a whole day or hour; chosen
@@ -59,7 +60,9 @@ def order_rows(
     if len(back) and (period := period_of(t, unit)) and goes_on(known, back):
         t += period * np.searchsorted(back, rows, side="right")
         where = ", ".join(str(k + 1) for k in back[:SHOWN]) + (", ..." if len(back) > SHOWN else "")
-        notes.append(f"{source}: row {where}, column {column}: the clock begins anew every {period:.6g} s, read on")
+        notes.append(
+            f"{source}: row {where}, column {column}: the clock begins anew every {format_number(period, 6)} s, read on"
+        )
     repeated = np.flatnonzero(np.diff(t) == 0) + 1
     if len(repeated):
         before = table.iloc[repeated - 1].reset_index(drop=True)
@@ -69,7 +72,9 @@ def order_rows(
             keep = np.setdiff1d(rows, drop)
             rows, t = rows[keep], t[keep]
             which = (
-                "every row is there twice" if len(drop) >= len(keep) - 1 else f"{len(drop)} rows repeat the one before"
+                "every row is there twice"
+                if len(drop) >= len(keep) - 1
+                else f"{count(len(drop), 'row repeats', 'rows repeat')} the one before"
             )
             notes.append(f"{source}: {which}, the copies are left out")
     runs = _split(rows, t, column, source, notes)
@@ -96,12 +101,12 @@ def _split(rows: np.ndarray, t: np.ndarray, column: str, source: str, notes: lis
     order = np.argsort(t, kind="stable")
     steps = np.diff(t[order])
     if (steps > 0).all() and np.abs(steps / np.median(steps) - 1).max() < SORTED_EVEN:
-        notes.append(f"{source}: {len(back)} rows are not in order of time, sorted")
+        notes.append(f"{source}: {count(len(back), 'row is', 'rows are')} not in order of time, sorted")
         return [Run(rows[order], t[order])]
     k = int(back[0])
     raise LogError(
         f"{source}: row {rows[k] + 1}, column {column}: time goes back ({t[k - 1]:g} s, then {t[k]:g} s;"
-        f" {len(back)} times in all), and no order of the rows is even: is it the time of all channels?"
+        f" {count(len(back), 'time')} in all), and no order of the rows is even: is it the time of all channels?"
     )
 
 
@@ -119,12 +124,13 @@ def _even_ticks(run: Run, column: str, source: str, notes: list[str]) -> Run:
     if tick <= 0 or slope <= 0 or off > 1.5 * tick:
         first = int(np.argmax(np.diff(t) == 0)) + 1
         raise LogError(
-            f"{source}: row {run.rows[first] + 1}, column {column}: {shared} rows share their time with the row before,"
-            " and rows are not even along the clock: log a finer time"
+            f"{source}: row {run.rows[first] + 1}, column {column}:"
+            f" {count(shared, 'row shares its', 'rows share their')} time with the row before, and rows are not even"
+            " along the clock: log a finer time"
         )
     notes.append(
-        f"{source}: {shared} {'row shares its' if shared == 1 else 'rows share their'} time with the row before: the"
-        f" clock ticks every {tick:.3g} s, the rows are taken to be {slope:.4g} s apart"
+        f"{source}: {count(shared, 'row shares its', 'rows share their')} time with the row before: the clock ticks"
+        f" every {format_number(tick, 3)} s, the rows are taken to be {format_number(slope, 4)} s apart"
     )
     return Run(run.rows, start + slope * k)
 
@@ -145,7 +151,7 @@ def _unrounded(run: Run, positions: np.ndarray, nominal_step: float, source: str
         rounding = max(rounding, found[1])
     rate = 1 / float(np.median(np.diff(times[0])))
     notes.append(
-        f"{source}: times are rounded to {1e3 * rounding:.3g} ms: an even clock of {rate:.5g} Hz explains all of them"
-        " and is used"
+        f"{source}: times are rounded to {format_number(1e3 * rounding, 3)} ms: an even clock of"
+        f" {format_number(rate, 5)} Hz explains all of them and is used"
     )
     return Run(run.rows, np.concatenate(times))

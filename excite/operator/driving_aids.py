@@ -21,6 +21,7 @@ from excite.operator.ground import DriveQuality, Trace
 from excite.operator.server import GrowingLog, serve_page
 from excite.operator.sheet import Sheet
 from excite.simulation import Motion
+from excite.text import format_number
 from excite.trajectories import SavedDesign
 
 PEOPLE = 3  # simulated drivers; chosen
@@ -152,7 +153,7 @@ def verdict(
 def _attained_words(median: float, worst: float) -> str:
     """Describe errors as multiples of those with torques played back."""
     exact = "torques played back exactly"
-    factors = {name: f"{x:.2g}" for name, x in (("median", median), ("worst", worst))}
+    factors = {name: f"{format_number(x, 2)}" for name, x in (("median", median), ("worst", worst))}
     more = [f"{x} times the {name} error" for name, x in factors.items() if x != "1"]
     same = [name for name, x in factors.items() if x == "1"]
     if not more:

@@ -18,6 +18,7 @@ from excite.errors import UndrivableError
 from excite.model import Model
 from excite.model.machine import Body, Problem
 from excite.simulation import Motion, left_turn_sign
+from excite.text import format_number
 
 BROKEN_SHARE = 0.02  # excess, as a share of a limit's range, from which the limit counts as broken; chosen
 GRID_S = 0.5  # [s]: phases begin at multiples of it; chosen
@@ -294,10 +295,14 @@ def _stopping_phase(trace: Trace, t: float) -> int:
 
 
 def _speed_words(v0: float, v1: float, took: float, start: float, name: str) -> str:
-    seconds = f"in {took:.3g} s"
+    seconds = f"in {format_number(took, 3)} s"
     way = " backward" if min(v0, v1) < 0 else ""
     if v0 == v1:
-        return f"hold {abs(v1):.1f} m/s{way} for {took:.3g} s" if v1 else f"stand still for {took:.3g} s"
+        return (
+            f"hold {abs(v1):.1f} m/s{way} for {format_number(took, 3)} s"
+            if v1
+            else f"stand still for {format_number(took, 3)} s"
+        )
     if v0 * v1 < 0:
         turn, way = format_clock(start + took * v0 / (v0 - v1)), "backward" if v1 < 0 else "forward"
         return f"through a stop {name + ' ' if name else ''}at {turn} to {abs(v1):.1f} m/s {way} {seconds}"

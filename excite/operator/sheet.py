@@ -20,6 +20,7 @@ from excite.operator import ground
 from excite.operator.ground import DriveQuality, TouchedGround, Trace
 from excite.reports import COLOURS
 from excite.simulation import Motion
+from excite.text import format_number
 
 A4 = (8.27, 11.69)
 LEFT, RIGHT = 0.08, 0.95
@@ -340,8 +341,9 @@ def _table(figure: Figure, y: float, rows: Sequence[Sequence[str]], space: float
 
 def _score_line(name: str, score: DriveQuality) -> str:
     return (
-        f"{name}: attainable error {score.median_percent:.2g} % (median parameter), {score.worst_percent:.2g} %"
-        f" (worst, {score.worst}); cond(Phi) {score.cond_phi:.3g}"
+        f"{name}: attainable error {format_number(score.median_percent, 2)} % (median parameter),"
+        f" {format_number(score.worst_percent, 2)} % (worst, {score.worst}); cond(Phi)"
+        f" {format_number(score.cond_phi, 3)}"
     )
 
 

@@ -6,7 +6,11 @@ from .descriptions import (
     describe_drive_faults as describe_drive_faults,
     format_sum as format_sum,
 )
-from .diagnosis_figures import figure_calls as figure_calls, signals_figure as signals_figure
+from .diagnosis_figures import (
+    figure_calls as figure_calls,
+    figures_by_file as figures_by_file,
+    signals_figure as signals_figure,
+)
 from .figures import (
     COLOURS as COLOURS,
     compare_figure as compare_figure,
@@ -19,5 +23,21 @@ from .figures import (
     verify_figure as verify_figure,
 )
 from .html import Picture as Picture, report_page as report_page, templates as templates
-from .pages import REPORT as REPORT, check_log as check_log, write_report as write_report
+from .log_check import check_log as check_log, log_account as log_account, log_frame as log_frame
+from .pages import REPORT as REPORT, write_report as write_report
+from .plain_text import PIPE_WIDTH as PIPE_WIDTH, text_parts as text_parts, text_table as text_table
+from .results import (
+    Account as Account,
+    Shown as Shown,
+    ShownAssessment as ShownAssessment,
+    ShownComparison as ShownComparison,
+    ShownDesign as ShownDesign,
+    ShownEstimate as ShownEstimate,
+    ShownLog as ShownLog,
+    ShownPrediction as ShownPrediction,
+    ShownScore as ShownScore,
+    ShownVerification as ShownVerification,
+    drive_frame as drive_frame,
+    rows_frame as rows_frame,
+)
 from .top_view import footprints as footprints, steered_joints as steered_joints, top_view_figure as top_view_figure

@@ -8,19 +8,23 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.stats
 
 from excite import trajectories
 from excite.identification import SIGNIFICANT_BIAS
 from excite.smoothing import MAX_IDENTIFIABLE_STD
-from excite.text import first_lines, format_number, format_p_value, format_percent
+from excite.text import count, first_lines, format_number, format_p_value, format_percent, format_rounded
 from excite.trajectories import TOLERANCE
 
 Summary = Mapping[str, Any]
 
-WORD = re.compile(r"a|[a-z]{3,},?")  # a word that a sentence may begin with in a capital letter; a name stays as it is
+WORD = re.compile(
+    r"a|no|[a-z]{3,},?"
+)  # a word that a sentence may begin with in a capital letter; a name stays as it is
 NUMBER = re.compile(r"[<≤]?\s*[-+−]?\d")
 MAX_CELLS = 200  # cells of a study in a table; chosen
 MAX_CONDITION = 1e15  # condition number that is infinite but for rounding
+FALSE_ALARM = 0.01  # probability of a verdict against intervals that hold; chosen
 SHOWN_VIOLATION = 5e-6  # of a limit's range: smaller ones round to 0.000 %
 
 
@@ -57,7 +61,7 @@ class Description:
     """A result for people.
 
     title: what it is. headline: the answer in a sentence. remarks: what else the reader must know, a sentence each.
-    status: `valid`, `doubtful` or `invalid`.
+    status: `valid`, `doubtful` or `invalid`. verdict: what to think of it and do, the last sentence, "" for none.
     """
 
     title: str
@@ -65,6 +69,12 @@ class Description:
     tables: tuple[Table, ...] = ()
     remarks: tuple[str, ...] = ()
     status: str = "valid"
+    verdict: str = ""
+
+    @property
+    def closing(self) -> tuple[str, ...]:
+        """The remarks and the verdict."""
+        return (*self.remarks, f"Verdict: {self.verdict}") if self.verdict else self.remarks
 
 
 def describe(kind: str, summary: Summary) -> Description:
@@ -134,13 +144,14 @@ def describe_design(s: Summary) -> Description:
         f" {format_percent(np.median(list(sigma.values())))}); {limits}."
     )
     remarks = [
-        f"Condition number of Phi {s['cond_phi']:.4g}, of W {s['cond_w']:.4g}; best start {s['cond_phi_start']:.4g}."
+        f"Condition number of Phi {format_number(s['cond_phi'], 4)}, of W {format_number(s['cond_w'], 4)}; best start"
+        f" {format_number(s['cond_phi_start'], 4)}."
     ]
     lowest = s.get("lowest_cond")
     if lowest:
         remarks.append(
-            f"The lowest cond(Phi) found is {lowest['cond_phi']:.4g}, with {lowest['worst_parameter']} to"
-            f" {format_percent(lowest['worst_percent'])}; this drive is the most accurate one within"
+            f"The lowest cond(Phi) found is {format_number(lowest['cond_phi'], 4)}, with {lowest['worst_parameter']}"
+            f" to {format_percent(lowest['worst_percent'])}; this drive is the most accurate one within"
             f" {s['cond_slack_percent']:g} % of it (`--cond-slack 0` gives the other)."
         )
     remarks += describe_outside_law(s.get("share_outside_law"))
@@ -171,7 +182,7 @@ def describe_score(s: Summary) -> Description:
     hidden = [n for n, v in sigma.items() if v > 100 * MAX_IDENTIFIABLE_STD]
     shown = f"identify every parameter to {format_percent(s['worst_percent'])} or better"
     if hidden:
-        shown = f"do not show {len(hidden)} of {len(sigma)} parameters ({_join_some(hidden)})"
+        shown = f"do not show {len(hidden)} of {count(len(sigma), 'parameter')} ({_join_some(hidden)})"
     over = describe_violations(s["violations"])
     limits = f"limits broken: {over}" if over else "every limit is kept"
     headline = (
@@ -187,7 +198,7 @@ def describe_score(s: Summary) -> Description:
 
 
 def _condition(value: float | None) -> str:
-    return "infinite" if value is None or value > MAX_CONDITION else f"{value:.4g}"
+    return "infinite" if value is None or value > MAX_CONDITION else f"{format_number(value, 4)}"
 
 
 def _sigma_table(s: Summary) -> Table:
@@ -216,14 +227,16 @@ def _describe_by_hand(s: Summary) -> tuple[list[str], list[Table]]:
     free, hand = d["played_back"], d["by_hand"]
     over = ", ".join(f"{name} by {format_percent(100 * value)}" for name, value in d["limits_broken"].items())
     value = trajectories.describe_value(s["objective"], hand["score"])
+    people = count(d["people"], "simulated person", "simulated people")
     remarks = [
-        f"In people's hands these {len(d['phases'])} phases give {value}, torques played back {free['score']:.4g}; the"
-        f" worst parameter is identified to {format_percent(hand['worst_percent'])} ({hand['worst_parameter']}) instead"
-        f" of {format_percent(free['worst_percent'])}, the median one to {format_percent(hand['median_percent'])}"
-        f" instead of {format_percent(free['median_percent'])}.",
-        f"In the hands of {d['people']} simulated people these limits are exceeded: {over} of their range."
+        f"In people's hands these {count(len(d['phases']), 'phase')} give {value}, torques played back"
+        f" {format_number(free['score'], 4)}; the worst parameter is identified to"
+        f" {format_percent(hand['worst_percent'])} ({hand['worst_parameter']}) instead of"
+        f" {format_percent(free['worst_percent'])}, the median one to {format_percent(hand['median_percent'])} instead"
+        f" of {format_percent(free['median_percent'])}.",
+        f"In the hands of {people} these limits are exceeded: {over} of their range."
         if over
-        else f"In the hands of {d['people']} simulated people every limit is kept.",
+        else f"In the hands of {people} every limit is kept.",
         "The accuracy of single parameters is of a steady person; `excite drive` makes the driver's sheet and page of"
         " this drive.",
     ]
@@ -258,7 +271,7 @@ def describe_compare(s: Summary) -> Description:
     best = min(kept, key=lambda d: d["cond_phi"]) if kept else None
     if own and len(own) == len(s["designs"]) - 1:
         designed = s["designs"][0]
-        headline = f"The designed drive has cond(Phi) {designed['cond_phi']:.4g}; " + "; ".join(
+        headline = f"The designed drive has cond(Phi) {format_number(designed['cond_phi'], 4)}; " + "; ".join(
             f"{d['name']} has {_condition(d['cond_phi'])}"
             + ("" if d["breaks"] is None else f" and breaks {_broken_limit(d)}")
             for d in own
@@ -268,11 +281,11 @@ def describe_compare(s: Summary) -> Description:
     else:
         word = "lower" if ratio > 1 else "higher"
         headline = (
-            f"In the same time the designed drive reaches a condition number {max(ratio, 1 / ratio):.2g} times {word}"
-            " than the best usual one."
+            f"In the same time the designed drive reaches a condition number {format_number(max(ratio, 1 / ratio), 2)}"
+            f" times {word} than the best usual one."
         )
     remarks = (
-        (f"Lowest among those that keep every limit: {best['name']}, cond(Phi) {best['cond_phi']:.4g}.",)
+        (f"Lowest among those that keep every limit: {best['name']}, cond(Phi) {format_number(best['cond_phi'], 4)}.",)
         if best
         else ()
     )
@@ -315,19 +328,19 @@ def describe_verify(s: Summary) -> Description:
     title, rows = f"Verification of a drive for {s['machine']}", s["parameters"]
     errors = {n: float(r["rms_percent"]) for n, r in rows.items() if np.isfinite(r["rms_percent"])}
     if not errors:
-        return Description(title, f"No parameter was identified in any of {s['runs']} simulated test days.")
+        return Description(title, f"No parameter was identified in {count(s['runs'], 'simulated test day')}.")
     worst = max(errors, key=lambda n: errors[n])
     cover = 100 * float(np.mean([rows[n]["coverage95"] for n in errors]))
     median = float(np.median(list(errors.values())))
     headline = (
-        f"In {s['runs']} simulated test days the parameters came out within {format_percent(median)} of the truth"
-        f" (median; worst {worst}, {format_percent(errors[worst])}), and the 95 % intervals held it in {cover:.0f} % of"
-        " cases."
+        f"In {count(s['runs'], 'simulated test day')} the parameters came out within {format_percent(median)} of the"
+        f" truth (median; worst {worst}, {format_percent(errors[worst])}), and the 95 % intervals held it in"
+        f" {cover:.0f} % of cases."
     )
     remarks = [f"Biased, the intervals do not hold: {', '.join(s['biased'])}."] if s["biased"] else []
     remarks += describe_outside_law(s.get("share_outside_law"))
     if s["failed"]:
-        remarks.append(f"{s['failed']} runs gave no estimate.")
+        remarks.append(f"{count(s['failed'], 'run')} gave no estimate.")
     table = tuple(
         (
             n,
@@ -346,17 +359,45 @@ def describe_verify(s: Summary) -> Description:
     if s.get("method"):
         caption = f"True and estimated parameters, method {s['method']}, kit {s['kit']}; biased ones are set off."
     tables = (Table(caption, (*names, "coverage %"), table, marked, _meaning_index(s)),)
-    return Description(title, headline, tables, tuple(remarks))
+    return Description(title, headline, tables, tuple(remarks), verdict=_judge_drive(s, errors[worst]))
+
+
+def _judge_drive(s: Summary, worst_percent: float) -> str:
+    """Say in a sentence whether intervals hold and what the drive shows."""
+    runs = s["runs"] - s["failed"]
+    narrow = [n for n, r in s["parameters"].items() if n not in s["biased"] and _misses_too_often(r, s)]
+    wrong = [*s["biased"], *narrow]
+    shown = f"the drive shows every parameter to {format_percent(worst_percent)} or better"
+    if worst_percent > 100 * MAX_IDENTIFIABLE_STD:
+        shown = f"the drive does not show every parameter (errors up to {format_percent(worst_percent)})"
+    if wrong:
+        return f"{shown}, but the 95 % intervals of {_join_some(wrong)} do not hold."
+    tell = f"as far as {count(runs, 'test day tells', 'test days tell')}"
+    return f"{shown}, and the 95 % intervals hold, {tell}."
+
+
+def _misses_too_often(row: Mapping[str, Any], s: Summary) -> bool:
+    """Tell if an interval holds the truth less often than chance leaves to one of 95 %, all parameters together."""
+    runs = s["runs"] - s["failed"]
+    if not runs or not np.isfinite(row["coverage95"]):
+        return False
+    held = round(runs * row["coverage95"])
+    return bool(scipy.stats.binom.cdf(held, runs, 0.95) < FALSE_ALARM / len(s["parameters"]))
 
 
 MAX_NAMES = 4  # parameters that a headline names
-ESTIMATE_COLUMNS = (  # of a parameter: heading, key, digits
-    ("value", "value", 6),
-    ("std", "std", 3),
-    ("std %", "std_percent", 3),
-    ("95 % from", "low95", 6),
-    ("to", "high95", 6),
+ESTIMATE_COLUMNS = (  # of a parameter: heading, key
+    ("value", "value"),
+    ("std", "std"),
+    ("std %", "std_percent"),
+    ("95 % from", "low95"),
+    ("to", "high95"),
 )
+
+
+def _estimate_cell(row: Mapping[str, Any], key: str) -> str:
+    """Format a number of a parameter: one in its unit to the decimals of its standard deviation, or in per cent."""
+    return format_number(row[key], 2) if key.endswith("percent") else format_rounded(row[key], row["std"])
 
 
 def describe_identify(s: Summary) -> Description:
@@ -365,11 +406,9 @@ def describe_identify(s: Summary) -> Description:
     known = {n: abs(r["std_percent"]) for n, r in rows.items() if r["std_percent"] is not None}
     known = {n: v for n, v in known.items() if np.isfinite(v)}
     worst = max(known, key=lambda n: known[n], default="")
-    count = (
-        f"{len(known)} parameters"
-        if not s["unidentifiable"]
-        else f"{len(known)} of {len(known) + len(s['unidentifiable'])} parameters"
-    )
+    every = len(known) + len(s["unidentifiable"])
+    what = count(every, "parameter is", "parameters are")
+    what = f"{len(known)} of {what}" if s["unidentifiable"] else what
     logs = "one log" if len(s["logs"]) == 1 else f"{len(s['logs'])} logs"
     error = format_percent(float(s["relative_error_percent"]))
     accuracy = (
@@ -378,13 +417,11 @@ def describe_identify(s: Summary) -> Description:
         if known
         else " no known accuracy"
     )
-    headline = (
-        f"From {logs}, {count} are identified to{accuracy}; the prediction error is {error} of what was measured."
-    )
+    headline = f"From {logs}, {what} identified to{accuracy}; the prediction error is {error} of what was measured."
     if s["status"] == "doubtful":
         headline = (
-            f"From {logs}, {count} are estimated, but their 95 % intervals do not hold: {s['doubt']}"
-            f" (stated:{accuracy}; prediction error {error})."
+            f"From {logs}, {what} estimated, but their 95 % intervals do not hold: {s['doubt']} (stated:{accuracy};"
+            f" prediction error {error})."
         )
     off = {n: abs(r["bias"] / (r["value"] - r["bias"])) for n, r in rows.items() if n in known and _is_biased(r)}
     impossible = [n for n, r in rows.items() if not r["possible"]]
@@ -399,7 +436,7 @@ def describe_identify(s: Summary) -> Description:
         most = max(off, key=lambda n: off[n])
         wrong = (
             f"On simulated logs like this {s['method']} is wrong by up to {format_percent(100 * off[most])} ({most}),"
-            f" in {len(off)} parameters by more than it says.",
+            f" in {count(len(off), 'parameter')} by more than it says.",
         )
     remarks = [
         *wrong,
@@ -416,10 +453,10 @@ def describe_identify(s: Summary) -> Description:
             n,
             *_meaning(s, n),
             r["unit"],
-            *(format_number(r[k], d) for _, k, d in ESTIMATE_COLUMNS),
-            *((format_number(r.get("prior_std"), 3),) if prior else ()),
-            *((format_number(r.get("bias"), 3),) if biased else ()),
-            *(("" if r["possible"] else "no", format_number(r.get("consistent"), 6)) if impossible else ()),
+            *(_estimate_cell(r, k) for _, k in ESTIMATE_COLUMNS),
+            *((format_number(r.get("prior_std"), 2),) if prior else ()),
+            *((format_rounded(r.get("bias"), r["std"], 3),) if biased else ()),
+            *(("" if r["possible"] else "no", format_rounded(r.get("consistent"), r["std"])) if impossible else ()),
         )
         for n, r in rows.items()
     )
@@ -427,12 +464,12 @@ def describe_identify(s: Summary) -> Description:
         "parameter",
         *_meaning_column(s),
         "unit",
-        *(heading for heading, *_ in ESTIMATE_COLUMNS),
+        *(heading for heading, _ in ESTIMATE_COLUMNS),
         *(("std known before",) if prior else ()),
         *(("bias of the method",) if biased else ()),
         *(("possible", "nearest possible machine") if impossible else ()),
     )
-    conds = f"cond(W) {s['cond_w']:.4g}, cond(Phi) {s['cond_phi']:.4g}"
+    conds = f"cond(W) {format_number(s['cond_w'], 4)}, cond(Phi) {format_number(s['cond_phi'], 4)}"
     caption = f"Parameters with one standard deviation and 95 % interval, method {s['method']}; {conds}."
     if s["status"] == "invalid":
         caption = (
@@ -440,7 +477,21 @@ def describe_identify(s: Summary) -> Description:
         )
     marked = tuple(k for k, r in enumerate(rows.values()) if not r["possible"])
     tables = (Table(caption, names, table, marked, _meaning_index(s), grey=s["status"] != "valid"),)
-    return Description(f"Parameters of {s['machine']}", headline, tables, tuple(remarks), s["status"])
+    verdict = _judge_estimate(s, max(known.values(), default=None), impossible)
+    return Description(f"Parameters of {s['machine']}", headline, tables, tuple(remarks), s["status"], verdict)
+
+
+def _judge_estimate(s: Summary, worst_percent: float | None, impossible: Sequence[str]) -> str:
+    """Say in a sentence what an estimate can be used for."""
+    if s["status"] == "invalid":
+        return "there is no estimate, use none of its values; `excite diagnose` looks for the cause."
+    if s["status"] == "doubtful":
+        return "doubtful, values may be off by more than their intervals say; `excite diagnose` looks for the cause."
+    if lacking := [*impossible, *s["unidentifiable"]]:
+        return f"valid except for {_join_some(lacking)}; a drive that shows more of the machine may give them."
+    if worst_percent is None:
+        return "valid, of unknown accuracy."
+    return f"valid, the 95 % intervals hold; every parameter is known to {format_percent(worst_percent)} or better."
 
 
 def _describe_validation(check: Mapping[str, Any]) -> str:
@@ -562,7 +613,9 @@ def _is_biased(row: Mapping[str, Any]) -> bool:
 def describe_log(s: Summary) -> Description:
     """Describe a log: whether it is usable, its columns, its faults."""
     faults, name = s["faults"], s["log"]
-    span = f"{s['rows']} rows" + (f", {s['duration_s']:.4g} s at {s['rate_hz']:.4g} Hz" if s["rate_hz"] else "")
+    span = count(s["rows"], "row") + (
+        f", {format_number(s['duration_s'], 4)} s at {format_number(s['rate_hz'], 4)} Hz" if s["rate_hz"] else ""
+    )
     if s["machine"] is None:
         headline = f"{name} is a table of {span}; no machine was named that it could be checked against."
     elif faults:
@@ -582,7 +635,7 @@ def describe_log(s: Summary) -> Description:
     )
     names = ("column", "what it is", "unit", "lowest", "highest", "bad cells")
     tables = (Table("Columns as the file has them.", names, rows),)
-    return Description(f"The log {name}", headline, tables, _check_remarks(s))
+    return Description(f"Check of {name}", headline, tables, _check_remarks(s))
 
 
 MACHINE_COLUMNS = ("parameter", "what it is", "stands for", "value", "unit", "random drives: std %")
@@ -595,7 +648,8 @@ def describe_machine(s: Summary) -> Description:
         headline = f"{_count_things(len(faults))} wrong with {name}."
     else:
         doubtful = f"{_count_things(len(doubts)).lower()} doubtful" if doubts else "nothing is doubtful"
-        headline = f"{name} can be used: {len(s['parameters'])} parameters are identifiable, {doubtful}."
+        shown = count(len(s["parameters"]), "parameter is", "parameters are")
+        headline = f"{name} can be used: {shown} identifiable, {doubtful}."
     rows = tuple(
         (
             *(n, r["what"], format_sum(r["stands_for"]), format_number(r["value"]), r["unit"]),
@@ -616,7 +670,7 @@ def format_sum(parts: Mapping[str, float]) -> str:
     text = ""
     for name, c in parts.items():
         text += ("-" if not text else " - ") if c < 0 else " + " if text else ""
-        text += name if abs(abs(c) - 1) < 1e-9 else f"{abs(c):.4g} {name}"
+        text += name if abs(abs(c) - 1) < 1e-9 else f"{format_number(abs(c), 4)} {name}"
     return text
 
 
@@ -642,8 +696,8 @@ def describe_diagnose(s: Summary) -> Description:
     remarks += [f"Still unexplained: {line}." for line in first_lines(s["located"])]
     if s["machine_file"]:
         remarks.append(
-            f"{s['machine_file']} in this folder is the machine with the findings in it: `excite design`, `verify`,"
-            " `simulate` and `identify` take it."
+            f"{s['machine_file']} in the folder of this result is the machine with the findings in it: `excite"
+            " design`, `verify`, `simulate` and `identify` take it."
         )
     remarks += s["notes"]
     tables = []
@@ -669,8 +723,9 @@ def describe_diagnose(s: Summary) -> Description:
             (
                 n,
                 r["unit"],
-                *(format_number(r[k], 6) for k in ("before", "after")),
-                *(format_number(r[k], 2) for k in ("std_before", "std_after", "moved")),
+                *(format_rounded(r[k], r[f"std_{k}"]) for k in ("before", "after")),
+                *(format_rounded(r[k], r[k], 2) for k in ("std_before", "std_after")),
+                format_number(r["moved"], 2),
             )
             for n, r in s["parameters"].items()
         )
@@ -684,8 +739,8 @@ def _table_of_findings(findings: Sequence[Mapping[str, Any]]) -> Table:
     rows = tuple(
         (
             f"{f['effect']}@{f['where']}",
-            format_number(f["amount"], 5),
-            format_number(f["amount_std"], 2),
+            format_rounded(f["amount"], f["amount_std"], 5),
+            format_rounded(f["amount_std"], f["amount_std"], 2),
             f["unit"],
             "; ".join(f"{n} {format_number(x['value'], 4)} {x['unit']}" for n, x in f["shapes"].items()) or "-",
             format_p_value(f["p_value"]),
@@ -722,7 +777,7 @@ def _describe_separating_drive(drive: Mapping[str, Any]) -> str:
 
 def describe_study(s: Summary) -> Description:
     """Describe a study: how its runs ended, the best and the worst cell, all cells as a table."""
-    headline = f"{s['done']} of {s['runs']} runs gave a result, {s['failed']} could not give one"
+    headline = f"{s['done']} of {count(s['runs'], 'run')} gave a result, {s['failed']} could not give one"
     headline += f", {s['defects']} showed a defect of the program." if s["defects"] else "."
     ranked = [r for r in s["cells"] if np.isfinite(r.get("worst_rms_percent") or np.nan)]
     if len(ranked) > 1:

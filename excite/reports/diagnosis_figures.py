@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from excite import diagnosis
 from excite.diagnosis import Diagnosis, LogResiduals, TorqueDiagnosis
 from excite.reports.figures import COLOURS, escape_dollar, save
-from excite.reports.torque_figures import torque_figure_calls
+from excite.reports.torque_figures import torque_figure_calls, torque_figures_by_file
+from excite.text import format_number
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 MAX_ROWS = 3  # torques and forces in a figure; chosen
@@ -40,8 +41,31 @@ def figure_calls(place: Path, d: Diagnosis | TorqueDiagnosis, title: str) -> lis
     return [partial(_draw, place, d, title, kind) for kind in ("misfit", "when")]
 
 
+def figures_by_file(d: Diagnosis | TorqueDiagnosis, title: str) -> dict[str, Callable[[], Figure]]:
+    """Return for each file that `figure_calls` writes what draws it alone."""
+    if isinstance(d, TorqueDiagnosis):
+        return torque_figures_by_file(d, title)
+    n = len(d.before.data.logs)
+    return {_file(kind, k, n): partial(_one, d, title, kind, k) for kind in ("misfit", "when") for k in range(n)}
+
+
+def _file(kind: str, k: int, n: int) -> str:
+    return f"{kind}-{k + 1}.png" if n > 1 else f"{kind}.png"
+
+
+def _one(d: Diagnosis, title: str, kind: str, k: int) -> Figure:
+    return list(_figures(d, title, kind))[k]
+
+
 def _draw(place: Path, d: Diagnosis, title: str, kind: str) -> None:
     """Draw one of the two figures of every log."""
+    figures = list(_figures(d, title, kind))
+    for k, one in enumerate(figures):
+        save(one, place / _file(kind, k, len(figures)))
+
+
+def _figures(d: Diagnosis, title: str, kind: str) -> Iterator[Figure]:
+    """Yield one of the two figures for every log."""
     before, after = d.before, d.after
     if kind == "misfit" and before.exact != after.exact:
         # Show forces that one of the two models needs for the other as well.
@@ -49,9 +73,8 @@ def _draw(place: Path, d: Diagnosis, title: str, kind: str) -> None:
     without = diagnosis.residuals_of_logs(before)
     beside = diagnosis.residuals_of_logs(after) if d.stages else [None] * len(without)
     figure = misfit_figure if kind == "misfit" else when_figure
-    for k, (old, new) in enumerate(zip(without, beside, strict=True)):
-        name = f"{kind}-{k + 1}.png" if len(without) > 1 else f"{kind}.png"
-        save(figure(old, new, f"{title}: {Path(old.source).name}"), place / name)
+    for old, new in zip(without, beside, strict=True):
+        yield figure(old, new, f"{title}: {Path(old.source).name}")
 
 
 def misfit_figure(before: LogResiduals, after: LogResiduals | None, title: str) -> Figure:
@@ -208,7 +231,7 @@ def signals_figure(signals: Mapping[str, Mapping[str, Any]], found: bool, title:
         for y, value, n in zip(places + shift, rms, names, strict=True):
             if np.isfinite(value):
                 right.annotate(
-                    f"{value:.3g} {signals[n]['unit']}",
+                    f"{format_number(value, 3)} {signals[n]['unit']}",
                     (0, y),
                     xytext=(4, 0),
                     textcoords="offset points",

@@ -19,6 +19,7 @@ from excite.logs import Inspection
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion
+from excite.text import format_number
 from excite.trajectories import DESIGNED, ComparisonRow
 
 # Okabe-Ito colours, distinct for the colour-blind; line styles are distinct in black and white.
@@ -168,7 +169,9 @@ def sigma_figure(sigma: Mapping[str, float], title: str) -> Figure:
     ax.hlines(names, low, values, color="0.75", linewidth=5)
     ax.plot(values, names, "o", color=COLOURS[0])
     for y, value in enumerate(values):
-        ax.annotate(f"{value:.2g}", (value, y), xytext=(7, 0), textcoords="offset points", va="center", fontsize=8)
+        ax.annotate(
+            f"{format_number(value, 2)}", (value, y), xytext=(7, 0), textcoords="offset points", va="center", fontsize=8
+        )
     ax.set_xscale("log")
     ax.set_xlim(low, 1.3 * high)
     ax.xaxis.set_major_formatter("{x:g}")
@@ -320,7 +323,14 @@ def compare_figure(rows: Sequence[ComparisonRow], title: str) -> Figure:
             ours, hatch = r.name == DESIGNED, "" if r.breaks is None else "///"
             width = min(value, 2 * max(finite))
             ax.barh(y, width, height=0.65, color=COLOURS[1 if ours else 0], edgecolor="black", hatch=hatch)
-            ax.annotate(f"{value:.3g}", (width, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=8)
+            ax.annotate(
+                f"{format_number(value, 3)}",
+                (width, y),
+                xytext=(4, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=8,
+            )
         ax.set_xscale("log")
         ax.set_xlim(min(finite) / 2, max(finite) * 2)
         ax.xaxis.set_major_formatter("{x:g}")

@@ -12,7 +12,7 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup, escape
 
-from excite.reports.descriptions import Table, as_sentence
+from excite.reports.descriptions import Description, Table, as_sentence
 
 COMMAND = re.compile("`([^`]+)`")
 
@@ -66,4 +66,19 @@ def report_page(
     template = templates().get_template("report.html")
     return template.render(
         title=title, answer=answer, figures=figures, tables=tables, how=dict(how or {}), remarks=remarks, status=status
+    )
+
+
+def result_fragment(description: Description) -> str:
+    """Render a result for a notebook: title, headline, tables, remarks, in the notebook's own style."""
+    shown = description.status != "invalid"
+    return (
+        templates()
+        .get_template("result.html")
+        .render(
+            title=description.title,
+            answer=description.headline,
+            tables=[one for one in description.tables if shown or not one.grey],
+            remarks=description.closing,
+        )
     )

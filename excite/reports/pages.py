@@ -4,17 +4,9 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from excite import output
-from excite.logs import guess_machine, inspect, read_table, table_of
-from excite.model.machine import load_machine
-from excite.reports import figures
 from excite.reports.descriptions import Summary, describe
 from excite.reports.html import Picture, report_page
 from excite.text import format_number
@@ -58,8 +50,11 @@ FIT_CAPTION = (
 )
 
 
-def write_page(place: Path, kind: str, summary: Summary) -> None:
-    """Write report.html of a folder from its summary and figures. Raises KeyError for an unknown kind."""
+def write_page(place: Path, kind: str, summary: Summary, command: str | None = None) -> None:
+    """Write report.html of a folder from its summary and figures. Raises KeyError for an unknown kind.
+
+    command: how it was made, the command line by default.
+    """
     description = describe(kind, summary)
     pictures = [Picture(path, _caption(path.name, summary)) for path in sorted(place.glob("*.png"))]
     order = list(CAPTIONS)
@@ -69,22 +64,22 @@ def write_page(place: Path, kind: str, summary: Summary) -> None:
         description.headline,
         pictures,
         description.tables,
-        provenance(summary),
-        description.remarks,
+        provenance(summary, command),
+        description.closing,
         description.status,
     )
     (place / REPORT).write_text(text, encoding="utf-8")
 
 
-def write_report(place: Path, kind: str, summary: Summary) -> None:
-    """Write report.html and summary.json of a folder, after its figures."""
-    write_page(place, kind, summary)
+def write_report(place: Path, kind: str, summary: Summary, command: str | None = None) -> None:
+    """Write report.html and summary.json of a folder, after its figures; command as in `write_page`."""
+    write_page(place, kind, summary, command)
     output.write_summary(place, summary)
 
 
-def provenance(summary: Summary) -> dict[str, str]:
+def provenance(summary: Summary, command: str | None = None) -> dict[str, str]:
     """Return how a result was made: command, machine, settings, seed, time, versions."""
-    rows = {"command": shlex.join(["excite", *sys.argv[1:]])}
+    rows = {"command": command or shlex.join(["excite", *sys.argv[1:]])}
     names = ("machine", "problem", "objective", "method", "kit", "runs", "samples", "starts", "design", "estimate")
     for key in (*names, "target", "duration_s", "budget_s", "seed", "wall_s"):
         value = summary.get(key)
@@ -113,32 +108,3 @@ def _caption(name: str, summary: Summary) -> str:
     if kind in CAPTIONS_BY_LOG:
         return CAPTIONS_BY_LOG[kind].format(summary["logs"][k])
     return FIT_CAPTION.format(summary["logs"][k]) if kind == "fit" else name
-
-
-def check_log(place: Path, path: Path, machine: str | None, versions: Mapping[str, str]) -> dict[str, Any]:
-    """Check a log into a folder with figure and report; return the summary. Raises LogError for an unreadable file.
-
-    machine: a shipped name or a path, None to guess it by the columns.
-    """
-    table = read_table(path)
-    loaded = load_machine(machine) if machine is not None else guess_machine(table)
-    if loaded is not None:
-        table = table_of(path, loaded)
-    found = inspect(table, loaded, str(path))
-    summary: dict[str, Any] = {
-        "log": str(path),
-        "machine": found.machine,
-        "usable": found.usable and found.machine is not None,
-        "rows": found.rows,
-        "duration_s": found.duration_s if np.isfinite(found.duration_s) else None,
-        "rate_hz": found.rate_hz if np.isfinite(found.rate_hz) else None,
-        "faults": list(found.faults),
-        "doubts": list(found.doubts),
-        "remarks": list(found.remarks),
-        "columns": [asdict(c) for c in found.columns],
-        "versions": dict(versions),
-    }
-    if found.signals:
-        figures.save(figures.log_figure(found, str(path)), place / "log.png")
-    write_report(place, "log", summary)
-    return summary

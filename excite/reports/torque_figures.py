@@ -21,12 +21,17 @@ MAX_COLUMNS = 3  # curves side by side; chosen
 
 def torque_figure_calls(place: Path, d: TorqueDiagnosis, title: str) -> list[Callable[[], None]]:
     """Return independent calls that draw misfit.png and, where there are curves, curves.png."""
-    calls = [partial(_save, misfit_of_torques, d, title, place / "misfit.png")]
-    return [*calls, partial(_save, curves_figure, d, title, place / "curves.png")] if d.curves else list(calls)
+    return [partial(_save, draw, place / file) for file, draw in torque_figures_by_file(d, title).items()]
 
 
-def _save(draw: Callable[[TorqueDiagnosis, str], Figure], d: TorqueDiagnosis, title: str, place: Path) -> None:
-    save(draw(d, title), place)
+def torque_figures_by_file(d: TorqueDiagnosis, title: str) -> dict[str, Callable[[], Figure]]:
+    """Return for each file of `torque_figure_calls` what draws it."""
+    drawn: dict[str, Callable[[], Figure]] = {"misfit.png": partial(misfit_of_torques, d, title)}
+    return drawn | {"curves.png": partial(curves_figure, d, title)} if d.curves else drawn
+
+
+def _save(draw: Callable[[], Figure], place: Path) -> None:
+    save(draw(), place)
 
 
 def misfit_of_torques(d: TorqueDiagnosis, title: str) -> Figure:

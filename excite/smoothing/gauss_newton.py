@@ -19,6 +19,7 @@ from excite.smoothing import parallel_smoother
 from excite.smoothing.innovations import LinearisedLog
 from excite.smoothing.linearisation import BATCH_SIZE, StateSpace, advance, differentiate
 from excite.smoothing.measurements import Measurements, Trajectory, ground_inputs, offset_scale, predict_readings
+from excite.text import format_number
 
 # Prior of the parameters, relative to each parameter's scale. All values are chosen.
 PRIOR_STD = 3.0  # prior standard deviation; a value further off than this counts as its own prior
@@ -471,8 +472,9 @@ def fit_logs(
             process_noise,
         )
     raise NotConvergedError(
-        f"joint smoothing found no estimate in {k + 1} passes (last step {step:.3g} standard deviations): check the"
-        " log with `excite log check` and `excite diagnose`, or start from better values in the machine file",
+        f"joint smoothing found no estimate in {k + 1} passes (last step {format_number(step, 3)} standard"
+        " deviations): check the log with `excite log check` and `excite diagnose`, or start from better values in"
+        " the machine file",
         final,
         float(step if best is None else best_step),
         stalled and len(costs) > SETTLING_PASSES + 2 and np.ptp(costs[-3:]) < MAX_SWING_COST_RANGE * costs[-1],

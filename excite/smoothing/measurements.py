@@ -17,6 +17,7 @@ from excite.logs import Log, passes, remember, samples, white_noise
 from excite.model import Model
 from excite.model.machine import Filter, Sensor
 from excite.smoothing.linearisation import StateSpace
+from excite.text import format_number
 
 # Smallest standard deviation of an encoder edge [counts]: the division error of a good encoder. Without it, slow
 # passages, whose edges are timed exactly, would outweigh everything else.
@@ -338,6 +339,6 @@ def describe_noise(space: StateSpace, measurements: Sequence[Measurements]) -> t
             levels.append((sensor, float(np.sqrt(np.mean([data.noise.sensor[j] ** 2 for data in measurements])))))
     texts = []
     for sensor, level in levels:
-        sheet = f"data sheet {float(sensor.noise):.3g}" if sensor.noise is not None else "no data sheet"
-        texts.append(f"{sensor.name} {level:.3g} ({sheet})")
+        sheet = f"data sheet {format_number(float(sensor.noise), 3)}" if sensor.noise is not None else "no data sheet"
+        texts.append(f"{sensor.name} {format_number(level, 3)} ({sheet})")
     return (f"noise per sample found in the log, SI: {', '.join(texts)}",)

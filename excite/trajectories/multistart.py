@@ -25,7 +25,7 @@ from excite.errors import InfeasibleError, SolverError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.simulation import Motion, simulate
-from excite.text import format_percent
+from excite.text import format_number, format_percent
 from excite.trajectories import composite_objective, objective as objectives
 from excite.trajectories.composite_objective import SIGMA_MAX, CompositeObjective
 from excite.trajectories.continuation import (
@@ -181,7 +181,11 @@ def _no_optimum(solver: str, best: SearchState, starts: int) -> SolverError:
     """Build the error of a solver that ended without an optimum from every start."""
     name = max(best.latest.violations, key=lambda limit: best.latest.violations[limit])
     excess = best.latest.excess
-    where = f", where {name} is exceeded by {100 * excess:.2g} % of its range" if not best.latest.feasible else ""
+    where = (
+        f", where {name} is exceeded by {format_number(100 * excess, 2)} % of its range"
+        if not best.latest.feasible
+        else ""
+    )
     return SolverError(
         f"{solver} found no optimum from any of the starts ({starts}), the best ended with {best.failure}{where};"
         " give more starts or another seed, or take the other solver"

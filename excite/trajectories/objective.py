@@ -17,6 +17,7 @@ import numpy as np
 
 from excite.model import Model
 from excite.simulation import Motion, effect_inputs
+from excite.text import format_number
 
 ObjectiveFunction = Callable[[ca.SX, ca.SX], ca.SX]
 
@@ -148,7 +149,7 @@ def describe_value(objective: str, value: float) -> str:
     """Write a reported value with its name and unit."""
     shown_as = OBJECTIVES[objective].shown_as
     name = f"{objective}(Phi)" if shown_as == "cond" else f"objective {objective}"
-    return f"{name} {value:.4g}{' %' if shown_as == 'percent' else ''}"
+    return f"{name} {format_number(value, 4)}{' %' if shown_as == 'percent' else ''}"
 
 
 def local_model(objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, sharpness: float) -> LocalModel:

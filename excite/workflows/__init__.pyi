@@ -3,15 +3,29 @@ from .design_request import (
     design_from as design_from,
     require_noise_figures as require_noise_figures,
 )
-from .design_workflow import compare as compare, design as design, read_rivals as read_rivals
-from .diagnose_workflow import diagnose as diagnose, diagnose_from as diagnose_from
+from .design_workflow import (
+    compare as compare,
+    compare_account as compare_account,
+    design as design,
+    design_account as design_account,
+    read_rivals as read_rivals,
+)
+from .diagnose_workflow import (
+    DiagnoseResult as DiagnoseResult,
+    diagnose as diagnose,
+    diagnose_account as diagnose_account,
+    diagnose_from as diagnose_from,
+    rivals as rivals,
+    separating_drive as separating_drive,
+)
 from .identify_workflow import (
     describe_agreement as describe_agreement,
     identify as identify,
+    identify_account as identify_account,
     identify_from as identify_from,
 )
 from .machine_check import check_machine as check_machine
-from .predict_workflow import predict as predict, predict_from as predict_from
+from .predict_workflow import predict as predict, predict_account as predict_account, predict_from as predict_from
 from .requests import (
     build_model as build_model,
     choices as choices,
@@ -24,8 +38,8 @@ from .requests import (
     require_objective as require_objective,
     require_positive as require_positive,
 )
-from .score_workflow import judge_limits as judge_limits, score as score
+from .score_workflow import judge_limits as judge_limits, score as score, score_account as score_account
 from .simulate_workflow import doubtful_effects as doubtful_effects, with_effects as with_effects
 from .study_plan import Study as Study, read_study as read_study
 from .study_runner import run_study as run_study
-from .verify_workflow import verify as verify
+from .verify_workflow import verify as verify, verify_account as verify_account

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,11 @@ from excite.errors import MachineError, UsageError
 from excite.logs import profile_of, read_drive, torque_column
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Problem
-from excite.trajectories import Score
+from excite.reports import Account
+from excite.simulation import Motion
+from excite.trajectories import Comparison, ComparisonRow, Score
 from excite.workflows import design_request, requests
-from excite.workflows.design_request import DesignRequest
+from excite.workflows.design_request import DesignRequest, DesignResult
 from excite.workflows.progress import Bar, no_bar
 
 
@@ -54,22 +57,38 @@ def design_model(
                 " can reach?"
             ) from None
     wall = time.perf_counter() - begin
-    profile_of(found.model, found.design.motion).to_csv(place / "profile.csv", index=False)
-    (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    return design_account(found, name, chosen, request, wall).write(place)
+
+
+def design_account(found: DesignResult, name: str, problem: Problem, request: DesignRequest, wall_s: float) -> Account:
+    """Give an account of a design for a problem of some name; its frame is the profile. wall_s [s]: what it took."""
+    model = found.model
     summary: dict[str, Any] = {
         "machine": model.machine.name,
         "problem": name,
-        "duration_s": float(chosen.duration_s),
+        "duration_s": float(problem.duration_s),
         **design_request.summarise_result(request, found),
-        "meanings": parameter_descriptions(found.model),
-        "wall_s": wall,
+        "meanings": parameter_descriptions(model),
+        "wall_s": wall_s,
         "versions": requests.package_versions(),
     }
     title = f"{model.machine.title}: {name}, cond(Phi) = {found.design.cond_phi:.2f}"
-    reports.save(reports.design_figure(found.model, chosen, found.design.motion, title), place / "design.png")
-    reports.save(reports.sigma_figure(summary["sigma_percent"], title), place / "sigma.png")
-    reports.write_report(place, "design", summary)
-    return summary
+    return Account(
+        "design",
+        summary,
+        {
+            "design.png": partial(reports.design_figure, model, problem, found.design.motion, title),
+            "sigma.png": partial(reports.sigma_figure, summary["sigma_percent"], title),
+        },
+        partial(reports.drive_frame, model, found.design.motion),
+        (partial(write_drive, model, found.design.motion),),
+    )
+
+
+def write_drive(model: Model, motion: Motion, place: Path) -> None:
+    """Write profile.csv and machine.json, from which `trajectories.read_design` reads a drive back."""
+    profile_of(model, motion).to_csv(place / "profile.csv", index=False)
+    (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
 
 
 def read_rivals(
@@ -113,32 +132,32 @@ def compare(
     usual, own = read_rivals("--against", against, model, chosen)
     with bar("comparing") as advance:
         result = trajectories.compare(model, chosen, samples, seed, budget, advance, usual, own)
-    columns = ["t_s", *(torque_column(model, u) for u in model.inputs)]
-    (place / "drives").mkdir()
-    designs = []
-    for row in result.rows:
-        file = row.name.replace(",", "").replace(" ", "-").removesuffix(".csv")
-        knots = f"drives/{'own-' if row.own else ''}{file}.csv"
-        table = pd.DataFrame([[t, *u] for t, u in zip(row.manoeuvre.times, row.manoeuvre.torque, strict=True)])
-        table.to_csv(place / knots, index=False, header=columns, float_format="%.12g")
-        designs.append(
-            {
-                "name": row.name,
-                "cond_phi": row.cond_phi,
-                "cond_w": row.cond_w,
-                "worst_std_percent": row.worst_std_percent,
-                "median_std_percent": row.median_std_percent,
-                "max_violation": row.max_violation,
-                "breaks": row.breaks,
-                "kept": row.kept,
-                "samples": row.samples,
-                "wall_s": row.wall_s,
-                "equal_score_s": row.equal_s,
-                "knots": knots,
-                "own": row.own,
-                "start": dict(zip(model.coordinates, row.start, strict=True)),
-            }
-        )
+    return compare_account(model, name, result, samples, seed, budget).write(place)
+
+
+def compare_account(
+    model: Model, name: str, result: Comparison, samples: int, seed: int, budget: float | None
+) -> Account:
+    """Give an account of a comparison on a problem of some name; options as in `compare`."""
+    designs = [
+        {
+            "name": row.name,
+            "cond_phi": row.cond_phi,
+            "cond_w": row.cond_w,
+            "worst_std_percent": row.worst_std_percent,
+            "median_std_percent": row.median_std_percent,
+            "max_violation": row.max_violation,
+            "breaks": row.breaks,
+            "kept": row.kept,
+            "samples": row.samples,
+            "wall_s": row.wall_s,
+            "equal_score_s": row.equal_s,
+            "knots": _knots_file(row),
+            "own": row.own,
+            "start": dict(zip(model.coordinates, row.start, strict=True)),
+        }
+        for row in result.rows
+    ]
     summary = {
         "machine": model.machine.name,
         "problem": name,
@@ -151,6 +170,26 @@ def compare(
         "versions": requests.package_versions(),
     }
     title = f"{model.machine.title}: {name}, the designed drive and the usual ones"
-    reports.save(reports.compare_figure(result.rows, title), place / "compare.png")
-    reports.write_report(place, "compare", summary)
-    return summary
+    shown = {str(d["name"]): {k: v for k, v in d.items() if k not in ("name", "start", "knots")} for d in designs}
+    return Account(
+        "compare",
+        summary,
+        {"compare.png": partial(reports.compare_figure, result.rows, title)},
+        partial(reports.rows_frame, shown, "drive"),
+        (partial(_write_knots, model, result),),
+    )
+
+
+def _knots_file(row: ComparisonRow) -> str:
+    """Return the file of a drive's torques in the folder of a comparison."""
+    file = row.name.replace(",", "").replace(" ", "-").removesuffix(".csv")
+    return f"drives/{'own-' if row.own else ''}{file}.csv"
+
+
+def _write_knots(model: Model, result: Comparison, place: Path) -> None:
+    """Write the torques of every drive at its knots."""
+    columns = ["t_s", *(torque_column(model, u) for u in model.inputs)]
+    (place / "drives").mkdir()
+    for row in result.rows:
+        table = pd.DataFrame([[t, *u] for t, u in zip(row.manoeuvre.times, row.manoeuvre.torque, strict=True)])
+        table.to_csv(place / _knots_file(row), index=False, header=columns, float_format="%.12g")

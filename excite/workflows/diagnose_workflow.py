@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,10 @@ from excite import diagnosis, identification, reports
 from excite.diagnosis import Assessment, Diagnosis, RivalPair, TorqueDiagnosis, run_forked
 from excite.errors import InfeasibleError, MachineError, NotIdentifiableError, SimulationError
 from excite.identification import FILTERS
-from excite.logs import Log, doubts_in_errors, examine, moves, prepare
+from excite.logs import Log, Prepared, doubts_in_errors, examine, moves, prepare
 from excite.model import Model, build
 from excite.model.machine import Filter, Machine
+from excite.reports import Account
 from excite.workflows import design_request, design_workflow, requests
 from excite.workflows.design_request import DesignRequest
 from excite.workflows.progress import Bar, no_bar
@@ -45,14 +47,32 @@ def _prepare_logs(model: Model, logs: Sequence[Log], filtering: str) -> Prepared
     return PreparedLogs(repaired, notes, doubts, chosen)
 
 
-def diagnose_from(model: Model, logs: Sequence[Log], filtering: str = "machine") -> Assessment:
+@dataclass(frozen=True)
+class DiagnoseResult:
+    """An assessment, the repaired logs that it is of, and notes."""
+
+    assessment: Assessment
+    logs: list[Log]
+    notes: list[str]
+
+
+def diagnose_from(
+    model: Model,
+    logs: Sequence[Log],
+    filtering: str = "machine",
+    report: Callable[[float], None] = lambda share: None,
+) -> DiagnoseResult:
     """Diagnose checked logs and measure the gain of each finding.
 
-    filtering: a name of `FILTERS`, used for the first guess. Raises LogError, NotIdentifiableError, NoEstimateError.
+    filtering: a name of `FILTERS`, used for the first guess. report(share of the work): called now and then.
+    Raises LogError, NotIdentifiableError, NoEstimateError.
     """
     prepared = _prepare_logs(model, logs, filtering)
     with doubts_in_errors(prepared.doubts):
-        return diagnosis.explain(model, prepared.logs, prepared.filter, runner=run_forked)
+        assessment = diagnosis.explain(
+            model, prepared.logs, prepared.filter, lambda share, what: report(share), run_forked
+        )
+    return DiagnoseResult(assessment, prepared.logs, [*prepared.notes, *_baseline_note(assessment.diagnosis)])
 
 
 def diagnose(
@@ -70,36 +90,54 @@ def diagnose(
     """
     model = requests.build_model(machine)
     with bar("diagnosing") as advance:
+        ready = prepare(model, logs, identification.needed_sensors(model, "joint"))
+        found = diagnose_from(
+            ready.model, ready.logs, filtering, lambda share: advance(round(1000 * share), 1000, None)
+        )
+    drive = separating_drive(place, ready.model.machine, rivals(found), design_next, bar)
+    return diagnose_account(machine, ready, found, drive).write(place)
 
-        def report(share: float, what: str) -> None:
-            advance(round(1000 * share), 1000, None)
 
-        needs = identification.needed_sensors(model, "joint")
-        ready = prepare(model, logs, needs)
-        model, notes = ready.model, ready.notes
-        prepared = _prepare_logs(model, ready.logs, filtering)
-        with doubts_in_errors(prepared.doubts):
-            account = diagnosis.explain(model, prepared.logs, prepared.filter, report, run_forked)
-        title, found = model.machine.title, account.diagnosis
-        for _ in run_forked(reports.figure_calls(place, found, title)):
-            pass
-        text = diagnosis.machine_file(machine, model.machine, found)
-        if text is not None:
-            (place / MACHINE).write_text(text, encoding="utf-8")
-        summary: dict[str, Any] = {
-            "machine": model.machine.name,
-            "logs": [one.source for one in prepared.logs],
-            **diagnosis.summarise(account),
-            "machine_file": MACHINE if text is not None else None,
-            "separating_drive": None,
-            "notes": [*notes, *prepared.notes, *_baseline_note(found)],
-            "versions": requests.package_versions(),
-        }
-        reports.save(reports.signals_figure(summary["signals"], bool(found.findings), title), place / "signals.png")
-    tied = diagnosis.rival_pairs(found) if isinstance(found, Diagnosis) else ()
-    summary["separating_drive"] = separating_drive(place, model.machine, tied, design_next, bar)
-    reports.write_report(place, "diagnose", summary)
-    return summary
+def rivals(found: DiagnoseResult) -> Sequence[RivalPair]:
+    """Return the pairs of tied causes; a diagnosis by regression has none."""
+    d = found.assessment.diagnosis
+    return diagnosis.rival_pairs(d) if isinstance(d, Diagnosis) else ()
+
+
+def diagnose_account(machine: str, ready: Prepared, found: DiagnoseResult, drive: Mapping[str, Any] | None) -> Account:
+    """Give an account of a diagnosis.
+
+    machine: the name or path that machine.toml extends. drive: as `separating_drive` returns it.
+    """
+    model, d, title = ready.model, found.assessment.diagnosis, ready.model.machine.title
+    text = diagnosis.machine_file(machine, model.machine, d)
+    summary: dict[str, Any] = {
+        "machine": model.machine.name,
+        "logs": [one.source for one in found.logs],
+        **diagnosis.summarise(found.assessment),
+        "machine_file": MACHINE if text is not None else None,
+        "separating_drive": drive,
+        "notes": [*ready.notes, *found.notes],
+        "versions": requests.package_versions(),
+    }
+    keys = ("kind", "amount", "amount_std", "unit", "share_percent", "p_value", "gain_percent", "gain_ci95")
+    rows = {f"{f['effect']}@{f['where']}": {k: f[k] for k in keys} for f in summary["findings"]}
+    return Account(
+        "diagnose",
+        summary,
+        {"signals.png": partial(reports.signals_figure, summary["signals"], bool(d.findings), title)},
+        partial(reports.rows_frame, rows, "finding"),
+        (partial(_write_diagnosis, d, title, text),),
+        reports.figures_by_file(d, title),
+    )
+
+
+def _write_diagnosis(d: Diagnosis | TorqueDiagnosis, title: str, machine_file: str | None, place: Path) -> None:
+    """Write the figures of each log, several at a time, and machine.toml."""
+    for _ in run_forked(reports.figure_calls(place, d, title)):
+        pass
+    if machine_file is not None:
+        (place / MACHINE).write_text(machine_file, encoding="utf-8")
 
 
 def _baseline_note(found: Diagnosis | TorqueDiagnosis) -> list[str]:

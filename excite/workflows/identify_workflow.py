@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from excite import identification, reports
 from excite.errors import NoEstimateError, NotIdentifiableError, SimulationError
 from excite.identification import FILTERS, Agreement, Estimate, describe_late_channels
-from excite.logs import Log, examine, prepare
+from excite.logs import Log, Prepared, examine, prepare
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Filter
-from excite.text import format_p_value
+from excite.reports import Account
+from excite.text import format_number, format_p_value, format_uncertain
 from excite.workflows import requests
 from excite.workflows.progress import Bar, no_bar
 
@@ -81,15 +84,19 @@ def _compare_sources(model: Model, logs: Sequence[Log], method: str, filter: Fil
 def describe_agreement(agreement: Agreement) -> str:
     """Say whether logs agree on the parameters, and what changed."""
     if agreement.agree:
-        return f"one set of parameters explains the {len(agreement.logs)} logs (p = {agreement.p_value:.2g})"
+        return (
+            f"one set of parameters explains the {len(agreement.logs)} logs (p = {format_number(agreement.p_value, 2)})"
+        )
     p = format_p_value(agreement.p_value)
     p = p if p.startswith("<") else f"= {p}"
     text = f"the logs do not agree on the parameters (p {p})"
     if not agreement.explained:
         return f"{text}, and more than {len(agreement.changed)} of them would have to differ: identify each by itself"
     changes = "; ".join(
-        f"{c.name} [{c.unit}]: "
-        + ", ".join(f"{v:.4g} +- {s:.2g} in {n}" for n, v, s in zip(agreement.logs, c.value, c.std, strict=True))
+        f"{c.name}: "
+        + ", ".join(
+            f"{format_uncertain(v, s, c.unit)} in {n}" for n, v, s in zip(agreement.logs, c.value, c.std, strict=True)
+        )
         for c in agreement.changed
     )
     return f"{text}; what changed: {changes}. Estimated together these are averages"
@@ -113,7 +120,7 @@ def identify(
     method = requests.choose_method(method, model)
     needs = identification.needed_sensors(model, method)
     ready = prepare(model, logs, needs)
-    model, cut = ready.model, ready.notes
+    model = ready.model
     others = (
         prepare(model, validate, needs, "validated on", rate=float(model.machine.sampling_hz)) if validate else None
     )
@@ -122,15 +129,30 @@ def identify(
     more_notes = [*(others.notes if others else ()), *(line for e in examined for line in (*e.notes, *e.doubts))]
     with bar("identifying"):
         found = identify_from(model, ready.logs, method, filtering)
-    read, estimate, chosen = found.logs, found.estimate, found.filter
+    return identify_account(as_in_file, ready, found, unfitted, more_notes).write(place)
+
+
+def identify_account(
+    as_in_file: Model,
+    ready: Prepared,
+    found: IdentifyResult,
+    unfitted: Sequence[Log] = (),
+    more_notes: Sequence[str] = (),
+) -> Account:
+    """Give an account of an estimate, predicting logs that were not fitted.
+
+    as_in_file: the model before it had the rate of the logs. more_notes: on the logs that were not fitted.
+    """
+    model, read, estimate, chosen = ready.model, found.logs, found.estimate, found.filter
     said = [] if found.agreement is None else [describe_agreement(found.agreement)]
+    parameters = _parameters(estimate)
     summary = {
         "machine": model.machine.name,
         "logs": [one.source for one in read],
         "status": estimate.status,
         "doubt": estimate.doubt,
         "method": estimate.method,
-        "parameters": _parameters(estimate),
+        "parameters": parameters,
         "meanings": parameter_descriptions(model),
         "cond_w": estimate.cond_w,
         "cond_phi": estimate.cond_phi,
@@ -139,21 +161,28 @@ def identify(
         "share_outside_law": estimate.share_outside_law,
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
-        "notes": [*said, *cut, *estimate.notes, *more_notes],
+        "notes": [*said, *ready.notes, *estimate.notes, *more_notes],
         "agreement": None if found.agreement is None else _agreement(found.agreement),
         "validation": [_check(model, one, estimate, chosen) for one in unfitted],
         "versions": requests.package_versions(),
     }
-    identification.write_estimate(place, as_in_file, estimate)
-    for kind, several in (("fit", read), ("validation", unfitted)):
-        for k, one in enumerate(several):
-            title = f"{model.machine.title}: {one.source}"
-            figure = reports.comparison_figure(
-                model, identification.compare_torques(model, one, estimate, chosen), title
-            )
-            reports.save(figure, place / (f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png"))
-    reports.write_report(place, "identify", summary)
-    return summary
+    figures = {
+        f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png": partial(_fit_figure, model, one, estimate, chosen)
+        for kind, several in (("fit", read), ("validation", unfitted))
+        for k, one in enumerate(several)
+    }
+    return Account(
+        "identify",
+        summary,
+        figures,
+        partial(reports.rows_frame, parameters, "parameter"),
+        (partial(identification.write_estimate, model=as_in_file, estimate=estimate),),
+    )
+
+
+def _fit_figure(model: Model, one: Log, estimate: Estimate, chosen: Filter) -> Figure:
+    torques = identification.compare_torques(model, one, estimate, chosen)
+    return reports.comparison_figure(model, torques, f"{model.machine.title}: {one.source}")
 
 
 def _agreement(agreement: Agreement) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from excite.model import Model, build, effects, mechanics, parameter_description
 from excite.model.effects import GRAVITY
 from excite.model.machine import Machine, Problem, Quantity, error_lines, load_machine
 from excite.simulation import simulate
+from excite.text import format_number
 from excite.workflows.requests import LONGEST_DRIVE_S
 
 PICTURE = "machine.png"
@@ -119,11 +120,11 @@ def _tensor(model: Model) -> Iterator[str]:
             J = np.array([[i.XX, i.XY, i.XZ], [i.XY, i.YY, i.YZ], [i.XZ, i.YZ, i.ZZ]], float)
             small, middle, large = np.linalg.eigvalsh(J)
             if small < -1e-9 * large:
-                yield f"{b.name}: inertia: has a negative principal moment, {small:.4g} kg m2"
+                yield f"{b.name}: inertia: has a negative principal moment, {format_number(small, 4)} kg m2"
             elif small + middle < large * (1 - 1e-9):
                 yield (
-                    f"{b.name}: inertia: principal moments {small:.4g}, {middle:.4g}, {large:.4g} kg m2: no body"
-                    " has one larger than the other two together"
+                    f"{b.name}: inertia: principal moments {format_number(small, 4)}, {format_number(middle, 4)},"
+                    f" {format_number(large, 4)} kg m2: no body has one larger than the other two together"
                 )
 
 
@@ -142,7 +143,10 @@ def _lane(model: Model) -> Iterator[str]:
         apart = max((float(np.linalg.norm(a - b)) for a in places for b in places), default=0.0)
         room = float(np.hypot(*problem.lane_m))
         if apart >= room:
-            yield f"problems.{name}.lane_m: lane_points {apart:.3g} m apart don't fit its diagonal, {room:.3g} m"
+            yield (
+                f"problems.{name}.lane_m: lane_points {format_number(apart, 3)} m apart don't fit its diagonal,"
+                f" {format_number(room, 3)} m"
+            )
         for b in model.machine.actuated:
             if b.limit.torque_rate is None or b.friction is None:
                 continue
@@ -150,7 +154,8 @@ def _lane(model: Model) -> Iterator[str]:
             if reached <= float(b.friction.Fs):
                 yield (
                     f"{b.name}: limit.torque_rate: in {float(problem.duration_s):g} s (problem {name}) the torque"
-                    f" comes to {reached:.3g} and back, which is not above its friction Fs {float(b.friction.Fs):g}"
+                    f" comes to {format_number(reached, 3)} and back, which is not above its friction Fs"
+                    f" {float(b.friction.Fs):g}"
                 )
 
 
@@ -181,9 +186,15 @@ def _traction(model: Model) -> Iterator[str]:
         for key in ("Kx", "Ky"):
             stiff = abs(float(getattr(b.contact, key)))
             if not STIFFNESS_PER_LOAD[0] * load < stiff < STIFFNESS_PER_LOAD[1] * load:
-                yield f"{b.name}: contact.{key}: {stiff:.3g} N per slip, {stiff / load:.2g} times its load"
+                yield (
+                    f"{b.name}: contact.{key}: {format_number(stiff, 3)} N per slip, {format_number(stiff / load, 2)}"
+                    " times its load"
+                )
     if push < MIN_ACCELERATION * mass:
-        yield f"contacts: with all slip that is allowed they push {push:.3g} N, {push / mass:.2g} m/s2 for {mass:g} kg"
+        yield (
+            f"contacts: with all slip that is allowed they push {format_number(push, 3)} N,"
+            f" {format_number(push / mass, 2)} m/s2 for {mass:g} kg"
+        )
 
 
 def _speed(model: Model) -> Iterator[str]:
@@ -199,8 +210,8 @@ def _speed(model: Model) -> Iterator[str]:
         reached = R * spare / float(b.friction.Fv) if float(b.friction.Fv) else np.inf
         if reached < top:
             yield (
-                f"{b.name}: limit.rim_speed: {top:g} m/s is never reached, friction alone holds it at {reached:.3g} m/s"
-                " with full torque"
+                f"{b.name}: limit.rim_speed: {top:g} m/s is never reached, friction alone holds it at"
+                f" {format_number(reached, 3)} m/s with full torque"
             )
 
 
@@ -235,9 +246,15 @@ def _bodies(model: Model) -> Iterator[str]:
             continue
         away, around = float(np.linalg.norm(i.com.value)), float(np.sqrt(float(i.ZZ) / float(i.mass)))
         if away > reach:
-            yield f"{b.name}: inertia.com: {away:.3g} m from its frame, the machine is {reach:.3g} m long"
+            yield (
+                f"{b.name}: inertia.com: {format_number(away, 3)} m from its frame, the machine is"
+                f" {format_number(reach, 3)} m long"
+            )
         if around > reach:
-            yield f"{b.name}: inertia.ZZ: {float(i.ZZ):g} kg m2: a radius of gyration of {around:.3g} on {reach:.3g} m"
+            yield (
+                f"{b.name}: inertia.ZZ: {float(i.ZZ):g} kg m2: a radius of gyration of {format_number(around, 3)} on"
+                f" {format_number(reach, 3)} m"
+            )
         if i.axisymmetric and float(i.XX) and float(i.ZZ) > 2 * float(i.XX) * (1 + 1e-9):
             yield (
                 f"{b.name}: inertia.ZZ: {float(i.ZZ):g} kg m2 is more than a flat disc has beside XX {float(i.XX):g}:"
@@ -339,8 +356,9 @@ def _scales(model: Model) -> Iterator[str]:
         first = base.units[k] == "kg m"
         if first and name not in model.machine.scale and abs(model.nominal[k]) < 5e-3 * mass:
             yield (
-                f"{name}: {model.nominal[k]:.3g} kg m, a centre of mass {1e3 * abs(model.nominal[k]) / mass:.2g} mm"
-                f" off: errors relative to it mean little, give it a scale ([scale] {name} = ...)"
+                f"{name}: {format_number(model.nominal[k], 3)} kg m, a centre of mass"
+                f" {format_number(1e3 * abs(model.nominal[k]) / mass, 2)} mm off: errors relative to it mean little,"
+                f" give it a scale ([scale] {name} = ...)"
             )
 
 

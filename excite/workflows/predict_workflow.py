@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from excite.errors import NoEstimateError, UsageError
 from excite.identification import Estimate, Prediction
 from excite.logs import Log, PlannedDrive, examine, is_profile, prepare, read_drive
 from excite.model import Model
+from excite.reports import Account
 from excite.workflows import requests
 from excite.workflows.progress import Bar, no_bar
 
@@ -61,29 +63,54 @@ def predict(place: Path, result: Path, target: Path, bar: Bar = no_bar) -> dict[
     saved = identification.read_estimate(result)
     with bar("predicting"):
         found = predict_from(saved.model, saved.estimate, target)
+    return predict_account(saved.model, saved.estimate, found, str(result), str(target)).write(place)
+
+
+def predict_account(model: Model, estimate: Estimate, found: PredictResult, result: str, target: str) -> Account:
+    """Give an account of a prediction. result, target: what the estimate and the log or drive are called."""
+    p = found.prediction
     summary = {
-        "machine": saved.model.machine.name,
-        "estimate": str(result),
-        "target": str(target),
+        "machine": model.machine.name,
+        "estimate": result,
+        "target": target,
         "along": found.along,
-        "status": saved.estimate.status,
-        "doubt": saved.estimate.doubt,
-        "method": saved.estimate.method,
-        "duration_s": float(found.prediction.t[-1]),
-        "signals": _signals(found.prediction),
+        "status": estimate.status,
+        "doubt": estimate.doubt,
+        "method": estimate.method,
+        "duration_s": float(p.t[-1]),
+        "signals": _signals(p),
         "outside": [
-            {"signal": name, "from_s": begin, "to_s": end, "ratio": ratio}
-            for name, begin, end, ratio in found.prediction.worst
+            {"signal": name, "from_s": begin, "to_s": end, "ratio": ratio} for name, begin, end, ratio in p.worst
         ],
-        "assumed": list(found.prediction.assumed),
+        "assumed": list(p.assumed),
         "notes": list(found.notes),
         "versions": requests.package_versions(),
     }
-    found.prediction.table.to_csv(place / "prediction.csv", index=False)
-    title = f"{saved.model.machine.title}: {target}"
-    reports.save(reports.prediction_figure(found.prediction, title), place / "prediction.png")
-    reports.write_report(place, "predict", summary)
-    return summary
+    title = f"{model.machine.title}: {target}"
+    return Account(
+        "predict",
+        summary,
+        {"prediction.png": partial(reports.prediction_figure, p, title)},
+        partial(_frame, p),
+        (partial(_write_table, p),),
+    )
+
+
+def _write_table(p: Prediction, place: Path) -> None:
+    p.table.to_csv(place / "prediction.csv", index=False)
+
+
+def _frame(p: Prediction) -> pd.DataFrame:
+    """Return the table of a prediction, with the unit of each column."""
+    table = p.table
+    of = dict(zip(p.names, p.units, strict=True))
+    table.attrs["units"] = {"t_s": "s"} | {
+        f"{name}{end}": unit
+        for name, unit in of.items()
+        for end in ("", "_low95", "_high95", "_measured")
+        if f"{name}{end}" in table
+    }
+    return table
 
 
 def _signals(p: Prediction) -> dict[str, dict[str, Any]]:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from excite import reports, trajectories
-from excite.logs import profile_of, read_drive
+from excite.logs import read_drive
 from excite.model import Model, parameter_descriptions
+from excite.model.machine import Problem
+from excite.reports import Account
 from excite.simulation import Motion
-from excite.workflows import design_request, requests
+from excite.trajectories import Score
+from excite.workflows import design_request, design_workflow, requests
 
 
 def score(place: Path, machine: str, profile: Path, problem: str | None) -> dict[str, Any]:
@@ -24,12 +28,15 @@ def score(place: Path, machine: str, profile: Path, problem: str | None) -> dict
     design_request.require_noise_figures(model)
     drive = read_drive(profile, model, any_rate=True)
     found = trajectories.score(model, chosen, drive.torque, drive.start, drive.nu0)
-    profile_of(model, found.motion).to_csv(place / "profile.csv", index=False)
-    (place / "machine.json").write_text(model.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    return score_account(model, name, chosen, found, str(profile)).write(place)
+
+
+def score_account(model: Model, name: str, problem: Problem, found: Score, profile: str) -> Account:
+    """Give an account of a drive judged on a problem of some name. profile: what the drive is called."""
     summary: dict[str, Any] = {
         "machine": model.machine.name,
         "problem": name,
-        "profile": str(profile),
+        "profile": profile,
         "duration_s": float(found.motion.t[-1]),
         "cond_phi": found.cond_phi,
         "cond_w": found.cond_w,
@@ -43,11 +50,18 @@ def score(place: Path, machine: str, profile: Path, problem: str | None) -> dict
         "meanings": parameter_descriptions(model),
         "versions": requests.package_versions(),
     }
-    title = f"{model.machine.title}: {name}, {profile.name}"
-    reports.save(reports.design_figure(model, chosen, found.motion, title), place / "design.png")
-    reports.save(reports.sigma_figure(found.sigma_percent, title), place / "sigma.png")
-    reports.write_report(place, "score", summary)
-    return summary
+    title = f"{model.machine.title}: {name}, {Path(profile).name}"
+    rows = {n: {"sigma_percent": v, "what": summary["meanings"].get(n, "")} for n, v in found.sigma_percent.items()}
+    return Account(
+        "score",
+        summary,
+        {
+            "design.png": partial(reports.design_figure, model, problem, found.motion, title),
+            "sigma.png": partial(reports.sigma_figure, found.sigma_percent, title),
+        },
+        partial(reports.rows_frame, rows, "parameter"),
+        (partial(design_workflow.write_drive, model, found.motion),),
+    )
 
 
 def judge_limits(model: Model, motion: Motion, placed: bool) -> Mapping[str, float]:

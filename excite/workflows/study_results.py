@@ -21,6 +21,7 @@ from excite import identification, reports
 from excite.identification import Verification
 from excite.model import build_cached
 from excite.reports import COLOURS
+from excite.text import count
 from excite.workflows import study_runs
 from excite.workflows.study_plan import Cell, StudyPlan
 from excite.workflows.study_runs import DEFECT, DONE, Row
@@ -221,7 +222,7 @@ def _cell_axes(s: CellResult) -> dict[str, str]:
         "objective": d.objective,
         "duration": "" if d.duration_s is None else f"{d.duration_s:g} s",
         "limits": " ".join(f"{n} x {f:g}" for n, f in d.limits),
-        "starts": f"{d.starts} starts",
+        "starts": count(d.starts, "start"),
         "design_seed": f"design {d.seed}",
         "profile": d.profile or "",
         "kit": s.cell.kit,

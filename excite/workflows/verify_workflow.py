@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from excite import identification, reports, simulation, trajectories
 from excite.errors import NotIdentifiableError, UsageError
-from excite.model import parameter_descriptions
+from excite.identification import Verification
+from excite.model import Model, parameter_descriptions
+from excite.reports import Account
+from excite.simulation import Motion
+from excite.text import count
 from excite.workflows import requests
 from excite.workflows.progress import Bar, no_bar
 
@@ -41,15 +46,25 @@ def verify(
             model, motion, method, kit, runs, seed, progress=lambda done, total: advance(done, total, None)
         )
     if len(result.failures) == runs:
-        raise NotIdentifiableError(f"all {runs} runs failed, the first one: {result.failures[0]}")
+        raise NotIdentifiableError(f"all {count(runs, 'run')} failed, the first one: {result.failures[0]}")
+    return verify_account(model, motion, result, seed, str(shown_as or design_dir), made.summary.get("problem")).write(
+        place
+    )
+
+
+def verify_account(
+    model: Model, motion: Motion, result: Verification, seed: int, drive: str, problem: str | None = None
+) -> Account:
+    """Give an account of a verification. drive: what the drive is called; problem: that it was designed for."""
     parameters = identification.summarise_runs(result)
+    runs = len(result.value)
     summary = {
         "machine": model.machine.name,
-        "problem": made.summary.get("problem"),
-        "design": str(shown_as or design_dir),
+        "problem": problem,
+        "design": drive,
         "runs": runs,
-        "method": method,
-        "kit": kit,
+        "method": result.method,
+        "kit": result.kit,
         "seed": seed,
         "failed": len(result.failures),
         "failures": result.failures,
@@ -59,7 +74,10 @@ def verify(
         "biased": identification.biased_parameters(parameters),
         "versions": requests.package_versions(),
     }
-    title = f"{model.machine.title}: {runs} simulated runs, {method}, kit {kit}"
-    reports.save(reports.verify_figure(result, title), place / "verify.png")
-    reports.write_report(place, "verify", summary)
-    return summary
+    title = f"{model.machine.title}: {count(runs, 'simulated run')}, {result.method}, kit {result.kit}"
+    return Account(
+        "verify",
+        summary,
+        {"verify.png": partial(reports.verify_figure, result, title)},
+        partial(reports.rows_frame, parameters, "parameter"),
+    )

@@ -12,6 +12,7 @@ from excite.model.effects import sizes
 from excite.model.effects.catalogue import CATALOGUE
 from excite.model.effects.effect import DEFAULT_DURATION, Effect, PlacedEffect, Site
 from excite.model.machine import Body, EffectEntry, Machine, Quantity, Sensor
+from excite.text import format_number
 
 SUSPICIOUS_RATIO = 50.0  # multiple of the typical magnitude that suggests a wrong unit; chosen
 MIN_TYPICAL_FRICTION = 1e-5  # N m, friction below this is no reference for others; chosen
@@ -123,7 +124,7 @@ def size_warning(machine: Machine, effect: PlacedEffect) -> str | None:
     if large < SUSPICIOUS_RATIO * small or (typical < MIN_TYPICAL_FRICTION and unit.startswith("N")):
         return None
     much = f"{magnitude:g} {unit}".removesuffix(" -")
-    return f"{effect.name}: {much}, usual are about {typical:.1g}: in another unit?"
+    return f"{effect.name}: {much}, usual are about {format_number(typical, 1)}: in another unit?"
 
 
 def place_effect(machine: Machine, entry: EffectEntry, duration: float = DEFAULT_DURATION) -> PlacedEffect:

@@ -593,7 +593,7 @@ def test_what_no_machine_has_is_no_name(straight: Model, straight_motion: Motion
         assert (d.verdict, d.findings, d.share) == ("unexplained", (), 0.0)
         assert d.nearest is not None
         assert (d.nearest.name, len(d.nearest.impossible)) == ("rolling_resistance@rear_roll", 1)
-        assert d.nearest.impossible[0].startswith(f"{name} = -" if value < 0 else f"{name} = 1e+05")
+        assert d.nearest.impossible[0].startswith(f"{name} = -" if value < 0 else f"{name} = 100000 N")
         assert "which no machine has" in findings.answer_text(findings.assess(d))
 
 

@@ -142,7 +142,9 @@ def test_identify_reports_what_was_found(
     summary = json.loads((out / "summary.json").read_text())
     assert f"<code>excite identify va12_straight {tmp_path / 'log.csv'} --method ols --out {out}</code>" in text
     for name, row in summary["parameters"].items():
-        cells = (name, summary["meanings"][name], re.escape(row["unit"]), f"{row['value']:.6g}")
+        decimals = 1 - int(np.floor(np.log10(row["std"])))  # two digits of the standard deviation
+        numbers = (f"{round(row[key], decimals):.{max(decimals, 0)}f}" for key in ("value", "std"))
+        cells = (name, summary["meanings"][name], re.escape(row["unit"]), *numbers)
         assert re.search("".join(f"<td[^>]*>{cell}</td>" for cell in cells), text)
     assert summary["meanings"]["u10"] == "torque offset, front roll"
     assert text.count("data:image/png;base64,") == 1

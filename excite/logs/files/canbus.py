@@ -12,6 +12,7 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs.files.common import MOST_CELLS, NOTES, UNITS_SAID, lacking, merged, refuse_huge, said
+from excite.text import count
 
 OBJECT = struct.Struct("<4sHHII")  # signature, bytes of the header, its version, bytes of the object, kind
 CONTAINER = struct.Struct("<H6xL4x")  # method of compression, bytes unpacked
@@ -64,7 +65,10 @@ def read_can(path: Path, wanted: frozenset[str]) -> pd.DataFrame:
             if not rows:
                 raise
             notes.append(f"the file breaks off after frame {seen} ({said(err)}); read up to there")
-    notes += [f"message {name}: {n} frames are not as the DBC file says, left out" for name, n in undecoded.items()]
+    notes += [
+        f"message {name}: {count(n, 'frame is', 'frames are')} not as the DBC file says, left out"
+        for name, n in undecoded.items()
+    ]
     if not rows:
         what = "no frame" if not seen else f"none of {seen} frames is a message of the DBC file"
         raise LogError(f"{path}: {what}{'; ' + notes[-1] if notes else ''}")

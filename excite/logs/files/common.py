@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
+from excite.text import count, format_number
 
 Reader = Callable[[Path, frozenset[str]], pd.DataFrame]  # of a file, and names of the columns that are wanted
 
@@ -94,8 +95,8 @@ def refuse_huge(path: Path, rows: int, columns: int) -> None:
     """Raises LogError where a file claims more than fits into memory."""
     if rows * max(columns, 1) > MOST_CELLS:
         raise LogError(
-            f"{path}: claims {rows} rows of {columns} columns, more than the {MOST_CELLS} numbers that are read; is the"
-            " file damaged? otherwise cut it into shorter logs"
+            f"{path}: claims {count(rows, 'row')} of {count(columns, 'column')}, more than the {MOST_CELLS} numbers"
+            " that are read; is the file damaged? otherwise cut it into shorter logs"
         )
 
 
@@ -142,8 +143,8 @@ def merged(path: Path, groups: Sequence[tuple[np.ndarray, Mapping[str, np.ndarra
             last = int(np.argmin(np.diff(t)))
             if (back := t[last] - t[last + 1]) > LATE_S:
                 raise LogError(
-                    f"{path}: the times of {next(iter(columns), 'a group')} go back by {back:.4g} s after sample"
-                    f" {last + 1}: its clock begins anew there; cut the file into logs of their own"
+                    f"{path}: the times of {next(iter(columns), 'a group')} go back by {format_number(back, 4)} s"
+                    f" after sample {last + 1}: its clock begins anew there; cut the file into logs of their own"
                 )
             notes.append(f"the times of {next(iter(columns), 'a group')} go back, its samples were put in order")
             order = np.argsort(t, kind="stable")

@@ -1,0 +1,181 @@
+"""Results as Python users see them: a text, a table, figures and a folder, all from one account of the result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Self
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from excite import output
+from excite.diagnosis import Assessment
+from excite.errors import UsageError
+from excite.identification import Estimate, Prediction, Verification
+from excite.logs import Log, profile_of
+from excite.model import Model
+from excite.reports import figures, pages, plain_text
+from excite.reports.descriptions import Description, describe
+from excite.reports.html import result_fragment
+from excite.simulation import Motion
+from excite.trajectories import Comparison, Design, Score
+
+
+@dataclass(frozen=True)
+class Account:
+    """All that is told of a result.
+
+    kind: as `describe` takes it. summary: content of summary.json. figures: each by its file name, the main one first.
+    files: each writes other files into a folder. drawn: figures among these files.
+    frame: the numbers as a table, with units in `attrs["units"]`.
+    """
+
+    kind: str
+    summary: dict[str, Any]
+    figures: Mapping[str, Callable[[], Figure]]
+    frame: Callable[[], pd.DataFrame]
+    files: Sequence[Callable[[Path], object]] = ()
+    drawn: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
+
+    def write(self, place: Path, command: str | None = None) -> dict[str, Any]:
+        """Fill a folder with files, figures, report.html and summary.json; return the summary.
+
+        command: how the report says that it was made, the command line by default.
+        """
+        for file in self.files:
+            file(place)
+        for name, draw in self.figures.items():
+            figures.save(draw(), place / name)
+        pages.write_report(place, self.kind, self.summary, command)
+        return self.summary
+
+
+class Shown:
+    """A result that shows itself: printed, in a notebook, as a DataFrame, as a figure, as a folder."""
+
+    @classmethod
+    def of(cls, result: Any, account: Callable[[], Account]) -> Self:
+        """Return a result that has an account of itself, which is computed when it is first asked for."""
+        made = cls(**{f.name: getattr(result, f.name) for f in fields(result)})
+        made.__dict__["_make_account"] = account
+        return made
+
+    @property
+    def account(self) -> Account:
+        """All that is told of this result. Raises UsageError for one that was put together by hand."""
+        own = self.__dict__
+        if "_account" not in own:
+            if "_make_account" not in own:
+                raise UsageError(f"{type(self).__name__}: was changed or made by hand, only its values are known")
+            own["_account"] = own["_make_account"]()
+        return own["_account"]
+
+    def __repr__(self) -> str:
+        if "_make_account" not in self.__dict__:
+            return super().__repr__()
+        return plain_text.render(self.description)
+
+    def _repr_html_(self) -> str | None:
+        return result_fragment(self.description) if "_make_account" in self.__dict__ else None
+
+    @property
+    def description(self) -> Description:
+        """The result in words and tables, as its command prints it."""
+        return describe(self.account.kind, self.account.summary)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The result as in summary.json."""
+        return self.account.summary
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return the numbers as a table: `attrs["units"]` has the unit of each column, or of each row.
+
+        A log, a drive and a prediction give a row a time; estimates, scores and verifications a row a parameter;
+        comparisons a row a drive; diagnoses a row a finding.
+        """
+        return self.account.frame()
+
+    def plot(self, name: str | None = None) -> Figure:
+        """Return a figure of the report: the main one, or that of a name such as "sigma". Raises UsageError."""
+        every = {**self.account.figures, **self.account.drawn}
+        drawn = {file.removesuffix(".png"): draw for file, draw in every.items()}
+        if not drawn:
+            raise UsageError(f"{type(self).__name__}: has no figure")
+        name = name or next(iter(drawn))
+        if name not in drawn:
+            raise UsageError(f"plot: {name} is unknown, allowed: {', '.join(drawn)}")
+        return drawn[name]()
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the files that the command writes, into a folder that is complete or not there. Raises FolderError."""
+        out = Path(folder)
+        with output.new_folder(out, "folder") as place:
+            self.account.write(place, f"excite.{CALLS.get(self.account.kind, self.account.kind)}(...) in Python")
+        return out
+
+
+CALLS = {"log": "read_log"}  # kinds whose function has another name
+
+
+class ShownLog(Shown, Log):
+    """Measurements of a log, checked; fields as in `Log`."""
+
+
+class ShownDesign(Shown, Design):
+    """A designed drive; fields as in `Design`."""
+
+
+class ShownScore(Shown, Score):
+    """A drive judged as a design; fields as in `Score`."""
+
+
+class ShownComparison(Shown, Comparison):
+    """Drives side by side; fields as in `Comparison`."""
+
+
+class ShownVerification(Shown, Verification):
+    """Estimates of many simulated test days; fields as in `Verification`."""
+
+
+class ShownEstimate(Shown, Estimate):
+    """Parameters identified from logs; fields as in `Estimate`."""
+
+
+class ShownPrediction(Shown, Prediction):
+    """Predicted signals with 95 % bands; fields as in `Prediction`."""
+
+
+class ShownAssessment(Shown, Assessment):
+    """A diagnosis with what its findings gain; fields as in `Assessment`."""
+
+
+def rows_frame(rows: Mapping[str, Mapping[str, Any]], index: str) -> pd.DataFrame:
+    """Return a table with a row for each name; units of rows are those in the column `unit`, of columns by their ends.
+
+    index: what the names are of.
+    """
+    table = pd.DataFrame.from_dict(dict(rows), orient="index").rename_axis(index)
+    units = {str(c): unit for c in table.columns for end, unit in UNITS_OF_ENDS.items() if str(c).endswith(end)}
+    if "unit" in table.columns:
+        units |= dict(zip(table.index, table["unit"], strict=True))
+    table.attrs["units"] = units
+    return table
+
+
+UNITS_OF_ENDS = {"_percent": "%", "_s": "s", "gain_ci95": "%"}  # of columns of a summary
+
+
+def drive_frame(model: Model, motion: Motion) -> pd.DataFrame:
+    """Return a drive as its profile has it, with the unit of each column."""
+    table = profile_of(model, motion)
+    table.attrs["units"] = {"t_s": "s"} | {
+        str(c): unit for c in table.columns for end, unit in UNITS_OF_COLUMNS.items() if str(c).endswith(end)
+    }
+    return table
+
+
+# ends of a profile's columns; longer ones later, as the last one that fits counts
+UNITS_OF_COLUMNS = {"_m": "m", "_rad": "rad", "_N": "N", "_Nm": "N m", "_m_s": "m/s", "_rad_s": "rad/s"}
