@@ -74,7 +74,9 @@ def test_a_study_calls_the_program_as_it_is(study: Path, tmp_path: Path) -> None
 def test_a_study_can_be_rebuilt_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """No command of the list would refuse its folder for what is in it."""
     monkeypatch.chdir(ROOT)
-    places = re.findall(r"--out (results/[^ `]+)", (ROOT / "results" / "README.md").read_text(encoding="utf-8"))
+    places = re.findall(
+        r"`excite [^`]*--out (results/[^ `]+)", (ROOT / "results" / "README.md").read_text(encoding="utf-8")
+    )
     assert len(places) > 8
     for place in places:
         output.check_out_folder(Path(place))

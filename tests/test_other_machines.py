@@ -427,6 +427,7 @@ def biased() -> tuple[Motion, Diagnosis]:
     return motion, diagnose.diagnose(model, [measured], model.machine.filter)
 
 
+@pytest.mark.slow
 def test_a_diagnosis_names_what_a_robot_has(biased: tuple[Motion, Diagnosis]) -> None:
     """Its slips are each wheel's own: the inner ones' and the outer ones' differ in a turn."""
     motion, found = biased
@@ -464,6 +465,7 @@ def test_a_diagnosis_names_what_a_roll_has_that_nothing_drives(cause: str) -> No
     assert abs(found.findings[0].magnitude - float(amount)) < 2 * found.findings[0].magnitude_std < 0.15 * float(amount)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cause", "rival", "said"),
     [

@@ -49,10 +49,11 @@ def file_with(tmp_path: Path, text: str) -> Path:
 @pytest.mark.parametrize(
     ("wrong", "name", "amount"),
     [
-        (
+        pytest.param(
             '[body.rear_axle_frame]\nd = { value = -1.755, source = "measured" }\n',
             "contact_position@rear_roll",
             -0.005,
+            marks=pytest.mark.slow,
         ),
         pytest.param(
             '[sensor.thetal]\nlateral = { value = 1.255, source = "measured" }\n',

@@ -919,6 +919,7 @@ def test_forces_hide_which_of_two_is_right(
     assert bool(choice.rivals) == (excess == (4.0, 3.9))
 
 
+@pytest.mark.slow
 def test_a_harmonic_is_no_ripple_elsewhere(straight: Model, straight_motion: Motion) -> None:
     """Straight on, all rolls turn alike: what is twice an order of a known ripple is one of the same machine's."""
 
@@ -1106,6 +1107,7 @@ def test_what_foretells_nothing_is_no_name(percent: float, straight: Model, monk
     assert min(seen) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "seed"), [(0.03, 3), (0.03, 4), (0.2, 3), (0.4, 3), (3.0, 3), (30.0, 4)])
 def test_a_file_that_is_far_off_is_no_cause(straight: Model, share: float, seed: int) -> None:
     """A clean log, the file's contacts at so large a share of the true ones."""

@@ -891,6 +891,7 @@ def test_a_fit_that_came_near_the_log_is_gone_on_with(straight: Model, monkeypat
             assert tried.fit.cost == pytest.approx(stage.fit.cost, abs=20 if disturbed else 1)
 
 
+@pytest.mark.slow
 def test_who_gains_too_little_with_coarse_sensors_is_given_up(
     straight: Model, sloping: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,6 +17,7 @@ def logs(straight: Model, straight_motion: Motion) -> list[Log]:
     return [make_log(straight, straight_motion, seed=100 + k) for k in range(24)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["ols", "wls"])
 def test_the_bias_is_found_from_one_log(straight: Model, logs: list[Log], method: str) -> None:
     """Mean error over 24 logs beside what simulations of one of them say."""

@@ -78,6 +78,7 @@ def test_the_nearest_machine_in_the_metric_of_the_data(straight: Model) -> None:
     assert after.value[others] == pytest.approx(X[others], rel=1e-5)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(st.integers(0, 2**31))
 def test_random_bodies_are_possible_and_random_vectors_become_so(straight: Model, seed: int) -> None:

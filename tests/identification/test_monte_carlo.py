@@ -18,6 +18,7 @@ def four(straight: Model, straight_motion: Motion) -> Verification:
     return verify(straight, straight_motion, "ols", "paper", runs=4, seed=7, jobs=1)
 
 
+@pytest.mark.slow
 def test_same_seed_same_numbers_on_any_number_of_workers(
     straight: Model, straight_motion: Motion, four: Verification
 ) -> None:

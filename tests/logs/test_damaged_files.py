@@ -32,6 +32,7 @@ def test_damaged_files_give_a_table_or_one_line(each: int, child: damage.Child, 
         assert answer.good, (name, k, answer)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("each", SIZES)
 def test_damaged_logs_are_refused_or_prepared_without_nan(each: int, child: damage.Child, tmp_path: Path) -> None:
     seeds = log_files.logs_of("va12", tmp_path)

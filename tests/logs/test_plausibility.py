@@ -192,6 +192,7 @@ def test_identify_says_what_is_doubtful(straight: Model, straight_motion: Motion
         methods.identify(straight, [wrong], "iv")
 
 
+@pytest.mark.slow
 def test_a_doubtful_log_to_validate_with_is_said(
     straight: Model, straight_motion: Motion, tmp_path: Path, excite: Excite
 ) -> None:
@@ -216,7 +217,7 @@ def test_diagnose_says_what_is_doubtful(
     def fails(*args: object) -> None:
         raise NotConvergedError("no motion", None, 3.0)
 
-    monkeypatch.setattr(diagnosis, "diagnose", fails)
+    monkeypatch.setattr(diagnosis, "explain", fails)
     with pytest.raises(NotConvergedError, match=r"^no motion; .*log.csv: column u1_Nm: .* is it in kN m"):
         workflows.diagnose(tmp_path, "va12_straight", [tmp_path / "log.csv"])
 

@@ -321,6 +321,7 @@ def test_the_soil_only_takes_energy_from_the_machine(seed: int, va12: Model) -> 
     assert (np.sum(soil_force(va12, q, nu) * nu, axis=0) <= 1e-6).all()
 
 
+@pytest.mark.slow
 @given(m=motions, g_K=laws)
 def test_driving_backward_mirrors_driving_forward(m: Motion, g_K: float | None) -> None:
     """Seen in a mirror across the roll's axle, x and with it spin and yaw change sign: so do S_x and T_z, exactly."""
@@ -328,6 +329,7 @@ def test_driving_backward_mirrors_driving_forward(m: Motion, g_K: float | None) 
     assert wrench_of(ROLL, Motion(-m.Vx, m.Vy, -m.spin, -m.yaw), g_K) == (-Sx, Sy, -Tz)
 
 
+@pytest.mark.slow
 @given(m=motions, g_K=laws)
 def test_left_mirrors_right(m: Motion, g_K: float | None) -> None:
     """Seen in a mirror along the chassis, y and yaw change sign: so do S_y and T_z."""

@@ -37,6 +37,7 @@ def test_the_bound_closes_and_lies_below_every_drive(straight: Model, drives: li
     assert loose.certified < 23.31  # the best design of S40 that is known
 
 
+@pytest.mark.slow
 def test_what_drives_must_obey_raises_the_bound(
     straight: Model, problem: Problem, drives: list[Motion], loose: Bound
 ) -> None:

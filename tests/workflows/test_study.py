@@ -502,6 +502,7 @@ def test_a_full_disk_loses_nothing(tmp_path: Path) -> None:
         kept.add_rows([(k, {}) for k in range(10, 200)])
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_costs_nothing_and_a_deadly_piece_is_found(tmp_path: Path) -> None:
     def dies(number: int) -> int:
         """Piece 3 always kills its worker, piece 1 the first one, piece 9 the first two."""
