@@ -16,42 +16,11 @@ import numpy as np
 
 from excite.errors import MachineError
 from excite.model import mechanics
+from excite.model.base_parameters import BaseParameters, append_parameters, base_parameters
 from excite.model.effects import GroundMap, PlacedEffect, Site, place_effect
 from excite.model.equations import Equations, contact_lines, edge_slips, equations, kinematics, signed_balance
 from excite.model.known_values import KnownValues, known_values
 from excite.model.machine import Machine
-from excite.model.mechanics import independent_columns
-
-
-@dataclass(frozen=True)
-class BaseParameters:
-    """The identifiable combinations of the standard parameters (Gautier, 1991).
-
-    names, units (n_base): of the base parameters.
-    independent (n_base): column of the standard parameter that stands for each base parameter.
-    matrix (n_base, n_standard): base values = matrix @ standard values.
-    invisible: standard parameters that no motion shows.
-    standard (n_standard): names of the standard parameters.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    independent: tuple[int, ...]
-    matrix: np.ndarray
-    invisible: tuple[str, ...]
-    standard: tuple[str, ...]
-
-    @cached_property
-    def expand(self) -> np.ndarray:
-        """Map base values to standard values with the same motions (n_standard, n_base), all others zero."""
-        matrix = np.zeros((len(self.standard), len(self.names)))
-        matrix[list(self.independent), range(len(self.names))] = 1.0
-        return matrix
-
-    def grouping(self, name: str) -> dict[str, float]:
-        """Return the standard parameters that make up a base parameter, with their coefficients."""
-        row = self.matrix[self.names.index(name)]
-        return {s: float(c) for s, c in zip(self.standard, row, strict=True) if c != 0}
 
 
 def standard_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
@@ -382,7 +351,7 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
         if not fit_sensor_effects:
             shown = _visible_parameters(equations(machine, (*table, *magnitudes), placed))
             magnitudes = {name: row for name, row in magnitudes.items() if name in shown}
-        base = _append_parameters(base, magnitudes)
+        base = append_parameters(base, magnitudes)
         known = known.extended(len(magnitudes))
         nominal = np.concatenate([nominal, [v for v, _, _ in magnitudes.values()]])
         scale = np.concatenate([scale, [size for _, _, size in magnitudes.values()]])
@@ -447,21 +416,6 @@ def _effect_parameters(
     return found | magnitudes
 
 
-def _append_parameters(base: BaseParameters, magnitudes: Mapping[str, tuple[float, str, float]]) -> BaseParameters:
-    """Append parameters of effects to the base parameters, each independent of all others."""
-    n, k, m = len(base.names), len(base.standard), len(magnitudes)
-    matrix = np.zeros((n + m, k + m))
-    matrix[:n, :k], matrix[n:, k:] = base.matrix, np.eye(m)
-    return BaseParameters(
-        base.names + tuple(magnitudes),
-        base.units + tuple(unit for _, unit, _ in magnitudes.values()),
-        base.independent + tuple(range(k, k + m)),
-        matrix,
-        base.invisible,
-        base.standard + tuple(magnitudes),
-    )
-
-
 def _with_rate_readings(machine: Machine, found: Equations) -> ca.Function:
     """Return the readings; a rate sensor reads the time derivative of its angle and of the angle's error."""
     rates = {s.name for s in machine.sensor if s.is_rate}
@@ -497,49 +451,3 @@ def _check_names(machine: Machine, standard: tuple[str, ...]) -> None:
             raise MachineError(
                 f"{machine.name}: scale.{name}: no such parameter, allowed: {', '.join(standard)}, with R for a group"
             )
-
-
-def base_parameters(machine: Machine, W: ca.Function, p: np.ndarray, units: dict[str, str]) -> BaseParameters:
-    """Find base parameters by QR of the standard regressor over random motions (Gautier, 1991).
-
-    A column that depends on columns before it is grouped into them; coefficients are cleaned of rounding errors.
-    Raises MachineError if no motion shows any parameter.
-    """
-    standard = tuple(units)
-    n = len(machine.coordinates)
-    rng = np.random.default_rng(0)
-    samples = max(60, 4 * len(standard))
-    q, nu, a = (rng.uniform(-1, 1, (n, samples)) for _ in range(3))
-    flat = W(q, nu, a, p).full().reshape(n, samples, len(standard))
-    A = flat.transpose(1, 0, 2).reshape(-1, len(standard))
-    size = np.linalg.norm(A, axis=0)
-    visible = np.flatnonzero(size > 1e-12 * size.max())
-    kept, left = (visible[k] for k in independent_columns(A[:, visible] / size[visible], 1e-9))
-    matrix = np.zeros((len(standard), len(standard)))
-    matrix[kept, kept] = 1.0
-    for j in left:
-        before = kept[kept < j]
-        coefficients = np.linalg.lstsq(A[:, before], A[:, j], rcond=None)[0]
-        matrix[before, j] = np.where(np.abs(coefficients) < 1e-9, 0.0, np.round(coefficients, 12))
-    if not len(kept):
-        raise MachineError(
-            f"{machine.name}: no parameter can be seen in any motion, check the table and what is locked"
-        )
-    chosen = matrix[kept]
-    names = tuple(
-        machine.parameter_names.get(standard[j], standard[j] + ("R" if np.count_nonzero(row) > 1 else ""))
-        for j, row in zip(kept, chosen, strict=True)
-    )
-    twice = sorted({s for s in names if names.count(s) > 1})
-    if twice:
-        raise MachineError(
-            f"{machine.name}: parameter_names: two base parameters get the same name: {', '.join(twice)}"
-        )
-    return BaseParameters(
-        names,
-        tuple(units[standard[j]] for j in kept),
-        tuple(kept.tolist()),
-        chosen,
-        tuple(name for j, name in enumerate(standard) if j not in visible),
-        standard,
-    )
