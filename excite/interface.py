@@ -183,14 +183,15 @@ def predict(machine: Machine, estimate: Estimate, target: Source | Drive) -> Sho
     return ShownPrediction.of(found.prediction, account)
 
 
-def diagnose(machine: Machine, logs: Source | Sequence[Source]) -> ShownAssessment:
+def diagnose(machine: Machine, logs: Source | Sequence[Source], *, budget_s: float | None = None) -> ShownAssessment:
     """Find what the model of a machine gets wrong along logs: named causes, their magnitudes, the gain of each.
 
+    budget_s [s]: nothing new is begun after it, and the best answer so far is given.
     Raises LogError for an unusable log, NoEstimateError if nothing can be fitted.
     """
     model = load(machine)
     ready = readers.prepare(model, _several(logs), identification.needed_sensors(model, "joint"))
-    found = workflows.diagnose_from(ready.model, ready.logs)
+    found = workflows.diagnose_from(ready.model, ready.logs, budget_s=budget_s)
     name = model.machine.name if isinstance(machine, Model) else str(machine)
     return ShownAssessment.of(found.assessment, partial(_diagnose_account, name, ready, found))
 

@@ -510,6 +510,10 @@ def diagnose(
             "--next", help="also design the drive that separates tied causes, into the folder next/ (minutes)"
         ),
     ] = False,
+    budget: Annotated[
+        float | None,
+        typer.Option("--budget", help="begin nothing new after this many seconds: the best answer so far"),
+    ] = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -525,7 +529,7 @@ def diagnose(
     out = out or Path(f"results/diagnose-{load_machine(machine).name}")
     _check_logs_and_filter(logs, filtering)
     with _result(out, json, partial(terminal.show, "diagnose"), [*_machine_file(machine), *logs]) as (place, summary):
-        summary |= workflows.diagnose(place, machine, logs, filtering, design_next, terminal.bar)
+        summary |= workflows.diagnose(place, machine, logs, filtering, design_next, terminal.bar, budget)
 
 
 logs = typer.Typer(help="Check or convert a log.", rich_markup_mode=None)

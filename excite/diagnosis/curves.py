@@ -23,9 +23,9 @@ CURVE_POINTS = 41  # of a curve
 class Curve:
     """A torque that the model lacks as a smooth function of one signal.
 
-    row: name and unit of the torque sensor. signal: name and unit. at (M,) [signal's unit], value, std (M,) [row's
-    unit], its mean along the log taken off. percent: by how much the error of that torque on withheld stretches is
-    smaller, with its 95 % interval.
+    row: name and unit of the torque sensor. signal: name and unit. at (M,) [signal's unit]. value, std (M,) [row's
+    unit]: without what parameters explain as well (`absorbed`). percent: by how much the error of that torque on
+    withheld stretches is smaller, with its 95 % interval.
     """
 
     row: tuple[str, str]
@@ -77,7 +77,7 @@ def find_curves(fit: TorqueFit, torques: Sequence[np.ndarray], report: ProgressC
             if gain is None or gain.interval is None or not gain.interval[0] > 0:
                 continue
             if best is None or gain.percent > best.percent:
-                at, value, std = _evaluate(new, term, values)
+                at, value, std = _evaluate(new, term, values, unit)
                 label = name.replace(f"the torque u{k}", "its torque")
                 best = Curve(torque_names(model.machine)[k], (label, unit), at, value, std, gain.percent, gain.interval)
         if best is not None:
@@ -139,11 +139,25 @@ def _of_row(errors: HoldOutErrors, k: int) -> HoldOutErrors:
     )
 
 
-def _evaluate(fit: TorqueFit, term: Term, values: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Evaluate a curve: points, values with mean zero along the logs, standard deviations."""
+def absorbed(values: np.ndarray, unit: str) -> np.ndarray:
+    """Return functions (n, m) of a signal that parameters of a joint explain as well.
+
+    An offset; of a speed or a torque friction and what is proportional to it, of an angle gravity.
+    """
+    one = np.ones_like(values)
+    if unit == "rad":
+        return np.column_stack([one, np.cos(values), np.sin(values)])
+    return np.column_stack([one] if unit == "m" else [one, values, np.sign(values)])
+
+
+def _evaluate(
+    fit: TorqueFit, term: Term, values: Sequence[np.ndarray], unit: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Evaluate a curve beside what parameters explain as well: points, values, standard deviations."""
     every = np.concatenate(list(values))
     low, high = (float(x) for x in np.quantile(every, [0.01, 0.99]))
     at = np.linspace(low, high, CURVE_POINTS)
-    B = _basis(at, values) - _basis(every, values).mean(axis=0)
+    shares = np.linalg.lstsq(absorbed(every, unit), _basis(every, values), rcond=None)[0]
+    B = _basis(at, values) - absorbed(at, unit) @ shares
     own = fit.columns_of(term)
     return at, B @ fit.x[own], np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", B, fit.covariance[own, own], B), 0.0))

@@ -16,6 +16,7 @@ import numpy as np
 import scipy.stats
 
 from excite.diagnosis import hold_out as gains, magnitude_interval, selection
+from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.fits import (
     MIN_PROCESS_NOISE,
     ExtendedFit,
@@ -162,13 +163,15 @@ def diagnose(
     filter: Filter,
     progress: ProgressCallback | None = None,
     runner: CallRunner = run_in_turn,
+    deadline: Deadline | None = None,
 ) -> Diagnosis:
     """Diagnose what these logs show that the model lacks.
 
-    runner: runs independent calls; the answer does not depend on it. Raises NotConvergedError if the machine file's
+    runner: runs independent calls; the answer does not depend on it. deadline: once the model is fitted, no further
+    effect is begun after it. Raises NotConvergedError if the machine file's
     parameters give no motion, NotIdentifiableError if a torque is missing.
     """
-    report = progress or (lambda share, what: None)
+    report, deadline = progress or (lambda share, what: None), deadline or Deadline()
     report(0.0, "fitting the model")
     first = before = fit_machine_that_sticks(fit_machine(model.machine, logs, filter, runner), logs, filter, runner)
     chosen = list[Choice]()
@@ -177,23 +180,26 @@ def diagnose(
         sharp = selection.choose_with_inflated_noise(before, runner)
         before, chosen = sharp or (fit_with_process_noise(before, runner), chosen)
     tried: Container[str] = ()
-    if not (before.estimated or chosen):
+    if not (before.estimated or chosen or deadline.is_over()):
         report(0.15, "fitting effects from initial trajectories")
         before, chosen, tried = selection.choose_from_start(before, runner)
-    chosen, next_ratio = extend_model(before, chosen, runner, report)
+    chosen, next_ratio = extend_model(before, chosen, runner, report, deadline)
     added = chosen
     chosen, anomalies, nearest = drop_weak_effects(before, chosen, next_ratio)
-    if not (chosen or (before.exact and before.is_close)):  # a fit with inflated sensor noise has process noise, too
+    followed = before.exact and before.is_close
+    if not (chosen or followed or deadline.is_over()):  # a fit with inflated sensor noise has process noise, too
         report(0.85, "fitting less likely effects")
         old = before if before.data.noise_inflation == 1 else fit_with_process_noise(before, runner)
         before, anew = selection.choose_unlikely(first, old, tried if old is first else (), runner)
         if anew or before is not old:
-            anew, next_ratio = extend_model(before, anew, runner, lambda share, what: report(max(share, 0.85), what))
+            anew, next_ratio = extend_model(
+                before, anew, runner, lambda share, what: report(max(share, 0.85), what), deadline
+            )
             nearest = None if before is not old else nearest
             added = anew
         chosen, anomalies, closer = drop_weak_effects(before, anew, next_ratio)
         nearest = closer or nearest
-    if len(chosen) > 1:
+    if len(chosen) > 1 and not deadline.is_over():
         report(0.9, "testing each effect given the others")
         chosen, anomalies, nearest = drop_weak_effects(
             before, drop_unneeded(before, review_effects(before, chosen, runner)), next_ratio
@@ -226,7 +232,11 @@ def _corrections(
 
 
 def extend_model(
-    before: ExtendedFit, first: Sequence[Choice], runner: CallRunner, report: ProgressCallback
+    before: ExtendedFit,
+    first: Sequence[Choice],
+    runner: CallRunner,
+    report: ProgressCallback,
+    deadline: Deadline | None = None,
 ) -> tuple[list[Choice], float]:
     """Add effects one after the other until none is worth a place.
 
@@ -238,6 +248,9 @@ def extend_model(
         turn = len(chosen)
         report(0.15 + 0.2 * turn, "scoring effects")
         scores = selection.score_effects(stage, runner)
+        if deadline is not None and deadline.is_over():
+            next_ratio = max(0.0, scores[0].likelihood_ratio - selection.MIN_LIKELIHOOD_RATIO) if scores else 0.0
+            break
         hopeless = _cannot_explain(before, chosen, scores)
         choice = None if hopeless else selection.choose_effect(stage, scores, chosen, runner, report, 0.2 + 0.2 * turn)
         if choice is not None and before.estimated and _exceeds_earlier(choice, chosen):

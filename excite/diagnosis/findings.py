@@ -13,6 +13,7 @@ import tomli_w
 
 from excite.diagnosis import hold_out, residuals, separating_run, torque_regression
 from excite.diagnosis.acceptance import reason_against, widen
+from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.diagnosis import MIN_EXPLAINED_SHARE, Diagnosis, Finding, NearestEffect, anomaly_lines, diagnose
 from excite.diagnosis.fits import ExtendedFit, with_true_sensor_noise
 from excite.diagnosis.hold_out import HoldOutErrors, HoldOutGain
@@ -20,7 +21,7 @@ from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.residuals import InnovationLevel
 from excite.diagnosis.selection import ProgressCallback
 from excite.diagnosis.torque_regression import TorqueDiagnosis
-from excite.errors import NoEstimateError
+from excite.errors import NoEstimateError, NotIdentifiableError
 from excite.logs import Log
 from excite.model import Model
 from excite.model.machine import EffectEntry, Filter, Machine, shipped_machines
@@ -30,6 +31,7 @@ MACHINE_FILE_DIGITS = 8  # significant digits of magnitudes in a machine file; c
 FIRST_ANOMALY_LINES = 3  # lines about anomalies that precede all others; chosen
 MIN_NEAREST_SHARE = 0.05  # share of the misfit above which the nearest effect is mentioned; chosen
 MAX_FOLLOWED_JOINTS = 3  # driven joints of a machine without slips whose motion is followed in open loop; chosen
+SMOOTHING_SHARE = 0.6  # of a budget of time, where regression may follow; chosen
 DIAGNOSE_SHARE = 0.8  # of the progress; gains take the rest; chosen
 FULL_EXPLANATION_SHARE = 0.9  # share of the misfit below which the answer gives it; chosen
 
@@ -40,7 +42,8 @@ class Assessment:
 
     total_gain, gains: hold-out gain of all findings, and of each; None if no model could be fitted to the rest of the
     logs. before, after: size of each signal's innovations without and with the findings. located: where the misfit is.
-    separating_run: the run that would separate tied causes.
+    separating_run: the run that would separate tied causes. cut_short: the budget [s] that ended the search, None if it
+    ended by itself.
     """
 
     diagnosis: Diagnosis | TorqueDiagnosis
@@ -50,15 +53,21 @@ class Assessment:
     after: Mapping[str, InnovationLevel]
     located: tuple[str, ...]
     separating_run: str | None
+    cut_short: float | None = None
 
 
-def assess(d: Diagnosis, progress: ProgressCallback | None = None, runner: CallRunner = run_in_turn) -> Assessment:
+def assess(
+    d: Diagnosis,
+    progress: ProgressCallback | None = None,
+    runner: CallRunner = run_in_turn,
+    deadline: Deadline | None = None,
+) -> Assessment:
     """Measure hold-out gains, keep the findings that pay for their names, and locate the misfit.
 
     The gain of a finding is that over the model with the findings before it. If nothing is named, effects that explain
     too little to be causes are given as corrections, if they pay as well.
     """
-    report = progress or (lambda share, what: None)
+    report, deadline = progress or (lambda share, what: None), deadline or Deadline()
     entries = list(zip(d.findings, d.stages, strict=True)) or list(d.dropped)
     entries = [(widen(f, stage), stage) for f, stage in entries]
     stages = [d.before, *(stage for _, stage in entries)]
@@ -66,7 +75,7 @@ def assess(d: Diagnosis, progress: ProgressCallback | None = None, runner: CallR
     shown = [hold_out.hold_out_torques(stage) for stage in stages]
     shown = held if None in shown else shown
     reasons = _reasons_against(entries, held, shown)
-    if any(reasons) and held[0] is not None:  # withhold every part before a name is given up
+    if any(reasons) and held[0] is not None and not deadline.is_over():  # withhold every part before a name is given up
         reasons = _reasons_against(entries, _hold_out(stages, True, runner, report), shown)
     count = next((k for k, reason in enumerate(reasons) if reason), len(entries))
     d = _with_findings(d, entries[:count], reasons[count] if count < len(entries) else "")
@@ -156,34 +165,63 @@ def explain(
     filter: Filter,
     progress: ProgressCallback | None = None,
     runner: CallRunner = run_in_turn,
+    budget_s: float | None = None,
 ) -> Assessment:
     """Diagnose logs by joint smoothing, or by regression on the torques where that says more.
 
-    Joint smoothing needs a motion that is followed in open loop. For a machine without slips, regression takes its
-    place where there are more than MAX_FOLLOWED_JOINTS driven joints, where smoothing finds no estimate, or where it
-    explains nothing and the corrections of regression gain more. Raises NoEstimateError.
+    Joint smoothing needs a motion that is followed in open loop. For a machine without slips and effects whose joints
+    are all driven and which has no known values, regression takes its place where there are more than
+    MAX_FOLLOWED_JOINTS joints, where smoothing finds no estimate, or where it leaves something unexplained and the
+    corrections of regression surely gain more. budget_s [s]: after it nothing new is begun, and the
+    best answer so far is given. Raises NoEstimateError.
     """
+    whole, smoothing = Deadline(budget_s), Deadline(None if budget_s is None else SMOOTHING_SHARE * budget_s)
+    found = _explain(model, logs, filter, progress, runner, whole, smoothing)
+    return replace(found, cut_short=budget_s if whole.reached or smoothing.reached else None)
+
+
+def _explain(
+    model: Model,
+    logs: Sequence[Log],
+    filter: Filter,
+    progress: ProgressCallback | None,
+    runner: CallRunner,
+    deadline: Deadline,
+    smoothing_deadline: Deadline,
+) -> Assessment:
+    """Diagnose as `explain` does; smoothing leaves regression some time."""
     report = progress or (lambda share, what: None)
-    by_torques = not model.slips and model.plain
+    driven = len(model.actuated) == len(model.coordinates)
+    by_torques = driven and not model.slips and model.plain and not model.known
 
     def regress() -> Assessment:
-        return assess_torques(*torque_regression.diagnose_torques(model, logs, filter, report))
+        return assess_torques(*torque_regression.diagnose_torques(model, logs, filter, report, deadline))
 
     if by_torques and len(model.actuated) > MAX_FOLLOWED_JOINTS:
         return regress()
+    limit = smoothing_deadline if by_torques else deadline
     try:
-        found = diagnose(model, logs, filter, lambda share, what: report(DIAGNOSE_SHARE * share, what), runner)
+        found = diagnose(model, logs, filter, lambda share, what: report(DIAGNOSE_SHARE * share, what), runner, limit)
     except NoEstimateError:
         if not by_torques:
             raise
         return regress()
-    account = assess(found, lambda share, what: report(DIAGNOSE_SHARE + (1 - DIAGNOSE_SHARE) * share, what), runner)
-    if not (by_torques and account.diagnosis.verdict == "unexplained"):
+    left = 1 - DIAGNOSE_SHARE
+    account = assess(found, lambda share, what: report(DIAGNOSE_SHARE + left * share, what), runner, limit)
+    if not by_torques or account.diagnosis.verdict != "unexplained":
         return account
-    other = regress()
-    gain = account.total_gain.percent if account.total_gain and account.diagnosis.findings else 0.0
-    found_more = other.diagnosis.findings and other.total_gain is not None and other.total_gain.percent > gain
-    return other if found_more else account
+    try:
+        other = regress()
+    except NotIdentifiableError:
+        return account
+    return other if other.diagnosis.findings and _least_gain(other) > _least_gain(account) else account
+
+
+def _least_gain(a: Assessment) -> float:
+    """Lower end of the gain of all findings [%], 0 without any."""
+    if not (a.diagnosis.findings and a.total_gain):
+        return 0.0
+    return a.total_gain.interval[0] if a.total_gain.interval else 0.0
 
 
 def assess_torques(d: TorqueDiagnosis, errors: Sequence[HoldOutErrors]) -> Assessment:
@@ -305,8 +343,7 @@ def answer_text(a: Assessment) -> str:
         text = f"{logs} a misfit that no known effect explains"
         if rows:
             taken = ", ".join(
-                f"{describe_place(r['effect'], r['where'])} of {format_magnitude(r)} takes {r['share_percent']:.0f} %"
-                for r in rows
+                f"{_with_rivals(r)} of {format_magnitude(r)} takes {r['share_percent']:.0f} %" for r in rows
             )
             text += f"; as a correction, {taken} of it"
             if a.total_gain:
@@ -339,6 +376,12 @@ def answer_text(a: Assessment) -> str:
     if d.verdict == "tied":
         return f"{logs} {named}: the data cannot tell which.{remark}"
     return f"{logs} {named}: {'; '.join(format_magnitude(r) for r in rows)}.{remark}"
+
+
+def _with_rivals(row: Mapping[str, Any]) -> str:
+    """Return a finding with those that it cannot be told from, in words."""
+    also = " or ".join(describe_place(*x.split("@")) for x in row["tied_with"])
+    return describe_place(row["effect"], row["where"]) + (f" (or {also})" if also else "")
 
 
 def _describe_change(percent: float, interval: tuple[float, float] | None) -> str:

@@ -24,14 +24,16 @@ class Term:
     """An effect, or a smooth curve, as columns of the regression.
 
     columns: torques (n_rows, n, width) for each log; for an effect one, and a coefficient of 1 stands for the magnitude
-    of `placed`. slopes: of the column by relative changes of the shapes (and of a magnitude that does not scale it),
-    (n_rows, n, m), for the shapes `free`. chi2: of the effect, when it was added.
+    of `placed`. slopes: of the column by relative changes of the shapes `free`, (n_rows, n, m). by_magnitude: slope of
+    the column by a relative change of a magnitude that it is not proportional to, (n_rows, n, 1). chi2: of the effect,
+    when it was added.
     """
 
     placed: PlacedEffect | None
     columns: list[np.ndarray]
     slopes: list[np.ndarray]
     free: tuple[str, ...] = ()
+    by_magnitude: list[np.ndarray] | None = None
     chi2: float = 0.0
 
     @property
@@ -51,7 +53,8 @@ class Term:
 class TorqueFit:
     """Parameters and effects fitted to rows: weighted least squares, and the same with whitened residuals.
 
-    kept: numbers of the base parameters that the rows show. lowest (n_rows,): noise of the rows [N m or N].
+    kept: numbers of the base parameters that the rows show. lowest (n_rows,): noise of the rows [N m or N]. level
+    (n_rows,): root mean square of what the fit leaves, at least that noise.
     """
 
     def __init__(
@@ -68,7 +71,7 @@ class TorqueFit:
             self.residual = [r.Y - A @ self.x for r, A in zip(rows, self.design, strict=True)]
             self.level = np.maximum(self._level(self.residual), lowest)
         self.autoregression = self._autoregression()
-        self._predicted: dict[int, tuple[np.ndarray, HoldOutErrors]] = {}
+        self._predicted: dict[TorqueFit, tuple[np.ndarray, HoldOutErrors]] = {}
 
     def without(self, term: Term) -> TorqueFit:
         return self.with_terms([t for t in self.terms if t is not term])
@@ -168,10 +171,11 @@ class TorqueFit:
     @cached_property
     def covariance(self) -> np.ndarray:
         """Covariance (k + m, k + m) of x and of the shapes by the scatter from stretch to stretch."""
-        slopes = [
-            np.concatenate([A, *(t.slopes[k] * self.x[self.columns_of(t)][0] for t in self.terms)], axis=2)
-            for k, A in enumerate(self.design)
-        ]
+        slopes = []
+        for k, r in enumerate(self.rows):
+            own = [t.columns[k] if t.by_magnitude is None else t.by_magnitude[k] for t in self.terms]
+            shapes = [t.slopes[k] * self.x[self.columns_of(t)][0] for t in self.terms]
+            slopes.append(np.concatenate([r.W[:, :, self.kept], *own, *shapes], axis=2))
         A, e, stretch = self.weight_all(slopes), self.weight_all(self.residual), self.stretches(False)
         size = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
         A = A / size
@@ -205,9 +209,9 @@ class TorqueFit:
 
         like: whitens the rows. Return the log-likelihood (stretches,) of the innovations, and the torque errors.
         """
-        if id(like) not in self._predicted:
-            self._predicted[id(like)] = self._hold_out(like)
-        return self._predicted[id(like)]
+        if like not in self._predicted:
+            self._predicted[like] = self._hold_out(like)
+        return self._predicted[like]
 
     def _hold_out(self, like: TorqueFit) -> tuple[np.ndarray, HoldOutErrors]:
         A = np.column_stack([self._whitened_design(like), like._whitened_torques])
@@ -238,7 +242,7 @@ class TorqueFit:
             torque_names(self.model.machine),
             squares[:, rows],
             counts[:, rows],
-            motion[:, rows].mean(axis=0),
+            (motion * counts)[:, rows].sum(axis=0) / np.maximum(counts[:, rows].sum(axis=0), 1),
             self.level[rows] ** 2,
             np.zeros(len(names), int),
             np.full((len(names), 1), np.nan),
@@ -269,5 +273,5 @@ def _lagged(v: np.ndarray) -> np.ndarray:
 
 
 def _whole(used: np.ndarray) -> np.ndarray:
-    """Find the rows that count with all rows before them, (n - lags,) from (n,); as indices behind the first lags."""
+    """Find the rows that count, as do the LAGS rows before them: (n - lags,) from (n,)."""
     return np.asarray(_lagged(used).all(axis=1))

@@ -19,18 +19,22 @@ import scipy.stats
 
 from excite import identification
 from excite.diagnosis.curves import Curve, find_curves
+from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.diagnosis import Finding, NearestEffect, ParameterChange
 from excite.diagnosis.hold_out import HoldOutErrors, torque_names
 from excite.diagnosis.score_test import Candidate
 from excite.diagnosis.selection import ProgressCallback, identified_entry
-from excite.diagnosis.torque_fit import Term, TorqueFit
-from excite.diagnosis.torque_rows import torque_rows
+from excite.diagnosis.torque_fit import LAGS, Term, TorqueFit
+from excite.diagnosis.torque_rows import TorqueRows, torque_rows
 from excite.diagnosis.torque_search import SETTINGS, Search, reason_against
+from excite.errors import NotIdentifiableError
+from excite.identification import Solution
 from excite.logs import Log
 from excite.model import Model
 from excite.model.machine import EffectEntry, Filter
 from excite.text import format_number
 
+MIN_ROWS = 60  # in motion, of a joint; chosen
 MIN_LEVEL = 1e-6  # smallest noise of a row, of the torques' size; chosen
 
 
@@ -38,8 +42,8 @@ MIN_LEVEL = 1e-6  # smallest noise of a row, of the torques' size; chosen
 class TorqueDiagnosis:
     """What regression on the torques finds; the fields that it shares with `Diagnosis` mean the same.
 
-    curves: smooth functions of one signal that predict what no effect explains. rejected: effects that were tried, each
-    with the reason why it is not given.
+    solution: of the parameters alone. curves: smooth functions of one signal that predict what no effect explains.
+    rejected: effects that were tried, each with the reason why it is not given.
     """
 
     verdict: str
@@ -49,6 +53,7 @@ class TorqueDiagnosis:
     share: float
     located: tuple[str, ...]
     curves: tuple[Curve, ...]
+    solution: Solution
     rejected: tuple[str, ...] = ()
     nearest: NearestEffect | None = None
 
@@ -68,11 +73,12 @@ class TorqueDiagnosis:
     @property
     def parameters(self) -> list[ParameterChange]:
         model, shown = self.before.model, []
+        blocks = [(r.W * r.used[:, :, None], r.Y * r.used) for r in self.before.rows]
         for f in (self.before, self.after):
             value, std = model.nominal.copy(), np.full(len(model.nominal), np.inf)
             n = len(f.kept)
             value[f.kept], std[f.kept] = f.x[:n], np.sqrt(np.diag(f.covariance)[:n])
-            shown.append((value, std))
+            shown.append((identification.restore_tied_parameters(model, blocks, self.solution, value), std))
         (old, old_std), (new, new_std) = shown
         return [
             ParameterChange(*row)
@@ -87,24 +93,31 @@ def _explains(fit: TorqueFit) -> bool:
 
 
 def diagnose_torques(
-    model: Model, logs: Sequence[Log], filter: Filter, report: ProgressCallback | None = None
+    model: Model,
+    logs: Sequence[Log],
+    filter: Filter,
+    report: ProgressCallback | None = None,
+    deadline: Deadline | None = None,
 ) -> tuple[TorqueDiagnosis, list[HoldOutErrors]]:
     """Diagnose the torques of a machine without slips and without effects.
 
     Return the errors on withheld stretches without findings, with the first, the first two, ... as well. Raises
     NotIdentifiableError.
     """
-    report = report or (lambda share, what: None)
+    report, deadline = report or (lambda share, what: None), deadline or Deadline()
     report(0.05, "fitting the torques")
     rows = torque_rows(model, logs, filter)
+    _require_rows(model, rows)
     blocks = [(r.W, r.Y) for r in rows]
-    lowest = identification.row_levels([identification.row_errors(model, x, filter, 1) for x in logs], model.nominal)
+    errors = [identification.row_errors(model, x, filter, 1) for x in logs]
+    lowest = identification.row_levels(errors, model.nominal, [r.used for r in rows])
     lowest = np.maximum(lowest, MIN_LEVEL * np.sqrt(np.mean(np.concatenate([r.Y**2 for r in rows], axis=1))))
-    before = TorqueFit(model, rows, identification.solve_blocks(blocks, model.scale).kept, lowest, [])
+    solution = identification.solve_blocks(blocks, model.scale)
+    before = TorqueFit(model, rows, solution.kept, lowest, [])
     search = Search(model, rows, filter, identification.fit_rows(model, blocks))
-    after, reasons = search.extend(before, report)
+    after, reasons = search.extend(before, report, deadline)
     stages = [before.with_terms(after.terms[:k]) for k in range(len(after.terms))] + [after]
-    errors = [stage.hold_out(before)[1] for stage in stages]
+    withheld = [stage.hold_out(before)[1] for stage in stages]
     explained = _explains(after)
     total = _excess(before)
     findings = []
@@ -115,12 +128,24 @@ def diagnose_torques(
     if explained:
         tied = any(f.rivals for f in findings)
         verdict = "clean" if not findings else "tied" if tied else "named"
-    curves = [] if explained else find_curves(after, search.torques, report)
+    curves = [] if explained or deadline.is_over() else find_curves(after, search.torques, report)
     located = [] if explained else [*_what_is_left(after), *map(str, curves)]
     share = 1.0 if explained else sum(f.share for f in findings)
-    return TorqueDiagnosis(
-        verdict, tuple(findings), before, after, share, tuple(located), tuple(curves), tuple(reasons)
-    ), errors
+    found = TorqueDiagnosis(
+        verdict, tuple(findings), before, after, share, tuple(located), tuple(curves), solution, tuple(reasons)
+    )
+    return found, withheld
+
+
+def _require_rows(model: Model, rows: Sequence[TorqueRows]) -> None:
+    """Raise NotIdentifiableError if a joint hardly moves along all logs."""
+    for k, body in zip(model.actuated, model.machine.actuated, strict=True):
+        count = sum(int(r.used[k].sum()) for r in rows)
+        if count < MIN_ROWS or not all(r.Y.shape[1] > 2 * LAGS for r in rows):
+            raise NotIdentifiableError(
+                f"{rows[0].log.source}: {count} filtered rows with {body.where} in motion are too few to explain its"
+                f" torque (at least {MIN_ROWS}): record a longer log, or reduce the filter's decimation"
+            )
 
 
 def _excess(fit: TorqueFit) -> float:
@@ -135,7 +160,7 @@ def _finding(search: Search, fit: TorqueFit, term: Term, share: float, kind: str
     c, std = fit.coefficient(term)
     relative = fit.shape_stds(term)
     magnitude = placed.values["A"] / c if placed.effect.inverse else placed.values["A"] * c
-    size = abs(magnitude) * (np.hypot(std / c, relative["A"]) if "A" in relative else abs(std / c))
+    size = abs(magnitude * std / c)
     shapes = {
         n: (placed.values[n], abs(placed.values[n]) * relative.get(n, 0.0), placed.shape_unit(n)) for n in placed.shapes
     }

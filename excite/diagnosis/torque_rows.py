@@ -14,7 +14,6 @@ from excite.logs import BLOCK, Log, decimate, kept_samples, samples
 from excite.model import Model, signatures
 from excite.model.effects import PlacedEffect
 from excite.model.machine import Filter
-from excite.simulation import delivered_torque
 
 STRETCHES = 20  # parts of each log from which variances and predictions are taken; chosen
 BATCH = 64  # columns evaluated at a time
@@ -84,7 +83,7 @@ def effect_columns(
             force = functions.force(*sample, ca.DM(p)).full().reshape(r.q.shape[1], len(r.t), len(batch))
             for c, e in enumerate(batch):
                 if e.effect.channel is not None:
-                    force[:, :, c] += _channel_error(model, e, r.t, u)
+                    force[:, :, c] -= _reading_error(model, e, r.t, u)
             first_row, last = filter.drop[0], len(r.t) - filter.drop[1]
             own.append(-decimate(force[:, first_row:last], filter.decimation))
     return [np.concatenate(own, axis=2) for own in parts]
@@ -99,8 +98,8 @@ def needed_torques(model: Model, r: TorqueRows, X: np.ndarray) -> np.ndarray:
     return np.concatenate(found) - model.offsets @ X
 
 
-def _channel_error(model: Model, e: PlacedEffect, t: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return the additional torque (n_q, N) that is delivered if a torque channel reads as the effect says.
+def _reading_error(model: Model, e: PlacedEffect, t: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return what a torque channel adds to the torques (n_q, N) that it reads.
 
     t (N,) [s]; u (N, n_u): torques.
     """
@@ -108,5 +107,5 @@ def _channel_error(model: Model, e: PlacedEffect, t: np.ndarray, u: np.ndarray) 
     more = np.zeros((len(model.coordinates), len(t)))
     for k, (row, body) in enumerate(zip(model.actuated, model.machine.actuated, strict=True)):
         if body.index in e.bodies:
-            more[row] = delivered_torque(t, u[:, k], gain, offset, delay) - u[:, k]
+            more[row] = gain * np.interp(t - delay, t, u[:, k]) + offset - u[:, k]
     return more

@@ -10,8 +10,9 @@ import scipy.stats
 
 from excite import identification
 from excite.diagnosis import score_test
+from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.score_test import Candidate
-from excite.diagnosis.selection import TRANSITION, ProgressCallback
+from excite.diagnosis.selection import ProgressCallback
 from excite.diagnosis.torque_fit import Term, TorqueFit
 from excite.diagnosis.torque_rows import TorqueRows, effect_columns, needed_torques
 from excite.model import Model
@@ -42,6 +43,9 @@ class Settings:
 SETTINGS = Settings()
 REACHES = 1.0, 0.35, 0.12  # shares of the way between trial values of shapes at which they are refined in turn; chosen
 SHAPE_STEP = 0.03  # relative step of the slope by a shape; chosen
+SHORT_DELAYS = 2.0, 8.0  # samples; trial values of delays and lags; chosen
+MAX_SETTLING = 12  # passes to the magnitude of an effect that is not proportional to it; chosen
+SETTLED = 0.02  # logarithm of the coefficient that ends them; chosen
 MIN_UNABSORBED_SHARE = 1e-4  # share of a column below which the parameters absorb it; chosen
 
 
@@ -86,13 +90,23 @@ def score_columns(fit: TorqueFit, columns: Sequence[np.ndarray]) -> tuple[np.nda
 
 def log_odds(chi2: float, term: PlacedEffect, n: int, n_candidates: int) -> float:
     """Log odds for an effect by its Bayesian information: n rows, candidates that are all as likely before."""
-    k = 1 + sum(len(s.grid) > 1 and not s.whole and term.values[n] != 0 for n, s in term.shapes.items())
+    k = 1 + len(free_shapes(term))
     return 0.5 * chi2 - 0.5 * k * np.log(n) - np.log(n_candidates)
 
 
-def _is_seen_in_torques(effect: Effect) -> bool:
-    """Tell if an effect changes the torques of moving joints: not a sensor's, and not the friction's turn near rest."""
-    return effect.reading is None and effect.shaking is None and effect.name != TRANSITION
+def free_shapes(term: PlacedEffect) -> list[str]:
+    """Return the shapes that are fitted."""
+    return [n for n, s in term.shapes.items() if not s.whole and len(s.grid) > 1 and term.values[n] != 0]
+
+
+def is_proportional(effect: Effect) -> bool:
+    """Tell if an effect's torque is proportional to its magnitude: not a delay, a lag or a gain."""
+    return len(effect.grid) == 1 and effect.channel is None and not effect.inverse
+
+
+def _is_seen_in_torques(e: PlacedEffect) -> bool:
+    """Tell if an effect changes the torques of moving joints: not a sensor's, and not what friction does near rest."""
+    return e.effect.reading is None and e.effect.shaking is None and not e.unsticking
 
 
 class Search:
@@ -105,12 +119,40 @@ class Search:
         # trial values of the machine at the speeds of the logs, whatever rate its file gives for the friction's turn
         self.machine = identification.with_soft_friction(model, [r.log for r in rows], filter).machine
         found = score_test.candidates(self.machine, [s.name for s in self.machine.sensors("full")], self.duration)
-        self.candidates = [x for x in found if _is_seen_in_torques(x.placed.effect)]
+        self.candidates = [x for x in found if _is_seen_in_torques(x.placed)]
+        self.candidates += self._short_delays()
         self.names = sorted({x.name for x in self.candidates})
         self.columns = self._columns([x.placed for x in self.candidates])
 
     def _columns(self, placed: Sequence[PlacedEffect]) -> list[np.ndarray]:
         return effect_columns(self.model, self.rows, self.torques, placed, self.X, self.filter)
+
+    def _short_delays(self) -> list[Candidate]:
+        """Return delays and lags of a few samples, beside the trials that are as long as hydraulics are slow."""
+        sample = 1 / float(self.machine.sampling_hz)
+        seen = {x.name: x for x in self.candidates if x.placed.effect.unit == "s" and not x.placed.effect.timed}
+        return [
+            replace(x, placed=replace(x.placed, values={**x.placed.values, "A": times * sample}))
+            for x in seen.values()
+            for times in SHORT_DELAYS
+        ]
+
+    def settle(self, fit: TorqueFit, x: Tested) -> Tested | None:
+        """Return a candidate with the magnitude at which its coefficient is 1, None if there is none.
+
+        The torque of a delay is not proportional to it: only there is the column that of the magnitude.
+        """
+        for _ in range(MAX_SETTLING):
+            placed = x.candidate.placed
+            if is_proportional(placed.effect) or not x.coefficient > 0:
+                return x if is_proportional(placed.effect) else None
+            if abs(np.log(x.coefficient)) < SETTLED:
+                return x
+            step = float(np.clip(x.coefficient, 0.3, 3.0))
+            value = placed.values["A"] / step if placed.effect.inverse else placed.values["A"] * step
+            moved = replace(x.candidate, placed=replace(placed, values={**placed.values, "A": value}))
+            (x,) = self.test(fit, [moved], self._columns([moved.placed]))
+        return None
 
     def test(self, fit: TorqueFit, candidates: Sequence[Candidate], columns: Sequence[np.ndarray]) -> list[Tested]:
         """Test candidates beside a fit, the likeliest first; a coefficient of impossible sign counts for nothing."""
@@ -137,29 +179,33 @@ class Search:
             if near:
                 for x in self.test(fit, near, self._columns([x.placed for x in near])):
                     chosen = [x if y.candidate.name == x.candidate.name and x.chi2 > y.chi2 else y for y in chosen]
-        return sorted(chosen, key=lambda x: -x.log_odds)
+        settled = [self.settle(fit, x) for x in chosen]
+        return sorted((x for x in settled if x is not None), key=lambda x: -x.log_odds)
 
     def term(self, x: Tested) -> Term:
         """Return a candidate as columns, with slopes by its shapes."""
         placed = x.candidate.placed
-        free = [n for n, s in placed.shapes.items() if not s.whole and placed.values[n] != 0]
-        free += ["A"] if len(placed.effect.grid) > 1 else []
+        free = free_shapes(placed)
         moved = [
             replace(placed, values={**placed.values, n: placed.values[n] * (1 + sign * SHAPE_STEP)})
-            for n in free
+            for n in [*free, "A"]
             for sign in (1, -1)
         ]
         columns = self._columns([placed, *moved])
         slopes = [(c[:, :, 1::2] - c[:, :, 2::2]) / (2 * SHAPE_STEP) for c in columns]
-        return Term(placed, [c[:, :, :1] for c in columns], slopes, tuple(free), x.chi2)
+        sign = -1.0 if placed.effect.inverse else 1.0
+        by_magnitude = None if is_proportional(placed.effect) else [sign * s[:, :, -1:] for s in slopes]
+        shapes = [s[:, :, :-1] for s in slopes]
+        return Term(placed, [c[:, :, :1] for c in columns], shapes, tuple(free), by_magnitude, x.chi2)
 
-    def extend(self, fit: TorqueFit, report: ProgressCallback) -> tuple[TorqueFit, list[str]]:
-        """Add the likeliest effect that holds, and drop those that do not beside it, until none holds.
+    def extend(self, fit: TorqueFit, report: ProgressCallback, deadline: Deadline) -> tuple[TorqueFit, list[str]]:
+        """Add the likeliest effect that holds, and drop those that do not beside it, until none holds or time is over.
 
         Return the last fit, and why effects that were likely were not added.
         """
         reasons: dict[str, str] = {}
-        while len(fit.terms) < SETTINGS.max_effects:
+        tried = {frozenset[str]()}
+        while len(fit.terms) < SETTINGS.max_effects and not deadline.is_over():
             report(0.2 + 0.6 * len(fit.terms) / SETTINGS.max_effects, "testing effects on the torques")
             added = None
             for x in self.finalists(fit):
@@ -180,8 +226,10 @@ class Search:
                 if abs(added.coefficient(t)[0]) < SETTINGS.min_stds * added.coefficient(t)[1]
             ]
             fit = added.with_terms([t for t in added.terms if t not in weak]) if weak else added
-            if weak and len(fit.terms) <= len(added.terms) - 2:
+            names = frozenset(t.name for t in fit.terms)
+            if names in tried:  # effects that replace each other in turn
                 break
+            tried.add(names)
         found = {t.name for t in fit.terms}
         return fit, [f"{name}: {why}" for name, why in reasons.items() if name not in found]
 

@@ -9,9 +9,11 @@ from .joint import (
     find_suspect_sensors as find_suspect_sensors,
     shows_sticking as shows_sticking,
 )
+from .least_squares import Solution as Solution
 from .linear_methods import (
     filtered_blocks as filtered_blocks,
     fit_rows as fit_rows,
+    restore_tied_parameters as restore_tied_parameters,
     solve_blocks as solve_blocks,
 )
 from .methods import (

@@ -69,7 +69,9 @@ def wls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     every = filtered_blocks(model, logs, filter)
     moving, notes = rows_in_motion(model, logs, filter, every)
     blocks = leave_out(every, moving)
-    lowest = row_levels([row_errors(model, log, filter, 1) for log in logs], model.nominal)
+    every_row = [np.ones(Y.shape, bool) for _, Y in every]
+    in_motion = every_row if model.slips else [moving_rows(model, log, filter) for log in logs]
+    lowest = row_levels([row_errors(model, log, filter, 1) for log in logs], model.nominal, in_motion)
     lowest = np.maximum(lowest, MIN_ROW_NOISE * rms_torque(blocks))  # logs without noise have no residual
     count = np.maximum(sum(_used(b).sum(axis=1) for b in blocks), 1)
     level, weighted = lowest, scale_rows(blocks, lowest)

@@ -48,7 +48,7 @@ def slow_samples(model: Model, nu: np.ndarray) -> np.ndarray:
 
 def with_soft_friction(model: Model, logs: Sequence[Log], filter: Filter) -> Model:
     """Widen the change of the friction's sign to speeds near rest, where the model is none of friction that sticks."""
-    fast = np.min([np.quantile(np.abs(samples(model, log, filter).nu), 0.99, axis=1) for log in logs], axis=0)
+    fast = np.max([np.quantile(np.abs(samples(model, log, filter).nu), 0.99, axis=1) for log in logs], axis=0)
     bodies = []
     for body in model.machine.body:
         width = 0.0

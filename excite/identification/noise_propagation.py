@@ -107,11 +107,15 @@ def _prediction_jacobian(model: Model) -> ca.Function:
     return ca.Function("slopes", [q, nu, a, *beside, p], [ca.densify(slope)], {"cse": True})
 
 
-def row_levels(errors: Sequence[list[np.ndarray]], x: np.ndarray) -> np.ndarray:
-    """Level (n_rows,) of Y - W x from errors of [W Y], over all logs."""
+def row_levels(errors: Sequence[list[np.ndarray]], x: np.ndarray, used: Sequence[np.ndarray]) -> np.ndarray:
+    """Level (n_rows,) of Y - W x from errors of [W Y], over the rows of all logs that are used, (n_rows, n) each.
+
+    Near rest the sign of a noisy speed turns friction over: such rows tell nothing of the noise of others.
+    """
     v = np.append(-x, 1.0)
-    every = [(E @ v) ** 2 for log in errors for E in log]
-    return np.sqrt(sum(e.sum(axis=1) for e in every) / sum(e.shape[1] for e in every))
+    square = sum(((E @ v) ** 2 * own).sum(axis=1) for log, own in zip(errors, used, strict=True) for E in log)
+    count = sum(own.sum(axis=1) * len(log) for log, own in zip(errors, used, strict=True))
+    return np.asarray(np.sqrt(square / np.maximum(count, 1)))
 
 
 def second_moments(errors: Sequence[list[np.ndarray]]) -> np.ndarray:

@@ -39,7 +39,9 @@ def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
     if not definite:
         moved = np.isin(estimate.names, [n for n in model.base.names if n[0] in INERTIAL_INITIALS])
         consistent = _nearest(model, estimate)
-        if consistent is not None:
+        if consistent is None:
+            together = "no possible machine is near these values: the model lacks something"
+        else:
             with np.errstate(invalid="ignore"):
                 shift = np.abs(consistent - estimate.value)
                 moved &= shift > MOVED_STDS * estimate.std

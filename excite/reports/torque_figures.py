@@ -77,6 +77,8 @@ def misfit_of_torques(d: TorqueDiagnosis, title: str) -> Figure:
 def _means(x: np.ndarray, y: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean of y in bins with equally many samples x."""
     x, y = x[used], y[used]
+    if not len(x):
+        return x, y
     order = np.argsort(x, kind="stable")
     parts = [part for part in np.array_split(order, min(BINS, len(order))) if len(part)]
     return np.array([x[p].mean() for p in parts]), np.array([y[p].mean() for p in parts])

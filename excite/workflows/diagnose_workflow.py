@@ -17,6 +17,7 @@ from excite.logs import Log, Prepared, doubts_in_errors, examine, moves, prepare
 from excite.model import Model, build
 from excite.model.machine import Filter, Machine
 from excite.reports import Account
+from excite.text import format_number
 from excite.workflows import design_request, design_workflow, requests
 from excite.workflows.design_request import DesignRequest
 from excite.workflows.progress import Bar, no_bar
@@ -61,18 +62,26 @@ def diagnose_from(
     logs: Sequence[Log],
     filtering: str = "machine",
     report: Callable[[float], None] = lambda share: None,
+    budget_s: float | None = None,
 ) -> DiagnoseResult:
     """Diagnose checked logs and measure the gain of each finding.
 
     filtering: a name of `FILTERS`, used for the first guess. report(share of the work): called now and then.
+    budget_s [s]: ends the search with the best answer so far.
     Raises LogError, NotIdentifiableError, NoEstimateError.
     """
     prepared = _prepare_logs(model, logs, filtering)
     with doubts_in_errors(prepared.doubts):
         assessment = diagnosis.explain(
-            model, prepared.logs, prepared.filter, lambda share, what: report(share), run_forked
+            model, prepared.logs, prepared.filter, lambda share, what: report(share), run_forked, budget_s
         )
-    return DiagnoseResult(assessment, prepared.logs, [*prepared.notes, *_baseline_note(assessment.diagnosis)])
+    notes = [*prepared.notes, *_baseline_note(assessment.diagnosis)]
+    if assessment.cut_short is not None:
+        notes.append(
+            f"the search ended with its budget of {format_number(assessment.cut_short, 3)} s: this is the best answer"
+            " so far, and further effects were not tried"
+        )
+    return DiagnoseResult(assessment, prepared.logs, notes)
 
 
 def diagnose(
@@ -82,17 +91,19 @@ def diagnose(
     filtering: str = "machine",
     design_next: bool = False,
     bar: Bar = no_bar,
+    budget_s: float | None = None,
 ) -> dict[str, Any]:
     """Diagnose logs into a folder: report, figures, and machine.toml if a cause is named; return the summary.
 
     machine: a shipped name or a path. filtering: a name of `FILTERS`. design_next: design the drive that separates
-    tied causes. Raises LogError, MachineError, NoEstimateError.
+    tied causes. budget_s [s]: ends the search with the best answer so far. Raises LogError, MachineError,
+    NoEstimateError.
     """
     model = requests.build_model(machine)
     with bar("diagnosing") as advance:
         ready = prepare(model, logs, identification.needed_sensors(model, "joint"))
         found = diagnose_from(
-            ready.model, ready.logs, filtering, lambda share: advance(round(1000 * share), 1000, None)
+            ready.model, ready.logs, filtering, lambda share: advance(round(1000 * share), 1000, None), budget_s
         )
     drive = separating_drive(place, ready.model.machine, rivals(found), design_next, bar)
     return diagnose_account(machine, ready, found, drive).write(place)

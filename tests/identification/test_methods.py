@@ -74,7 +74,9 @@ def test_a_disturbed_row_counts_less(straight: Model, straight_motion: Motion) -
     found = methods.identify(straight, [disturbed], "wls")
     blocks = [filtered.filtered_regression(straight, disturbed, straight.machine.filter)]
     least = noise_propagation.row_levels(
-        [noise_propagation.row_errors(straight, disturbed, straight.machine.filter, 1)], straight.nominal
+        [noise_propagation.row_errors(straight, disturbed, straight.machine.filter, 1)],
+        straight.nominal,
+        [np.ones(blocks[0][1].shape, bool)],
     )
     level = np.sqrt((found.residual**2).mean(axis=1))
     assert level[2] > 2 * least[2]
