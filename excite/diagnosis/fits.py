@@ -32,9 +32,8 @@ from excite.smoothing import (
     build_state_space,
     common_sensors,
     encoders_with_offset,
-    initial_trajectory,
     innovation_statistics,
-    prepare_measurements,
+    prepare_logs,
     transfer_trajectory,
 )
 from excite.text import format_number
@@ -219,12 +218,12 @@ def fit_machine_that_sticks(
     follows = plain.exact and plain.is_close
     if model.slips or (follows and not identification.shows_sticking(model, logs, filter, plain.fit)):
         return plain
-    extra = [identification.friction_near_rest(model, log, filter) for log in logs]
-    if not any(x.any() for x in extra):
+    rests = identification.sticking(model, logs, filter)
+    if rests is None:
         return plain
+    soft, extra = rests
     try:
-        soft = identification.with_soft_friction(model, logs, filter).machine
-        found = fit_machine(soft, logs, filter, runner, extra)
+        found = fit_machine(soft.machine, logs, filter, runner, extra)
     except NotConvergedError:
         return plain
     return found if found.exact and found.is_close else plain
@@ -246,10 +245,7 @@ def fit_machine(
     All attempts start at once where there are processes for them. extra_torque_noise: see `Measurements`. Raises
     NotConvergedError.
     """
-    data = _prepare(machine, logs, filter)
-    if extra_torque_noise is not None:
-        noisy = zip(data.measurements, extra_torque_noise, strict=True)
-        data = replace(data, measurements=tuple(replace(r, extra_torque_noise=x) for r, x in noisy))
+    data = _prepare(machine, logs, filter, extra_torque_noise)
     calls: list[Callable[[], Any]] = [
         partial(_fit_exact_from_start, data),
         partial(fit_reducing_process_noise, machine, data, identification.PROCESS_NOISE_LEVELS[0]),
@@ -661,10 +657,11 @@ def _build_space(machine: Machine, logs: Sequence[Log]) -> StateSpace:
     return build_state_space(model, common_sensors(model, logs))
 
 
-def _prepare(machine: Machine, logs: Sequence[Log], filter: Filter) -> FitData:
+def _prepare(
+    machine: Machine, logs: Sequence[Log], filter: Filter, extra_torque_noise: Sequence[np.ndarray] | None = None
+) -> FitData:
     space = _build_space(machine, logs)
-    measurements = tuple(prepare_measurements(space, log) for log in logs)
-    starts = tuple(initial_trajectory(space, r, log, filter) for r, log in zip(measurements, logs, strict=True))
+    measurements, starts = prepare_logs(space, logs, filter, extra_torque_noise=extra_torque_noise)
     return FitData(
         space,
         tuple(logs),

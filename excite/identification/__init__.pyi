@@ -31,11 +31,7 @@ from .monte_carlo import (
     summarise_runs as summarise_runs,
     verify as verify,
 )
-from .near_rest import (
-    friction_near_rest as friction_near_rest,
-    moving_rows as moving_rows,
-    with_soft_friction as with_soft_friction,
-)
+from .near_rest import moving_rows as moving_rows, sticking as sticking, with_soft_friction as with_soft_friction
 from .noise_propagation import row_errors as row_errors, row_levels as row_levels
 from .prediction import Prediction as Prediction, predict_motion as predict_motion, predict_torques as predict_torques
 from .prior import prior_from_logs as prior_from_logs

@@ -17,7 +17,7 @@ from excite.errors import NotIdentifiableError
 from excite.identification import identifiability
 from excite.identification.combinations import describe_combinations
 from excite.identification.estimate import NOTHING_MOVES_MESSAGE, Estimate, held_note
-from excite.identification.near_rest import friction_near_rest, with_soft_friction
+from excite.identification.near_rest import friction_near_rest, sticking
 from excite.logs import Log, decimate, derivative
 from excite.model import Model
 from excite.model.machine import Filter
@@ -33,9 +33,8 @@ from excite.smoothing import (
     common_sensors,
     describe_noise,
     fit_logs,
-    initial_trajectory,
     innovation_statistics,
-    prepare_measurements,
+    prepare_logs,
     quantify_uncertainty,
     smoothed_motion,
 )
@@ -70,9 +69,8 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     Raises NotConvergedError if that fails too, NotIdentifiableError if a torque is missing.
     """
     space = build_state_space(model, common_sensors(model, logs))
-    measurements = [prepare_measurements(space, log, unbiased=True) for log in logs]
+    measurements, starts = prepare_logs(space, logs, filter, unbiased=True)
     weighted = [replace(data, unbiased=False) for data in measurements]
-    starts = [initial_trajectory(space, data, log, filter) for data, log in zip(measurements, logs, strict=True)]
     notes = describe_noise(space, measurements)
     held = identifiability.parameters_at_rest(model, logs, filter, slow=False)
 
@@ -87,7 +85,7 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         if differs:
             yield held_if_slow, True
 
-    sticking: Estimate | None = None
+    stuck: Estimate | None = None
     failure: NotConvergedError | None = None
     noisy_fit: Fit | None = None
     suspect_fit: tuple[tuple[bool, float], Fit, np.ndarray, list[str]] | None = None
@@ -98,14 +96,14 @@ def joint(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
             trajectories, X = (starts, model.nominal) if noisy_fit is None else (noisy_fit.trajectories, noisy_fit.X)
             fit, bias_notes = _fit_exact(space, measurements, weighted, trajectories, X, starts, held_now)
         except NotConvergedError as failed:
-            if failure is None and (sticking := _fit_sticking(model, logs, filter, held_now)):
-                return sticking
+            if failure is None and (stuck := _fit_sticking(model, logs, filter, held_now)):
+                return stuck
             failure = failure or failed
             continue
         suspects = find_suspect_sensors(space, logs, fit)
         sticks = bool(suspects) or shows_sticking(model, logs, filter, fit)
-        if sticks and failure is None and (sticking := _fit_sticking(model, logs, filter, held_now)):
-            return sticking
+        if sticks and failure is None and (stuck := _fit_sticking(model, logs, filter, held_now)):
+            return stuck
         if not suspects:
             if bias_notes:
                 return _build_estimate(space, measurements, fit, filter, (*notes, *bias_notes))
@@ -145,21 +143,14 @@ def shows_sticking(model: Model, logs: Sequence[Log], filter: Filter, fit: Fit) 
 
 
 def _fit_sticking(model: Model, logs: Sequence[Log], filter: Filter, held: np.ndarray) -> Estimate | None:
-    """Fit with friction of either sign near rest; None if the logs have no rest or are not explained by it.
-
-    A joint that sticks, |U| < Fs, has any friction in between: a torque error of size Fs, while the joint is near rest.
-    """
-    extra = [friction_near_rest(model, log, filter) for log in logs]
-    if not any(x.any() for x in extra):
+    """Fit with friction of either sign near rest; None if the logs have no rest or are not explained by it."""
+    rests = sticking(model, logs, filter)
+    if rests is None:
         return None
-    soft = with_soft_friction(model, logs, filter)
+    soft, extra = rests
     space = build_state_space(soft, common_sensors(soft, logs))
-    measurements = [
-        replace(prepare_measurements(space, log, unbiased=True), extra_torque_noise=x)
-        for log, x in zip(logs, extra, strict=True)
-    ]
+    measurements, starts = prepare_logs(space, logs, filter, unbiased=True, extra_torque_noise=extra)
     weighted = [replace(data, unbiased=False) for data in measurements]
-    starts = [initial_trajectory(space, data, log, filter) for data, log in zip(measurements, logs, strict=True)]
     try:
         fit, bias_notes = _fit_exact(space, measurements, weighted, starts, model.nominal, starts, held)
         if find_suspect_sensors(space, logs, fit):

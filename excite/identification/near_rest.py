@@ -72,6 +72,15 @@ def friction_near_rest(model: Model, log: Log, filter: Filter) -> np.ndarray:
     return size
 
 
+def sticking(model: Model, logs: Sequence[Log], filter: Filter) -> tuple[Model, list[np.ndarray]] | None:
+    """Return what joints need that stick, |U| < Fs, and so have any friction in between; None without such rests.
+
+    The model with soft friction near rest, and the size of free friction there, `friction_near_rest` of each log.
+    """
+    size = [friction_near_rest(model, log, filter) for log in logs]
+    return (with_soft_friction(model, logs, filter), size) if any(x.any() for x in size) else None
+
+
 def leave_out(blocks: Sequence[Block], moving: Sequence[np.ndarray]) -> list[Block]:
     """Set rows near rest to zero; rows of a log without motion are all left in."""
     return [(W * m[:, :, None], Y * m) for (W, Y), m in zip(blocks, moving, strict=True)]

@@ -44,6 +44,7 @@ from .measurements import (
     encoders_with_offset as encoders_with_offset,
     initial_trajectory as initial_trajectory,
     predict_readings as predict_readings,
+    prepare_logs as prepare_logs,
     prepare_measurements as prepare_measurements,
     smoothed_motion as smoothed_motion,
     torque_sensor as torque_sensor,

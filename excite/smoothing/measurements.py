@@ -175,6 +175,25 @@ def torque_sensor(model: Model, body: int) -> Sensor:
     return next(s for s in model.machine.sensor if s.kind == "torque" and s.body == body)
 
 
+def prepare_logs(
+    space: StateSpace,
+    logs: Sequence[Log],
+    filter: Filter,
+    unbiased: bool = False,
+    extra_torque_noise: Sequence[np.ndarray] | None = None,
+) -> tuple[tuple[Measurements, ...], tuple[Trajectory, ...]]:
+    """Prepare logs for fits: their measurements, and trajectories to begin with.
+
+    unbiased: see `prepare_measurements`. extra_torque_noise: of each log, see `Measurements`.
+    """
+    measurements = tuple(prepare_measurements(space, log, unbiased) for log in logs)
+    if extra_torque_noise is not None:
+        noisy = zip(measurements, extra_torque_noise, strict=True)
+        measurements = tuple(replace(r, extra_torque_noise=x) for r, x in noisy)
+    starts = tuple(initial_trajectory(space, r, log, filter) for r, log in zip(measurements, logs, strict=True))
+    return measurements, starts
+
+
 def initial_trajectory(space: StateSpace, data: Measurements, log: Log, filter: Filter) -> Trajectory:
     """Build a first trajectory from the filtered log."""
     filtered = samples(space.model, log, filter)
