@@ -385,7 +385,7 @@ def test_a_drive_that_hardly_shows_the_machine_still_shows_a_cause(seed: int, st
 @pytest.mark.slow
 def test_a_stop_tells_by_which_law_its_rubber_hardens(va12: Model) -> None:
     """What it is at first touch is seen nowhere alone: by the wrong law it would come out twice as stiff."""
-    shapes = {"stop": 0.25, "hardening": 1.0, "power": 1.0}
+    shapes = {"stop": 0.15, "hardening": 1.0, "power": 1.0}
     hidden = selection.identified_entry("articulation_stop_spring", "articulation", 10000.0, shapes)
     truth = prediction.build(placing.with_effects(va12.machine, hidden))
     table = sensors.measure(truth, designed("R60_accuracy", truth), kit="full", seed=5)
