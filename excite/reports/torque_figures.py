@@ -88,13 +88,13 @@ def curves_figure(d: TorqueDiagnosis, title: str) -> Figure:
     """Plot the torque that each joint lacks as a function of one signal, with its 95 % band."""
     columns = min(MAX_COLUMNS, len(d.curves))
     lines = -(-len(d.curves) // columns)
-    figure = Figure(figsize=(3.6 * columns + 0.4, 2.8 * lines + 0.5), layout="constrained")
+    figure = Figure(figsize=(max(3.6 * columns + 0.4, 6.4), 2.8 * lines + 0.7), layout="constrained")
     axes = figure.subplots(lines, columns, squeeze=False).ravel()
     for axis, curve in zip(axes, d.curves, strict=False):
         _draw_curve(axis, curve)
     for axis in axes[len(d.curves) :]:
         axis.set_axis_off()
-    figure.suptitle(escape_dollar(f"{title}: torque that the model lacks, mean and 95 % band"))
+    figure.suptitle(escape_dollar(f"{title}:\ntorque that the model lacks, mean and 95 % band"))
     return figure
 
 
