@@ -4,7 +4,7 @@ python results/attacks/study.py [--per-attack 1] [--first 0] [--jobs 1] [--only 
 runs the cases from number `--first` on: numbers that were never run are fresh logs. Writes summary.json and README.md
 to `--out`. Each case is stored in results/.attacks/ when done, so an interrupted study resumes; cases of other versions
 of the program or the attacks are not reused. `--jobs 0` reports the stored cases. To publish a round, give
-`--out results/attacks`.
+`--out=results/attacks`.
 """
 
 from __future__ import annotations
@@ -139,6 +139,7 @@ def readme(s: dict[str, Any], command: str) -> str:
     kinds = "\n".join(
         f"| {kind} | {c['cases']} | {' | '.join(str(c[name]) for name in OUTCOMES)} |"
         for kind, c in {**s["by_kind"], "all": total}.items()
+        if c["cases"]
     )
     order = {name: k for k, name in enumerate(KINDS)}
     rows = sorted(s["cases"], key=lambda r: (order[r["kind"]], r["attack"]))
@@ -150,29 +151,29 @@ def readme(s: dict[str, Any], command: str) -> str:
     )
     bad = [r for r in rows if r["score"] in ("wrong", "failed")]
     wrong = "\n".join(
-        f"- **{r['attack']}** (size {r['size']:.2f}). Hidden: {', '.join(r['hidden'] or ['-'])}. Right: {r['key']}. "
-        f"Said: {r['verdict']}; {'; '.join(r['named']) or (r['error'] or 'nothing named').strip()[-200:]}."
+        f"- **{r['attack']}** (size {r['size']:.2f}). Hidden: {', '.join(r['hidden'] or ['-'])}. Key: {r['key']}. "
+        f"Said: {r['verdict']}; {'; '.join(r['named']) or (r['error'] or 'nothing named').splitlines()[-1].strip()}."
         for r in bad
     )
     part = f" These are {total['cases']} of {s['planned']} planned cases." if total["cases"] < s["planned"] else ""
     return f"""# Attacks on the diagnosis
 
 **Result.** {total["wrong"]} of {total["cases"]} attacks were answered wrongly. {total["right"]} answers were right,
-{total["partly"]} partly right, {total["honest"]} honest (no cause named); {total["failed"]} diagnoses failed.
+{total["partly"]} partly right, {total["honest"]} honest (no cause named), {total["failed"]} ended with an error.
 
 `{command}`
 rebuilds this page; program version {s["program"]}. All cases are in [summary.json](summary.json).{part}
 
 - **Attacks** (`tests/support/attacks.py`): physics that the catalogue lacks, each with its source; true machines that
-  differ from the machine file; listed causes of unequal size together; poor data; rigs that stick; and the surprises of
-  the blind test. The engine was not tuned on them.
+  differ from the machine file; listed causes of unequal size together; poor data; rigs that stick; and, with
+  `--only surprise`, the surprises of the blind test. The engine was not tuned on them.
 - **Logs** come from the second roller (60 s) or from a rig with set-valued friction (25 s). Size is drawn from the
   seed, up to 1 (strong). Combinations and poor data draw the magnitudes of their causes apart from it.
 - **Keys** are written before the diagnosis is asked. *Right*: every hidden thing that has a name is named, alone or in
   a tie, and nothing else. *Partly*: some of them, or a name of the same physics with another law. *Honest*: no cause is
   named. *Wrong*: a cause is named that is not there; with nothing hidden, anything but `clean`.
 - **chi2**: what the roller without the attack cannot explain (`tests/support/visibility.py`); below
-  {s["visible_chi2"]:g} nothing can be found.
+  {s["visible_chi2"]:g} nothing can be found. It does not see a wrong clock rate and does not apply to rigs.
 
 | kind | cases | {" | ".join(OUTCOMES)} |
 |---|---|{"---|" * len(OUTCOMES)}
@@ -222,7 +223,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             )
     files = [kept / f"{one.label}.json" for one in wanted]
     rows = [json.loads(file.read_text()) for file in files if file.is_file()]
-    options = f"--per-attack {given.per_attack} --first {given.first} --out results/attacks"
+    options = f"--per-attack {given.per_attack} --first {given.first} --out=results/attacks"
     if set(given.only) != set(KINDS):
         options += f" --only {' '.join(given.only)}"
     report(rows, len(wanted), program, given.out, f"python results/attacks/study.py {options}")
