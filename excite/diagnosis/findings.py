@@ -145,7 +145,8 @@ def _with_findings(d: Diagnosis, entries: Sequence[Entry], reason: str) -> Diagn
     after = stages[-1] if stages else d.before
     share = sum(f.share for f in findings)
     left = anomaly_lines(after)
-    verdict = d.verdict if share >= MIN_EXPLAINED_SHARE or not left else "unexplained"
+    told = "tied" if any(f.tied_with for f in findings) else "named" if findings else d.verdict
+    verdict = told if d.verdict != "unexplained" and (share >= MIN_EXPLAINED_SHARE or not left) else "unexplained"
     kind = "correction" if verdict == "unexplained" else "cause"
     return replace(
         d,

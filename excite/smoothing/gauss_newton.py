@@ -617,6 +617,8 @@ def _bounded_step(lowest: np.ndarray, free: np.ndarray, information: np.ndarray,
     """
     if (free >= lowest).all() or not np.isfinite(free).all():
         return free
+    if not (np.diag(information) > 0).all():
+        return np.maximum(free, lowest)
     size = np.sqrt(np.diag(information))
     try:
         root = np.linalg.cholesky(information / np.outer(size, size))
