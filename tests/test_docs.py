@@ -130,7 +130,7 @@ def test_every_public_function_has_an_example() -> None:
 def test_examples_in_python_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What the page says that they print differs in numbers at most."""
+    """Their output differs from the page in numbers at most."""
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     printed, shown = "", 0

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 # ruff: noqa: E402  (threads are set before numpy loads)
 import argparse
-import hashlib
 import json
 import os
 import sys
@@ -32,24 +31,14 @@ sys.path.insert(0, str(ROOT / "tests"))
 import joblib
 from support.attacks import ATTACKS, KINDS, OUTCOMES, Attack, attack, key_of, score, simulate
 from support.blind import ask
+from support.rounds import program_version, store
 from support.visibility import VISIBLE, visibility
 
-from excite.output import new_file
-
 Row = dict[str, Any]
-PACKAGES = ("model", "simulation", "logs", "smoothing", "identification", "trajectories", "diagnosis")
-SUPPORT = ("attacks", "plant", "causes", "surprises", "sticking", "blind", "visibility")
-
-
-def version() -> str:
-    """Hash the packages that a diagnosis uses, the machine files and the attacks: eight digits."""
-    seen = hashlib.sha1()
-    files = [f for p in PACKAGES for f in sorted((ROOT / "excite" / p).resolve().rglob("*.py"))]
-    files += sorted((ROOT / "model").rglob("*.toml"))
-    files += [ROOT / "tests" / "support" / f"{name}.py" for name in SUPPORT]
-    for file in dict.fromkeys(files):
-        seen.update(file.read_bytes())
-    return seen.hexdigest()[:8]
+SUPPORT = [
+    ROOT / "tests" / "support" / f"{name}.py"
+    for name in ("attacks", "plant", "causes", "surprises", "sticking", "blind", "visibility")
+]
 
 
 def cases(per_attack: int, first: int, kinds: Sequence[str]) -> list[Attack]:
@@ -60,11 +49,6 @@ def cases(per_attack: int, first: int, kinds: Sequence[str]) -> list[Attack]:
         every = [attack(name, number) for number in range(first, first + per_attack) for name in names]
         ordered += [((k + 0.5) / len(every), one) for k, one in enumerate(every)]
     return [one for _, one in sorted(ordered, key=lambda both: both[0])]
-
-
-def store(file: Path, content: Any) -> None:
-    with new_file(file) as part:
-        part.write_text(json.dumps(content, default=float))
 
 
 def run_case(one: Attack, kept: Path) -> Row:
@@ -206,7 +190,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", nargs="+", choices=KINDS, default=list(KINDS), help="kinds of attacks to run")
     parser.add_argument("--out", type=Path, default=KEPT)
     given = parser.parse_args(argv)
-    program = version()
+    program = program_version(SUPPORT)
     kept = KEPT / program
     kept.mkdir(parents=True, exist_ok=True)
     wanted = cases(given.per_attack, given.first, given.only)

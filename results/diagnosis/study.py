@@ -10,7 +10,6 @@ from __future__ import annotations
 
 # ruff: noqa: E402  (threads are set before numpy loads)
 import argparse
-import hashlib
 import json
 import os
 import sys
@@ -36,6 +35,7 @@ import scipy.stats
 from matplotlib.figure import Figure
 from support.blind import Case, ask, blind, case, score
 from support.causes import CAUSES
+from support.rounds import file_hash, program_version, store
 from support.surprises import SURPRISES
 from support.visibility import VISIBLE, visibility
 
@@ -50,24 +50,9 @@ FRESH = {
     "pair": 106,
 }
 GOOD = ("right", "tied")  # a tie that holds the cause counts as right
-PACKAGES = ("model", "simulation", "logs", "smoothing", "identification", "trajectories", "diagnosis")
 ROLLER = [
     ROOT / "tests" / "support" / n for n in ("plant.py", "causes.py", "surprises.py", "blind.py", "visibility.py")
 ]
-
-
-def file_hash(files: Sequence[Path]) -> str:
-    seen = hashlib.sha1()
-    for file in dict.fromkeys(files):
-        seen.update(file.read_bytes())
-    return seen.hexdigest()[:8]
-
-
-def version() -> str:
-    """Hash the packages that a diagnosis uses, the machine files and the second roller: eight digits."""
-    files = [f for p in PACKAGES for f in sorted((ROOT / "excite" / p).resolve().rglob("*.py"))]
-    files += sorted((ROOT / "model").rglob("*.toml"))
-    return file_hash([*files, *ROLLER])
 
 
 def cases(wanted: Mapping[str, int], first: Mapping[str, int]) -> list[Case]:
@@ -83,11 +68,6 @@ def cases(wanted: Mapping[str, int], first: Mapping[str, int]) -> list[Case]:
         for k in range(count)
     ]
     return [c for _, c in sorted(every, key=lambda both: both[0])]
-
-
-def store(file: Path, row: Row) -> None:
-    with new_file(file) as part:
-        part.write_text(json.dumps(row, default=float))
 
 
 def simulate_case(one: Case) -> tuple[pd.DataFrame, float]:
@@ -313,7 +293,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", default="", help="run cases whose key begins with this, and print them")
     parser.add_argument("--out", type=Path, default=HERE)
     given = parser.parse_args(argv)
-    kept = KEPT / version()
+    kept = KEPT / program_version(ROLLER)
     kept.mkdir(parents=True, exist_ok=True)
     many = {"nothing": given.nothing, "cause": given.per_cause, "surprise": given.per_surprise, "pair": given.pairs}
     every = cases(many, dict.fromkeys(FRESH, 0) if given.seen else FRESH)

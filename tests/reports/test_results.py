@@ -151,7 +151,7 @@ def test_a_design_shows_and_saves_itself(designed: ShownDesign, tmp_path: Path) 
 
 
 def test_a_changed_result_is_its_values_only(results: dict[str, Shown]) -> None:
-    """What is told of the old one would be false."""
+    """It has no account, as that of the old one would be false."""
     changed = replace(results["identify"], value=np.zeros(11))  # type: ignore[type-var]
     assert repr(changed).startswith("ShownEstimate(method='ols'")
     assert changed._repr_html_() is None

@@ -727,7 +727,7 @@ def sticks(rig: Rig, size: float, draw: Draw) -> Key:
 
 
 def sticks_noisily(rig: Rig, size: float, draw: Draw) -> Key:
-    """The same with a coarse position sensor. Source: see above."""
+    """Friction sticks, and the position sensor is coarse. Source: see above."""
     rig.noise_m, rig.noise_N = 2e-5 * size, 1.0
     return Key(related=("friction_transition@carriage", "stribeck_friction@carriage"))
 
