@@ -26,7 +26,7 @@ from excite.diagnosis.score_test import Candidate
 from excite.diagnosis.selection import ProgressCallback, identified_entry
 from excite.diagnosis.torque_fit import LAGS, Term, TorqueFit
 from excite.diagnosis.torque_rows import TorqueRows, torque_rows
-from excite.diagnosis.torque_search import SETTINGS, Search, reason_against
+from excite.diagnosis.torque_search import SETTINGS, Search, reason_against, scaled_magnitude
 from excite.errors import NotIdentifiableError
 from excite.identification import Solution
 from excite.logs import Log
@@ -40,7 +40,7 @@ MIN_LEVEL = 1e-6  # smallest noise of a row, of the torques' size; chosen
 
 @dataclass(frozen=True)
 class TorqueDiagnosis:
-    """What regression on the torques finds; the fields that it shares with `Diagnosis` mean the same.
+    """Verdict and findings of a regression on the torques; fields that it shares with `Diagnosis` mean the same.
 
     solution: of the parameters alone. curves: smooth functions of one signal that predict what no effect explains.
     rejected: effects that were tried, each with the reason why it is not given.
@@ -114,9 +114,10 @@ def diagnose_torques(
     lowest = np.maximum(lowest, MIN_LEVEL * np.sqrt(np.mean(np.concatenate([r.Y**2 for r in rows], axis=1))))
     solution = identification.solve_blocks(blocks, model.scale)
     before = TorqueFit(model, rows, solution.kept, lowest, [])
-    search = Search(model, rows, filter, identification.fit_rows(model, blocks))
+    search = Search(model, rows, filter, identification.fit_rows(model, blocks, solution))
     after, reasons = search.extend(before, report, deadline)
-    stages = [before.with_terms(after.terms[:k]) for k in range(len(after.terms))] + [after]
+    between = [before.with_terms(after.terms[:k]) for k in range(1, len(after.terms))]
+    stages = [before, *between, after] if after.terms else [before]
     withheld = [stage.hold_out(before)[1] for stage in stages]
     explained = _explains(after)
     total = _excess(before)
@@ -159,7 +160,7 @@ def _finding(search: Search, fit: TorqueFit, term: Term, share: float, kind: str
     placed = term.effect
     c, std = fit.coefficient(term)
     relative = fit.shape_stds(term)
-    magnitude = placed.values["A"] / c if placed.effect.inverse else placed.values["A"] * c
+    magnitude = scaled_magnitude(placed, c)
     size = abs(magnitude * std / c)
     shapes = {
         n: (placed.values[n], abs(placed.values[n]) * relative.get(n, 0.0), placed.shape_unit(n)) for n in placed.shapes
@@ -192,9 +193,8 @@ def _rivals(search: Search, fit: TorqueFit, term: Term) -> tuple[EffectEntry, ..
             new = rest.with_terms([*rest.terms, search.term(x)])
             if not reason_against(rest, new, new.terms[-1]):
                 values = {n: placed.values[n] for n in placed.shapes}
-                found.append(
-                    identified_entry(placed.effect.name, placed.where, x.coefficient * placed.values["A"], values)
-                )
+                magnitude = scaled_magnitude(placed, x.coefficient)
+                found.append(identified_entry(placed.effect.name, placed.where, magnitude, values))
     return tuple(found)
 
 

@@ -14,6 +14,7 @@ from excite.logs import BLOCK, Log, decimate, kept_samples, samples
 from excite.model import Model, signatures
 from excite.model.effects import PlacedEffect
 from excite.model.machine import Filter
+from excite.simulation import measured_torque
 
 STRETCHES = 20  # parts of each log from which variances and predictions are taken; chosen
 BATCH = 64  # columns evaluated at a time
@@ -103,9 +104,9 @@ def _reading_error(model: Model, e: PlacedEffect, t: np.ndarray, u: np.ndarray) 
 
     t (N,) [s]; u (N, n_u): torques.
     """
-    gain, offset, delay = e.channel(t)
+    channel = e.channel(t)
     more = np.zeros((len(model.coordinates), len(t)))
     for k, (row, body) in enumerate(zip(model.actuated, model.machine.actuated, strict=True)):
         if body.index in e.bodies:
-            more[row] = gain * np.interp(t - delay, t, u[:, k]) + offset - u[:, k]
+            more[row] = measured_torque(t, u[:, k], *channel) - u[:, k]
     return more

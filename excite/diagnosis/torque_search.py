@@ -22,7 +22,7 @@ from excite.model.machine import Filter
 
 @dataclass(frozen=True)
 class Settings:
-    """The numbers of the regression; all are chosen, and `MIN_ODDS` decides about false names.
+    """The numbers of the regression; all are chosen, and `min_odds` decides about false names.
 
     min_odds: posterior odds from which an effect is tried, with even odds that there is one.
     tie_odds: odds against the best below which a rival stays. min_stds: of an effect's size over its standard
@@ -45,6 +45,7 @@ REACHES = 1.0, 0.35, 0.12  # shares of the way between trial values of shapes at
 SHAPE_STEP = 0.03  # relative step of the slope by a shape; chosen
 SHORT_DELAYS = 2.0, 8.0  # samples; trial values of delays and lags; chosen
 MAX_SETTLING = 12  # passes to the magnitude of an effect that is not proportional to it; chosen
+STEPS = 0.3, 3.0  # factors on that magnitude in a pass at least and at most; chosen
 SETTLED = 0.02  # logarithm of the coefficient that ends them; chosen
 MIN_UNABSORBED_SHARE = 1e-4  # share of a column below which the parameters absorb it; chosen
 
@@ -104,6 +105,16 @@ def is_proportional(effect: Effect) -> bool:
     return len(effect.grid) == 1 and effect.channel is None and not effect.inverse
 
 
+def scaled_magnitude(e: PlacedEffect, coefficient: float) -> float:
+    """Return the magnitude that a coefficient of an effect's column stands for."""
+    return e.values["A"] / coefficient if e.effect.inverse else e.values["A"] * coefficient
+
+
+def _is_impossible(e: PlacedEffect, coefficient: float) -> bool:
+    """Tell if a coefficient gives an effect a sign that it cannot have."""
+    return bool(coefficient * e.values["A"] < 0) and (e.effect.positive or e.effect.opposes_motion)
+
+
 def _is_seen_in_torques(e: PlacedEffect) -> bool:
     """Tell if an effect changes the torques of moving joints: not a sensor's, and not what friction does near rest."""
     return e.effect.reading is None and e.effect.shaking is None and not e.unsticking
@@ -142,14 +153,15 @@ class Search:
 
         The torque of a delay is not proportional to it: only there is the column that of the magnitude.
         """
+        if is_proportional(x.candidate.placed.effect):
+            return x
         for _ in range(MAX_SETTLING):
-            placed = x.candidate.placed
-            if is_proportional(placed.effect) or not x.coefficient > 0:
-                return x if is_proportional(placed.effect) else None
+            if not x.coefficient > 0:
+                return None
             if abs(np.log(x.coefficient)) < SETTLED:
                 return x
-            step = float(np.clip(x.coefficient, 0.3, 3.0))
-            value = placed.values["A"] / step if placed.effect.inverse else placed.values["A"] * step
+            placed = x.candidate.placed
+            value = scaled_magnitude(placed, float(np.clip(x.coefficient, *STEPS)))
             moved = replace(x.candidate, placed=replace(placed, values={**placed.values, "A": value}))
             (x,) = self.test(fit, [moved], self._columns([moved.placed]))
         return None
@@ -159,9 +171,7 @@ class Search:
         chi2, step = score_columns(fit, columns)
         n, found = len(fit.innovations), []
         for x, c, a in zip(candidates, chi2, step, strict=True):
-            effect = x.placed.effect
-            impossible = a * x.placed.values["A"] < 0 and (effect.positive or effect.opposes_motion)
-            c = 0.0 if impossible else float(c)
+            c = 0.0 if _is_impossible(x.placed, a) else float(c)
             found.append(Tested(x, c, float(a), log_odds(c, x.placed, n, len(self.names))))
         return sorted(found, key=lambda x: -x.log_odds)
 
@@ -220,12 +230,8 @@ class Search:
                 reasons[term.name] = why
             if added is None:
                 break
-            weak = [
-                t
-                for t in added.terms[:-1]
-                if abs(added.coefficient(t)[0]) < SETTINGS.min_stds * added.coefficient(t)[1]
-            ]
-            fit = added.with_terms([t for t in added.terms if t not in weak]) if weak else added
+            held = [t for t in added.terms if t is added.terms[-1] or _is_certain(added, t)]
+            fit = added if len(held) == len(added.terms) else added.with_terms(held)
             names = frozenset(t.name for t in fit.terms)
             if names in tried:  # effects that replace each other in turn
                 break
@@ -244,7 +250,7 @@ def reason_against(before: TorqueFit, after: TorqueFit, term: Term) -> str:
     x = after.coefficient(term)[0]
     if not _is_certain(after, term):
         return "its size is uncertain"
-    if x * term.effect.values["A"] < 0 and (term.effect.effect.positive or term.effect.effect.opposes_motion):
+    if _is_impossible(term.effect, x):
         return "its sign is impossible"
     if not predicts_better(before, after):
         return "it does not predict withheld stretches better"

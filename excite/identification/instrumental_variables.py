@@ -24,6 +24,7 @@ from excite.identification.linear_methods import (
     residual,
     robust_covariance,
     rows_in_motion,
+    rows_to_trust,
     solve_blocks,
     whiten_block,
 )
@@ -66,7 +67,7 @@ def iv(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         ]
     projection = rest_projection(model, logs, filter, motions=measured)
     blocks = project_blocks([regression(model, s, filter) for s in measured], projection)
-    moving, notes = rows_in_motion(model, logs, filter, blocks)
+    moving, notes = rows_in_motion(model, blocks, rows_to_trust(model, logs, filter, blocks))
     initial = solve_blocks(leave_out(blocks, moving), model.scale)
     kept = list(initial.kept)
     x, step = model.nominal.copy(), np.full(len(model.nominal), np.nan)

@@ -67,10 +67,9 @@ def wls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     regressor is noisy, but less if noisy rows have less weight.
     """
     every = filtered_blocks(model, logs, filter)
-    moving, notes = rows_in_motion(model, logs, filter, every)
+    in_motion = rows_to_trust(model, logs, filter, every)
+    moving, notes = rows_in_motion(model, every, in_motion)
     blocks = leave_out(every, moving)
-    every_row = [np.ones(Y.shape, bool) for _, Y in every]
-    in_motion = every_row if model.slips else [moving_rows(model, log, filter) for log in logs]
     lowest = row_levels([row_errors(model, log, filter, 1) for log in logs], model.nominal, in_motion)
     lowest = np.maximum(lowest, MIN_ROW_NOISE * rms_torque(blocks))  # logs without noise have no residual
     count = np.maximum(sum(_used(b).sum(axis=1) for b in blocks), 1)
@@ -98,7 +97,7 @@ def tls(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     signal has noise, or if the noise hides every parameter.
     """
     every = filtered_blocks(model, logs, filter)
-    moving, notes = rows_in_motion(model, logs, filter, every)
+    moving, notes = rows_in_motion(model, every, rows_to_trust(model, logs, filter, every))
     blocks = leave_out(every, moving)
     first = solve_blocks(blocks, model.scale)
     whitening = [
@@ -156,19 +155,25 @@ def filtered_blocks(model: Model, logs: Sequence[Log], filter: Filter) -> list[B
     return project_blocks([filtered_regression(model, log, filter) for log in logs], projection)
 
 
+def rows_to_trust(model: Model, logs: Sequence[Log], filter: Filter, blocks: Sequence[Block]) -> list[np.ndarray]:
+    """Find the rows (n_rows, n) of each log that are not of joints near rest.
+
+    Machines with slips keep all rows: a selection by noisy slips would bias the estimate.
+    """
+    if model.slips:
+        return [np.ones(Y.shape, bool) for _, Y in blocks]
+    return [moving_rows(model, log, filter) for log in logs]
+
+
 def rows_in_motion(
-    model: Model, logs: Sequence[Log], filter: Filter, blocks: Sequence[Block]
+    model: Model, blocks: Sequence[Block], moving: list[np.ndarray]
 ) -> tuple[list[np.ndarray], tuple[str, ...]]:
     """Find the rows (n_rows, n) of each log to use, with a note.
 
-    Rows of joints near rest are left out if they move an estimate by more than noise explains (test of J. A. Hausman,
-    Econometrica 46, 1978), and every parameter is identified without them. Machines with slips keep all rows: a
-    selection by noisy slips would bias the estimate.
+    moving: see `rows_to_trust`. Rows of joints near rest are left out if they move an estimate by more than noise
+    explains (test of J. A. Hausman, Econometrica 46, 1978), and every parameter is identified without them.
     """
     every = [np.ones(Y.shape, bool) for _, Y in blocks]
-    if model.slips:
-        return every, ()
-    moving = [moving_rows(model, log, filter) for log in logs]
     share = 1 - float(np.mean(np.concatenate(moving, axis=1)))
     if not share:
         return every, ()
@@ -225,12 +230,12 @@ def least_squares(model: Model, W: np.ndarray, Y: np.ndarray, method: str) -> Es
     return estimate_with_white_noise(model, blocks, solve_blocks(blocks, model.scale), method)
 
 
-def fit_rows(model: Model, blocks: Sequence[Block]) -> np.ndarray:
+def fit_rows(model: Model, blocks: Sequence[Block], solution: Solution | None = None) -> np.ndarray:
     """Solve least squares on rows; return X (n_base,), the machine file's values where the rows do not show them.
 
-    Raises NotIdentifiableError.
+    solution: of these rows, if it is known. Raises NotIdentifiableError.
     """
-    solution = solve_blocks(blocks, model.scale)
+    solution = solution or solve_blocks(blocks, model.scale)
     x = restore_tied_parameters(model, blocks, solution, solution.x)
     shown = [*solution.kept, *solution.tied]
     found = model.nominal.copy()

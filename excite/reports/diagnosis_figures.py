@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from excite import diagnosis
 from excite.diagnosis import Diagnosis, LogResiduals, TorqueDiagnosis
 from excite.reports.figures import COLOURS, escape_dollar, save
-from excite.reports.torque_figures import torque_figure_calls, torque_figures_by_file
+from excite.reports.torque_figures import torque_figures_by_file
 from excite.text import format_number
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
@@ -37,7 +37,7 @@ def figure_calls(place: Path, d: Diagnosis | TorqueDiagnosis, title: str) -> lis
     misfit.png and when.png of each log; misfit.png and, where there are curves, curves.png of one by regression.
     """
     if isinstance(d, TorqueDiagnosis):
-        return torque_figure_calls(place, d, title)
+        return [partial(_save, draw, place / file) for file, draw in figures_by_file(d, title).items()]
     return [partial(_draw, place, d, title, kind) for kind in ("misfit", "when")]
 
 
@@ -47,6 +47,10 @@ def figures_by_file(d: Diagnosis | TorqueDiagnosis, title: str) -> dict[str, Cal
         return torque_figures_by_file(d, title)
     n = len(d.before.data.logs)
     return {_file(kind, k, n): partial(_one, d, title, kind, k) for kind in ("misfit", "when") for k in range(n)}
+
+
+def _save(draw: Callable[[], Figure], file: Path) -> None:
+    save(draw(), file)
 
 
 def _file(kind: str, k: int, n: int) -> str:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from excite.diagnosis import Curve, TorqueDiagnosis
-from excite.reports.figures import COLOURS, escape_dollar, save
+from excite.reports.figures import COLOURS, escape_dollar
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 MAX_TORQUES = 4  # with the largest errors, in the figure; chosen
@@ -19,19 +18,10 @@ BINS = 40  # of time or speed in a panel; chosen
 MAX_COLUMNS = 3  # curves side by side; chosen
 
 
-def torque_figure_calls(place: Path, d: TorqueDiagnosis, title: str) -> list[Callable[[], None]]:
-    """Return independent calls that draw misfit.png and, where there are curves, curves.png."""
-    return [partial(_save, draw, place / file) for file, draw in torque_figures_by_file(d, title).items()]
-
-
 def torque_figures_by_file(d: TorqueDiagnosis, title: str) -> dict[str, Callable[[], Figure]]:
-    """Return for each file of `torque_figure_calls` what draws it."""
+    """Return what draws misfit.png and, where there are curves, curves.png."""
     drawn: dict[str, Callable[[], Figure]] = {"misfit.png": partial(misfit_of_torques, d, title)}
     return drawn | {"curves.png": partial(curves_figure, d, title)} if d.curves else drawn
-
-
-def _save(draw: Callable[[], Figure], place: Path) -> None:
-    save(draw(), place)
 
 
 def misfit_of_torques(d: TorqueDiagnosis, title: str) -> Figure:
@@ -66,8 +56,7 @@ def misfit_of_torques(d: TorqueDiagnosis, title: str) -> Figure:
         over_time.set_ylim(bottom=0.0)
         over_speed.set_ylabel(escape_dollar(f"mean error of {name} [{unit}]"))
         over_speed.set_xlabel(escape_dollar(f"speed of {body.where.replace('_', ' ')} [{'rad/s' if turns else 'm/s'}]"))
-    for axis in axes[-1, :1]:
-        axis.set_xlabel("time [s]" if len(d.sources) == 1 else "time, one log after the other [s]")
+    axes[-1, 0].set_xlabel("time [s]" if len(d.sources) == 1 else "time, one log after the other [s]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
     figure.suptitle(escape_dollar(f"{title}: errors of the torques along the measured motion"))

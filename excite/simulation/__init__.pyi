@@ -22,6 +22,7 @@ from .sensors import (
     delivered_torques as delivered_torques,
     exact_readings as exact_readings,
     measure as measure,
+    measured_torque as measured_torque,
     measured_torques as measured_torques,
 )
 from .slip import (

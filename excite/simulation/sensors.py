@@ -79,7 +79,14 @@ def measured_torques(model: Model, t: np.ndarray, u: np.ndarray, X: np.ndarray) 
     """Return readings (N, n_u) of the torque channels from delivered torques u (N, n_u) [N m] at times t (N,) [s]."""
     channels = (x.full() for x in model.channels(t[None], X))
     each = zip(u.T, *channels, strict=True)
-    return np.column_stack([gain * np.interp(t - delay, t, one) + offset for one, gain, offset, delay in each])
+    return np.column_stack([measured_torque(t, *one) for one in each])
+
+
+def measured_torque(
+    t: np.ndarray, delivered: np.ndarray, gain: np.ndarray, offset: np.ndarray, delay: np.ndarray
+) -> np.ndarray:
+    """Return the readings (N,) of a channel from the delivered torque (N,) [N m]; gain, offset, delay [s]: (N,)."""
+    return np.asarray(gain * np.interp(t - delay, t, delivered) + offset)
 
 
 def delivered_torque(

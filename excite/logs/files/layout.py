@@ -170,7 +170,7 @@ def bracketed_units(names: Sequence[str]) -> dict[str, str]:
 
 
 def unknown_units(names: Sequence[str]) -> dict[str, str]:
-    """What stands in brackets behind names and is no known unit, by column, with its brackets: vir [mV] -> [mV]."""
+    """Return what stands in brackets behind names and is no known unit, by column: vir [mV] -> [mV]."""
     matches = {name: BRACKETED.fullmatch(name) for name in names}
     return {
         name: name[m.end(1) :].strip()
