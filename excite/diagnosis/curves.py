@@ -9,12 +9,15 @@ import numpy as np
 import scipy.interpolate
 
 from excite.diagnosis.hold_out import HoldOutErrors, hold_out_gain, torque_names
-from excite.diagnosis.selection import ProgressCallback
+from excite.diagnosis.selection import ProgressCallback, identified_entry
 from excite.diagnosis.torque_fit import Term, TorqueFit, normalise
 from excite.diagnosis.torque_search import MIN_UNABSORBED_SHARE, predicts_better
+from excite.model.effects import MAP_NODES, table_shapes
+from excite.model.machine import Body, EffectEntry, Quantity
 from excite.text import format_number, format_percent, format_uncertain
 
-FUNCTIONS = 8  # B-splines of a curve; chosen
+KNOTS = (MAP_NODES + 1) // 2  # of a curve: every second node of its table
+FUNCTIONS = KNOTS + 2  # cubic B-splines of a curve
 FINALIST_CURVES = 3  # signals of a torque that are tried on withheld stretches; chosen
 CURVE_POINTS = 41  # of a curve
 
@@ -25,7 +28,8 @@ class Curve:
 
     row: name and unit of the torque sensor. signal: name and unit. at (M,) [signal's unit]. value, std (M,) [row's
     unit]: without what parameters explain as well (`absorbed`). percent: by how much the error of that torque on
-    withheld stretches is smaller, with its 95 % interval.
+    withheld stretches is smaller, with its 95 % interval. entry: the curve as a table in the machine file, with its
+    relative standard deviation.
     """
 
     row: tuple[str, str]
@@ -35,6 +39,7 @@ class Curve:
     std: np.ndarray
     percent: float
     interval: tuple[float, float]
+    entry: EffectEntry
 
     def __str__(self) -> str:
         low, high = int(np.argmin(self.value)), int(np.argmax(self.value))
@@ -57,17 +62,17 @@ def find_curves(fit: TorqueFit, torques: Sequence[np.ndarray], report: ProgressC
     """
     found, model = [], fit.model
     signals = _signals(fit, torques)
-    for k, row in enumerate(model.actuated):
+    for k, (row, body) in enumerate(zip(model.actuated, model.machine.actuated, strict=True)):
         report(0.8 + 0.15 * k / len(model.actuated), "drawing what is left")
         tested = []
-        for signal, values in signals.items():
-            if signal[1] in ("N m", "N") and signal[0] != f"the torque u{k}":
+        for signal in signals:
+            if signal.kind == "torque" and signal.body.index != body.index:
                 continue
-            term = _curve_term(fit, row, values)
-            tested.append((_block_chi2(fit, term), signal, values, term))
+            term = _curve_term(fit, row, signal.values)
+            tested.append((_block_chi2(fit, term), signal, term))
         tested.sort(key=lambda x: -x[0])
         best: Curve | None = None
-        for chi2, (name, unit), values, term in tested[:FINALIST_CURVES]:
+        for chi2, signal, term in tested[:FINALIST_CURVES]:
             if chi2 < 2 * term.width:
                 break
             new = fit.with_terms([*fit.terms, term])
@@ -77,32 +82,62 @@ def find_curves(fit: TorqueFit, torques: Sequence[np.ndarray], report: ProgressC
             if gain is None or gain.interval is None or not gain.interval[0] > 0:
                 continue
             if best is None or gain.percent > best.percent:
-                at, value, std = _evaluate(new, term, values, unit)
-                label = name.replace(f"the torque u{k}", "its torque")
-                best = Curve(torque_names(model.machine)[k], (label, unit), at, value, std, gain.percent, gain.interval)
+                low, high = (float(x) for x in np.quantile(np.concatenate(signal.values), [0.01, 0.99]))
+                at = np.linspace(low, high, CURVE_POINTS)
+                value, std = _evaluate(new, term, signal, at)
+                best = Curve(
+                    torque_names(model.machine)[k],
+                    (signal.name, signal.unit),
+                    at,
+                    value,
+                    std,
+                    gain.percent,
+                    gain.interval,
+                    _entry(new, term, signal, body),
+                )
         if best is not None:
             found.append(best)
     return found
 
 
-def _signals(fit: TorqueFit, torques: Sequence[np.ndarray]) -> dict[tuple[str, str], list[np.ndarray]]:
-    """Return signals (n,) of each log by name and unit."""
-    model, found = fit.model, dict[tuple[str, str], list[np.ndarray]]()
+@dataclass(frozen=True)
+class Signal:
+    """Angle, speed or torque (kind) of a body's joint along each log: values (n,) [unit]."""
+
+    kind: str
+    body: Body
+    unit: str
+    values: list[np.ndarray]
+
+    @property
+    def name(self) -> str:
+        if self.kind == "torque":
+            return "its torque"
+        angle = "angle" if self.body.joint == "revolute" else "position"
+        return f"the {angle if self.kind == 'angle' else 'speed'} of {self.body.where}"
+
+
+def _signals(fit: TorqueFit, torques: Sequence[np.ndarray]) -> list[Signal]:
+    """Return angle and speed of every joint, and the torque of every driven one."""
+    model, found = fit.model, list[Signal]()
     for body in (b for b in model.machine.body if b.coordinates):
-        turns = body.joint == "revolute"
+        unit = "rad" if body.joint == "revolute" else "m"
         k = model.coordinates.index(body.coordinates[0])
-        angle, unit = ("angle", "rad") if turns else ("position", "m")
-        found[f"the {angle} of {body.where}", unit] = [r.q[r.at, k] for r in fit.rows]
-        found[f"the speed of {body.where}", f"{unit}/s"] = [r.nu[r.at, k] for r in fit.rows]
-    for k, (_, unit) in enumerate(torque_names(model.machine)):
-        found[f"the torque u{k}", unit] = [u[r.at, k] for u, r in zip(torques, fit.rows, strict=True)]
+        found.append(Signal("angle", body, unit, [r.q[r.at, k] for r in fit.rows]))
+        found.append(Signal("speed", body, f"{unit}/s", [r.nu[r.at, k] for r in fit.rows]))
+    for k, (body, (_, unit)) in enumerate(zip(model.machine.actuated, torque_names(model.machine), strict=True)):
+        found.append(Signal("torque", body, unit, [u[r.at, k] for u, r in zip(torques, fit.rows, strict=True)]))
     return found
 
 
+def _knots(along: Sequence[np.ndarray]) -> np.ndarray:
+    """Return quantiles (KNOTS,) of a signal along all logs."""
+    return np.asarray(np.quantile(np.concatenate(list(along)), np.linspace(0, 1, KNOTS)))
+
+
 def _basis(values: np.ndarray, along: Sequence[np.ndarray]) -> np.ndarray:
-    """Evaluate cubic B-splines (n, functions) with knots at quantiles of a signal along all logs."""
-    n = FUNCTIONS
-    inner = np.quantile(np.concatenate(list(along)), np.linspace(0, 1, n - 2))
+    """Evaluate cubic B-splines (n, FUNCTIONS) with knots at quantiles of a signal along all logs."""
+    inner = _knots(along)
     knots = np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
     inside = np.clip(values, inner[0], inner[-1])
     return np.asarray(scipy.interpolate.BSpline.design_matrix(inside, knots, 3).toarray())
@@ -150,14 +185,28 @@ def absorbed(values: np.ndarray, unit: str) -> np.ndarray:
     return np.column_stack([one] if unit == "m" else [one, values, np.sign(values)])
 
 
-def _evaluate(
-    fit: TorqueFit, term: Term, values: Sequence[np.ndarray], unit: str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Evaluate a curve beside what parameters explain as well: points, values, standard deviations."""
-    every = np.concatenate(list(values))
-    low, high = (float(x) for x in np.quantile(every, [0.01, 0.99]))
-    at = np.linspace(low, high, CURVE_POINTS)
-    shares = np.linalg.lstsq(absorbed(every, unit), _basis(every, values), rcond=None)[0]
-    B = _basis(at, values) - absorbed(at, unit) @ shares
-    own = fit.columns_of(term)
-    return at, B @ fit.x[own], np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", B, fit.covariance[own, own], B), 0.0))
+def _beside_parameters(signal: Signal, at: np.ndarray) -> np.ndarray:
+    """Evaluate the splines at points (m,) without what parameters explain as well, (m, FUNCTIONS)."""
+    every = np.concatenate(signal.values)
+    shares = np.linalg.lstsq(absorbed(every, signal.unit), _basis(every, signal.values), rcond=None)[0]
+    return np.asarray(_basis(at, signal.values) - absorbed(at, signal.unit) @ shares)
+
+
+def _evaluate(fit: TorqueFit, term: Term, signal: Signal, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a curve beside what parameters explain as well, and its standard deviations, at points (m,)."""
+    B, own = _beside_parameters(signal, at), fit.columns_of(term)
+    return B @ fit.x[own], np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", B, fit.covariance[own, own], B), 0.0))
+
+
+def _entry(fit: TorqueFit, term: Term, signal: Signal, body: Body) -> EffectEntry:
+    """Return a curve as a table, at the knots and midway between them."""
+    knots = _knots(signal.values)
+    x = np.unique(np.concatenate([knots, (knots[1:] + knots[:-1]) / 2]))
+    while len(x) < MAP_NODES:  # knots coincide where the signal rests
+        widest = int(np.argmax(np.diff(x)))
+        x = np.insert(x, widest + 1, x[widest : widest + 2].mean())
+    f, std = _evaluate(fit, term, signal, x)
+    relative = float(np.sqrt(np.mean(std**2) / np.mean(f**2)))
+    shapes = table_shapes(signal.kind, signal.body.index, x.tolist(), f.tolist())
+    entry = identified_entry("torque_map", body.where, 1.0, shapes)
+    return entry.model_copy(update={"std": Quantity(value=relative, source="identified")})

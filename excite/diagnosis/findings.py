@@ -398,15 +398,16 @@ def _describe_change(percent: float, interval: tuple[float, float] | None) -> st
 
 
 def machine_file(name: str, machine: Machine, d: Diagnosis | TorqueDiagnosis) -> str | None:
-    """Return the machine with the findings as a TOML file; None if nothing is named.
+    """Return the machine with the findings, and with the curves as tables, as a TOML file; None if there are none.
 
     For a shipped machine the file holds only what is new; for a machine file it holds everything. Base parameters
     combine several parameters of the file and are left out.
     """
-    if not d.findings:
+    curves = [c.entry for c in d.curves] if isinstance(d, TorqueDiagnosis) else []
+    if not (d.findings or curves):
         return None
-    found = [_effect_table(f) for f in d.findings]
-    entries = [*map(_entry_table, machine.effect), *map(_entry_table, found)]
+    found = map(_effect_table, d.findings)
+    entries = [*map(_entry_table, machine.effect), *map(_entry_table, found), *map(_entry_table, curves)]
     if name in shipped_machines():
         content: dict[str, Any] = {"extends": name}
     else:

@@ -25,3 +25,4 @@ from .placing import (
     without_effect as without_effect,
 )
 from .sizes import GRAVITY as GRAVITY, duration as duration, large_torque as large_torque
+from .torque_map import MAP_NODES as MAP_NODES, table_shapes as table_shapes

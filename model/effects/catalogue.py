@@ -12,7 +12,7 @@ from math import pi
 
 import casadi as ca
 
-from excite.model.effects import friction, ground_map, sizes, soil
+from excite.model.effects import friction, ground_map, sizes, soil, torque_map
 from excite.model.effects.effect import Channel, Effect, Memory, SampleView, Shape, Site, Values
 from excite.model.machine import Body
 
@@ -271,6 +271,19 @@ _declare(
         positive=True,
         torque=lambda s, k, p: -p["A"] * s.sign(k) * ca.fmax(0, _between(s.time, p["begin"], p["end"])),
         timed=True,
+    ),
+    Effect(
+        "torque_map",
+        ("drives",),
+        "-",
+        "resistance by a table of the angle, speed or torque of a joint, times A; a diagnosis fits it to what no other"
+        " effect explains, and never names it as a cause",
+        "a torque error that is a function of one signal",
+        "piecewise linear basis: Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., 5.2",
+        sizes.constant(1.0),
+        torque_map.map_shapes(),
+        grid=(),
+        torque=torque_map.resist_by_table,
     ),
     # Drives and torque channels
     Effect(

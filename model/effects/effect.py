@@ -157,6 +157,7 @@ class Shape:
     default, grid: value for simulation and trial values for diagnosis, in units of `size` at the site.
     circular: a phase, fitted by its sine and cosine.
     whole: never refined by a fit.
+    either_sign: it may be negative.
     only: the allowed values, if they are few.
     meaning: explanation, if the name needs one.
     form: the form of the effect that has this shape, None for all.
@@ -169,6 +170,7 @@ class Shape:
     size: Callable[[Site], float] = unit_size
     circular: bool = False
     whole: bool = False
+    either_sign: bool = False
     only: tuple[float, ...] = ()
     meaning: str = ""
     form: Form | None = None
@@ -176,8 +178,8 @@ class Shape:
 
     @property
     def signed(self) -> bool:
-        """True if it may have either sign: a phase, or zero by default."""
-        return self.circular or self.default == 0
+        """True if it may have either sign: a phase, zero by default, or declared so."""
+        return self.circular or self.default == 0 or self.either_sign
 
 
 @dataclass(frozen=True)

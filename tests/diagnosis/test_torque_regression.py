@@ -14,12 +14,14 @@ import pytest
 import scipy.signal
 from support.files import SHARED
 
+from excite.diagnosis import machine_file
 from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.torque_regression import TorqueDiagnosis, diagnose_torques
 from excite.errors import NotIdentifiableError
-from excite.identification import needed_sensors
+from excite.identification import identify, needed_sensors
 from excite.logs import prepare
-from excite.model import Model
+from excite.model import Model, build
+from excite.model.machine import load_machine
 
 Hidden = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 SECONDS, VOLTS_PER_NEWTON = 25.0, 1 / 35.1507
@@ -129,6 +131,22 @@ def test_a_force_that_no_effect_has_is_drawn_as_a_curve(emps: Model) -> None:
     off = curve.value - true - np.mean(curve.value - true)
     assert np.mean(np.abs(off) < 3 * curve.std) > 0.85
     assert np.ptp(curve.value) == pytest.approx(8.0, rel=0.3)
+
+
+def test_a_curve_goes_into_the_machine_file_and_holds_on_another_log(emps: Model, tmp_path: Path) -> None:
+    """As a table that identification takes: the error of a log that it was not found on falls by a quarter."""
+
+    def force(q: np.ndarray, v: np.ndarray, F: np.ndarray) -> np.ndarray:
+        return 4 * np.sin(2 * np.pi * q / 0.4)
+
+    text = machine_file("emps", emps.machine, diagnosed(emps, rig_log(0, force)))
+    assert text is not None
+    (tmp_path / "machine.toml").write_text(text)
+    ready = prepare(emps, [rig_log(1, force)], needed_sensors(emps, "ols"))
+    plain = identify(ready.model, ready.logs, "ols")
+    mapped = identify(build(load_machine(str(tmp_path / "machine.toml"))), ready.logs, "ols")
+    assert mapped.relative_error_percent < 0.75 * plain.relative_error_percent
+    assert mapped.value[mapped.names.index("torque_map@carriage")] == pytest.approx(1.0, abs=0.5)
 
 
 @pytest.mark.slow

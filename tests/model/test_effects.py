@@ -17,7 +17,16 @@ from excite.errors import MachineError
 from excite.identification import identify
 from excite.logs import log, passes
 from excite.model import Model, build, signatures
-from excite.model.effects import CATALOGUE, DEFAULT_DURATION, Effect, PlacedEffect, Site, ground_map, placing
+from excite.model.effects import (
+    CATALOGUE,
+    DEFAULT_DURATION,
+    Effect,
+    PlacedEffect,
+    Site,
+    ground_map,
+    placing,
+    table_shapes,
+)
 from excite.model.machine import EffectEntry, Quantity, machine
 from excite.model.mechanics import tree
 from excite.simulation import Motion, sensors, simulate
@@ -96,6 +105,24 @@ def test_a_negative_amount_is_a_positive_one_half_a_turn_on(effect: Effect, circ
         told.append(np.vstack([model.acceleration(q, nu, u, z, model.nominal).full(), read]))
     np.testing.assert_allclose(told[0], told[1], rtol=1e-9, atol=1e-9)
     assert abs(opposite_phase(0.7)) <= np.pi
+
+
+def test_a_torque_map_is_a_table_between_its_nodes(va12: Model) -> None:
+    """Against numpy's interpolation: a torque of the articulation by the front roll's speed, constant beyond."""
+    x, f = np.array([-2, -1.5, -1, -0.5, -0.1, 0, 0.3, 0.5, 1, 1.2, 2]), np.arange(11) ** 2 - 30.0
+    shapes = table_shapes("speed", 1, x.tolist(), f.tolist())
+    model = build(placing.with_effects(VA12, shaped("torque_map@articulation=2", shapes)))
+    w = np.linspace(-3, 3, 50)
+    q, a, nu, u, z = (np.zeros((n, len(w))) for n in (6, 6, 6, 3, 0))
+    nu[3] = w
+    with_it = model.predict(q, nu, a, model.expand @ model.nominal, u, z).full()
+    without = va12.predict(q, nu, a, va12.expand @ va12.nominal).full()
+    more = np.zeros_like(with_it)
+    more[4] = 2 * np.interp(w, x, f)
+    np.testing.assert_allclose(with_it - without, more, atol=1e-6)
+    for wrong, said in (({"x3": 5.0}, "x1 to x11 must increase"), ({"of": 9.0}, "of must be the number of a joint")):
+        with pytest.raises(MachineError, match=said):
+            build(placing.with_effects(VA12, shaped("torque_map@articulation=2", shapes | wrong)))
 
 
 @pytest.mark.parametrize("slow", [0.0, 0.6])
