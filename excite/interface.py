@@ -162,7 +162,7 @@ def identify(machine: Machine, logs: Source | Sequence[Source], method: str | No
     name = workflows.choose_method(method, model)
     ready = readers.prepare(model, _several(logs), identification.needed_sensors(model, name))
     found = workflows.identify_from(ready.model, ready.logs, name)
-    said = () if found.agreement is None else (workflows.describe_agreement(found.agreement),)
+    said = () if found.agreement is None else (identification.describe_agreement(found.agreement),)
     noted = replace(found.estimate, notes=(*said, *ready.notes, *found.estimate.notes))
     return ShownEstimate.of(noted, partial(workflows.identify_account, model, ready, found))
 

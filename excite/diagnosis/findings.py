@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from excite import identification
 from excite.diagnosis import hold_out, residuals, separating_run, torque_regression
 from excite.diagnosis.acceptance import reason_against, widen
 from excite.diagnosis.deadline import Deadline
@@ -22,6 +23,7 @@ from excite.diagnosis.residuals import InnovationLevel
 from excite.diagnosis.selection import ProgressCallback
 from excite.diagnosis.torque_regression import TorqueDiagnosis
 from excite.errors import NoEstimateError, NotIdentifiableError
+from excite.identification import Agreement
 from excite.logs import Log
 from excite.model import Model
 from excite.model.machine import EffectEntry, Filter, Machine, shipped_machines
@@ -43,7 +45,8 @@ class Assessment:
     total_gain, gains: hold-out gain of all findings, and of each; None if no model could be fitted to the rest of the
     logs. before, after: size of each signal's innovations without and with the findings. located: where the misfit is.
     separating_run: the run that would separate tied causes. cut_short: the budget [s] that ended the search, None if it
-    ended by itself.
+    ended by itself. differences: between logs of which each alone is explained, None if there are none; no effect is
+    sought then.
     """
 
     diagnosis: Diagnosis | TorqueDiagnosis
@@ -54,6 +57,7 @@ class Assessment:
     located: tuple[str, ...]
     separating_run: str | None
     cut_short: float | None = None
+    differences: Agreement | None = None
 
 
 def assess(
@@ -173,12 +177,38 @@ def explain(
     Joint smoothing needs a motion that is followed in open loop. For a machine without slips and effects whose joints
     are all driven and which has no known values, regression takes its place where there are more than
     MAX_FOLLOWED_JOINTS joints, where smoothing finds no estimate, or where it leaves something unexplained and the
-    corrections of regression surely gain more. budget_s [s]: after it nothing new is begun, and the
-    best answer so far is given. Raises NoEstimateError.
+    corrections of regression surely gain more. Several logs are compared first: if each alone is explained and they
+    differ in parameters, that is the answer. budget_s [s]: after it nothing new is begun, and the best answer so far is
+    given. Raises NoEstimateError.
     """
+    differences = _find_differences(model, logs, filter)
+    if differences is not None:
+        together = diagnose(model, logs, filter, progress, runner, Deadline(0.0))
+        verdict = "named" if differences.explained else "unexplained"
+        plain = replace(
+            together,
+            verdict=verdict,
+            findings=(),
+            stages=(),
+            after=together.before,
+            nearest=None,
+            dropped=(),
+            located=(),
+        )
+        return replace(assess(plain, progress, runner), located=(), differences=differences)
     whole, smoothing = Deadline(budget_s), Deadline(None if budget_s is None else SMOOTHING_SHARE * budget_s)
     found = _explain(model, logs, filter, progress, runner, whole, smoothing)
     return replace(found, cut_short=budget_s if whole.reached or smoothing.reached else None)
+
+
+def _find_differences(model: Model, logs: Sequence[Log], filter: Filter) -> Agreement | None:
+    """Return what differs between several logs of which each alone is explained down to noise; None if nothing."""
+    if model.effects or (not model.slips and len(model.actuated) > MAX_FOLLOWED_JOINTS):
+        return None
+    agreement, estimates = identification.compare_sources(model, logs, "joint", filter)
+    if agreement is None or agreement.agree or any(e.status != "valid" for e in estimates):
+        return None
+    return agreement
 
 
 def _explain(
@@ -246,6 +276,7 @@ def summarise(a: Assessment) -> dict[str, Any]:
         "verdict": d.verdict,
         "answer": answer_text(a),
         "findings": [_finding_row(f, g) for f, g in zip(d.findings, a.gains, strict=True)],
+        "differences": None if a.differences is None else identification.summarise_agreement(a.differences),
         "error_before_percent": a.total_gain.before if a.total_gain else None,
         "error_after_percent": a.total_gain.after if a.total_gain else None,
         "gain_percent": a.total_gain.percent if a.total_gain and d.findings else None,
@@ -333,6 +364,11 @@ def answer_text(a: Assessment) -> str:
     """Return the diagnosis in a sentence or two."""
     d = a.diagnosis
     logs = "The log shows" if len(d.sources) == 1 else "The logs show"
+    if a.differences is not None:
+        each = "Each log alone shows nothing that the model lacks, but the logs differ"
+        if not a.differences.explained:
+            return f"{each} in more than {len(a.differences.changed)} parameters: diagnose each by itself."
+        return f"{each}. {identification.describe_changes(a.differences)}."
     if d.verdict == "clean":
         return f"{logs} nothing that the model lacks: the residuals are noise."
     rows = [_finding_row(f, g) for f, g in zip(d.findings, a.gains, strict=True)]

@@ -7,7 +7,8 @@
 - `verify` simulates a motion with sensor noise many times and identifies from each log (`Verification`), which shows
   bias, dispersion and coverage of the intervals.
 - `add_bias` estimates the bias of a method on given logs from simulated ones.
-- `compare_logs` tests whether one set of parameters explains several logs, and names what changed (`Agreement`).
+- `compare_sources` and `compare_logs` test whether one set of parameters explains several logs, and name what changed
+  (`Agreement`).
 - `compare_torques` and `compare_motions` test an estimate on another log (`SignalComparison`).
 - `predict_torques` and `predict_motion` predict signals along a log or a profile, with 95 % bands (`Prediction`);
   `write_estimate` and `read_estimate` keep an estimate in a folder for that.

@@ -1,4 +1,11 @@
-from .agreement import Agreement as Agreement, compare_logs as compare_logs
+from .agreement import (
+    Agreement as Agreement,
+    compare_logs as compare_logs,
+    compare_sources as compare_sources,
+    describe_agreement as describe_agreement,
+    describe_changes as describe_changes,
+    summarise_agreement as summarise_agreement,
+)
 from .bias import SIGNIFICANT_BIAS as SIGNIFICANT_BIAS
 from .delays import describe_late_channels as describe_late_channels
 from .estimate import Estimate as Estimate

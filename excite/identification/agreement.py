@@ -8,11 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy
 
+from excite.errors import NoEstimateError
 from excite.identification.estimate import Estimate
+from excite.identification.methods import identify
+from excite.logs import Log
+from excite.model import Model
+from excite.model.machine import Filter
+from excite.text import format_number, format_p_value, format_uncertain
 
 SIGNIFICANCE = 1e-3  # p-value below which logs disagree; chosen
 MAX_CHANGED = 4  # parameters that are named; more have no single cause; chosen
@@ -44,6 +51,25 @@ class Agreement:
     def agree(self) -> bool:
         """Tell if one set of parameters explains all logs."""
         return self.p_value >= SIGNIFICANCE
+
+
+def compare_sources(
+    model: Model, logs: Sequence[Log], method: str, filter: Filter
+) -> tuple[Agreement | None, list[Estimate]]:
+    """Identify each file of logs by itself and compare the estimates.
+
+    Return no comparison and no estimates for one file, or if one of them gives no estimate.
+    """
+    groups: dict[str, list[Log]] = {}
+    for one in logs:
+        groups.setdefault(one.source.partition(" from row ")[0], []).append(one)
+    if len(groups) < 2:
+        return None, []
+    try:
+        estimates = [identify(model, group, method, filter) for group in groups.values()]
+    except NoEstimateError:
+        return None, []
+    return compare_logs(tuple(groups), estimates), estimates
 
 
 def compare_logs(names: Sequence[str], estimates: Sequence[Estimate]) -> Agreement | None:
@@ -116,3 +142,40 @@ def _misfit(
     x = covariance @ g
     left = [v - D @ x for v, D in zip(values, design, strict=True)]
     return float(sum(e @ P @ e for e, P in zip(left, information, strict=True))), x, covariance
+
+
+def describe_agreement(agreement: Agreement) -> str:
+    """Say whether logs agree on the parameters, and what changed."""
+    if agreement.agree:
+        return (
+            f"one set of parameters explains the {len(agreement.logs)} logs (p = {format_number(agreement.p_value, 2)})"
+        )
+    p = format_p_value(agreement.p_value)
+    p = p if p.startswith("<") else f"= {p}"
+    text = f"the logs do not agree on the parameters (p {p})"
+    if not agreement.explained:
+        return f"{text}, and more than {len(agreement.changed)} of them would have to differ: identify each by itself"
+    return f"{text}; what changed: {describe_changes(agreement)}. Estimated together these are averages"
+
+
+def describe_changes(agreement: Agreement) -> str:
+    """List the parameters that changed, with the value in each log."""
+    return "; ".join(
+        f"{c.name}: "
+        + ", ".join(
+            f"{format_uncertain(v, s, c.unit)} in {n}" for n, v, s in zip(agreement.logs, c.value, c.std, strict=True)
+        )
+        for c in agreement.changed
+    )
+
+
+def summarise_agreement(agreement: Agreement) -> dict[str, Any]:
+    """Return a comparison of logs, ready for JSON."""
+    return {
+        "agree": agreement.agree,
+        "p_value": agreement.p_value,
+        "explained": agreement.explained,
+        "changed": {
+            c.name: {"unit": c.unit, "value": c.value.tolist(), "std": c.std.tolist()} for c in agreement.changed
+        },
+    }

@@ -19,7 +19,6 @@ from .diagnose_workflow import (
     separating_drive as separating_drive,
 )
 from .identify_workflow import (
-    describe_agreement as describe_agreement,
     identify as identify,
     identify_account as identify_account,
     identify_from as identify_from,

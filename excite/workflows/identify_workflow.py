@@ -18,7 +18,6 @@ from excite.logs import Log, Prepared, examine, prepare
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Filter
 from excite.reports import Account
-from excite.text import format_number, format_p_value, format_uncertain
 from excite.workflows import requests
 from excite.workflows.progress import Bar, no_bar
 
@@ -42,13 +41,13 @@ def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str
     filtering: a name of `FILTERS`. Raises NoEstimateError, LogError.
     """
     chosen, reason = FILTERS[filtering](model, logs)
-    agreement = _compare_sources(model, logs, method, chosen)
+    agreement, _ = identification.compare_sources(model, logs, method, chosen)
     try:
         estimate = identification.identify(model, logs, method, chosen)
     except NoEstimateError as err:
         if agreement is None or agreement.agree:
             raise
-        raise NotIdentifiableError(f"{describe_agreement(agreement)}; together: {err}") from None
+        raise NotIdentifiableError(f"{identification.describe_agreement(agreement)}; together: {err}") from None
     if agreement is not None and not agreement.agree and estimate.status == "valid":
         estimate = replace(estimate, status="doubtful", doubt="the logs do not agree on the parameters")
     used = [examine(model.machine, one).log for one in logs]
@@ -65,41 +64,6 @@ def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str
     notes = (*first, *estimate.notes, *identification.far_from_nominal(model, estimate), *late)
     estimate = identification.add_consistent(model, replace(estimate, notes=notes))
     return IdentifyResult(estimate, used, chosen, agreement)
-
-
-def _compare_sources(model: Model, logs: Sequence[Log], method: str, filter: Filter) -> Agreement | None:
-    """Compare the estimates of each log by itself; None for one log, or if one of them gives no estimate."""
-    groups: dict[str, list[Log]] = {}
-    for one in logs:
-        groups.setdefault(one.source.partition(" from row ")[0], []).append(one)
-    if len(groups) < 2:
-        return None
-    try:
-        estimates = [identification.identify(model, group, method, filter) for group in groups.values()]
-    except NoEstimateError:
-        return None
-    return identification.compare_logs(tuple(groups), estimates)
-
-
-def describe_agreement(agreement: Agreement) -> str:
-    """Say whether logs agree on the parameters, and what changed."""
-    if agreement.agree:
-        return (
-            f"one set of parameters explains the {len(agreement.logs)} logs (p = {format_number(agreement.p_value, 2)})"
-        )
-    p = format_p_value(agreement.p_value)
-    p = p if p.startswith("<") else f"= {p}"
-    text = f"the logs do not agree on the parameters (p {p})"
-    if not agreement.explained:
-        return f"{text}, and more than {len(agreement.changed)} of them would have to differ: identify each by itself"
-    changes = "; ".join(
-        f"{c.name}: "
-        + ", ".join(
-            f"{format_uncertain(v, s, c.unit)} in {n}" for n, v, s in zip(agreement.logs, c.value, c.std, strict=True)
-        )
-        for c in agreement.changed
-    )
-    return f"{text}; what changed: {changes}. Estimated together these are averages"
 
 
 def identify(
@@ -144,7 +108,7 @@ def identify_account(
     as_in_file: the model before it had the rate of the logs. more_notes: on the logs that were not fitted.
     """
     model, read, estimate, chosen = ready.model, found.logs, found.estimate, found.filter
-    said = [] if found.agreement is None else [describe_agreement(found.agreement)]
+    said = [] if found.agreement is None else [identification.describe_agreement(found.agreement)]
     parameters = _parameters(estimate)
     summary = {
         "machine": model.machine.name,
@@ -162,7 +126,7 @@ def identify_account(
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
         "notes": [*said, *ready.notes, *estimate.notes, *more_notes],
-        "agreement": None if found.agreement is None else _agreement(found.agreement),
+        "agreement": None if found.agreement is None else identification.summarise_agreement(found.agreement),
         "validation": [_check(model, one, estimate, chosen) for one in unfitted],
         "versions": requests.package_versions(),
     }
@@ -183,17 +147,6 @@ def identify_account(
 def _fit_figure(model: Model, one: Log, estimate: Estimate, chosen: Filter) -> Figure:
     torques = identification.compare_torques(model, one, estimate, chosen)
     return reports.comparison_figure(model, torques, f"{model.machine.title}: {one.source}")
-
-
-def _agreement(agreement: Agreement) -> dict[str, Any]:
-    return {
-        "agree": agreement.agree,
-        "p_value": agreement.p_value,
-        "explained": agreement.explained,
-        "changed": {
-            c.name: {"unit": c.unit, "value": c.value.tolist(), "std": c.std.tolist()} for c in agreement.changed
-        },
-    }
 
 
 def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:
