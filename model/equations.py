@@ -15,7 +15,7 @@ import casadi as ca
 from excite.errors import MachineError
 from excite.model import effects, mechanics
 from excite.model.effects import ContactMotion, PlacedEffect, SampleView, Soil, Values
-from excite.model.machine import Body, Machine
+from excite.model.machine import Body, Machine, Sensor
 from excite.text import format_number
 
 
@@ -68,6 +68,16 @@ class ActiveEffect:
     placed: PlacedEffect
     view: SampleView
     values: Values
+
+    def reading_error(self, exact: ca.SX, sensor: Sensor) -> ca.SX:
+        """Return the error of a sensor's reading, zero if the effect does not sit in it."""
+        hook, own = self.placed.effect.reading, self.placed.sensors
+        if hook is None or sensor.name not in own:
+            return ca.SX(0)
+        radius = 1.0 if sensor.radius is None else float(sensor.radius)
+        right = len(own) > 1 and float(sensor.lateral or 0) < 0
+        view = replace(self.view, wheel_radius=radius, outwards=-1.0 if right else 1.0)
+        return hook(view, exact, sensor.body, self.values)
 
 
 @dataclass(frozen=True)
@@ -239,8 +249,8 @@ def signatures(machine: Machine, standard: tuple[str, ...], placed: Sequence[Pla
         read = ca.SX.zeros(exact.numel())
         if e.effect.reading is not None:
             sensors = [x for x in machine.sensors("full") if x.kind != "torque"]
-            at = next(i for i, x in enumerate(sensors) if x.name == e.sensor)
-            read[at] = e.effect.reading(own.view, exact[at], sensors[at].body, own.values)
+            for at, sensor in enumerate(sensors):
+                read[at] = own.reading_error(exact[at], sensor)
         reading.append(read)
         states += z.values()
         rates += _memory_rates(own)
@@ -322,8 +332,7 @@ def _active_effect(
     if e.uses_map:
         n = effects.MAX_PASSES
         passes = {k: ca.vertcat(*map_inputs[n * i : n * (i + 1)]) for i, k in enumerate(passes)}
-    radius = next((float(x.radius) for x in s.machine.sensor if x.name == e.sensor and x.radius is not None), 1.0)
-    own = replace(view, z=dict.fromkeys(e.memories, ca.SX(0)) | z, passes=passes, wheel_radius=radius)
+    own = replace(view, z=dict.fromkeys(e.memories, ca.SX(0)) | z, passes=passes)
     return ActiveEffect(e, own, values)
 
 
@@ -481,8 +490,7 @@ def _readings(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX,
             value = s.at[root.coordinates["xy".index(sensor.kind)]]
         exact = value
         for e in acting:
-            if e.placed.effect.reading is not None and e.placed.sensor == sensor.name:
-                value = value + e.placed.effect.reading(e.view, exact, body.index, e.values)
+            value = value + e.reading_error(exact, sensor)
         readings[sensor.name] = value
     return ca.vertcat(*readings.values(), ca.SX(0, 1)), tuple(readings)
 

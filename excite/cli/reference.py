@@ -35,6 +35,7 @@ PLACES = {
     "drive": "all driven contacts together; where it is the ground that changes, all contacts",
     "articulation": "each driven joint without a contact",
     "wheels": "each measuring wheel",
+    "wheel_pair": "all measuring wheels together",
     "yaw_rate": "the gyro",
     "lateral_speed": "the lateral speed sensor",
     "machine": "the machine as a whole",
@@ -89,7 +90,7 @@ def effects_page() -> str:
         if typical:
             lines += [f"Typical magnitudes on va12: {', '.join(typical)}", ""]
         if e.shapes:
-            bodies, _ = next(iter(sites.values()), ((1,), None))
+            bodies, _ = next(iter(sites.values()), ((1,), ()))
             beside = e.extra_trials(Site.of(va12, bodies))
             lines += _table(
                 "shape | unit | default | tried values | meaning",

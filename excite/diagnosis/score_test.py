@@ -94,12 +94,12 @@ def candidates(machine: Machine, sensors: Sequence[str], duration: float) -> lis
     found: list[Candidate] = []
     columns = 0
     for effect in CATALOGUE.values():
-        for where, (bodies, sensor) in effects.allowed_places(machine, effect).items():
-            if effect.reading is not None and sensor not in sensors:
+        for where, (bodies, sitting) in effects.allowed_places(machine, effect).items():
+            if effect.reading is not None and not set(sitting) & set(sensors):
                 continue
             site = Site.of(machine, bodies, duration)
             for values, width in _trial_values(effect, site):
-                placed = PlacedEffect(effect, where, bodies, sensor, values, effects.is_straight(machine, bodies))
+                placed = PlacedEffect(effect, where, bodies, sitting, values, effects.is_straight(machine, bodies))
                 found.append(Candidate(placed, tuple(range(columns, columns + width))))
                 columns += width
     return found

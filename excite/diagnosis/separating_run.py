@@ -154,12 +154,12 @@ def _placed_effect(stage: ExtendedFit, name: str) -> PlacedEffect:
         return known
     name, _, where = name.partition("@")
     effect = effects.CATALOGUE[name]
-    bodies, sensor = effects.allowed_places(stage.machine, effect)[where]
+    bodies, sensors = effects.allowed_places(stage.machine, effect)[where]
     log = stage.data.logs[0]
     site = Site.of(stage.machine, bodies, float(log.t[-1] - log.t[0]))
     shapes = {n: s.default * s.size(site) for n, s in effect.shapes.items()}
     values = {"A": effect.typical_magnitude(site), **shapes}
-    return PlacedEffect(effect, where, bodies, sensor, values, effects.is_straight(site.machine, bodies))
+    return PlacedEffect(effect, where, bodies, sensors, values, effects.is_straight(site.machine, bodies))
 
 
 def _longest_motion(stage: ExtendedFit) -> SampledMotion:

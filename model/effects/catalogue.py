@@ -705,19 +705,19 @@ _declare(
     ),
     Effect(
         "measuring_wheel_position",
-        ("wheels",),
+        ("wheels", "wheel_pair"),
         "m",
-        "the measuring wheel rolls A further to the left than the machine file says",
+        "the measuring wheel rolls A further to the left than the machine file says; of several, each A further out",
         "a difference between the measuring wheels proportional to the yaw rate",
         "paper (32)",
         sizes.constant(0.005),
         memory={"turned": Memory(lambda s, k, p: s.yaw_rate[k], 1e-6)},
-        reading=lambda s, exact, k, p: -p["A"] * s.z["turned"] / s.wheel_radius,
+        reading=lambda s, exact, k, p: -s.outwards * p["A"] * s.z["turned"] / s.wheel_radius,
     ),
     # Sensors
     Effect(
         "measuring_wheel_radius",
-        ("wheels",),
+        ("wheels", "wheel_pair"),
         "-",
         "the true radius is R (1 + A)",
         "slip where there is none, proportional to speed, and the same forward and backward",

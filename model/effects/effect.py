@@ -85,7 +85,8 @@ class SampleView:
     large_torque [N m]: see `sizes.large_torque`.
     contacts: motion of each contact.
     forward_speed [m/s]: V_x of a body's origin in its own axes. yaw_rate [rad/s]: of a body.
-    wheel_radius [m]: of the measuring wheel that the effect acts on, 1 for others.
+    wheel_radius [m]: of the measuring wheel that is read, 1 for others. outwards: 1, or -1 for a wheel to the right of
+        an effect that acts on several.
     time [s]: since the log began.
     z: memory states of this effect by name; zero for those of a form that it does not have.
     passes (MAX_PASSES,): shares of a contact's width passed over at least 1, 2, ... times (`GroundMap`); zero for an
@@ -105,6 +106,7 @@ class SampleView:
     yaw_rate: Mapping[int, ca.SX]
     time: ca.SX
     wheel_radius: float = 1.0
+    outwards: float = 1.0
     z: Mapping[str, ca.SX] = field(default_factory=dict)
     passes: Mapping[int, ca.SX] = field(default_factory=dict)
 
@@ -204,7 +206,7 @@ class Effect:
 
     places: joints (with friction), drives (driven joints), contacts, driven_contacts, drive (all driven contacts
         together, or all contacts for an effect on the soil), articulation (driven joints without contact), wheels
-        (measuring ones), yaw_rate, lateral_speed, machine.
+        (measuring ones), wheel_pair (all measuring ones), yaw_rate, lateral_speed, machine.
     unit, meaning, signature, source: unit of the magnitude A; formula; symptom in a log; reference.
     typical_magnitude: a typical magnitude [unit] at a site.
     grid: multiples of it to try; several if the signature is not proportional to the magnitude.
@@ -268,7 +270,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class PlacedEffect:
-    """An effect at a place: the bodies it acts on, the sensor it sits in, values of "A" and shapes [unit].
+    """An effect at a place: the bodies it acts on, the sensors it sits in, values of "A" and shapes [unit].
 
     straight: it acts on a sliding joint, whose angles are positions and whose torques are forces.
     """
@@ -276,7 +278,7 @@ class PlacedEffect:
     effect: Effect
     where: str
     bodies: tuple[int, ...]
-    sensor: str | None
+    sensors: tuple[str, ...]
     values: Mapping[str, float]
     straight: bool = False
 

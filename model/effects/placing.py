@@ -18,8 +18,8 @@ SUSPICIOUS_RATIO = 50.0  # multiple of the typical magnitude that suggests a wro
 MIN_TYPICAL_FRICTION = 1e-5  # N m, friction below this is no reference for others; chosen
 
 
-def allowed_places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...], str | None]]:
-    """Return the places where a machine may have an effect: name -> (indices of bodies, name of sensor)."""
+def allowed_places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[int, ...], tuple[str, ...]]]:
+    """Return the places where a machine may have an effect: name -> (indices of bodies, names of sensors)."""
     driven = list(machine.actuated)
     pulling = [b for b in driven if b.contact is not None]
     together = machine.contacts if effect.soil else pulling
@@ -28,28 +28,31 @@ def allowed_places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[in
         each["articulation"] = [b for b in driven if b.contact is None]
     sensors = [s for s in machine.sensors("full") if not (effect.angle_only and s.is_rate)]
     root = machine.body[0].index
-    found: dict[str, tuple[tuple[int, ...], str | None]] = {}
+    wheels = [s for s in sensors if s.kind == "wheel"]
+    found: dict[str, tuple[tuple[int, ...], tuple[str, ...]]] = {}
     for place in effect.places:
         if place in each:
             found |= {b.where: ((b.index,), _angle_sensor(sensors, b)) for b in each[place]}
         elif place == "drive" and len(together) > 1:
-            found["drive"] = tuple(b.index for b in together), None
+            found["drive"] = tuple(b.index for b in together), ()
         elif place == "wheels":
-            found |= {s.place or s.name: ((s.body,), s.name) for s in sensors if s.kind == "wheel"}
+            found |= {s.place or s.name: ((s.body,), (s.name,)) for s in wheels}
+        elif place == "wheel_pair" and len(wheels) > 1:
+            found["measuring_wheels"] = (wheels[0].body,), tuple(s.name for s in wheels)
         elif place in ("yaw_rate", "lateral_speed"):
-            found |= {s.place or place: ((s.body,), s.name) for s in sensors if s.kind == place}
+            found |= {s.place or place: ((s.body,), (s.name,)) for s in sensors if s.kind == place}
         elif place == "machine" and machine.planar and (effect.gravity or payload_body(machine) is not None):
-            found["machine"] = (root,), None
+            found["machine"] = (root,), ()
     if effect.soil or effect.push:
         found = {w: at for w, at in found.items() if all(machine.find(k).contact for k in at[0])}
     if effect.angle_only:
-        found = {w: at for w, at in found.items() if at[1] is not None}
+        found = {w: at for w, at in found.items() if at[1]}
     return found
 
 
-def _angle_sensor(sensors: Sequence[Sensor], body: Body) -> str | None:
-    """Return the name of the sensor that measures a body's angle, None for none."""
-    return next((s.name for s in sensors if s.kind == "angle" and s.body == body.index), None)
+def _angle_sensor(sensors: Sequence[Sensor], body: Body) -> tuple[str, ...]:
+    """Return the name of the sensor that measures a body's angle, () for none."""
+    return tuple(s.name for s in sensors if s.kind == "angle" and s.body == body.index)[:1]
 
 
 def payload_body(machine: Machine) -> int | None:
@@ -151,8 +154,8 @@ def place_effect(machine: Machine, entry: EffectEntry, duration: float = DEFAULT
             raise MachineError(f"{machine.name}: effect {entry.name}: no shape {name}, allowed: {options}")
     if effect.positive and not float(entry.amount) > 0:
         raise MachineError(f"{machine.name}: effect {entry.name}: amount must be > 0 (got {float(entry.amount):g})")
-    bodies, sensor = allowed[where]
-    if effect.sensor_only and sensor is None:
+    bodies, sensors = allowed[where]
+    if effect.sensor_only and not sensors:
         raise MachineError(f"{machine.name}: effect {entry.name}: {where} has no sensor that it could sit in")
     site = Site.of(machine, bodies, duration)
     values = {"A": float(entry.amount)}
@@ -164,7 +167,7 @@ def place_effect(machine: Machine, entry: EffectEntry, duration: float = DEFAULT
             raise MachineError(
                 f"{machine.name}: effect {entry.name}: shape {name} must be one of {options} (got {values[name]:g})"
             )
-    made = PlacedEffect(effect, where, bodies, sensor, values, is_straight(machine, bodies))
+    made = PlacedEffect(effect, where, bodies, sensors, values, is_straight(machine, bodies))
     for name, shape in made.shapes.items():
         stated = (
             name in entry.shape and entry.shape[name].source != "identified"

@@ -107,6 +107,21 @@ def test_a_negative_amount_is_a_positive_one_half_a_turn_on(effect: Effect, circ
     assert abs(opposite_phase(0.7)) <= np.pi
 
 
+def test_both_measuring_wheels_further_out_turn_further_apart(va12: Model) -> None:
+    """Turned on the spot, the left one rolls -(D_l + A) angle / R_l, the right one (D_r + A) angle / R_r."""
+    model = build(placing.with_effects(VA12, shaped("measuring_wheel_position@measuring_wheels=0.01", {})))
+    turned = np.array([0.3, -1.2])
+    z = np.zeros((len(model.memory), 2))
+    z[model.memory.index("measuring_wheel_position@measuring_wheels.turned")] = turned
+    q, u, rolled = np.zeros((6, 2)), np.zeros((3, 2)), np.zeros((2, 2))
+    read = model.read(q, q, rolled, u, z, model.nominal).full()
+    change = read - va12.read(q, q, rolled, u, np.zeros((0, 2)), va12.nominal).full()
+    sensors = [s.name for s in VA12.sensors("full") if s.kind != "torque"]
+    np.testing.assert_allclose(change[sensors.index("thetal")], -0.01 * turned / 0.33)
+    np.testing.assert_allclose(change[sensors.index("thetar")], 0.01 * turned / 0.33)
+    assert np.count_nonzero(change.any(axis=1)) == 2
+
+
 def test_a_torque_map_is_a_table_between_its_nodes(va12: Model) -> None:
     """Against numpy's interpolation: a torque of the articulation by the front roll's speed, constant beyond."""
     x, f = np.array([-2, -1.5, -1, -0.5, -0.1, 0, 0.3, 0.5, 1, 1.2, 2]), np.arange(11) ** 2 - 30.0
@@ -738,7 +753,8 @@ def test_a_rate_has_no_errors_of_an_angle() -> None:
     assert offered("encoder_eccentricity") == {"rear_roll", "measuring_wheel_right"}
     assert not offered("articulation_backlash") | offered("articulation_compliance")
     assert offered("articulation_stop_spring") == {"articulation"}
-    assert offered("measuring_wheel_radius") == {"measuring_wheel_left", "measuring_wheel_right"}
+    wheels = {"measuring_wheel_left", "measuring_wheel_right", "measuring_wheels"}
+    assert offered("measuring_wheel_radius") == wheels
     names = {c.name for c in score_test.candidates(known, [s.name for s in known.sensors("full")], 60.0)}
     assert "encoder_eccentricity@rear_roll" in names
     assert not names & {"encoder_eccentricity@front_roll", "articulation_backlash@articulation"}
@@ -749,7 +765,7 @@ def test_a_rate_has_no_errors_of_an_angle() -> None:
 def test_effects_of_one_contact_on_others_need_a_drive() -> None:
     """Of the three-wheel roller the steered front roll is driven by nothing: nothing couples to it."""
     known = machine.load_machine("three_wheel")
-    assert placing.allowed_places(known, CATALOGUE["pump_coupling"]) == {"drive": ((1, 2), None)}
+    assert placing.allowed_places(known, CATALOGUE["pump_coupling"]) == {"drive": ((1, 2), ())}
     model = build(placing.with_effects(known, placing.parse_effect("pump_coupling=0.1", known, 10.0)))
     still, torque = np.zeros(len(model.coordinates)), np.array([100.0, 200.0, 0.0])
     more = model.balance(still, still, still, model.expand @ model.nominal, torque, []).full()
@@ -770,7 +786,7 @@ def test_what_needs_no_motor_may_sit_at_a_contact_that_has_none() -> None:
     assert set(TOWED) == possible | {"compaction_per_pass"}
     assert not set(TOWED) & needing
     assert {e.name for e in CATALOGUE.values() if e.soil or e.push} <= set(TOWED)
-    assert placing.allowed_places(THREE, CATALOGUE["compaction_per_pass"]) == {"drive": ((1, 2, 4), None)}
+    assert placing.allowed_places(THREE, CATALOGUE["compaction_per_pass"]) == {"drive": ((1, 2, 4), ())}
     with pytest.raises(MachineError, match="where must be one of left_roll, right_roll"):
         placing.parse_effect("torque_deadband@front_roll=100", THREE, 10.0)
 

@@ -420,10 +420,15 @@ def wheel_radius(t: Trial, size: float, draw: Draw) -> Key:
     return Key(((f"measuring_wheel_radius@{place}",),))
 
 
+def _of_both_wheels(effect: str) -> Key:
+    """An error of both measuring wheels, named once or at each."""
+    return Key(tuple((f"{effect}@{place}", f"{effect}@measuring_wheels") for place in WHEELS))
+
+
 def wheel_radii(t: Trial, size: float, draw: Draw) -> Key:
     """Both measuring wheels' radii up to 3 mm off. Source: temperature, load."""
     t.shift["R_wheel"] = _length(size, draw, 0.003)
-    return Key(tuple((f"measuring_wheel_radius@{place}",) for place in WHEELS))
+    return _of_both_wheels("measuring_wheel_radius")
 
 
 def track(t: Trial, size: float, draw: Draw) -> Key:
@@ -437,7 +442,7 @@ def both_tracks(t: Trial, size: float, draw: Draw) -> Key:
     """Both measuring wheels up to 10 mm further out or in. Source: tape measure."""
     more = _length(size, draw, 0.010)
     t.shift |= {"D_l": more, "D_r": more}
-    return Key(tuple((f"measuring_wheel_position@{place}",) for place in WHEELS))
+    return _of_both_wheels("measuring_wheel_position")
 
 
 def roll_counts(t: Trial, size: float, draw: Draw) -> Key:
