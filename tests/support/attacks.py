@@ -460,9 +460,9 @@ def wheel_counts(t: Trial, size: float, draw: Draw) -> Key:
 
 
 def articulation_counts(t: Trial, size: float, draw: Draw) -> Key:
-    """The articulation's encoder of fewer counts, down to 16000 for 16384: no name in the list. Source: see above."""
+    """The articulation's encoder of fewer counts, down to 16000 for 16384. Source: see above."""
     t.scene.read["theta2_rad"] *= round(16384 - 384 * size) / 16384
-    return Key()
+    return Key((("encoder_scale@articulation",),))
 
 
 def clock_rate(t: Trial, size: float, draw: Draw) -> Key:
@@ -480,16 +480,17 @@ def clocks_apart(t: Trial, size: float, draw: Draw) -> Key:
 
 
 def late_encoder(t: Trial, size: float, draw: Draw) -> Key:
-    """A roll's angle arrives up to 60 ms late: no name in the list. Source: CAN bus latency."""
-    t.sensed(ANGLE_COLUMN[_roll(draw)], lambda at, x: np.interp(at - 0.06 * size, at, x))
-    return Key()
+    """A roll's angle arrives up to 60 ms late. Source: CAN bus latency."""
+    place = _roll(draw)
+    t.sensed(ANGLE_COLUMN[place], lambda at, x: np.interp(at - 0.06 * size, at, x))
+    return Key(((f"encoder_delay@{place}",),))
 
 
 def late_gyro(t: Trial, size: float, draw: Draw) -> Key:
-    """The gyro arrives up to 100 ms late: no name in the list. Source: CAN bus latency."""
+    """The gyro arrives up to 100 ms late; by name a lag. Source: CAN bus latency."""
     t.kit = "full"
     t.sensed("yaw_rate_rad_s", lambda at, x: np.interp(at - 0.1 * size, at, x))
-    return Key()
+    return Key((("yaw_rate_lag@yaw_rate",),))
 
 
 def late_torques(t: Trial, size: float, draw: Draw) -> Key:
