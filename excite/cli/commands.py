@@ -727,17 +727,32 @@ def new_machine(
             autocompletion=options.machine_names,
         ),
     ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            help="shipped machine to copy whole, with unit and meaning of every key",
+            autocompletion=options.machine_names,
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="file to write [NAME.toml]")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Write a commented machine file to start from."""
+    """Write a commented machine file to start from: a roller, or a shipped machine.
+
+    Example: excite machine new my_tandem --from tandem
+    """
     from excite.cli import machine_template
     from excite.model.machine import shipped_machines
 
     if like is not None:
         workflows.require_known("--like", like, shipped_machines())
+    if origin is not None:
+        workflows.require_known("--from", origin, shipped_machines())
+    if like is not None and origin is not None:
+        raise UsageError("--from: writes a whole file, --like one that extends another: leave one out")
     out = out or Path(f"{name}.toml")
-    machine_template.start(name, out, like)
+    machine_template.start(name, out, like, origin)
     if json:
         terminal.show_json({"machine": name, "file": str(out)})
     else:

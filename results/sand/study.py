@@ -47,8 +47,8 @@ grows without bound when a wheel locks (that level is left out).
   law is ruled out. Supported laws (bold) are those not ruled out, without those that add to another of them.
 - **Saturation with slip divided by the larger speed is not supported**: its magnitude runs to the bound where it has
   no effect.
-- **What remains** is {remains} times the repeatability by the larger speed, {remains_rim} times by the rim speed: driving
-  flattens at about 1 N, which a linear law on both sides can't follow.
+- **What remains** is {remains} times the repeatability by the larger speed, {remains_rim} times by the rim speed:
+  driving flattens at about 1 N, which a linear law on both sides can't follow.
 
 `python results/sand/study.py` uses measurements of a smooth wheel on sand by Carnegie Mellon University
 (`../shared/data/cmu_single_wheel`): straight driving, 9 slip levels, 3 repeats each; `excite slip` does the same with

@@ -62,13 +62,14 @@ def test_another_soil_is_named_with_its_values(
     assert (np.abs(np.subtract(row["value"], truth)) < 3 * np.array(row["std"])).all()
     assert any("what changed: Kx1" in note for note in summary["notes"])
 
-
     code, stdout, _ = excite("diagnose", "va12_straight", *paths, "--out", tmp_path / "diagnosed", "--json")
     assert code == 0
     diagnosed = json.loads(stdout)
     assert (diagnosed["verdict"], diagnosed["findings"]) == ("named", [])
     assert list(diagnosed["differences"]["changed"]) == ["Kx1"]
-    assert diagnosed["answer"].startswith("Each log alone shows nothing that the model lacks, but the logs differ. Kx1: ")
+    assert diagnosed["answer"].startswith(
+        "Each log alone shows nothing that the model lacks, but the logs differ. Kx1: "
+    )
 
 
 def test_one_log_has_nothing_to_agree_with(straight: Model, straight_motion: Motion) -> None:
