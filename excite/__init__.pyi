@@ -9,5 +9,6 @@ from .interface import (
     read_log as read_log,
     score as score,
     simulate as simulate,
+    slip as slip,
     verify as verify,
 )

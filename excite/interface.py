@@ -11,7 +11,7 @@ A result prints as its command prints it, in a notebook too. `to_frame()` gives 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -30,10 +30,11 @@ from excite import (
     workflows,
 )
 from excite.errors import LogError
-from excite.identification import Estimate
+from excite.identification import Estimate, fit_slip_laws
 from excite.logs import Log, PlannedDrive, Prepared
 from excite.model import Model
 from excite.model.machine import load_machine
+from excite.model.mechanics import SoilConstants
 from excite.reports import (
     Account,
     ShownAssessment,
@@ -43,6 +44,7 @@ from excite.reports import (
     ShownLog,
     ShownPrediction,
     ShownScore,
+    ShownSlip,
     ShownVerification,
 )
 from excite.simulation import Motion
@@ -194,6 +196,32 @@ def diagnose(machine: Machine, logs: Source | Sequence[Source], *, budget_s: flo
     found = workflows.diagnose_from(ready.model, ready.logs, budget_s=budget_s)
     name = model.machine.name if isinstance(machine, Model) else str(machine)
     return ShownAssessment.of(found.assessment, partial(_diagnose_account, name, ready, found))
+
+
+def slip(
+    table: str | Path | pd.DataFrame,
+    *,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    per: str = "rim",
+    radius: float | None = None,
+    soil: SoilConstants | None = None,
+    machine: str | None = None,
+    where: str | None = None,
+) -> ShownSlip:
+    """Fit contact laws to a single-wheel test; `supported` has the laws that its data do not rule out.
+
+    table: a file, or a DataFrame. columns: role -> column, "-NAME" for the opposite sign, where names are not
+    recognised; roles are keys of `excite.logs.SLIP_ROLES`. units: role -> unit where headers say none.
+    per: what slips are divided by, "rim" as in machine files or the "larger" of rim and forward speed.
+    radius [m]: of the wheel, for a rate of turn. soil: constants whose law (18) is compared with the table.
+    machine, where: for which `contact.toml` of `save` is written, a table to paste by default.
+    Raises LogError for an unusable table, UsageError for an unknown `per` or contact, NotIdentifiableError for too few
+    settings.
+    """
+    workflows.require_known("per", per, ("rim", "larger"))
+    fit = fit_slip_laws(readers.read_slip_table(table, columns, units, per, radius))
+    return ShownSlip.of(fit, partial(workflows.slip_account, fit, soil, machine, where))
 
 
 def verify(

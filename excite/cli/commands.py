@@ -532,6 +532,91 @@ def diagnose(
         summary |= workflows.diagnose(place, machine, logs, filtering, design_next, terminal.bar, budget)
 
 
+@app.command()
+def slip(
+    table: Annotated[
+        Path | None,
+        typer.Argument(metavar="[TABLE]", help="forces of a wheel at some slips (.csv, .xlsx, .mat, .parquet, ...)"),
+    ] = None,
+    column: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--column",
+            help="ROLE=NAME, or ROLE=-NAME for the opposite sign, of a column that is not recognised (repeatable);"
+            " roles: slip, speed, rim_speed, spin, angle, load, traction, side, level",
+        ),
+    ] = None,
+    unit: Annotated[
+        list[str] | None,
+        typer.Option("--unit", help="ROLE=UNIT where the header says none, such as slip=% or angle=deg (repeatable)"),
+    ] = None,
+    per: Annotated[
+        str,
+        typer.Option(
+            "--per", help="what slips are divided by: `rim` speed as in machine files, or the `larger` of both speeds"
+        ),
+    ] = "rim",
+    radius: Annotated[float | None, typer.Option("--radius", help="of the wheel [m], for a rate of turn")] = None,
+    machine: Annotated[
+        str | None,
+        typer.Option(
+            "--machine",
+            help="machine that the contact is written for; a table to paste by default",
+            autocompletion=options.machine_names,
+        ),
+    ] = None,
+    where: Annotated[str | None, typer.Option("--where", help="its wheel or roll, all by default")] = None,
+    cohesion: Annotated[float | None, typer.Option("--cohesion", help="c of the soil [Pa]")] = None,
+    friction_angle: Annotated[
+        float | None, typer.Option("--friction-angle", help="phi of the soil, in degrees")
+    ] = None,
+    shear_modulus: Annotated[float | None, typer.Option("--shear-modulus", help="K of the soil [m]")] = None,
+    contact_length: Annotated[float | None, typer.Option("--contact-length", help="of the patch [m]")] = None,
+    width: Annotated[float | None, typer.Option("--width", help="of the patch [m]")] = None,
+    load: Annotated[float | None, typer.Option("--load", help="on the patch [N]")] = None,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Fit contact laws to a single-wheel test, or take the contact from a soil's constants.
+
+    Says which of the catalogue's laws the table supports, by settings left out of the fit, and writes the contact for a
+    machine file (contact.toml). With the six constants of the soil, their law (18) is compared with the table; without
+    a table it is the result.
+
+    Example: excite slip wheel.csv --column traction=DP_N --unit slip=% --machine va12
+    """
+    from math import radians
+
+    from excite.model.mechanics import SoilConstants
+
+    given = (cohesion, friction_angle, shear_modulus, contact_length, width, load)
+    soil = None
+    if any(x is not None for x in given):
+        if None in given:
+            raise UsageError(
+                "--cohesion, --friction-angle, --shear-modulus, --contact-length, --width, --load: give all six or none"
+            )
+        c, phi, K, length, wide, weight = (float(x) for x in given if x is not None)
+        try:
+            soil = SoilConstants(c, radians(phi), K, length, wide, weight)
+        except ValueError as err:
+            raise UsageError(f"soil: {err}") from None
+    workflows.require_known("--per", per, ("rim", "larger"))
+    columns, units = (_pairs(option, x or []) for option, x in (("--column", column), ("--unit", unit)))
+    out = out or Path(f"results/slip-{table.stem if table else 'soil'}")
+    inputs = [*([table] if table else []), *(_machine_file(machine) if machine else [])]
+    with _result(out, json, partial(terminal.show, "slip"), inputs) as (place, summary):
+        summary |= workflows.slip(place, table, columns, units, per, radius, soil, machine, where)
+
+
+def _pairs(option: str, given: Sequence[str]) -> dict[str, str]:
+    """Return the pairs of an option's NAME=VALUE. Raises UsageError."""
+    for text in given:
+        if not all(text.partition("=")[::2]):
+            raise UsageError(f"{option}: must be ROLE=NAME (got {text})")
+    return {role: value for role, _, value in (text.partition("=") for text in given)}
+
+
 logs = typer.Typer(help="Check or convert a log.", rich_markup_mode=None)
 app.add_typer(logs, name="log")
 
@@ -642,17 +727,32 @@ def new_machine(
             autocompletion=options.machine_names,
         ),
     ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            help="shipped machine to copy whole, with unit and meaning of every key",
+            autocompletion=options.machine_names,
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="file to write [NAME.toml]")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Write a commented machine file to start from."""
+    """Write a commented machine file to start from: a roller, or a shipped machine.
+
+    Example: excite machine new my_tandem --from tandem
+    """
     from excite.cli import machine_template
     from excite.model.machine import shipped_machines
 
     if like is not None:
         workflows.require_known("--like", like, shipped_machines())
+    if origin is not None:
+        workflows.require_known("--from", origin, shipped_machines())
+    if like is not None and origin is not None:
+        raise UsageError("--from: writes a whole file, --like one that extends another: leave one out")
     out = out or Path(f"{name}.toml")
-    machine_template.start(name, out, like)
+    machine_template.start(name, out, like, origin)
     if json:
         terminal.show_json({"machine": name, "file": str(out)})
     else:

@@ -1,8 +1,9 @@
-"""A machine file to start from: a commented template, or a shipped machine with columns to change."""
+"""A machine file to start from: a commented template, a shipped machine explained, or one with columns to change."""
 
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,15 @@ from excite.model.machine import Machine
 TEMPLATE = "machine.toml"
 
 
-def start(name: str, file: Path, like: str | None = None) -> None:
-    """Write the template, or a copy of the shipped machine `like` with its columns to change.
+def start(name: str, file: Path, like: str | None = None, origin: str | None = None) -> None:
+    """Write the template, the whole shipped machine `origin`, or one that extends `like` with its columns to change.
 
     Raises MachineError for an existing file or an impossible name.
     """
-    text = fresh(name, file) if like is None else renamed(name, file, machine.load_machine(like))
+    if origin is not None:
+        text = whole(name, file, origin)
+    else:
+        text = fresh(name, file) if like is None else renamed(name, file, machine.load_machine(like))
     if file.exists():
         raise MachineError(f"{file}: exists already, give another --out")
     with output.new_file(file) as place:
@@ -35,6 +39,77 @@ def fresh(name: str, file: Path) -> str:
         loader=jinja2.PackageLoader("excite", "templates"), keep_trailing_newline=True, undefined=jinja2.StrictUndefined
     ).get_template(TEMPLATE)
     return text.render(name=name, title=name.replace("_", " ").replace("-", " "), file=file)
+
+
+def whole(name: str, file: Path, origin: str) -> str:
+    """Return the whole file of a shipped machine, each key with unit and meaning. Raises MachineError."""
+    _named(name)
+    lines = [
+        f"# {name}: a copy of the shipped machine {origin}, with unit and meaning of every key. Everything is SI: m,",
+        "# kg, s, N, N m, rad. Change the values and their sources (paper, data sheet, measured, published, identified,",
+        f"# assumed or definition), then run `excite machine check {file}`. `excite docs` lists the keys that may be",
+        f'# added. To write only what differs, begin a file with extends = "{origin}" instead.',
+        "",
+    ]
+    record, header_of, open_list = "Machine", "", 0
+    text, tables = machine.machine_tables(origin)
+    for line in (_dumped(tables) if EXTENDS.search(text) else text).splitlines():
+        if header := HEADER.match(line):
+            header_of = header[1]
+            record = RECORDS.get("problems" if header_of.startswith("problems.") else header_of, "")
+            lines.append(line if record else _explained(line, machine.MEANINGS["Machine"].get(header_of)))
+            continue
+        key = KEY.match(line)
+        says = machine.MEANINGS.get(record, {}).get(key[1]) if key and not open_list else None
+        open_list += 0 if line.lstrip().startswith("#") else line.count("[") - line.count("]")
+        if key and not header_of and key[1] == "name":
+            line = f'name = "{name}"'
+        lines.append(line if open_list else _explained(line, says))
+    return "\n".join(lines) + "\n"
+
+
+EXTENDS = re.compile(r"^extends\s*=", re.MULTILINE)
+HEADER = re.compile(r"^\[\[?([\w.-]+)\]\]?")
+KEY = re.compile(r"^(\w+)\s*=")
+COMMENT = re.compile(r"""^((?:"[^"]*"|[^"#])*)#\s*(.*)$""")
+RECORDS = {  # of the tables of a machine file, by their headers
+    "": "Machine",
+    "body": "Body",
+    "body.inertia": "Inertia",
+    "body.friction": "Friction",
+    "body.contact": "Contact",
+    "body.limit": "JointLimit",
+    "sensor": "Sensor",
+    "filter": "Filter",
+    "problems": "Problem",
+    "effect": "EffectEntry",
+}
+
+
+def _dumped(tables: dict[str, Any], header: str = "") -> str:
+    """Write tables as TOML, quantities on one line each, tables of a machine file under their headers."""
+    lines, below = [], []
+    for key, value in tables.items():
+        name = f"{header}.{key}".lstrip(".")
+        own = (
+            name in RECORDS or header == "problems" or (not header and isinstance(value, dict) and "value" not in value)
+        )
+        if own and isinstance(value, list):
+            below += [f"\n[[{name}]]\n{_dumped(one, name)}" for one in value]
+        elif own and isinstance(value, dict):
+            below.append(_dumped(value, name) if name == "problems" else f"\n[{name}]\n{_dumped(value, name)}")
+        else:
+            lines.append(f"{key} = {_toml(value)}\n")
+    return "".join((*lines, *below))
+
+
+def _explained(line: str, says: str | None) -> str:
+    """Add a meaning to a line of TOML, before the comment that it has."""
+    if says is None:
+        return line
+    there = COMMENT.match(line)
+    code, rest = (there[1].rstrip(), f"; {there[2]}") if there else (line, "")
+    return f"{code} # {says}{rest}"
 
 
 def renamed(name: str, file: Path, like: Machine) -> str:

@@ -20,7 +20,7 @@ from excite import identification, simulation, trajectories, workflows
 from excite.cli import reference_html
 from excite.model import effects
 from excite.model.effects import DEFAULT_DURATION, Effect, Shape, Site, unit_size
-from excite.model.machine import UNITS, FileRecord, Machine, load_machine, shipped_machines
+from excite.model.machine import MEANINGS, UNITS, FileRecord, Machine, load_machine, shipped_machines
 
 MAX_SHAPE_SETS = 8  # sets of shapes that are listed one by one; chosen
 PLAIN_DEFAULTS = (str, int, float, tuple, type(None))  # types of defaults that are shown
@@ -159,7 +159,10 @@ def _keys(root: type[FileRecord]) -> Iterator[str]:
     """Yield the lines of a table of keys for a record and each record inside it."""
     for record in _records(root, set()):
         yield from (f"## {record.__name__}", "", _doc(record), "")
-        yield from _table("key | value | default", ((n, _type(f), _default(f)) for n, f in record.model_fields.items()))
+        said = MEANINGS.get(record.__name__, {})
+        heads = "key | value | default" + " | meaning" * bool(said)
+        keys = ((n, _type(f), _default(f)) for n, f in record.model_fields.items())
+        yield from _table(heads, ((*k, *([said.get(k[0], "-")] if said else [])) for k in keys))
 
 
 def _records(record: type[FileRecord], seen: set[type[FileRecord]]) -> Iterator[type[FileRecord]]:

@@ -47,6 +47,7 @@ from .saved_estimate import (
     read_estimate as read_estimate,
     write_estimate as write_estimate,
 )
+from .slip_laws import SlipFit as SlipFit, SlipLaw as SlipLaw, fit_slip_laws as fit_slip_laws, soil_law as soil_law
 from .status import add_consistent as add_consistent
 from .validation import (
     SignalComparison as SignalComparison,

@@ -36,8 +36,10 @@ from .results import (
     ShownLog as ShownLog,
     ShownPrediction as ShownPrediction,
     ShownScore as ShownScore,
+    ShownSlip as ShownSlip,
     ShownVerification as ShownVerification,
     drive_frame as drive_frame,
     rows_frame as rows_frame,
 )
+from .slip_figure import slip_figure as slip_figure
 from .top_view import footprints as footprints, steered_joints as steered_joints, top_view_figure as top_view_figure

@@ -13,7 +13,15 @@ import scipy.stats
 from excite import trajectories
 from excite.identification import SIGNIFICANT_BIAS
 from excite.smoothing import MAX_IDENTIFIABLE_STD
-from excite.text import count, first_lines, format_number, format_p_value, format_percent, format_rounded
+from excite.text import (
+    count,
+    first_lines,
+    format_number,
+    format_p_value,
+    format_percent,
+    format_rounded,
+    format_uncertain,
+)
 from excite.trajectories import TOLERANCE
 
 Summary = Mapping[str, Any]
@@ -22,6 +30,7 @@ WORD = re.compile(
     r"a|no|[a-z]{3,},?"
 )  # a word that a sentence may begin with in a capital letter; a name stays as it is
 NUMBER = re.compile(r"[<≤]?\s*[-+−]?\d")
+MISFIT_OF_REPEATS = 2.0  # error over repeatability, from which something remains; chosen
 MAX_CELLS = 200  # cells of a study in a table; chosen
 MAX_CONDITION = 1e15  # condition number that is infinite but for rounding
 FALSE_ALARM = 0.01  # probability of a verdict against intervals that hold; chosen
@@ -683,6 +692,73 @@ def _check_remarks(s: Summary) -> tuple[str, ...]:
     return (*(f"Wrong: {x}" for x in s["faults"]), *(f"Doubtful: {x}" for x in s["doubts"]), *s["remarks"])
 
 
+# ------------------------------------------------------------------------------------------------ contact laws
+
+
+def describe_slip(s: Summary) -> Description:
+    """Describe contact laws fitted to a single-wheel test: the laws supported, their errors, the contact."""
+    soil = s["soil"]
+    remarks = []
+    if soil is not None:
+        remarks.append(
+            f"The soil's constants give Kx = Ky = {format_number(soil['Kx_N'], 4)} N and the saturation slip K / xi_s ="
+            f" {format_number(soil['saturation_slip'], 3)}: (18), linear while |g| stays well below it (20)."
+        )
+    if s["table"] is None:
+        return Description(
+            "The contact of a soil", "contact.toml holds the contact for a machine file.", (), tuple(remarks)
+        )
+    supported, laws = s["supported"], s["laws"]
+    first = next(r for r in laws if r["law"] == supported[0])
+    known = [x for x in s["repeatability_N"].values() if x is not None]
+    if len(supported) == 1:
+        headline = f"The data support one law: {supported[0]}."
+    else:
+        headline = f"These data can't tell {len(supported)} laws apart: {'; '.join(supported)}."
+    headline += (
+        f" {'It' if len(supported) == 1 else 'The first'} errs by {format_number(first['rms_left_out_N'], 3)} N on"
+        " settings left out of the fit"
+    )
+    headline += f"; repeats differ by {format_number(max(known), 2)} N." if known else "; nothing was repeated."
+    if s["best"] not in supported:
+        best = next(r for r in laws if r["law"] == s["best"])
+        remarks.append(
+            f"{s['best']} errs less, by {format_number(best['rms_left_out_N'], 3)} N, but adds to a law that these data"
+            f" do not rule out (chance {format_number(first['chance'], 2)} against it; 0.5 is as good)."
+        )
+    if known and first["rms_left_out_N"] > MISFIT_OF_REPEATS * max(known):
+        remarks.append(
+            f"Repeats do not explain the error of {supported[0]}: something remains that it does not describe."
+        )
+    if s["per"] == "larger":
+        remarks.append(
+            "Slips are divided by the larger speed. Machine files divide by the rim speed, which is the same for a"
+            " driving wheel only: with --per rim the law holds for braking in a machine file, too."
+        )
+    rows = tuple(
+        (
+            r["law"],
+            ", ".join(
+                f"{n.replace('_', ' ')} {format_uncertain(p['value'], p['std'] or 0.0, p['unit'])}"
+                + ("" if p["std"] or r["chance"] is None else " (at its bound)")
+                for n, p in r["parameters"].items()
+            ),
+            format_number(r["rms_fitted_N"], 3),
+            format_number(r["rms_left_out_N"], 3) if r["chance"] is not None else "-",
+            format_number(r["chance"], 2),
+        )
+        for r in laws
+    )
+    marked = tuple(k for k, r in enumerate(laws) if r["supported"])
+    caption = (
+        f"Laws by their error on settings left out ({s['settings']} settings, {s['rows']} rows); chance: of predicting"
+        " a new setting better than the first, 0.5 is as well, below 0.05 a law is ruled out."
+    )
+    columns = ("law", "parameters", "error fitted [N]", "left out [N]", "chance")
+    table = Table(caption, columns, rows, marked, optional=(1,))
+    return Description(f"Contact laws of {s['table']}", headline, (table,), (*remarks, *s["notes"]))
+
+
 # ------------------------------------------------------------------------------------------------ diagnosis
 
 
@@ -825,5 +901,6 @@ DESCRIPTIONS: dict[str, Callable[[Summary], Description]] = {
     "log": describe_log,
     "machine": describe_machine,
     "diagnose": describe_diagnose,
+    "slip": describe_slip,
     "study": describe_study,
 }

@@ -31,6 +31,8 @@ CAPTIONS = {
     " band alone; along a log the residual in it, and in grey where 95 % of the readings are if the model is right.",
     "compare.png": "Drives side by side: condition number of Phi, and attainable standard deviation of the worst"
     " parameter [%]; hatched drives break a limit that their label names.",
+    "slip.png": "Forces against slip: measured, one mark a row, and by the laws that the data support, beside the"
+    " linear one. Right, the error of each law on settings left out of its fit, and the standard deviation of repeats.",
     "machine.png": "The machine from above: dots its centres of mass, green its measuring wheels, dashed with every"
     " steered joint at its stop.",
     "study.png": "Cell by cell: each parameter's error, root mean square over the cell's runs [%], and the share of 95"

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from excite import output
 from excite.diagnosis import Assessment
 from excite.errors import UsageError
-from excite.identification import Estimate, Prediction, Verification
+from excite.identification import Estimate, Prediction, SlipFit, Verification
 from excite.logs import Log, profile_of
 from excite.model import Model
 from excite.reports import figures, pages, plain_text
@@ -146,6 +146,10 @@ class ShownEstimate(Shown, Estimate):
 
 class ShownPrediction(Shown, Prediction):
     """Predicted signals with 95 % bands; fields as in `Prediction`."""
+
+
+class ShownSlip(Shown, SlipFit):
+    """Contact laws fitted to a single-wheel test; fields as in `SlipFit`."""
 
 
 class ShownAssessment(Shown, Assessment):

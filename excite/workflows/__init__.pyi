@@ -39,6 +39,7 @@ from .requests import (
 )
 from .score_workflow import judge_limits as judge_limits, score as score, score_account as score_account
 from .simulate_workflow import doubtful_effects as doubtful_effects, with_effects as with_effects
+from .slip_workflow import slip as slip, slip_account as slip_account
 from .study_plan import Study as Study, read_study as read_study
 from .study_runner import run_study as run_study
 from .verify_workflow import verify as verify, verify_account as verify_account

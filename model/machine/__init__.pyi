@@ -12,8 +12,10 @@ from .machine import (
     Sensor as Sensor,
     load_machine as load_machine,
     machine_files as machine_files,
+    machine_tables as machine_tables,
     shipped_machines as shipped_machines,
 )
+from .meanings import MEANINGS as MEANINGS
 from .records import (
     FileRecord as FileRecord,
     Number as Number,

@@ -594,6 +594,12 @@ def load_machine(name: str | Path) -> Machine:
         raise MachineError(error_line(path, err, Machine)) from None
 
 
+def machine_tables(name: str) -> tuple[str, dict[str, Any]]:
+    """Return the text of a shipped machine's own file, and its tables merged over those that it extends."""
+    path = _find(name)
+    return path.read_text(encoding="utf-8"), extends.read(path, MACHINES)
+
+
 def machine_files(name: str | Path) -> list[Path]:
     """Return the user's files behind a machine, including those it extends; none for a shipped machine.
 

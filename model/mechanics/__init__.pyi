@@ -1,6 +1,7 @@
 from .contact import (
     Saturation as Saturation,
     Slip as Slip,
+    SoilConstants as SoilConstants,
     Wrench as Wrench,
     rim_speed as rim_speed,
     slip as slip,

@@ -144,3 +144,47 @@ def mobilised_share(x: ca.SX, bend: ca.SX | float = 0.0) -> ca.SX:
     safe = ca.fmax(x, 0.05)
     exponential = ca.if_else(x < 0.05, series, 2 * (safe - 1 + ca.exp(-safe)) / safe**2)
     return exponential + bend * (1 / (1 + x / 3) - exponential)
+
+
+@dataclass(frozen=True)
+class SoilConstants:
+    """Constants of a soil and a patch of contact under uniform pressure.
+
+    cohesion c [Pa], friction_angle phi [rad], shear_modulus K [m] (18); length xi_s and width [m] of the patch;
+    load [N]. Raises ValueError for a value that no soil has.
+    """
+
+    cohesion: float
+    friction_angle: float
+    shear_modulus: float
+    length: float
+    width: float
+    load: float
+
+    def __post_init__(self) -> None:
+        for name in ("shear_modulus", "length", "width", "load"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: must be > 0 (got {getattr(self, name):g})")
+        if not self.cohesion >= 0:
+            raise ValueError(f"cohesion: must be >= 0 (got {self.cohesion:g})")
+        if not 0 <= self.friction_angle < np.pi / 2:
+            raise ValueError(f"friction_angle: must be from 0 to below pi / 2 (got {self.friction_angle:g})")
+
+    @property
+    def strength(self) -> float:
+        """Largest force [N] of the patch (18): A c + load tan(phi), A its area."""
+        return self.length * self.width * self.cohesion + self.load * float(np.tan(self.friction_angle))
+
+    @property
+    def saturation_slip(self) -> float:
+        """K / xi_s [-]: the slip at which the shear displacement is K at the rear of the patch."""
+        return self.shear_modulus / self.length
+
+    @property
+    def stiffness(self) -> float:
+        """Kx = Ky [N] < 0, the law's slope at zero slip (24, 25): -(A c + load tan(phi)) xi_s / (2 K).
+
+        The shear stress (c + sigma tan(phi)) |g| xi / K, linear along the patch, integrated over it (18, 20). The law
+        has no direction, so both are equal.
+        """
+        return -self.strength / (2 * self.saturation_slip)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from excite.cli import machine_template
 from excite.errors import MachineError
 from excite.logs import log
 from excite.model import Model, build
-from excite.model.machine import Machine, load_machine, shipped_machines
+from excite.model.machine import MEANINGS, Machine, load_machine, machine_tables, shipped_machines
 from excite.model.mechanics import tree
 from excite.reports import top_view
 from excite.simulation import Motion, sensors
@@ -59,6 +60,19 @@ def test_the_file_to_start_from_is_beyond_doubt(tmp_path: Path) -> None:
 def test_a_name_that_cannot_be_one_is_refused(name: str) -> None:
     with pytest.raises(MachineError):
         machine_template.fresh(name, Path("x.toml"))
+
+
+@pytest.mark.parametrize("name", shipped_machines())
+def test_a_shipped_machine_is_copied_whole_with_its_keys_explained(name: str) -> None:
+    text = machine_template.whole("mine", Path("mine.toml"), name)
+    _, tables = machine_tables(name)
+    assert tomllib.loads(text) == tables | {"name": "mine"}
+    known = {key for record in MEANINGS.values() for key in record}
+    for line in text.splitlines():
+        key = re.match(r"(\w+) = ", line)
+        assert key is None or key[1] not in known or " # " in line, line
+    if name == "tandem":
+        assert 'mass = { value = 5200, source = "assumed" } # [kg]' in text.splitlines()
 
 
 # ------------------------------------------------------------------------------------------------- wrong, doubtful

@@ -1,0 +1,329 @@
+"""Tables of a single-wheel test: forces of a wheel or roll on soil at some slips, slip angles and loads."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from excite.errors import LogError
+from excite.logs.files.common import UNITS_SAID, UNITS_UNKNOWN
+from excite.logs.tables import read_table
+from excite.model.machine import UNITS
+from excite.text import count
+
+
+@dataclass(frozen=True)
+class Role:
+    """What a column of the table may be: its SI unit, the quantities of its units, and the names it goes by."""
+
+    unit: str
+    quantities: tuple[str, ...]
+    names: tuple[str, ...]
+    meaning: str
+
+
+SLIP_ROLES = {
+    "slip": Role(
+        "-",
+        ("ratio",),
+        ("slip", "slip_ratio", "longitudinal_slip", "wheel_slip", "kappa", "s", "i"),
+        "+ driving, divided by the larger of rim and forward speed",
+    ),
+    "speed": Role(
+        "m/s",
+        ("speed",),
+        ("speed", "velocity", "v", "forward_speed", "travel_speed", "carriage_speed", "carriage_velocity"),
+        "of the wheel's centre over ground",
+    ),
+    "rim_speed": Role(
+        "m/s",
+        ("speed",),
+        ("rim_speed", "wheel_speed", "circumferential_speed", "peripheral_speed", "r_omega", "rw"),
+        "radius times rate of turn",
+    ),
+    "spin": Role(
+        "rad/s",
+        ("angular rate",),
+        ("spin", "omega", "w", "angular_velocity", "angular_speed", "wheel_rate"),
+        "rate of turn; needs the radius",
+    ),
+    "angle": Role(
+        "rad",
+        ("angle",),
+        ("slip_angle", "sideslip_angle", "angle", "alpha", "beta"),
+        "between the wheel's plane and its motion",
+    ),
+    "load": Role("N", ("force",), ("load", "fz", "normal_load", "vertical_load", "normal_force"), "on the contact"),
+    "traction": Role(
+        "N",
+        ("force",),
+        ("traction", "fx", "tractive_force", "drawbar_pull", "drawbar", "dp", "pull", "longitudinal_force"),
+        "net force of the soil on the wheel, + forward",
+    ),
+    "side": Role(
+        "N",
+        ("force",),
+        ("side", "fy", "side_force", "lateral_force", "cornering_force"),
+        "of the soil on the wheel, against its lateral motion negative",
+    ),
+    "level": Role("-", ("ratio",), ("level", "setting", "setpoint"), "equal for repeats of one setting"),
+}
+RATIOS = {"-": 1.0, "%": 0.01, "percent": 0.01, "pct": 0.01}
+AVERAGED = re.compile(r"^(avg|mean|average)_")
+SPREAD = re.compile(r"(^|_)(std|sd|stdev|slope|offset|min|max)(_|$)")
+SAME_SLIP = 0.02  # slips closer than this, one to the next, are of one setting; chosen
+SAME_ANGLE = math.radians(2)  # [rad] the same of slip angles; chosen
+SAME_LOAD = 0.1  # the same of loads, of their mean; chosen
+SWEEP_LEVELS = 12  # stretches of slip that a continuous sweep is divided into; chosen
+MIN_RIM_SHARE = 0.05  # rim speed over forward speed, below which slip divided by the rim speed says nothing; chosen
+PER = ("rim", "larger")
+
+
+@dataclass(frozen=True)
+class SlipTable:
+    """Rows of a single-wheel test, in SI units and the machine file's axes.
+
+    Vx, Vy, rim (N,) [m/s]: velocity of the centre along and across the wheel, speed of the rim.
+    load (N,) [N], or None. forces: "traction", and "side" if it was measured, (N,) [N] each.
+    level (N,): number of the setting, equal for repeats.
+    per: what slips are divided by, "rim" as in the machine file, or the "larger" of rim and forward speed.
+    notes: what was taken for what, and left out.
+    """
+
+    source: str
+    Vx: np.ndarray
+    Vy: np.ndarray
+    rim: np.ndarray
+    load: np.ndarray | None
+    forces: Mapping[str, np.ndarray]
+    level: np.ndarray
+    per: str
+    notes: tuple[str, ...] = ()
+
+    @property
+    def norm(self) -> np.ndarray:
+        """Speed [m/s] that slips are divided by."""
+        return np.abs(self.rim) if self.per == "rim" else np.maximum(np.abs(self.rim), np.hypot(self.Vx, self.Vy))
+
+    @property
+    def slip(self) -> np.ndarray:
+        """Longitudinal slip [-], + driving (the -g_x of the machine file's laws)."""
+        return (self.rim - self.Vx) / self.norm
+
+    @property
+    def angle(self) -> np.ndarray:
+        """Slip angle [rad]."""
+        return np.arctan2(self.Vy, np.abs(self.Vx))
+
+
+def read_slip_table(
+    source: str | Path | pd.DataFrame,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    per: str = "rim",
+    radius: float | None = None,
+) -> SlipTable:
+    """Read a table of a single-wheel test.
+
+    columns: role (a key of SLIP_ROLES) -> name of its column, "-NAME" for one of opposite sign; the others are
+        recognised by name. units: role -> unit; the others come from the headers, SI where these say nothing.
+    per: see `SlipTable`. radius [m]: of the wheel, for a rate of turn.
+    Raises LogError: what is missing or impossible, and what to do.
+    """
+    name = "the table" if isinstance(source, pd.DataFrame) else str(source)
+    chosen, units = dict(columns or {}), dict(units or {})
+    table = source if isinstance(source, pd.DataFrame) else read_table(source, [c.lstrip("-") for c in chosen.values()])
+    for role in (*chosen, *units):
+        if role not in SLIP_ROLES:
+            raise LogError(f"{name}: {role} is no role of a column, allowed: {', '.join(SLIP_ROLES)}")
+    every = {role: _Column.find(name, table, role, chosen, units) for role in SLIP_ROLES}
+    found = {role: column for role, column in every.items() if column is not None}
+    if {"speed", "rim_speed"} <= found.keys():
+        found.pop("slip", None)
+    notes = [f"{role.replace('_', ' ')}: column {c.name} [{c.unit}]{c.remark}" for role, c in found.items()]
+    values = {role: c.values for role, c in found.items()}
+    if "traction" not in values:
+        raise LogError(_missing(name, table, "traction"))
+    kept = np.all([np.isfinite(v) for v in values.values()], axis=0)
+    if not kept.all():
+        notes.append(f"{count(int((~kept).sum()), 'row')} with missing values left out")
+    values = {role: v[kept] for role, v in values.items()}
+    if "spin" in values and "rim_speed" not in values:
+        if radius is None:
+            raise LogError(f"{name}: column {found['spin'].name} is a rate of turn, give the wheel's radius as well")
+        values["rim_speed"] = radius * values["spin"]
+    Vx, Vy, rim = _speeds(name, table, values, notes)
+    level = _levels(rim, Vx, Vy, values)
+    made = SlipTable(
+        name, Vx, Vy, rim, values.get("load"), {k: values[k] for k in ("traction", "side") if k in values}, level, per
+    )
+    least = MIN_RIM_SHARE * np.abs(Vx) if per == "rim" else np.zeros(len(Vx))
+    inside = (made.norm > least) & (made.norm > 0)
+    if not inside.all():
+        notes.append(
+            f"{count(int((~inside).sum()), 'row')} of a wheel that hardly turns left out: slip divided by the rim speed"
+            " has no bound there; slip per larger speed keeps them"
+        )
+    return _require_usable(_rows(made, inside, tuple(notes)))
+
+
+def _rows(t: SlipTable, at: np.ndarray, notes: tuple[str, ...]) -> SlipTable:
+    forces = {k: v[at] for k, v in t.forces.items()}
+    _, level = np.unique(t.level[at], return_inverse=True)
+    load = None if t.load is None else t.load[at]
+    return SlipTable(t.source, t.Vx[at], t.Vy[at], t.rim[at], load, forces, level, t.per, notes)
+
+
+def _require_usable(t: SlipTable) -> SlipTable:
+    """Return the table. Raises LogError for too few settings, and forces or loads of the wrong sign."""
+    levels = int(t.level.max()) + 1 if len(t.level) else 0
+    if levels < 4:
+        raise LogError(f"{t.source}: {count(levels, 'setting')} of slip, laws need 4 at least")
+    if t.load is not None and not (t.load > 0).all():
+        raise LogError(f"{t.source}: load: must be > 0 in every row; if down is negative give load=-COLUMN")
+    straight = np.abs(t.angle) <= max(float(np.abs(t.angle).min()), SAME_ANGLE)
+    pairs = (("traction", t.slip, straight, 1), ("side", t.Vy / t.norm, np.full(len(t.slip), True), -1))
+    for role, slip, at, sign in pairs:
+        force = t.forces.get(role)
+        if force is None or np.ptp(slip[at]) < SAME_SLIP or np.ptp(force[at]) == 0:
+            continue
+        if sign * np.corrcoef(slip[at], force[at])[0, 1] < -0.5:
+            way = "grow with slip" if sign > 0 else "be against the lateral motion"
+            raise LogError(f"{t.source}: {role}: the force must {way}, here it does the opposite; give {role}=-COLUMN")
+    return t
+
+
+@dataclass(frozen=True)
+class _Column:
+    name: str
+    values: np.ndarray
+    unit: str
+    remark: str
+
+    @classmethod
+    def find(
+        cls, source: str, table: pd.DataFrame, role: str, chosen: Mapping[str, str], units: Mapping[str, str]
+    ) -> _Column | None:
+        """Return the column of a role in SI units, None if there is none. Raises LogError."""
+        there = [str(c) for c in table.columns]
+        said: dict[str, str] = {**table.attrs.get(UNITS_UNKNOWN, {}), **table.attrs.get(UNITS_SAID, {})}
+        if role in chosen:
+            wanted = chosen[role]
+            name = wanted if wanted in there else wanted.removeprefix("-")
+            if name not in there:
+                raise LogError(f"{source}: no column {name} for {role}, there are: {', '.join(there)}")
+            sign = 1.0 if name == wanted else -1.0
+        else:
+            known = SLIP_ROLES[role].names
+            taken = {c.removeprefix("-") for c in chosen.values()}
+            fits = [c for c in there if c not in taken and _split(c)[0] in known]
+            best = [c for c in fits if _split(c)[0] == min((_split(f)[0] for f in fits), key=known.index)]
+            if len(best) > 1:
+                raise LogError(f"{source}: {role} may be {' or '.join(best)}: say which ({role}=COLUMN)")
+            if not best:
+                return None
+            name, sign = best[0], 1.0
+        unit = (units.get(role) or said.get(name) or _split(name)[1] or "").strip("[]() ")
+        values = sign * pd.to_numeric(table[name], errors="coerce").to_numpy(float)
+        return cls(name, values * _size(source, role, name, unit, values), unit or SLIP_ROLES[role].unit, _remark(sign))
+
+
+def _remark(sign: float) -> str:
+    return "" if sign > 0 else ", sign turned"
+
+
+def _size(source: str, role: str, name: str, unit: str, values: np.ndarray) -> float:
+    """Return the SI value of one of a column's unit. Raises LogError."""
+    allowed = {u: size for u, (q, size) in UNITS.items() if q in SLIP_ROLES[role].quantities}
+    if SLIP_ROLES[role].quantities == ("ratio",):
+        allowed = RATIOS
+    if role == "level":
+        return 1.0
+    if unit and unit not in allowed:
+        raise LogError(f"{source}: {name}: {unit} is no unit of {role}, allowed: {', '.join(allowed)}")
+    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    if not unit and role == "slip" and largest > 2:
+        raise LogError(f"{source}: {name}: slips up to {largest:g} and no unit: per cent? give slip=%")
+    if not unit and role == "angle" and largest > math.pi / 2:
+        raise LogError(f"{source}: {name}: slip angles up to {largest:g} and no unit: degrees? give angle=deg")
+    return allowed[unit] if unit else 1.0
+
+
+def _split(header: str) -> tuple[str, str | None]:
+    """Split a header into its plain name and its unit: "Fx (kN)", "avg_speed_mm_s", "slip [%]"."""
+    bracket = re.fullmatch(r"(.*?)\s*[\[(]\s*(.+?)\s*[\])]\s*", header)
+    bare, unit = (bracket[1], bracket[2]) if bracket else (header, None)
+    plain = re.sub(r"[^a-z0-9%]+", "_", bare.lower()).strip("_")
+    if SPREAD.search(plain):
+        return "", None
+    plain = AVERAGED.sub("", plain)
+    if unit is None:
+        for known in sorted((*UNITS, *RATIOS), key=len, reverse=True):
+            end = "_" + re.sub(r"[^a-z0-9%]+", "_", known.lower()).strip("_")
+            if len(end) > 1 and plain.endswith(end):
+                return plain.removesuffix(end), known
+    return plain, unit
+
+
+def _missing(source: str, table: pd.DataFrame, role: str) -> str:
+    r = SLIP_ROLES[role]
+    return (
+        f"{source}: no column is {role.replace('_', ' ')} ({r.meaning}); name it ({role}=COLUMN), there are:"
+        f" {', '.join(map(str, table.columns))}"
+    )
+
+
+def _speeds(
+    source: str, table: pd.DataFrame, values: Mapping[str, np.ndarray], notes: list[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return velocity along and across the wheel and speed of its rim [m/s] of every row. Raises LogError."""
+    angle = values.get("angle", np.zeros(len(values["traction"])))
+    if "speed" in values and "rim_speed" in values:
+        speed, rim = values["speed"], values["rim_speed"]
+        return speed * np.cos(angle), speed * np.sin(angle), rim
+    if "slip" not in values:
+        raise LogError(_missing(source, table, "slip") + "; or give speed and rim_speed")
+    s = values["slip"]
+    if (s < -1).any() or (s > 1).any():
+        raise LogError(
+            f"{source}: slip: must be from -1 to 1 (got {s.min():g} to {s.max():g}); give speed and rim_speed"
+        )
+    if "rim_speed" in values:
+        rim = values["rim_speed"]
+        Vx = np.where(s >= 0, rim * (1 - s), rim / np.maximum(1 + s, 1e-9))
+    else:
+        Vx = values.get("speed", np.ones(len(s))) * np.cos(angle)
+        Vx = np.where(s == 1, 0.0, Vx)
+        rim = np.where(s >= 0, np.where(s == 1, 1.0, Vx / np.maximum(1 - s, 1e-9)), Vx * (1 + s))
+        if "speed" not in values:
+            notes.append("no speed given: 1 m/s assumed, which a law of slip alone doesn't notice")
+    return Vx, Vx * np.tan(angle), rim
+
+
+def _levels(rim: np.ndarray, Vx: np.ndarray, Vy: np.ndarray, values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Number the settings: by a column of levels, or rows whose slip, slip angle and load agree."""
+    if "level" in values:
+        keys = [values["level"]]
+    else:
+        speed = np.hypot(Vx, Vy)
+        slip = (rim - speed) / np.maximum(np.maximum(np.abs(rim), speed), 1e-12)
+        load = values.get("load", np.ones(len(slip)))
+        keys = [_chained(slip, SAME_SLIP), _chained(load / np.mean(load), SAME_LOAD)]
+        if keys[0].max() < 3:  # a sweep
+            keys[0] = np.digitize(slip, np.quantile(slip, np.linspace(0, 1, SWEEP_LEVELS + 1)[1:-1]))
+    keys.append(_chained(np.arctan2(Vy, np.maximum(np.abs(Vx), 1e-12)), SAME_ANGLE))
+    return np.unique(np.column_stack(keys), axis=0, return_inverse=True)[1].ravel()
+
+
+def _chained(x: np.ndarray, gap: float) -> np.ndarray:
+    """Number groups of values with no gap inside."""
+    order = np.argsort(x)
+    group = np.empty(len(x), int)
+    group[order] = np.concatenate([[0], np.cumsum(np.diff(x[order]) > gap)])
+    return group
