@@ -1,5 +1,6 @@
 from .interface import (
     __version__ as __version__,
+    campaign as campaign,
     compare as compare,
     design as design,
     diagnose as diagnose,

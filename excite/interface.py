@@ -38,6 +38,7 @@ from excite.model.mechanics import SoilConstants
 from excite.reports import (
     Account,
     ShownAssessment,
+    ShownCampaign,
     ShownComparison,
     ShownDesign,
     ShownEstimate,
@@ -49,7 +50,7 @@ from excite.reports import (
 )
 from excite.simulation import Motion
 from excite.trajectories import Design
-from excite.workflows import DesignRequest, DiagnoseResult
+from excite.workflows import CampaignRequest, DesignRequest, DiagnoseResult
 
 __version__ = version("excite")
 
@@ -89,6 +90,8 @@ def design(
     sigma_max: float | None = None,
     cond_slack: float = 12.0,
     robust: bool = False,
+    between: Sequence[str] = (),
+    of: str | Path | None = None,
     starts: int = 2,
     seed: int = 0,
     budget: float | None = None,
@@ -103,6 +106,8 @@ def design(
     sigma_max [%]: bound on the largest attainable standard deviation.
     cond_slack [%]: with objective cond, by how much cond(Phi) may grow for the most accurate drive; 0 for the lowest.
     robust: design for machines up to 20 % off the nominal one.
+    between: with objective discrimination, the effects NAME[@WHERE]=MAGNITUDE to separate, two or more.
+    of: with objective prediction (mean) or prediction-max, the profile or design folder of the drive to predict.
     starts, seed: starting guesses and their random seed.
     budget [s]: time after which the search stops.
     solver: a name of `excite.trajectories.SOLVERS`: `own`, or `ipopt` for a check.
@@ -110,19 +115,66 @@ def design(
     Raises InfeasibleError with the limit that can't be kept, SolverError if the solver finds no optimum, UsageError for
     an unknown name.
     """
-    model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
-    name, chosen = workflows.choose_problem(model.machine, problem, duration)
-    workflows.require_objective(objective, model.machine)
-    workflows.require_known("solver", solver, tuple(trajectories.SOLVERS))
-    workflows.require_positive("sigma_max", sigma_max, "%")
-    workflows.require_positive("budget", budget, "s")
     request = DesignRequest(
-        objective, sigma_max, robust, (), starts, seed, budget, cond_slack=cond_slack, solver=solver
+        objective,
+        sigma_max,
+        robust,
+        (),
+        starts,
+        seed,
+        budget,
+        tuple(between),
+        cond_slack=cond_slack,
+        solver=solver,
+        of=None if of is None else Path(of),
     )
+    model, name, chosen = workflows.prepare_design(_as_given(machine), problem, duration, request)
     begin = time.perf_counter()
     found = workflows.design_from(model, chosen, request, progress)
     wall_s = time.perf_counter() - begin
     return ShownDesign.of(found.design, partial(workflows.design_account, found, name, chosen, request, wall_s))
+
+
+def campaign(
+    machine: Machine,
+    target: float | Mapping[str, float],
+    problem: str | None = None,
+    objective: str = "worst",
+    *,
+    drives: int = 1,
+    duration: float | None = None,
+    within: float | None = None,
+    after: Sequence[str | Path] = (),
+    of: str | Path | None = None,
+    starts: int = 2,
+    seed: int = 0,
+    budget: float | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+) -> ShownCampaign:
+    """Design the fewest drives, then the shortest, that attain an accuracy together; the best found if none do.
+
+    target [%]: of the worst parameter's standard deviation, or of single parameters by name, of which the others then
+    don't matter (those of "" is the target of all others); with another objective in per cent, of its value.
+    drives: the most. duration [s]: longest of one drive, the problem's if not given. within [s]: longest time of all.
+    after: earlier logs, whose information counts. Other arguments as in `design`.
+    `reached` tells whether the target is. Raises what `design` raises.
+    """
+    single = dict(target) if isinstance(target, Mapping) else {}
+    general = single.pop("", None) if isinstance(target, Mapping) else target
+    one = DesignRequest(
+        objective,
+        after=tuple(map(Path, after)),
+        starts=starts,
+        seed=seed,
+        budget_s=budget,
+        of=None if of is None else Path(of),
+    )
+    model, name, chosen = workflows.prepare_design(_as_given(machine), problem, duration, one)
+    request = workflows.check_campaign(CampaignRequest(general, single, drives, within, one), model, chosen)
+    begin = time.perf_counter()
+    found = workflows.campaign_from(model, chosen, request, progress)
+    wall_s = time.perf_counter() - begin
+    return ShownCampaign.of(found.campaign, partial(workflows.campaign_account, found, name, chosen, request, wall_s))
 
 
 def simulate(
@@ -284,6 +336,10 @@ def compare(
     usual, own = workflows.read_rivals("against", against, model, chosen)
     found = trajectories.compare(model, chosen, samples, seed, budget, None, usual, own)
     return ShownComparison.of(found, partial(workflows.compare_account, model, name, found, samples, seed, budget))
+
+
+def _as_given(machine: Machine) -> str | Model:
+    return machine if isinstance(machine, Model) else str(machine)
 
 
 def _called(given: object, otherwise: str) -> str:

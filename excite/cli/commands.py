@@ -141,8 +141,28 @@ def design(
         list[str] | None,
         typer.Option(
             "--between",
-            help="given twice: two effects NAME[@WHERE]=MAGNITUDE that the drive must separate, such as"
+            help="given twice or more: effects NAME[@WHERE]=MAGNITUDE that the drive must separate, such as"
             " ground_slope=0.01; `excite docs` lists effects and units",
+        ),
+    ] = None,
+    of: Annotated[
+        Path | None,
+        typer.Option("--of", help="profile (.csv) or design folder of the drive that --objective prediction is about"),
+    ] = None,
+    target: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--target",
+            help="design the fewest and shortest drives after which the worst parameter has this standard deviation, in"
+            " per cent; PARAMETER=PERCENT for a single one (repeatable); with another --objective, a target of its"
+            " value",
+        ),
+    ] = None,
+    drives: Annotated[int, typer.Option("--drives", min=1, help="for --target: most drives, designed together")] = 1,
+    within: Annotated[
+        float | None,
+        typer.Option(
+            "--within", help="for --target: longest time of driving, in seconds; no drive is longer than --duration"
         ),
     ] = None,
     driver: Annotated[bool, typer.Option("--driver", help="design for a person at the levers, in phases")] = False,
@@ -159,25 +179,33 @@ def design(
     Finds the torques over time that make every parameter identifiable, and states the attainable accuracy.
 
     Example: excite design va12 --duration 30 --objective accuracy
+    Example: excite design va12 --target 0.5 --drives 3
     """
-    from excite.workflows import DesignRequest
+    from excite.workflows import CampaignRequest, DesignRequest
 
     if between:
-        if len(between) != 2 or objective not in ("cond", "discrimination"):
-            raise UsageError("--between: give it twice, two effects, and no other --objective")
+        if len(between) < 2 or objective not in ("cond", "discrimination"):
+            raise UsageError("--between: give it at least twice, two effects or more, and no other --objective")
         objective = "discrimination"
     if phase_min != 3.0 and not driver:
         raise UsageError("--phase-min needs --driver as well")
     earlier, pair = tuple(after or ()), tuple(between or ())
     request = DesignRequest(
-        objective, sigma_max, robust, earlier, starts, seed, budget, pair, driver, phase_min, cond_slack, solver
+        objective, sigma_max, robust, earlier, starts, seed, budget, pair, driver, phase_min, cond_slack, solver, of
     )
     out = out or Path(f"results/design-{workflows.machine_stem(machine)}")
-    with _result(out, json, partial(terminal.show, "design"), [*_machine_file(machine), *(after or [])]) as (
-        place,
-        summary,
-    ):
-        summary |= workflows.design(place, machine, problem, duration, request, terminal.bar)
+    inputs = [*_machine_file(machine), *(after or []), *([] if of is None else [of])]
+    if target is None:
+        if drives != 1 or within is not None:
+            raise UsageError("--drives and --within need --target as well")
+        with _result(out, json, partial(terminal.show, "design"), inputs) as (place, summary):
+            summary |= workflows.design(place, machine, problem, duration, request, terminal.bar)
+        return
+    together = CampaignRequest(*workflows.read_targets(target), drives, within, request)
+    with _result(out, json, partial(terminal.show, "campaign"), inputs) as (place, summary):
+        summary |= workflows.campaign(place, machine, problem, duration, together, terminal.bar)
+    if not summary["reached"]:
+        raise typer.Exit(1)
 
 
 @app.command(cls=CommandWithChoices)

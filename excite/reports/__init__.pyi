@@ -13,9 +13,11 @@ from .diagnosis_figures import (
 )
 from .figures import (
     COLOURS as COLOURS,
+    campaign_figure as campaign_figure,
     compare_figure as compare_figure,
     comparison_figure as comparison_figure,
     design_figure as design_figure,
+    draw_campaign as draw_campaign,
     escape_dollar as escape_dollar,
     prediction_figure as prediction_figure,
     save as save,
@@ -30,6 +32,7 @@ from .results import (
     Account as Account,
     Shown as Shown,
     ShownAssessment as ShownAssessment,
+    ShownCampaign as ShownCampaign,
     ShownComparison as ShownComparison,
     ShownDesign as ShownDesign,
     ShownEstimate as ShownEstimate,

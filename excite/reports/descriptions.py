@@ -163,6 +163,13 @@ def describe_design(s: Summary) -> Description:
             f" to {format_percent(lowest['worst_percent'])}; this drive is the most accurate one within"
             f" {s['cond_slack_percent']:g} % of it (`--cond-slack 0` gives the other)."
         )
+    if s.get("prediction"):
+        p = s["prediction"]
+        remarks.append(
+            f"Along {p['of']} the signals are predicted with a standard deviation of"
+            f" {format_percent(p['mean_percent'])} of each signal's own size in the root mean square,"
+            f" {format_percent(p['max_percent'])} at most."
+        )
     remarks += describe_outside_law(s.get("share_outside_law"))
     if not s["complete"]:
         remarks.append("Cut short: this is the best drive so far, more time may find a better one.")
@@ -183,6 +190,68 @@ def describe_design(s: Summary) -> Description:
     return Description(
         f"Test drive for {s['machine']}, problem {s['problem']}", headline, tuple(tables), tuple(remarks)
     )
+
+
+def describe_campaign(s: Summary) -> Description:
+    """Describe drives designed together: the target, what is attained, each drive, what else was tried."""
+    n, target = len(s["drives"]), format_percent(s["target_percent"])
+    what = {
+        "worst": f"every parameter is known to {format_percent(s['attained_percent'], 3)} or better",
+        "discrimination": f"every effect is identified to {format_percent(s['attained_percent'], 3)} or better",
+    }.get(s["objective"], f"{s['objective']} is {format_percent(s['attained_percent'], 3)}")
+    length = f"{count(n, 'drive')} of {format_number(s['duration_s'], 4)} s"
+    if any(s["targets"][name] for name in s["targets"] if name):
+        asked = ", ".join(f"{k or 'all others'} {format_percent(v)}" for k, v in s["targets"].items())
+        what = (
+            f"all targets ({asked}) are met"
+            if s["reached"]
+            else (
+                "the standard deviation is up to"
+                f" {format_number(s['attained_percent'] / s['target_percent'], 3)} times a target ({asked})"
+            )
+        )
+    limit = f"{count(s['most_drives'], 'drive')} of {s['longest_s']:g} s"
+    if s["within_s"] is not None:
+        limit += f" and {s['within_s']:g} s in all"
+    if s["reached"]:
+        headline = f"After {length}, {s['total_s'] / 60:.2g} min of driving, {what} (target {target})."
+    else:
+        headline = (
+            f"Not reachable within {limit}, as far as this search finds: the best is {length}, after which {what}"
+            f" (target {target})."
+        )
+    headline = f"{headline[:-1]}; one standard deviation, Cramer-Rao bound."
+    remarks = []
+    if not s["complete"]:
+        remarks.append("Cut short: this is the best so far, more time may find fewer or shorter drives.")
+    missed = [t for t in s["trials"] if t["drives"] == n and t["duration_s"] < s["duration_s"]]
+    if s["reached"] and missed:
+        near = max(missed, key=lambda t: t["duration_s"])
+        got = "keep no limits" if near["percent"] is None else f"attained {format_percent(near['percent'], 3)}"
+        remarks.append(f"The longest shorter ones tried, {near['duration_s']:g} s each, {got}.")
+    if s["max_violation"] > TOLERANCE:
+        remarks.append(f"Limits are exceeded by {100 * s['max_violation']:.2f} % of their range.")
+    remarks.append(
+        "Each folder is a design, which `excite drive` and `excite verify` take; `excite identify` takes the logs of"
+        " all drives together."
+    )
+    shown = tuple(
+        (d["folder"], format_number(d["duration_s"], 4), format_number(d["alone_percent"], 3)) for d in s["drives"]
+    )
+    tried = tuple(
+        (
+            str(t["drives"]),
+            format_number(t["duration_s"], 4),
+            "-" if t["percent"] is None else format_number(t["percent"], 3),
+        )
+        for t in s["trials"]
+    )
+    tables = (
+        Table("Drives, and what each attains alone.", ("folder", "s", "%"), shown),
+        Table("What was tried, and what it attains together.", ("drives", "s each", "%"), tried),
+        _sigma_table(s),
+    )
+    return Description(f"Campaign for {s['machine']}, problem {s['problem']}", headline, tables, tuple(remarks))
 
 
 def describe_score(s: Summary) -> Description:
@@ -892,6 +961,7 @@ def _cell_error(row: Mapping[str, Any]) -> str:
 
 DESCRIPTIONS: dict[str, Callable[[Summary], Description]] = {
     "design": describe_design,
+    "campaign": describe_campaign,
     "drive": describe_drive,
     "score": describe_score,
     "compare": describe_compare,

@@ -181,6 +181,42 @@ def sigma_figure(sigma: Mapping[str, float], title: str) -> Figure:
     return figure
 
 
+def campaign_figure(summary: Mapping[str, Any], title: str) -> Figure:
+    """Plot what drives designed together attain [%] over the time of driving [min], from a campaign's summary."""
+    figure = Figure(figsize=(7.5, 4.5), layout="constrained")
+    ax = figure.subplots()
+    figure.suptitle(escape_dollar(title), fontsize=11)
+    draw_campaign(ax, summary)
+    return figure
+
+
+def draw_campaign(ax: Axes, summary: Mapping[str, Any]) -> None:
+    """Draw the trials of a campaign, its target and its answer."""
+    trials = [t for t in summary["trials"] if t["percent"] is not None and np.isfinite(t["percent"])]
+    first, target = trials[0], summary["target_percent"]
+    most = max(t["drives"] * t["duration_s"] for t in trials)
+    repeats = max(first["duration_s"] * max(1.0, first["percent"] / target) ** 2, most)
+    t = np.geomspace(first["duration_s"], 1.05 * repeats, 50)
+    ax.plot(t / 60, first["percent"] * np.sqrt(first["duration_s"] / t), color="0.65", label="first drive repeated")
+    for k, count in enumerate(sorted({t["drives"] for t in trials})):
+        own = sorted((t["duration_s"], t["percent"]) for t in trials if t["drives"] == count)
+        minutes = [count * seconds / 60 for seconds, _ in own]
+        label = f"{count} drive{'s' if count > 1 else ''}"
+        ax.plot(minutes, [percent for _, percent in own], marker="o", markersize=4, **_style(k), label=label)
+    ax.axhline(target, color="k", linestyle=":", linewidth=1)
+    ax.plot(summary["total_s"] / 60, summary["attained_percent"], "kD", fillstyle="none", markersize=9, label="answer")
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("{x:.2g}")
+    ax.tick_params(which="minor", labelsize=7)
+    ax.set_xlabel("driving [min]")
+    ax.set_ylabel(f"{'worst parameter' if summary['objective'] == 'worst' else summary['objective']} [%]")
+    ax.grid(alpha=0.3, which="both")
+    ax.legend(fontsize=8)
+
+
 def limit_use(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
     """Return the largest used share of each limit; 1 is the limit itself."""
     du = np.gradient(motion.u, motion.t, axis=0)

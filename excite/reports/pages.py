@@ -17,6 +17,8 @@ CAPTIONS = {
     "design.png": "The drive: torques in per cent of their limits, speeds [m/s], steered joints [rad] and the larger"
     " slip [-] of both edges of each contact over time, dotted lines the limits; the most used share of each limit, in"
     " per cent; where the machine steers, its path on the lane from above, dots the start.",
+    "campaign.png": "What drives of each number and duration attain together, over the time of driving; the line is the"
+    " target, the diamond the answer; grey, the first drive repeated, whose errors fall with the square root of time.",
     "sigma.png": "Attainable accuracy of the drive: one standard deviation (Cramer-Rao bound, all sensors together) of"
     " every parameter in per cent of its nominal value, on a logarithmic axis.",
     "verify.png": "Left, the error of every parameter in every simulated run, in per cent of the true value: dots are"

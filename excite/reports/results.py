@@ -20,7 +20,7 @@ from excite.reports import figures, pages, plain_text
 from excite.reports.descriptions import Description, describe
 from excite.reports.html import result_fragment
 from excite.simulation import Motion
-from excite.trajectories import Comparison, Design, Score
+from excite.trajectories import Campaign, Comparison, Design, Score
 
 
 @dataclass(frozen=True)
@@ -126,6 +126,10 @@ class ShownLog(Shown, Log):
 
 class ShownDesign(Shown, Design):
     """A designed drive; fields as in `Design`."""
+
+
+class ShownCampaign(Shown, Campaign):
+    """Drives designed together; fields as in `Campaign`."""
 
 
 class ShownScore(Shown, Score):

@@ -5,13 +5,16 @@ from .baselines import (
     ComparisonRow as ComparisonRow,
     compare as compare,
 )
+from .campaign import Campaign as Campaign, CampaignTrial as CampaignTrial, design_campaign as design_campaign
 from .composite_objective import (
     COND_MAX as COND_MAX,
     CompositeObjective as CompositeObjective,
     calibrate_surrogates as calibrate_surrogates,
     compose_objective as compose_objective,
+    covariance_bound as covariance_bound,
     information_matrices as information_matrices,
     local_model as local_model,
+    rival_contrasts as rival_contrasts,
     score_matrices as score_matrices,
     score_motions as score_motions,
     sigma_percent as sigma_percent,
@@ -42,11 +45,14 @@ from .objective import (
     OBJECTIVES as OBJECTIVES,
     cond_phi as cond_phi,
     cond_w as cond_w,
+    contrast_variances as contrast_variances,
     describe_value as describe_value,
     is_condition_number as is_condition_number,
+    reference_values as reference_values,
     relative_std_percent as relative_std_percent,
     reported_value as reported_value,
 )
+from .prediction_contrasts import prediction_contrasts as prediction_contrasts
 from .saved_design import (
     SavedDesign as SavedDesign,
     read_design as read_design,

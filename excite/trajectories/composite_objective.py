@@ -38,7 +38,7 @@ class Term:
     """weight * objective(D (A + prior) D) with D = diag(column_scale), in the model's scale.
 
     column_scale (n_base,). block: row of `CompositeObjective.row_weights`. prior (n_base, n_base). ceiling: if given,
-    only the excess over it counts.
+    only the excess over it counts. contrasts (n_base, m): of relative errors, each parameter by default.
     """
 
     objective: str
@@ -47,6 +47,7 @@ class Term:
     weight: float = 1.0
     prior: np.ndarray | None = None
     ceiling: float | None = None
+    contrasts: np.ndarray | None = None
 
     @property
     def of_variances(self) -> bool:
@@ -80,6 +81,7 @@ def compose_objective(
     prior: np.ndarray | None = None,
     machines: Sequence[Model] = (),
     cond_max: float | None = None,
+    contrasts: np.ndarray | None = None,
 ) -> CompositeObjective:
     """Build the objective of a design from a name and the requirements beside it.
 
@@ -89,8 +91,11 @@ def compose_objective(
         not in a condition number, which is of the regressor.
     machines: possible machines, whose scores are averaged; the model alone by default.
     cond_max: bound on cond(Phi).
+    contrasts (n_base, m): combinations of relative parameter errors whose variances count in an objective of variances.
+        By default every parameter, and the magnitude of every effect in `discrimination`; a prediction needs those of
+        `prediction_contrasts`.
 
-    Raises KeyError for an unknown objective and ValueError for a bad prior or sigma_max.
+    Raises KeyError for an unknown objective and ValueError for a bad prior or sigma_max, or a lack of contrasts.
     """
     if objective not in OBJECTIVES:
         raise KeyError(f"no objective {objective}, allowed: {', '.join(OBJECTIVES)}")
@@ -103,6 +108,10 @@ def compose_objective(
     # Row 0: one noise for all rows, in units in which a prior adds up. Row 1: each row by its own noise.
     rows = np.stack([np.full(len(noise), 1 / np.sqrt(np.mean(noise**2))), 1 / noise])
     chosen = OBJECTIVES[objective]
+    if contrasts is None and chosen.contrasts != "parameters":
+        contrasts = rival_contrasts(model) if chosen.contrasts == "rivals" else np.empty((n, 0))
+        if not contrasts.size:
+            raise ValueError(f"objective {objective}: nothing to judge by, give contrasts")
     every = tuple(machines) or (model,)
     known = None if prior is None else prior * model.scale * model.scale[:, None]
     total = _with_known(model, known)
@@ -114,6 +123,7 @@ def compose_objective(
             int(chosen.weighted),
             1 / len(every),
             own,
+            contrasts=contrasts if chosen.of == "variances" else None,
         )
         for m in every
     ]
@@ -133,6 +143,12 @@ def compose_objective(
     )
 
 
+def rival_contrasts(model: Model, names: Sequence[str] | None = None) -> np.ndarray:
+    """Return unit contrasts (n_base, m) of parameters by name: by default the magnitudes of all effects shown."""
+    names = [e.name for e in model.effects if e.name in model.base.names] if names is None else names
+    return np.eye(len(model.scale))[:, [model.base.names.index(n) for n in names]]
+
+
 def _with_known(model: Model, prior: np.ndarray | None) -> np.ndarray | None:
     """Add what the machine file calls known to a prior (n_base, n_base), scaled; None if there is neither."""
     if not model.known:
@@ -150,7 +166,7 @@ def score_matrices(
     """Score information matrices (n_base, n_base), one per row of `row_weights`; inf if one is singular."""
     total = 0.0
     for term in objective.terms:
-        x = objectives.score_matrix(term.objective, _accumulated(term, A[term.block]), sharpness)
+        x = objectives.score_matrix(term.objective, _accumulated(term, A[term.block]), sharpness, term.contrasts)
         if not np.isfinite(x):
             return float("inf")
         total += term.weight * (x if term.ceiling is None else _smooth_hinge(x - term.ceiling)[0])
@@ -169,7 +185,8 @@ def local_model(
     total, slope = 0.0, np.zeros(len(A) * n_a)
     factors: list[np.ndarray] = []
     for term in objective.terms:
-        near = objectives.local_model(term.objective, _accumulated(term, A[term.block]), rows, columns, sharpness)
+        J = _accumulated(term, A[term.block])
+        near = objectives.local_model(term.objective, J, rows, columns, sharpness, term.contrasts)
         own = slice(term.block * n_a, (term.block + 1) * n_a)
         by = term.column_scale[rows] * term.column_scale[columns]
         x, push, bend = near.value, 1.0, 0.0
@@ -200,9 +217,8 @@ def exact_derivatives(
     n_a = len(rows)
     total, slope, hessian = 0.0, np.zeros(len(A) * n_a), np.zeros((len(A) * n_a, len(A) * n_a))
     for term in objective.terms:
-        x, g, H = objectives.exact_derivatives(
-            term.objective, _accumulated(term, A[term.block]), rows, columns, sharpness
-        )
+        J = _accumulated(term, A[term.block])
+        x, g, H = objectives.exact_derivatives(term.objective, J, rows, columns, sharpness, term.contrasts)
         own = slice(term.block * n_a, (term.block + 1) * n_a)
         by = term.column_scale[rows] * term.column_scale[columns]
         g, H = by * g, by[:, None] * H * by
@@ -276,14 +292,15 @@ def score_motions(objective: CompositeObjective, motions: Sequence[tuple[Model, 
     primary = [t for t in objective.terms if t.ceiling is None]
     total, worst = 0.0, 0.0
     for term, (model, motion) in zip(primary, motions, strict=True):
-        sigma = (
-            sigma_percent(objective, model, motion) if term.of_variances or objective.sigma_max is not None else None
-        )
-        if sigma is not None:
-            worst = max(worst, float(sigma.max()))
+        C = None
+        if term.of_variances or objective.sigma_max is not None:
+            reference = reference_values(model)
+            C = covariance_bound(objective, model, motion) / np.outer(reference, reference)
+            worst = max(worst, 100 * float(np.sqrt(np.diag(C).max())))
         if term.of_variances:
-            assert sigma is not None
-            total += term.weight * objectives.score_values(term.objective, (sigma / 100) ** 2)
+            assert C is not None
+            variances = objectives.contrast_variances(C, term.contrasts)
+            total += term.weight * objectives.score_values(term.objective, variances)
         else:
             A = _term_information(objective, term, model, motion)
             total += term.weight * objectives.score_matrix(term.objective, _accumulated(term, A))

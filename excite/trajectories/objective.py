@@ -1,8 +1,9 @@
 """Objectives of a design: scores of the information matrix A = Phi' Phi, Phi = W diag(scale). Lower is better.
 
-An objective is a pure function in the table OBJECTIVES, of the eigenvalues of A or of the relative variances
-diag(A^-1). The same expression runs on numbers and on CasADi symbols. `sharpness` p replaces max_i x_i by
-log(sum_i exp(p x_i)) / p, which is smooth and at most log(n) / p above the maximum.
+An objective is a pure function in the table OBJECTIVES, of the eigenvalues of A or of the variances diag(G' A^-1 G) of
+contrasts G (n, m), combinations of relative parameter errors: each parameter alone by default. The same expression runs
+on numbers and on CasADi symbols. `sharpness` p replaces max_i x_i by log(sum_i exp(p x_i)) / p, which is smooth and at
+most log(n) / p above the maximum.
 """
 
 from __future__ import annotations
@@ -24,17 +25,18 @@ ObjectiveFunction = Callable[[ca.SX, ca.SX], ca.SX]
 
 @dataclass(frozen=True)
 class Objective:
-    """An entry of OBJECTIVES: function(x, sharpness) of the eigenvalues of A or of diag(A^-1), x (n,).
+    """An entry of OBJECTIVES: function(x, sharpness) of the eigenvalues of A or of variances diag(G' A^-1 G).
 
     of: the input of the function. weighted: divide the rows of Phi by their noise (`row_noise`), so that variances are
     those of the estimate. shown_as: the value for people; the logarithm of a square is shown as a condition number or
-    as a relative standard deviation [%].
+    as a relative standard deviation [%]. contrasts: whose variances count.
     """
 
     function: ObjectiveFunction
     of: Literal["eigenvalues", "variances"]
     weighted: bool
     shown_as: Literal["cond", "percent", "value"] = "value"
+    contrasts: Literal["parameters", "rivals", "prediction"] = "parameters"
 
 
 def _smooth_maximum(x: ca.SX, sharpness: ca.SX) -> ca.SX:
@@ -63,7 +65,7 @@ def e_optimal(eigenvalues: ca.SX, sharpness: ca.SX) -> ca.SX:
 
 
 def worst_sigma(variances: ca.SX, sharpness: ca.SX) -> ca.SX:
-    """log of the largest relative variance: the least accurate parameter."""
+    """log of the largest variance: the least accurate parameter, rival effect or predicted signal."""
     return _smooth_maximum(ca.log(variances), sharpness)
 
 
@@ -73,13 +75,9 @@ def accuracy(variances: ca.SX, sharpness: ca.SX) -> ca.SX:
     return (_smooth_maximum(logs, sharpness) + 2 * (ca.logsumexp(logs / 2) - float(np.log(logs.numel())))) / 2
 
 
-def discrimination(variances: ca.SX, sharpness: ca.SX) -> ca.SX:
-    """log of the larger relative variance of the last two parameters, the magnitudes of two rival effects.
-
-    To first order, the noncentrality of one effect against the other is the inverse of that variance, with all other
-    parameters free. Source: T-optimality, Atkinson and Fedorov, Biometrika 62, 1975; equal to Ds-optimality here.
-    """
-    return _smooth_maximum(ca.log(variances[-2:]), sharpness)
+def mean_variance(variances: ca.SX, sharpness: ca.SX) -> ca.SX:
+    """log of the mean variance. Of a prediction's signals: I-optimality."""
+    return ca.log(ca.sum1(variances) / variances.numel())
 
 
 OBJECTIVES: dict[str, Objective] = {
@@ -90,7 +88,12 @@ OBJECTIVES: dict[str, Objective] = {
     "E": Objective(e_optimal, "eigenvalues", True),
     "worst": Objective(worst_sigma, "variances", True, "percent"),
     "accuracy": Objective(accuracy, "variances", True),
-    "discrimination": Objective(discrimination, "variances", True, "percent"),
+    # Magnitudes of rival effects, all other parameters free: to first order, the noncentrality of one effect against
+    # the others is the inverse of its variance (T-optimality, Atkinson and Fedorov, Biometrika 62, 1975; Ds-optimality)
+    "discrimination": Objective(worst_sigma, "variances", True, "percent", "rivals"),
+    # Signals along another drive: I- and G-optimality (Atkinson, Donev and Tobias, Optimum Experimental Designs, 2007)
+    "prediction": Objective(mean_variance, "variances", True, "percent", "prediction"),
+    "prediction-max": Objective(worst_sigma, "variances", True, "percent", "prediction"),
 }
 
 EXACT_SHARPNESS = 1e6  # exceeds a reported maximum by at most log(n) / 1e6
@@ -117,20 +120,30 @@ def _derivatives(objective: str, n: int) -> ca.Function:
     return ca.Function("objective", [x, sharpness], [f, g, ca.densify(H)])
 
 
-def score_matrix(objective: str, A: np.ndarray, sharpness: float = EXACT_SHARPNESS) -> float:
+def score_matrix(
+    objective: str, A: np.ndarray, sharpness: float = EXACT_SHARPNESS, contrasts: np.ndarray | None = None
+) -> float:
     """Score an information matrix (n, n); inf if it is singular.
 
+    contrasts (n, m): combinations of parameters whose variances count, each parameter by default.
     Raises KeyError for an unknown objective.
     """
     eigenvalues = np.linalg.eigvalsh(A)
     if not np.isfinite(eigenvalues).all() or eigenvalues[0] <= 1e-14 * eigenvalues[-1]:
         return float("inf")
-    x = eigenvalues if OBJECTIVES[objective].of == "eigenvalues" else np.diag(np.linalg.inv(A))
-    return float(_derivatives(objective, len(A))(x, sharpness)[0])
+    x = eigenvalues if OBJECTIVES[objective].of == "eigenvalues" else contrast_variances(np.linalg.inv(A), contrasts)
+    return float(_derivatives(objective, len(x))(x, sharpness)[0])
+
+
+def contrast_variances(covariance: np.ndarray, contrasts: np.ndarray | None) -> np.ndarray:
+    """Return diag(G' C G) (m,) of a covariance (n, n) and contrasts G (n, m), each parameter by default."""
+    if contrasts is None:
+        return np.diag(covariance)
+    return np.asarray((contrasts * (covariance @ contrasts)).sum(axis=0))
 
 
 def score_values(objective: str, x: np.ndarray) -> float:
-    """Score the eigenvalues or relative variances (n,) that the objective takes."""
+    """Score the eigenvalues or variances (m,) that the objective takes."""
     return float(_derivatives(objective, len(x))(x, EXACT_SHARPNESS)[0])
 
 
@@ -152,15 +165,23 @@ def describe_value(objective: str, value: float) -> str:
     return f"{name} {format_number(value, 4)}{' %' if shown_as == 'percent' else ''}"
 
 
-def local_model(objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, sharpness: float) -> LocalModel:
+def local_model(
+    objective: str,
+    A: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    sharpness: float,
+    contrasts: np.ndarray | None = None,
+) -> LocalModel:
     """Expand an objective in the entries A[rows, columns], rows <= columns, to second order with convex curvature.
 
     Eigenvalues: with A = V diag(x) V' and H in the axes of V, d2F[H, H] = sum_ij F_ij H_ii H_jj
     + sum_{i != j} (F_i - F_j) / (x_i - x_j) H_ij^2 (Lewis and Sendov, 2001). Negative parts are dropped.
-    Variances v_i = c_i[i], C = A^-1: d2F[H, H] = sum_i 2 F_i c_i' H C H c_i + sum_ij F_ij (c_i' H c_i) (c_j' H c_j).
+    Variances v_i = g_i' C g_i, C = A^-1, c_i = C g_i: d2F[H, H] = sum_i 2 F_i c_i' H C H c_i
+    + sum_ij F_ij (c_i' H c_i) (c_j' H c_j).
     """
     if OBJECTIVES[objective].of == "variances":
-        value, slope, curvature = _derivatives_of_variances(objective, A, rows, columns, sharpness)
+        value, slope, curvature = _derivatives_of_variances(objective, A, rows, columns, sharpness, contrasts)
         return LocalModel(value, slope, factor_positive_part(curvature))
     n = len(A)
     x, V = np.linalg.eigh(A)
@@ -193,14 +214,19 @@ def _spectral_derivatives(
 
 
 def exact_derivatives(
-    objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, sharpness: float
+    objective: str,
+    A: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    sharpness: float,
+    contrasts: np.ndarray | None = None,
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return value, slope (n_a,) and Hessian (n_a, n_a) of an objective in the entries A[rows, columns].
 
     The formulas of `local_model` without dropping negative curvature. Raises LinAlgError for a singular A.
     """
     if OBJECTIVES[objective].of == "variances":
-        return _derivatives_of_variances(objective, A, rows, columns, sharpness)
+        return _derivatives_of_variances(objective, A, rows, columns, sharpness, contrasts)
     n = len(A)
     x, V = np.linalg.eigh(A)
     value, g, H, E, ratio = _spectral_derivatives(objective, x, V, rows, columns, sharpness)
@@ -210,21 +236,30 @@ def exact_derivatives(
 
 
 def _derivatives_of_variances(
-    objective: str, A: np.ndarray, rows: np.ndarray, columns: np.ndarray, sharpness: float
+    objective: str,
+    A: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    sharpness: float,
+    contrasts: np.ndarray | None,
 ) -> tuple[float, np.ndarray, np.ndarray]:
     C = np.linalg.inv(A)
-    out = _derivatives(objective, len(A))(np.diag(C), sharpness)
+    through = C if contrasts is None else C @ contrasts  # c_i
+    variances = contrast_variances(C, contrasts)
+    out = _derivatives(objective, len(variances))(variances, sharpness)
     g, H = out[1].full().ravel(), out[2].full()
     twice = np.where(rows != columns, 2.0, 1.0)
-    through = twice[:, None] * C[rows] * C[columns]  # c_i' E_l c_i, E_l the unit matrix of entry l
-    curvature = through @ H @ through.T
-    for i, weight in enumerate(g):
-        moved = np.zeros((len(rows), len(A)))  # E_l c_i
-        np.add.at(moved, (np.arange(len(rows)), rows), C[columns, i])
-        off = rows != columns
-        np.add.at(moved, (np.flatnonzero(off), columns[off]), C[rows[off], i])
-        curvature += 2 * weight * moved @ C @ moved.T
-    return float(out[0]), -through @ g, curvature
+    moved = twice[:, None] * through[rows] * through[columns]  # c_i' E_l c_i, E_l the unit matrix of entry l
+    # sum_i F_i c_i' E_l C E_m c_i = tr(P E_l C E_m), P = sum_i F_i c_i c_i': four products of entries
+    P = (through * g) @ through.T
+    pairs = sum(P[np.ix_(a, d)] * C[np.ix_(b, c)] for a, b in _ends(rows, columns) for c, d in _ends(rows, columns))
+    scale = np.where(rows != columns, 1.0, 0.5)
+    return float(out[0]), -moved @ g, moved @ H @ moved.T + 2 * np.outer(scale, scale) * pairs
+
+
+def _ends(rows: np.ndarray, columns: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Return both orders of the entries of a symmetric matrix."""
+    return (rows, columns), (columns, rows)
 
 
 def factor_positive_part(matrix: np.ndarray) -> np.ndarray:

@@ -1,3 +1,11 @@
+from .campaign_workflow import (
+    CampaignRequest as CampaignRequest,
+    campaign as campaign,
+    campaign_account as campaign_account,
+    campaign_from as campaign_from,
+    check_campaign as check_campaign,
+    read_targets as read_targets,
+)
 from .design_request import (
     DesignRequest as DesignRequest,
     design_from as design_from,
@@ -8,6 +16,7 @@ from .design_workflow import (
     compare_account as compare_account,
     design as design,
     design_account as design_account,
+    prepare_design as prepare_design,
     read_rivals as read_rivals,
 )
 from .diagnose_workflow import (

@@ -37,7 +37,8 @@ class DesignRequest:
     after: logs of earlier drives, whose information counts.
     starts, seed: starting guesses and their random seed.
     budget_s [s]: time after which the search stops.
-    between: two effects, NAME[@WHERE]=MAGNITUDE, that the drive must separate.
+    between: two effects or more, NAME[@WHERE]=MAGNITUDE, that the drive must separate.
+    of: profile (.csv) or design folder of the drive to predict, for the objectives of a prediction.
     driver: design for people, in phases of phase_min_s [s] or more.
     cond_slack [%]: with objective cond, by how much cond(Phi) may grow for the most accurate drive; 0 for the lowest.
     solver: a name of `SOLVERS`.
@@ -55,6 +56,7 @@ class DesignRequest:
     phase_min_s: float = 3.0
     cond_slack: float = 12.0
     solver: str = "own"
+    of: Path | None = None
 
     @property
     def second_step(self) -> bool:
@@ -68,6 +70,7 @@ class DesignResult:
     """A design with its model and objective.
 
     model: with `after`, its nominal values are the estimate from the logs.
+    contrasts (n_base, m): combinations of relative errors that the objective judges, None for each parameter.
     phased: the phases of a design for people; `design` is then the motion of a steady driver.
     first: the drive of lowest cond(Phi), if `design` is the most accurate one near it.
     """
@@ -77,10 +80,11 @@ class DesignResult:
     design: Design
     phased: PhasedDrive | None = None
     first: Design | None = None
+    contrasts: np.ndarray | None = None
 
 
 def add_rival_effects(model: Model, between: tuple[str, ...], duration: float) -> Model:
-    """Add two effects, NAME[@WHERE]=MAGNITUDE each, that a drive of some duration [s] must separate.
+    """Add effects, NAME[@WHERE]=MAGNITUDE each, that a drive of some duration [s] must separate.
 
     Raises MachineError for an effect that is unknown, impossible on this machine, or invisible to a drive.
     """
@@ -88,14 +92,14 @@ def add_rival_effects(model: Model, between: tuple[str, ...], duration: float) -
 
 
 def with_rivals(model: Model, rivals: Sequence[EffectEntry]) -> Model:
-    """Add the entries of two effects to a model. Raises MachineError for an effect that no drive shows.
+    """Add the entries of effects to a model. Raises MachineError for an effect that no drive shows.
 
     Shapes become parameters too, unless they are times of a log: a rival effect may have any shape.
     """
     machine = effects.with_effects(model.machine, *rivals)
     times = any(effects.CATALOGUE[e.name].timed for e in machine.effect)
     both = build(machine, model.fit_sensor_effects, fit_shapes=not times)
-    for e in both.effects[-2:]:
+    for e in both.effects[-len(rivals) :]:
         if e.name not in both.base.names:
             raise MachineError(
                 f"effect {e.name}: no equation of motion shows its magnitude at once (it sits in a sensor, or acts"
@@ -114,6 +118,27 @@ def require_noise_figures(model: Model) -> None:
             )
 
 
+def with_earlier_logs(model: Model, after: Sequence[Path]) -> tuple[Model, np.ndarray | None]:
+    """Return the model with the estimate from logs as nominal values, and their information [1/SI^2], None without."""
+    if not after:
+        return model, None
+    ready = logs.prepare(model, list(after), identification.needed_sensors(model, "joint"))
+    known = identification.prior_from_logs(ready.model, ready.logs)
+    return replace(known.model, machine=model.machine), known.information
+
+
+def contrasts(model: Model, request: DesignRequest) -> np.ndarray | None:
+    """Return what the objective judges (n_base, m), None for each parameter or effect. Raises LogError."""
+    if request.between:
+        return trajectories.rival_contrasts(model, [e.name for e in model.effects[-len(request.between) :]])
+    if request.of is None:
+        return None
+    path = request.of / "profile.csv" if request.of.is_dir() else request.of
+    drive = logs.read_drive(path, model)
+    motion = simulation.simulate(model, drive.torque, q0=drive.q0, nu0=drive.nu0)
+    return trajectories.prediction_contrasts(model, motion)
+
+
 def singular_message(problem: str) -> str:
     """Return the message for a problem whose information matrix is singular."""
     return f"some parameter moves nothing in problem {problem}, so no drive shows it"
@@ -130,21 +155,17 @@ def design_from(
     if request.driver:
         operator.check_phase_length(model, problem, request.phase_min_s)
     require_noise_figures(model)
-    prior = None
-    if request.after:
-        needs = identification.needed_sensors(model, "joint")
-        ready = logs.prepare(model, list(request.after), needs)
-        known = identification.prior_from_logs(ready.model, ready.logs)
-        model, prior = replace(known.model, machine=model.machine), known.information
+    model, prior = with_earlier_logs(model, request.after)
+    judged = contrasts(model, request)
     machines = (
         simulation.perturbed_machines(model, ROBUST_MACHINES, ROBUST_SPREAD, request.seed) if request.robust else ()
     )
-    aim = trajectories.compose_objective(model, request.objective, request.sigma_max, prior, machines)
+    aim = trajectories.compose_objective(model, request.objective, request.sigma_max, prior, machines, None, judged)
     if not request.driver:
         budget = request.budget_s if not request.second_step or request.budget_s is None else request.budget_s / 2
         lowest = design(model, problem, aim, request.starts, request.seed, budget, progress, solver=request.solver)
         if not request.second_step:
-            return DesignResult(model, aim, lowest)
+            return DesignResult(model, aim, lowest, contrasts=judged)
         return _make_accurate(model, problem, request, aim, lowest, prior, budget)
     begin = time.time()
     half = None if request.budget_s is None else request.budget_s / 2
@@ -156,7 +177,7 @@ def design_from(
     made = operator.design_phases(
         model, problem, aim, free.motion, request.phase_min_s, request.seed, out_of_time, progress
     )
-    return DesignResult(model, aim, operator.as_design(model, problem, free, made), made)
+    return DesignResult(model, aim, operator.as_design(model, problem, free, made), made, contrasts=judged)
 
 
 def _make_accurate(
@@ -228,6 +249,15 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
         }
     if result.phased is not None:
         summary["driver"] = _by_hand(request, result.aim, result.phased)
+    if request.of is not None:
+        C = trajectories.covariance_bound(result.aim, result.model, drive.motion)
+        by = trajectories.reference_values(result.model)
+        variances = trajectories.contrast_variances(C / np.outer(by, by), result.contrasts)
+        summary["prediction"] = {
+            "of": str(request.of),
+            "mean_percent": 100 * float(np.sqrt(variances.mean())),
+            "max_percent": 100 * float(np.sqrt(variances.max())),
+        }
     if request.sigma_max is not None:
         summary["sigma_max"] = request.sigma_max
     if request.between:

@@ -32,15 +32,26 @@ def design(
     machine: a shipped name or a path. problem: None for the machine's own. duration [s]: None for the problem's own.
     Raises UsageError, MachineError, InfeasibleError, LogError.
     """
-    model = requests.build_model(machine, fit_sensor_effects=False)
+    model, name, chosen = prepare_design(machine, problem, duration, request)
+    return design_model(place, model, name, chosen, request, bar)
+
+
+def prepare_design(
+    machine: str | Model, problem: str | None, duration: float | None, request: DesignRequest
+) -> tuple[Model, str, Problem]:
+    """Return model, problem and its name for a request, with the effects that the drive must separate.
+
+    Raises UsageError, MachineError.
+    """
+    model = machine if isinstance(machine, Model) else requests.build_model(machine, fit_sensor_effects=False)
     name, chosen = requests.choose_problem(model.machine, problem, duration)
     if request.between:
         model = design_request.add_rival_effects(model, request.between, float(chosen.duration_s))
-    requests.require_objective(request.objective, model.machine)
+    requests.require_objective(request.objective, model.machine, request.of)
     requests.require_known("--solver", request.solver, tuple(trajectories.SOLVERS))
     requests.require_positive("--budget", request.budget_s, "s")
     requests.require_positive("--sigma-max", request.sigma_max, "%")
-    return design_model(place, model, name, chosen, request, bar)
+    return model, name, chosen
 
 
 def design_model(

@@ -43,8 +43,7 @@ def choose_problem(machine: Machine, name: str | None, duration: float | None) -
         knot = float(found.knot_s)
         if not 4 * knot <= duration <= LONGEST_DRIVE_S:
             raise UsageError(f"--duration: must be between {4 * knot:g} and {LONGEST_DRIVE_S:g} s (got {duration:g})")
-        longer = found.duration_s.model_copy(update={"value": round(duration / knot) * knot})
-        found = found.model_copy(update={"duration_s": longer})
+        found = found.lasting(duration)
     return name, found
 
 
@@ -96,16 +95,25 @@ def require_known(what: str, value: str, allowed: Sequence[str]) -> None:
         raise UsageError(f"{what}: {value} is unknown, allowed: {', '.join(allowed)}")
 
 
-def require_objective(name: str, machine: Machine) -> None:
-    """Raise UsageError for an unknown objective, or `discrimination` without two effects that a drive shows.
+def require_objective(name: str, machine: Machine, of: Path | None = None) -> None:
+    """Raise UsageError for an unknown objective, or one without what it needs.
 
+    `discrimination` needs two effects that a drive shows; a prediction needs the drive to predict (of), no other does.
     Raises MachineError for effects that this machine can't have.
     """
     from excite.model import build
     from excite.trajectories import OBJECTIVES
 
     require_known("--objective", name, tuple(OBJECTIVES))
-    if name != "discrimination":
+    wanted = OBJECTIVES[name].contrasts
+    if (wanted == "prediction") != (of is not None):
+        every = [n for n, o in OBJECTIVES.items() if o.contrasts == "prediction"]
+        raise UsageError(
+            f"--objective {name}: needs --of PROFILE.csv, the drive to predict"
+            if of is None
+            else f"--of: is for --objective {' or '.join(every)} (got {name})"
+        )
+    if wanted != "rivals":
         return
     model = build(machine, fit_sensor_effects=False)
     shown = sum(e.name in model.base.names for e in model.effects)

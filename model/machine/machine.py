@@ -351,6 +351,12 @@ class Problem(FileRecord):
             raise ValueError(f"duration_s: must be at least 4 knots long, {least:g} s (got {self.duration_s.value:g})")
         return self
 
+    def lasting(self, seconds: float) -> Problem:
+        """Return this problem with another duration [s], rounded to whole knots, four at least."""
+        knot = float(self.knot_s)
+        duration = self.duration_s.model_copy(update={"value": max(4, round(seconds / knot)) * knot})
+        return self.model_copy(update={"duration_s": duration})
+
 
 class EffectEntry(FileRecord):
     """An effect of the machine beyond the plain model: name in the catalogue, place, magnitude and shapes."""
