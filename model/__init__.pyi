@@ -1,6 +1,9 @@
 from .equations import SignatureFunctions as SignatureFunctions, signatures as signatures
 from .known_values import KnownValues as KnownValues, nothing_known as nothing_known
-from .parameter_names import parameter_descriptions as parameter_descriptions
+from .parameter_names import (
+    parameter_descriptions as parameter_descriptions,
+    signal_descriptions as signal_descriptions,
+)
 from .prediction import (
     Model as Model,
     build as build,

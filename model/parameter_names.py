@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from excite.model.machine import Body
+from excite.model.machine import Body, Machine
 from excite.model.prediction import Model
 
 MOMENTS = {"MX": "first moment x", "MY": "first moment y", "MZ": "first moment z"}
@@ -32,6 +32,25 @@ def parameter_descriptions(model: Model) -> dict[str, str]:
             own = f"regrouped {own}"
         found[name] = own
     return found
+
+
+KINDS = {"yaw_rate": "yaw rate", "lateral_speed": "lateral speed", "x": "x", "y": "y"}  # of sensors of the chassis
+
+
+def signal_descriptions(machine: Machine) -> dict[str, str]:
+    """Describe every sensor by name: "angle, JOINT"; every sensor has words of its own."""
+    words: dict[str, str] = {}
+    for sensor in machine.sensors("full"):
+        body = machine.find(sensor.body)
+        kind = "force" if sensor.kind == "torque" and body.joint == "prismatic" else sensor.kind
+        if sensor.kind in KINDS:
+            words[sensor.name] = KINDS[sensor.kind]
+        else:
+            place = sensor.place or (sensor.name if sensor.kind == "wheel" else body.where)
+            what = "angle" if kind == "wheel" else "position" if (kind, body.joint) == ("angle", "prismatic") else kind
+            words[sensor.name] = f"{what}, {place.replace('_', ' ')}"
+    clashing = [name for name, text in words.items() if list(words.values()).count(text) > 1]
+    return words | {name: f"{words[name]} ({name})" for name in clashing}
 
 
 def _body_descriptions(body: Body) -> dict[str, str]:

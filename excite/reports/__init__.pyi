@@ -1,3 +1,4 @@
+from .charts import Explorable as Explorable
 from .descriptions import (
     Description as Description,
     Table as Table,
@@ -5,6 +6,7 @@ from .descriptions import (
     describe as describe,
     describe_drive_faults as describe_drive_faults,
     format_sum as format_sum,
+    with_sentences as with_sentences,
 )
 from .diagnosis_figures import (
     figure_calls as figure_calls,
@@ -16,10 +18,12 @@ from .figures import (
     campaign_figure as campaign_figure,
     compare_figure as compare_figure,
     comparison_figure as comparison_figure,
+    correlation_figure as correlation_figure,
     design_figure as design_figure,
     draw_campaign as draw_campaign,
     escape_dollar as escape_dollar,
     prediction_figure as prediction_figure,
+    prior_figure as prior_figure,
     save as save,
     sigma_figure as sigma_figure,
     verify_figure as verify_figure,

@@ -91,6 +91,12 @@ def describe(kind: str, summary: Summary) -> Description:
     return DESCRIPTIONS[kind](summary)
 
 
+def with_sentences(kind: str, summary: Summary) -> dict[str, Any]:
+    """Return a summary with its `headline`, and its `verdict` where it has none: sentences for people."""
+    told = describe(kind, summary)
+    return {**({"verdict": told.verdict} if told.verdict else {}), **summary, "headline": told.headline}
+
+
 def as_sentence(text: str) -> str:
     """Begin a remark with a capital letter, unless it begins with a name, and end it with a full stop."""
     first = text.partition(" ")[0]
@@ -833,7 +839,7 @@ def describe_slip(s: Summary) -> Description:
 
 def describe_diagnose(s: Summary) -> Description:
     """Describe a diagnosis: the answer, the findings, errors signal by signal, what to drive next."""
-    remarks = []
+    remarks = [_describe_finding(f) for f in s["findings"]]
     if s["separating_run"]:
         remarks.append(f"To separate the tied causes, drive: {s['separating_run']}.")
     if s["separating_drive"]:
@@ -878,6 +884,18 @@ def describe_diagnose(s: Summary) -> Description:
         caption = "The parameters before and after: the bias that the findings took away."
         tables.append(Table(caption, titles, moved, optional=(4, 5)))
     return Description(f"Diagnosis of {s['machine']}", s["answer"], tuple(tables), tuple(remarks))
+
+
+def _describe_finding(f: Mapping[str, Any]) -> str:
+    """Say of a finding in a sentence how much it is, what it explains and what it gains."""
+    name = f"{f['effect'].replace('_', ' ').capitalize()}, {f['where'].replace('_', ' ')}"
+    text = f"{name}: {format_uncertain(f['amount'], f['amount_std'], f['unit'])}, a {f['kind']} that takes"
+    text += f" {format_percent(f['share_percent'], 3)} of what noise does not explain"
+    if f["gain_ci95"] is not None:
+        low, high = (format_number(x, 2) for x in f["gain_ci95"])
+        gain = f"{format_percent(f['gain_percent'])} (95 %: {low} to {high} %)"
+        text += f", and the error on data not fitted falls by {gain}"
+    return f"{text}; it can't be told from {_join_some(f['tied_with'])}." if f["tied_with"] else f"{text}."
 
 
 def _table_of_findings(findings: Sequence[Mapping[str, Any]]) -> Table:

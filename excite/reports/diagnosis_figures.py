@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from excite import diagnosis
 from excite.diagnosis import Diagnosis, LogResiduals, TorqueDiagnosis
+from excite.model import signal_descriptions
+from excite.reports.charts import EXPLORE, Explorable
 from excite.reports.figures import COLOURS, escape_dollar, save
 from excite.reports.torque_figures import torque_figures_by_file
 from excite.text import format_number
@@ -28,17 +33,19 @@ HEAD = 0.28  # above the panels of one torque or force
 EDGE = 0.35  # for the title, and for the legend
 PLAIN_POWERS = -3, 5  # powers of ten that axes write without an exponent; chosen
 CLEAR_STRENGTH = 4.0  # strength of a dependence from which its panel gets a thick frame; chosen
+MAX_CLEAR, MIN_CLEAR = 4, 2  # dependences drawn large: that are clear, if none is; chosen
 MAX_INNOVATION = 30.0  # mean square of innovations at which the colours end; chosen
 
 
-def figure_calls(place: Path, d: Diagnosis | TorqueDiagnosis, title: str) -> list[Callable[[], None]]:
-    """Return independent calls that draw the figures of a diagnosis into its folder.
+def figure_calls(place: Path, d: Diagnosis | TorqueDiagnosis, title: str) -> list[Callable[[], dict[str, Explorable]]]:
+    """Return independent calls that draw the figures of a diagnosis into its folder, and return what charts show.
 
-    misfit.png and when.png of each log; misfit.png and, where there are curves, curves.png of one by regression.
+    clearest.png, misfit.png and when.png of each log; misfit.png and, where there are curves, curves.png of one by
+    regression.
     """
     if isinstance(d, TorqueDiagnosis):
         return [partial(_save, draw, place / file) for file, draw in figures_by_file(d, title).items()]
-    return [partial(_draw, place, d, title, kind) for kind in ("misfit", "when")]
+    return [partial(_draw, place, d, title, kind) for kind in KINDS]
 
 
 def figures_by_file(d: Diagnosis | TorqueDiagnosis, title: str) -> dict[str, Callable[[], Figure]]:
@@ -46,11 +53,11 @@ def figures_by_file(d: Diagnosis | TorqueDiagnosis, title: str) -> dict[str, Cal
     if isinstance(d, TorqueDiagnosis):
         return torque_figures_by_file(d, title)
     n = len(d.before.data.logs)
-    return {_file(kind, k, n): partial(_one, d, title, kind, k) for kind in ("misfit", "when") for k in range(n)}
+    return {_file(kind, k, n): partial(_one, d, title, kind, k) for kind in KINDS for k in range(n)}
 
 
-def _save(draw: Callable[[], Figure], file: Path) -> None:
-    save(draw(), file)
+def _save(draw: Callable[[], Figure], file: Path) -> dict[str, Explorable]:
+    return {file.name: save(draw(), file)}
 
 
 def _file(kind: str, k: int, n: int) -> str:
@@ -61,24 +68,56 @@ def _one(d: Diagnosis, title: str, kind: str, k: int) -> Figure:
     return list(_figures(d, title, kind))[k]
 
 
-def _draw(place: Path, d: Diagnosis, title: str, kind: str) -> None:
-    """Draw one of the two figures of every log."""
+def _draw(place: Path, d: Diagnosis, title: str, kind: str) -> dict[str, Explorable]:
+    """Draw one of the figures of every log."""
     figures = list(_figures(d, title, kind))
-    for k, one in enumerate(figures):
-        save(one, place / _file(kind, k, len(figures)))
+    files = [_file(kind, k, len(figures)) for k in range(len(figures))]
+    return {file: save(one, place / file) for file, one in zip(files, figures, strict=True)}
 
 
 def _figures(d: Diagnosis, title: str, kind: str) -> Iterator[Figure]:
-    """Yield one of the two figures for every log."""
+    """Yield one of the figures for every log."""
     before, after = d.before, d.after
-    if kind == "misfit" and before.exact != after.exact:
+    if kind != "when" and before.exact != after.exact:
         # Show forces that one of the two models needs for the other as well.
         before, after = diagnosis.refit_with_process_noise(before), diagnosis.refit_with_process_noise(after)
     without = diagnosis.residuals_of_logs(before)
     beside = diagnosis.residuals_of_logs(after) if d.stages else [None] * len(without)
-    figure = misfit_figure if kind == "misfit" else when_figure
+    figure = KINDS[kind]
+    if kind == "when":
+        figure = partial(when_figure, words=signal_descriptions(before.machine))
     for old, new in zip(without, beside, strict=True):
         yield figure(old, new, f"{title}: {Path(old.source).name}")
+
+
+Evidence = dict[str, dict[str, float]]  # strength of the dependence of each torque or force on each quantity
+
+
+def _evidence(before: LogResiduals) -> Evidence:
+    return {
+        row: {q: diagnosis.dependence_strength(before, row, q) for q in before.quantities} for row in before.missing
+    }
+
+
+def clearest_figure(before: LogResiduals, after: LogResiduals | None, title: str) -> Figure:
+    """Plot the clearest dependences of missing torques and forces on the state of the machine, large."""
+    evidence = _evidence(before)
+    pairs = sorted(((row, q) for row in evidence for q in evidence[row]), key=lambda p: -evidence[p[0]][p[1]])
+    clear = [p for p in pairs if evidence[p[0]][p[1]] > CLEAR_STRENGTH][:MAX_CLEAR] or pairs[:MIN_CLEAR]
+    columns = min(len(clear), 2)
+    figure = Figure(figsize=(5.2 * columns, 3.3 * -(-len(clear) // columns) + 0.8), layout="constrained")
+    figure.suptitle(escape_dollar(title), fontsize=11)
+    axes = figure.subplots(-(-len(clear) // columns), columns, squeeze=False).ravel()
+    for ax, (row, quantity) in zip(axes, clear, strict=False):
+        _against(ax, before, after, row, quantity)
+        ax.set_gid(EXPLORE)
+        ax.set_ylabel(f"missing {row} [{before.missing[row][1]}]", fontsize=9)
+        ax.xaxis.label.set_fontsize(9)
+        ax.tick_params(which="both", labelsize=8)
+    for ax in axes[len(clear) :]:
+        ax.set_axis_off()
+    figure.legend(*_key(before, after, [row for row, _ in clear]), loc="outside lower center", ncols=3)
+    return figure
 
 
 def misfit_figure(before: LogResiduals, after: LogResiduals | None, title: str) -> Figure:
@@ -86,9 +125,7 @@ def misfit_figure(before: LogResiduals, after: LogResiduals | None, title: str) 
 
     A thick frame marks the quantity on which a torque depends most clearly.
     """
-    evidence = {
-        row: {q: diagnosis.dependence_strength(before, row, q) for q in before.quantities} for row in before.missing
-    }
+    evidence = _evidence(before)
     rows = sorted(evidence, key=lambda row: -max(evidence[row].values()))[:MAX_ROWS]
     panels = max(sum(row in v for _, v in before.quantities.values()) for row in rows) + 1
     block = HEAD + -(-panels // MAX_COLUMNS) * PANEL[1]
@@ -115,15 +152,19 @@ def misfit_figure(before: LogResiduals, after: LogResiduals | None, title: str) 
                 for spine in ax.spines.values():
                     spine.set_linewidth(2.2)
             ax.tick_params(which="both", labelsize=7)
-    key = figure.add_axes((0, 0, 0.001, 0.001))
-    key.axis("off")
-    key.plot([], [], color=BEFORE, label="without what was found" if after is not None else "missing (mean)")
-    if after is not None:
-        key.plot([], [], color=AFTER, linestyle="--", label="with it")
-    if any(np.isfinite(before.missing[row][2]) for row in rows):
-        key.fill_between([], [], [], color="0.8", label="what noise alone leaves")
-    figure.legend(*key.get_legend_handles_labels(), loc="lower center", ncols=3, fontsize=9, frameon=False)
+    figure.legend(*_key(before, after, rows), loc="lower center", ncols=3, fontsize=9, frameon=False)
     return figure
+
+
+def _key(before: LogResiduals, after: LogResiduals | None, rows: Sequence[str]) -> tuple[list[Artist], list[str]]:
+    """Return handles and labels of a legend."""
+    words = "without what was found" if after is not None else "missing (mean)"
+    key: dict[str, Artist] = {words: Line2D([], [], color=BEFORE)}
+    if after is not None:
+        key["with it"] = Line2D([], [], color=AFTER, linestyle="--")
+    if any(np.isfinite(before.missing[row][2]) for row in rows):
+        key["what noise alone leaves"] = Patch(color="0.8")
+    return list(key.values()), list(key)
 
 
 def _against(ax: Axes, before: LogResiduals, after: LogResiduals | None, row: str, column: str) -> None:
@@ -133,12 +174,19 @@ def _against(ax: Axes, before: LogResiduals, after: LogResiduals | None, row: st
     if np.isfinite(sigma):
         ax.fill_between(centre, -band, band, color="0.8", linewidth=0)
     ax.axhline(0, color="black", linewidth=0.6)
-    ax.plot(centre, mean, color=BEFORE, linewidth=1.4, marker="." if len(centre) < 8 else None)
+    ax.plot(
+        centre,
+        mean,
+        color=BEFORE,
+        linewidth=1.4,
+        marker="." if len(centre) < 8 else None,
+        label="without" if after is not None else "missing",
+    )
     if after is not None and row in after.missing:
         at = after.quantities[column][1].get(row)
         if at is not None:
             centre, mean, _ = diagnosis.bin_means(at, after.missing[row][0], 0.0)
-            ax.plot(centre, mean, color=AFTER, linewidth=1.4, linestyle="--")
+            ax.plot(centre, mean, color=AFTER, linewidth=1.4, linestyle="--", label="with the findings")
     ax.locator_params("x", nbins=6, steps=(1, 2, 5, 10))
     ax.ticklabel_format(scilimits=PLAIN_POWERS, useOffset=False)
     for axis in (ax.xaxis, ax.yaxis):
@@ -157,7 +205,9 @@ def _spectrum(ax: Axes, before: LogResiduals, after: LogResiduals | None, row: s
     ax.grid(alpha=0.3)
 
 
-def when_figure(before: LogResiduals, after: LogResiduals | None, title: str) -> Figure:
+def when_figure(
+    before: LogResiduals, after: LogResiduals | None, title: str, words: Mapping[str, str] | None = None
+) -> Figure:
     """Plot innovations over time by signal (1 is noise), and over speed and steering angle or torque."""
     shown = [(before, "without what was found" if after is not None else "")]
     if after is not None:
@@ -168,16 +218,16 @@ def when_figure(before: LogResiduals, after: LogResiduals | None, title: str) ->
     axes = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(2.2, 1), sharex="col")
     norm = LogNorm(1 / 3, MAX_INNOVATION)
     picture = None
-    for k, (course, words) in enumerate(shown):
+    for k, (course, kind) in enumerate(shown):
         t, size = diagnosis.innovation_levels_over_time(course)
         ax = axes[k, 0]
         step = diagnosis.BLOCK_S / 2
         picture = ax.pcolormesh(
             np.append(t - step, t[-1] + step), np.arange(m + 1), size, norm=norm, cmap="inferno_r", rasterized=True
         )
-        ax.set_yticks(np.arange(m) + 0.5, course.sensors, fontsize=9)
+        ax.set_yticks(np.arange(m) + 0.5, [(words or {}).get(n, n) for n in course.sensors], fontsize=9)
         ax.invert_yaxis()
-        ax.set_title(f"when, in which signal {f'({words})' if words else ''}", fontsize=9, loc="left")
+        ax.set_title(f"when, in which signal {f'({kind})' if kind else ''}", fontsize=9, loc="left")
         _map(axes[k, 1], course, norm)
     axes[-1, 0].set_xlabel("time [s]")
     assert picture is not None
@@ -200,10 +250,14 @@ def _map(ax: Axes, course: LogResiduals, norm: LogNorm) -> None:
     total = np.histogram2d(x, y, bins, weights=np.where(finite, z, 0.0).sum(axis=1))[0]
     count = np.histogram2d(x, y, bins, weights=finite.sum(axis=1).astype(float))[0]
     mean = np.where(count >= diagnosis.MIN_BIN_SAMPLES, total / np.maximum(count, 1), np.nan)
+    ax.set_gid(EXPLORE)
     ax.pcolormesh(*bins, mean.T, norm=norm, cmap="inferno_r", rasterized=True)
     ax.set_title("where, over all signals", fontsize=9, loc="left")
     ax.set_xlabel(f"speed [{x_unit}]")
     ax.set_ylabel(f"{up.replace('_', ' ')} [{y_unit}]", fontsize=9)
+
+
+KINDS = {"clearest": clearest_figure, "misfit": misfit_figure, "when": when_figure}  # figures of each log
 
 
 def _edges(x: np.ndarray) -> np.ndarray:
@@ -212,10 +266,12 @@ def _edges(x: np.ndarray) -> np.ndarray:
     return np.arange(17) / 16 * (max(high - low, 1e-9)) + low
 
 
-def signals_figure(signals: Mapping[str, Mapping[str, Any]], found: bool, title: str) -> Figure:
+def signals_figure(
+    signals: Mapping[str, Mapping[str, Any]], found: bool, title: str, words: Mapping[str, str] | None = None
+) -> Figure:
     """Plot the systematic share of each signal's error, and errors on withheld stretches, before and after.
 
-    found: whether there are findings; without them only the errors before are plotted.
+    found: whether there are findings; without them only the errors before are plotted. words: what signals are called.
     """
     names = list(signals)
     figure = Figure(figsize=(11, 0.5 * len(names) + 1.9), layout="constrained")
@@ -224,10 +280,10 @@ def signals_figure(signals: Mapping[str, Mapping[str, Any]], found: bool, title:
     places = np.arange(len(names))[::-1].astype(float)
     kinds = (("before", BEFORE, 0.2, ""), ("after", AFTER, -0.2, "//")) if found else (("before", BEFORE, 0.0, ""),)
     for kind, colour, shift, hatch in kinds:
-        words = {"before": "without what was found" if found else "the model", "after": "with it"}[kind]
+        label = {"before": "without what was found" if found else "the model", "after": "with it"}[kind]
         share = [signals[n][f"systematic_{kind}_percent"] for n in names]
         height = 0.36 if found else 0.6
-        left.barh(places + shift, share, height=height, color=colour, hatch=hatch, edgecolor="white", label=words)
+        left.barh(places + shift, share, height=height, color=colour, hatch=hatch, edgecolor="white", label=label)
         rms = np.array([signals[n][f"rms_{kind}"] or np.nan for n in names], float)
         base = np.array([signals[n]["rms_before"] or np.nan for n in names], float)
         ratio = 100 * rms / base
@@ -243,8 +299,9 @@ def signals_figure(signals: Mapping[str, Mapping[str, Any]], found: bool, title:
                     fontsize=8,
                     bbox={"boxstyle": "square,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8},
                 )
-    left.set_yticks(places, names)
+    left.set_yticks(places, [escape_dollar((words or {}).get(n, n)) for n in names], fontsize=9)
     left.set_xlim(0, 100)
+    left.set_xticks((0, 25, 50, 75, 100))
     left.set_xlabel("systematic share of the error one step ahead [%]")
     right.set_xlabel("error on withheld stretches [% of that without]")
     if not any(np.isfinite(row["rms_before"] or np.nan) for row in signals.values()):

@@ -14,10 +14,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from excite import simulation, trajectories
-from excite.identification import Prediction, SignalComparison, Verification
+from excite.identification import Estimate, Prediction, SignalComparison, Verification
 from excite.logs import Inspection
-from excite.model import Model
+from excite.model import Model, signal_descriptions
 from excite.model.machine import Problem
+from excite.reports.charts import EXPLORE, Explorable, explorable
 from excite.simulation import Motion
 from excite.text import format_number
 from excite.trajectories import DESIGNED, ComparisonRow
@@ -33,9 +34,13 @@ UNIT_OF_COLUMN = re.compile(r"_(Nm|N|(rad|m)(_s)?)$")  # at the end of a profile
 TICKED_DECADES = 3  # of a logarithmic axis, up to which it has ticks between powers of ten; chosen
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure at print resolution without a date: the same data give the same bytes."""
+def save(figure: Figure, path: Path) -> Explorable:
+    """Write a figure at print resolution without a date: the same data give the same bytes.
+
+    Return what of it a chart shows.
+    """
     figure.savefig(path, dpi=160, metadata={"Software": None} if path.suffix == ".png" else None)
+    return explorable(figure)
 
 
 def escape_dollar(text: str) -> str:
@@ -86,10 +91,7 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
     figure.suptitle(escape_dollar(title))
 
     # Torques in per cent of their limits, so that one panel shows joints of all sizes.
-    named = {
-        f"{name} {b.where.replace('_', ' ')}": k
-        for k, (name, b) in enumerate(zip(model.inputs, machine.actuated, strict=True))
-    }
+    named = {b.where.replace("_", " "): k for k, b in enumerate(machine.actuated)}
     tops = [float(b.limit.torque or np.abs(motion.u[:, k]).max() or 1.0) for k, b in enumerate(machine.actuated)]
     unit = "N m" if all(b.joint == "revolute" for b in machine.actuated) else "N"
     curves = {f"{n} ({tops[k]:g} {unit})": 100 * motion.u[:, k] / tops[k] for n, k in named.items()}
@@ -276,20 +278,67 @@ def _error_axis(ax: Axes, reach: float) -> None:
     ax.set_xlabel(label)
 
 
+def correlation_figure(estimate: Estimate, title: str) -> Figure:
+    """Plot the correlation of the errors of every two identified parameters."""
+    known = np.flatnonzero(estimate.std > 0)
+    names = [estimate.names[k] for k in known]
+    correlation = estimate.covariance[np.ix_(known, known)] / np.outer(estimate.std[known], estimate.std[known])
+    n = len(names)
+    size = 2.2 + 0.24 * n
+    figure = Figure(figsize=(size + 0.8, size), layout="constrained")
+    figure.suptitle(escape_dollar(title), fontsize=11)
+    ax = figure.subplots()
+    ax.set_gid(EXPLORE)
+    edges = np.arange(n + 1)
+    mesh = ax.pcolormesh(edges, edges, correlation, cmap="RdBu", vmin=-1, vmax=1, edgecolor="white", linewidth=0.3)
+    ax.set_xticks(edges[:-1] + 0.5, names, rotation=90, fontsize=8)
+    ax.set_yticks(edges[:-1] + 0.5, names, fontsize=8)
+    ax.invert_yaxis()
+    ax.set_aspect("equal")
+    figure.colorbar(mesh, ax=ax, shrink=0.8, label="correlation of the errors [-]")
+    return figure
+
+
+def prior_figure(estimate: Estimate, nominal: np.ndarray, title: str) -> Figure:
+    """Plot the 95 % intervals of parameters before the log, by what the machine file calls known, and after it.
+
+    nominal (n,) [SI]: the machine file's values. Raises ValueError for an estimate without a prior.
+    """
+    if estimate.prior_std is None:
+        raise ValueError("the estimate has no prior")
+    known = np.flatnonzero(np.isfinite(estimate.prior_std) & (estimate.prior_std > 0) & np.isfinite(estimate.std))
+    before = estimate.prior_std[known]
+    moved, after = (estimate.value[known] - nominal[known]) / before, estimate.std[known] / before
+    figure = Figure(figsize=(7.5, 1.6 + 0.3 * len(known)), layout="constrained")
+    figure.suptitle(escape_dollar(title), fontsize=11)
+    ax = figure.subplots()
+    places = np.arange(len(known))[::-1]
+    ax.barh(places, 2 * 1.96, left=-1.96, height=0.6, color="0.85", label="known before")
+    reach = 1.15 * max(1.96, float(np.max(np.abs(moved) + 1.96 * after)))
+    ax.set_xlim(-reach, reach)
+    ax.errorbar(moved, places, xerr=1.96 * after, fmt="D", color=COLOURS[0], markersize=4, label="with the log")
+    ax.axvline(0, color="black", linewidth=0.8)
+    ax.set_yticks(places, [estimate.names[k] for k in known])
+    ax.set_xlabel("95 % intervals about the machine file's value\n[standard deviations known before]")
+    ax.grid(axis="x", alpha=0.3)
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    return figure
+
+
 def comparison_figure(model: Model, c: SignalComparison, title: str) -> Figure:
     """Plot measured and predicted signals, with the residual below each."""
     n = len(c.names)
     figure = Figure(figsize=(10, 0.8 + 3.0 * n), layout="constrained")
     figure.suptitle(escape_dollar(title), fontsize=11)
     axes = figure.subplots(2 * n, 1, sharex=True, squeeze=False, height_ratios=(2, 1) * n)[:, 0]
-    places = {name: b.where.replace("_", " ") for name, b in zip(model.inputs, model.machine.actuated, strict=True)}
+    words = signal_descriptions(model.machine)
     for k, (name, unit) in enumerate(zip(c.names, c.units, strict=True)):
-        label = f"{name} {places.get(name, '')}".strip()
-        _lines(axes[2 * k], c.t, {"measured": c.measured[k], "predicted": c.predicted[k]}, f"{label} [{unit}]")
+        label = escape_dollar(words.get(name, name)).replace(", ", "\n")
+        _lines(axes[2 * k], c.t, {"measured": c.measured[k], "predicted": c.predicted[k]}, f"{label}\n[{unit}]")
         if c.expected is not None:
             band = 1.96 * c.expected[k]
             axes[2 * k + 1].fill_between(c.t, -band, band, color="0.8", linewidth=0, label="95 % if the model is right")
-        _lines(axes[2 * k + 1], c.t, {"residual": c.residual[k]}, f"residual [{unit}]", legend=c.expected is not None)
+        _lines(axes[2 * k + 1], c.t, {"residual": c.residual[k]}, f"residual\n[{unit}]", legend=c.expected is not None)
     axes[-1].set_xlabel("time [s]")
     return figure
 
@@ -309,7 +358,7 @@ def prediction_figure(p: Prediction, title: str) -> Figure:
     for i, row in enumerate(rows):
         for j, k in enumerate(row):
             column = slice(None) if len(row) == 1 else j
-            above = figure.add_subplot(grid[2 * i, column])
+            above = figure.add_subplot(grid[2 * i, column], sharex=figure.axes[0] if figure.axes else None)
             below = figure.add_subplot(grid[2 * i + 1, column], sharex=above)
             above.tick_params(labelbottom=False)
             _predicted(above, below, p, k)

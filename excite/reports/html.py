@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup, escape
 
+from excite.reports import charts
 from excite.reports.descriptions import Description, Table, as_sentence
 
 COMMAND = re.compile("`([^`]+)`")
@@ -25,7 +27,13 @@ def templates() -> jinja2.Environment:
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     made.filters["sentence"] = sentence
+    made.filters["script_source"] = script_source
     return made
+
+
+def script_source(text: str) -> Markup:
+    """Return what allows an inline script in a Content-Security-Policy: no other script of the page runs."""
+    return Markup(f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'")
 
 
 def sentence(text: str) -> Markup:
@@ -35,10 +43,17 @@ def sentence(text: str) -> Markup:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of a report: a file (.png, .svg) and its caption, with units."""
+    """A figure of a report: a file (.png, .svg) and its caption, with units.
+
+    chart: the same to zoom into, as `charts.documents` gives it, "" for none. whole: whether it shows all of it.
+    folded: what the figure is called until it is opened, "" if it is always shown.
+    """
 
     path: Path
     caption: str
+    chart: str = ""
+    whole: bool = False
+    folded: str = ""
 
     @property
     def kind(self) -> str:
@@ -57,15 +72,26 @@ def report_page(
     how: Mapping[str, str] | None = None,
     remarks: Sequence[str] = (),
     status: str = "valid",
+    verdict: str = "",
 ) -> str:
     """Render a printable report: the answer first, then remarks, figures, tables and how it was made.
 
-    answer: one sentence, coloured by status (valid, doubtful or invalid). remarks: a sentence each. how: name -> value,
-    `command` among them.
+    answer: one sentence, coloured by status (valid, doubtful or invalid); below the verdict, if there is one. remarks:
+    a sentence each. how: name -> value, `command` among them.
     """
+    own = Path(__file__).parents[1].joinpath("templates", "report.js").read_text(encoding="utf-8")
+    library = [charts.library()] if any(figure.chart for figure in figures) else []
     template = templates().get_template("report.html")
     return template.render(
-        title=title, answer=answer, figures=figures, tables=tables, how=dict(how or {}), remarks=remarks, status=status
+        title=title,
+        answer=answer,
+        verdict=verdict,
+        figures=figures,
+        tables=tables,
+        how=dict(how or {}),
+        remarks=remarks,
+        status=status,
+        scripts=[*library, own],
     )
 
 

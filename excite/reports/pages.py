@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from excite import output
+from excite.reports import charts
+from excite.reports.charts import Explorable
 from excite.reports.descriptions import Summary, describe
 from excite.reports.html import Picture, report_page
 from excite.text import format_number
@@ -24,6 +27,10 @@ CAPTIONS = {
     "verify.png": "Left, the error of every parameter in every simulated run, in per cent of the true value: dots are"
     " runs, diamonds their mean, grey bars the 95 % interval that the method itself predicts. Right, the share of runs"
     " in which the interval holds the truth; it claims 95 %.",
+    "correlation.png": "Correlation of the errors of every two parameters: near 1 or -1 the log shows their"
+    " difference or sum far better than each of them.",
+    "prior.png": "What the machine file calls known and what the log adds: grey, the 95 % interval before the log,"
+    " diamonds and bars the estimate and its 95 % interval, all in standard deviations known before.",
     "log.png": "Every channel that the machine file knows, in SI units, over time: as recorded, and as it is used after"
     " repair and resampling.",
     "signals.png": "Left, the share of each signal's error that is systematic, the rest being noise. Right, the error"
@@ -40,7 +47,14 @@ CAPTIONS = {
     "study.png": "Cell by cell: each parameter's error, root mean square over the cell's runs [%], and the share of 95"
     " % intervals that hold; or the verdicts of diagnosis; or the drives' condition numbers.",
 }
+ZOOM = " On the screen: drag to zoom, point to read values, the arrows go back; names hide curves."
+FOLDED = {  # figures that a reader opens, by what they are called
+    "misfit": "what each torque lacks against everything",
+    "correlation": "correlation of the parameters' errors",
+}
 CAPTIONS_BY_LOG = {
+    "clearest": "What the model lacks most clearly in {}: mean torque or force against the state of the machine on"
+    " which it depends. Flat at zero is right; grey is what noise alone leaves.",
     "misfit": "The mean torque (and force, if torques alone can't make the model follow the log) that the model lacks"
     " in {}, against the state of the machine. Flat at zero is right; grey is what noise alone leaves.",
     "when": "Left, when and in which signal the model is off in {}; right, at which speed and steering angle (or"
@@ -54,30 +68,54 @@ FIT_CAPTION = (
 )
 
 
-def write_page(place: Path, kind: str, summary: Summary, command: str | None = None) -> None:
+def write_page(
+    place: Path,
+    kind: str,
+    summary: Summary,
+    command: str | None = None,
+    explorable: Mapping[str, Explorable] | None = None,
+) -> None:
     """Write report.html of a folder from its summary and figures. Raises KeyError for an unknown kind.
 
-    command: how it was made, the command line by default.
+    command: how it was made, the command line by default. explorable: what of each figure a chart shows.
     """
     description = describe(kind, summary)
-    pictures = [Picture(path, _caption(path.name, summary)) for path in sorted(place.glob("*.png"))]
+    shown = dict(explorable or {})
+    made = charts.documents({name: one.panels for name, one in shown.items()})
+    pictures = [
+        Picture(
+            path,
+            _caption(path.name, summary) + (ZOOM if path.name in made else ""),
+            made.get(path.name, ""),
+            path.name in made and shown[path.name].whole,
+            FOLDED.get(path.name.removesuffix(".png").partition("-")[0], ""),
+        )
+        for path in sorted(place.glob("*.png"))
+    ]
     order = list(CAPTIONS)
-    pictures.sort(key=lambda p: order.index(p.path.name) if p.path.name in order else len(order))
+    pictures.sort(key=lambda p: (bool(p.folded), order.index(p.path.name) if p.path.name in order else len(order)))
     text = report_page(
         description.title,
         description.headline,
         pictures,
         description.tables,
         provenance(summary, command),
-        description.closing,
+        description.remarks,
         description.status,
+        description.verdict,
     )
     (place / REPORT).write_text(text, encoding="utf-8")
 
 
-def write_report(place: Path, kind: str, summary: Summary, command: str | None = None) -> None:
-    """Write report.html and summary.json of a folder, after its figures; command as in `write_page`."""
-    write_page(place, kind, summary, command)
+def write_report(
+    place: Path,
+    kind: str,
+    summary: Summary,
+    command: str | None = None,
+    explorable: Mapping[str, Explorable] | None = None,
+) -> None:
+    """Write report.html and summary.json of a folder, after its figures; command, explorable as in `write_page`."""
+    write_page(place, kind, summary, command, explorable)
     output.write_summary(place, summary)
 
 

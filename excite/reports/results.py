@@ -17,6 +17,7 @@ from excite.identification import Estimate, Prediction, SlipFit, Verification
 from excite.logs import Log, profile_of
 from excite.model import Model
 from excite.reports import figures, pages, plain_text
+from excite.reports.charts import Explorable
 from excite.reports.descriptions import Description, describe
 from excite.reports.html import result_fragment
 from excite.simulation import Motion
@@ -28,7 +29,8 @@ class Account:
     """All that is told of a result.
 
     kind: as `describe` takes it. summary: content of summary.json. figures: each by its file name, the main one first.
-    files: each writes other files into a folder. drawn: figures among these files.
+    files: each writes other files into a folder. drawn: figures more, which `draw` writes into a folder, several at a
+    time, returning what of them a chart shows.
     frame: the numbers as a table, with units in `attrs["units"]`.
     """
 
@@ -38,6 +40,7 @@ class Account:
     frame: Callable[[], pd.DataFrame]
     files: Sequence[Callable[[Path], object]] = ()
     drawn: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
+    draw: Callable[[Path], Mapping[str, Explorable]] | None = None
 
     def write(self, place: Path, command: str | None = None) -> dict[str, Any]:
         """Fill a folder with files, figures, report.html and summary.json; return the summary.
@@ -46,9 +49,10 @@ class Account:
         """
         for file in self.files:
             file(place)
+        explorable = {} if self.draw is None else dict(self.draw(place))
         for name, draw in self.figures.items():
-            figures.save(draw(), place / name)
-        pages.write_report(place, self.kind, self.summary, command)
+            explorable[name] = figures.save(draw(), place / name)
+        pages.write_report(place, self.kind, self.summary, command, explorable)
         return self.summary
 
 

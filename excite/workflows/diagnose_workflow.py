@@ -14,9 +14,9 @@ from excite.diagnosis import Assessment, Diagnosis, RivalPair, TorqueDiagnosis, 
 from excite.errors import InfeasibleError, MachineError, NotIdentifiableError, SimulationError
 from excite.identification import FILTERS
 from excite.logs import Log, Prepared, doubts_in_errors, examine, moves, prepare
-from excite.model import Model, build
+from excite.model import Model, build, signal_descriptions
 from excite.model.machine import Filter, Machine
-from excite.reports import Account
+from excite.reports import Account, Explorable
 from excite.text import format_number
 from excite.workflows import design_request, design_workflow, requests
 from excite.workflows.design_request import DesignRequest
@@ -133,20 +133,26 @@ def diagnose_account(machine: str, ready: Prepared, found: DiagnoseResult, drive
     }
     keys = ("kind", "amount", "amount_std", "unit", "share_percent", "p_value", "gain_percent", "gain_ci95")
     rows = {f"{f['effect']}@{f['where']}": {k: f[k] for k in keys} for f in summary["findings"]}
+    signals = partial(
+        reports.signals_figure, summary["signals"], bool(d.findings), title, signal_descriptions(model.machine)
+    )
     return Account(
         "diagnose",
-        summary,
-        {"signals.png": partial(reports.signals_figure, summary["signals"], bool(d.findings), title)},
+        reports.with_sentences("diagnose", summary),
+        {"signals.png": signals},
         partial(reports.rows_frame, rows, "finding"),
-        (partial(_write_diagnosis, d, title, text),),
+        (partial(_write_machine, text),),
         reports.figures_by_file(d, title),
+        partial(_draw, d, title),
     )
 
 
-def _write_diagnosis(d: Diagnosis | TorqueDiagnosis, title: str, machine_file: str | None, place: Path) -> None:
-    """Write the figures of each log, several at a time, and machine.toml."""
-    for _ in run_forked(reports.figure_calls(place, d, title)):
-        pass
+def _draw(d: Diagnosis | TorqueDiagnosis, title: str, place: Path) -> dict[str, Explorable]:
+    """Write the figures of each log, several at a time."""
+    return {k: v for one in run_forked(reports.figure_calls(place, d, title)) for k, v in one.items()}
+
+
+def _write_machine(machine_file: str | None, place: Path) -> None:
     if machine_file is not None:
         (place / MACHINE).write_text(machine_file, encoding="utf-8")
 

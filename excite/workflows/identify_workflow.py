@@ -135,9 +135,14 @@ def identify_account(
         for kind, several in (("fit", read), ("validation", unfitted))
         for k, one in enumerate(several)
     }
+    title = f"{model.machine.title}, {estimate.method}"
+    if estimate.status != "invalid" and np.isfinite(estimate.std).any():
+        figures["correlation.png"] = partial(reports.correlation_figure, estimate, title)
+        if estimate.prior_std is not None and (np.isfinite(estimate.prior_std) & (estimate.prior_std > 0)).any():
+            figures["prior.png"] = partial(reports.prior_figure, estimate, as_in_file.nominal, title)
     return Account(
         "identify",
-        summary,
+        reports.with_sentences("identify", summary),
         figures,
         partial(reports.rows_frame, parameters, "parameter"),
         (partial(identification.write_estimate, model=as_in_file, estimate=estimate),),

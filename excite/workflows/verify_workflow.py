@@ -77,7 +77,7 @@ def verify_account(
     title = f"{model.machine.title}: {count(runs, 'simulated run')}, {result.method}, kit {result.kit}"
     return Account(
         "verify",
-        summary,
+        reports.with_sentences("verify", summary),
         {"verify.png": partial(reports.verify_figure, result, title)},
         partial(reports.rows_frame, parameters, "parameter"),
     )

@@ -527,7 +527,7 @@ def test_every_log_is_drawn(straight: Model, tmp_path: Path, monkeypatch: pytest
             draw()
         assert all(a is b for a, b in zip(loosened, asked, strict=True))
         drawn = {p.name for p in tmp_path.iterdir()}
-        assert drawn == {f"{kind}-{k}.png" for kind in ("misfit", "when") for k in (1, 2)}
+        assert drawn == {f"{kind}-{k}.png" for kind in ("clearest", "misfit", "when") for k in (1, 2)}
 
 
 @pytest.mark.parametrize("size", [3e-8, 4e-4, 1.0, 3e5])

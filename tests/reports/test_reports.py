@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import re
 from pathlib import Path
@@ -15,7 +17,7 @@ from support.commands import Excite
 from excite.cli import terminal
 from excite.logs import profile as profiles
 from excite.model import Model
-from excite.reports import Picture, Table, describe, figures, html, pages
+from excite.reports import Picture, Table, charts, describe, figures, html, pages
 from excite.simulation import Motion
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -57,7 +59,7 @@ def test_answer_comes_first_then_figure_table_and_how(picture: Path) -> None:
 
 def test_names_from_files_cannot_break_the_page() -> None:
     text = html.report_page("<b>", "x < y & z", how={"logs": "<script>alert(1)</script>.csv"})
-    assert "<script" not in text
+    assert "<script>alert" not in text
     assert "x &lt; y &amp; z" in text
 
 
@@ -226,3 +228,69 @@ def test_report_in_a_browser_fits_screen_and_paper(browser: Any, tmp_path: Path)
         assert 1 <= len(re.findall(rb"/Type\s*/Page\b", paper)) <= 3
         assert said == []
         tab.close()
+
+
+def test_charts_keep_every_peak_and_gap() -> None:
+    """Of a long log the extremes of every stretch stay, whatever is left out between them."""
+    rng = np.random.default_rng(0)
+    first, second = rng.normal(size=(2, 60_000)).cumsum(axis=1)
+    second[30_000:31_000] = np.nan
+    kept = charts.thin_out([first, second], 2000)
+    assert len(kept) < 2300
+    for y in (first, second):
+        for part in np.array_split(np.arange(60_000), 500):
+            here = kept[(kept >= part[0]) & (kept <= part[-1])]
+            if np.isfinite(y[part]).any():
+                assert np.nanmax(y[here]) == np.nanmax(y[part])
+                assert np.nanmin(y[here]) == np.nanmin(y[part])
+            else:
+                assert len(here)
+    assert charts.thin_out([first], 60_000).tolist() == list(range(60_000))
+
+
+def test_a_report_zooms_sorts_and_copies(browser: Any, va12: Model, va12_motion: Motion, tmp_path: Path) -> None:
+    """In a browser: linked charts with values under the pointer, sortable tables, and no network; on paper pictures."""
+    problem = va12.machine.problems[str(va12.machine.problem)]
+    figure = figures.design_figure(va12, problem, va12_motion, "t")
+    shown = figures.save(figure, tmp_path / "design.png")
+    panels = shown.panels
+    assert [p.y_label for p in panels] == ["torque [% of limit]", "speed [m/s]", "angle [rad]", "largest slip [-]"]
+    assert panels[1].curves[0].y == pytest.approx(va12_motion.nu[:, 0])
+    assert not shown.whole  # the path and the use of limits are in the picture alone
+    chart = charts.documents({"design.png": panels})["design.png"]
+    table = Table("T", ("name", "value"), (("a,b", "10"), ('c"', "9"), ("<i>", "-"), ("d", "< 1e-12")))
+    picture = html.Picture(tmp_path / "design.png", "c", chart, shown.whole)
+    text = html.report_page("t", "a", [picture], [table], remarks=["<script>alert(1)</script>"])
+    assert len(text) - (tmp_path / "design.png").stat().st_size * 4 / 3 < 2e6
+    (tmp_path / "report.html").write_text(text)
+    tab = browser.new_page(viewport={"width": 1000, "height": 900})
+    said: list[str] = []
+    tab.on("pageerror", lambda error: said.append(str(error)))
+    tab.on("console", lambda m: said.append(m.text) if m.type == "error" else None)
+    tab.on("request", lambda r: said.append(r.url) if not r.url.startswith(("file:", "data:")) else None)
+    tab.goto((tmp_path / "report.html").as_uri())
+    tab.wait_for_function("window.Bokeh && Bokeh.documents.length && Bokeh.documents[0].is_idle")
+    ranges = "Bokeh.documents[0].roots()[0].children.map(c => [c[0].x_range.start, c[0].x_range.end])"
+    before = tab.evaluate(ranges)
+    assert len(before) == 4
+    box = tab.locator(".chart").bounding_box()
+    tab.mouse.move(box["x"] + 300, box["y"] + 120)
+    tab.mouse.down()
+    tab.mouse.move(box["x"] + 500, box["y"] + 150, steps=4)
+    tab.mouse.up()
+    tab.wait_for_timeout(200)
+    after = tab.evaluate(ranges)
+    assert all(x == after[0] for x in after)
+    assert after[0][1] - after[0][0] < 0.5 * (before[0][1] - before[0][0])
+    cells = "[...document.querySelectorAll('tbody td:first-child')].map(c => c.textContent)"
+    tab.get_by_role("button", name="value").click()
+    assert tab.evaluate(cells) == ["d", 'c"', "a,b", "<i>"]
+    tab.evaluate("navigator.clipboard.writeText = async (text) => { window.copied = text; }")
+    tab.get_by_role("button", name="Copy as CSV").click()
+    rows = list(csv.reader(io.StringIO(tab.evaluate("window.copied"))))
+    assert rows[0] == ["name", "value"]
+    assert sorted(rows[1:]) == sorted([list(row) for row in table.rows])
+    tab.emulate_media(media="print")
+    assert tab.evaluate("getComputedStyle(document.querySelector('.chart')).display") == "none"
+    assert said == []
+    tab.close()
