@@ -47,8 +47,8 @@ def whole(name: str, file: Path, origin: str) -> str:
     lines = [
         f"# {name}: a copy of the shipped machine {origin}, with unit and meaning of every key. Everything is SI: m,",
         "# kg, s, N, N m, rad. Change the values and their sources (paper, data sheet, measured, published,",
-        f"# identified, assumed or definition), then run `excite machine check {file}`. `excite docs` lists the keys that may be",
-        f'# added. To write only what differs, begin a file with extends = "{origin}" instead.',
+        f"# identified, assumed or definition), then run `excite machine check {file}`. `excite docs` lists the keys",
+        f'# that may be added. To write only what differs, begin a file with extends = "{origin}" instead.',
         "",
     ]
     record, header_of, open_list = "Machine", "", 0
