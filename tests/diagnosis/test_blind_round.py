@@ -270,11 +270,10 @@ def test_the_study_takes_cases_that_no_test_knows() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("half", [0, 1])
-def test_most_plain_causes_are_named_and_hardly_any_wrongly(half: int) -> None:
-    """One case of each cause; the study in results/diagnosis has many more, of any size."""
+def test_most_plain_causes_are_named_and_hardly_any_wrongly() -> None:
+    """One case of every second cause; the study in results/diagnosis has all, of any size."""
     told: dict[str, str] = {}
-    for name, number in list(PLAIN.items())[half::2]:
+    for name, number in list(PLAIN.items())[::2]:
         seen = blind(case("cause", name, number))
         assert visibility(seen) > 10 * VISIBLE
         told[seen.case.key] = score(seen.case, ask(seen.log)).outcome
@@ -287,8 +286,6 @@ def test_most_plain_causes_are_named_and_hardly_any_wrongly(half: int) -> None:
     ("name", "number"),
     [
         ("articulation_backlash", 1),
-        ("articulation_backlash", 2),
-        ("articulation_backlash", 16),
         ("ground_slope", 3),
         ("articulation_stop_spring", 1),
         ("payload_shift", 0),
@@ -306,11 +303,10 @@ def test_what_is_so_strong_that_nothing_follows_the_log_is_named(name: str, numb
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [0, 1, 2, 3, 5])
+@pytest.mark.parametrize("number", [0, 1, 5])
 def test_compaction_that_a_map_of_the_ground_counts_is_named(number: int) -> None:
-    """In a slalom, one way, in circles, to and fro, in an eight: tracks that fan out and cross; and the front roll
-    on new ground, the rear one on what that has passed over, which tells what a pass does and not how many are to come.
-    """
+    """In a slalom, one way, in an eight: tracks that fan out and cross; and the front roll on new ground, the rear one
+    on what that has passed over, which tells what a pass does and not how many are to come."""
     one = case("cause", "compaction_per_pass", number)
     judged = score(one, ask(blind(one).log))
     assert judged.outcome == "right", judged
@@ -339,8 +335,6 @@ def test_hardly_any_clean_log_is_accused() -> None:
         ("side_wind", 0),
         ("stuck_bit", 2),
         ("cg_drift", 2),
-        ("cg_drift", 4),
-        ("cg_drift", 7),
     ],
 )
 def test_a_surprise_gets_no_name(name: str, number: int) -> None:
