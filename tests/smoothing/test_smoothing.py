@@ -244,8 +244,7 @@ def test_errors_are_as_large_as_it_says(va12: Model, drive: str, kit: str) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kit", ["full", "paper"])
-@pytest.mark.parametrize(("drive", "middle"), [("energetic", 0.25), ("human", 0.4)])
+@pytest.mark.parametrize(("drive", "middle", "kit"), [("energetic", 0.25, "paper"), ("human", 0.4, "full")])
 def test_coverage(va12: Model, drive: str, kit: str, middle: float) -> None:
     """Another machine, drive and noise each time, started from a file up to 20 % off: errors as large as said."""
     z, percent, _ = errors(va12, drive, kit, range(50))
