@@ -50,6 +50,28 @@ def watch_interrupts() -> Iterator[InterruptFlag]:
                 signal.signal(number, handler)
 
 
+@contextmanager
+def note_first_interrupt() -> Iterator[InterruptFlag]:
+    """Note the first SIGINT in the block and go on; a second one has its usual effect (main thread only)."""
+    flag = InterruptFlag()
+    if threading.current_thread() is not threading.main_thread() or not callable(signal.getsignal(signal.SIGINT)):
+        yield flag
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def note(number: int, frame: FrameType | None) -> None:
+        if flag.stop and callable(before):
+            before(number, frame)
+        flag.stop = True
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield flag
+    finally:
+        if signal.getsignal(signal.SIGINT) is note:
+            signal.signal(signal.SIGINT, before)
+
+
 def ignore_interrupts() -> None:
     """Ignore Ctrl-C from here on, while the program only waits for its processes to end."""
     if threading.current_thread() is threading.main_thread():

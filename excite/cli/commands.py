@@ -548,7 +548,7 @@ def diagnose(
     """Find and name what the model gets wrong along logs.
 
     Gives the magnitude of each cause, and how much the error falls with it in the model. Writes the machine
-    file with the causes in it.
+    file with the causes in it. Ctrl-C ends the search and keeps what was found; pressed again, it discards that.
 
     Example: excite diagnose va12 log.csv
     """

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from excite import identification
+from excite import identification, interrupt
 from excite.diagnosis import hold_out, residuals, separating_run, torque_regression
 from excite.diagnosis.acceptance import reason_against, widen
 from excite.diagnosis.deadline import Deadline
@@ -44,9 +44,8 @@ class Assessment:
 
     total_gain, gains: hold-out gain of all findings, and of each; None if no model could be fitted to the rest of the
     logs. before, after: size of each signal's innovations without and with the findings. located: where the misfit is.
-    separating_run: the run that would separate tied causes. cut_short: the budget [s] that ended the search, None if it
-    ended by itself. differences: between logs of which each alone is explained, None if there are none; no effect is
-    sought then.
+    separating_run: the run that would separate tied causes. cut_short: what ended the search, "" if it ended by itself.
+    differences: between logs of which each alone is explained, None if there are none; no effect is sought then.
     """
 
     diagnosis: Diagnosis | TorqueDiagnosis
@@ -56,7 +55,7 @@ class Assessment:
     after: Mapping[str, InnovationLevel]
     located: tuple[str, ...]
     separating_run: str | None
-    cut_short: float | None = None
+    cut_short: str = ""
     differences: Agreement | None = None
 
 
@@ -178,8 +177,8 @@ def explain(
     are all driven and which has no known values, regression takes its place where there are more than
     MAX_FOLLOWED_JOINTS joints, where smoothing finds no estimate, or where it leaves something unexplained and the
     corrections of regression surely gain more. Several logs are compared first: if each alone is explained and they
-    differ in parameters, that is the answer. budget_s [s]: after it nothing new is begun, and the best answer so far is
-    given. Raises NoEstimateError.
+    differ in parameters, that is the answer. budget_s [s]: after it, and after a first Ctrl-C, nothing new is begun,
+    and the best answer so far is given. Raises NoEstimateError.
     """
     differences = _find_differences(model, logs, filter)
     if differences is not None:
@@ -196,9 +195,14 @@ def explain(
             located=(),
         )
         return replace(assess(plain, progress, runner), located=(), differences=differences)
-    whole, smoothing = Deadline(budget_s), Deadline(None if budget_s is None else SMOOTHING_SHARE * budget_s)
-    found = _explain(model, logs, filter, progress, runner, whole, smoothing)
-    return replace(found, cut_short=budget_s if whole.reached or smoothing.reached else None)
+    with interrupt.note_first_interrupt() as asked:
+        limits = (budget_s, None if budget_s is None else SMOOTHING_SHARE * budget_s)
+        whole, smoothing = (Deadline(seconds, lambda: asked.stop) for seconds in limits)
+        found = _explain(model, logs, filter, progress, runner, whole, smoothing)
+    if not (whole.reached or smoothing.reached):
+        return found
+    by = "Ctrl-C" if asked.stop else f"its budget of {format_number(budget_s or 0.0, 3)} s"
+    return replace(found, cut_short=by)
 
 
 def _find_differences(model: Model, logs: Sequence[Log], filter: Filter) -> Agreement | None:
@@ -378,6 +382,8 @@ def answer_text(a: Assessment) -> str:
     )
     if d.verdict == "unexplained":
         text = f"{logs} a misfit that no known effect explains"
+        if a.cut_short and not rows:
+            return f"{logs} a misfit; the search for its cause was ended by {a.cut_short} before it found one."
         if rows:
             taken = ", ".join(
                 f"{_with_rivals(r)} of {format_magnitude(r)} takes {r['share_percent']:.0f} %" for r in rows

@@ -17,7 +17,6 @@ from excite.logs import Log, Prepared, doubts_in_errors, examine, moves, prepare
 from excite.model import Model, build, signal_descriptions
 from excite.model.machine import Filter, Machine
 from excite.reports import Account, Explorable
-from excite.text import format_number
 from excite.workflows import design_request, design_workflow, requests
 from excite.workflows.design_request import DesignRequest
 from excite.workflows.progress import Bar, no_bar
@@ -76,10 +75,10 @@ def diagnose_from(
             model, prepared.logs, prepared.filter, lambda share, what: report(share), run_forked, budget_s
         )
     notes = [*prepared.notes, *_baseline_note(assessment.diagnosis)]
-    if assessment.cut_short is not None:
+    if assessment.cut_short:
         notes.append(
-            f"the search ended with its budget of {format_number(assessment.cut_short, 3)} s: this is the best answer"
-            " so far, and further effects were not tried"
+            f"the search was ended by {assessment.cut_short}: this is the best answer so far, and further effects were"
+            " not tried"
         )
     return DiagnoseResult(assessment, prepared.logs, notes)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +33,8 @@ from excite.diagnosis import (
     selection,
 )
 from excite.diagnosis.parallel import run_in_turn
-from excite.logs import log, profile
+from excite.identification import needed_sensors
+from excite.logs import log, prepare, profile
 from excite.model import Model, prediction
 from excite.model.effects import placing
 from excite.model.machine import EffectEntry, Quantity, machine
@@ -1122,3 +1125,19 @@ def test_a_file_that_is_far_off_is_no_cause(straight: Model, share: float, seed:
     found = diagnosis.diagnose(far, [one], straight.machine.filter)
     assert not found.findings
     assert found.verdict == "clean"
+
+
+def test_ctrl_c_ends_the_search_and_keeps_the_answer_so_far(sloping: Path, straight: Model) -> None:
+    ready = prepare(straight, [sloping], needed_sensors(straight, "joint"))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def press(share: float, what: str) -> None:
+        if what == "fitting the model":
+            os.kill(os.getpid(), signal.SIGINT)
+
+    try:
+        found = package.explain(straight, ready.logs, straight.machine.filter, press)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert (found.diagnosis.verdict, found.cut_short) == ("unexplained", "Ctrl-C")
+    assert "the search for its cause was ended by Ctrl-C before it found one" in findings.answer_text(found)
