@@ -11,12 +11,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
+import numpy as np
 
 from excite.errors import MachineError
 from excite.model import effects, mechanics
 from excite.model.effects import ContactMotion, PlacedEffect, SampleView, Soil, Values
 from excite.model.machine import Body, Machine, Sensor
 from excite.text import format_number
+
+SPEED_ROUNDING = 1e-3  # speed below which the size of a speed is rounded off, for its derivative [m/s]; chosen
 
 
 @dataclass(frozen=True)
@@ -51,14 +54,24 @@ class SymbolicSample:
 
     def row(self, body: Body) -> int:
         """Return the equation of a body's joint."""
-        return self.names.index(body.coordinates[0])
+        return self.names.index(self.machine.coordinate(body))
 
     @cached_property
     def by_inertia(self) -> ca.SX:
         """Jacobian (n_q, 10 n_bodies) of the generalised forces to the inertial parameters of all bodies."""
         every = {b.index: ca.SX.sym(f"inertia{b.index}", 10) for b in self.machine.body}
-        rows = mechanics.generalised_forces(self.machine, self.at, self.frames, every)
-        return ca.jacobian(ca.vertcat(*[rows[c] for c in self.names]), ca.vertcat(*every.values()))
+        return ca.jacobian(self.reduced_forces(self.frames, every), ca.vertcat(*every.values()))
+
+    def reduced_forces(self, frames: dict[int, mechanics.Frame], inertia: dict[int, ca.SX]) -> ca.SX:
+        """Return the generalised forces (n_q,) of the free coordinates q: S^T f of all joints' f, whose angles are S q.
+
+        inertia: (10,) parameters of each body.
+        """
+        rows = mechanics.generalised_forces(self.machine, self.at, frames, inertia)
+        for body in self.machine.body:
+            if body.moves_with is not None:
+                rows[self.machine.coordinate(body)] += self.machine.ratio(body) * rows[body.coordinates[0]]
+        return ca.vertcat(*[rows[c] for c in self.names])
 
 
 @dataclass(frozen=True)
@@ -130,6 +143,10 @@ def symbolic_sample(
     at = full | dict(zip(names, ca.vertsplit(q), strict=True))
     rate = full | dict(zip(names, ca.vertsplit(nu), strict=True))
     accel = full | dict(zip(names, ca.vertsplit(a), strict=True))
+    for moving in (at, rate, accel):
+        for b in machine.body:
+            if b.moves_with is not None:
+                moving[b.coordinates[0]] = machine.ratio(b) * moving[machine.coordinate(b)]
     heading = at[machine.body[0].coordinates[2]] if machine.planar else ca.SX(0)
     gravity = mechanics.rot_z(-heading) @ ca.DM(machine.gravity)
     smoothed = {
@@ -137,6 +154,10 @@ def symbolic_sample(
         for b in machine.body
         if b.friction is not None
     }
+    smoothed |= dict(sign or {})
+    for b in machine.body:  # joints that move together turn and stick together
+        if b.moves_with is not None and b.friction is not None:
+            smoothed[b.index] = np.sign(machine.ratio(b)) * smoothed[b.moves_with.joint]
     return SymbolicSample(
         machine,
         q,
@@ -151,7 +172,7 @@ def symbolic_sample(
         mechanics.body_motions(machine, at, rate, accel, gravity),
         gravity,
         heading,
-        smoothed | dict(sign or {}),
+        smoothed,
     )
 
 
@@ -182,7 +203,7 @@ def equations(machine: Machine, standard: tuple[str, ...], placed: Sequence[Plac
     gain, offset, delay = _channels(s, acting, time)
     now = z[memory.index("time")] if "time" in memory else ca.SX(0)
     read, reading_names = _readings(s, acting)
-    predict = ca.SX(balance)
+    predict = ca.sparsify(ca.DM(machine.row_matrix)) @ balance
     for k, body in enumerate(machine.actuated):
         row = s.row(body)
         predict[row] = ca.substitute(gain[k], time, now) * predict[row] + ca.substitute(offset[k], time, now)
@@ -309,12 +330,16 @@ def _common_view(s: SymbolicSample, time: ca.SX) -> SampleView:
     return SampleView(
         {b.index: s.at[b.coordinates[0]] for b in turning},
         {b.index: s.rate[b.coordinates[0]] for b in turning},
-        dict(zip([b.index for b in s.machine.actuated], ca.vertsplit(s.u), strict=True)),
+        {
+            b.index: torque * (1.0 if b.driven_with is None else float(b.driven_with.ratio))
+            for driven, torque in zip(s.machine.actuated, ca.vertsplit(s.u), strict=True)
+            for b in s.machine.drives(driven)
+        },
         {b.index: _friction_torque(s, b) for b in rubbing},
         {b.index: s.by_name[f"Fs{b.index}"] for b in rubbing},
         {b.index: float(b.friction.smoothing) for b in rubbing if b.friction is not None},
         s.sign,
-        {b.index: effects.large_torque(s.machine, b) for b in s.machine.actuated},
+        {b.index: effects.large_torque(s.machine, b) for d in s.machine.actuated for b in s.machine.drives(d)},
         {b.index: _contact_motion(s, b)[0] for b in s.machine.contacts},
         {b.index: s.frames[b.index].velocity[0] for b in s.machine.body},
         {b.index: s.frames[b.index].omega[2] for b in s.machine.body},
@@ -351,11 +376,10 @@ def _balance(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, 
     """Return generalised forces (n_q,) that the motors must deliver, and slips by name."""
     machine = s.machine
     inertia = {b.index: mechanics.inertial_vector(b, s.by_name) for b in machine.body}
-    rows = mechanics.generalised_forces(machine, s.at, s.frames, inertia)
-    force = ca.vertcat(*[rows[c] for c in s.names])
+    force = s.reduced_forces(s.frames, inertia)
     for body in machine.body:
-        if body.friction is not None and body.coordinates[0] in s.names:
-            force[s.row(body)] += _friction_torque(s, body)
+        if body.friction is not None and machine.is_free(body):
+            force[s.row(body)] += machine.ratio(body) * _friction_torque(s, body)
     for e in acting:
         force -= _effect_force(s, e, inertia)
     slips: dict[str, ca.SX] = {}
@@ -376,7 +400,7 @@ def _effect_force(s: SymbolicSample, e: ActiveEffect, inertia: Mapping[int, ca.S
     for k in e.placed.bodies:
         body = machine.find(k)
         if effect.torque is not None:
-            force[s.row(body)] += effect.torque(e.view, k, e.values)
+            force[s.row(body)] += machine.ratio(body) * effect.torque(e.view, k, e.values)
         if effect.push is not None:
             lever = _contact_motion(s, body)[1]
             force += lever[:2, :].T @ ca.vertcat(*effect.push(e.view, k, e.values))
@@ -384,8 +408,7 @@ def _effect_force(s: SymbolicSample, e: ActiveEffect, inertia: Mapping[int, ca.S
         pull = mechanics.rot_z(-s.heading) @ ca.vertcat(*effect.gravity(e.view, e.values), 0)
         still = {c: ca.SX(0) for c in s.at}
         frames = mechanics.body_motions(machine, s.at, still, still, pull)
-        rows = mechanics.generalised_forces(machine, s.at, frames, dict(inertia))
-        force -= ca.vertcat(*[rows[c] for c in s.names])
+        force -= s.reduced_forces(frames, dict(inertia))
     if effect.inertia is not None:
         changes = effect.inertia(e.view, e.values)
         by_parameter = effects.payload_change(machine, changes)
@@ -484,15 +507,29 @@ def _readings(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX,
             value = s.wheels[wheels.index(sensor.name)]
         elif sensor.kind == "yaw_rate":
             value = s.rate[root.coordinates[2]]
-        elif sensor.kind == "lateral_speed":
-            value = s.frames[body.index].velocity[1]
         else:
-            value = s.at[root.coordinates["xy".index(sensor.kind)]]
+            value = _reading_at_place(s, sensor)
         exact = value
         for e in acting:
             value = value + e.reading_error(exact, sensor)
         readings[sensor.name] = value
     return ca.vertcat(*readings.values(), ca.SX(0, 1)), tuple(readings)
+
+
+def _reading_at_place(s: SymbolicSample, sensor: Sensor) -> ca.SX:
+    """Return the exact reading of a speed or position at a sensor's place on the root."""
+    frame, (ahead, lateral) = s.frames[sensor.body], sensor.mounted_at
+    along, across = frame.velocity[0] - lateral * frame.omega[2], frame.velocity[1] + ahead * frame.omega[2]
+    if sensor.kind == "forward_speed":
+        return along
+    if sensor.kind == "lateral_speed":
+        return across
+    if sensor.kind == "ground_speed":
+        return ca.sqrt(along**2 + across**2 + SPEED_ROUNDING**2) - SPEED_ROUNDING
+    axis = "xy".index(sensor.kind)
+    return (
+        s.at[s.machine.body[0].coordinates[axis]] + (mechanics.rot_z(s.heading) @ ca.vertcat(ahead, lateral, 0))[axis]
+    )
 
 
 def contact_lines(s: SymbolicSample) -> ca.Function:

@@ -1,7 +1,8 @@
 """The model of a machine: prediction, base parameters and regressor.
 
 Rows are the equations of motion in the paper's form: an actuated row predicts the measured torque (dynamics + friction
-- contact + offset u0), any other row predicts zero. The regressor is the exact Jacobian of that prediction, so the
+- contact + offset u0), any other row predicts zero; that of a joint with a share of another's torque is first freed of
+it (`Machine.row_matrix`). The regressor is the exact Jacobian of that prediction, so the
 physics is written once. Effects of the machine file are part of the prediction; their magnitudes are parameters.
 """
 
@@ -169,7 +170,7 @@ class Model:
     @cached_property
     def actuated(self) -> tuple[int, ...]:
         """Indices of the actuated coordinates, one per input."""
-        return tuple(self.coordinates.index(b.coordinates[0]) for b in self.machine.actuated)
+        return tuple(self.coordinates.index(self.machine.coordinate(b)) for b in self.machine.actuated)
 
     @cached_property
     def rubbing(self) -> tuple[int, ...]:
@@ -256,10 +257,7 @@ class Model:
         sign (n_rubbing,): as in `equations`. slips (n_rubbing,): 0 for joints held at rest, 1 for all others.
         """
         M, bias = self.equations(q, nu, X, u, z, sign)
-        drive = ca.SX(len(self.coordinates), 1)
-        for k, row in enumerate(self.actuated):
-            drive[row] = u[k]
-        force = drive - bias
+        force = self.joint_torques(u) - bias
         if slips is not None:
             free = ca.SX.ones(len(self.coordinates))
             for k, row in enumerate(self.rubbing):
@@ -267,6 +265,10 @@ class Model:
             M, force = M * (free @ free.T) + ca.diag(1 - free), force * free
         D, L, order = ca.ldl(M)
         return ca.ldl_solve(force, D, L, order)
+
+    def joint_torques(self, u: ca.SX) -> ca.SX:
+        """Return the torques (n_q,) on the coordinates from those of the drives u (n_u,) [N m]."""
+        return ca.sparsify(ca.DM(self.machine.input_matrix)) @ u
 
     def equations(
         self,
@@ -277,7 +279,7 @@ class Model:
         z: ca.SX | None = None,
         sign: ca.SX | None = None,
     ) -> tuple[ca.SX, ca.SX]:
-        """Return mass matrix (n_q, n_q) and bias (n_q,): M a + bias = u, the delivered torques [N m].
+        """Return mass matrix (n_q, n_q) and bias (n_q,): M a + bias = `joint_torques` of the delivered [N m].
 
         u and z matter to effects only; they are zero by default. sign (n_rubbing,): sgn of the joints' rates in dry
         friction, smoothed by default.

@@ -341,9 +341,9 @@ def _input_sensitivities(space: StateSpace, p: Trajectory, u: np.ndarray, X: np.
 
 
 def _order_forces(space: StateSpace, force: np.ndarray) -> np.ndarray:
-    """Order forces (K, n_q, C): rows with an actuator, then rows without, as in `_input_sensitivities`."""
+    """Order forces (K, n_q, C) as in `_input_sensitivities`: torques of the drives, then what else acts."""
     rows = [*space.model.actuated, *(space.forced_rows[k] for k in _unactuated_rows(space))]
-    return force[:, rows].astype(np.float32)
+    return (space.model.machine.row_matrix @ force)[:, rows].astype(np.float32)
 
 
 def _torque_channel_error(space: StateSpace, e: PlacedEffect, u: np.ndarray, t: np.ndarray) -> np.ndarray:

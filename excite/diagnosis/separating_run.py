@@ -186,7 +186,6 @@ class _EffectResponses:
         self.model, self.machine, self.placed = model, stage.machine, placed
         self.made: SignatureFunctions = signatures(stage.machine, standard, placed)
         self.p = (model.expand @ stage.fit.X)[: len(standard)]
-        self.rows = {b.index: k for b, k in zip(stage.machine.actuated, model.actuated, strict=True)}
         self.readings = self.made.reading.size1_out(0)
 
     def __call__(self, m: SampledMotion) -> np.ndarray:
@@ -211,7 +210,8 @@ class _EffectResponses:
         for k, body in enumerate(self.machine.actuated):
             if body.index in e.bodies:
                 rate = np.gradient(m.u[:, k], m.t)
-                added[self.rows[body.index]] = (gain - 1) * m.u[:, k] + offset - delay * rate
+                misread = (gain - 1) * m.u[:, k] + offset - delay * rate
+                added += self.machine.input_matrix[:, k : k + 1] * misread
         return added
 
 

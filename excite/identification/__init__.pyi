@@ -30,6 +30,7 @@ from .methods import (
     needed_sensors as needed_sensors,
     recommend_method as recommend_method,
     require_sensors as require_sensors,
+    unused_sensors as unused_sensors,
 )
 from .monte_carlo import (
     Verification as Verification,

@@ -78,7 +78,7 @@ def rest_projection(
         return identity
     machine, coordinate_index = model.machine, model.coordinates.index
     joints = [
-        coordinate_index(machine.find(s.body).coordinates[0])
+        coordinate_index(machine.coordinate(machine.find(s.body)))
         for s in machine.sensors("full")
         if s.kind == "angle"
         and s.resolution is not None

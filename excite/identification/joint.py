@@ -257,7 +257,7 @@ def _build_estimate(
         for k, name in enumerate(names)
         if weak[k]
     }
-    residual = np.concatenate(errors, axis=1)
+    residual, size = np.concatenate(errors, axis=1), float(np.linalg.norm(np.concatenate(Y, axis=1)))
     covariance = fit.covariance.copy()
     covariance[weak], covariance[:, weak] = np.nan, np.nan
     return Estimate(
@@ -272,7 +272,7 @@ def _build_estimate(
                 R * np.maximum(np.abs(fit.X), [float(model.machine.scale.get(n, 0.0)) for n in model.base.names])
             )
         ),
-        100 * float(np.linalg.norm(residual) / np.linalg.norm(np.concatenate(Y, axis=1))),
+        100 * float(np.linalg.norm(residual)) / size if size else np.nan,
         residual,
         int(sum(data.used.sum() for data in measurements)) - len(fit.X),
         reasons,

@@ -254,7 +254,10 @@ def solve_blocks(blocks: Sequence[Block], scale: np.ndarray | None = None) -> So
             raise NotIdentifiableError("the filtered log is not finite: is a value in it far out of range?")
     rows = sum(Y.size for _, Y in blocks)
     if not any((Y != 0).any() for _, Y in blocks):
-        raise NotIdentifiableError("every torque is zero all along: are their sensors connected?")
+        raise NotIdentifiableError(
+            "every torque is zero all along: are their sensors connected? A log without drive tells ratios only: give a"
+            " value of the machine file as known, and use joint"
+        )
     if rows <= n_base:
         raise NotIdentifiableError(
             f"{count(rows, 'filtered row')} for {count(n_base, 'parameter')}: the log is too short"

@@ -19,7 +19,7 @@ from excite.identification.joint import joint
 from excite.identification.linear_methods import filtered_blocks, ols, tls, wls
 from excite.identification.output_error import oe
 from excite.identification.status import assess
-from excite.logs import NEEDED, Log, doubts_in_errors, examine, samples, unmeasured
+from excite.logs import NEEDED, Log, doubts_in_errors, examine, planar_speed_sensors, samples, unmeasured
 from excite.model import Model
 from excite.model.machine import Filter
 from excite.simulation import outside_law
@@ -30,13 +30,15 @@ class Method:
     """An identification method: a function(model, logs, filter) that returns an Estimate.
 
     effects: which it estimates beside the base parameters: none, those linear in the equations of motion, or any.
-    simulates: finds an unmeasured speed from the dynamics. biased: noisy slips bias it, so `excite identify` estimates
+    simulates: finds an unmeasured speed from the dynamics. reads: kinds of sensor that it uses beside those of
+        `LINEAR_KINDS`. biased: noisy slips bias it, so `excite identify` estimates
         its bias.
     """
 
     find: Estimator
     effects: Literal["none", "linear", "any"] = "none"
     simulates: bool = False
+    reads: tuple[str, ...] = ()
     biased: bool = False
     optimistic: bool = False
 
@@ -54,7 +56,7 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
         raise ValueError(f"method: {method} is unknown, allowed: {', '.join(METHODS)}")
     if not logs:
         raise ValueError("identify: no log given")
-    require_sensors(model)
+    require_sensors(model, method)
     _require_method_for_effects(model, method)
     examined = [examine(model.machine, log) for log in logs]
     repaired, filter = [e.log for e in examined], filter or model.machine.filter
@@ -79,7 +81,9 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     estimate = assess(model, repaired, estimate, filter)
     if estimate.share_outside_law is None:
         estimate = replace(estimate, share_outside_law=_share_outside_law(model, repaired, filter))
-    return add_notes(estimate, *(note for e in examined for note in e.notes), *doubts)
+    unused = unused_sensors(model, method, repaired)
+    said = [f"{method} does not use {', '.join(unused)}"] if unused else []
+    return add_notes(estimate, *said, *(note for e in examined for note in e.notes), *doubts)
 
 
 def _share_outside_law(model: Model, logs: Sequence[Log], filter: Filter) -> float | None:
@@ -93,26 +97,38 @@ def _share_outside_law(model: Model, logs: Sequence[Log], filter: Filter) -> flo
     return float(np.concatenate(outside).mean())
 
 
-def require_sensors(model: Model) -> None:
-    """Raise MachineError if the machine file's sensors cannot determine the motion and torques."""
+def require_sensors(model: Model, method: str = "joint") -> None:
+    """Raise MachineError if a method cannot determine the motion and torques from the machine file's sensors."""
     machine = model.machine
-    present = {(s.kind, s.body) for s in machine.sensor}
+    present = {
+        (s.kind, machine.coordinate(machine.find(s.body))) for s in machine.sensor if s.kind in ("angle", "torque")
+    }
     for body in machine.actuated:
         for kind in ("angle", "torque"):
-            if (kind, body.index) not in present:
+            if (kind, machine.coordinate(body)) not in present:
                 raise MachineError(
                     f"{machine.name}: sensor: none of kind {kind} on joint {body.index} ({body.where}): identification"
                     " needs one"
                 )
     if not machine.planar:
         return
-    wheels = [s for s in machine.sensors("full") if s.kind == "wheel"]
-    turns = machine.body[0].coordinates[2] in model.coordinates
-    tracks = len({float(s.lateral or 0) for s in wheels})
-    if not wheels or (turns and tracks < 2):
+    sensors = machine.sensors("full")
+    found = planar_speed_sensors(model, [s.name for s in sensors])
+    known = dict(zip(found.coordinates, found.determined, strict=True))
+    x, y, turn = machine.body[0].coordinates
+    kinds = {s.kind for s in sensors} & set(METHODS[method].reads)
+    if "ground_speed" in kinds or {"x", "y"} <= kinds or ("x" in kinds and y not in model.coordinates):
+        known[x] = True
+    if {"x", "y"} <= kinds and x in model.coordinates:
+        known[turn] = True
+    if not all(known.values()):
+        wheels, others, yaw = "a measuring wheel", "or another speed over ground", ""
+        if turn in known:
+            wheels, yaw = "two measuring wheels apart", " and the yaw rate"
+            others = "or one speed over ground and a gyro (yaw_rate)"
+        gnss = "" if "ground_speed" in METHODS[method].reads else f"; {method} does not use GNSS, joint does"
         raise MachineError(
-            f"{machine.name}: sensor: {'two measuring wheels apart' if turns else 'a measuring wheel'} (kind wheel)"
-            " must measure the speed over ground" + (" and the yaw rate" if turns else "")
+            f"{machine.name}: sensor: {wheels} (kind wheel), {others}, must measure the speed over ground{yaw}{gnss}"
         )
 
 
@@ -163,8 +179,17 @@ def recommend_method(model: Model) -> str:
 def needed_sensors(model: Model, method: str) -> tuple[str, ...]:
     """Return the names of the sensors that a method needs on this machine."""
     speed = () if METHODS[method].simulates else ("lateral_speed",)
-    kinds = (*NEEDED, *speed)
-    return tuple(s.name for s in model.machine.sensors("full") if s.kind in kinds)
+    sensors = model.machine.sensors("full")
+    planar = planar_speed_sensors(model, [s.name for s in sensors]).sensors if model.machine.planar else ()
+    return tuple(s.name for s in sensors if s.kind in (*NEEDED, *speed) or s in planar)
+
+
+def unused_sensors(model: Model, method: str, logs: Sequence[Log]) -> tuple[str, ...]:
+    """Return the names of the sensors in the logs that a method does not use."""
+    chosen = METHODS[method.partition(" ")[0]]
+    there = [s for s in model.machine.sensors("full") if any(s.name in log.values for log in logs)]
+    planar = planar_speed_sensors(model, [s.name for s in there]).sensors if model.machine.planar else ()
+    return tuple(s.name for s in there if s.kind not in (*LINEAR_KINDS, *chosen.reads) and s not in planar)
 
 
 def restrict_to_possible(plain: Estimator) -> Estimator:
@@ -179,6 +204,7 @@ def restrict_to_possible(plain: Estimator) -> Estimator:
     return method
 
 
+LINEAR_KINDS = ("angle", "torque", "wheel", "forward_speed", "lateral_speed")  # of sensors that every method uses
 LINEAR_METHODS: dict[str, Method] = {
     "ols": Method(ols, effects="linear", biased=True),
     "wls": Method(wls, biased=True),
@@ -187,8 +213,8 @@ LINEAR_METHODS: dict[str, Method] = {
 }
 METHODS: dict[str, Method] = {
     **LINEAR_METHODS,
-    "oe": Method(oe, simulates=True),
-    "joint": Method(joint, effects="any", simulates=True),
+    "oe": Method(oe, simulates=True, reads=("yaw_rate",)),
+    "joint": Method(joint, effects="any", simulates=True, reads=("yaw_rate", "ground_speed", "x", "y")),
     **{
         f"{name}+consistent": replace(m, find=restrict_to_possible(m.find), effects="none")
         for name, m in LINEAR_METHODS.items()

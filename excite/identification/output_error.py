@@ -36,6 +36,8 @@ ACCEPTABLE_STEP = 0.1
 MAX_HALVINGS = 8  # of a step to a machine that cannot be simulated; chosen
 MAX_RELATIVE_STEP = 0.5  # of a parameter in one pass, relative to its size; chosen
 
+UNUSED_KINDS = ("ground_speed", "x", "y")  # of sensors that are often slower than the log
+
 
 @dataclass(frozen=True)
 class Segment:
@@ -44,6 +46,9 @@ class Segment:
     torque: np.ndarray
     reading: np.ndarray
     start: np.ndarray
+
+
+UNUSED_KINDS = ("ground_speed", "x", "y")  # of sensors that are often slower than the log
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,7 @@ def oe(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
     enlarged if the residuals exceed these. Raises NotIdentifiableError if Gauss-Newton does not converge.
     """
     common = set.intersection(*(set(log.values) for log in logs))
-    names = tuple(s.name for s in model.machine.sensors("full") if s.name in common)
+    names = tuple(s.name for s in model.machine.sensors("full") if s.name in common and s.kind not in UNUSED_KINDS)
     space = build_state_space(model, names)
     segments = [p for log in logs for p in _cut_into_segments(space, log, filter)]
     torque_noise = _torque_noise(model, logs)

@@ -85,7 +85,7 @@ def _estimate(summary: dict[str, Any], covariance: pd.DataFrame) -> Estimate:
         spread,
         float(summary["cond_w"]),
         float(summary["cond_phi"]),
-        float(summary["relative_error_percent"]),
+        float(summary["relative_error_percent"] or np.nan),
         np.empty((0, 0)),
         int(summary["degrees"]),
         dict(summary["reasons"]),

@@ -50,7 +50,13 @@ MANY = 0.005  # share of a channel's samples that may be repaired; chosen
 FEW = 20  # readings that do not say how fast a channel is; chosen
 SLOWER = 1.5  # times the step of the fastest channel, from which one is slower; chosen
 CUTOFFS = 10.0  # times the filter's cutoff at which a channel follows what the filter passes; chosen
-FILTERED = ("angle", "torque", "wheel", "lateral_speed")  # kinds of sensor whose readings an estimate rests on
+FILTERED = (
+    "angle",
+    "torque",
+    "wheel",
+    "forward_speed",
+    "lateral_speed",
+)  # kinds of sensor whose readings an estimate rests on
 ORDINALS = ("", "", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 import casadi as ca
@@ -63,7 +63,8 @@ def kept_samples(first: int, last: int, factor: int) -> np.ndarray:
 
 def samples(model: Model, log: Log, filter: Filter) -> Samples:
     """Coordinates, velocities and accelerations of a log: zero-phase Butterworth of what is measured, then central
-    differences. V_x and yaw rate come from the measuring wheels (32), V_y from its sensor; the heading begins at zero.
+    differences. V_x and yaw rate come from measuring wheels (32), forward speeds and, if these leave it open, the gyro;
+    V_y from its sensor; the heading begins at zero. A V_x that none of them measures is that of rolls without slip.
     """
     machine = model.machine
     rate = float(machine.sampling_hz)
@@ -72,19 +73,15 @@ def samples(model: Model, log: Log, filter: Filter) -> Samples:
     filtered = {
         s.name: lowpass(log.values[s.name], rate, filter) for s in machine.sensors("full") if s.name in log.values
     }
-    wheels: list[tuple[Sensor, np.ndarray]] = []
     for sensor in machine.sensors("full"):
         if sensor.name not in filtered:
             continue
         if sensor.kind == "angle":
-            k = model.coordinates.index(machine.find(sensor.body).coordinates[0])
-            q[k], nu[k] = _angle_and_rate(sensor, filtered[sensor.name], rate)
-        elif sensor.kind == "wheel":
-            wheels.append((sensor, _angle_and_rate(sensor, filtered[sensor.name], rate)[1]))
-        elif sensor.kind == "lateral_speed":
-            nu[model.coordinates.index(machine.body[0].coordinates[1])] = filtered[sensor.name]
-    if wheels:
-        _planar_speed(model, wheels, nu)
+            body = machine.find(sensor.body)
+            k = model.coordinates.index(machine.coordinate(body))
+            q[k], nu[k] = (x / machine.ratio(body) for x in _angle_and_rate(sensor, filtered[sensor.name], rate))
+    if machine.planar:
+        _planar_speed(model, filtered, rate, nu)
         turn = machine.body[0].coordinates[2]
         if turn in model.coordinates:
             k = model.coordinates.index(turn)
@@ -126,6 +123,13 @@ def passes(model: Model, q: np.ndarray, nu: np.ndarray, step: float) -> np.ndarr
     whose pose follows from its velocities."""
     if not model.machine.contacts:
         return np.zeros((len(q), 0))
+    at = integrate_pose(model, q, nu, step)
+    ground = model.new_ground_map()
+    return np.array([ground(one) for one in at])
+
+
+def integrate_pose(model: Model, q: np.ndarray, nu: np.ndarray, step: float) -> np.ndarray:
+    """Return coordinates (N, n_q) with the pose that follows from velocities (N, n_q), from zero, `step` [s] apart."""
     at = q.copy()
     if model.machine.planar:
         x, y, turn = (
@@ -145,8 +149,7 @@ def passes(model: Model, q: np.ndarray, nu: np.ndarray, step: float) -> np.ndarr
         ):
             if k is not None:
                 at[:, k] = own
-    ground = model.new_ground_map()
-    return np.array([ground(one) for one in at])
+    return at
 
 
 def implicit(flow: ca.Function, start: np.ndarray, along: np.ndarray, step: float, told: np.ndarray) -> np.ndarray:
@@ -181,23 +184,71 @@ def unmeasured(model: Model, log: Log) -> tuple[int, ...]:
         if sensor.name not in log.values:
             continue
         if sensor.kind == "angle":
-            seen.add(machine.find(sensor.body).coordinates[0])
-        elif sensor.kind == "wheel":
-            seen |= {machine.body[0].coordinates[0], machine.body[0].coordinates[2]}
+            seen.add(machine.coordinate(machine.find(sensor.body)))
         elif sensor.kind == "lateral_speed":
             seen.add(machine.body[0].coordinates[1])
+    if machine.planar:
+        found = planar_speed_sensors(model, log.values)
+        seen |= {c for c, known in zip(found.coordinates, found.determined, strict=True) if known}
     return tuple(k for k, c in enumerate(model.coordinates) if c not in seen)
 
 
-def _planar_speed(model: Model, wheels: list[tuple[Sensor, np.ndarray]], nu: np.ndarray) -> None:
-    """V_x and yaw rate of the root from its measuring wheels: R rate = V_x - lateral yaw (32), by least squares."""
+@dataclass(frozen=True)
+class PlanarSpeedSensors:
+    """Sensors of V_x and yaw rate of the root, linear in both: A (k, n) per unit of each of n free `coordinates`."""
+
+    coordinates: tuple[str, ...]
+    sensors: tuple[Sensor, ...]
+    A: np.ndarray
+
+    @property
+    def determined(self) -> np.ndarray:
+        """Coordinates (n,) whose speed the sensors determine."""
+        projection = np.linalg.pinv(self.A) @ self.A
+        return np.abs(projection - np.eye(len(projection))).max(axis=1, initial=0.0) < 1e-9
+
+
+def planar_speed_sensors(model: Model, names: Collection[str]) -> PlanarSpeedSensors:
+    """Choose the sensors with these names that V_x and yaw rate come from: gyros only if all others leave one open.
+
+    A measuring wheel reads R rate = V_x - lateral yaw (32), as a forward speed does.
+    """
     x, _, turn = model.machine.body[0].coordinates
-    rows = [k for k in (x, turn) if k in model.coordinates]
-    A = np.array([[1.0, -float(s.lateral or 0)][: len(rows)] for s, _ in wheels])
-    speeds = np.array([float(s.radius or 0) * rate for s, rate in wheels])
-    found = np.linalg.lstsq(A, speeds, rcond=None)[0]
-    for name, value in zip(rows, found, strict=True):
-        nu[model.coordinates.index(name)] = value
+    free = tuple(c for c in (x, turn) if c in model.coordinates)
+    there = [s for s in model.machine.sensors("full") if s.name in names]
+    rows = {s: np.array([1.0, -s.mounted_at[1]])[: len(free)] for s in there if s.kind in ("wheel", "forward_speed")}
+    found = PlanarSpeedSensors(free, tuple(rows), np.array([*rows.values()]).reshape(-1, len(free)))
+    gyros = tuple(s for s in there if s.kind == "yaw_rate")
+    if found.determined.all() or not gyros:
+        return found
+    A = np.concatenate([found.A, np.tile([c == turn for c in free], (len(gyros), 1))])
+    return PlanarSpeedSensors(free, (*found.sensors, *gyros), A)
+
+
+def _planar_speed(model: Model, filtered: Mapping[str, np.ndarray], rate: float, nu: np.ndarray) -> None:
+    """Put V_x, V_y and yaw rate of the root into velocities nu (n_q, N), from low-passed readings."""
+    machine = model.machine
+    found = planar_speed_sensors(model, filtered)
+    if found.sensors:
+        speeds = [
+            float(s.radius or 0) * _angle_and_rate(s, filtered[s.name], rate)[1]
+            if s.kind == "wheel"
+            else filtered[s.name]
+            for s in found.sensors
+        ]
+        for c, value in zip(found.coordinates, np.linalg.lstsq(found.A, np.array(speeds), rcond=None)[0], strict=True):
+            nu[model.coordinates.index(c)] = value
+    x, across, turn = machine.body[0].coordinates
+    if x in found.coordinates and not found.determined[0]:
+        rims = [
+            float(b.contact.radius) * machine.joint_values(b, nu) for b in machine.contacts if b.contact is not None
+        ]
+        if rims:
+            nu[model.coordinates.index(x)] = np.mean(rims, axis=0)
+    yaw = nu[model.coordinates.index(turn)] if turn in model.coordinates else 0.0
+    for sensor in machine.sensors("full"):
+        if sensor.kind == "lateral_speed" and sensor.name in filtered:
+            nu[model.coordinates.index(across)] = filtered[sensor.name] - sensor.mounted_at[0] * yaw
 
 
 def lowpass(x: np.ndarray, rate: float, filter: Filter) -> np.ndarray:

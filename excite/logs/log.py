@@ -68,6 +68,19 @@ def table_of(path: str | Path, machine: Machine) -> pd.DataFrame:
     if MDF_TIME in table.columns and machine.time_column not in table.columns:
         one = UNITS[machine.time_unit][1]
         table.insert(0, machine.time_column, table[MDF_TIME] / one)
+    return with_drives_off(table, machine)
+
+
+def with_drives_off(table: pd.DataFrame, machine: Machine) -> pd.DataFrame:
+    """The table with torques of zero where the machine file says that a column is absent while the drive is off."""
+    absent = [s for s in machine.sensor if s.zero_if_absent and not set(s.columns) & set(table.columns)]
+    if not absent:
+        return table
+    attrs = dict(table.attrs)
+    said = [f"no column {', '.join(s.columns)}: {what_of(s, machine)} counts as zero, its drive is off" for s in absent]
+    attrs["notes"] = [*attrs.get("notes", ()), *said]
+    table = table.assign(**{c: 0.0 for s in absent for c in s.columns})
+    table.attrs = attrs
     return table
 
 

@@ -237,7 +237,9 @@ def _opposed(one: Sensor, other: Sensor, values: Mapping[str, np.ndarray]) -> bo
 
 
 def unchanging(sensor: Sensor, values: np.ndarray) -> str:
-    """Return a line for a channel that always reads the same, "" otherwise."""
+    """Return a line for a channel that always reads the same, "" otherwise or for a drive that may be off."""
+    if sensor.zero_if_absent and not values.any():
+        return ""
     name = " - ".join(sensor.columns)
     return f"column {name}: never changes ({values[0]:g}): is the sensor connected?" if np.ptp(values) == 0 else ""
 

@@ -110,7 +110,7 @@ def read_stretches(
     source: str | Path | pd.DataFrame, machine: Machine, needs: Sequence[str] = (), rate: float | None = None
 ) -> tuple[list[Stretch], list[str]]:
     """Read one log as even stretches, with notes. Raises LogError."""
-    table = source if isinstance(source, pd.DataFrame) else log.table_of(source, machine)
+    table = log.with_drives_off(source, machine) if isinstance(source, pd.DataFrame) else log.table_of(source, machine)
     name = _name(source)
     table = on_one_clock(table, machine, name)
     notes = [f"{name}: {line}" for line in table.attrs.get("notes", ())]

@@ -375,6 +375,8 @@ def sensor_line(machine: Machine, sensor: Sensor) -> str:
         "angle": f"angle of the {where}, counted on over turns",
         "wheel": f"angle of the {where}",
         "torque": f"torque at the {where}",
+        "forward_speed": f"forward speed of the {where}",
+        "ground_speed": f"speed over ground of the {where}",
         "yaw_rate": f"yaw rate of the {where}",
         "lateral_speed": f"lateral speed of the {where}",
         "x": f"position along x of the {where}",

@@ -494,14 +494,16 @@ def describe_identify(s: Summary) -> Description:
     what = count(every, "parameter is", "parameters are")
     what = f"{len(known)} of {what}" if s["unidentifiable"] else what
     logs = "one log" if len(s["logs"]) == 1 else f"{len(s['logs'])} logs"
-    error = format_percent(float(s["relative_error_percent"]))
+    share = s["relative_error_percent"]
+    known_error = share is not None and np.isfinite(share)
+    error = f"{format_percent(share)} of what was measured" if known_error else "unknown, as no torque was measured"
     accuracy = (
         f" {format_percent(float(np.median(list(known.values()))))} (median, one standard deviation; worst {worst},"
         f" {format_percent(known[worst])})"
         if known
         else " no known accuracy"
     )
-    headline = f"From {logs}, {what} identified to{accuracy}; the prediction error is {error} of what was measured."
+    headline = f"From {logs}, {what} identified to{accuracy}; the prediction error is {error}."
     if s["status"] == "doubtful":
         headline = (
             f"From {logs}, {what} estimated, but their 95 % intervals do not hold: {s['doubt']} (stated:{accuracy};"
@@ -514,7 +516,7 @@ def describe_identify(s: Summary) -> Description:
         headline = f"{headline[:-1]}; {_join_some(impossible)} {have} that no machine has."
     if s["status"] == "invalid":
         reason = f", and {_join_some(impossible)} would have values that no machine has" if impossible else ""
-        headline = f"No estimate from {logs} (prediction error {error} of what was measured){reason}: {s['doubt']}."
+        headline = f"No estimate from {logs} (prediction error {error}){reason}: {s['doubt']}."
     wrong: tuple[str, ...] = ()
     if off and s["status"] != "invalid":
         most = max(off, key=lambda n: off[n])

@@ -104,7 +104,7 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
         speeds["forward speed"] = motion.nu[:, 0]
     for b in machine.contacts:
         assert b.contact is not None
-        rim = float(b.contact.radius) * motion.nu[:, model.coordinates.index(b.coordinates[0])]
+        rim = float(b.contact.radius) * machine.joint_values(b, motion.nu.T)
         speeds[f"rim of {b.name.replace('_', ' ')}"] = rim
     if not speeds:
         speeds = {c: motion.nu[:, k] for k, c in enumerate(model.coordinates)}

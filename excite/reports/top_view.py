@@ -98,7 +98,7 @@ def _contacts(ax: Axes, machine: Machine, q: Mapping[str, float], ghost: bool) -
         if ghost:
             ax.add_patch(Polygon(shape, closed=True, facecolor="none", edgecolor=GHOST, linestyle="--", zorder=4))
             continue
-        driven = b.actuated
+        driven = b.actuated or b.driven_with or b.moves_with
         ax.add_patch(
             Polygon(shape, closed=True, facecolor="white" if driven else "0.9", edgecolor="black", alpha=0.9, zorder=3)
         )
@@ -128,7 +128,9 @@ def _joints(ax: Axes, machine: Machine, poses: Mapping[int, tuple[np.ndarray, np
         place = poses[b.index][1][:2]
         held = b.coordinates[0] in machine.locked
         ax.plot(*place, "s" if held else "o", markersize=8, color="white", markeredgecolor=COLOURS[1], zorder=6)
-        words = b.where.replace("_", " ") + (" (held)" if held else "" if b.actuated else " (free)")
+        words = b.where.replace("_", " ") + (
+            " (held)" if held else "" if b.actuated or b.driven_with or b.moves_with else " (free)"
+        )
         row = sum(np.allclose(place, other, atol=0.05) for other in taken)
         taken.append(place)
         ax.annotate(

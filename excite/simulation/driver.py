@@ -196,7 +196,8 @@ def drive_gains(model: Model) -> np.ndarray:
     rolling[0] = WALKING_SPEED
     for b in model.machine.contacts:
         assert b.contact is not None
-        rolling[names.index(b.coordinates[0])] = WALKING_SPEED / float(b.contact.radius)
+        spin = WALKING_SPEED / float(b.contact.radius) / model.machine.ratio(b)
+        rolling[names.index(model.machine.coordinate(b))] = spin
     M, D = at(still, still)[0].full(), at(still, rolling)[1].full()
     aside = [names.index(c) for c in model.machine.body[0].coordinates[1:] if c in names]  # the chassis gives way
     D -= D[:, aside] @ np.linalg.solve(D[np.ix_(aside, aside)], D[aside])

@@ -234,11 +234,8 @@ def _terms_function(model: Model) -> ca.Function:
     X = ca.SX.sym("X", len(model.base.names))
     sign, slips = ca.SX.sym("sign", n), ca.SX.sym("slips", n)
     M, bias = model.equations(q, nu, X, u, z, sign)
-    drive = ca.SX(len(model.coordinates), 1)
-    for k, row in enumerate(model.actuated):
-        drive[row] = u[k]
     low, high = (model.equations(q, nu, X, u, z, side * ca.SX.ones(n))[1] for side in (-1, 1))
     a = model.accelerate(q, nu, u, X, z, sign, slips)
     state = ca.vertcat(q, nu, ca.SX.sym("w", wheels), z)
-    results = [ca.densify(x) for x in (M, drive - bias, a, (high - low)[list(model.rubbing)])]
+    results = [ca.densify(x) for x in (M, model.joint_torques(u) - bias, a, (high - low)[list(model.rubbing)])]
     return ca.Function("terms", [state, u, ca.vertcat(X, sign, slips)], results, {"cse": True})

@@ -22,7 +22,8 @@ def measure(
     """Return the log (N rows) of a motion that a kit's sensors would write, in their own units and columns.
 
     X (n_base,): parameters, with the torque offsets u0. noise: False for exact readings, which keep these offsets.
-    An encoder counts whole steps from a random phase between two edges; noise is white and normal.
+    An encoder counts whole steps from a random phase between two edges; noise is white and normal. A sensor slower than
+    the log has no number in the rows between its readings.
     Raises ValueError for an unknown kit.
     """
     if kit not in KITS:
@@ -32,8 +33,16 @@ def measure(
     columns = {model.machine.time_column: motion.t / UNITS[model.machine.time_unit][1]}
     for sensor in model.machine.sensors(kit):
         read = _with_sensor_errors(sensor, exact[sensor.name], rng) if noise else exact[sensor.name]
+        if sensor.rate_hz is not None:
+            read = np.where(_reads_in_row(motion.t, float(sensor.rate_hz)), read, np.nan)
         columns |= _as_columns(sensor, read, _joint_angle(model, motion, sensor))
     return pd.DataFrame(columns)
+
+
+def _reads_in_row(t: np.ndarray, rate: float) -> np.ndarray:
+    """Tell the rows (N,) at times t (N,) [s] in which a sensor with `rate` readings per second has one."""
+    count = np.floor((t - t[0]) * rate + 1e-6)
+    return np.diff(count, prepend=-1) > 0
 
 
 def _as_columns(sensor: Sensor, read: np.ndarray, angle: np.ndarray) -> dict[str, np.ndarray]:
@@ -111,6 +120,11 @@ def _with_sensor_errors(sensor: Sensor, exact: np.ndarray, rng: np.random.Genera
         phase = rng.uniform()
         counts = np.floor(exact / step + phase)
         return (counts - counts[0]) * step + np.round(exact[0] / step) * step
+    read = exact
     if sensor.noise is not None:
-        return exact + float(sensor.noise) * rng.standard_normal(len(exact))
-    return exact
+        read = exact + float(sensor.noise) * rng.standard_normal(len(exact))
+    if sensor.kind == "ground_speed":
+        read = np.abs(read)
+    if sensor.step is not None:
+        read = np.round(read / float(sensor.step)) * float(sensor.step)
+    return read

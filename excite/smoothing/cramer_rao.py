@@ -5,13 +5,16 @@ The bound is the covariance of joint smoothing along an exactly known motion, wi
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from excite.model import Model
 from excite.simulation import Motion, measured_torques
 from excite.smoothing.gauss_newton import PRIOR_STD, covariance_in_si, linearise_log
-from excite.smoothing.linearisation import build_state_space
+from excite.smoothing.linearisation import StateSpace, build_state_space
 from excite.smoothing.measurements import (
+    LEAST_GROUND_SPEED,
     Measurements,
     SensorNoise,
     Trajectory,
@@ -25,14 +28,15 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
     """Compute the covariance (n_base, n_base) [SI] that the sensors of a kit allow along a motion.
 
     All noise counts as Gaussian, with the machine file's standard deviations. An encoder gives one reading per count,
-    and its edges are off by a tenth of a count at least. A weak prior (300 % of each scale) keeps the standard
+    and its edges are off by a tenth of a count at least; a slow sensor gives the
+    share of its `rate_hz`. A weak prior (300 % of each scale) keeps the standard
     deviation of a parameter finite that the motion does not excite. What the machine file calls known adds to the
     measurements.
 
     X (n_base,): true parameters, the nominal ones by default. Raises ValueError for a sensor without noise or counts.
     """
     X = model.nominal if X is None else np.asarray(X, float)
-    sensors = [s for s in model.machine.sensors(kit) if s.kind not in ("x", "y")]
+    sensors = list(model.machine.sensors(kit))
     for s in sensors:
         if not s.has_noise_figure:
             raise ValueError(
@@ -44,16 +48,16 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
     counts = np.array([s.resolution is not None for s in space.sensors])
     noise = SensorNoise(
         np.array([float(torque_sensor(model, b.index).noise or 0) for b in model.machine.actuated]),
-        np.array([s.resolution or float(s.noise or 0) for s in space.sensors]),
+        np.array([s.resolution or float(np.hypot(float(s.noise or 0), s.least_noise)) for s in space.sensors]),
     )
     none = np.zeros((len(state), len(space.sensors)))
     data = Measurements(
         measured_torques(model, motion.t, motion.u, X), none, none, counts, encoders_with_offset(space, counts), noise
     )
     trajectory = Trajectory(state, np.zeros_like(motion.u[1:]), np.zeros(len(data.offset_sensors)), over)
-    linear = linearise_log(
-        space, with_mean_edge_rates(space, data, trajectory, motion.u, X), trajectory, state[0], X, 0.0, exact=True
-    )
+    data = with_mean_edge_rates(space, data, trajectory, motion.u, X)
+    data = replace(data, used=data.used * _shares_read(space, state, noise, X))
+    linear = linearise_log(space, data, trajectory, state[0], X, 0.0, exact=True)
     assert linear is not None
     information = linear.Z[1:, 1:].copy()
     information[: len(X), : len(X)] += model.known.information(model.scale)
@@ -61,3 +65,16 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
         [np.full(len(X), PRIOR_STD**-2), np.ones(len(data.offset_sensors))]
     )
     return covariance_in_si(space, np.linalg.inv(information))
+
+
+def _shares_read(space: StateSpace, state: np.ndarray, noise: SensorNoise, X: np.ndarray) -> np.ndarray:
+    """Return the share (N, m) of each sample that slow sensors read and smoothing uses."""
+    rate = float(space.model.machine.sampling_hz)
+    share = np.ones((len(state), len(space.sensors)))
+    for j, s in enumerate(space.sensors):
+        if s.rate_hz is not None:
+            share[:, j] = min(float(s.rate_hz) / rate, 1.0)
+        if s.kind == "ground_speed":
+            inputs = np.zeros((len(state), len(space.model.inputs) + len(space.model.map_inputs)))
+            share[:, j] *= space.readings(state, inputs, X)[0][:, j, 0] > LEAST_GROUND_SPEED * noise.sensor[j]
+    return share

@@ -32,6 +32,7 @@ from excite.simulation import (
 # Error of a speed over one interval [rad/s, m/s], and of an effect's memory relative to its size. The torque noise of
 # one sample does far more; chosen.
 STEP_TOLERANCE = 1e-5
+POSE_STD = (1e3, 1e3, 10.0)  # of a pose at the start of a log, of which nothing is known [m, m, rad]; chosen
 BATCH_SIZE = 1000  # samples whose intermediate results stay in the processor's cache; measured
 MIN_BLOCK_SAMPLES = 80  # from this many samples on, the evaluation by numpy is faster; measured
 CASADI_SAMPLES = 20  # in one call of CasADi for fewer samples; measured
@@ -335,7 +336,7 @@ class TransitionJacobians:
 def build_state_space(model: Model, names: tuple[str, ...]) -> StateSpace:
     """Build the state space of a model and the sensors with these names.
 
-    Torque sensors and positions on the ground are left out.
+    Torque sensors are left out. The pose on the ground is a state if a sensor reads it.
     """
     machine = model.machine
     n_q, n_u = len(model.coordinates), len(model.inputs)
@@ -349,24 +350,25 @@ def build_state_space(model: Model, names: tuple[str, ...]) -> StateSpace:
 
     M, bias = model.equations(q, nu, X, u, z)
     forced_rows = tuple(k for k in range(n_q) if k not in model.actuated) or tuple(range(n_q))
-    load = ca.SX(n_q, 1)
-    for k, row in enumerate(model.actuated):
-        load[row] += u[k]
+    load = model.joint_torques(u)
     factors = ca.ldl(M)
     a = ca.ldl_solve(load - bias, *factors)
     flow = model.flow(q, nu, u, z, X)
     rates = ca.vertcat(dq, a, wheel_rates, flow)
-    core = [k for k, c in enumerate(model.coordinates) if c in model.active_coordinates] + list(range(n_q, 2 * n_q))
+    sensors = tuple(s for s in machine.sensors("full") if s.name in names and s.kind != "torque")
+    pose = machine.body[0].coordinates if any(s.kind in ("x", "y") for s in sensors) else ()
+    active = {*model.active_coordinates, *pose[2:]}
+    core = [k for k, c in enumerate(model.coordinates) if c in active] + list(range(n_q, 2 * n_q))
     ground = ca.SX.sym("over", len(model.map_inputs))
     last = full.numel() - len(model.map_inputs)
     core += range(full.numel() - len(model.memory), last)
 
-    sensors = tuple(s for s in machine.sensors("full") if s.name in names and s.kind not in ("torque", "x", "y"))
-    index, angle = list(core), []
+    index, angle, ratios = list(core), list[int](), list[float]()
     for s in sensors:
+        ratios.append(machine.ratio(machine.find(s.body)))
         if s.kind in ("angle", "wheel") and not s.is_rate:
             at = (
-                model.coordinates.index(machine.find(s.body).coordinates[0])
+                model.coordinates.index(machine.coordinate(machine.find(s.body)))
                 if s.kind == "angle"
                 else 2 * n_q + wheel_names.index(s.name)
             )
@@ -375,6 +377,7 @@ def build_state_space(model: Model, names: tuple[str, ...]) -> StateSpace:
             angle.append(index.index(at))
         else:
             angle.append(-1)
+    index += [at for at, c in enumerate(model.coordinates) if c in pose and at not in index]
     state = ca.SX.sym("s", len(index))
     full_values = ca.SX.zeros(full.numel(), 1)
     for k, at in enumerate(index):
@@ -407,13 +410,16 @@ def build_state_space(model: Model, names: tuple[str, ...]) -> StateSpace:
         ),
         substitute_state(ca.jacobian(rates[index[len(core) :]], full[core])),
     ]
-    speed = ca.vertcat(*[rates[index[k]] if k >= 0 else ca.SX(0) for k in angle])
+    speed = ca.vertcat(*[c * rates[index[k]] if k >= 0 else ca.SX(0) for k, c in zip(angle, ratios, strict=True)])
     all_readings = model.read(q, nu, wheels, u, z, X)
     reading = ca.vertcat(*[all_readings[model.reading_names.index(s.name)] for s in sensors])
     reading_parameters = tuple(k for k in range(X.numel()) if ca.depends_on(reading, X[k]))
     jacobian_function = ca.Function("slopes", [state, inputs, X], jacobians)
     initial_std = np.full(len(index), np.nan)
     initial_std[len(core) - len(model.initial_memory_std) : len(core)] = model.initial_memory_std
+    for c, std in zip(pose, POSE_STD, strict=False):
+        if c in model.coordinates:
+            initial_std[index.index(model.coordinates.index(c))] = std
     error_scale = np.fmax(initial_std, 1.0)  # an effect's memory may be a torque, thousands of N m
     input_slopes = ca.horzcat(jacobians[1], substitute_state(core_jacobian(full[last:])))
     step = _rosenbrock_step(

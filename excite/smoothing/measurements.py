@@ -13,7 +13,7 @@ import numpy as np
 import scipy.integrate
 
 from excite.errors import NotIdentifiableError
-from excite.logs import Log, passes, remember, samples, white_noise
+from excite.logs import Log, integrate_pose, passes, remember, samples, white_noise
 from excite.model import Model
 from excite.model.machine import Filter, Sensor
 from excite.smoothing.linearisation import StateSpace
@@ -22,6 +22,7 @@ from excite.text import format_number
 # Smallest standard deviation of an encoder edge [counts]: the division error of a good encoder. Without it, slow
 # passages, whose edges are timed exactly, would outweigh everything else.
 EDGE_STD = 0.1
+LEAST_GROUND_SPEED = 5.0  # speed over ground from which a reading is used [standard deviations]; chosen
 BEAT_HZ = 3.0  # a beat below this frequency is as slow as the machine's motion [Hz]; chosen
 HARMONICS = 4  # of the sawtooth error that are considered; chosen
 MAX_BEAT_READINGS = 200  # longest beat that is considered [readings]; chosen
@@ -131,7 +132,10 @@ def prepare_measurements(space: StateSpace, log: Log, unbiased: bool = False) ->
         there = log.read_in(sensor.name)
         used[:, j] = there
         if count_size is None:
-            sigma[j] = max(white_noise(log.readings(sensor.name)), 1e-9 + 1e-3 * float(sensor.noise or 0))
+            found = white_noise(log.readings(sensor.name))
+            sigma[j] = max(found, sensor.least_noise, 1e-9 + 1e-3 * float(sensor.noise or 0))
+            if sensor.kind == "ground_speed":  # near standstill noise has no sign, and the mean reading is above zero
+                used[:, j] &= value > LEAST_GROUND_SPEED * sigma[j]
             continue
         sigma[j] = count_size
         if sensor.name in log.edges:
@@ -203,8 +207,10 @@ def initial_trajectory(space: StateSpace, data: Measurements, log: Log, filter: 
     if n_z:
         u, _ = space.delivered_torques(data.torque, space.model.nominal)
         full[:, space.full_size - n_z :] = remember(space.model, filtered.q.T, filtered.nu.T, u, space.model.nominal)
-    state, ground = space.from_full_state(full)
     rate = float(space.model.machine.sampling_hz)
+    if any(s.kind in ("x", "y") for s in space.sensors):
+        full[:, :n_q] = _on_the_ground(space, data, integrate_pose(space.model, full[:, :n_q], filtered.nu.T, 1 / rate))
+    state, ground = space.from_full_state(full)
     for j, k in enumerate(space.angle_state):
         if space.index[k] >= 2 * n_q and k >= 0:
             speed = space.readings(state, space.inputs(data.torque, ground), space.model.nominal)[2][:, j, 0]
@@ -212,6 +218,36 @@ def initial_trajectory(space: StateSpace, data: Measurements, log: Log, filter: 
                 [[0], np.cumsum(speed[1:] + speed[:-1]) / (2 * rate)]
             )
     return Trajectory(state, np.zeros_like(data.torque[1:]), np.zeros(len(data.offset_sensors)), ground)
+
+
+def _on_the_ground(space: StateSpace, data: Measurements, q: np.ndarray) -> np.ndarray:
+    """Turn and shift a path (N, n_q) that begins at zero onto the measured positions, by least squares (Kabsch)."""
+    model = space.model
+    x, y, turn = (
+        model.coordinates.index(c) if c in model.coordinates else None for c in model.machine.body[0].coordinates
+    )
+    place = {s.kind: (s, j) for j, s in enumerate(space.sensors) if s.kind in ("x", "y")}
+    q, rows = q.copy(), [k for k in (x, y) if k is not None]
+    heading = q[:, turn] if turn is not None else np.zeros(len(q))
+    path = q[:, x or 0] + 1j * (q[:, y] if y is not None else 0.0)
+    measured = np.zeros(len(q), complex)
+    used = np.ones(len(q), bool)
+    for kind, unit in (("x", 1), ("y", 1j)):
+        if kind in place:
+            sensor, j = place[kind]
+            measured += unit * data.reading[:, j]
+            used &= data.used[:, j] > 0
+            lever = complex(*sensor.mounted_at)
+    antenna = path + lever * np.exp(1j * heading)
+    if len(place) == 2 and turn is not None:
+        correlation = np.vdot(antenna[used] - antenna[used].mean(), measured[used] - measured[used].mean())
+        angle = np.angle(correlation)
+        q[:, turn] += angle
+        path, antenna = path * np.exp(1j * angle), antenna * np.exp(1j * angle)
+    path += (measured - antenna)[used].mean()
+    for k, part in zip(rows, (path.real, path.imag) if x is not None else (path.imag,), strict=False):
+        q[:, k] = part
+    return q
 
 
 def ground_inputs(space: StateSpace, state: np.ndarray) -> np.ndarray:

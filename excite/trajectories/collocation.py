@@ -265,14 +265,11 @@ def transcribe(
     map_values = ca.SX.sym("over", len(model.map_inputs))
     beside = () if model.plain else (u, ca.vertcat(kept, map_values))
     p = model.expand @ model.nominal
-    drive = ca.SX(n_q, 1)
-    for k, row in enumerate(model.actuated):
-        drive[row] = u[k]
     dq = model.kinematics(q, nu)[0]
     turns = [(rate[k] - dq[model.coordinates.index(c)]) * interval_s / z_size[k] for k, c in enumerate(used)]
     flow = model.flow(q, nu, u, ca.vertcat(kept, map_values), model.nominal)[: len(names) - memory]
     going = (kept_rate - flow) * interval_s / ca.DM(z_size[memory:])
-    balance = (model.balance(q, nu, a, p, *beside) - drive) / float(u_size.max())
+    balance = (model.balance(q, nu, a, p, *beside) - model.joint_torques(u)) / float(u_size.max())
     residual = ca.vertcat(*turns, balance, going)
     g = ca.vertcat(*[(g.expression(q, nu, u, 0) - g.centre) * (2 / g.range) for g in staged], ca.SX(0, 1))
     W = model.regressor(q, nu, a, *beside)

@@ -96,19 +96,17 @@ def _torque_rate(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[B
 def _position(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
     """A joint's angle or stroke from its zero, `position` of a joint."""
     for body in model.machine.body:
-        if body.limit.position is not None and body.coordinates[0] in model.coordinates:
-            high = float(body.limit.position)
-            k = model.coordinates.index(body.coordinates[0])
-            yield f"position {body.where}", s.q[k], -high, high, "rad" if body.joint == "revolute" else "m"
+        if body.limit.position is not None and model.machine.is_free(body):
+            high, angle = float(body.limit.position), model.machine.joint_values(body, s.q)
+            yield f"position {body.where}", angle, -high, high, "rad" if body.joint == "revolute" else "m"
 
 
 def _rate(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
     """A joint's speed, `rate` of a joint."""
     for body in model.machine.body:
-        if body.limit.rate is not None and body.coordinates[0] in model.coordinates:
-            high = float(body.limit.rate)
-            k = model.coordinates.index(body.coordinates[0])
-            yield f"rate {body.where}", s.nu[k], -high, high, "rad/s" if body.joint == "revolute" else "m/s"
+        if body.limit.rate is not None and model.machine.is_free(body):
+            high, rate = float(body.limit.rate), model.machine.joint_values(body, s.nu)
+            yield f"rate {body.where}", rate, -high, high, "rad/s" if body.joint == "revolute" else "m/s"
 
 
 def _rim_speed(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
@@ -116,8 +114,8 @@ def _rim_speed(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[Bou
     for body in model.machine.contacts:
         if body.limit.rim_speed is not None and body.contact is not None:
             high = float(body.limit.rim_speed)
-            k = model.coordinates.index(body.coordinates[0])
-            yield f"rim speed {body.where}", float(body.contact.radius) * s.nu[k], -high, high, "m/s"
+            rim = float(body.contact.radius) * model.machine.joint_values(body, s.nu)
+            yield f"rim speed {body.where}", rim, -high, high, "m/s"
 
 
 def _slip(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
@@ -142,7 +140,8 @@ def _power(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[Bounded
     if model.machine.power_limit is not None:
         high = float(model.machine.power_limit)
         rounding = (POWER_SMOOTHING * high) ** 2
-        parts = [ca.sqrt((s.u[k] * s.nu[row]) ** 2 + rounding) for k, row in enumerate(model.actuated)]
+        speeds = ca.vertsplit(ca.sparsify(ca.DM(model.machine.input_matrix.T)) @ s.nu)
+        parts = [ca.sqrt((s.u[k] * speed) ** 2 + rounding) for k, speed in enumerate(speeds)]
         yield "power", sum(parts, ca.SX(0)), -np.inf, high, "W"
 
 
@@ -265,7 +264,7 @@ def lane_excess(excess: Mapping[str, float]) -> float:
 def resting_coordinates(model: Model) -> tuple[int, ...]:
     """Return the coordinates that are zero at both ends: those with a position limit or that forces depend on."""
     limited = {
-        body.coordinates[0]
+        model.machine.coordinate(body)
         for body in model.machine.body
         if body.coordinates and (body.limit.position is not None or body.coordinates[0] in model.active_coordinates)
     }

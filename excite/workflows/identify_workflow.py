@@ -123,6 +123,7 @@ def identify_account(
         "relative_error_percent": estimate.relative_error_percent,
         "degrees": estimate.degrees,
         "share_outside_law": estimate.share_outside_law,
+        "unused_sensors": list(identification.unused_sensors(model, estimate.method, read)),
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
         "notes": [*said, *ready.notes, *estimate.notes, *more_notes],

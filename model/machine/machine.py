@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -33,6 +34,12 @@ from excite.model.machine.records import (
 )
 
 MACHINES = Path(__file__).parents[1] / "machines"
+# Kinds of sensor whose place matters, by key of that place.
+SENSOR_PLACE_KEYS = {
+    "radius": ("wheel",),
+    "lateral": ("wheel", "forward_speed", "ground_speed", "x", "y"),
+    "ahead": ("lateral_speed", "ground_speed", "x", "y"),
+}
 Index = Annotated[int, Field(strict=True, ge=0, le=99)]
 
 # Checks of a log that a sensor can be left out of (`checks_off`), with what each looks for.
@@ -103,6 +110,24 @@ class Friction(FileRecord):
     smoothing: Positive
 
 
+def _one() -> Quantity:
+    """Return the default of a ratio."""
+    return Quantity(value=1.0, source="definition")
+
+
+class Coupling(FileRecord):
+    """A joint that another one takes along. `ratio`: angle (`moves_with`) or torque (`driven_with`) per that of it."""
+
+    joint: Index
+    ratio: Quantity = Field(default_factory=_one)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Coupling:
+        if self.ratio.value == 0:
+            raise ValueError("ratio: must not be 0")
+        return self
+
+
 class Contact(FileRecord):
     """A roll or wheel on the soil (11, 17, 24, 25). Frame: the chassis that carries it, at its own centre.
 
@@ -149,6 +174,10 @@ class Body(FileRecord):
 
     Transform from the antecedent: Rot(z, gamma) Trans(z, b) Rot(x, alpha) Trans(x, d) Rot(z, theta) Trans(z, r);
     the joint's coordinate replaces theta (revolute) or r (prismatic).
+
+    moves_with: this joint's angle is that of another one times a ratio (chained wheels, joints on one lever); it has
+    no coordinate of its own. driven_with: its torque is the other's times a ratio while its speed is free (two motors
+    on one pump, an open differential).
     """
 
     index: Index
@@ -156,6 +185,8 @@ class Body(FileRecord):
     antecedent: Annotated[Index | Literal["ground"], WrapValidator(_antecedent)]
     joint: Literal["planar", "revolute", "prismatic", "fixed"]
     actuated: Flag = False
+    moves_with: Coupling | None = None
+    driven_with: Coupling | None = None
     place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
     gamma: Quantity = Field(default_factory=_zero)
     b: Quantity = Field(default_factory=_zero)
@@ -190,9 +221,13 @@ class Body(FileRecord):
         for key in replaced.get(self.joint, ()):
             if getattr(self, key).value:
                 raise ValueError(f"{key}: a {self.joint} joint's coordinate takes its place, leave it out")
-        if self.joint in ("fixed", "planar") and (self.actuated or self.friction):
-            key = "actuated" if self.actuated else "friction"
-            raise ValueError(f"{key}: a {self.joint} joint can't be actuated or have friction")
+        if self.joint in ("fixed", "planar"):
+            for key in ("actuated", "friction", "moves_with", "driven_with"):
+                if getattr(self, key):
+                    raise ValueError(f"{key}: a {self.joint} joint can't be actuated or have friction or a coupling")
+        for key in ("moves_with", "driven_with"):
+            if self.actuated and getattr(self, key):
+                raise ValueError(f"{key}: the drive is that of the other joint, leave out actuated here")
         if self.actuated and self.friction is None:
             raise ValueError("friction: an actuated joint needs a [body.friction] table (Fv, Fs, u0, smoothing)")
         if self.joint == "planar" and self.antecedent != "ground":
@@ -208,13 +243,20 @@ class Sensor(FileRecord):
     `factor`: SI value of the number 1 in the column, in place of the unit's; needed for units without one, such as V.
 
     kind `angle`: encoder of a joint; `wheel`: measuring wheel of `radius` [m] at `lateral` [m] (+ left) on the axis
-    through the body's origin (32); `torque`: delivered torque or force + u0; `yaw_rate`, `lateral_speed`: of the
-    body, in its own frame; `x`, `y`: position of its origin on the ground. All but angles and torques sit on the first
-    chassis. Every sensor is in kit `full`. An angle given as a rate (rpm, deg/s) has the `noise` of a rate [rad/s].
+    through the body's origin (32); `torque`: delivered torque or force + u0; `yaw_rate`: of the body; `forward_speed`,
+    `lateral_speed`: along and across it, such as a fifth wheel's; `ground_speed`: speed over ground without direction,
+    `x`, `y`: position on the ground, such as those of GNSS. All but angles and torques sit on the first chassis, at
+    `ahead` and `lateral` [m] of its origin (a fifth wheel, an antenna).
+
+    Every sensor is in kit `full`. An angle given as a rate (rpm, deg/s) has the `noise` of a rate [rad/s].
 
     A torque may be given as two pressures, in `column` and `return_column`: those of a hydraulic motor with its
     `displacement` [m3 per turn of the joint, gear included], u = displacement / (2 pi) (p - p_return), or those of
     `cylinders` (see `hydraulics`). `factor` is then the pressure of the number 1 [Pa], 4e6 for 0-10 V over 0-400 bar.
+
+    `step`: smallest step of a reading [SI]. `rate_hz`: readings per second, if it has fewer than the log has rows.
+
+    `zero_if_absent`: a log without this torque's column is one with the drive off: a free decay, a coast-down.
 
     `wraps_at`: reading, in the column's unit, after which an encoder begins anew, such as 360 for degrees; it is then
     counted on. `checks_off`: names of LOG_CHECKS that this sensor is left out of.
@@ -224,7 +266,7 @@ class Sensor(FileRecord):
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
-    kind: Literal["angle", "wheel", "torque", "yaw_rate", "lateral_speed", "x", "y"]
+    kind: Literal["angle", "wheel", "torque", "yaw_rate", "lateral_speed", "forward_speed", "ground_speed", "x", "y"]
     body: Index
     column: Annotated[str, Field(min_length=1)]
     unit: str
@@ -236,9 +278,13 @@ class Sensor(FileRecord):
     place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
     counts_per_turn: Positive | None = None
     noise: NotNegative | None = None
+    step: Positive | None = None
+    rate_hz: Positive | None = None
+    ahead: Quantity | None = None
     lateral: Quantity | None = None
     radius: Positive | None = None
     wraps_at: Annotated[float | None, Field(gt=0, allow_inf_nan=False)] = None
+    zero_if_absent: Flag = False
     checks_off: tuple[str, ...] = ()
     time_column: Annotated[str | None, Field(min_length=1)] = None
     time_unit: TimeUnit | None = None
@@ -267,6 +313,16 @@ class Sensor(FileRecord):
         return self.kind in ("angle", "wheel") and known in units.RATES
 
     @property
+    def mounted_at(self) -> tuple[float, float]:
+        """Distance [m] ahead of and to the left of the body's origin."""
+        return float(self.ahead or 0.0), float(self.lateral or 0.0)
+
+    @property
+    def least_noise(self) -> float:
+        """Standard deviation [SI] that its smallest step alone gives a reading, 0 without one."""
+        return 0.0 if self.step is None else float(self.step) / math.sqrt(12)
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Its columns in a log."""
         return (self.column,) if self.return_column is None else (self.column, self.return_column)
@@ -292,8 +348,13 @@ class Sensor(FileRecord):
             raise ValueError("counts_per_turn: is for a column that counts, not for a rate")
         if self.kind == "wheel" and (self.radius is None or self.lateral is None):
             raise ValueError(f"{'lateral' if self.radius else 'radius'}: a measuring wheel needs radius and lateral")
-        if self.kind != "wheel" and (self.radius is not None or self.lateral is not None):
-            raise ValueError(f"{'radius' if self.radius else 'lateral'}: is for kind wheel only")
+        for key, kinds in SENSOR_PLACE_KEYS.items():
+            if getattr(self, key) is not None and self.kind not in kinds:
+                raise ValueError(f"{key}: is for kind {', '.join(kinds)} only")
+        if self.zero_if_absent and self.kind != "torque":
+            raise ValueError("zero_if_absent: is for kind torque only")
+        if self.step is not None and self.counts_per_turn is not None:
+            raise ValueError("step: is for a column that does not count turns; leave it or counts_per_turn out")
         if self.factor is not None and self.factor.value == 0:
             raise ValueError("factor: must not be 0")
         if self.wraps_at is not None and (self.kind not in ("angle", "wheel") or self.is_rate):
@@ -421,22 +482,80 @@ class Machine(FileRecord):
     @property
     def coordinates(self) -> tuple[str, ...]:
         """Names of the free coordinates, in the order of the table."""
-        return tuple(c for b in self.body for c in b.coordinates if c not in self.locked)
+        return tuple(c for b in self.body if b.moves_with is None for c in b.coordinates if c not in self.locked)
 
     @property
     def planar(self) -> bool:
         """True if the root moves on the plane; velocities are then in the chassis' own axes."""
         return self.body[0].joint == "planar"
 
-    @property
+    @cached_property
     def actuated(self) -> tuple[Body, ...]:
-        """Actuated bodies whose coordinate is free."""
-        return tuple(b for b in self.body if b.actuated and b.coordinates[0] not in self.locked)
+        """Actuated bodies whose coordinate is free, one per drive.
+
+        Their limits of torque are the lowest ones that also keep those of the joints driven with them.
+        """
+        return tuple(self._with_shared_limits(b) for b in self.body if b.actuated and self.is_free(b))
+
+    def _with_shared_limits(self, body: Body) -> Body:
+        """Return a body with limits of torque that also keep those of the joints driven with it."""
+        shared = [
+            (b.limit, abs(b.driven_with.ratio.value)) for b in self.body if b.driven_with and b in self.drives(body)
+        ]
+        lowest = {}
+        for key in ("torque", "torque_rate"):
+            own: Quantity | None = getattr(body.limit, key)
+            others = [
+                q.model_copy(update={"value": q.value / ratio}) for limit, ratio in shared if (q := getattr(limit, key))
+            ]
+            lowest[key] = min([*([own] if own else []), *others], key=float, default=None)
+        return body.model_copy(update={"limit": body.limit.model_copy(update=lowest)}) if shared else body
+
+    def drives(self, body: Body) -> tuple[Body, ...]:
+        """Return the bodies that the drive of an actuated one turns: itself, then those driven with it."""
+        return (body, *(b for b in self.body if b.driven_with and b.driven_with.joint == body.index))
+
+    def joint_values(self, body: Body, x: Any) -> Any:
+        """Return a joint's angle from coordinates x (n_q, ...), or its rate from velocities."""
+        return self.ratio(body) * x[self.coordinates.index(self.coordinate(body))]
+
+    @cached_property
+    def input_matrix(self) -> np.ndarray:
+        """Matrix B (n_q, n_u): torques on the coordinates per torque of each drive, S^T of those on the joints."""
+        B = np.zeros((len(self.coordinates), len(self.actuated)))
+        for k, driven in enumerate(self.actuated):
+            for b in self.drives(driven):
+                if self.is_free(b):
+                    share = 1.0 if b.driven_with is None else float(b.driven_with.ratio)
+                    B[self.coordinates.index(self.coordinate(b)), k] += share * self.ratio(b)
+        return B
+
+    @cached_property
+    def row_matrix(self) -> np.ndarray:
+        """Matrix T (n_q, n_q) of the equations: T B has each drive's torque in the row of its own joint alone."""
+        T, B = np.eye(len(self.coordinates)), self.input_matrix
+        for k, driven in enumerate(self.actuated):
+            row = self.coordinates.index(self.coordinate(driven))
+            T[:, row] -= B[:, k]
+            T[row, row] = 1.0
+        return T
+
+    def is_free(self, body: Body) -> bool:
+        """True if a free coordinate moves this body's joint."""
+        return bool(body.coordinates) and self.coordinate(body) not in self.locked
+
+    def coordinate(self, body: Body) -> str:
+        """Return the coordinate that a joint moves by: its own, or that of the joint that it moves with."""
+        return body.coordinates[0] if body.moves_with is None else self.find(body.moves_with.joint).coordinates[0]
+
+    def ratio(self, body: Body) -> float:
+        """Return a joint's angle per that of its `coordinate`."""
+        return 1.0 if body.moves_with is None else float(body.moves_with.ratio)
 
     @property
     def rubbing(self) -> tuple[Body, ...]:
-        """Bodies with dry friction whose coordinate is free."""
-        return tuple(b for b in self.body if b.friction is not None and b.coordinates[0] not in self.locked)
+        """Bodies with dry friction whose coordinate is free; a joint that moves with another sticks with it."""
+        return tuple(b for b in self.body if b.friction is not None and b.moves_with is None and self.is_free(b))
 
     @property
     def contacts(self) -> tuple[Body, ...]:
@@ -453,14 +572,14 @@ class Machine(FileRecord):
         if sensor.kind in ("angle", "wheel"):
             return ("m" if straight and sensor.kind == "angle" else "rad") + ("/s" if sensor.is_rate else "")
         torque = "N" if straight else "N m"
-        return {"torque": torque, "yaw_rate": "rad/s", "lateral_speed": "m/s", "x": "m", "y": "m"}[sensor.kind]
+        return {"torque": torque, "yaw_rate": "rad/s", "x": "m", "y": "m"}.get(sensor.kind, "m/s")
 
     def _visible(self, sensor: Sensor) -> bool:
         """True if a free coordinate moves what the sensor measures."""
         free = set(self.coordinates)
         body = self.find(sensor.body)
         if sensor.kind in ("angle", "torque"):
-            return body.coordinates[0] in free
+            return self.is_free(body)
         if sensor.kind == "yaw_rate":
             return f"theta{self.body[0].index}" in free
         if sensor.kind in ("lateral_speed", "y"):
@@ -470,6 +589,7 @@ class Machine(FileRecord):
     @model_validator(mode="after")
     def _consistent(self) -> Machine:
         self._check_tree()
+        self._check_couplings()
         self._check_locked()
         self._check_sensors()
         if self.problem is not None and self.problem not in self.problems:
@@ -506,6 +626,32 @@ class Machine(FileRecord):
             seen.add(body.index)
             names |= {body.name, body.where}
 
+    def _check_couplings(self) -> None:
+        """Check that coupled joints name others that exist, lead and, for a common torque, are driven."""
+        known = {b.index: b for b in self.body}
+        for k, body in enumerate(self.body):
+            for key in ("moves_with", "driven_with"):
+                coupling: Coupling | None = getattr(body, key)
+                if coupling is None:
+                    continue
+                where, other = f"body[{k}].{key}.joint", known.get(coupling.joint)
+                if other is None or other.joint not in ("revolute", "prismatic") or other is body:
+                    joints = [b.index for b in self.body if b.joint in ("revolute", "prismatic") and b is not body]
+                    raise ValueError(f"{where}: no other joint {coupling.joint}, allowed: {joints}")
+                if key == "driven_with" and not other.actuated:
+                    raise ValueError(f"{where}: joint {other.index} isn't actuated: give the drive that both share")
+                if key == "moves_with" and other.moves_with is not None:
+                    raise ValueError(
+                        f"{where}: joint {other.index} moves with joint {other.moves_with.joint} itself: give that one"
+                    )
+                if key == "moves_with" and body.friction is not None and other.friction is None:
+                    raise ValueError(f"{where}: joint {other.index} needs friction of its own, as its speed decides")
+                if key == "driven_with" and body.moves_with is not None and known[body.moves_with.joint].actuated:
+                    raise ValueError(f"body[{k}].driven_with: it moves with a driven joint; give that one the torque")
+                for one in (body, other) if key == "moves_with" else ():
+                    if one.coordinates[0] in self.locked:
+                        raise ValueError(f"locked: {one.coordinates[0]} is coupled by {key}, take one of both out")
+
     def _check_locked(self) -> None:
         """Check that locked coordinates exist and leave a machine that can be driven."""
         every = [c for b in self.body for c in b.coordinates]
@@ -538,7 +684,10 @@ class Machine(FileRecord):
             if sensor.kind == "angle" and sensor.body not in jointed:
                 raise ValueError(f"sensor[{k}].body: body {sensor.body} has no joint to measure, allowed: {jointed}")
             if sensor.kind == "torque" and sensor.body not in driven:
-                raise ValueError(f"sensor[{k}].body: joint {sensor.body} isn't actuated, allowed: {driven}")
+                raise ValueError(
+                    f"sensor[{k}].body: joint {sensor.body} isn't actuated, allowed: {driven}; a common torque is that"
+                    " of the joint it is driven with"
+                )
             if sensor.kind not in ("angle", "torque") and not self.planar:
                 raise ValueError(f"sensor[{k}].kind: {sensor.kind} needs a planar root, allowed here: angle, torque")
             if sensor.kind not in ("angle", "torque") and sensor.body != self.body[0].index:

@@ -61,6 +61,8 @@ QUANTITIES_BY_KIND: dict[str, tuple[str, ...]] = {
     "torque": ("torque", "force"),
     "yaw_rate": ("angular rate",),
     "lateral_speed": ("speed",),
+    "forward_speed": ("speed",),
+    "ground_speed": ("speed",),
     "x": ("length",),
     "y": ("length",),
 }

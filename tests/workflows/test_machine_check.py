@@ -95,7 +95,10 @@ WRONG = {
     "lane too small": ([("problems.T30.lane_m", [1.0, 1.0])], "problems.T30.lane_m: lane_points 2.4 m apart"),
     "no torque measured": ([("sensor.5", None)], "sensor: none of kind torque on joint 1 (front_axle)"),
     "rolls the wrong way": ([("body.1.alpha.value", "pi/2")], "front_axle: contact: must turn about y"),
-    "two wheels in one place": ([("sensor.4.lateral.value", 1.1)], "two measuring wheels apart"),
+    "two wheels in one place, no gyro": (
+        [("sensor.4.lateral.value", 1.1), ("sensor.8", None)],
+        "two measuring wheels apart",
+    ),
 }
 
 
