@@ -347,6 +347,18 @@ def _friction_torque(s: SymbolicSample, body: Body) -> ca.SX:
     return s.by_name[f"Fv{k}"] * w + s.by_name[f"Fs{k}"] * s.sign[k]
 
 
+def _joint_torque(s: SymbolicSample, body: Body) -> ca.SX:
+    """Return Ia q" + Fv w + Fs sgn w + Ks q - Ts [N m] of a joint: rotor, friction, spring."""
+    c, k, torque = body.coordinates[0], body.index, ca.SX(0)
+    if body.drive is not None:
+        torque += s.by_name[f"Ia{k}"] * s.a[s.row(body)]
+    if body.friction is not None:
+        torque += _friction_torque(s, body)
+    if body.spring is not None:
+        torque += s.by_name[f"Ks{k}"] * s.at[c] - s.by_name[f"Ts{k}"]
+    return torque
+
+
 def _balance(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, dict[str, ca.SX]]:
     """Return generalised forces (n_q,) that the motors must deliver, and slips by name."""
     machine = s.machine
@@ -354,8 +366,8 @@ def _balance(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, 
     rows = mechanics.generalised_forces(machine, s.at, s.frames, inertia)
     force = ca.vertcat(*[rows[c] for c in s.names])
     for body in machine.body:
-        if body.friction is not None and body.coordinates[0] in s.names:
-            force[s.row(body)] += _friction_torque(s, body)
+        if body.joint in ("revolute", "prismatic") and body.coordinates[0] in s.names:
+            force[s.row(body)] += _joint_torque(s, body)
     for e in acting:
         force -= _effect_force(s, e, inertia)
     slips: dict[str, ca.SX] = {}

@@ -24,6 +24,11 @@ from excite.model import Model
 from excite.model.machine import Filter
 from excite.simulation import outside_law
 
+RATIOS_NOTE = (
+    "no torque constant is given, so torques are currents and every value is divided by that constant (N m/A at the"
+    " joint, or N/A), the same for all drives; give torque_constant to get SI values"
+)
+
 
 @dataclass(frozen=True)
 class Method:
@@ -79,7 +84,8 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     estimate = assess(model, repaired, estimate, filter)
     if estimate.share_outside_law is None:
         estimate = replace(estimate, share_outside_law=_share_outside_law(model, repaired, filter))
-    return add_notes(estimate, *(note for e in examined for note in e.notes), *doubts)
+    ratios = (RATIOS_NOTE,) if model.machine.in_ratios else ()
+    return add_notes(estimate, *ratios, *(note for e in examined for note in e.notes), *doubts)
 
 
 def _share_outside_law(model: Model, logs: Sequence[Log], filter: Filter) -> float | None:
