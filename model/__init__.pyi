@@ -1,5 +1,5 @@
 from .equations import SignatureFunctions as SignatureFunctions, signatures as signatures
-from .known_values import KnownValues as KnownValues, nothing_known as nothing_known
+from .known_values import JOINT_KEYS as JOINT_KEYS, KnownValues as KnownValues, nothing_known as nothing_known
 from .parameter_names import (
     parameter_descriptions as parameter_descriptions,
     signal_descriptions as signal_descriptions,

@@ -372,14 +372,26 @@ def _friction_torque(s: SymbolicSample, body: Body) -> ca.SX:
     return s.by_name[f"Fv{k}"] * w + s.by_name[f"Fs{k}"] * s.sign[k]
 
 
+def _joint_torque(s: SymbolicSample, body: Body) -> ca.SX:
+    """Return Ia q" + Fv w + Fs sgn w + Ks q - Ts [N m] of a joint: rotor, friction, spring."""
+    c, k, torque = body.coordinates[0], body.index, ca.SX(0)
+    if body.drive is not None:
+        torque += s.by_name[f"Ia{k}"] * s.machine.ratio(body) * s.a[s.row(body)]
+    if body.friction is not None:
+        torque += _friction_torque(s, body)
+    if body.spring is not None:
+        torque += s.by_name[f"Ks{k}"] * s.at[c] - s.by_name[f"Ts{k}"]
+    return torque
+
+
 def _balance(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, dict[str, ca.SX]]:
     """Return generalised forces (n_q,) that the motors must deliver, and slips by name."""
     machine = s.machine
     inertia = {b.index: mechanics.inertial_vector(b, s.by_name) for b in machine.body}
     force = s.reduced_forces(s.frames, inertia)
     for body in machine.body:
-        if body.friction is not None and machine.is_free(body):
-            force[s.row(body)] += machine.ratio(body) * _friction_torque(s, body)
+        if body.joint in ("revolute", "prismatic") and machine.is_free(body):
+            force[s.row(body)] += machine.ratio(body) * _joint_torque(s, body)
     for e in acting:
         force -= _effect_force(s, e, inertia)
     slips: dict[str, ca.SX] = {}

@@ -22,8 +22,11 @@ from excite.model.mechanics import standard_inertia
 EXACT_SHARE = 1e-4  # standard deviation of an exact quantity relative to the scale, for conditioning; chosen
 NULL_TOLERANCE = 1e-9  # relative size below which a quantity leaves a combination unchanged; chosen
 INERTIA_KEYS = ("XX", "XY", "XZ", "YY", "YZ", "ZZ")
-FRICTION_KEYS = {"Fv": "Fv{}", "Fs": "Fs{}", "u0": "u{}0"}
-CONTACT_KEYS = {"Kx": "Kx{}", "Ky": "Ky{}"}
+JOINT_KEYS = {
+    "drive": {"rotor_inertia": "Ia{}"},
+    "friction": {"Fv": "Fv{}", "Fs": "Fs{}", "u0": "u{}0"},
+    "contact": {"Kx": "Kx{}", "Ky": "Ky{}"},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +144,16 @@ def _quantities(body: Body) -> Iterator[tuple[str, bool | float, Slopes]]:
     Each is name in the file, `known`, and derivative of the standard parameters by it.
     """
     k, where = body.index, f"body.{body.name}"
-    for table, keys in ((body.friction, FRICTION_KEYS), (body.contact, CONTACT_KEYS)):
+    for part, keys in JOINT_KEYS.items():
+        table = getattr(body, part)
         for key, form in keys.items():
             if table is not None:
                 quantity: Quantity = getattr(table, key)
-                part = "friction" if table is body.friction else "contact"
                 yield f"{where}.{part}.{key}", quantity.known, {form.format(k): 1.0}
+    if body.spring is not None:
+        stiffness, rest = body.spring.stiffness, body.spring.rest
+        yield f"{where}.spring.stiffness", stiffness.known, {f"Ks{k}": 1.0, f"Ts{k}": float(rest)}
+        yield f"{where}.spring.rest", rest.known, {f"Ts{k}": float(stiffness)}
     if body.inertia is None:
         return
     for key in ("mass", "com.x", "com.y", "com.z", *INERTIA_KEYS):

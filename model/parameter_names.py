@@ -8,6 +8,9 @@ from excite.model.prediction import Model
 MOMENTS = {"MX": "first moment x", "MY": "first moment y", "MZ": "first moment z"}
 INERTIA = {"XX": "about x", "YY": "about y", "ZZ": "about the axis", "XY": "xy", "XZ": "xz", "YZ": "yz"}
 ACTING = {
+    "Ia": "rotor inertia",
+    "Ks": "stiffness of the spring",
+    "Ts": "spring torque at zero",
     "Fv": "viscous friction",
     "Fs": "dry friction",
     "Kx": "lengthwise force per slip",

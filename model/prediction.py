@@ -21,7 +21,7 @@ from excite.model.base_parameters import BaseParameters, append_parameters, base
 from excite.model.effects import GroundMap, PlacedEffect, Site, place_effect
 from excite.model.equations import Equations, contact_lines, edge_slips, equations, kinematics, signed_balance
 from excite.model.known_values import KnownValues, known_values
-from excite.model.machine import Machine
+from excite.model.machine import PER_FORCE_CONSTANT, PER_TORQUE_CONSTANT, Machine
 
 
 def standard_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
@@ -38,24 +38,42 @@ def standard_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
             joints |= inertia
         else:
             chassis |= inertia
+        turn = body.joint == "revolute"
+        if body.drive is not None:
+            joints[f"Ia{k}"] = (float(body.drive.rotor_inertia), "kg m2" if turn else "kg")
         if body.friction is not None:
-            turn = body.joint == "revolute"
             joints[f"Fv{k}"] = (float(body.friction.Fv), "N m s" if turn else "N s/m")
             joints[f"Fs{k}"] = (float(body.friction.Fs), "N m" if turn else "N")
+        if body.spring is not None:
+            stiffness = float(body.spring.stiffness)
+            joints[f"Ks{k}"] = (stiffness, "N m/rad" if turn else "N/m")
+            joints[f"Ts{k}"] = (stiffness * float(body.spring.rest), "N m" if turn else "N")
         if body.contact is not None:
             joints[f"Kx{k}"] = (float(body.contact.Kx), "N")
             joints[f"Ky{k}"] = (float(body.contact.Ky), "N")
         if body.friction is not None:
-            joints[f"u{k}0"] = (float(body.friction.u0), "N m" if body.joint == "revolute" else "N")
-    return chassis | joints
+            joints[f"u{k}0"] = (float(body.friction.u0), "N m" if turn else "N")
+    every = chassis | joints
+    if not machine.in_ratios:
+        return every
+    turns = machine.actuated[0].joint == "revolute"
+    per_constant = PER_TORQUE_CONSTANT if turns else PER_FORCE_CONSTANT
+    return {
+        name: (value, per_constant.get(unit, f"{unit} A/({'N m' if turns else 'N'})"))
+        for name, (value, unit) in every.items()
+    }
 
 
 def required_signs(machine: Machine) -> dict[str, float]:
-    """Return the physically required sign of friction (+1) and contact stiffness (-1), by standard parameter."""
+    """Return the physically required sign by standard parameter: contact stiffness -1, joint parameters +1."""
     found: dict[str, float] = {}
     for body in machine.body:
         if body.friction is not None:
             found |= dict.fromkeys((f"Fv{body.index}", f"Fs{body.index}"), 1.0)
+        if body.drive is not None:
+            found[f"Ia{body.index}"] = 1.0
+        if body.spring is not None:
+            found[f"Ks{body.index}"] = 1.0
         if body.contact is not None:
             found |= dict.fromkeys((f"Kx{body.index}", f"Ky{body.index}"), -1.0)
     return found

@@ -55,5 +55,6 @@ from .validation import (
     compare_motions as compare_motions,
     compare_torques as compare_torques,
     far_from_nominal as far_from_nominal,
+    torque_errors as torque_errors,
     validate_torques as validate_torques,
 )

@@ -24,6 +24,11 @@ from excite.model import Model
 from excite.model.machine import Filter
 from excite.simulation import outside_law
 
+RATIOS_NOTE = (
+    "no torque constant is given, so torques are currents and every value is divided by that constant (N m/A at the"
+    " joint, or N/A), the same for all drives; give torque_constant to get SI values"
+)
+
 
 @dataclass(frozen=True)
 class Method:
@@ -81,9 +86,10 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     estimate = assess(model, repaired, estimate, filter)
     if estimate.share_outside_law is None:
         estimate = replace(estimate, share_outside_law=_share_outside_law(model, repaired, filter))
+    ratios = (RATIOS_NOTE,) if model.machine.in_ratios else ()
     unused = unused_sensors(model, method, repaired)
     said = [f"{method} does not use {', '.join(unused)}"] if unused else []
-    return add_notes(estimate, *said, *(note for e in examined for note in e.notes), *doubts)
+    return add_notes(estimate, *ratios, *said, *(note for e in examined for note in e.notes), *doubts)
 
 
 def _share_outside_law(model: Model, logs: Sequence[Log], filter: Filter) -> float | None:

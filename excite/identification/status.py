@@ -20,7 +20,7 @@ MOVED_STDS = 2.0  # shift to the nearest possible machine that makes an inertial
 TRIED_POSTURES = 200  # of the logs, in which the mass matrix must be positive definite; chosen
 MIN_TESTED_SHARE = 1e-6  # of a known value's variance that the logs must leave for a test of it, above rounding; chosen
 CONTRADICTION_LEVEL = 1e-3  # of that test; chosen
-INERTIAL_INITIALS = "MXYZ"  # of the names of inertial parameters
+INERTIAL_INITIALS = "MXYZI"  # of the names of inertial parameters
 NEVER_NEGATIVE = ("M", "XX", "YY", "ZZ")  # standard inertial parameters that no body has below zero
 CAUSES = "the sign of a torque or angle column, a unit, or a radius in the machine file"
 

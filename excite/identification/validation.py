@@ -99,6 +99,16 @@ class SignalComparison:
         return np.sqrt(np.mean(self.residual**2, axis=1))
 
 
+@dataclass(frozen=True)
+class SignalErrors:
+    """Errors of m signals: rms (m,) in their units, and in per cent of what was measured (rms)."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    rms: np.ndarray
+    percent: np.ndarray
+
+
 def compare_torques(model: Model, log: Log, estimate: Estimate, filter: Filter | None = None) -> SignalComparison:
     """Predict the torques of a log from its motion and compare them, both low-passed.
 
@@ -265,8 +275,24 @@ def _filtered_torques(model: Model, log: Log, estimate: Estimate, filter: Filter
     return SignalComparison(model.inputs, units, log.t[keep], measured[:, keep], predicted[:, keep])
 
 
+def torque_errors(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter) -> SignalErrors:
+    """Return the error of an estimate by joint, on the rows that it was fitted to."""
+    rate, rows = float(model.machine.sampling_hz), list(model.actuated)
+    measured = np.concatenate(
+        [lowpass(samples(model, log, filter).Y[rows], rate, filter)[:, _settled(log, filter, rate)] for log in logs],
+        axis=1,
+    )
+    rms = np.sqrt(np.mean(estimate.residual[rows] ** 2, axis=1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        percent = 100 * rms / np.sqrt(np.mean(measured**2, axis=1))
+    return SignalErrors(
+        tuple(b.where for b in model.machine.actuated), tuple(_torque_unit(model, k) for k in rows), rms, percent
+    )
+
+
 def _torque_unit(model: Model, row: int) -> str:
-    return "N m" if model.coordinates[row].startswith("theta") else "N"
+    turns = model.coordinates[row].startswith("theta")
+    return "A" if model.machine.in_ratios else "N m" if turns else "N"
 
 
 def far_from_nominal(model: Model, estimate: Estimate) -> tuple[str, ...]:

@@ -48,7 +48,7 @@ def _in_file_units(machine: Machine, sensor: Sensor, x: np.ndarray) -> dict[str,
     """Build the columns of a sensor; the pressures of cylinders, which no torque tells, become the torque in SI."""
     if sensor.cylinders:
         return {f"{sensor.name} [{machine.si_unit(sensor)}]": x}
-    columns = {sensor.column: x / sensor.gain}
+    columns = {sensor.column: (x + sensor.shift) / sensor.gain}
     if sensor.return_column is not None:
         columns[sensor.return_column] = np.zeros_like(x)  # only the difference of two pressures counts
     return columns

@@ -139,7 +139,7 @@ def values_of(sensor: Sensor, machine: Machine, table: pd.DataFrame, source: str
     """A sensor's readings (N,) [SI] from its columns: units, torques of pressures. Raises LogError."""
     number = numbers(table, sensor.column, source)
     if sensor.return_column is None:
-        return sensor.gain * number
+        return sensor.gain * number - sensor.shift
     back = numbers(table, sensor.return_column, source)
     if not sensor.cylinders:
         return sensor.gain * (number - back)

@@ -329,7 +329,8 @@ def as_log(stretch: Stretch, machine: Machine, needs: Sequence[str], source: str
     table = stretch.table.assign(**{machine.time_column: 0.0})
     table.attrs = {}
     made = log.from_table(table, machine, needs, source, np.arange(len(table)) / stretch.rate)
-    edges = {s.name: s.gain * stretch.edges[s.column] for s in machine.sensors("full") if s.column in stretch.edges}
+    counted = [s for s in machine.sensors("full") if s.column in stretch.edges]
+    edges = {s.name: s.gain * stretch.edges[s.column] - s.shift for s in counted}
     sampled = {s.name: stretch.sampled[s.column] for s in machine.sensors("full") if s.column in stretch.sampled}
     return replace(made, interpolated=stretch.interpolated, sampled=sampled, edges=edges, doubts=stretch.doubts)
 

@@ -84,7 +84,7 @@ def mended(table: pd.DataFrame, record: Record, source: str) -> tuple[pd.DataFra
             continue
         mean = _mean_of_neighbours(c, k)
         column = pd.to_numeric(table[c.sensor.column], errors="coerce").to_numpy(dtype=float).copy()
-        column[c.rows[k]] = mean / c.sensor.gain
+        column[c.rows[k]] = (mean + c.sensor.shift) / c.sensor.gain
         changed[c.sensor.column] = column
         notes.append(_note(c.sensor, record.machine, c.rows[k], float(np.abs(c.x[k] - mean).max()), source))
     if not changed:

@@ -46,6 +46,7 @@ def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
                 "said": lever.column,
                 "column": sensor.column if sensor else "",
                 "gain": degree * sensor.gain if sensor else 0.0,
+                "shift": degree * sensor.shift if sensor else 0.0,
                 "rate": sensor is not None and sensor.is_rate,
                 "degrees": degree,
                 "values": degrees.tolist(),

@@ -204,7 +204,7 @@ class GrowingLog:
         found = {}
         for key, s in self.angles:
             with contextlib.suppress(KeyError, ValueError):
-                found[key] = s.gain * float(cells[s.column])
+                found[key] = s.gain * float(cells[s.column]) - s.shift
                 if s.is_rate:
                     found[key] = self.turned.get(key, 0.0) + found[key] * seconds
         found = {key: angle for key, angle in found.items() if math.isfinite(angle)}

@@ -562,9 +562,22 @@ def describe_identify(s: Summary) -> Description:
             f"No estimate: where the fit by {s['method']} ended, to find the cause. {conds[0].upper()}{conds[1:]}."
         )
     marked = tuple(k for k, r in enumerate(rows.values()) if not r["possible"])
-    tables = (Table(caption, names, table, marked, _meaning_index(s), grey=s["status"] != "valid"),)
+    by_joint = s.get("error_by_joint", {})
+    tables = (
+        Table(caption, names, table, marked, _meaning_index(s), grey=s["status"] != "valid"),
+        *((_joint_errors_table(by_joint),) if len(by_joint) > 1 else ()),
+    )
     verdict = _judge_estimate(s, max(known.values(), default=None), impossible)
     return Description(f"Parameters of {s['machine']}", headline, tables, tuple(remarks), s["status"], verdict)
+
+
+def _joint_errors_table(by_joint: Mapping[str, Any]) -> Table:
+    rows = tuple(
+        (name.replace("_", " "), format_percent(e["percent"]), format_number(e["rms"], 3), e["unit"])
+        for name, e in by_joint.items()
+    )
+    caption = "Prediction error by joint, in per cent of the torque (rms) that was measured there."
+    return Table(caption, ("joint", "error", "rms", "unit"), rows)
 
 
 def _judge_estimate(s: Summary, worst_percent: float | None, impossible: Sequence[str]) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from excite.model import Model
+from excite.model import JOINT_KEYS, Model
 from excite.model.machine import Body, Machine, Quantity
 from excite.simulation.driver import drive_gains
 from excite.simulation.integrator import Motion, respond
@@ -57,12 +57,12 @@ def vary_machine(machine: Machine, spread: float, rng: np.random.Generator, corn
                 moved = tuple(x * factor() if x else 0.0 for x in b.inertia.com.value)
                 parts["com"] = b.inertia.com.model_copy(update={"value": moved})
             update["inertia"] = b.inertia.model_copy(update=parts)
-        if b.friction is not None:
-            update["friction"] = b.friction.model_copy(
-                update={n: changed(getattr(b.friction, n)) for n in ("Fv", "Fs", "u0")}
-            )
-        if b.contact is not None:
-            update["contact"] = b.contact.model_copy(update={n: changed(getattr(b.contact, n)) for n in ("Kx", "Ky")})
+        for table, names in JOINT_KEYS.items():
+            record = getattr(b, table)
+            if record is not None:
+                update[table] = record.model_copy(update={n: changed(getattr(record, n)) for n in names})
+        if b.spring is not None:
+            update["spring"] = b.spring.model_copy(update={"stiffness": changed(b.spring.stiffness)})
         return b.model_copy(update=update)
 
     return machine.model_copy(update={"body": tuple(body(b) for b in machine.body)})

@@ -51,7 +51,7 @@ def _as_columns(sensor: Sensor, read: np.ndarray, angle: np.ndarray) -> dict[str
     One side of a motor or cylinder pushes, the other is at BOOST_PRESSURE.
     """
     if sensor.return_column is None:
-        return {sensor.column: read / sensor.gain}
+        return {sensor.column: (read + sensor.shift) / sensor.gain}
     push, pull = machine.torque_per_pressure(sensor.displacement, sensor.cylinders, angle)
     more = read - (push + pull) * BOOST_PRESSURE
     forward = more * push > 0

@@ -121,6 +121,7 @@ def identify_account(
         "cond_w": estimate.cond_w,
         "cond_phi": estimate.cond_phi,
         "relative_error_percent": estimate.relative_error_percent,
+        "error_by_joint": _error_by_joint(model, read, estimate, chosen),
         "degrees": estimate.degrees,
         "share_outside_law": estimate.share_outside_law,
         "unused_sensors": list(identification.unused_sensors(model, estimate.method, read)),
@@ -153,6 +154,12 @@ def identify_account(
 def _fit_figure(model: Model, one: Log, estimate: Estimate, chosen: Filter) -> Figure:
     torques = identification.compare_torques(model, one, estimate, chosen)
     return reports.comparison_figure(model, torques, f"{model.machine.title}: {one.source}")
+
+
+def _error_by_joint(model: Model, read: Sequence[Log], estimate: Estimate, chosen: Filter) -> dict[str, Any]:
+    errors = identification.torque_errors(model, read, estimate, chosen)
+    each = zip(errors.names, errors.rms, errors.percent, errors.units, strict=True)
+    return {name: {"percent": percent, "rms": rms, "unit": unit} for name, rms, percent, unit in each}
 
 
 def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:

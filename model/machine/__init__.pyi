@@ -5,11 +5,13 @@ from .machine import (
     TIME_UNITS as TIME_UNITS,
     Body as Body,
     Contact as Contact,
+    Drive as Drive,
     EffectEntry as EffectEntry,
     Filter as Filter,
     Machine as Machine,
     Problem as Problem,
     Sensor as Sensor,
+    Spring as Spring,
     load_machine as load_machine,
     machine_files as machine_files,
     machine_tables as machine_tables,
@@ -24,4 +26,9 @@ from .records import (
     error_lines as error_lines,
     read_toml as read_toml,
 )
-from .units import TURN as TURN, UNITS as UNITS
+from .units import (
+    PER_FORCE_CONSTANT as PER_FORCE_CONSTANT,
+    PER_TORQUE_CONSTANT as PER_TORQUE_CONSTANT,
+    TURN as TURN,
+    UNITS as UNITS,
+)

@@ -128,6 +128,25 @@ class Coupling(FileRecord):
         return self
 
 
+class Drive(FileRecord):
+    """Inertia of a joint's geared rotor as seen at the joint: (gear ratio)^2 x that of the rotor [kg m2, kg].
+
+    It adds rotor_inertia q" to the joint's own equation; what the spinning rotor does to other joints is left out.
+    """
+
+    rotor_inertia: Positive
+
+
+class Spring(FileRecord):
+    """A spring at a joint, such as a gravity balancer: torque -stiffness (q - rest) on the body.
+
+    stiffness [N m/rad, N/m]; rest [rad, m]: where it exerts nothing.
+    """
+
+    stiffness: Positive
+    rest: Quantity
+
+
 class Contact(FileRecord):
     """A roll or wheel on the soil (11, 17, 24, 25). Frame: the chassis that carries it, at its own centre.
 
@@ -196,6 +215,8 @@ class Body(FileRecord):
     r: Quantity = Field(default_factory=_zero)
     inertia: Inertia | None = None
     friction: Friction | None = None
+    drive: Drive | None = None
+    spring: Spring | None = None
     contact: Contact | None = None
     limit: JointLimit = JointLimit()
 
@@ -222,9 +243,11 @@ class Body(FileRecord):
             if getattr(self, key).value:
                 raise ValueError(f"{key}: a {self.joint} joint's coordinate takes its place, leave it out")
         if self.joint in ("fixed", "planar"):
-            for key in ("actuated", "friction", "moves_with", "driven_with"):
+            for key in ("actuated", "friction", "drive", "spring", "moves_with", "driven_with"):
                 if getattr(self, key):
-                    raise ValueError(f"{key}: a {self.joint} joint can't be actuated or have friction or a coupling")
+                    raise ValueError(
+                        f"{key}: a {self.joint} joint can't be actuated or have friction, drive, spring or a coupling"
+                    )
         for key in ("moves_with", "driven_with"):
             if self.actuated and getattr(self, key):
                 raise ValueError(f"{key}: the drive is that of the other joint, leave out actuated here")
@@ -241,6 +264,7 @@ class Sensor(FileRecord):
     """One column of a log, in `unit` (see `units`). SI value = `gain` x (number in the column).
 
     `factor`: SI value of the number 1 in the column, in place of the unit's; needed for units without one, such as V.
+    `zero`: SI reading of an encoder where the joint's coordinate is 0; it is subtracted.
 
     kind `angle`: encoder of a joint; `wheel`: measuring wheel of `radius` [m] at `lateral` [m] (+ left) on the axis
     through the body's origin (32); `torque`: delivered torque or force + u0; `yaw_rate`: of the body; `forward_speed`,
@@ -253,6 +277,10 @@ class Sensor(FileRecord):
     A torque may be given as two pressures, in `column` and `return_column`: those of a hydraulic motor with its
     `displacement` [m3 per turn of the joint, gear included], u = displacement / (2 pi) (p - p_return), or those of
     `cylinders` (see `hydraulics`). `factor` is then the pressure of the number 1 [Pa], 4e6 for 0-10 V over 0-400 bar.
+
+    A torque may be given as the current of its motor: u = `torque_constant` [N m/A at the motor] x `gear_ratio` x
+    current. Without the constant all torques must be such currents of motors of one kind; results are then divided by
+    that constant (`Machine.in_ratios`).
 
     `step`: smallest step of a reading [SI]. `rate_hz`: readings per second, if it has fewer than the log has rows.
 
@@ -273,6 +301,9 @@ class Sensor(FileRecord):
     factor: Quantity | None = None
     return_column: Annotated[str | None, Field(min_length=1)] = None
     displacement: Positive | None = None
+    torque_constant: Quantity | None = None
+    gear_ratio: Quantity | None = None
+    zero: Quantity | None = None
     cylinders: tuple[hydraulics.Cylinder, ...] = ()
     kits: tuple[Literal["paper", "full"], ...] = ("paper", "full")
     place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
@@ -304,7 +335,20 @@ class Sensor(FileRecord):
     def gain(self) -> float:
         """SI value of the number 1 in the column: torque [N m] for a motor's pressure, [Pa] for a cylinder's."""
         one = float(self.factor) if self.factor is not None else units.UNITS[self.unit][1]
-        return one if self.displacement is None else one * float(self.displacement) / (2 * math.pi)
+        if self.displacement is not None:
+            one *= float(self.displacement) / (2 * math.pi)
+        return one * float(self.torque_constant or 1.0) * float(self.gear_ratio or 1.0)
+
+    @property
+    def shift(self) -> float:
+        """SI reading where the coordinate is 0: coordinate = gain x number - shift."""
+        return 0.0 if self.zero is None else float(self.zero)
+
+    @property
+    def is_bare_current(self) -> bool:
+        """True if the column holds a current without what makes it a torque."""
+        current = units.UNITS.get(self.unit, ("",))[0] == "current"
+        return current and self.factor is None and self.torque_constant is None
 
     @property
     def is_rate(self) -> bool:
@@ -344,6 +388,14 @@ class Sensor(FileRecord):
                 f"unit: {self.unit!r} is no {' or '.join(measured)}, allowed for kind {self.kind}:"
                 f" {units.units_of(measured)}, or any with its factor (the SI value of one)"
             )
+        for key in ("torque_constant", "gear_ratio"):
+            given = getattr(self, key)
+            if given is not None and (units.UNITS.get(self.unit, ("",))[0] != "current" or self.factor is not None):
+                raise ValueError(f"{key}: makes a torque of a current, unit A or mA without factor")
+            if given is not None and given.value == 0:
+                raise ValueError(f"{key}: must not be 0")
+        if self.zero is not None and (self.kind != "angle" or self.is_rate):
+            raise ValueError("zero: is for the position of a joint, kind angle without a rate's unit")
         if self.is_rate and self.counts_per_turn is not None:
             raise ValueError("counts_per_turn: is for a column that counts, not for a rate")
         if self.kind == "wheel" and (self.radius is None or self.lateral is None):
@@ -558,6 +610,11 @@ class Machine(FileRecord):
         return tuple(b for b in self.body if b.friction is not None and b.moves_with is None and self.is_free(b))
 
     @property
+    def in_ratios(self) -> bool:
+        """True if torques are known up to the motors' torque constant only; values then are divided by it."""
+        return any(s.is_bare_current for s in self.sensor)
+
+    @property
     def contacts(self) -> tuple[Body, ...]:
         """Bodies with a contact."""
         return tuple(b for b in self.body if b.contact)
@@ -571,7 +628,7 @@ class Machine(FileRecord):
         straight = self.find(sensor.body).joint == "prismatic"
         if sensor.kind in ("angle", "wheel"):
             return ("m" if straight and sensor.kind == "angle" else "rad") + ("/s" if sensor.is_rate else "")
-        torque = "N" if straight else "N m"
+        torque = "A" if self.in_ratios else "N" if straight else "N m"
         return {"torque": torque, "yaw_rate": "rad/s", "x": "m", "y": "m"}.get(sensor.kind, "m/s")
 
     def _visible(self, sensor: Sensor) -> bool:
@@ -701,6 +758,11 @@ class Machine(FileRecord):
                 if column in columns:
                     raise ValueError(f"sensor[{k}].column: {column} is used twice")
                 columns.add(column)
+            if self.in_ratios and sensor.kind == "torque" and not sensor.is_bare_current:
+                raise ValueError(
+                    f"sensor[{k}].unit: either every torque is a current of motors whose common torque_constant is"
+                    " unknown, or none: joints share parameters, which can't be in two units"
+                )
             if sensor.cylinders:
                 self._check_cylinders(f"sensor[{k}].cylinders", sensor)
             twin = (sensor.kind, sensor.body)
@@ -710,6 +772,24 @@ class Machine(FileRecord):
                 )
             measured.add(twin)
             names.add(sensor.name)
+        if self.in_ratios:
+            self._check_ratios()
+
+    def _check_ratios(self) -> None:
+        """Check that nothing of a machine whose torques are bare currents asks for torques in N m."""
+        if len({b.joint for b in self.actuated}) > 1:
+            raise ValueError(
+                "sensor.torque_constant: revolute and prismatic joints can't share an unknown one, give it"
+            )
+        quantities = [(f"known.{n}", q) for n, q in self.known.items()]
+        for body in self.body:
+            for table in ("inertia", "friction", "drive", "spring", "contact"):
+                record = getattr(body, table)
+                names = type(record).model_fields if record is not None else ()
+                quantities += [(f"body.{body.name}.{table}.{n}", getattr(record, n)) for n in names]
+        for key, quantity in quantities:
+            if getattr(quantity, "known", False):
+                raise ValueError(f"{key}: known needs torques in N m, give every current its torque_constant")
 
     def _check_cylinders(self, key: str, sensor: Sensor) -> None:
         """Check that each pressure turns the joint the same way along its range, and that its angle is measured."""

@@ -41,6 +41,8 @@ UNITS: dict[str, tuple[str, float]] = {
     "N": ("force", 1.0),
     "kN": ("force", 1e3),
     "lbf": ("force", POUND_FORCE),
+    "A": ("current", 1.0),
+    "mA": ("current", 1e-3),
     "Pa": ("pressure", 1.0),
     "kPa": ("pressure", 1e3),
     "MPa": ("pressure", 1e6),
@@ -58,7 +60,7 @@ UNITS: dict[str, tuple[str, float]] = {
 QUANTITIES_BY_KIND: dict[str, tuple[str, ...]] = {
     "angle": ("angle", "length", "angular rate", "speed"),
     "wheel": ("angle", "angular rate"),
-    "torque": ("torque", "force"),
+    "torque": ("torque", "force", "current"),
     "yaw_rate": ("angular rate",),
     "lateral_speed": ("speed",),
     "forward_speed": ("speed",),
@@ -67,6 +69,25 @@ QUANTITIES_BY_KIND: dict[str, tuple[str, ...]] = {
     "y": ("length",),
 }
 RATES = ("angular rate", "speed")
+
+
+# unit of a parameter divided by a torque constant [N m/A], or by a force constant [N/A] of sliding joints
+PER_TORQUE_CONSTANT = {
+    "N m": "A",
+    "N m s": "A s",
+    "N m/rad": "A/rad",
+    "kg": "A s2/m2",
+    "kg m": "A s2/m",
+    "kg m2": "A s2",
+}
+PER_FORCE_CONSTANT = {
+    "N": "A",
+    "N s/m": "A s/m",
+    "N/m": "A/m",
+    "kg": "A s2/m",
+    "kg m": "A s2",
+    "kg m2": "A m s2",
+}
 
 
 def units_of(quantities: tuple[str, ...]) -> str:
