@@ -21,7 +21,12 @@ from excite.model.base_parameters import BaseParameters, append_parameters, base
 from excite.model.effects import GroundMap, PlacedEffect, Site, place_effect
 from excite.model.equations import Equations, contact_lines, edge_slips, equations, kinematics, signed_balance
 from excite.model.known_values import KnownValues, known_values
-from excite.model.machine import PER_FORCE_CONSTANT, PER_TORQUE_CONSTANT, Machine
+from excite.model.machine import PER_FORCE_CONSTANT, PER_TORQUE_CONSTANT, Body, Machine
+
+SCALE_SAMPLES = 400  # random samples from which the default scale is taken; chosen
+USUAL_SPEED = 1.0  # rad/s or m/s, of a joint without a limit; chosen
+USUAL_FREQUENCY = 3.0  # rad/s, acceleration over speed: half a turn a second; chosen
+MIN_SHOWN_SHARE = 1e-3  # share of the torques (rms) from which a value shows; chosen
 
 
 def standard_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
@@ -180,6 +185,19 @@ class Model:
         own = [m.initial_std for e in self.effects for _, m in e.memory.values()]
         return np.array([1e-6] * ("time" in self.memory) + own)
 
+    @property
+    def fully_driven(self) -> bool:
+        """True if each joint is driven and none touches the ground: any smooth motion of the joints is possible."""
+        return len(self.actuated) == len(self.coordinates) and not self.machine.contacts
+
+    @cached_property
+    def follows_positions(self) -> bool:
+        """True for an arm: fully driven, with forces that depend on positions.
+
+        Torques alone do not keep such a machine on its path. Its drives are motions that position controllers follow.
+        """
+        return self.fully_driven and bool(self.active_coordinates)
+
     @cached_property
     def rows(self) -> tuple[str, ...]:
         """Names of the equations, one per coordinate."""
@@ -251,6 +269,13 @@ class Model:
             change = np.maximum(change, np.abs(at).max(axis=0))
         floor = 1e-9 * float(np.abs(self.nominal).max())
         return tuple(c for c, size in zip(self.coordinates, change, strict=True) if size > floor)
+
+    @cached_property
+    def mass_matrix(self) -> ca.Function:
+        """(q, X) -> mass matrix (n_q, n_q)."""
+        q, nu, _ = self.symbols()
+        X = ca.SX.sym("X", len(self.base.names))
+        return ca.Function("mass_matrix", [q, X], [self.equations(q, nu, X)[0]], ["q", "X"], ["M"])
 
     @cached_property
     def pivots(self) -> ca.Function:
@@ -357,14 +382,8 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
     units = {s: unit for s, (_, unit) in table.items()}
     base = base_parameters(machine, found.standard_regressor, values, units)
     nominal = base.matrix @ values
-    scale = np.array(
-        [float(machine.scale[s]) if s in machine.scale else abs(x) for s, x in zip(base.names, nominal, strict=True)]
-    )
-    for s, x in zip(base.names, scale, strict=True):
-        if x == 0:
-            raise MachineError(
-                f"{machine.name}: scale.{s}: the nominal value is 0, give a scale > 0 in the machine file"
-            )
+    stated = np.array([float(machine.scale[s]) if s in machine.scale else np.nan for s in base.names])
+    scale = np.where(np.isnan(stated), _default_scale(machine, found, base, nominal, ~np.isnan(stated)), stated)
     known = known_values(machine, base.names, base.matrix, base.standard, nominal, scale)
     if placed:
         magnitudes = _effect_parameters(machine, placed, fit_shapes)
@@ -402,6 +421,41 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
         fit_shapes,
         known,
     )
+
+
+def _default_scale(
+    machine: Machine, found: Equations, base: BaseParameters, nominal: np.ndarray, stated: np.ndarray
+) -> np.ndarray:
+    """Return the scale (n_base,) of parameters without a stated one: |nominal|, if motions show that value.
+
+    Otherwise a relative error would mean nothing, and the scale is what moves the torques as much as the median
+    parameter does: median(|nominal| column) / column, in root mean squares of the columns of W over random motions
+    within the limits. It is then that of all parameters, unless contacts dominate random motions: then of nominal
+    zeros. stated (n_base,): parameters that do not matter here.
+    """
+    n, rng = len(machine.coordinates), np.random.default_rng(0)
+    owner = {c: b for b in machine.body for c in b.coordinates}
+    low, high, speed = np.array([_usual_range(owner[c]) for c in machine.coordinates]).T
+    q = rng.uniform(low, high, (SCALE_SAMPLES, n)).T
+    nu = rng.uniform(-speed, speed, (SCALE_SAMPLES, n)).T
+    a = USUAL_FREQUENCY * rng.uniform(-speed, speed, (SCALE_SAMPLES, n)).T
+    W = found.standard_regressor(q, nu, a, base.expand @ nominal).full()
+    W = W.reshape(n, SCALE_SAMPLES, -1).transpose(1, 0, 2).reshape(n * SCALE_SAMPLES, -1) @ base.expand
+    columns = np.sqrt(np.mean(W**2, axis=0))
+    share = np.abs(nominal) * columns
+    typical = (float(np.median(share[share > 0])) if share.any() else 1.0) / columns
+    if machine.contacts:
+        return np.where(nominal == 0, typical, np.abs(nominal))
+    shown = share > MIN_SHOWN_SHARE * np.sqrt(np.mean((W @ nominal) ** 2))
+    return np.abs(nominal) if (shown | stated).all() else typical
+
+
+def _usual_range(body: Body) -> tuple[float, float, float]:
+    """Return lowest and highest position and the top speed of a body's coordinates, usual ones without a limit."""
+    speed = body.limit.rate or USUAL_SPEED
+    if body.limit.rim_speed is not None and body.contact is not None:
+        speed = float(body.limit.rim_speed) / float(body.contact.radius)
+    return *(body.limit.position_range or (-1.0, 1.0)), float(speed)
 
 
 @lru_cache(maxsize=8)

@@ -72,8 +72,8 @@ def _is_possible(model: Model, X: np.ndarray) -> bool:
     for body in model.machine.body:
         for c in body.coordinates:
             if c in model.active_coordinates:
-                range_limit = float(body.limit.position) if body.limit.position is not None else np.pi
-                q[model.coordinates.index(c)] = np.linspace(-range_limit, range_limit, POSE_COUNT)
+                low, high = body.limit.position_range or (-np.pi, np.pi)
+                q[model.coordinates.index(c)] = np.linspace(low, high, POSE_COUNT)
     if not (model.pivots(q, X).full() > 0).all():
         return False
     signs = required_signs(model.machine)

@@ -287,11 +287,11 @@ def check_limits(sensor: Sensor, values: np.ndarray, rate: float, machine: Machi
                 f"{source}: column {sensor.column}: turns at {format_number(usual, 3)} rad/s, the machine allows"
                 f" {format_number(fastest, 3)} rad/s; is the column in degrees?"
             )
-        limit = body.limit.position
-        if limit is not None and np.abs(values).max() > 3 * float(limit):
+        limit = body.limit.reach
+        if limit is not None and np.abs(values).max() > 3 * limit:
             raise LogError(
                 f"{source}: column {sensor.column}: up to {format_number(np.abs(values).max(), 3)} rad, the machine"
-                f" allows {float(limit):g} rad; is the column in degrees?"
+                f" allows {limit:g} rad; is the column in degrees?"
             )
     if sensor.kind == "torque" and body.limit.torque is not None:
         top, most = float(np.abs(values).max()), float(body.limit.torque)

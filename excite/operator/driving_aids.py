@@ -84,7 +84,7 @@ def prepare(
     motions = ground.place_in_lane(model, problem, people(trace))
     scores.append((PHASED, ground.middle_quality([ground.rate_motion(model, m) for m in motions])))
     room = ground.touched_ground(model, motions)
-    lane = (float(problem.lane_m[0]), float(problem.lane_m[1]))
+    lane = problem.lane
     over = _exceeded_limits(model, problem, motions)
     said = verdict(
         scores[0][1],
@@ -217,8 +217,8 @@ def _warnings(model: Model, trace: Trace, motions: tuple[Motion, ...], room: gro
             " it tightly, to different sides they move it sideways."
         )
     for lever, angle in zip(trace.levers, trace.angle.T, strict=True):
-        stop = lever.body.limit.position
-        if stop is not None and (top := float(np.abs(angle).max()) / float(stop)) > NEAR_STOP:
+        stop = lever.body.limit.reach
+        if stop is not None and (top := float(np.abs(angle).max()) / stop) > NEAR_STOP:
             lines.append(f"The {lever.name} goes to {100 * top:.0f} % of its stop: hands and feet away from the joint.")
     return lines
 

@@ -160,7 +160,7 @@ def trace_bounds(model: Model) -> tuple[float, np.ndarray, np.ndarray]:
     rims = [float(b.limit.rim_speed) for b in model.machine.contacts if b.limit.rim_speed is not None]
     fastest = np.floor(LIMIT_SHARE * min(rims) / SPEED_STEP + 1e-9) * SPEED_STEP if rims else np.inf
     stated = [j.body.limit for j in find_levers(model)]
-    top = np.array([np.inf if x.position is None else float(x.position) for x in stated])
+    top = np.array([x.reach or np.inf for x in stated])
     rate = np.array([np.inf if x.rate is None else float(x.rate) for x in stated])
     return float(fastest), np.floor(LIMIT_SHARE * top / ANGLE_STEP) * ANGLE_STEP, LIMIT_SHARE * rate
 

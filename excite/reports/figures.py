@@ -69,15 +69,15 @@ def _lines(ax: Axes, t: np.ndarray, curves: Mapping[str, np.ndarray], label: str
         )
 
 
-def _bound(ax: Axes, value: float) -> None:
-    for y in (-value, value):
+def _bound(ax: Axes, low: float, high: float) -> None:
+    for y in (low, high):
         ax.axhline(y, color="black", linewidth=0.8, linestyle=(0, (2, 3)))
 
 
 def design_figure(model: Model, problem: Problem, motion: Motion, title: str) -> Figure:
     """Plot a drive: torques, speeds, joint angles and slips over time, the path, and the used share of each limit."""
     machine, t = model.machine, motion.t
-    moving = [b for b in machine.actuated if b.limit.position is not None]
+    moving = [b for b in machine.actuated if b.limit.position_range is not None]
     slips: dict[str, np.ndarray] = {}
     for (index, _), x in zip(model.edges, simulation.resultant_slips(model, motion.q, motion.nu).T, strict=True):
         name = machine.find(index).where.replace("_", " ")
@@ -96,7 +96,7 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
     unit = "N m" if all(b.joint == "revolute" for b in machine.actuated) else "N"
     curves = {f"{n} ({tops[k]:g} {unit})": 100 * motion.u[:, k] / tops[k] for n, k in named.items()}
     _lines(axes[0], t, curves, "torque [% of limit]")
-    _bound(axes[0], 100)
+    _bound(axes[0], -100, 100)
     axes[0].set_ylim(-115, 115)
 
     speeds: dict[str, np.ndarray] = {}
@@ -111,12 +111,13 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
     _lines(axes[1], t, speeds, "speed [m/s]" if machine.planar else "speed [m/s or rad/s]")
     rims = [float(b.limit.rim_speed) for b in machine.contacts if b.limit.rim_speed is not None]
     if rims:
-        _bound(axes[1], max(rims))
+        _bound(axes[1], -max(rims), max(rims))
     row = 2
     if moving:
         angles = {b.where.replace("_", " "): motion.q[:, model.coordinates.index(b.coordinates[0])] for b in moving}
         _lines(axes[row], t, angles, "angle [rad]")
-        _bound(axes[row], max(float(b.limit.position) for b in moving if b.limit.position is not None))
+        lows, highs = zip(*(b.limit.position_range for b in moving if b.limit.position_range is not None), strict=True)
+        _bound(axes[row], min(lows), max(highs))
         row += 1
     if slips:
         _lines(axes[row], t, slips, "largest slip [-]")
@@ -148,7 +149,7 @@ def _path(ax: Axes, model: Model, problem: Problem, motion: Motion) -> None:
         x, y, _ = places[:, :, model.machine.body.index(body)]
         ax.plot(x, y, **_style(k), linewidth=1.2, label=body.name.replace("_", " "))
         ax.plot(x[0], y[0], "o", color=_style(k)["color"], markersize=5)
-    length, width = problem.lane_m
+    length, width = problem.lane
     ax.plot(
         *np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]).T * [[length / 2], [width / 2]], "k:", linewidth=0.8
     )

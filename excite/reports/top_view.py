@@ -33,9 +33,7 @@ def top_view_figure(machine: Machine) -> Figure:
 
 def draw_machine(ax: Axes, machine: Machine) -> None:
     """Draw a machine, forward to the right [m]. Dots are centres of mass, green outlines measuring wheels."""
-    at_stop = {
-        b.coordinates[0]: float(b.limit.position) for b in steered_joints(machine) if b.limit.position is not None
-    }
+    at_stop = {b.coordinates[0]: b.limit.reach for b in steered_joints(machine) if b.limit.reach is not None}
     if at_stop:
         _contacts(ax, machine, at_stop, ghost=True)
     poses = mechanics.body_poses(machine, {})

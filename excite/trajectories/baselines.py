@@ -167,7 +167,7 @@ def hand_made(model: Model, problem: Problem, seed: int, seconds: float) -> Mano
         speed += fast * np.interp(at, [0, 0.2, 0.8, 1], [0, 1, 1, 0])
         turn += np.interp(at, [0.1, 0.25, 0.4, 0.6, 0.75, 0.9], [0, 1, 1, -1, -1, 0]) * ((at > 0) & (at < 1))
     joints = [b for b in model.machine.actuated if b.contact is None]
-    wide = [float(b.limit.position) if b.limit.position is not None else 0.5 for b in joints]
+    wide = [b.limit.reach or 0.5 for b in joints]
     ways = _left_turn_signs(model, joints)
     angles = np.column_stack([2 / 3 * w * s * turn for w, s in zip(wide, ways, strict=True)] or [np.zeros((len(t), 0))])
     driven = follow(model, speed, angles, seed=seed)

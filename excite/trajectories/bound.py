@@ -237,8 +237,7 @@ def _state_space(model: Model, problem: Problem, degree: int) -> _StateSpace:
         if most.rim_speed is not None and contact is not None:
             speed = float(most.rim_speed) / float(contact.radius)
         at_most.append(speed)
-    places = [owner[model.coordinates[k]].limit.position for k in core]
-    size = [float(p) if p is not None else 1.0 for p in places] + at_most
+    size = [owner[model.coordinates[k]].limit.reach or 1.0 for k in core] + at_most
     size += [float(b.limit.torque) if b.limit.torque is not None else 1e4 for b in machine.actuated]
     z = ca.SX.sym("z", len(size))
     n_x = len(core) + n_q

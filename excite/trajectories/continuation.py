@@ -213,7 +213,8 @@ def typical_sizes(model: Model, problem: Problem, motion: Motion) -> dict[str, f
         sizes[name] = max(1e-3, 2 * float(np.sqrt((values**2).mean())))
     if model.machine.planar:
         x, y, heading = model.machine.body[0].coordinates
-        sizes |= {x: problem.lane_m[0] / 2, y: problem.lane_m[1] / 2, heading: 1.0}
+        length, width = problem.lane
+        sizes |= {x: length / 2, y: width / 2, heading: 1.0}
     return sizes
 
 

@@ -94,11 +94,12 @@ def _torque_rate(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[B
 
 
 def _position(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
-    """A joint's angle or stroke from its zero, `position` of a joint."""
+    """A joint's angle or stroke, `position` of a joint, or `position_low` and `position_high`."""
     for body in model.machine.body:
-        if body.limit.position is not None and model.machine.is_free(body):
-            high, angle = float(body.limit.position), model.machine.joint_values(body, s.q)
-            yield f"position {body.where}", angle, -high, high, "rad" if body.joint == "revolute" else "m"
+        if body.limit.position_range is not None and model.machine.is_free(body):
+            low, high = body.limit.position_range
+            angle = model.machine.joint_values(body, s.q)
+            yield f"position {body.where}", angle, low, high, "rad" if body.joint == "revolute" else "m"
 
 
 def _rate(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedExpression]:
@@ -155,7 +156,7 @@ def _lane(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedE
         point = places[:, bodies.index(index)]
         for axis, letter in enumerate("xy"):
             if any(ca.which_depends(point[axis], s.q, 1, False)):
-                high = problem.lane_m[axis] / 2
+                high = problem.lane[axis] / 2
                 yield f"lane {letter} {model.machine.find(index).where}", point[axis], -high, high, "m"
 
 
@@ -201,7 +202,7 @@ def polygon_edges(corners: Sequence[tuple[float, float]]) -> list[tuple[np.ndarr
 LIMITS: dict[str, LimitKind] = {
     "torque": LimitKind(_torque, ("body.limit.torque",)),
     "torque_rate": LimitKind(_torque_rate, ("body.limit.torque_rate",)),
-    "position": LimitKind(_position, ("body.limit.position",)),
+    "position": LimitKind(_position, ("body.limit.position", "body.limit.position_low", "body.limit.position_high")),
     "rate": LimitKind(_rate, ("body.limit.rate",)),
     "rim_speed": LimitKind(_rim_speed, ("body.limit.rim_speed",)),
     "slip": LimitKind(_slip, ("body.contact.slip_limit",)),
@@ -262,13 +263,28 @@ def lane_excess(excess: Mapping[str, float]) -> float:
 
 
 def resting_coordinates(model: Model) -> tuple[int, ...]:
-    """Return the coordinates that are zero at both ends: those with a position limit or that forces depend on."""
+    """Return the coordinates with a pose at both ends: those with a position limit or that forces depend on."""
     limited = {
         model.machine.coordinate(body)
         for body in model.machine.body
-        if body.coordinates and (body.limit.position is not None or body.coordinates[0] in model.active_coordinates)
+        if body.coordinates and (body.limit.reach is not None or body.coordinates[0] in model.active_coordinates)
     }
     return tuple(k for k, c in enumerate(model.coordinates) if c in limited)
+
+
+def end_poses(model: Model, problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Return the coordinates (n_q,) at the start and at the end, as `Problem` says."""
+    start = np.zeros(len(model.coordinates))
+    for body in model.machine.body:
+        if body.limit.position_range is not None and body.coordinates[0] in model.coordinates:
+            low, high = body.limit.position_range
+            start[model.coordinates.index(body.coordinates[0])] = 0.0 if low <= 0 <= high else (low + high) / 2
+    for c, place in problem.start_pose.items():
+        start[model.coordinates.index(c)] = place
+    end = start.copy()
+    for c, place in problem.end_pose.items():
+        end[model.coordinates.index(c)] = place
+    return start, end
 
 
 def rest_tolerances(model: Model) -> np.ndarray:
@@ -305,7 +321,7 @@ def check_limits(model: Model, problem: Problem, motion: Motion) -> dict[str, fl
 
 
 def _rest(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
-    """At both ends the machine stands still and its steering is centred, `rest` of the problem."""
+    """At both ends the machine stands still in the poses of the problem, `rest`."""
     if not problem.rest:
         return {}
     tolerance = rest_tolerances(model)
@@ -313,11 +329,8 @@ def _rest(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
         f"rest {c}'": max(0.0, float(np.abs(motion.nu[[0, -1], k]).max() / tolerance[k]) - 1)
         for k, c in enumerate(model.coordinates)
     }
-    centred = {
-        f"rest {model.coordinates[k]}": max(0.0, float(np.abs(motion.q[[0, -1], k]).max() / REST_POSITION) - 1)
-        for k in resting_coordinates(model)
-    }
-    return still | centred
+    away = np.abs(motion.q[[0, -1]] - end_poses(model, problem)).max(axis=0) / REST_POSITION - 1
+    return still | {f"rest {model.coordinates[k]}": max(0.0, float(away[k])) for k in resting_coordinates(model)}
 
 
 def _reversals(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
@@ -411,12 +424,12 @@ def simulate_on_lane(model: Model, problem: Problem, torque: np.ndarray, nu0: np
 def _fit_box(problem: Problem, path: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the share of the lane that a path (2, K) needs, and the shift (2,) [m] that centres it."""
     low, high = path.min(axis=1), path.max(axis=1)
-    return float(((high - low) / np.array(problem.lane_m)).max()), -(low + high) / 2
+    return float(((high - low) / np.array(problem.lane)).max()), -(low + high) / 2
 
 
 def _fit_polygon(problem: Problem, path: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the largest excess over box and polygon and the shift (2,) [m] that minimises it (linear program)."""
-    length, width = problem.lane_m
+    length, width = problem.lane
     box = [(length / 2, width / 2), (-length / 2, width / 2), (-length / 2, -width / 2), (length / 2, -width / 2)]
     sides = polygon_edges(box) + polygon_edges(problem.lane_polygon_m)
     rows = [[*outward / (high - low), -1.0] for outward, low, high in sides]

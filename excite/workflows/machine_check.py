@@ -41,7 +41,6 @@ TRIAL = Problem(
     duration_s=Quantity(value=20.0, source="definition"),
     knot_s=Quantity(value=0.2, source="definition"),
     lane_m=(1e3, 1e3),
-    lane_points=(),
 )
 
 
@@ -141,7 +140,7 @@ def _lane(model: Model) -> Iterator[str]:
     for name, problem in model.machine.problems.items():
         places = [poses[i][1][:2] for i in problem.lane_points]
         apart = max((float(np.linalg.norm(a - b)) for a in places for b in places), default=0.0)
-        room = float(np.hypot(*problem.lane_m))
+        room = float(np.hypot(*problem.lane))
         if apart >= room:
             yield (
                 f"problems.{name}.lane_m: lane_points {format_number(apart, 3)} m apart don't fit its diagonal,"
@@ -220,12 +219,12 @@ def _bounds(model: Model) -> Iterator[str]:
         missing = [key for key in ("torque", "torque_rate") if getattr(b.limit, key) is None]
         if b.contact is not None:
             missing += ["rim_speed"] * (b.limit.rim_speed is None)
-        elif b.limit.position is None:
+        elif b.limit.reach is None:
             missing.append("position")
         if missing:
             yield f"{b.name}: limit: {', '.join(missing)} not given: a designed drive knows no such bound"
-        if b.limit.position is not None and b.joint == "revolute" and float(b.limit.position) > np.pi:
-            yield f"{b.name}: limit.position: {float(b.limit.position):g} rad is beyond half a turn: degrees?"
+        if b.limit.reach is not None and b.joint == "revolute" and b.limit.reach > 2 * np.pi + 1e-9:
+            yield f"{b.name}: limit.position: {b.limit.reach:g} rad is beyond a turn: degrees?"
     for b in model.machine.contacts:
         if b.contact is not None and b.contact.slip_limit is None and b.contact.law == "linear":
             yield f"{b.name}: contact.slip_limit: not given: a drive may slip beyond where the linear law holds"

@@ -35,7 +35,7 @@ def friction_smoothing(site: Site) -> float:
 
 def angle_limit(site: Site) -> float:
     """A joint's position limit [rad], 0.6 if it has none (chosen)."""
-    return float(site.body.limit.position) if site.body.limit.position is not None else 0.6
+    return site.body.limit.reach or 0.6
 
 
 def large_torque(machine: Machine, body: Body) -> float:

@@ -171,13 +171,42 @@ class Contact(FileRecord):
 
 
 class JointLimit(FileRecord):
-    """Limits of a joint's drive. `rim_speed` is |radius x rate| of a contact [m/s]."""
+    """Limits of a joint's drive. `rim_speed` is |radius x rate| of a contact [m/s].
+
+    `position`: largest angle or stroke either way; `position_low` and `position_high` where the two differ.
+    """
 
     torque: Positive | None = None
     torque_rate: Positive | None = None
     position: Positive | None = None
+    position_low: Quantity | None = None
+    position_high: Quantity | None = None
     rate: Positive | None = None
     rim_speed: Positive | None = None
+
+    @property
+    def position_range(self) -> tuple[float, float] | None:
+        """Lowest and highest position [rad, m], None without a limit."""
+        if self.position_low is not None and self.position_high is not None:
+            return float(self.position_low), float(self.position_high)
+        return None if self.position is None else (-float(self.position), float(self.position))
+
+    @property
+    def reach(self) -> float | None:
+        """Largest distance from zero [rad, m], None without a limit."""
+        return None if self.position_range is None else max(map(abs, self.position_range))
+
+    @model_validator(mode="after")
+    def _consistent(self) -> JointLimit:
+        low, high = self.position_low, self.position_high
+        if (low is None) != (high is None):
+            raise ValueError(f"position_{'low' if low is None else 'high'}: is missing, give both ends of the range")
+        if low is not None and high is not None:
+            if self.position is not None:
+                raise ValueError("position: is the same both ways; leave it out beside position_low, position_high")
+            if float(low) >= float(high):
+                raise ValueError(f"position_low: must be below position_high (got {float(low):g}, {float(high):g})")
+        return self
 
 
 def _antecedent(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
@@ -441,21 +470,30 @@ class Problem(FileRecord):
     """A design problem: duration, lane and distance of knots. `source` is that of the lane.
 
     lane_m: length and width of the lane area, centred on 0, 0; lane_polygon_m: corners of a convex area, a second limit
-    of the `lane_points`. reversals: most reversals of the direction of travel. rest: start and end at rest.
+    of the `lane_points`. All three are for machines on the plane. reversals: most reversals of the direction of travel.
+    rest: start and end at rest. start_pose, end_pose: positions of joints there, by coordinate; those that are not
+    given start at zero, or in the middle of a range without zero, and end where they start.
     """
 
     source: Source
     duration_s: Positive
     knot_s: Positive
-    lane_m: tuple[Number, Number]
-    lane_points: tuple[Index, ...]
+    lane_m: tuple[Number, Number] | None = None
+    lane_points: tuple[Index, ...] = ()
     lane_polygon_m: tuple[tuple[Number, Number], ...] = ()
     reversals: Annotated[int, Field(strict=True, ge=0)] | None = None
     rest: Flag = True
+    start_pose: dict[str, Number] = Field(default={})
+    end_pose: dict[str, Number] = Field(default={})
+
+    @property
+    def lane(self) -> tuple[float, float]:
+        """Length and width of the lane [m], infinite without one."""
+        return self.lane_m or (math.inf, math.inf)
 
     @model_validator(mode="after")
     def _consistent(self) -> Problem:
-        if min(self.lane_m) <= 0:
+        if self.lane_m is not None and min(self.lane_m) <= 0:
             raise ValueError(f"lane_m: must be > 0, length and width (got {min(self.lane_m):g})")
         if self.lane_polygon_m and not _convex(self.lane_polygon_m):
             raise ValueError("lane_polygon_m: must be three corners or more, in order, of a convex area")
@@ -652,17 +690,35 @@ class Machine(FileRecord):
         if self.problem is not None and self.problem not in self.problems:
             allowed = ", ".join(self.problems) or "none is declared"
             raise ValueError(f"problem: no problem {self.problem}, allowed: {allowed}")
-        indices = [b.index for b in self.body]
         for name, problem in self.problems.items():
-            for i in problem.lane_points:
-                if i not in indices:
-                    raise ValueError(f"problems.{name}.lane_points: no body {i}, allowed: {sorted(indices)}")
+            self._check_problem(name, problem)
         if self.filter.cutoff_hz.value >= self.sampling_hz.value / 2:
             raise ValueError(
                 f"filter.cutoff_hz: must be below half the sampling rate, {self.sampling_hz.value / 2:g} Hz"
                 f" (got {self.filter.cutoff_hz.value:g})"
             )
         return self
+
+    def _check_problem(self, name: str, problem: Problem) -> None:
+        """Check the lane of a machine on the plane, and the joints and ranges of poses."""
+        indices = [b.index for b in self.body]
+        for i in problem.lane_points:
+            if i not in indices:
+                raise ValueError(f"problems.{name}.lane_points: no body {i}, allowed: {sorted(indices)}")
+        if self.planar and problem.lane_m is None:
+            raise ValueError(f"problems.{name}.lane_m: is missing, a machine on the plane needs length and width")
+        jointed = {b.coordinates[0]: b for b in self.body if b.joint in ("revolute", "prismatic")}
+        free = [c for c in self.coordinates if c in jointed]
+        for key in ("start_pose", "end_pose"):
+            for c, place in getattr(problem, key).items():
+                if c not in free:
+                    raise ValueError(f"problems.{name}.{key}: no joint coordinate {c}, allowed: {', '.join(free)}")
+                low, high = jointed[c].limit.position_range or (-math.inf, math.inf)
+                if not low <= place <= high:
+                    raise ValueError(
+                        f"problems.{name}.{key}.{c}: must be within the joint's range, {low:g} to {high:g}"
+                        f" (got {place:g})"
+                    )
 
     def _check_tree(self) -> None:
         """Check indices, names and antecedents of the bodies."""
@@ -800,10 +856,11 @@ class Machine(FileRecord):
         angles = [s for s in self.sensor if s.kind == "angle" and s.body == sensor.body and not s.is_rate]
         if pinned and not angles and body.coordinates[0] not in self.locked:
             raise ValueError(f"{key}: the lever depends on the angle of joint {body.index}, which no sensor measures")
-        top = float(body.limit.position) if body.limit.position is not None else 0.5
-        for arm in hydraulics.torque_per_pressure(sensor.displacement, sensor.cylinders, np.linspace(-top, top, 41)):
+        low, high = body.limit.position_range or (-0.5, 0.5)
+        for arm in hydraulics.torque_per_pressure(sensor.displacement, sensor.cylinders, np.linspace(low, high, 41)):
             if not (arm > 0).all() and not (arm < 0).all():
-                raise ValueError(f"{key}: a pressure has no lever at some angle within {top:g} rad, check the pins")
+                within = f"{high:g} rad" if low == -high else f"{low:g} to {high:g} rad"
+                raise ValueError(f"{key}: a pressure has no lever at some angle within {within}, check the pins")
 
 
 def shipped_machines() -> tuple[str, ...]:

@@ -28,14 +28,20 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: can't be read: {err.strerror}") from None
 
 
+_PLAIN = re.compile(r"^\s*[+-]?\d+(\.\d*)?\s*$")
 _PI = re.compile(r"^\s*([+-]?)\s*(?:(\d+(?:\.\d+)?)\s*\*\s*)?pi\s*(?:/\s*(\d+(?:\.\d+)?))?\s*$")
 
 
 def _number(value: Any) -> Any:
-    """Read a number or a multiple of pi such as "-pi/2", which keeps table entries exact. Raises ValueError."""
+    """Read a number, also in quotes, or a multiple of pi such as "-pi/2", which keeps table entries exact.
+
+    Raises ValueError.
+    """
     if isinstance(value, bool):
         raise ValueError("must be a number, not true/false")
     if isinstance(value, str):
+        if _PLAIN.match(value):
+            return float(value)
         match = _PI.match(value)
         if not match:
             raise ValueError('must be a number, or a multiple of pi such as "-pi/2"')

@@ -637,10 +637,6 @@ UNBUILDABLE: dict[str, tuple[str, str]] = {
     "two parameters with one name": (edit('M0 = "M"', 'M0 = "M"\nFv1 = "M"'), "parameter_names: two .* same name: M$"),
     "name for no parameter": (edit('M0 = "M"', 'M9 = "M"'), "parameter_names.M9: no such parameter, allowed: M0, MX0"),
     "scale of no parameter": (edit("u20 =", "u30 ="), "scale.u30: no such parameter, allowed: M0, .*u40"),
-    "nominal zero and no scale": (
-        edit("value = -181.94", "value = 0"),
-        "scale.u40: the nominal value is 0, give a scale > 0",
-    ),
 }
 
 

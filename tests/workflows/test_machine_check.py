@@ -120,7 +120,7 @@ DOUBTFUL = {
         [("body.1.friction.Fv.value", 2000)],
         "front_axle: limit.rim_speed: 2 m/s is never reached",
     ),
-    "degrees": ([("body.2.limit.position.value", 35)], "rear_frame: limit.position: 35 rad is beyond half a turn"),
+    "degrees": ([("body.2.limit.position.value", 35)], "rear_frame: limit.position: 35 rad is beyond a turn"),
     "no limit": ([("body.2.limit.torque", None)], "rear_frame: limit: torque not given"),
     "millimetres": ([("body.0.inertia.com.value", [200.0, 0.0, 0.0])], "front_frame: inertia.com: 200 m"),
     "more than a disc": ([("body.1.inertia.ZZ.value", 900)], "more than a flat disc"),
