@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
 
 STD_DIGITS = 2  # significant digits of a standard deviation; chosen
@@ -46,6 +47,12 @@ def format_uncertain(value: float, std: float, unit: str = "") -> str:
     if not (math.isfinite(std) and std > 0):
         return f"{format_number(value)}{tail}"
     return f"{format_rounded(value, std)} +- {format_rounded(std, std)}{tail}"
+
+
+def did_you_mean(name: object, allowed: Iterable[str]) -> str:
+    """Return " (did you mean X?)" for the allowed name that is most like a wrong one, "" if none is."""
+    like = difflib.get_close_matches(str(name), list(allowed), n=1)
+    return f" (did you mean {like[0]}?)" if like else ""
 
 
 def count(n: int, one: str, many: str = "") -> str:

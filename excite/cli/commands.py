@@ -35,7 +35,7 @@ from excite.cli.options import (
     SolverOption,
     StartsOption,
 )
-from excite.errors import UsageError
+from excite.errors import InputError, UsageError
 from excite.text import count, format_number
 
 app = typer.Typer(
@@ -732,12 +732,13 @@ def _write_check(
     json: bool,
     work: Callable[[Path], dict[str, Any]],
     describe: Callable[[dict[str, Any]], None],
+    faulty: int = 1,
 ) -> None:
-    """Write and describe the check of a file; end with exit code 1 if anything is wrong."""
+    """Write and describe the check of a file; end with exit code `faulty` if anything is wrong."""
     with _result(out, json, describe, [file]) as (place, summary):
         summary |= work(place)
     if summary["faults"]:
-        raise typer.Exit(1)
+        raise typer.Exit(faulty)
 
 
 machine_files = typer.Typer(help="Start or check a machine file.", rich_markup_mode=None)
@@ -795,7 +796,8 @@ def check_machine(
 ) -> None:
     """Check a machine file: everything that is wrong or doubtful, and a drawing from above.
 
-    Ends with exit code 1 if anything is wrong.
+    All faults at once, each with its line, name and key, and what was probably meant; values that look like those of
+    another unit are doubtful. Ends with exit code 2 if anything is wrong.
     """
     out = out or Path(f"results/machine-{file.stem}")
     _write_check(
@@ -804,6 +806,7 @@ def check_machine(
         json,
         lambda place: workflows.check_machine(place, file, workflows.package_versions()),
         partial(terminal.show, "machine"),
+        InputError.exit_code,
     )
 
 

@@ -91,9 +91,8 @@ def _dumped(tables: dict[str, Any], header: str = "") -> str:
     lines, below = [], []
     for key, value in tables.items():
         name = f"{header}.{key}".lstrip(".")
-        own = (
-            name in RECORDS or header == "problems" or (not header and isinstance(value, dict) and "value" not in value)
-        )
+        of_names = not header and isinstance(value, dict) and "value" not in value  # [scale], [known] and so on
+        own = of_names or name in RECORDS or header == "problems"
         if own and isinstance(value, list):
             below += [f"\n[[{name}]]\n{_dumped(one, name)}" for one in value]
         elif own and isinstance(value, dict):

@@ -13,15 +13,15 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from pydantic import ValidationError
 
 from excite import identification, reports, smoothing, trajectories
 from excite.errors import MachineError, SimulationError
 from excite.model import Model, build, effects, mechanics, parameter_descriptions, standard_parameters
 from excite.model.effects import GRAVITY
-from excite.model.machine import Machine, Problem, Quantity, error_lines, load_machine
+from excite.model.machine import Problem, Quantity, find_faults, machine_tables, with_line
 from excite.simulation import simulate
 from excite.text import format_number
+from excite.workflows.machine_units import UNIT_DOUBTS
 from excite.workflows.requests import LONGEST_DRIVE_S
 
 PICTURE = "machine.png"
@@ -61,33 +61,29 @@ class MachineCheck:
 
 def check_file(path: Path) -> MachineCheck:
     """Check a machine file. Raises MachineError for a file that can't be read."""
-    faults = file_errors(path)
-    if faults:
+    text, tables = machine_tables(str(path))
+    read = find_faults(text, tables)
+    faults = list(read.lines)
+    if read.machine is None:
         return MachineCheck(tuple(faults), (), (), None, {})
+    machine = read.machine
+    doubts = [with_line(line, machine, text) for rule in UNIT_DOUBTS for line in rule(machine)]
     try:
-        model = build(load_machine(path))
+        model = build(machine)
     except MachineError as err:
-        return MachineCheck((str(err),), (), (), None, {})
-    faults = [line for rule in FAULTS for line in rule(model)]
-    doubts = [line for rule in DOUBTS for line in rule(model)]
+        said = with_line(str(err).removeprefix(f"{machine.name}: body "), machine, text)
+        return MachineCheck((*faults, said), tuple(doubts), (), None, {})
+    if read.complete:
+        faults += [with_line(line, machine, text) for rule in FAULTS for line in rule(model)]
+    doubts += [with_line(line, machine, text) for rule in DOUBTS for line in rule(model)]
     sigma = {} if faults or float(model.machine.sampling_hz) > MAX_SAMPLING_HZ else _random_drive_sigma(model)
     doubts += [
         f"{name}: random drives leave it uncertain by {value:.0f} %: hardly any drive shows it apart from the others"
         for name, value in sigma.items()
         if value > POORLY_IDENTIFIABLE
     ]
-    return MachineCheck(tuple(faults), tuple(doubts), tuple(describe_invisible(model)), model, sigma)
-
-
-def file_errors(path: Path) -> list[str]:
-    """Return every error of a file's keys, a line each. Raises MachineError for a file that can't be read."""
-    try:
-        load_machine(path)
-    except MachineError as err:
-        if not isinstance(err.__context__, ValidationError):
-            raise
-        return error_lines(path, err.__context__, Machine)
-    return []
+    remarks = () if faults else tuple(describe_invisible(model))
+    return MachineCheck(tuple(faults), tuple(doubts), remarks, None if read.lines else model, sigma)
 
 
 # ------------------------------------------------------------------------------------------------ faults

@@ -1,3 +1,4 @@
+from .faults import find_faults as find_faults, with_line as with_line
 from .hydraulics import torque_per_pressure as torque_per_pressure
 from .machine import (
     LOG_CHECKS as LOG_CHECKS,

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from excite.model.machine.records import read_toml
+from excite.text import did_you_mean
 
 MAX_DEPTH = 4  # files that one file may extend in a chain; chosen
 NAMED_LISTS = ("body", "sensor")  # lists of tables with a name
@@ -71,7 +72,8 @@ def _change_named(path: Path, key: str, known: list[Any], changes: dict[str, Any
     for name, change in changes.items():
         if name not in names:
             allowed = ", ".join(str(x) for x in names)
-            raise ValueError(f"{path}: {key}.{name}: no such {key}, allowed: {allowed}")
+            hint = did_you_mean(name, map(str, names))
+            raise ValueError(f"{path}: {key}.{name}: no such {key}, allowed: {allowed}{hint}")
         if not isinstance(change, dict):
             raise ValueError(f"{path}: {key}.{name}: must be a table of the keys that differ (got {change!r})")
     return [_merge(x, changes[n]) if n in changes else x for n, x in zip(names, known, strict=True)]

@@ -7,7 +7,6 @@ All values are SI.
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Sequence
 from functools import cached_property
@@ -32,6 +31,7 @@ from excite.model.machine.records import (
     Vector3,
     error_line,
 )
+from excite.text import did_you_mean
 
 MACHINES = Path(__file__).parents[1] / "machines"
 # Kinds of sensor whose place matters, by key of that place.
@@ -416,6 +416,7 @@ class Sensor(FileRecord):
             raise ValueError(
                 f"unit: {self.unit!r} is no {' or '.join(measured)}, allowed for kind {self.kind}:"
                 f" {units.units_of(measured)}, or any with its factor (the SI value of one)"
+                f"{did_you_mean(self.unit, (u for u, (q, _) in units.UNITS.items() if q in measured))}"
             )
         for key in ("torque_constant", "gear_ratio"):
             given = getattr(self, key)
@@ -442,9 +443,8 @@ class Sensor(FileRecord):
             raise ValueError("wraps_at: is for a position that is counted, an angle or a measuring wheel")
         for name in self.checks_off:
             if name not in LOG_CHECKS:
-                like = difflib.get_close_matches(name, LOG_CHECKS, n=1)
-                hint = f"did you mean {like[0]}? " if like else ""
-                raise ValueError(f"checks_off: {name!r} is unknown; {hint}allowed: {', '.join(LOG_CHECKS)}")
+                hint = did_you_mean(name, LOG_CHECKS)
+                raise ValueError(f"checks_off: {name!r} is unknown, allowed: {', '.join(LOG_CHECKS)}{hint}")
         if self.noise is not None and self.noise.value == 0 and self.counts_per_turn is None:
             raise ValueError("noise: must be > 0 (got 0); leave it out if it is unknown")
         if "full" not in self.kits:
@@ -689,7 +689,8 @@ class Machine(FileRecord):
         self._check_sensors()
         if self.problem is not None and self.problem not in self.problems:
             allowed = ", ".join(self.problems) or "none is declared"
-            raise ValueError(f"problem: no problem {self.problem}, allowed: {allowed}")
+            hint = did_you_mean(self.problem, self.problems)
+            raise ValueError(f"problem: no problem {self.problem}, allowed: {allowed}{hint}")
         for name, problem in self.problems.items():
             self._check_problem(name, problem)
         if self.filter.cutoff_hz.value >= self.sampling_hz.value / 2:
@@ -770,7 +771,7 @@ class Machine(FileRecord):
         every = [c for b in self.body for c in b.coordinates]
         for c in self.locked:
             if c not in every:
-                raise ValueError(f"locked: no coordinate {c}, allowed: {', '.join(every)}")
+                raise ValueError(f"locked: no coordinate {c}, allowed: {', '.join(every)}{did_you_mean(c, every)}")
         if self.planar:
             x, y, heading = self.body[0].coordinates
             if {x, y} & set(self.locked) and heading not in self.locked:
@@ -887,9 +888,15 @@ def load_machine(name: str | Path) -> Machine:
 
 
 def machine_tables(name: str) -> tuple[str, dict[str, Any]]:
-    """Return the text of a shipped machine's own file, and its tables merged over those that it extends."""
+    """Return the text of a machine's own file, and its tables merged over those that it extends. Raises MachineError.
+
+    name: a shipped name, or a path.
+    """
     path = _find(name)
-    return path.read_text(encoding="utf-8"), extends.read(path, MACHINES)
+    try:
+        return path.read_text(encoding="utf-8-sig", errors="replace"), extends.read(path, MACHINES)
+    except ValueError as err:
+        raise MachineError(str(err)) from None
 
 
 def machine_files(name: str | Path) -> list[Path]:

@@ -12,6 +12,8 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
+from excite.text import did_you_mean
+
 Source = Literal["paper", "data sheet", "measured", "published", "identified", "assumed", "definition"]
 
 
@@ -138,26 +140,28 @@ def error_line(path: Path | str, err: ValidationError, root: type[FileRecord]) -
 
 def error_lines(path: Path | str, err: ValidationError, root: type[FileRecord]) -> list[str]:
     """Return all errors of a file that holds a `root` record, a line each."""
-    return [_error_text(path, one, root) for one in err.errors(include_url=False)]
+    texts = [error_text(one, root) for one in err.errors(include_url=False)]
+    return [" ".join(f"{path}: {key + ': ' if key else ''}{message}".split()) for key, message in texts]
 
 
-def _error_text(path: Path | str, one: ErrorDetails, root: type[FileRecord]) -> str:
-    """Put a validation error into plain words, in one line."""
+def error_text(one: ErrorDetails, root: type[FileRecord]) -> tuple[str, str]:
+    """Put a validation error into plain words: its key, and what is wrong with it."""
     key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in one["loc"]).lstrip(".")
     kind, message, got = one["type"], one["msg"], one.get("input")
     if kind == "extra_forbidden":
-        message = f"no such key here, allowed: {', '.join(_record_at(one['loc'][:-1], root).model_fields)}"
+        fields = record_at(one["loc"][:-1], root).model_fields
+        message = f"no such key here, allowed: {', '.join(fields)}{did_you_mean(one['loc'][-1], fields)}"
     elif kind == "missing":
         message = "is missing"
     elif kind == "model_type":
-        record = _record_at(one["loc"], root)
+        record = record_at(one["loc"], root)
         number = record in (Quantity, BodyPoint)
         table = '{ value = ..., source = "..." }' if number else f"with keys {', '.join(record.model_fields)}"
         message = f"must be a table {table} (got {reprlib.repr(got)})"
     elif kind == "value_error":
         message = message.removeprefix("Value error, ")
         inner, _, rest = message.partition(": ")
-        if inner in _record_at(one["loc"], root).model_fields:
+        if inner in record_at(one["loc"], root).model_fields:
             key, message = f"{key}.{inner}".lstrip("."), rest
     elif kind == "too_short":
         message = f"must have at least {one['ctx']['min_length']} (got {one['ctx']['actual_length']})"
@@ -166,10 +170,12 @@ def _error_text(path: Path | str, one: ErrorDetails, root: type[FileRecord]) -> 
     else:
         message = message.replace("Input should be", "must be").replace("String should", "must")
         message = message.replace("a valid tuple", "a list in brackets") + f" (got {reprlib.repr(got)})"
-    return " ".join(f"{path}: {key + ': ' if key else ''}{message}".split())
+        if kind == "literal_error":
+            message += did_you_mean(got, re.findall(r"'([^']*)'", one["ctx"]["expected"]))
+    return key, message
 
 
-def _record_at(where: tuple[int | str, ...], root: type[FileRecord]) -> type[FileRecord]:
+def record_at(where: tuple[int | str, ...], root: type[FileRecord]) -> type[FileRecord]:
     """Return the type of the record at a key of the file."""
     record = root
     for step in where:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 import tomllib
@@ -21,7 +22,7 @@ from excite.model.machine import MEANINGS, Machine, load_machine, machine_tables
 from excite.model.mechanics import tree
 from excite.reports import top_view
 from excite.simulation import Motion, sensors
-from excite.workflows import machine_check
+from excite.workflows import machine_check, machine_units
 
 FRESH = machine_template.fresh("mine", Path("mine.toml"))
 
@@ -188,18 +189,116 @@ def test_a_parameter_that_no_drive_shows_well_is_doubtful(tmp_path: Path) -> Non
 
 
 def test_everything_wrong_is_said_at_once(tmp_path: Path) -> None:
-    """Not only the first complaint, as the other commands do."""
-    path = spoilt(tmp_path, ("body.0.inertia.mass.value", -1), ("body.2.limit.torque.value", -3), ("colour", "red"))
-    found = machine_check.file_errors(path)
-    assert len(found) == 3
-    for says in ("body[0].inertia.mass: must be > 0", "body[2].limit.torque: must be > 0", "colour: no such key"):
-        assert sum(says in line for line in found) == 1
+    """Keys, names, signs, physics and doubts together, each with its line, and what was meant by what is misspelt."""
+    text = machine_template.whole("mine", Path("mine.toml"), "tandem")
+    changes = {
+        "mass = { value = 5200": "mass = { value = -5200",  # 1
+        "sampling_hz =": "samplig_hz =",  # 2
+        'kind = "wheel"': 'kind = "wheal"',  # 3
+        "ZZ = { value = 370": "ZZ = { value = 2",  # a doubt
+        'problem = "R30"': 'problem = "R3O"',
+        "torque = { value = 4000": "torque = { value = 50",  # below the friction Fs
+        "rim_speed = { value = 2,": "rim_speed = { value = 7.2,",  # a doubt
+    }
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new, 1)
+    path = tmp_path / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    lines = text.splitlines()
+
+    def at(part: str) -> int:
+        return next(k for k, line in enumerate(lines, start=1) if line.startswith(part))
+
+    wheal = 'kind = "wheal'
+    found = machine_check.check_file(path)
+    expected = (
+        f"line {at('mass = { value = -')}: frame: inertia.mass: must be > 0 (got -5200)",
+        f"line {at('samplig_hz')}: samplig_hz: no such key here",
+        f"line {at(wheal)}: sensor measuring_left: kind: must be",
+        f"line {at('problem = ')}: problem: no problem R3O, allowed: R30 (did you mean R30?)",
+        f"line {at('torque = { value = 50')}: front_drum: limit.torque: 50 is not above its own friction",
+    )
+    for says in expected:
+        assert sum(line.startswith(says) for line in found.faults) == 1, (says, found.faults)
+    assert len(found.faults) == len(expected)
+    for says in ("(did you mean sampling_hz?)", "(did you mean wheel?)"):
+        assert sum(says in line for line in found.faults) == 1
+    doubts = [line for line in found.doubts if line.startswith(f"line {at('rim_speed = { value = 7.2')}: front_drum")]
+    assert any("in km/h" in line for line in doubts)
+
+
+def test_a_fault_in_what_a_file_extends_has_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        'extends = "va12"\nname = "mine"\n\n[body.front_roll.inertia]\nZZ = { value = -1, source = "asumed" }\n'
+    )
+    faults = machine_check.check_file(path).faults
+    assert [f for f in faults if f.startswith("line 5: front_roll: inertia.ZZ: must be >= 0 (got -1)")]
+    assert [f for f in faults if "inertia.ZZ.source" in f and "(did you mean assumed?)" in f]
+    path.write_text(
+        'extends = "va12"\nname = "mine"\n[body.front_rol.inertia]\nZZ = { value = 1, source = "assumed" }\n'
+    )
+    with pytest.raises(MachineError, match=r"did you mean front_roll\?"):
+        machine_check.check_file(path)
+
+
+HYDRAULIC = {
+    "name": "u_front",
+    "kind": "torque",
+    "body": 2,
+    "column": "p1",
+    "return_column": "p2",
+    "unit": "V",
+    "factor": {"value": 4e6, "source": "assumed"},
+    "displacement": {"value": 1.0e-3, "source": "assumed"},
+    "noise": {"value": 35, "source": "assumed"},
+}
+SLIPS: dict[str, tuple[str, float | list[float], str]] = {  # key, its value in another unit, what is said
+    "cc": ("sensor.7.displacement.value", 1000.0, "in cc?"),
+    "a tenth of the pressure": ("sensor.7.factor.value", 4e5, "a tenth or ten times the pressure"),
+    "ten times the pressure": ("sensor.7.factor.value", 4e7, "a tenth or ten times the pressure"),
+    "km/h": ("body.2.limit.rim_speed.value", 7.2, "in km/h?"),
+    "mm of the table": ("body.1.d.value", 1700.0, "in mm?"),
+    "degrees of the table": ("body.2.alpha.value", -90.0, "in degrees?"),
+    "degrees of a gyro": ("sensor.10.noise.value", 0.115 * 57.3, "in degrees?"),
+    "rpm": ("body.2.limit.rate", 31.8, "in rpm?"),
+    "tonnes": ("mass", 1e-3, "in t?"),
+    "grams": ("mass", 1e3, "in g?"),
+    "kW": ("power_limit.value", 0.03, "in kW?"),
+    "g": ("gravity", [0.0, 0.0, -1.0], "in another unit?"),
+}
+
+
+@pytest.mark.parametrize("slip", SLIPS)
+def test_a_value_in_another_unit_is_doubted(slip: str) -> None:
+    """One change of an otherwise undoubted machine, its drums driven by motors of 1000 cc a turn, 251 bar at most."""
+    _, raw = machine_tables("tandem")
+    raw["sensor"][7] = copy.deepcopy(HYDRAULIC)
+    key, value, says = SLIPS[slip]
+    assert [line for rule in machine_units.UNIT_DOUBTS for line in rule(Machine.model_validate(raw))] == []
+    at: Any = raw
+    for step in key.split(".")[:-1]:
+        at = at[int(step)] if isinstance(at, list) else at[step]
+    last = key.split(".")[-1]
+    if key == "mass":
+        for body in raw["body"]:
+            body["inertia"]["mass"]["value"] *= value
+    else:
+        at[last] = assumed(float(value)) if last == "rate" else value  # type: ignore[arg-type]
+    said = [line for rule in machine_units.UNIT_DOUBTS for line in rule(Machine.model_validate(raw))]
+    assert any(says in line for line in said), said
 
 
 @pytest.mark.parametrize("name", shipped_machines())
 def test_nothing_is_wrong_with_what_ships(name: str) -> None:
     model = build(load_machine(name))
     assert [line for rule in machine_check.FAULTS for line in rule(model)] == []
+
+
+@pytest.mark.parametrize("name", shipped_machines())
+def test_no_unit_is_doubtful_in_what_ships(name: str) -> None:
+    assert [line for rule in machine_units.UNIT_DOUBTS for line in rule(load_machine(name))] == []
 
 
 @pytest.mark.parametrize("name", shipped_machines())
@@ -281,11 +380,11 @@ def test_new_then_check(tmp_path: Path, excite: Excite) -> None:
     assert "exists already" in stderr
 
 
-def test_a_faulty_file_ends_with_1_and_a_missing_one_with_2(tmp_path: Path, excite: Excite) -> None:
+def test_a_faulty_file_ends_with_2_and_a_missing_one_too(tmp_path: Path, excite: Excite) -> None:
     path = spoilt(tmp_path, ("body.1.limit.torque.value", 90))
     code, stdout, _ = excite("machine", "check", path, "--out", tmp_path / "out")
-    assert code == 1
-    assert "Wrong: front_axle: limit.torque: 90 is not above" in " ".join(stdout.split())
+    assert code == 2
+    assert ": front_axle: limit.torque: 90 is not above" in " ".join(stdout.split())
     code, _, stderr = excite("machine", "check", tmp_path / "nowhere.toml", "--out", tmp_path / "no")
     assert code == 2
     assert "no such file" in stderr
