@@ -53,6 +53,11 @@ def test_links_lead_somewhere() -> None:
             assert link.startswith("https://") or (page.parent / link).exists(), f"{page.name}: {link}"
 
 
+def test_the_page_on_sensors_has_the_study_s_table() -> None:
+    table = (ROOT / "results" / "sensors" / "table.md").read_text(encoding="utf-8")
+    assert table in (ROOT / "docs" / "measuring.md").read_text(encoding="utf-8")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("study", sorted((ROOT / "results").glob("*/study.py")), ids=lambda path: path.parent.name)
 def test_a_study_calls_the_program_as_it_is(study: Path, tmp_path: Path) -> None:
@@ -205,6 +210,12 @@ def test_public_functions_have_docstrings() -> None:
     bare = [name for name, text in entries if not text.strip()]
     assert len(entries) > 200
     assert len(bare) < 0.12 * len(entries), bare
+
+
+def test_every_command_has_an_example() -> None:
+    """In its help, and the example names the command itself."""
+    for name, command in reference._commands(typer.main.get_command(app), "excite"):
+        assert f"Example: {name} " in (command.help or ""), name
 
 
 def test_every_command_has_json() -> None:

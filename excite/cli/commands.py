@@ -98,7 +98,10 @@ def _machine_file(machine: str) -> list[Path]:
 
 @app.command()
 def machines(json: JsonOption = False) -> None:
-    """List the machines that come with excite."""
+    """List the machines that come with excite.
+
+    Example: excite machines --json
+    """
     from excite import reports
     from excite.model import build
     from excite.model.machine import load_machine, shipped_machines
@@ -236,7 +239,15 @@ def verify(
 def compare(
     machine: MachineArgument,
     problem: ProblemOption = None,
-    samples: Annotated[int, typer.Option("--samples", "--runs", min=1, help="drives of each random kind")] = 20,
+    samples: Annotated[
+        int,
+        typer.Option(
+            "--samples",
+            "--runs",
+            min=1,
+            help="how many drives are drawn of each usual kind that is random; the best that keeps every limit counts",
+        ),
+    ] = 20,
     against: Annotated[
         list[str] | None,
         typer.Option(
@@ -333,9 +344,21 @@ def run(
 def drive(
     design_dir: DesignArgument,
     phases: Annotated[
-        int | None, typer.Option("--phases", min=2, help="largest number of phases; as many as it takes by default")
+        int | None,
+        typer.Option(
+            "--phases",
+            min=2,
+            help="at most this many phases, instructions such as 'forward at 1.2 m/s for 5 s'; as many as it takes"
+            " by default",
+        ),
     ] = None,
-    shortest: Annotated[float, typer.Option("--shortest", help="shortest phase, in seconds")] = 2.0,
+    shortest: Annotated[
+        float,
+        typer.Option(
+            "--shortest",
+            help="seconds that every phase lasts at least: a person needs about 2 s to read and follow one",
+        ),
+    ] = 2.0,
     seed: SeedOption = 0,
     serve: Annotated[
         bool,
@@ -398,7 +421,9 @@ def simulate(
     ],
     out: Annotated[Path, typer.Option("--out", help="log to write (.csv or .parquet)")],
     seed: SeedOption = 0,
-    noise: Annotated[str, typer.Option("--noise", help="on: sensor noise and quantisation; off: exact signals")] = "on",
+    noise: Annotated[
+        str, typer.Option("--noise", help="on: sensor noise and encoder steps; off: exact signals")
+    ] = "on",
     kit: KitOption = "full",
     effect: Annotated[
         list[str] | None,
@@ -472,7 +497,12 @@ def identify(
     logs: LogsArgument,
     method: MethodOption = None,
     filtering: Annotated[
-        str, typer.Option("--filter", help="low-pass filter; machine: of the machine file, auto: chosen from the logs")
+        str,
+        typer.Option(
+            "--filter",
+            help="smoothing of noisy signals before they are differentiated; machine: cut-off frequency of the machine"
+            " file, auto: chosen from the logs",
+        ),
     ] = "machine",
     validate: Annotated[
         list[Path] | None, typer.Option("--validate", help="log that is predicted, not fitted (repeatable)")
@@ -529,7 +559,8 @@ def diagnose(
         str,
         typer.Option(
             "--filter",
-            help="low-pass filter of the first guess; machine: of the machine file, auto: chosen from the logs",
+            help="smoothing of noisy signals before the first guess; machine: cut-off frequency of the machine file,"
+            " auto: chosen from the logs",
         ),
     ] = "machine",
     design_next: Annotated[
@@ -661,6 +692,8 @@ def check_log(
     """Check a log: its columns, everything that is wrong with it, and a figure.
 
     Ends with exit code 1 if anything is wrong.
+
+    Example: excite log check log.csv --machine va12
     """
     from excite import reports
 
@@ -752,7 +785,8 @@ def new_machine(
         str | None,
         typer.Option(
             "--like",
-            help="shipped machine to copy, if only the logger differs: columns and units are left to change",
+            help="shipped machine to begin with, such as va12 (`excite machines` lists them): for the same type of"
+            " machine with another logger, whose columns and units are left to change; by default an empty form",
             autocompletion=options.machine_names,
         ),
     ] = None,
@@ -798,6 +832,8 @@ def check_machine(
 
     All faults at once, each with its line, name and key, and what was probably meant; values that look like those of
     another unit are doubtful. Ends with exit code 2 if anything is wrong.
+
+    Example: excite machine check my_roller.toml
     """
     out = out or Path(f"results/machine-{file.stem}")
     _write_check(
@@ -815,6 +851,8 @@ def docs(out: OutOption = None, json: JsonOption = False) -> None:
     """Write the reference pages.
 
     Effects, machine file, units, study file, commands, Python interface.
+
+    Example: excite docs --out reference
     """
     from excite import output
     from excite.cli import reference
@@ -837,7 +875,10 @@ def study(
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Carry out a study of many runs, or resume it."""
+    """Carry out a study of many runs, or resume it.
+
+    Example: excite study study.toml --jobs 4
+    """
     wanted = workflows.read_study(file)
     out = out or Path(f"results/study-{wanted.study.name}")
     if jobs is not None and cluster is not None:

@@ -52,11 +52,22 @@ LogsArgument = Annotated[
 OutOption = Annotated[Path | None, typer.Option("--out", help="folder to write [results/<command>-<machine>]")]
 JsonOption = Annotated[bool, typer.Option("--json", help="print the summary as JSON and nothing else")]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="seed of random numbers: same seed, same result")]
-KitOption = Annotated[str, typer.Option("--kit", help="set of sensors", autocompletion=names("kit"))]
+KitOption = Annotated[
+    str,
+    typer.Option(
+        "--kit",
+        help="which sensors the machine carries: paper has the angles, the measuring wheels and the torques, full also"
+        " yaw rate and lateral speed where the machine file has them",
+        autocompletion=names("kit"),
+    ),
+]
 MethodOption = Annotated[
     str | None,
     typer.Option(
-        "--method", help="method of identification, the recommended one by default", autocompletion=names("method")
+        "--method",
+        help="method of identification; by default the one recommended for the machine, joint where it has contacts"
+        " with the ground",
+        autocompletion=names("method"),
     ),
 ]
 ProblemOption = Annotated[
@@ -74,14 +85,22 @@ SolverOption = Annotated[
         "--solver", help="solver of the search, `ipopt` for a check by another one", autocompletion=names("solver")
     ),
 ]
-StartsOption = Annotated[int, typer.Option("--starts", min=1, help="number of starting guesses of the search")]
+StartsOption = Annotated[
+    int,
+    typer.Option(
+        "--starts",
+        min=1,
+        help="how often the search begins anew, each time from another random drive; the best result is kept, time"
+        " grows in proportion",
+    ),
+]
 CondSlackOption = Annotated[
     float,
     typer.Option(
         "--cond-slack",
         min=0,
-        help="with objective cond: find the most accurate drive whose cond(Phi) is at most this many per cent above the"
-        " lowest one; 0 for the lowest",
+        help="with objective cond: allow a condition number up to this many per cent above the lowest one found, and"
+        " give the most accurate of these drives; 0 gives the lowest",
     ),
 ]
 SigmaMaxOption = Annotated[
@@ -91,10 +110,25 @@ SigmaMaxOption = Annotated[
     ),
 ]
 RobustOption = Annotated[
-    bool, typer.Option("--robust", help="design for machines up to 20 % off the machine file as well")
+    bool,
+    typer.Option(
+        "--robust",
+        help="also keep limits and accuracy if the real machine's parameters are up to 20 % off the machine file; some"
+        " accuracy is lost, the search takes longer",
+    ),
 ]
 AfterOption = Annotated[
-    list[Path] | None, typer.Option("--after", help="log of an earlier drive, whose information counts (repeatable)")
+    list[Path] | None,
+    typer.Option(
+        "--after",
+        help="log of a test drive done before: the new drive is designed for the machine as identified from it, and for"
+        " what it left uncertain (repeatable)",
+    ),
 ]
-BudgetOption = Annotated[float | None, typer.Option("--budget", help="stop improving after this many seconds")]
-RunsOption = Annotated[int, typer.Option("--runs", min=1, help="number of simulated test days")]
+BudgetOption = Annotated[
+    float | None,
+    typer.Option("--budget", help="seconds of searching after which the best so far is given; no limit by default"),
+]
+RunsOption = Annotated[
+    int, typer.Option("--runs", min=1, help="number of simulated test days, each with sensor noise of its own")
+]

@@ -241,7 +241,8 @@ def phase_words(trace: Trace, k: int, letters: bool = False) -> str:
 
     letters: with the names of changes of direction on the map.
     """
-    return ", ".join(part for part in phase_parts(trace, k, letters) if part)
+    go, steer = phase_parts(trace, k, letters)
+    return ", ".join((go, *steer))
 
 
 def trace_table(trace: Trace) -> list[dict[str, Any]]:
@@ -273,8 +274,8 @@ def trace_from_table(model: Model, rows: Sequence[Mapping[str, Any]]) -> Trace:
     return Trace(times, speed, np.reshape(angle, (len(joints), len(times))).T, joints)
 
 
-def phase_parts(trace: Trace, k: int, letters: bool = False) -> tuple[str, str]:
-    """Return what to do in phase k with the speed lever, and with the steering (empty if nothing steers)."""
+def phase_parts(trace: Trace, k: int, letters: bool = False) -> tuple[str, tuple[str, ...]]:
+    """Return what to do in phase k with the speed lever, and with each steered joint."""
     start = float(trace.times[k])
     took = float(trace.times[k + 1]) - start
     v0, v1 = float(trace.speed[k]), float(trace.speed[k + 1])
@@ -284,7 +285,7 @@ def phase_parts(trace: Trace, k: int, letters: bool = False) -> tuple[str, str]:
     go = _speed_words(v0, v1, took, start, names[0] if names else "")
     several = len(trace.levers) > 1
     each = zip(trace.levers, trace.degrees[k], trace.degrees[k + 1], strict=True)
-    return go, ", ".join(_steer_words(a0, a1, lever.name if several else "") for lever, a0, a1 in each)
+    return go, tuple(_steer_words(a0, a1, lever.name if several else "") for lever, a0, a1 in each)
 
 
 def _stopping_phase(trace: Trace, t: float) -> int:
@@ -328,9 +329,10 @@ def angle_words(degrees: float) -> str:
     return f"{abs(degrees):.0f}°" + ("" if abs(degrees) < 0.5 else " left" if degrees > 0 else " right")
 
 
-def start_words(model: Model, motion: Motion, trace: Trace) -> str:
+def start_words(model: Model, motion: Motion, trace: Trace, lane: tuple[float, float] | None = None) -> str:
     """Describe place and heading of the first contact at the start, seen along the lane from its middle.
 
+    lane: length and width [m], to give its distances from the corner behind on the right as well, as a tape is laid.
     Empty for a machine that can't turn on the plane.
     """
     machine = model.machine
@@ -350,7 +352,11 @@ def start_words(model: Model, motion: Motion, trace: Trace) -> str:
         for lever, a in zip(trace.levers, trace.degrees[0], strict=True)
     )
     name = first.where.replace("_", " ")
-    return f"Start, seen along the lane: the middle of the {name} {along} and {across}, pointing {way}{steered}."
+    text = f"Start, seen along the lane: the middle of the {name} {along} and {across}, pointing {way}{steered}."
+    if lane is None:
+        return text
+    from_end, from_side = float(x) + lane[0] / 2, float(y) + lane[1] / 2
+    return f"{text} By tape: {from_end:.1f} m from the lane's near end, {from_side:.1f} m from its right side."
 
 
 def _offset_words(metres: float, more: str, less: str, none: str) -> str:

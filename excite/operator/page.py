@@ -60,7 +60,7 @@ def driver_data(model: Model, trace: Trace, title: str) -> dict[str, Any]:
         "speed": trace.speed.tolist(),
         "levers": levers,
         "phases": [
-            {"start": float(t), "go": go, "steer": steer}
+            {"start": float(t), "go": go, "steer": list(steer)}
             for t, (go, steer) in zip(trace.times[:-1], words, strict=True)
         ],
         "band": {

@@ -91,7 +91,7 @@ def _first(sheet: Sheet) -> Figure:
     lane = figure.add_axes((LEFT, 0.57, RIGHT - LEFT, 0.3))
     _lane(lane, sheet)
     trace = sheet.trace
-    for k, part in enumerate(textwrap.wrap(ground.start_words(sheet.model, sheet.motions[0], trace), 108)):
+    for k, part in enumerate(textwrap.wrap(ground.start_words(sheet.model, sheet.motions[0], trace, sheet.lane), 108)):
         figure.text(LEFT, 0.521 - 0.0128 * k, part, fontsize=8.5, weight="bold")
     space = 0.43 / (1 + len(trace.levers))
     bottom = figure.add_axes((LEFT, 0.48 - (space - 0.025), RIGHT - LEFT, space - 0.025))
@@ -157,12 +157,35 @@ def _lane(ax: Axes, sheet: Sheet) -> None:
     ax.plot([], [], color="0.8", linewidth=6, label="ground that is touched")
     metre = 36 / scale  # the axis is 2 scale metres an inch
     prints = [_box(outline * metre) for outline in reports.footprints(model.machine, start)]
+    prints += _tape(ax, sheet, centre[0], metre)
     _mark(ax, marks, metre, [*prints, *((x, y, 2.0, 2.0) for x, y in centre[::25] * metre)])
     ax.set_xlabel("along the lane, from its middle [m] →", fontsize=8, labelpad=1)
     ax.set_ylabel("left of its middle [m] →", fontsize=8)
     ax.tick_params(labelsize=7)
     ax.grid(alpha=0.25)
     ax.legend(fontsize=7, ncols=5, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False, borderpad=0)
+
+
+def _tape(ax: Axes, sheet: Sheet, start: np.ndarray, metre: float) -> list[tuple[float, float, float, float]]:
+    """Draw the distances [m] of the start from the near end and the right side of the lane.
+
+    metre: points per metre. Return the boxes (centre x, centre y, width, height) [points] of their words.
+    """
+    if not set(sheet.model.machine.body[0].coordinates) <= set(sheet.model.coordinates):
+        return []
+    boxes = []
+    edges = ax.get_xlim()[0], ax.get_ylim()[0]
+    for k, (edge, name) in enumerate(zip(edges, ("near end", "right side"), strict=True)):
+        side = -sheet.lane[k] / 2
+        end = start.copy()
+        end[k] = max(side, edge)  # at the picture's edge where the lane goes on beyond it
+        tip, tail = (end[0], end[1]), (start[0], start[1])
+        ax.annotate("", tip, tail, arrowprops={"arrowstyle": "->", "linestyle": ":", "linewidth": 1.0}, zorder=2)
+        text, shift = f"{start[k] - side:.1f} m to the {name}", ((3.0, -9.0), (4.0, 5.0))[k]
+        ax.annotate(text, tip, xytext=shift, textcoords="offset points", fontsize=7, zorder=7)
+        width = 3.7 * len(text)
+        boxes.append((end[0] * metre + shift[0] + width / 2, end[1] * metre + shift[1] + 3.0, width, 8.0))
+    return boxes
 
 
 def _view(ax: Axes, sheet: Sheet) -> float:
@@ -342,8 +365,7 @@ def _table(figure: Figure, y: float, rows: Sequence[Sequence[str]], space: float
 def _score_line(name: str, score: DriveQuality) -> str:
     return (
         f"{name}: attainable error {format_number(score.median_percent, 2)} % (median parameter),"
-        f" {format_number(score.worst_percent, 2)} % (worst, {score.worst}); cond(Phi)"
-        f" {format_number(score.cond_phi, 3)}"
+        f" {format_number(score.worst_percent, 2)} % (worst, {score.worst})"
     )
 
 
@@ -365,6 +387,14 @@ def set_up_lines(machine: Machine) -> list[str]:
     rate = float(machine.sampling_hz)
     lines = [f"Log all columns at {rate:g} Hz, from 5 s before the drive to 5 s after it, the machine at rest."]
     return lines + [sensor_line(machine, s) for s in machine.sensors("full")]
+
+
+def _noise_words(machine: Machine, sensor: Sensor) -> str:
+    """Return the noise of a sensor in the unit of its column, in SI where cylinders make the torque."""
+    noise = float(sensor.noise or 0)
+    if sensor.cylinders or not sensor.gain:
+        return f"{format_number(noise, 3)} {machine.si_unit(sensor)}"
+    return f"{format_number(noise / abs(sensor.gain), 3)} {sensor.unit}"
 
 
 def sensor_line(machine: Machine, sensor: Sensor) -> str:
@@ -395,6 +425,6 @@ def sensor_line(machine: Machine, sensor: Sensor) -> str:
     if sensor.counts_per_turn is not None:
         extra.append(f"{float(sensor.counts_per_turn):g} counts per turn")
     if sensor.noise is not None:
-        extra.append(f"noise below {float(sensor.noise):g} {machine.si_unit(sensor)}")
+        extra.append(f"noise below {_noise_words(machine, sensor)}")
     kit = "" if "paper" in sensor.kits else "; optional"
     return f"{sensor.column} [{sensor.unit}]: {what}" + (f"; {', '.join(extra)}" if extra else "") + kit

@@ -60,11 +60,11 @@ def _lengths(machine: Machine) -> Iterator[str]:
             value = float(getattr(b, key))
             if abs(value) > MAX_LENGTH:
                 yield f"{b.name}: {key}: {value:g} m, usual are {MAX_LENGTH:g} at most: in mm?"
-        top = b.limit.position
-        if b.joint == "prismatic" and top is not None and float(top) > MAX_SLIDE:
-            yield f"{b.name}: limit.position: {float(top):g} m, usual are {MAX_SLIDE:g} at most: in mm?"
+        top = b.limit.reach
+        if b.joint == "prismatic" and top is not None and top > MAX_SLIDE:
+            yield f"{b.name}: limit.position: {top:g} m, usual are {MAX_SLIDE:g} at most: in mm?"
     for name, problem in machine.problems.items():
-        if max(problem.lane_m) > MAX_LANE:
+        if problem.lane_m is not None and max(problem.lane_m) > MAX_LANE:
             yield f"problems.{name}.lane_m: {max(problem.lane_m):g} m, usual are {MAX_LANE:g} at most: in mm?"
 
 

@@ -158,6 +158,9 @@ def test_where_to_start_is_said(va12: Model, x: float, y: float, degrees: float,
     motion.q[:, :3] = [x, y, np.deg2rad(degrees)]
     trace = Trace(KNOTS, SPEED, ANGLE, ground.find_levers(va12))
     said = ground.start_words(va12, motion, trace)
+    x, y = ground.contact_edges(va12, motion)[0].mean(axis=0)[0]
+    tape = f"By tape: {x + 20:.1f} m from the lane's near end, {y + 10:.1f} m from its right side."
+    assert ground.start_words(va12, motion, trace, (40.0, 20.0)) == f"{said} {tape}"
     assert said.startswith(f"Start, seen along the lane: the middle of the front roll {words}")
 
 
@@ -171,7 +174,7 @@ def test_words_name_each_of_several_joints() -> None:
     degrees = np.array([[0.0, 0], [20, 0], [20, -10], [20, -10], [0, -10], [0, 0]])
     times, speed = np.arange(0, 18, 3.0), np.array([0.0, 1, 1, 1, 1, 0])
     trace = Trace(times, speed, np.deg2rad(degrees) * [front.left, rear.left], (front, rear))
-    assert [ground.phase_parts(trace, k)[1] for k in range(len(trace))] == [
+    assert [", ".join(ground.phase_parts(trace, k)[1]) for k in range(len(trace))] == [
         "front steering to 20° left, rear steering straight",
         "keep front steering 20° left, rear steering to 10° right",
         "keep front steering 20° left, keep rear steering 10° right",
@@ -483,3 +486,11 @@ def test_drive_command_writes_two_pages(excite: Excite, tmp_path: Path) -> None:
     code, _, stderr = excite("drive", tmp_path)
     assert code == 2
     assert "excite design" in stderr
+
+
+def test_the_sheet_speaks_the_logger_s_units(va12: Model) -> None:
+    """Noise in the unit of the column: 0.002 rad/s are 0.115 deg/s."""
+    rate = next(s for s in va12.machine.sensor if s.kind == "yaw_rate")
+    assert sheet.sensor_line(va12.machine, rate).endswith("noise below 0.002 rad/s; optional")
+    degrees = rate.model_copy(update={"unit": "deg/s"})
+    assert sheet.sensor_line(va12.machine, degrees).endswith("noise below 0.115 deg/s; optional")
