@@ -1140,5 +1140,7 @@ def test_ctrl_c_ends_the_search_and_keeps_the_answer_so_far(sloping: Path, strai
     finally:
         signal.signal(signal.SIGINT, before)
     assert found.cut_short == "Ctrl-C"
-    nothing = replace(found, diagnosis=replace(found.diagnosis, verdict="unexplained", findings=(), stages=()))
+    nothing = replace(
+        found, diagnosis=replace(found.diagnosis, verdict="unexplained", findings=(), stages=()), gains=()
+    )
     assert "the search for its cause was ended by Ctrl-C before it found one" in findings.answer_text(nothing)
