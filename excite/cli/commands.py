@@ -507,6 +507,13 @@ def identify(
     validate: Annotated[
         list[Path] | None, typer.Option("--validate", help="log that is predicted, not fitted (repeatable)")
     ] = None,
+    unloaded: Annotated[
+        Path | None,
+        typer.Option(
+            "--unloaded",
+            help="result of `identify` without the payload of these logs: its inertia on the last body is given, too",
+        ),
+    ] = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -519,8 +526,9 @@ def identify(
     out = out or Path(f"results/identify-{load_machine(machine).name}")
     _check_logs_and_filter(logs, filtering)
     inputs = [*_machine_file(machine), *logs, *(validate or [])]
+    inputs += [unloaded] if unloaded else []
     with _result(out, json, partial(terminal.show, "identify"), inputs) as (place, summary):
-        summary |= workflows.identify(place, machine, logs, method, filtering, validate or [], terminal.bar)
+        summary |= workflows.identify(place, machine, logs, method, filtering, validate or [], terminal.bar, unloaded)
     if summary["status"] == "invalid":
         raise typer.Exit(1)
 

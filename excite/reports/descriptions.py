@@ -34,6 +34,7 @@ MISFIT_OF_REPEATS = 2.0  # error over repeatability, from which something remain
 MAX_CELLS = 200  # cells of a study in a table; chosen
 MAX_CONDITION = 1e15  # condition number that is infinite but for rounding
 FALSE_ALARM = 0.01  # probability of a verdict against intervals that hold; chosen
+MOVED_LEVEL = 1e-3  # p-value below which more than a payload changed between two estimates; chosen
 SHOWN_VIOLATION = 5e-6  # of a limit's range: smaller ones round to 0.000 %
 
 
@@ -566,6 +567,7 @@ def describe_identify(s: Summary) -> Description:
     tables = (
         Table(caption, names, table, marked, _meaning_index(s), grey=s["status"] != "valid"),
         *((_joint_errors_table(by_joint),) if len(by_joint) > 1 else ()),
+        *((_payload_table(s["payload"]),) if "payload" in s else ()),
     )
     verdict = _judge_estimate(s, max(known.values(), default=None), impossible)
     return Description(f"Parameters of {s['machine']}", headline, tables, tuple(remarks), s["status"], verdict)
@@ -578,6 +580,20 @@ def _joint_errors_table(by_joint: Mapping[str, Any]) -> Table:
     )
     caption = "Prediction error by joint, in per cent of the torque (rms) that was measured there."
     return Table(caption, ("joint", "error", "rms", "unit"), rows)
+
+
+def _payload_table(payload: Mapping[str, Any]) -> Table:
+    """Table of a payload's parameters in the frame of its body, with its centre of mass."""
+    rows = [
+        (n, format_sum(r["grouping"]), r["unit"], format_rounded(r["value"], r["std"]), format_number(r["std"], 2))
+        for n, r in payload["parameters"].items()
+    ]
+    for axis, x, std in zip("xyz", payload.get("centre_m", ()), payload.get("centre_std_m", ()), strict=False):
+        rows.append((axis, "centre of mass", "m", format_rounded(x, std), format_number(std, 2)))
+    moved = np.isfinite(payload["p_value"] or np.nan) and payload["p_value"] < MOVED_LEVEL
+    doubt = " Other parameters changed as well between the two estimates, so these are no payload's." if moved else ""
+    caption = f"Payload in the frame of {payload['body']}, from the difference to the estimate without it.{doubt}"
+    return Table(caption, ("parameter", "is", "unit", "value", "std"), tuple(rows), grey=bool(moved))
 
 
 def _judge_estimate(s: Summary, worst_percent: float | None, impossible: Sequence[str]) -> str:

@@ -74,13 +74,16 @@ def identify(
     filtering: str = "machine",
     validate: Sequence[Path] = (),
     bar: Bar = no_bar,
+    unloaded: Path | None = None,
 ) -> dict[str, Any]:
     """Estimate parameters from logs into a folder; return the summary.
 
     machine: a shipped name or a path. method: None for the recommended one. filtering: a name of `FILTERS`.
-    validate: logs that are not fitted, only predicted. Raises LogError, NoEstimateError, UsageError.
+    validate: logs that are not fitted, only predicted. unloaded: folder of an estimate of the machine without the
+    payload that it carries in the logs. Raises LogError, NoEstimateError, UsageError, EstimateFolderError.
     """
     as_in_file = model = requests.build_model(machine)
+    before = None if unloaded is None else identification.read_estimate(unloaded).estimate
     method = requests.choose_method(method, model)
     needs = identification.needed_sensors(model, method)
     ready = prepare(model, logs, needs)
@@ -93,7 +96,7 @@ def identify(
     more_notes = [*(others.notes if others else ()), *(line for e in examined for line in (*e.notes, *e.doubts))]
     with bar("identifying"):
         found = identify_from(model, ready.logs, method, filtering)
-    return identify_account(as_in_file, ready, found, unfitted, more_notes).write(place)
+    return identify_account(as_in_file, ready, found, unfitted, more_notes, before).write(place)
 
 
 def identify_account(
@@ -102,10 +105,12 @@ def identify_account(
     found: IdentifyResult,
     unfitted: Sequence[Log] = (),
     more_notes: Sequence[str] = (),
+    unloaded: Estimate | None = None,
 ) -> Account:
     """Give an account of an estimate, predicting logs that were not fitted.
 
     as_in_file: the model before it had the rate of the logs. more_notes: on the logs that were not fitted.
+    unloaded: estimate without the payload.
     """
     model, read, estimate, chosen = ready.model, found.logs, found.estimate, found.filter
     said = [] if found.agreement is None else [identification.describe_agreement(found.agreement)]
@@ -132,6 +137,8 @@ def identify_account(
         "validation": [_check(model, one, estimate, chosen) for one in unfitted],
         "versions": requests.package_versions(),
     }
+    if unloaded is not None:
+        summary["payload"] = _payload(identification.payload_parameters(model, estimate, unloaded))
     figures = {
         f"{kind}-{k + 1}.png" if len(several) > 1 else f"{kind}.png": partial(_fit_figure, model, one, estimate, chosen)
         for kind, several in (("fit", read), ("validation", unfitted))
@@ -160,6 +167,15 @@ def _error_by_joint(model: Model, read: Sequence[Log], estimate: Estimate, chose
     errors = identification.torque_errors(model, read, estimate, chosen)
     each = zip(errors.names, errors.rms, errors.percent, errors.units, strict=True)
     return {name: {"percent": percent, "rms": rms, "unit": unit} for name, rms, percent, unit in each}
+
+
+def _payload(payload: identification.Payload) -> dict[str, Any]:
+    each = zip(payload.names, payload.units, payload.value, payload.std, payload.groups, strict=True)
+    shown = {n: {"unit": unit, "value": v, "std": std, "grouping": group} for n, unit, v, std, group in each}
+    found: dict[str, Any] = {"body": payload.body, "parameters": shown, "p_value": payload.p_value}
+    if payload.centre is not None and payload.centre_std is not None:
+        found |= {"centre_m": payload.centre.tolist(), "centre_std_m": payload.centre_std.tolist()}
+    return found
 
 
 def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:

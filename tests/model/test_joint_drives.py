@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pinocchio as pin
 import pytest
 from test_tree import Case, quantity, random_tree
 
 import excite
+from excite.identification import payload_parameters
 from excite.model import build
 from excite.model.machine import Machine, load_machine
 
@@ -74,6 +76,24 @@ def test_rotor_spring_and_current_are_identified_on_a_tilted_base(log: pd.DataFr
     off = {n: abs(found[n] - true[n]) / s for n, s in zip(true, size, strict=True)}
     assert max(off.values()) < 0.004, off
     assert max(e["percent"] for e in estimate.summary["error_by_joint"].values()) < 0.1
+
+
+def test_a_payload_is_the_difference_of_two_estimates(log: pd.DataFrame) -> None:
+    """Mass, moments and inertia of a body that pinocchio welds to the last one, in groups that the arm shows."""
+    case = Case(random_tree(7, "rr", (-1, 0)))
+    inertia = pin.Inertia(2.0, np.array([0.3, -0.2, 0.1]), np.diag([0.05, 0.08, 0.06]))
+    case.pin.appendBodyToJoint(2, inertia, case.pin.frames[case.frames[1]].placement)
+    case.data = case.pin.createData()
+    model = build(arm())
+    loaded, unloaded = (excite.identify(model, one, method="wls") for one in (log_of(case), log))
+    found = payload_parameters(model, loaded, unloaded)
+    J = inertia.inertia - inertia.mass * pin.skew(inertia.lever) @ pin.skew(inertia.lever)
+    moments = inertia.mass * inertia.lever
+    true = dict(zip(("M", "MX", "MY", "MZ"), (inertia.mass, *moments), strict=True))
+    true |= {f"{a}{b}": J["XYZ".index(a), "XYZ".index(b)] for a, b in ("XX", "XY", "XZ", "YY", "YZ", "ZZ")}
+    expected = [sum(share * true[n] for n, share in group.items()) for group in found.groups]
+    assert {"MX", "MY", "ZZ"} <= set(found.names)
+    assert found.value == pytest.approx(expected, abs=0.01)
 
 
 def test_currents_without_a_constant_give_ratios_and_say_so(log: pd.DataFrame) -> None:
