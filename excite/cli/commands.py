@@ -802,7 +802,7 @@ def new_machine(
         str | None,
         typer.Option(
             "--from",
-            help="shipped machine to copy whole, with unit and meaning of every key",
+            help="shipped machine to copy whole, or a robot's .urdf file, with unit and meaning of every key",
             autocompletion=options.machine_names,
         ),
     ] = None,
@@ -818,7 +818,7 @@ def new_machine(
 
     if like is not None:
         workflows.require_known("--like", like, shipped_machines())
-    if origin is not None:
+    if origin is not None and not machine_template.is_urdf(origin):
         workflows.require_known("--from", origin, shipped_machines())
     if like is not None and origin is not None:
         raise UsageError("--from: writes a whole file, --like one that extends another: leave one out")

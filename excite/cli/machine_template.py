@@ -9,7 +9,7 @@ from typing import Any
 
 import jinja2
 
-from excite import output
+from excite import output, workflows
 from excite.errors import MachineError
 from excite.model import machine
 from excite.model.machine import Machine
@@ -18,12 +18,12 @@ TEMPLATE = "machine.toml"
 
 
 def start(name: str, file: Path, like: str | None = None, origin: str | None = None) -> None:
-    """Write the template, the whole shipped machine `origin`, or one that extends `like` with its columns to change.
+    """Write the template, all of `origin` (a shipped machine or a URDF), or what extends `like` with columns to change.
 
-    Raises MachineError for an existing file or an impossible name.
+    Raises MachineError for an existing file, an impossible name, or a URDF that can't be expressed.
     """
     if origin is not None:
-        text = whole(name, file, origin)
+        text = from_urdf(name, file, Path(origin)) if is_urdf(origin) else whole(name, file, origin)
     else:
         text = fresh(name, file) if like is None else renamed(name, file, machine.load_machine(like))
     if file.exists():
@@ -51,9 +51,33 @@ def whole(name: str, file: Path, origin: str) -> str:
         f'# that may be added. To write only what differs, begin a file with extends = "{origin}" instead.',
         "",
     ]
-    record, header_of, open_list = "Machine", "", 0
     text, tables = machine.machine_tables(origin)
-    for line in (_dumped(tables) if EXTENDS.search(text) else text).splitlines():
+    return "\n".join([*lines, *_with_meanings(name, _dumped(tables) if EXTENDS.search(text) else text)]) + "\n"
+
+
+def is_urdf(origin: str) -> bool:
+    """True if a path ends as URDF files do."""
+    return Path(origin).suffix.lower() in (".urdf", ".xml")
+
+
+def from_urdf(name: str, file: Path, origin: Path) -> str:
+    """Return the file of a robot described in URDF, each key with unit and meaning. Raises MachineError."""
+    _named(name)
+    lines = [
+        f"# {name}: the robot of {origin.name}, its base fixed, z up. Frames are those of modified Denavit-Hartenberg,",
+        "# z along each joint's axis; coordinates are those of the URDF, and `published` values are its own. Columns,",
+        "# sampling, filter and what is `assumed` must be changed to yours; positions may go as far either way as the",
+        f"# larger limit. Then run `excite machine check {file}`. Everything is SI: m, kg, s, N, N m, rad.",
+        "",
+    ]
+    return "\n".join([*lines, *_with_meanings(name, _dumped(workflows.machine_from_urdf(origin, name)))]) + "\n"
+
+
+def _with_meanings(name: str, text: str) -> list[str]:
+    """Return the lines of a machine file under another name, each key with unit and meaning."""
+    lines = list[str]()
+    record, header_of, open_list = "Machine", "", 0
+    for line in text.splitlines():
         if header := HEADER.match(line):
             header_of = header[1]
             record = RECORDS.get("problems" if header_of.startswith("problems.") else header_of, "")
@@ -65,7 +89,7 @@ def whole(name: str, file: Path, origin: str) -> str:
         if key and not header_of and key[1] == "name":
             line = f'name = "{name}"'
         lines.append(line if open_list else _explained(line, says))
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 EXTENDS = re.compile(r"^extends\s*=", re.MULTILINE)
@@ -77,6 +101,8 @@ RECORDS = {  # of the tables of a machine file, by their headers
     "body": "Body",
     "body.inertia": "Inertia",
     "body.friction": "Friction",
+    "body.drive": "Drive",
+    "body.spring": "Spring",
     "body.contact": "Contact",
     "body.limit": "JointLimit",
     "sensor": "Sensor",

@@ -47,6 +47,13 @@ MEANINGS: dict[str, dict[str, str]] = {
         "ZZ": "[kg m2] moment of inertia about z, the joint's axis, through the centre of mass",
         "axisymmetric": "balanced about its joint's axis: only mass, XX and ZZ are there",
     },
+    "Drive": {
+        "rotor_inertia": "[kg m2; kg if it slides] inertia of the geared rotor as seen at the joint",
+    },
+    "Spring": {
+        "stiffness": "[N m/rad; N/m if it slides] of a spring at the joint, such as a gravity balancer",
+        "rest": "[rad; m if it slides] where it exerts nothing",
+    },
     "Friction": {
         "Fv": "[N m s/rad; N s/m if it slides] viscous friction: torque per rate",
         "Fs": "[N m; N if it slides] dry friction",
@@ -79,6 +86,9 @@ MEANINGS: dict[str, dict[str, str]] = {
         "unit": "unit of that column",
         "factor": "[SI unit] of the number 1 in the column, in place of the unit's",
         "return_column": "column of the second pressure",
+        "zero": "[rad; m if it slides] reading where the joint's coordinate is 0; subtracted",
+        "torque_constant": "[N m/A at the motor] makes a torque of its current",
+        "gear_ratio": "turns of the motor per turn of the joint",
         "displacement": "[m3 per turn of the joint, gear included] of a hydraulic motor; 1 cc = 1e-6 m3",
         "cylinders": "[m2, m] areas and levers or pins of the cylinders that turn the joint",
         "kits": 'sets of sensors that it belongs to, "full" always',
