@@ -18,6 +18,7 @@ from excite.model import Model, standard_parameters
 from excite.model.machine import Body
 from excite.model.mechanics import INERTIAL, independent_columns
 
+CLEAR_STDS = 2.0  # standard deviations of the mass, below which the centre is anywhere; chosen
 RANK_TOLERANCE = 1e-9  # relative size below which a parameter of the payload is a combination of others
 
 
@@ -27,7 +28,7 @@ class Payload:
 
     names, units (m,); value (m,), covariance (m, m) [SI]. groups: the standard parameters that make up each, with
     their coefficients. centre, centre_std (3,) [m]: centre of mass, None if mass and first moments are not all
-    identifiable. p_value: that the other parameters did not change between the two estimates, NaN without redundancy.
+    identifiable, or the mass is not clearly above zero. p_value: that the other parameters did not change between the two estimates, NaN without redundancy.
     """
 
     body: str
@@ -110,5 +111,7 @@ def _centre(
         return None, None
     at = [names.index(n) for n in wanted]
     mass, moments = value[at[0]], value[at[1:]]
+    if mass < CLEAR_STDS * np.sqrt(covariance[at[0], at[0]]):
+        return None, None
     slope = np.column_stack([-moments / mass**2, np.eye(3) / mass])
     return moments / mass, np.sqrt(np.diag(slope @ covariance[np.ix_(at, at)] @ slope.T))
