@@ -28,7 +28,8 @@ class Payload:
 
     names, units (m,); value (m,), covariance (m, m) [SI]. groups: the standard parameters that make up each, with
     their coefficients. centre, centre_std (3,) [m]: centre of mass, None if mass and first moments are not all
-    identifiable, or the mass is not clearly above zero. p_value: that the other parameters did not change between the two estimates, NaN without redundancy.
+    identifiable, or the mass is not clearly above zero. p_value: that the other parameters did not change between the
+    two estimates, NaN without redundancy.
     """
 
     body: str
