@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy
+import tomli_w
+from support.commands import Excite
 from support.coupled import Table, quantity
 from support.files import SHARED
 
@@ -152,3 +155,14 @@ def test_a_vehicle_known_by_its_motor_controller_tells_ratios() -> None:
         low, high = estimate.interval95
         assert (low[2:] < 0).all()  # it only goes one way: dry friction and offset stay open
         assert (high[2:] > 0).all()
+
+
+def test_the_command_reports_a_log_without_torque(excite: Excite, tmp_path: Path) -> None:
+    machine, log = tmp_path / "pendulum.toml", tmp_path / "decay.csv"
+    machine.write_text(tomli_w.dumps(pendulum()))
+    model = build(load_machine(machine))
+    measure(model, released(model), seed=3).drop(columns="u").to_csv(log, index=False)
+    code, out, _ = excite("identify", machine, log, "--method", "joint", "--out", tmp_path / "found")
+    summary = json.loads((tmp_path / "found" / "summary.json").read_text())
+    assert (code, summary["status"], summary["relative_error_percent"]) == (0, "valid", None)
+    assert "no torque was measured" in " ".join(out.split())
