@@ -47,6 +47,8 @@ def estimate_delays(model: Model, log: Log, filter: Filter | None = None) -> tup
     filter = filter or model.machine.filter
     rate = float(model.machine.sampling_hz)
     motion = samples(model, log, filter)
+    if not motion.Y.any():
+        return ()  # a log without drive
     W, Y = regression(model, motion, filter)
     keep = slice(filter.drop[0], len(log) - filter.drop[1])
     rows = list(model.actuated)

@@ -255,8 +255,8 @@ def solve_blocks(blocks: Sequence[Block], scale: np.ndarray | None = None) -> So
     rows = sum(Y.size for _, Y in blocks)
     if not any((Y != 0).any() for _, Y in blocks):
         raise NotIdentifiableError(
-            "every torque is zero all along: are their sensors connected? A log without drive tells ratios only: give a"
-            " value of the machine file as known, and use joint"
+            "every torque is zero all along: are their sensors connected? A log without drive needs joint, and a value"
+            " of the machine file that is known"
         )
     if rows <= n_base:
         raise NotIdentifiableError(

@@ -72,7 +72,15 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     if all(s.resolution is None for s in angles) and not any(changes):  # counts may stand still, readings never do
         raise NotIdentifiableError(f"{repaired[0].source}: no angle ever changes: is its sensor connected?")
     doubts = [line for e in examined for line in e.doubts]
+    torques = [s.name for s in model.machine.sensors("full") if s.kind == "torque"]
     with doubts_in_errors(doubts):
+        if not (
+            model.known.values.any() or any(log.values[n].any() for log in repaired for n in torques if n in log.values)
+        ):
+            raise NotIdentifiableError(
+                f"{repaired[0].source}: every torque is zero all along: are their sensors connected? Without a drive"
+                " logs tell ratios only: call one value of the machine file known, other than zero, to get all others"
+            )
         try:
             estimate = add_advice(model, repaired, METHODS[method].find(model, repaired, filter), filter)
         except np.linalg.LinAlgError:
