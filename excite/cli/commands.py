@@ -830,6 +830,37 @@ def new_machine(
         terminal.say(f"{out}: change what differs, then `excite machine check {out}`")
 
 
+@machine_files.command("urdf")
+def write_urdf(
+    result: Annotated[Path, typer.Argument(metavar="RESULT", help="folder that `excite identify` wrote")],
+    origin: Annotated[Path, typer.Option("--from", help="the .urdf file that the machine file is from")],
+    out: Annotated[Path, typer.Option("--out", help="URDF to write")],
+    json: JsonOption = False,
+) -> None:
+    """Write a robot's URDF with the inertia and friction that were identified.
+
+    Of all physically possible bodies with the identified parameters, the nearest to the machine file's are written.
+
+    Example: excite machine urdf results/identify-my_arm --from robot.urdf --out identified.urdf
+    """
+    from excite import identification, output
+
+    if out.resolve() == origin.resolve():
+        raise UsageError(f"--out {out}: is what the robot is read from, choose another file")
+    saved = identification.read_estimate(result)
+    if saved.estimate.status == "invalid":
+        raise UsageError(f"{result}: holds no estimate: {saved.estimate.doubt}")
+    text, notes = workflows.urdf_with_estimate(origin, saved.model, saved.estimate)
+    with output.new_file(out) as part:
+        part.write_text(text, encoding="utf-8")
+    if json:
+        terminal.show_json({"machine": saved.model.machine.name, "file": str(out), "notes": notes})
+        return
+    terminal.say(f"{out}: {count(len(saved.model.machine.body), 'link')} with identified inertia")
+    for line in notes:
+        terminal.say(f"- {line}")
+
+
 @machine_files.command("check")
 def check_machine(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="a machine file (.toml)")],

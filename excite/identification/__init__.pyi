@@ -7,6 +7,7 @@ from .agreement import (
     summarise_agreement as summarise_agreement,
 )
 from .bias import SIGNIFICANT_BIAS as SIGNIFICANT_BIAS
+from .consistency import possible_standard as possible_standard
 from .delays import describe_late_channels as describe_late_channels
 from .estimate import Estimate as Estimate
 from .filter_choice import FILTERS as FILTERS

@@ -35,11 +35,7 @@ def nearest_possible(model: Model, estimate: Estimate) -> Estimate:
     NotConsistentError.
     """
     kept = np.flatnonzero(np.isfinite(estimate.value) & np.isfinite(estimate.std))
-    table = standard_parameters(model.machine)
-    scale = _scales(model)
-    scaled = cp.Variable(len(table))
-    by_name = {name: scaled[k] * scale[k] for k, name in enumerate(table)}
-    X = (model.base.matrix * scale) @ scaled
+    _, by_name, X = _variables(model)
     shift = (X[kept] - estimate.value[kept]) / model.scale[kept]
     covariance = estimate.covariance[np.ix_(kept, kept)] / np.outer(model.scale[kept], model.scale[kept])
     root = _inverse_root(covariance)
@@ -76,16 +72,45 @@ def constrained_estimate(model: Model, estimate: Estimate, blocks: Sequence[Bloc
     return replace(found, residual=e, relative_error_percent=100 * float(np.sqrt(np.mean(e**2))) / rms_torque(blocks))
 
 
+def possible_standard(model: Model, estimate: Estimate) -> dict[str, float]:
+    """Return the standard parameters [SI] of the possible machine that is nearest to the estimate, by name.
+
+    Its base parameters are those of `nearest_possible`; among all machines that have them it is the nearest to the
+    machine file, relative to the size of each parameter. Raises NotConsistentError.
+    """
+    found = nearest_possible(model, estimate).value
+    kept = np.flatnonzero(np.isfinite(found))
+    scaled, by_name, X = _variables(model)
+    nominal = np.array([v for v, _ in standard_parameters(model.machine).values()]) / _scales(model)
+    equality = (X[kept] - found[kept]) / model.scale[kept] == 0
+    problem = cp.Problem(
+        cp.Minimize(cp.sum_squares(scaled - nominal)),
+        [equality, *_possibility_constraints(model, by_name, INTERIOR_MARGIN / 10)],
+    )
+    try:
+        problem.solve(solver=cp.CLARABEL)
+    except cp.error.SolverError as err:
+        raise NotConsistentError(f"no possible bodies found for the estimate: {err}") from None
+    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+        raise NotConsistentError(f"no possible bodies found for the estimate: the solver says {problem.status}")
+    return {name: float(x.value) for name, x in by_name.items()}
+
+
 def is_possible(model: Model, X: np.ndarray) -> bool:
     """True if some possible machine has these base parameters (n_base,)."""
-    table = standard_parameters(model.machine)
-    scale = _scales(model)
-    scaled = cp.Variable(len(table))
-    by_name = {name: scaled[k] * scale[k] for k, name in enumerate(table)}
-    equality = ((model.base.matrix * scale) @ scaled - X) / model.scale == 0
+    _, by_name, base = _variables(model)
+    equality = (base - X) / model.scale == 0
     problem = cp.Problem(cp.Minimize(0), [equality, *_possibility_constraints(model, by_name, 0.0)])
     problem.solve(solver=cp.CLARABEL)
     return problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
+
+
+def _variables(model: Model) -> tuple[cp.Variable, dict[str, cp.Expression], cp.Expression]:
+    """Return scaled standard parameters, the same by name [SI], and the base parameters (n_base,) that they give."""
+    scale = _scales(model)
+    scaled = cp.Variable(len(scale))
+    by_name = {name: scaled[k] * scale[k] for k, name in enumerate(standard_parameters(model.machine))}
+    return scaled, by_name, (model.base.matrix * scale) @ scaled
 
 
 def _possibility_constraints(model: Model, p: dict[str, cp.Expression], margin: float) -> list[cp.Constraint]:

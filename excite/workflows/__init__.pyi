@@ -51,5 +51,5 @@ from .simulate_workflow import doubtful_effects as doubtful_effects, with_effect
 from .slip_workflow import slip as slip, slip_account as slip_account
 from .study_plan import Study as Study, read_study as read_study
 from .study_runner import run_study as run_study
-from .urdf import machine_from_urdf as machine_from_urdf
+from .urdf import machine_from_urdf as machine_from_urdf, urdf_with_estimate as urdf_with_estimate
 from .verify_workflow import verify as verify, verify_account as verify_account

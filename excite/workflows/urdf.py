@@ -9,20 +9,23 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from excite import identification
 from excite.errors import MachineError
-from excite.model import build, standard_parameters
+from excite.identification import Estimate
+from excite.model import Model, build, standard_parameters
 from excite.model.machine import Machine
 
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 PARALLEL = 1e-9  # sine of the angle and distance [m] below which two axes count as parallel, or meet
 ROUND_DIGITS = 12  # of numbers in the file; below them are errors of rounding
+SAME_ROW = 1e-6  # rad, m, by which lengths and angles of a machine may differ from the URDF's; chosen
 ASSUMED_INERTIA = 0.01  # kg m2, of a link without inertia; assumed
 SAMPLING_HZ, CUTOFF_HZ, DECIMATION, SMOOTHING = 100, 5, 5, 0.01  # of the machine file to start from; assumed
 SIZES = {"kg": 1.0, "kg m": 0.1, "kg m2": 0.01}  # of parameters that are zero in the URDF; assumed
@@ -250,6 +253,70 @@ def _scales(machine: dict[str, Any]) -> dict[str, Any]:
         if size < typical / 100:
             found[name] = _assumed(float(f"{typical:.2g}"))
     return found
+
+
+def urdf_with_estimate(path: Path, model: Model, estimate: Estimate) -> tuple[str, list[str]]:
+    """Return the text of a URDF with identified inertia and friction, and notes on what has no place in it.
+
+    model: of the machine file from this URDF. Each moving link gets the inertia of all links attached to it, which lose
+    theirs. The bodies are the possible ones nearest to the machine file with the identified base parameters, see
+    `possible_standard`. Raises MachineError for another robot's URDF, NotConsistentError.
+    """
+    robot = read_urdf(path)
+    from lxml import etree  # comes with the extra
+
+    machine = model.machine
+    if machine.in_ratios:
+        raise MachineError(
+            f"{machine.name}: its values are divided by an unknown torque constant, URDF needs SI values"
+        )
+    _check_same(path, robot, machine)
+    p = identification.possible_standard(model, estimate)
+    tree = etree.parse(str(path))
+    links = {link.get("name"): link for link in tree.getroot().findall("link")}
+    joints = {joint.get("name"): joint for joint in tree.getroot().findall("joint")}
+    for k, (frame, attached) in enumerate(zip(robot.joints, robot.attached, strict=True), start=1):
+        for link, _ in attached:
+            for old in links[link.name].findall("inertial"):
+                links[link.name].remove(old)
+        mass, centre, J = _about_centre(p, k)
+        R, t = frame.placement[:3, :3], frame.placement[:3, 3]
+        centre, J = R.T @ (centre - t), R.T @ J @ R
+        inertial = etree.SubElement(links[frame.link], "inertial")
+        etree.SubElement(inertial, "origin", xyz=" ".join(f"{x:.12g}" for x in centre), rpy="0 0 0")
+        etree.SubElement(inertial, "mass", value=f"{mass:.12g}")
+        axes = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+        etree.SubElement(inertial, "inertia", **{key: f"{J[ij]:.12g}" for key, ij in axes.items()})
+        joint = joints[frame.name]
+        dynamics = joint.find("dynamics")
+        dynamics = etree.SubElement(joint, "dynamics") if dynamics is None else dynamics
+        dynamics.set("damping", f"{p[f'Fv{k}']:.12g}")
+        dynamics.set("friction", f"{p[f'Fs{k}']:.12g}")
+    etree.indent(tree)
+    lost = [(b.where, what) for b in machine.body for what in ("drive", "spring") if getattr(b, what) is not None]
+    said = {"drive": "rotor inertia", "spring": "spring"}
+    notes = [f"{where}: a URDF has no place for its {said[what]}, which is left out" for where, what in lost]
+    return etree.tostring(tree, encoding="unicode", pretty_print=True), notes
+
+
+def _check_same(path: Path, robot: Robot, machine: Machine) -> None:
+    """Raise MachineError unless the machine's joints are those of the URDF."""
+    same = len(machine.body) == len(robot.joints)
+    for body, name, frame in zip(machine.body, body_names(robot), robot.joints, strict=False):
+        same &= body.name == name and body.joint == frame.kind and body.inertia is not None
+        same &= all(abs(float(getattr(body, key)) - value) < SAME_ROW for key, value in frame.row.items())
+    if not same:
+        raise MachineError(
+            f"{path}: has other joints than machine {machine.name}: give the URDF that `excite machine new --from` read"
+        )
+
+
+def _about_centre(p: Mapping[str, float], k: int) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return mass, centre of mass (3,) and inertia (3, 3) about it of body k, in its frame."""
+    M = p[f"M{k}"]
+    c = np.array([p[f"M{axis}{k}"] for axis in "XYZ"]) / M
+    J = np.array([[p[f"{min(a, b)}{max(a, b)}{k}"] for b in "XYZ"] for a in "XYZ"])
+    return M, c, J - M * (float(c @ c) * np.eye(3) - np.outer(c, c))
 
 
 def _rounded(value: float) -> float:
