@@ -284,7 +284,7 @@ def _slips(model: Model) -> Iterator[str]:
 
 def _times(model: Model) -> Iterator[str]:
     """Find rates and durations in wrong units, and a decimation that removes more than the filter's cut-off."""
-    for b in reports.steered_joints(model.machine):
+    for b in reports.steered_joints(model.machine) if model.machine.planar else ():
         if b.limit.rate is not None and float(b.limit.rate) > MAX_STEERING_RATE:
             yield (
                 f"{b.name}: limit.rate: {float(b.limit.rate):g} rad/s, steered joints turn by less than"
