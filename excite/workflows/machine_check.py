@@ -76,7 +76,9 @@ def check_file(path: Path) -> MachineCheck:
     if read.complete:
         faults += [with_line(line, machine, text) for rule in FAULTS for line in rule(model)]
     doubts += [with_line(line, machine, text) for rule in DOUBTS for line in rule(model)]
-    sigma = {} if faults or float(model.machine.sampling_hz) > MAX_SAMPLING_HZ else _random_drive_sigma(model)
+    silent = any(not s.has_noise_figure for s in model.machine.sensors("full"))  # no accuracy can be said
+    fast = float(model.machine.sampling_hz) > MAX_SAMPLING_HZ
+    sigma = {} if faults or silent or fast else _random_drive_sigma(model)
     doubts += [
         f"{name}: random drives leave it uncertain by {value:.0f} %: hardly any drive shows it apart from the others"
         for name, value in sigma.items()
