@@ -76,7 +76,9 @@ def check_file(path: Path) -> MachineCheck:
     if read.complete:
         faults += [with_line(line, machine, text) for rule in FAULTS for line in rule(model)]
     doubts += [with_line(line, machine, text) for rule in DOUBTS for line in rule(model)]
-    sigma = {} if faults or float(model.machine.sampling_hz) > MAX_SAMPLING_HZ else _random_drive_sigma(model)
+    silent = any(not s.has_noise_figure for s in model.machine.sensors("full"))  # no accuracy can be said
+    fast = float(model.machine.sampling_hz) > MAX_SAMPLING_HZ
+    sigma = {} if faults or silent or fast else _random_drive_sigma(model)
     doubts += [
         f"{name}: random drives leave it uncertain by {value:.0f} %: hardly any drive shows it apart from the others"
         for name, value in sigma.items()
@@ -284,7 +286,7 @@ def _slips(model: Model) -> Iterator[str]:
 
 def _times(model: Model) -> Iterator[str]:
     """Find rates and durations in wrong units, and a decimation that removes more than the filter's cut-off."""
-    for b in reports.steered_joints(model.machine):
+    for b in reports.steered_joints(model.machine) if model.machine.planar else ():
         if b.limit.rate is not None and float(b.limit.rate) > MAX_STEERING_RATE:
             yield (
                 f"{b.name}: limit.rate: {float(b.limit.rate):g} rad/s, steered joints turn by less than"

@@ -129,11 +129,11 @@ def cases(runs: int, data: Path) -> dict[str, tuple[tuple[str, ...], Callable[[s
         found["EMPS, two halves"] = (METHODS, lambda m: halves(emps, emps_file, m))
     panda_file = data / "franka_panda" / "exciting_trajectory_1.csv"
     if panda_file.is_file():
-        panda = build(load_machine(HERE / "panda.toml"))
+        panda = build(load_machine("panda"))
         found["Panda, two halves"] = (("ols", "wls"), lambda m: halves(panda, panda_file, m))
     pair = [data / "ur10e" / f"20_02_19_{n}harm50sec.csv" for n in (14, 15)]
     if all(p.is_file() for p in pair):
-        ur10e = build(load_machine(HERE / "ur10e.toml"))
+        ur10e = build(load_machine("ur10e"))
         found["UR10e, two logs of a day"] = (("ols", "wls"), lambda m: two_logs(ur10e, pair, m))
     return found
 
@@ -202,7 +202,7 @@ def readme(summary: dict[str, Any]) -> str:
         "itself is noisy: `ols` and `wls` are biased there, the intervals of `iv` and `tls` are too narrow, and",
         "`excite identify` says it; on va12 the noise hides every parameter from `tls`, which gives no estimate.",
         "The rigs are EMPS with known truth: friction set-valued (`tests/support/sticking.py`), or as tanh over",
-        "2 mm/s. Machine files of the robots: ur10e.toml, panda.toml.",
+        "2 mm/s. The robots are the shipped machines `ur10e` and `panda`.",
         "",
     ]
     return "\n".join(lines)

@@ -35,6 +35,7 @@ def test_shipped_machines_load_and_build(name: str) -> None:
 def test_every_number_says_where_it_comes_from(name: str) -> None:
     """A number stands in a table with its source. Labels, counts of a filter and a lane's size are no data."""
     labels = {"index", "body", "antecedent", "lane_points", "order", "decimation", "drop", "lane_m", "gravity"}
+    labels.add("time_offset")  # of a logger's clock
 
     def bare(node: Any, key: str, where: str) -> list[str]:
         if isinstance(node, dict):
