@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +19,8 @@ from excite.model.machine import load_machine
 from excite.reports import diagnosis_figures, figures
 from excite.simulation import simulate
 
-MACHINES = ("va12", "emps", "skid_robot", "long names")
+LONG = "long names"
+MACHINES = ("va12", "emps", "tandem", "pendulum_loader")
 TOUCH = 1.0  # px by which boxes of texts may overlap: letters don't fill theirs
 
 
@@ -32,9 +34,9 @@ def long_names() -> Model:
     return build(machine.model_copy(update={"body": body}))
 
 
-@pytest.fixture(scope="module")
-def models() -> dict[str, Model]:
-    return {name: long_names() if name == "long names" else build(load_machine(name)) for name in MACHINES}
+@lru_cache
+def model_of(name: str) -> Model:
+    return long_names() if name == LONG else build(load_machine(name))
 
 
 def faults(figure: Figure) -> Iterator[str]:
@@ -111,12 +113,13 @@ KINDS: dict[str, Callable[[Model], Figure]] = {
 }
 
 
-@pytest.mark.parametrize("machine", MACHINES)
+@pytest.mark.parametrize("machine", [LONG, *(pytest.param(name, marks=pytest.mark.slow) for name in MACHINES)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_text_is_cut_off_or_lies_on_another(models: dict[str, Model], kind: str, machine: str) -> None:
-    if kind == "design" and not models[machine].machine.problems:
+def test_no_text_is_cut_off_or_lies_on_another(kind: str, machine: str) -> None:
+    model = model_of(machine)
+    if kind == "design" and not model.machine.problems:
         pytest.skip("has no design problem")
-    assert list(faults(KINDS[kind](models[machine]))) == []
+    assert list(faults(KINDS[kind](model))) == []
 
 
 def test_the_check_finds_what_cannot_be_read() -> None:
