@@ -973,10 +973,17 @@ def describe_study(s: Summary) -> Description:
     """Describe a study: how its runs ended, the best and the worst cell, all cells as a table."""
     headline = f"{s['done']} of {count(s['runs'], 'run')} gave a result, {s['failed']} could not give one"
     headline += f", {s['defects']} showed a defect of the program." if s["defects"] else "."
-    ranked = [r for r in s["cells"] if np.isfinite(r.get("worst_rms_percent") or np.nan)]
+    alike: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}  # cells with other effects err for other reasons
+    for r in s["cells"]:
+        if np.isfinite(r.get("worst_rms_percent") or np.nan):
+            alike.setdefault(tuple(r.get("effects", ())), []).append(r)
+    effects, ranked = max(alike.items(), key=lambda one: len(one[1]), default=((), []))
     if len(ranked) > 1:
         best, worst = (pick(ranked, key=lambda r: r["worst_rms_percent"]) for pick in (min, max))
-        headline += f" By the error of its worst parameter, {_cell_error(best)} is the best of {len(ranked)} cells,"
+        among = f"{len(ranked)} cells"
+        if len(alike) > 1:
+            among += f" with {' and '.join(effects)}" if effects else " without effects"
+        headline += f" By the error of its worst parameter, {_cell_error(best)} is the best of {among},"
         headline += f" {_cell_error(worst)} the worst."
     remarks = [
         "runs.parquet has one row per run; the command in its column `command`, given in this folder, repeats it"

@@ -19,7 +19,7 @@ from excite import diagnosis
 from excite.diagnosis import Diagnosis, LogResiduals, TorqueDiagnosis
 from excite.model import signal_descriptions
 from excite.reports.charts import EXPLORE, Explorable
-from excite.reports.figures import COLOURS, escape_dollar, save
+from excite.reports.figures import COLOURS, escape_dollar, save, set_title
 from excite.reports.torque_figures import torque_figures_by_file
 from excite.text import format_number
 
@@ -106,7 +106,7 @@ def clearest_figure(before: LogResiduals, after: LogResiduals | None, title: str
     clear = [p for p in pairs if evidence[p[0]][p[1]] > CLEAR_STRENGTH][:MAX_CLEAR] or pairs[:MIN_CLEAR]
     columns = min(len(clear), 2)
     figure = Figure(figsize=(5.2 * columns, 3.3 * -(-len(clear) // columns) + 0.8), layout="constrained")
-    figure.suptitle(escape_dollar(title), fontsize=11)
+    set_title(figure, title)
     axes = figure.subplots(-(-len(clear) // columns), columns, squeeze=False).ravel()
     for ax, (row, quantity) in zip(axes, clear, strict=False):
         _against(ax, before, after, row, quantity)
@@ -214,7 +214,7 @@ def when_figure(
         shown.append((after, "with it"))
     m = len(before.sensors)
     figure = Figure(figsize=(12, (0.34 * m + 1.7) * len(shown) + 0.6), layout="constrained")
-    figure.suptitle(escape_dollar(title), fontsize=11)
+    set_title(figure, title)
     axes = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(2.2, 1), sharex="col")
     norm = LogNorm(1 / 3, MAX_INNOVATION)
     picture = None
@@ -275,7 +275,7 @@ def signals_figure(
     """
     names = list(signals)
     figure = Figure(figsize=(11, 0.5 * len(names) + 1.9), layout="constrained")
-    figure.suptitle(escape_dollar(title), fontsize=11)
+    set_title(figure, title)
     left, right = figure.subplots(1, 2, sharey=True)
     places = np.arange(len(names))[::-1].astype(float)
     kinds = (("before", BEFORE, 0.2, ""), ("after", AFTER, -0.2, "//")) if found else (("before", BEFORE, 0.0, ""),)

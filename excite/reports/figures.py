@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,13 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
 LINEAR_UP_TO = 5.0  # errors [%] up to which their axis is linear; chosen
 UNIT_OF_COLUMN = re.compile(r"_(Nm|N|(rad|m)(_s)?)$")  # at the end of a profile's columns
+POINTS_PER_INCH = 72
+TITLE_SIZE = 11  # pt; chosen
+LETTER = 0.58  # width of a letter as a share of its size, on average
+LEGEND_WIDTH, LEGEND_HANDLE = 470.0, 38.0  # pt: of a legend above a plot, and of an entry without its letters; chosen
+LINE_INCHES = 0.165  # of a limit's name; chosen
+LABEL_LETTERS = 22  # of an axis label in a line; chosen
+LIMIT_LETTERS = 32  # of a limit's name in a line; chosen
 TICKED_DECADES = 3  # of a logarithmic axis, up to which it has ticks between powers of ten; chosen
 
 
@@ -48,6 +56,12 @@ def escape_dollar(text: str) -> str:
     return text.replace("$", r"\$")
 
 
+def set_title(figure: Figure, text: str) -> None:
+    """Write a title above a figure, in as many lines as its width asks for."""
+    letters = int(figure.get_figwidth() * POINTS_PER_INCH / (LETTER * TITLE_SIZE))
+    figure.suptitle(escape_dollar("\n".join(textwrap.wrap(text, letters))), fontsize=TITLE_SIZE)
+
+
 def _style(k: int) -> dict[str, Any]:
     """Return colour and dashes of the k-th of several lines."""
     return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
@@ -59,11 +73,13 @@ def _lines(ax: Axes, t: np.ndarray, curves: Mapping[str, np.ndarray], label: str
     ax.set_ylabel(label)
     ax.grid(alpha=0.3)
     if legend:
+        names = ax.get_legend_handles_labels()[1]
+        longest = max((len(name) for name in names), default=0)
         ax.legend(
             loc="lower right",
             bbox_to_anchor=(1, 0.98),
             fontsize=8,
-            ncols=max(1, len(curves)),
+            ncols=min(len(names), max(1, int(LEGEND_WIDTH / (LETTER * 8 * longest + LEGEND_HANDLE)))) or 1,
             frameon=False,
             borderpad=0,
         )
@@ -83,12 +99,15 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
         name = machine.find(index).where.replace("_", " ")
         slips[name] = np.maximum(slips.get(name, x), x)
     panels = 2 + bool(moving) + bool(slips)
-    figure = Figure(figsize=(11.5, 2.3 * max(panels, 3) + 0.6), layout="constrained")
+    use = limit_use(model, problem, motion)
+    limits = ["\n".join(textwrap.wrap(n.replace("_", " "), LIMIT_LETTERS)) for n in use]
+    lines = len(limits) * max(n.count("\n") + 1 for n in limits)
+    figure = Figure(figsize=(11.5, max(2.3 * max(panels, 3) + 0.6, LINE_INCHES * lines + 4.0)), layout="constrained")
     halves = figure.subfigures(1, 2, width_ratios=(1.7, 1))
     assert isinstance(halves, np.ndarray)
     left, right = halves
     axes = left.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]
-    figure.suptitle(escape_dollar(title))
+    set_title(figure, title)
 
     # Torques in per cent of their limits, so that one panel shows joints of all sizes.
     named = {b.where.replace("_", " "): k for k, b in enumerate(machine.actuated)}
@@ -126,19 +145,18 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
             axes[row].axhline(max(allowed), color="black", linewidth=0.8, linestyle=(0, (2, 3)))
     axes[-1].set_xlabel("time [s]")
 
-    use = limit_use(model, problem, motion)
     lane = machine.planar and f"y{machine.body[0].index}" in model.coordinates
     if lane:
         path, bars = right.subplots(2, 1, height_ratios=(1, 1.5))
         _path(path, model, problem, motion)
     else:
         bars = right.subplots(1, 1)
-    names = list(use)[::-1]
-    bars.barh(names, [100 * use[n] for n in names], color=COLOURS[0], height=0.6)
+    bars.barh(range(len(use)), [100 * x for x in use.values()][::-1], color=COLOURS[0], height=0.6)
     bars.axvline(100, color="black", linewidth=0.8, linestyle=(0, (2, 3)))
     bars.set_xlim(0, 115)
-    bars.set_xlabel("most used [% of the limit]")
-    bars.tick_params(axis="y", labelsize=8)
+    bars.set_xlabel("most used\n[% of the limit]")
+    bars.set_yticks(range(len(use)), limits[::-1])
+    bars.tick_params(axis="y", labelsize=7)
     return figure
 
 
@@ -165,7 +183,7 @@ def sigma_figure(sigma: Mapping[str, float], title: str) -> Figure:
     n = len(sigma)
     figure = Figure(figsize=(7.5, 1.2 + 0.27 * n), layout="constrained")
     ax = figure.subplots()
-    figure.suptitle(escape_dollar(title), fontsize=11)
+    set_title(figure, title)
     names = list(sigma)[::-1]
     values = np.array([sigma[s] for s in names])
     low, high = 10.0 ** np.floor(np.log10(values.min())), 10.0 ** np.ceil(np.log10(values.max()) + 1e-9)
@@ -188,7 +206,7 @@ def campaign_figure(summary: Mapping[str, Any], title: str) -> Figure:
     """Plot what drives designed together attain [%] over the time of driving [min], from a campaign's summary."""
     figure = Figure(figsize=(7.5, 4.5), layout="constrained")
     ax = figure.subplots()
-    figure.suptitle(escape_dollar(title), fontsize=11)
+    set_title(figure, title)
     draw_campaign(ax, summary)
     return figure
 
@@ -238,7 +256,7 @@ def verify_figure(v: Verification, title: str) -> Figure:
     n = len(v.names)
     figure = Figure(figsize=(10, 1.6 + 0.34 * n), layout="constrained")
     errors, cover = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
-    figure.suptitle(escape_dollar(title))
+    set_title(figure, title)
     places = np.arange(n)[::-1]
     e = v.error_percent
     # The error lies within these ends exactly if the interval around the value holds the truth.
@@ -287,7 +305,7 @@ def correlation_figure(estimate: Estimate, title: str) -> Figure:
     n = len(names)
     size = 2.2 + 0.24 * n
     figure = Figure(figsize=(size + 0.8, size), layout="constrained")
-    figure.suptitle(escape_dollar(title), fontsize=11)
+    set_title(figure, title)
     ax = figure.subplots()
     ax.set_gid(EXPLORE)
     edges = np.arange(n + 1)
@@ -311,7 +329,7 @@ def prior_figure(estimate: Estimate, nominal: np.ndarray, title: str) -> Figure:
     before = estimate.prior_std[known]
     moved, after = (estimate.value[known] - nominal[known]) / before, estimate.std[known] / before
     figure = Figure(figsize=(7.5, 1.6 + 0.3 * len(known)), layout="constrained")
-    figure.suptitle(escape_dollar(title), fontsize=11)
+    set_title(figure, title)
     ax = figure.subplots()
     places = np.arange(len(known))[::-1]
     ax.barh(places, 2 * 1.96, left=-1.96, height=0.6, color="0.85", label="known before")
@@ -330,11 +348,13 @@ def comparison_figure(model: Model, c: SignalComparison, title: str) -> Figure:
     """Plot measured and predicted signals, with the residual below each."""
     n = len(c.names)
     figure = Figure(figsize=(10, 0.8 + 3.0 * n), layout="constrained")
-    figure.suptitle(escape_dollar(title), fontsize=11)
+    set_title(figure, title)
     axes = figure.subplots(2 * n, 1, sharex=True, squeeze=False, height_ratios=(2, 1) * n)[:, 0]
     words = signal_descriptions(model.machine)
+    for name, b in zip(model.inputs, model.machine.actuated, strict=True):
+        words[name] = f"{'torque' if b.joint == 'revolute' else 'force'}, {b.where.replace('_', ' ')}"
     for k, (name, unit) in enumerate(zip(c.names, c.units, strict=True)):
-        label = escape_dollar(words.get(name, name)).replace(", ", "\n")
+        label = "\n".join(textwrap.wrap(escape_dollar(words.get(name, name)), LABEL_LETTERS))
         _lines(axes[2 * k], c.t, {"measured": c.measured[k], "predicted": c.predicted[k]}, f"{label}\n[{unit}]")
         if c.expected is not None:
             band = 1.96 * c.expected[k]
@@ -354,7 +374,7 @@ def prediction_figure(p: Prediction, title: str) -> Figure:
     half = len(motion) // 2
     rows = [[k] for k in forces] + [[motion[k], motion[half + k]] for k in range(half)]
     figure = Figure(figsize=(12 if motion else 10, 0.8 + 3.0 * len(rows)), layout="constrained")
-    figure.suptitle(escape_dollar(title), fontsize=11)
+    set_title(figure, title)
     grid = figure.add_gridspec(2 * len(rows), 2, height_ratios=(2, 1) * len(rows))
     for i, row in enumerate(rows):
         for j, k in enumerate(row):
@@ -398,7 +418,7 @@ def compare_figure(rows: Sequence[ComparisonRow], title: str) -> Figure:
     rows = sorted(rows, key=lambda r: r.cond_phi, reverse=True)
     figure = Figure(figsize=(10.5, 1.5 + 0.36 * len(rows)), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
-    figure.suptitle(escape_dollar(title), fontsize=11)
+    set_title(figure, title)
     values = ([r.cond_phi for r in rows], [r.worst_std_percent for r in rows])
     places = np.arange(len(rows))
     for ax, x, label in zip(
@@ -443,7 +463,7 @@ def log_figure(found: Inspection, title: str) -> Figure:
     columns = 1 if count <= ONE_COLUMN else 2
     rows = -(-count // columns)
     figure = Figure(figsize=(5.5 + 5 * columns, 1.1 + 1.3 * rows), layout="constrained")
-    figure.suptitle(escape_dollar(title), fontsize=11)
+    set_title(figure, title)
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False).T.ravel()
     for ax, (name, (t, values, unit)) in zip(axes, found.signals.items(), strict=False):
         ax.plot(t, values, ".", color=RECORDED, markersize=2.5, rasterized=True)

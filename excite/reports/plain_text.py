@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from excite.reports.descriptions import Description, Table, as_sentence
+from excite.text import count
 
 # Rich is imported inside, so that --help is there at once.
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ def text_parts(description: Description, console: Console, whole: str) -> Iterat
         yield f"\n{one.caption}"
         yield _fitted_table(one, console)
         if len(one.rows) > MAX_ROWS:
-            yield f"... and {len(one.rows) - MAX_ROWS} rows more, see {whole}"
+            yield f"... and {count(len(one.rows) - MAX_ROWS, 'row')} more, see {whole}"
     for remark in description.remarks:
         yield f"- {as_sentence(remark)}"
     if description.verdict:

@@ -249,6 +249,7 @@ def _cell_summary(s: CellResult, name: str) -> dict[str, Any]:
     summary: dict[str, Any] = {
         "cell": name,
         "cond_phi": s.cond_phi,
+        "effects": list(s.cell.effects),
         **{k: s.statuses.get(k, 0) for k in study_runs.STATUSES},
     }
     if s.reasons:
@@ -316,5 +317,5 @@ def study_figure(results: Sequence[CellResult], title: str) -> Figure:
 def write_report(plan: StudyPlan, results: Sequence[CellResult], summary: Mapping[str, Any], place: Path) -> None:
     """Write figure, report and summary of a study into its folder."""
     title = plan.study.title or plan.study.name
-    reports.save(study_figure(results, f"{title}: {summary['runs']} runs"), place / FIGURE)
+    reports.save(study_figure(results, f"{title}: {count(summary['runs'], 'run')}"), place / FIGURE)
     reports.write_report(place, "study", summary)

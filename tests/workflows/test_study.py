@@ -294,6 +294,11 @@ def test_the_page_says_which_cell_is_best_and_what_made_it(tmp_path: Path) -> No
     assert "0123456789abcdef" in text
     assert "the command in its column <code>command</code>, given in this folder, repeats it" in text
     assert "the best" not in describe("study", said | {"cells": cells[:1]}).headline
+    sloped = [one | {"effects": ["ground_slope=0.01"] if k == 0 else []} for k, one in enumerate(cells)]
+    assert (
+        "cond, 20 s (Ky1 0.81 % rms) is the best of 2 cells without effects, accuracy, 20 s (Fs1 3 % rms)"
+        in describe("study", said | {"cells": sloped}).headline
+    )
 
 
 def test_each_row_tells_how_to_repeat_it(
