@@ -299,20 +299,25 @@ def verify(
     return ShownVerification.of(found, partial(workflows.verify_account, model, motion, found, seed, called))
 
 
-def score(machine: Machine, drive: Drive, problem: str | None = None) -> ShownScore:
+def score(
+    machine: Machine, drive: Drive, problem: str | None = None, *, sensors: bool = False, kit: str = "full"
+) -> ShownScore:
     """Judge any drive as a design: condition numbers, attainable accuracy, limits, on a fresh simulation.
 
     drive: as in `simulate`; one that gives no pose is placed on the lane as a design is. problem: a design problem of
-    the machine file, its default one if not given.
-    Raises LogError for a profile, MachineError for sensors of unknown noise, UsageError for an unknown problem,
+    the machine file, its default one if not given. sensors: also find what each sensor of a kit buys, in
+    `summary["sensors"]`, printed and drawn (`plot("sensors")`).
+    Raises LogError for a profile, MachineError for sensors of unknown noise, UsageError for an unknown problem or kit,
     SimulationError for a motion that can't be integrated.
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
     name, chosen = workflows.choose_problem(model.machine, problem, None)
     workflows.require_noise_figures(model)
     found = trajectories.score(model, chosen, *_torques(model, drive, any_rate=True))
+    workflows.require_known("kit", kit, simulation.KITS)
     called = _called(drive, "the drive")
-    return ShownScore.of(found, partial(workflows.score_account, model, name, chosen, found, called))
+    valued = kit if sensors else None
+    return ShownScore.of(found, partial(workflows.score_account, model, name, chosen, found, called, valued))
 
 
 def compare(

@@ -273,13 +273,18 @@ def compare(
         summary |= workflows.compare(place, machine, problem, samples, tuple(against or ()), seed, budget, terminal.bar)
 
 
-@app.command()
+@app.command(cls=CommandWithChoices)
 def score(
     machine: MachineArgument,
     profile: Annotated[
         Path, typer.Argument(metavar="PROFILE.csv", help="torques over time, as in a design's profile.csv")
     ],
     problem: ProblemOption = None,
+    sensors: Annotated[
+        bool,
+        typer.Option("--sensors", help="also find what each sensor of --kit buys: left out, added, twice as accurate"),
+    ] = False,
+    kit: KitOption = "full",
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -287,11 +292,13 @@ def score(
 
     Its torques are simulated afresh. `excite verify` takes the folder as it takes a design.
 
-    Example: excite score va12 my.csv
+    Example: excite score va12 my.csv --sensors
     """
+    if kit != "full" and not sensors:
+        raise UsageError("--kit needs --sensors as well: accuracy is that of all sensors")
     out = out or Path(f"results/score-{workflows.machine_stem(machine)}")
     with _result(out, json, partial(terminal.show, "score"), [*_machine_file(machine), profile]) as (place, summary):
-        summary |= workflows.score(place, machine, profile, problem)
+        summary |= workflows.score(place, machine, profile, problem, sensors, kit)
 
 
 @app.command(cls=CommandWithChoices)

@@ -21,7 +21,7 @@ from excite.operator.ground import DriveQuality, Trace
 from excite.operator.server import GrowingLog, serve_page
 from excite.operator.sheet import Sheet
 from excite.simulation import Motion
-from excite.text import format_number
+from excite.text import format_number, format_percent
 from excite.trajectories import SavedDesign
 
 PEOPLE = 3  # simulated drivers; chosen
@@ -93,7 +93,8 @@ def prepare(
         by_hand=design.summary.get("driver") is not None,
         fewer=most is not None,
         over=over,
-        slower=_slower_share(model, problem, trace, motion.q[0], seed) if over else None,
+        slower=_slower_drive(model, problem, trace, motion.q[0], seed) if over else None,
+        asked=design.summary.get("sigma_max"),
     )
     return Sheet(
         design.title,
@@ -121,33 +122,44 @@ def verdict(
     by_hand: bool = False,
     fewer: bool = False,
     over: Mapping[str, float] | None = None,
-    slower: float | None = None,
+    slower: tuple[float, DriveQuality] | None = None,
+    asked: float | None = None,
 ) -> str:
     """Say in a sentence what a person keeps of a design, and what to do if that is too little.
 
     by_hand: the design was made with `--driver`. fewer: `--phases` replaced its phases. over: limits that people
-    exceed, as shares of their range. slower: share of the speeds at which they keep them.
+    exceed, as shares of their range. slower: share of the speeds at which simulated people keep them, and what they
+    attain then. asked [%]: largest standard deviation that the design may have; without it the torques played back are
+    the measure. Advice that nothing has simulated is called untried.
     """
     worst, median = person.worst_percent / played.worst_percent, person.median_percent / played.median_percent
     ratio = max(worst, median)
     again = _what_to_ask(trajectories.is_condition_number(objective), by_hand, fewer)
-    if ratio <= 1.1:
+    if asked is not None:
+        reached = f"the worst parameter comes to {format_percent(person.worst_percent)}, asked are {asked:g} %"
+        enough = person.worst_percent <= asked
+        said = f"accurate enough, {reached}" if enough else f"not accurate enough, {reached}; {again} (untried)"
+    elif ratio <= 1.1:
         said = "nothing that counts is lost"
     elif ratio <= ground.MAX_ERROR_RATIO:
         said = "good enough to drive"
     else:
-        said = f"too much is lost; {again}, or play back the torques"
+        said = f"too much is lost; play back the torques, or {again} (untried)"
     text = f"A person on these phases {_attained_words(median, worst)}: {said}."
     if not over:
         return text
     named = ", ".join(f"{n.replace('_', ' ')} by {100 * v:.0f} %" for n, v in over.items())
-    keep = "design again with --driver"
-    if by_hand:
-        keep = again if fewer else "design again with them so much tighter in the machine file"
-    below = "" if slower is None else f", or stay {100 * (1 - slower):.0f} % below all speeds, which keeps them"
-    return (
-        f"{text} But a person exceeds limits, {named} of {'its' if len(over) == 1 else 'their'} range: {keep}{below}."
-    )
+    if slower is not None:
+        share, then = slower
+        keep = (
+            f"stay {100 * (1 - share):.0f} % below all speeds, with which simulated people keep them and identify the"
+            f" worst parameter to {format_percent(then.worst_percent)}"
+        )
+    elif by_hand:
+        keep = f"{again if fewer else 'design again with them so much tighter in the machine file'} (untried)"
+    else:
+        keep = "slower driving doesn't keep them, design again with --driver (untried)"
+    return f"{text} But a person exceeds limits, {named} of {'its' if len(over) == 1 else 'their'} range: {keep}."
 
 
 def _attained_words(median: float, worst: float) -> str:
@@ -180,14 +192,19 @@ def _exceeded_limits(model: Model, problem: Problem, motions: tuple[Motion, ...]
     return over
 
 
-def _slower_share(model: Model, problem: Problem, trace: Trace, start: np.ndarray, seed: int) -> float | None:
-    """Return the largest share of the speeds at which simulated people keep every limit, None if none helps."""
+def _slower_drive(
+    model: Model, problem: Problem, trace: Trace, start: np.ndarray, seed: int
+) -> tuple[float, DriveQuality] | None:
+    """Return the largest share of the speeds at which simulated people keep every limit, and what they attain.
+
+    None if no share helps.
+    """
     for share in SLOWER_SHARES:
         slow = replace(trace, speed=share * trace.speed)
         with contextlib.suppress(SimulationError):
             motions = tuple(ground.follow_trace(model, slow, None, seed + k, start) for k in range(PEOPLE))
             if not _exceeded_limits(model, problem, ground.place_in_lane(model, problem, motions)):
-                return share
+                return share, ground.middle_quality([ground.rate_motion(model, m) for m in motions])
     return None
 
 

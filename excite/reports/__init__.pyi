@@ -25,6 +25,7 @@ from .figures import (
     prediction_figure as prediction_figure,
     prior_figure as prior_figure,
     save as save,
+    sensors_figure as sensors_figure,
     sigma_figure as sigma_figure,
     verify_figure as verify_figure,
 )

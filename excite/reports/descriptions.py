@@ -278,8 +278,30 @@ def describe_score(s: Summary) -> Description:
         f"Condition number of Phi {_condition(s['cond_phi'])}, of W {_condition(s['cond_w'])}.",
         *describe_outside_law(s["share_outside_law"]),
     )
-    tables = (_sigma_table(s), *_violations_table(s))
+    tables = (*_sensors_table(s), _sigma_table(s), *_violations_table(s))
     return Description(f"Score of {s['profile']} on {s['machine']}, problem {s['problem']}", headline, tables, remarks)
+
+
+def _sensors_table(s: Summary) -> tuple[Table, ...]:
+    """Return the table of what each sensor buys, none if it was not asked for."""
+    if not s.get("sensors"):
+        return ()
+    rows = tuple(
+        (
+            v["sensor"] or "all as they are",
+            v["change"] if v["sensor"] else "",
+            format_number(v["worst_percent"], 3),
+            v["worst_parameter"],
+            format_number(v["median_percent"], 3),
+            f"{v['error_ratio']:.2f}",
+        )
+        for v in s["sensors"]
+    )
+    caption = (
+        f"What each sensor of kit {s['kit']} buys along this drive: attainable standard deviations after each change,"
+        " and the geometric mean of their ratios; sensors that identification needs can't be left out."
+    )
+    return (Table(caption, ("sensor", "change", "worst %", "which", "median %", "all"), rows),)
 
 
 def _condition(value: float | None) -> str:

@@ -22,7 +22,7 @@ from excite.model.machine import Problem
 from excite.reports.charts import EXPLORE, Explorable, explorable
 from excite.simulation import Motion
 from excite.text import format_number
-from excite.trajectories import DESIGNED, ComparisonRow
+from excite.trajectories import DESIGNED, ComparisonRow, SensorValue
 
 # Okabe-Ito colours, distinct for the colour-blind; line styles are distinct in black and white.
 RECORDED = "0.6"  # grey of readings as recorded
@@ -199,6 +199,27 @@ def sigma_figure(sigma: Mapping[str, float], title: str) -> Figure:
     ax.xaxis.set_minor_formatter("")
     ax.set_xlabel("attainable standard deviation [% of the nominal value]")
     ax.grid(axis="x", alpha=0.3)
+    return figure
+
+
+def sensors_figure(values: Sequence[SensorValue], title: str) -> Figure:
+    """Plot the accuracy of the worst and the median parameter [%] after each change of the sensors."""
+    now, *changes = values
+    figure = Figure(figsize=(8, 1.4 + 0.27 * len(changes)), layout="constrained")
+    ax = figure.subplots()
+    figure.suptitle(escape_dollar(title), fontsize=11)
+    names = [f"{v.sensor}, {v.change}" for v in changes][::-1]
+    of = {"worst": ("worst_percent", "o"), "median": ("median_percent", "s")}
+    for k, (label, (key, mark)) in enumerate(of.items()):
+        ax.axvline(getattr(now, key), color=COLOURS[k], linewidth=1)
+        ax.plot([getattr(v, key) for v in changes][::-1], names, mark, color=COLOURS[k], label=f"{label} parameter")
+    ax.set_xscale("log")
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.xaxis.set_minor_formatter("{x:.2g}")
+    ax.tick_params(axis="x", which="minor", labelsize=7)
+    ax.set_xlabel("attainable standard deviation [% of the nominal value]")
+    ax.grid(axis="x", which="both", alpha=0.3)
+    ax.legend(fontsize=8)
     return figure
 
 

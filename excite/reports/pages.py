@@ -24,6 +24,8 @@ CAPTIONS = {
     " target, the diamond the answer; grey, the first drive repeated, whose errors fall with the square root of time.",
     "sigma.png": "Attainable accuracy of the drive: one standard deviation (Cramer-Rao bound, all sensors together) of"
     " every parameter in per cent of its nominal value, on a logarithmic axis.",
+    "sensors.png": "What each sensor buys along this drive: the attainable standard deviation of the worst and the"
+    " median parameter after each change, the best first; the lines are without a change.",
     "verify.png": "Left, the error of every parameter in every simulated run, in per cent of the true value: dots are"
     " runs, diamonds their mean, grey bars the 95 % interval that the method itself predicts. Right, the share of runs"
     " in which the interval holds the truth; it claims 95 %.",

@@ -5,11 +5,13 @@ The bound is the covariance of joint smoothing along an exactly known motion, wi
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from excite.model import Model
+from excite.model.machine import Sensor
 from excite.simulation import Motion, measured_torques
 from excite.smoothing.gauss_newton import PRIOR_STD, covariance_in_si, linearise_log
 from excite.smoothing.linearisation import StateSpace, build_state_space
@@ -24,19 +26,28 @@ from excite.smoothing.measurements import (
 )
 
 
-def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | None = None) -> np.ndarray:
+def cramer_rao(
+    model: Model,
+    motion: Motion,
+    kit: str = "full",
+    X: np.ndarray | None = None,
+    noise_factors: Mapping[str, float] | None = None,
+) -> np.ndarray:
     """Compute the covariance (n_base, n_base) [SI] that the sensors of a kit allow along a motion.
 
     All noise counts as Gaussian, with the machine file's standard deviations. An encoder gives one reading per count,
-    and its edges are off by a tenth of a count at least; a slow sensor gives the
-    share of its `rate_hz`. A weak prior (300 % of each scale) keeps the standard
-    deviation of a parameter finite that the motion does not excite. What the machine file calls known adds to the
-    measurements.
+    and its edges are off by a tenth of a count at least; a slow sensor gives the share of its `rate_hz`. A weak prior
+    (300 % of each scale) keeps the standard deviation of a parameter finite that the motion does not excite. What the
+    machine file calls known adds to the measurements.
 
-    X (n_base,): true parameters, the nominal ones by default. Raises ValueError for a sensor without noise or counts.
+    X (n_base,): true parameters, the nominal ones by default. noise_factors: factors on the noise of sensors, or on the
+    count of encoders, by name; inf leaves a sensor out, which torque sensors can't be.
+
+    Raises ValueError for a sensor without noise or counts.
     """
     X = model.nominal if X is None else np.asarray(X, float)
-    sensors = list(model.machine.sensors(kit))
+    factors = noise_factors or {}
+    sensors = [s for s in model.machine.sensors(kit) if factors.get(s.name, 1) < np.inf]
     for s in sensors:
         if not s.has_noise_figure:
             raise ValueError(
@@ -46,9 +57,10 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
     full = np.hstack([motion.q, motion.nu, motion.wheels, motion.memory])
     state, over = space.from_full_state(full)
     counts = np.array([s.resolution is not None for s in space.sensors])
+    torques = [torque_sensor(model, b.index) for b in model.machine.actuated]
     noise = SensorNoise(
-        np.array([float(torque_sensor(model, b.index).noise or 0) for b in model.machine.actuated]),
-        np.array([s.resolution or float(np.hypot(float(s.noise or 0), s.least_noise)) for s in space.sensors]),
+        np.array([float(s.noise or 0) * factors.get(s.name, 1) for s in torques]),
+        np.array([_noise(s) * factors.get(s.name, 1) for s in space.sensors]),
     )
     none = np.zeros((len(state), len(space.sensors)))
     data = Measurements(
@@ -65,6 +77,11 @@ def cramer_rao(model: Model, motion: Motion, kit: str = "full", X: np.ndarray | 
         [np.full(len(X), PRIOR_STD**-2), np.ones(len(data.offset_sensors))]
     )
     return covariance_in_si(space, np.linalg.inv(information))
+
+
+def _noise(sensor: Sensor) -> float:
+    """Return the standard deviation of a sensor [SI], for an encoder its count."""
+    return sensor.resolution or float(np.hypot(float(sensor.noise or 0), sensor.least_noise))
 
 
 def _shares_read(space: StateSpace, state: np.ndarray, noise: SensorNoise, X: np.ndarray) -> np.ndarray:

@@ -59,3 +59,4 @@ from .saved_design import (
     read_design_summary as read_design_summary,
 )
 from .scoring import Score as Score, score as score, score_motion as score_motion
+from .sensor_value import SensorValue as SensorValue, value_sensors as value_sensors

@@ -7,20 +7,23 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from excite import reports, trajectories
+from excite import identification, reports, trajectories
 from excite.logs import read_drive
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Problem
 from excite.reports import Account
-from excite.simulation import Motion
+from excite.simulation import KITS, Motion
 from excite.trajectories import Score
 from excite.workflows import design_request, design_workflow, requests
 
 
-def score(place: Path, machine: str, profile: Path, problem: str | None) -> dict[str, Any]:
+def score(
+    place: Path, machine: str, profile: Path, problem: str | None, sensors: bool = False, kit: str = "full"
+) -> dict[str, Any]:
     """Judge a profile as a design into a folder; return the summary.
 
-    machine: a shipped name or a path. problem: None for the machine's own. The folder can be verified as a design can.
+    machine: a shipped name or a path. problem: None for the machine's own. sensors: also find what each sensor of a kit
+    buys. The folder can be verified as a design can.
     Raises UsageError, MachineError, LogError, SimulationError.
     """
     model = requests.build_model(machine, fit_sensor_effects=False)
@@ -28,11 +31,17 @@ def score(place: Path, machine: str, profile: Path, problem: str | None) -> dict
     design_request.require_noise_figures(model)
     drive = read_drive(profile, model, any_rate=True)
     found = trajectories.score(model, chosen, drive.torque, drive.start, drive.nu0)
-    return score_account(model, name, chosen, found, str(profile)).write(place)
+    requests.require_known("--kit", kit, KITS)
+    return score_account(model, name, chosen, found, str(profile), kit if sensors else None).write(place)
 
 
-def score_account(model: Model, name: str, problem: Problem, found: Score, profile: str) -> Account:
-    """Give an account of a drive judged on a problem of some name. profile: what the drive is called."""
+def score_account(
+    model: Model, name: str, problem: Problem, found: Score, profile: str, kit: str | None = None
+) -> Account:
+    """Give an account of a drive judged on a problem of some name.
+
+    profile: what the drive is called. kit: whose sensors are valued, None for none.
+    """
     summary: dict[str, Any] = {
         "machine": model.machine.name,
         "problem": name,
@@ -51,14 +60,20 @@ def score_account(model: Model, name: str, problem: Problem, found: Score, profi
         "versions": requests.package_versions(),
     }
     title = f"{model.machine.title}: {name}, {Path(profile).name}"
+    figures = {
+        "design.png": partial(reports.design_figure, model, problem, found.motion, title),
+        "sigma.png": partial(reports.sigma_figure, found.sigma_percent, title),
+    }
+    if kit is not None:
+        needed = identification.needed_sensors(model, identification.recommend_method(model))
+        values = trajectories.value_sensors(model, found.motion, kit, needed)
+        summary |= {"kit": kit, "sensors": [vars(v) for v in values]}
+        figures["sensors.png"] = partial(reports.sensors_figure, values, f"{title}, kit {kit}")
     rows = {n: {"sigma_percent": v, "what": summary["meanings"].get(n, "")} for n, v in found.sigma_percent.items()}
     return Account(
         "score",
         summary,
-        {
-            "design.png": partial(reports.design_figure, model, problem, found.motion, title),
-            "sigma.png": partial(reports.sigma_figure, found.sigma_percent, title),
-        },
+        figures,
         partial(reports.rows_frame, rows, "parameter"),
         (partial(design_workflow.write_drive, model, found.motion),),
     )

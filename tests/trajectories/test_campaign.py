@@ -10,10 +10,10 @@ import pytest
 from support.commands import Excite
 
 from excite.errors import InfeasibleError
-from excite.model import Model
+from excite.model import Model, prediction
 from excite.simulation import Motion, simulate
 from excite.smoothing import cramer_rao
-from excite.trajectories import campaign, objective, prediction_contrasts, read_design, rival_contrasts
+from excite.trajectories import campaign, objective, prediction_contrasts, read_design, rival_contrasts, value_sensors
 from excite.trajectories.campaign import design_campaign
 from excite.trajectories.composite_objective import compose_objective, score_motions
 from excite.trajectories.multistart import Design
@@ -46,7 +46,7 @@ def test_derivatives_with_contrasts(name: str) -> None:
 
 def test_prediction_variance_is_that_of_perturbed_machines(straight: Model, straight_motion: Motion) -> None:
     """The mean variance along another drive equals that of simulated machines drawn from the covariance."""
-    other = simulate(straight, 0.5 * straight_motion.u[:1500])
+    other = simulate(straight, 0.5 * straight_motion.u[:800])
     C = cramer_rao(straight, straight_motion)
     score = score_motions(
         compose_objective(straight, "prediction", contrasts=prediction_contrasts(straight, other)),
@@ -137,3 +137,34 @@ def test_more_than_two_rivals(straight: Model, straight_motion: Motion) -> None:
             100 * max(sigma[both.base.names.index(e.name)] for e in both.effects[-n:]), rel=1e-6
         )
     assert scores[1] >= scores[0]
+
+
+def test_sensors_are_worth_what_another_machine_file_says(va12: Model, va12_motion: Motion) -> None:
+    """Machine files with half the noise, twice the counts or without a sensor give the same bounds."""
+    motion = simulate(va12, va12_motion.u[:1500])
+    rows = {(v.sensor, v.change): v for v in value_sensors(va12, motion, "full", ("thetal",))}
+    assert ("thetal", "left out") not in rows
+    assert ("u1", "left out") not in rows
+    sensors = {s.name: s for s in va12.machine.sensor}
+
+    def bound(name: str, key: str, factor: float) -> list[float]:
+        number = getattr(sensors[name], key)
+        other = sensors[name].model_copy(update={key: number.model_copy(update={"value": factor * float(number)})})
+        kept = tuple({**sensors, name: other}.values())
+        model = prediction.build(va12.machine.model_copy(update={"sensor": kept}))
+        sigma = 100 * np.sqrt(np.diag(cramer_rao(model, motion))) / objective.reference_values(model)
+        return [float(sigma.max()), float(np.median(sigma))]
+
+    for name, key, factor, change in (
+        ("u2", "noise", 0.5, "half the noise"),
+        ("theta2", "counts_per_turn", 2, "twice the counts"),
+        ("yaw_rate", "noise", 1e6, "left out"),
+    ):
+        row = rows[name, change]
+        assert [row.worst_percent, row.median_percent] == pytest.approx(bound(name, key, factor), rel=1e-3)
+        assert (row.error_ratio < 1) == (change != "left out")
+    paper = value_sensors(va12, motion, "paper")
+    sigma = np.sqrt(np.diag(cramer_rao(va12, motion, "paper"))) / objective.reference_values(va12)
+    assert paper[0].worst_percent == pytest.approx(100 * sigma.max())
+    assert {v.sensor for v in paper if v.change == "added"} == {"yaw_rate", "vy"}
+    assert all(v.error_ratio <= 1 + 1e-6 for v in paper if v.change != "left out")
