@@ -14,6 +14,7 @@ import typer
 from excite import workflows
 from excite.cli import options, terminal
 from excite.cli.options import (
+    AcceptOption,
     AfterOption,
     BudgetOption,
     CommandWithChoices,
@@ -514,6 +515,7 @@ def identify(
             help="result of `identify` without the payload of these logs: its inertia on the last body is given, too",
         ),
     ] = None,
+    accept: AcceptOption = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -528,7 +530,9 @@ def identify(
     inputs = [*_machine_file(machine), *logs, *(validate or [])]
     inputs += [unloaded] if unloaded else []
     with _result(out, json, partial(terminal.show, "identify"), inputs) as (place, summary):
-        summary |= workflows.identify(place, machine, logs, method, filtering, validate or [], terminal.bar, unloaded)
+        summary |= workflows.identify(
+            place, machine, logs, method, filtering, validate or [], terminal.bar, unloaded, accept
+        )
     if summary["status"] == "invalid":
         raise typer.Exit(1)
 
@@ -581,6 +585,7 @@ def diagnose(
         float | None,
         typer.Option("--budget", help="begin nothing new after this many seconds: the best answer so far"),
     ] = None,
+    accept: AcceptOption = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -596,7 +601,7 @@ def diagnose(
     out = out or Path(f"results/diagnose-{load_machine(machine).name}")
     _check_logs_and_filter(logs, filtering)
     with _result(out, json, partial(terminal.show, "diagnose"), [*_machine_file(machine), *logs]) as (place, summary):
-        summary |= workflows.diagnose(place, machine, logs, filtering, design_next, terminal.bar, budget)
+        summary |= workflows.diagnose(place, machine, logs, filtering, design_next, terminal.bar, budget, accept)
 
 
 @app.command()
