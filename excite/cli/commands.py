@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -857,6 +858,37 @@ def check_machine(
         partial(terminal.show, "machine"),
         InputError.exit_code,
     )
+
+
+@app.command(name="app")
+def open_window(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of the day's results")] = Path("results"),
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="port, 0 for any free one")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page in the browser")] = True,
+    json: JsonOption = False,
+) -> None:
+    """Open one window for the whole test day: machine, design, drive, log, identify, diagnose.
+
+    Serves a page on this computer alone, until Ctrl-C; its address holds a key without which nothing is answered. Each
+    step runs the command of its name and shows the folder that it writes, so the window and the commands take turns.
+
+    Example: excite app results
+    """
+    from excite import app as window
+
+    def ready(address: str) -> None:
+        if json:
+            terminal.show_json({"address": address, "folder": str(folder)})
+            sys.stdout.flush()
+        else:
+            typer.echo(f"{address} (Ctrl-C ends)", err=True)
+
+    try:
+        window.serve(folder, port, browser, ready)
+    except ModuleNotFoundError as err:
+        if (err.name or "").partition(".")[0] not in ("nicegui", "fastapi", "uvicorn"):
+            raise
+        raise UsageError("excite app needs NiceGUI: pip install 'excite[app]'") from None
 
 
 @app.command()
