@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -14,6 +15,7 @@ import typer
 from excite import workflows
 from excite.cli import options, terminal
 from excite.cli.options import (
+    AcceptOption,
     AfterOption,
     BudgetOption,
     CommandWithChoices,
@@ -521,6 +523,7 @@ def identify(
             help="result of `identify` without the payload of these logs: its inertia on the last body is given, too",
         ),
     ] = None,
+    accept: AcceptOption = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -535,7 +538,9 @@ def identify(
     inputs = [*_machine_file(machine), *logs, *(validate or [])]
     inputs += [unloaded] if unloaded else []
     with _result(out, json, partial(terminal.show, "identify"), inputs) as (place, summary):
-        summary |= workflows.identify(place, machine, logs, method, filtering, validate or [], terminal.bar, unloaded)
+        summary |= workflows.identify(
+            place, machine, logs, method, filtering, validate or [], terminal.bar, unloaded, accept
+        )
     if summary["status"] == "invalid":
         raise typer.Exit(1)
 
@@ -588,6 +593,7 @@ def diagnose(
         float | None,
         typer.Option("--budget", help="begin nothing new after this many seconds: the best answer so far"),
     ] = None,
+    accept: AcceptOption = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -603,7 +609,7 @@ def diagnose(
     out = out or Path(f"results/diagnose-{load_machine(machine).name}")
     _check_logs_and_filter(logs, filtering)
     with _result(out, json, partial(terminal.show, "diagnose"), [*_machine_file(machine), *logs]) as (place, summary):
-        summary |= workflows.diagnose(place, machine, logs, filtering, design_next, terminal.bar, budget)
+        summary |= workflows.diagnose(place, machine, logs, filtering, design_next, terminal.bar, budget, accept)
 
 
 @app.command()
@@ -890,6 +896,37 @@ def check_machine(
         partial(terminal.show, "machine"),
         InputError.exit_code,
     )
+
+
+@app.command(name="app")
+def open_window(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder of the day's results")] = Path("results"),
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="port, 0 for any free one")] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page in the browser")] = True,
+    json: JsonOption = False,
+) -> None:
+    """Open one window for the whole test day: machine, design, drive, log, identify, diagnose.
+
+    Serves a page on this computer alone, until Ctrl-C; its address holds a key without which nothing is answered. Each
+    step runs the command of its name and shows the folder that it writes, so the window and the commands take turns.
+
+    Example: excite app results
+    """
+    from excite import app as window
+
+    def ready(address: str) -> None:
+        if json:
+            terminal.show_json({"address": address, "folder": str(folder)})
+            sys.stdout.flush()
+        else:
+            typer.echo(f"{address} (Ctrl-C ends)", err=True)
+
+    try:
+        window.serve(folder, port, browser, ready)
+    except ModuleNotFoundError as err:
+        if (err.name or "").partition(".")[0] not in ("nicegui", "fastapi", "uvicorn"):
+            raise
+        raise UsageError("excite app needs NiceGUI: pip install 'excite[app]'") from None
 
 
 @app.command()

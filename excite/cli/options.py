@@ -132,3 +132,9 @@ BudgetOption = Annotated[
 RunsOption = Annotated[
     int, typer.Option("--runs", min=1, help="number of simulated test days, each with sensor noise of its own")
 ]
+AcceptOption = Annotated[
+    str | None,
+    typer.Option(
+        "--accept", help="why the doubts about the logs may stand; the result keeps these words", metavar="WORDS"
+    ),
+]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import math
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -9,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from excite import reports
+from excite import reports, workflows
 
 LINE_INTERVAL_S = 30.0  # between lines of progress where there is no terminal; chosen
 INTERRUPTED = 130  # exit code of Ctrl-C, as shells have it
@@ -63,7 +66,18 @@ Advance = Callable[[int, int, float | None], None]
 
 @contextmanager
 def bar(label: str) -> Iterator[Advance]:
-    """Show a progress bar on stderr, nothing if that is no terminal."""
+    """Show a progress bar on stderr; lines of JSON if `PROGRESS_VARIABLE` asks for them, nothing without a terminal."""
+    if os.environ.get(workflows.PROGRESS_VARIABLE) == "json":
+
+        def write(done: int, total: int, best: float | None) -> None:
+            finite = best is not None and math.isfinite(best)
+            said = {"label": label, "done": done, "total": total, "best": best if finite else None}
+            sys.stderr.write(f"{json.dumps(said)}\n")
+            sys.stderr.flush()
+
+        write(0, 0, None)
+        yield write
+        return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 

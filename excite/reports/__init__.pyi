@@ -29,9 +29,14 @@ from .figures import (
     sigma_figure as sigma_figure,
     verify_figure as verify_figure,
 )
-from .html import Picture as Picture, report_page as report_page, templates as templates
+from .html import (
+    Picture as Picture,
+    report_page as report_page,
+    result_fragment as result_fragment,
+    templates as templates,
+)
 from .log_check import check_log as check_log, log_account as log_account, log_frame as log_frame
-from .pages import REPORT as REPORT, write_report as write_report
+from .pages import REPORT as REPORT, folder_pictures as folder_pictures, write_report as write_report
 from .plain_text import PIPE_WIDTH as PIPE_WIDTH, text_parts as text_parts, text_table as text_table
 from .results import (
     Account as Account,

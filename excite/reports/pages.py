@@ -82,6 +82,21 @@ def write_page(
     command: how it was made, the command line by default. explorable: what of each figure a chart shows.
     """
     description = describe(kind, summary)
+    text = report_page(
+        description.title,
+        description.headline,
+        folder_pictures(place, summary, explorable),
+        description.tables,
+        provenance(summary, command),
+        description.remarks,
+        description.status,
+        description.verdict,
+    )
+    (place / REPORT).write_text(text, encoding="utf-8")
+
+
+def folder_pictures(place: Path, summary: Summary, explorable: Mapping[str, Explorable] | None = None) -> list[Picture]:
+    """Return the figures of a result folder with their captions, in the order of the report; explorable as there."""
     shown = dict(explorable or {})
     made = charts.documents({name: one.panels for name, one in shown.items()})
     pictures = [
@@ -95,18 +110,9 @@ def write_page(
         for path in sorted(place.glob("*.png"))
     ]
     order = list(CAPTIONS)
-    pictures.sort(key=lambda p: (bool(p.folded), order.index(p.path.name) if p.path.name in order else len(order)))
-    text = report_page(
-        description.title,
-        description.headline,
-        pictures,
-        description.tables,
-        provenance(summary, command),
-        description.remarks,
-        description.status,
-        description.verdict,
+    return sorted(
+        pictures, key=lambda p: (bool(p.folded), order.index(p.path.name) if p.path.name in order else len(order))
     )
-    (place / REPORT).write_text(text, encoding="utf-8")
 
 
 def write_report(

@@ -34,6 +34,7 @@ from .identify_workflow import (
 )
 from .machine_check import check_machine as check_machine
 from .predict_workflow import predict as predict, predict_account as predict_account, predict_from as predict_from
+from .progress import PROGRESS_VARIABLE as PROGRESS_VARIABLE
 from .requests import (
     build_model as build_model,
     choices as choices,

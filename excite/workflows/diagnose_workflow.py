@@ -91,12 +91,13 @@ def diagnose(
     design_next: bool = False,
     bar: Bar = no_bar,
     budget_s: float | None = None,
+    accepted: str | None = None,
 ) -> dict[str, Any]:
     """Diagnose logs into a folder: report, figures, and machine.toml if a cause is named; return the summary.
 
     machine: a shipped name or a path. filtering: a name of `FILTERS`. design_next: design the drive that separates
-    tied causes. budget_s [s]: ends the search with the best answer so far. Raises LogError, MachineError,
-    NoEstimateError.
+    tied causes. budget_s [s]: ends the search with the best answer so far. accepted: why doubts about the logs may
+    stand. Raises LogError, MachineError, NoEstimateError.
     """
     model = requests.build_model(machine)
     with bar("diagnosing") as advance:
@@ -105,7 +106,7 @@ def diagnose(
             ready.model, ready.logs, filtering, lambda share: advance(round(1000 * share), 1000, None), budget_s
         )
     drive = separating_drive(place, ready.model.machine, rivals(found), design_next, bar)
-    return diagnose_account(machine, ready, found, drive).write(place)
+    return diagnose_account(machine, ready, found, drive, accepted).write(place)
 
 
 def rivals(found: DiagnoseResult) -> Sequence[RivalPair]:
@@ -114,10 +115,17 @@ def rivals(found: DiagnoseResult) -> Sequence[RivalPair]:
     return diagnosis.rival_pairs(d) if isinstance(d, Diagnosis) else ()
 
 
-def diagnose_account(machine: str, ready: Prepared, found: DiagnoseResult, drive: Mapping[str, Any] | None) -> Account:
+def diagnose_account(
+    machine: str,
+    ready: Prepared,
+    found: DiagnoseResult,
+    drive: Mapping[str, Any] | None,
+    accepted: str | None = None,
+) -> Account:
     """Give an account of a diagnosis.
 
-    machine: the name or path that machine.toml extends. drive: as `separating_drive` returns it.
+    machine: the name or path that machine.toml extends. drive: as `separating_drive` returns it. accepted: why
+    doubts about the logs may stand.
     """
     model, d, title = ready.model, found.assessment.diagnosis, ready.model.machine.title
     text = diagnosis.machine_file(machine, model.machine, d)
@@ -127,7 +135,8 @@ def diagnose_account(machine: str, ready: Prepared, found: DiagnoseResult, drive
         **diagnosis.summarise(found.assessment),
         "machine_file": MACHINE if text is not None else None,
         "separating_drive": drive,
-        "notes": [*ready.notes, *found.notes],
+        "notes": [*requests.acceptance_notes(accepted), *ready.notes, *found.notes],
+        "accepted": accepted,
         "versions": requests.package_versions(),
     }
     keys = ("kind", "amount", "amount_std", "unit", "share_percent", "p_value", "gain_percent", "gain_ci95")

@@ -75,12 +75,14 @@ def identify(
     validate: Sequence[Path] = (),
     bar: Bar = no_bar,
     unloaded: Path | None = None,
+    accepted: str | None = None,
 ) -> dict[str, Any]:
     """Estimate parameters from logs into a folder; return the summary.
 
     machine: a shipped name or a path. method: None for the recommended one. filtering: a name of `FILTERS`.
     validate: logs that are not fitted, only predicted. unloaded: folder of an estimate of the machine without the
-    payload that it carries in the logs. Raises LogError, NoEstimateError, UsageError, EstimateFolderError.
+    payload that it carries in the logs. accepted: why doubts about the logs may stand.
+    Raises LogError, NoEstimateError, UsageError, EstimateFolderError.
     """
     as_in_file = model = requests.build_model(machine)
     before = None if unloaded is None else identification.read_estimate(unloaded).estimate
@@ -96,7 +98,7 @@ def identify(
     more_notes = [*(others.notes if others else ()), *(line for e in examined for line in (*e.notes, *e.doubts))]
     with bar("identifying"):
         found = identify_from(model, ready.logs, method, filtering)
-    return identify_account(as_in_file, ready, found, unfitted, more_notes, before).write(place)
+    return identify_account(as_in_file, ready, found, unfitted, more_notes, before, accepted).write(place)
 
 
 def identify_account(
@@ -106,11 +108,12 @@ def identify_account(
     unfitted: Sequence[Log] = (),
     more_notes: Sequence[str] = (),
     unloaded: Estimate | None = None,
+    accepted: str | None = None,
 ) -> Account:
     """Give an account of an estimate, predicting logs that were not fitted.
 
     as_in_file: the model before it had the rate of the logs. more_notes: on the logs that were not fitted.
-    unloaded: estimate without the payload.
+    unloaded: estimate without the payload. accepted: why doubts about the logs may stand.
     """
     model, read, estimate, chosen = ready.model, found.logs, found.estimate, found.filter
     said = [] if found.agreement is None else [identification.describe_agreement(found.agreement)]
@@ -132,7 +135,8 @@ def identify_account(
         "unused_sensors": list(identification.unused_sensors(model, estimate.method, read)),
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
-        "notes": [*said, *ready.notes, *estimate.notes, *more_notes],
+        "notes": [*said, *requests.acceptance_notes(accepted), *ready.notes, *estimate.notes, *more_notes],
+        "accepted": accepted,
         "agreement": None if found.agreement is None else identification.summarise_agreement(found.agreement),
         "validation": [_check(model, one, estimate, chosen) for one in unfitted],
         "versions": requests.package_versions(),

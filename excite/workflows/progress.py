@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 Advance = Callable[[int, int, float | None], None]  # done, total, best score so far
+PROGRESS_VARIABLE = "EXCITE_PROGRESS"  # environment: with "json", commands report progress on stderr as JSON lines
 Bar = Callable[[str], AbstractContextManager[Advance]]  # opened with the name of the work
 
 

@@ -135,6 +135,11 @@ def machine_stem(machine: str) -> str:
     return Path(machine).stem if machine.endswith(".toml") else machine
 
 
+def acceptance_notes(words: str | None) -> list[str]:
+    """Return the note on doubts about logs that somebody accepted, none without words."""
+    return [f'doubts about the logs were accepted: "{words}"'] if words else []
+
+
 def package_versions() -> dict[str, str]:
     """Return the versions of the packages that results depend on."""
     return {name: version(name) for name in ("excite", "casadi", "numpy", "scipy")}

@@ -1,0 +1,152 @@
+"""What the window reads from a folder of results, what each step needs, and the lines that messages are about."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from support.commands import Excite
+from support.drives import drive
+from support.logs import logged
+
+from excite.app.day import Day
+from excite.app.key_lines import find_line
+from excite.model import Model
+from excite.simulation import simulate
+
+
+@pytest.fixture(scope="module")
+def log(straight: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    motion = simulate(straight, drive(straight, 8, 1, {"u1": 1500, "u4": 1500}))
+    return logged(straight, motion, tmp_path_factory.mktemp("log") / "log.csv", 3)
+
+
+def lacking(day: Day, step: str) -> list[str]:
+    return [need.text for need in day.needs(step) if not need.met]
+
+
+def test_failed_log_blocks_identification_until_it_is_mended_and_doubts_until_accepted_in_words(
+    log: Path, tmp_path: Path, excite: Excite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    good, path = pd.read_csv(log), tmp_path / "day.csv"
+    torn = good.astype({"u1_Nm": object})
+    torn.loc[400, "u1_Nm"] = "x"
+    torn.to_csv(path, index=False)
+    day = Day(Path("results"))
+    assert lacking(day, "identify") == ["a machine: choose one in step Machine"]
+    day.choose("va12_straight")
+    assert lacking(day, "identify") == ["a log that passes its check: step Log"]
+    day.logs = ["day.csv"]
+    assert lacking(day, "identify") == ["day.csv checked: step Log"]
+
+    code, _, _ = excite(*day.command("log", "day.csv"))
+    assert code == 1
+    assert "mend it first" in lacking(day, "identify")[0]
+    assert "row 401, column u1_Nm" in lacking(day, "identify")[0]
+    assert not day.ready("identify")
+    assert not day.ready("diagnose")
+    day.accepted = {"words": "it is fine", "doubts": day.doubts()}
+    assert not day.ready("identify"), "words don't mend a log that no method can read"
+
+    step = 2 * np.pi / 1024  # mended, but one encoder is coarser than the machine file says
+    good.assign(theta1_rad=np.floor(good.theta1_rad / step) * step).to_csv(path, index=False)
+    assert lacking(day, "identify") == ["day.csv checked again: day.csv has changed since"]
+    code, _, _ = excite(*day.command("log", "day.csv"))
+    assert code == 0
+    assert day.doubts()
+    assert not day.ready("identify")
+    assert "--accept" not in day.command("identify")
+    words = "The front encoder was changed today."
+    day.accepted = {"words": words, "doubts": day.doubts()}
+    assert day.ready("identify")
+    day.save()
+
+    again = Day(Path("results"))
+    assert (again.machine, again.logs, again.accepted_words()) == ("va12_straight", ["day.csv"], words)
+    again.accepted["doubts"] = ["another doubt"]
+    assert not again.ready("identify"), "words accept the doubts that were seen, no others"
+
+    day.forms["identify"]["method"] = "ols"
+    excite(*day.command("identify"))
+    summary = json.loads(Path("results/identify-va12_straight/summary.json").read_text())
+    assert summary["accepted"] == words
+    assert words in Path("results/identify-va12_straight/report.html").read_text()
+    assert Day(Path("results")).result_of("identify") is not None
+
+
+def test_day_is_read_from_what_the_commands_wrote(
+    log: Path, tmp_path: Path, excite: Excite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(log, "log.csv")
+    Path("mine.toml").write_text('extends = "va12_straight"\nname = "mine"\n')
+    code, _, _ = excite("log", "check", "log.csv", "--machine", "mine.toml", "--out", "results/checked")
+    assert code == 0
+    day = Day(Path("results"))
+    assert (day.machine, day.logs) == ("mine.toml", ["log.csv"])
+    states = {step: day.state(step) for step in ("machine", "design", "drive", "log", "identify")}
+    assert states == {"machine": "ready", "design": "waiting", "drive": "waiting", "log": "done", "identify": "ready"}
+    now = Path("mine.toml").stat().st_mtime + 60
+    os.utime("mine.toml", (now, now))
+    assert day.state("log") == "to do again"
+    assert lacking(day, "identify") == ["log.csv checked again: mine.toml has changed since"]
+    Path("mine.toml").write_text('extends = "va12_straight"\nname = \n')
+    assert "mine.toml" in lacking(day, "design")[0]
+    assert not day.ready("log")
+
+
+TEXT = """\
+extends = "va12"
+name = "mine"
+
+[body.front_roll.contact]
+Kx = { value = 100000, source = "measured" }
+
+[[sensor]]
+name = "u9"
+
+[problems.S40]
+lane_m = [80.0, -20.0]
+
+[[body]]
+index = 0
+name = "frame"
+[body.inertia]
+mass = { value = -3, sourc = "assumed" }
+"""
+
+
+@pytest.mark.parametrize(
+    ("message", "line"),
+    [
+        ("front_roll: contact.Kx: 10 N per slip, 0.01 times its load", 5),
+        ("problems.S40.lane_m: must be > 0, length and width (got -20)", 11),
+        ("body[0].inertia.mass.sourc: no such key here", 17),
+        ("frame: inertia: has a negative principal moment", 16),
+        ("sensor[0].column: is missing", 7),
+        ("Invalid value (at line 9, column 3)", 9),
+        ("the mass matrix is not positive definite", None),
+    ],
+)
+def test_message_finds_its_line(message: str, line: int | None) -> None:
+    assert find_line(TEXT, message) == line
+
+
+def test_result_of_other_logs_is_not_shown(log: Path, tmp_path: Path) -> None:
+    day = Day(tmp_path / "results")
+    day.choose("va12_straight")
+    other = tmp_path / "results" / "identify-x"
+    other.mkdir(parents=True)
+    said = {"machine": "va12_straight", "logs": ["other.csv from row 12"], "unidentifiable": [], "status": "valid"}
+    (other / "summary.json").write_text(json.dumps(said))
+    day.logs = [str(log)]
+    assert day.result_of("identify") is None
+    day.logs = ["other.csv"]
+    assert day.result_of("identify") is not None
+    assert np.isfinite(day.result_of("identify").time)  # type: ignore[union-attr]
