@@ -238,7 +238,7 @@ def exact_derivatives(
 
 
 def _along(objective: str, x: np.ndarray, E: np.ndarray, sharpness: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return value, slope (m,) and Hessian (m, m) of an objective of the eigenvalues x, along E (m, n, n) in its axes."""
+    """Return value, slope (m,) and Hessian (m, m) of an objective of eigenvalues x, along E (m, n, n) in its axes."""
     value, g, H, ratio = _spectral_derivatives(objective, x, sharpness)
     own = np.einsum("lii->li", E)
     pairs = E[:, *np.triu_indices(len(x), 1)]
