@@ -206,10 +206,16 @@ def simulate(
     return reports.log_frame(simulation.measure(true, motion, kit=kit, seed=seed, noise=noise), true.machine)
 
 
-def identify(machine: Machine, logs: Source | Sequence[Source], method: str | None = None) -> ShownEstimate:
+def identify(
+    machine: Machine,
+    logs: Source | Sequence[Source],
+    method: str | None = None,
+    unloaded: Estimate | None = None,
+) -> ShownEstimate:
     """Estimate the parameters of a machine, with uncertainty, from one log or several.
 
     method: a name of `excite.identification.METHODS`, the one recommended for the machine if not given.
+    unloaded: estimate of the machine without the payload that it carries in the logs; the summary then has the payload.
     Raises LogError for an unusable log, NoEstimateError if there is no estimate, UsageError for an unknown method.
     """
     model = load(machine)
@@ -218,7 +224,7 @@ def identify(machine: Machine, logs: Source | Sequence[Source], method: str | No
     found = workflows.identify_from(ready.model, ready.logs, name)
     said = () if found.agreement is None else (identification.describe_agreement(found.agreement),)
     noted = replace(found.estimate, notes=(*said, *ready.notes, *found.estimate.notes))
-    return ShownEstimate.of(noted, partial(workflows.identify_account, model, ready, found))
+    return ShownEstimate.of(noted, partial(workflows.identify_account, model, ready, found, unloaded=unloaded))
 
 
 def predict(machine: Machine, estimate: Estimate, target: Source | Drive) -> ShownPrediction:

@@ -25,10 +25,11 @@ from excite.model.machine import Machine
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 PARALLEL = 1e-9  # sine of the angle and distance [m] below which two axes count as parallel, or meet
 ROUND_DIGITS = 12  # of numbers in the file; below them are errors of rounding
+NEAR_ZERO = 0.1  # of the typical size with its unit, below which a parameter gets that size as scale; chosen
 SAME_ROW = 1e-6  # rad, m, by which lengths and angles of a machine may differ from the URDF's; chosen
 ASSUMED_INERTIA = 0.01  # kg m2, of a link without inertia; assumed
 SAMPLING_HZ, CUTOFF_HZ, DECIMATION, SMOOTHING = 100, 5, 5, 0.01  # of the machine file to start from; assumed
-SIZES = {"kg": 1.0, "kg m": 0.1, "kg m2": 0.01}  # of parameters that are zero in the URDF; assumed
+SIZES = {"kg": 1.0, "kg m": 0.1, "kg m2": 0.01}  # at least, of parameters near zero; assumed
 
 
 @dataclass(frozen=True)
@@ -241,7 +242,7 @@ def _body(robot: Robot, k: int, name: str) -> dict[str, Any]:
 
 
 def _scales(machine: dict[str, Any]) -> dict[str, Any]:
-    """Return a size for each base parameter that is zero in the URDF: a typical one of those with its unit."""
+    """Return a size for each base parameter near zero in the URDF: a typical one of those with its unit."""
     record = Machine.model_validate(machine)
     every = {n + end: _assumed(1.0) for n in standard_parameters(record) for end in ("", "R")}
     model = build(Machine.model_validate(machine | {"scale": every}))
@@ -250,7 +251,7 @@ def _scales(machine: dict[str, Any]) -> dict[str, Any]:
     for name, unit, size in zip(model.base.names, model.base.units, sizes, strict=True):
         alike = np.array([s for u, s in zip(model.base.units, sizes, strict=True) if u == unit and s > 0])
         typical = max(float(np.median(alike)) if len(alike) else 0.0, SIZES.get(unit, 1.0))
-        if size < typical / 100:
+        if size < NEAR_ZERO * typical:
             found[name] = _assumed(float(f"{typical:.2g}"))
     return found
 

@@ -85,7 +85,8 @@ def test_a_payload_is_the_difference_of_two_estimates(log: pd.DataFrame) -> None
     case.pin.appendBodyToJoint(2, inertia, case.pin.frames[case.frames[1]].placement)
     case.data = case.pin.createData()
     model = build(arm())
-    loaded, unloaded = (excite.identify(model, one, method="wls") for one in (log_of(case), log))
+    unloaded = excite.identify(model, log, method="wls")
+    loaded = excite.identify(model, log_of(case), method="wls", unloaded=unloaded)
     found = payload_parameters(model, loaded, unloaded)
     J = inertia.inertia - inertia.mass * pin.skew(inertia.lever) @ pin.skew(inertia.lever)
     moments = inertia.mass * inertia.lever
@@ -94,6 +95,9 @@ def test_a_payload_is_the_difference_of_two_estimates(log: pd.DataFrame) -> None
     expected = [sum(share * true[n] for n, share in group.items()) for group in found.groups]
     assert {"MX", "MY", "ZZ"} <= set(found.names)
     assert found.value == pytest.approx(expected, abs=0.01)
+    shown = loaded.summary["payload"]
+    assert [r["value"] for r in shown["parameters"].values()] == pytest.approx(found.value)
+    assert "Payload in the frame of body1" in str(loaded)
 
 
 def test_currents_without_a_constant_give_ratios_and_say_so(log: pd.DataFrame) -> None:
