@@ -66,11 +66,18 @@ def read_urdf(path: Path) -> Robot:
     """
     try:
         import yourdfpy
+        from lxml import etree
     except ImportError:
         raise MachineError(f"{path}: URDF needs the extra `urdf`: pip install 'excite[urdf]'") from None
     try:
+        root = etree.parse(str(path)).getroot().tag
+    except (OSError, etree.XMLSyntaxError) as err:
+        raise MachineError(f"{path}: can't be read as URDF: {' '.join(str(err).split())}") from None
+    if root != "robot":
+        raise MachineError(f"{path}: no URDF: its root is <{root}>, not <robot>; xacro must be expanded first")
+    try:
         urdf = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False)
-    except Exception as err:  # whatever the parser of XML or URDF raises
+    except Exception as err:  # whatever the parser of URDF raises
         raise MachineError(f"{path}: can't be read as URDF: {' '.join(str(err).split())}") from None
     robot = urdf.robot
     children = {j.child for j in robot.joints}
@@ -264,7 +271,7 @@ def urdf_with_estimate(path: Path, model: Model, estimate: Estimate) -> tuple[st
     `possible_standard`. Raises MachineError for another robot's URDF, NotConsistentError.
     """
     robot = read_urdf(path)
-    from lxml import etree  # comes with the extra
+    from lxml import etree
 
     machine = model.machine
     if machine.in_ratios:
