@@ -23,6 +23,7 @@ from excite.model import Model, required_signs, standard_parameters
 from excite.model.mechanics import INERTIAL
 
 INTERIOR_MARGIN = 1e-6  # distance from the constraints, of a parameter's scale; keeps the mass matrix invertible
+PULL = 0.01  # of bodies to the machine file's: 100 % off there costs as much as 0.1 standard deviations; chosen
 NOTABLE_SHIFT = 1e-3  # smallest shift that is reported [standard deviations]; chosen
 
 
@@ -34,28 +35,12 @@ def nearest_possible(model: Model, estimate: Estimate) -> Estimate:
     bound at an active constraint. The residual is not recomputed (see `constrained_estimate`). Raises
     NotConsistentError.
     """
-    kept = np.flatnonzero(np.isfinite(estimate.value) & np.isfinite(estimate.std))
-    _, by_name, X = _variables(model)
-    shift = (X[kept] - estimate.value[kept]) / model.scale[kept]
-    covariance = estimate.covariance[np.ix_(kept, kept)] / np.outer(model.scale[kept], model.scale[kept])
-    root = _inverse_root(covariance)
-    problem = cp.Problem(
-        cp.Minimize(cp.sum_squares(root @ shift)), _possibility_constraints(model, by_name, INTERIOR_MARGIN)
-    )
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of an inaccurate solution, which the status tells as well
-            problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
-    except cp.error.SolverError as err:
-        raise NotConsistentError(f"no possible machine found near the estimate: {err}") from None
-    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or X.value is None:
-        raise NotConsistentError(f"no possible machine found near the estimate: the solver says {problem.status}")
+    kept, distance, _, X = _nearest(model, estimate, 0.0)
     value = np.full(len(estimate.value), np.nan)
-    value[kept] = np.asarray(X.value)[kept]
+    value[kept] = X[kept]
     shift_in_stds = (value[kept] - estimate.value[kept]) / estimate.std[kept]
     if np.abs(shift_in_stds).max(initial=0.0) < NOTABLE_SHIFT:
         return add_notes(replace(estimate, method=f"{estimate.method}+consistent"), "consistent: possible as it is")
-    distance = float(np.sqrt(max(problem.value, 0.0)))
     worst = [f"{estimate.names[kept[k]]} {shift_in_stds[k]:+.1f}" for k in np.argsort(-np.abs(shift_in_stds))[:3]]
     note = (
         f"consistent: no real machine has the unconstrained values; the nearest possible one is {distance:.1f} standard"
@@ -73,27 +58,39 @@ def constrained_estimate(model: Model, estimate: Estimate, blocks: Sequence[Bloc
 
 
 def possible_standard(model: Model, estimate: Estimate) -> dict[str, float]:
-    """Return the standard parameters [SI] of the possible machine that is nearest to the estimate, by name.
+    """Return the standard parameters [SI] of a possible machine near the estimate and near the machine file, by name.
 
-    Its base parameters are those of `nearest_possible`; among all machines that have them it is the nearest to the
-    machine file, relative to the size of each parameter. Raises NotConsistentError.
+    What the logs do not show is that of the machine file, if possible. What they show is the estimate, to a small share
+    of its standard deviations if that is possible: the pull to the machine file keeps bodies of a usual size where only
+    extreme ones have the estimated values. Raises NotConsistentError.
     """
-    found = nearest_possible(model, estimate).value
-    kept = np.flatnonzero(np.isfinite(found))
+    return _nearest(model, estimate, PULL)[2]
+
+
+def _nearest(model: Model, estimate: Estimate, pull: float) -> tuple[np.ndarray, float, dict[str, float], np.ndarray]:
+    """Find the nearest possible machine in the metric of the estimate's covariance.
+
+    pull: weight of the squared distance to the machine file, relative to the size of each standard parameter.
+    Returns identified parameters (indices), distance [standard deviations], standard parameters, base parameters.
+    """
+    kept = np.flatnonzero(np.isfinite(estimate.value) & np.isfinite(estimate.std))
     scaled, by_name, X = _variables(model)
     nominal = np.array([v for v, _ in standard_parameters(model.machine).values()]) / _scales(model)
-    equality = (X[kept] - found[kept]) / model.scale[kept] == 0
-    problem = cp.Problem(
-        cp.Minimize(cp.sum_squares(scaled - nominal)),
-        [equality, *_possibility_constraints(model, by_name, INTERIOR_MARGIN / 10)],
-    )
+    shift = (X[kept] - estimate.value[kept]) / model.scale[kept]
+    covariance = estimate.covariance[np.ix_(kept, kept)] / np.outer(model.scale[kept], model.scale[kept])
+    cost = cp.sum_squares(_inverse_root(covariance) @ shift)
+    far = pull * cp.sum_squares(scaled - nominal) if pull else 0.0
+    problem = cp.Problem(cp.Minimize(cost + far), _possibility_constraints(model, by_name, INTERIOR_MARGIN))
     try:
-        problem.solve(solver=cp.CLARABEL)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of an inaccurate solution, which the status tells as well
+            problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-10, tol_gap_rel=1e-10, tol_feas=1e-10)
     except cp.error.SolverError as err:
-        raise NotConsistentError(f"no possible bodies found for the estimate: {err}") from None
-    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
-        raise NotConsistentError(f"no possible bodies found for the estimate: the solver says {problem.status}")
-    return {name: float(x.value) for name, x in by_name.items()}
+        raise NotConsistentError(f"no possible machine found near the estimate: {err}") from None
+    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or X.value is None:
+        raise NotConsistentError(f"no possible machine found near the estimate: the solver says {problem.status}")
+    standard = {name: float(x.value) for name, x in by_name.items()}
+    return kept, float(np.sqrt(max(cost.value, 0.0))), standard, np.asarray(X.value)
 
 
 def is_possible(model: Model, X: np.ndarray) -> bool:
