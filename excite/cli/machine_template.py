@@ -66,8 +66,8 @@ def from_urdf(name: str, file: Path, origin: Path) -> str:
     lines = [
         f"# {name}: the robot of {origin.name}, its base fixed, z up. Frames are those of modified Denavit-Hartenberg,",
         "# z along each joint's axis; coordinates are those of the URDF, and `published` values are its own. Columns,",
-        "# sampling, filter and what is `assumed` must be changed to yours; positions may go as far either way as the",
-        f"# larger limit. Then run `excite machine check {file}`. Everything is SI: m, kg, s, N, N m, rad.",
+        "# sampling, filter and what is `assumed` must be changed to yours.",
+        f"# Then run `excite machine check {file}`. Everything is SI: m, kg, s, N, N m, rad.",
         "",
     ]
     return "\n".join([*lines, *_with_meanings(name, _dumped(workflows.machine_from_urdf(origin, name)))]) + "\n"

@@ -240,11 +240,13 @@ def _body(robot: Robot, k: int, name: str) -> dict[str, Any]:
     }
     limit = given.limit
     if limit is not None:
-        ends = [abs(x) for x in (limit.lower, limit.upper) if x]
-        found = {"torque": limit.effort, "rate": limit.velocity}
-        if given.type != "continuous" and ends:
-            found["position"] = max(ends)
-        body["limit"] = {key: _given(value) for key, value in found.items() if value}
+        body["limit"] = {
+            key: _given(value) for key, value in (("torque", limit.effort), ("rate", limit.velocity)) if value
+        }
+        low, high = limit.lower or 0.0, limit.upper or 0.0
+        if given.type != "continuous" and low < high:
+            ends = {"position": high} if low == -high else {"position_low": low, "position_high": high}
+            body["limit"] |= {key: _given(value) for key, value in ends.items()}
     return body
 
 

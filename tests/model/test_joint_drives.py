@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from excite.identification import payload_parameters
 from excite.model import build
 from excite.model.machine import Machine, load_machine
 
-INTERVALS = Path(__file__).parents[2] / "results" / "intervals"
 ROTOR, STIFFNESS, REST = (0.8, 1.7), 25.0, 0.4
 CONSTANT, RATIO, ZERO = 0.12, 100.0, 0.35
 JOINT = {"Fv": 1.0, "Fs": 1.0, "u0": 1.0, "smoothing": 0.3}
@@ -130,7 +128,7 @@ def test_half_known_constants_are_refused() -> None:
 )
 def test_published_numbers_of_base_parameters(name: str, rotors: bool, inertial: int) -> None:
     """UR10e: 40 with rotor inertia, 36 without (Mamedov); Panda: 43 (Gaz et al., RA-L 2019)."""
-    machine = load_machine(INTERVALS / f"{name}.toml")
+    machine = load_machine(name)
     if rotors:
         drive = {"drive": {"rotor_inertia": quantity(0.5)}}
         bodies = [b.model_dump(mode="json", exclude_none=True) | drive for b in machine.body]

@@ -106,7 +106,8 @@ def test_limits_and_friction_are_the_urdfs(arm_file: Path) -> None:
     shoulder, elbow, *_ = load_machine(arm_file).body
     assert (shoulder.name, float(shoulder.limit.torque), float(shoulder.limit.rate)) == ("upper_arm", 120, 2.5)
     assert (float(shoulder.friction.Fv), float(shoulder.friction.Fs)) == (1.4, 0.7)
-    assert elbow.limit.position is None
+    assert shoulder.limit.position_range == (-1.2, 2.1)
+    assert elbow.limit.position_range is None
     assert elbow.friction.Fv.source == "assumed"
 
 
