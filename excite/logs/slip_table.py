@@ -146,7 +146,8 @@ def read_slip_table(
     found = {role: column for role, column in every.items() if column is not None}
     if {"speed", "rim_speed"} <= found.keys():
         found.pop("slip", None)
-    notes = [f"{role.replace('_', ' ')}: column {c.name} [{c.unit}]{c.remark}" for role, c in found.items()]
+    read = [f"{role.replace('_', ' ')} from {c.name} [{c.unit}]{c.remark}" for role, c in found.items()]
+    notes = [f"columns: {'; '.join(read)}"]
     values = {role: c.values for role, c in found.items()}
     if "traction" not in values:
         raise LogError(_missing(name, table, "traction"))
