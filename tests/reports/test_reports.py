@@ -149,7 +149,7 @@ def test_identify_reports_what_was_found(
         cells = (name, summary["meanings"][name], re.escape(row["unit"]), *numbers)
         assert re.search("".join(f"<td[^>]*>{cell}</td>" for cell in cells), text)
     assert summary["meanings"]["u10"] == "torque offset, front roll"
-    assert text.count("data:image/png;base64,") == 1
+    assert text.count('src="data:image/png;base64,') == 2  # torques, and the correlation of the errors
     assert f"for {tmp_path / 'log.csv'}. Each torque is predicted from the motion that the log shows" in text
     code, _, _ = excite("identify", "va12_straight", tmp_path / "log.csv", "--method", "ols", "--out", out)
     assert code == 0  # a folder with a report in it is ours and may be replaced
