@@ -126,7 +126,8 @@ def _edit(day: Day) -> None:
         for kind in ("faults", "doubts", "remarks"):
             for line in check.summary[kind]:
                 message = line.removeprefix(f"{check.summary['file']}: ")
-                said.append((find_line(text, message), kind, message))
+                at = find_line(text, message)
+                said.append((at, kind, message.removeprefix(f"line {at}: ")))
     said.sort(key=lambda one: one[0] or 0)
     if not is_own(day):
         ui.label(f"{day.machine} comes with excite; to change it, start a machine file like it.").classes("hint")

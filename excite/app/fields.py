@@ -171,7 +171,7 @@ def check_logs(day: Day) -> None:
     left = list(day.logs)
 
     def next_one(job: Job | None = None) -> None:
-        if left and (job is None or (job.code in (0, 1) and not job.stops)):
+        if left and (job is None or not (job.message or job.stops)):
             day.start("log", day.command("log", left.pop(0)), next_one)
 
     next_one()

@@ -71,13 +71,14 @@ class Job:
 
     def _follow(self) -> None:
         assert self._process.stderr is not None
-        last = ""
+        last, defect = "", False
         for line in self._process.stderr:
             try:
                 said = json.loads(line)
                 self.label, self.done, self.total, self.best = (said[k] for k in ("label", "done", "total", "best"))
             except (ValueError, TypeError, KeyError):
                 last = line.strip() or last
+                defect = defect or line.startswith("Traceback")
         code = self._process.wait()
         self.seconds = time.monotonic() - self.begin
         if self.stops > 1:
@@ -86,7 +87,7 @@ class Job:
             self.message = last.removeprefix(PREFIX)
         elif self.stops > 1:
             self.message = "stopped, nothing was written"
-        elif code not in (0, 1):
+        elif defect or code not in (0, 1, 2):
             self.message = f"`{command_line(self.arguments)}` ended with {code}: {last}"
         self.code = code
         self._ended(self)

@@ -10,18 +10,18 @@ HEADER = re.compile(r"\s*\[{1,2}([^\[\]]+)\]{1,2}\s*(#.*)?$")
 KEY = re.compile(r"\s*([\w.\"-]+)\s*=")
 NAME = re.compile(r"\s*name\s*=\s*[\"']([^\"']+)[\"']")
 WORD = re.compile(r"[A-Za-z_]\w*|(?<=\[)\d+(?=\])")
-AT_LINE = re.compile(r"\(at line (\d+)")  # of tomllib
+AT_LINE = re.compile(r"^line (\d+): |\(at line (\d+)")  # of the check, of tomllib
 
 
 def find_line(text: str, message: str) -> int | None:
     """Return the line (from 1) of a machine file that a message is about, None if it names no key of the file.
 
-    The message begins with the path of a key, such as `front_roll: contact.Kx: ...` or `body[1].limit.torque: ...`; the
-    line whose path has most of these words counts, of several the first.
+    The message gives its line, or begins with the path of a key, such as `front_roll: contact.Kx: ...` or
+    `body[1].limit.torque: ...`; the line whose path has most of these words counts, of several the first.
     """
     said = AT_LINE.search(message)
     if said:
-        return int(said[1])
+        return int(said[1] or said[2])
     keys = takewhile(lambda part: " " not in part, message.split(": ")[:-1])
     words = list(dict.fromkeys(word for part in keys for word in WORD.findall(part)))
     best, place = 0, None

@@ -1,8 +1,8 @@
 """Design the fewest and shortest drives that reach a stated accuracy together.
 
 Information matrices of drives add up. Each drive is designed with the information of the others as prior, one after
-the other and then once more around. The number of drives grows until the target is reached at the longest duration;
-then all become shorter together, as long as the target is kept. Every length is a design of its own, so an accuracy
+the other and then once more around; where repeating one of them is better, it is repeated. The number of drives grows
+until the target is reached at the longest duration; then all become shorter together, as long as the target is kept. Every length is a design of its own, so an accuracy
 that is not reached is one that this search does not find: no bound.
 """
 
@@ -175,7 +175,8 @@ class _CampaignSearch:
         drives = list(begun)
         try:
             while len(drives) < count and not self.cut:
-                drives.append(self._design(problem, drives, self.starts, self.seed + len(drives)))
+                made = self._design(problem, drives, self.starts, self.seed + len(drives))
+                drives.append(min((made, *drives), key=lambda d: self.attained([*drives, d])))  # or one repeated
         except (InfeasibleError, SolverError):
             if fatal:
                 raise

@@ -131,6 +131,7 @@ mass = { value = -3, sourc = "assumed" }
         ("frame: inertia: has a negative principal moment", 16),
         ("sensor[0].column: is missing", 7),
         ("Invalid value (at line 9, column 3)", 9),
+        ("line 8: sensor u9: has no column", 8),
         ("the mass matrix is not positive definite", None),
     ],
 )
