@@ -2,8 +2,8 @@
 
 Information matrices of drives add up. Each drive is designed with the information of the others as prior, one after
 the other and then once more around; where repeating one of them is better, it is repeated. The number of drives grows
-until the target is reached at the longest duration; then all become shorter together, as long as the target is kept. Every length is a design of its own, so an accuracy
-that is not reached is one that this search does not find: no bound.
+until the target is reached at the longest duration; then all become shorter together, as long as the target is kept.
+Every length is a design of its own, so an accuracy that is not reached is one that this search does not find: no bound.
 """
 
 from __future__ import annotations
