@@ -80,7 +80,7 @@ def _speeds(machine: Machine) -> Iterator[str]:
         if speed is not None and float(speed) > MAX_SPEED[kind]:
             yield (
                 f"{b.name}: limit.rim_speed: {float(speed):g} m/s, usual of a {kind} are {MAX_SPEED[kind]:g} at most:"
-                f" in km/h? ({float(speed):g} km/h are {float(speed) / 3.6:.3g} m/s)"
+                f" in km/h? ({float(speed):g} km/h are {format_number(float(speed) / 3.6, 3)} m/s)"
             )
         rim = float(rate) * float(b.contact.radius) if rate is not None else 0.0
         if rim > (3 * float(speed) if speed is not None else MAX_SPEED[kind]):

@@ -261,7 +261,7 @@ def _scales(machine: dict[str, Any]) -> dict[str, Any]:
         alike = np.array([s for u, s in zip(model.base.units, sizes, strict=True) if u == unit and s > 0])
         typical = max(float(np.median(alike)) if len(alike) else 0.0, SIZES.get(unit, 1.0))
         if size < NEAR_ZERO * typical:
-            found[name] = _assumed(float(f"{typical:.2g}"))
+            found[name] = _assumed(float(np.format_float_positional(typical, precision=2, fractional=False)))
     return found
 
 

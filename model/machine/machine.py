@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -579,7 +578,7 @@ class Machine(FileRecord):
         """True if the root moves on the plane; velocities are then in the chassis' own axes."""
         return self.body[0].joint == "planar"
 
-    @cached_property
+    @property
     def actuated(self) -> tuple[Body, ...]:
         """Actuated bodies whose coordinate is free, one per drive.
 
@@ -609,7 +608,7 @@ class Machine(FileRecord):
         """Return a joint's angle from coordinates x (n_q, ...), or its rate from velocities."""
         return self.ratio(body) * x[self.coordinates.index(self.coordinate(body))]
 
-    @cached_property
+    @property
     def input_matrix(self) -> np.ndarray:
         """Matrix B (n_q, n_u): torques on the coordinates per torque of each drive, S^T of those on the joints."""
         B = np.zeros((len(self.coordinates), len(self.actuated)))
@@ -620,7 +619,7 @@ class Machine(FileRecord):
                     B[self.coordinates.index(self.coordinate(b)), k] += share * self.ratio(b)
         return B
 
-    @cached_property
+    @property
     def row_matrix(self) -> np.ndarray:
         """Matrix T (n_q, n_q) of the equations: T B has each drive's torque in the row of its own joint alone."""
         T, B = np.eye(len(self.coordinates)), self.input_matrix

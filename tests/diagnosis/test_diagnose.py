@@ -541,7 +541,7 @@ def test_panels_keep_apart_whatever_their_numbers(size: float) -> None:
     course = residuals.LogResiduals("log.csv", t, missing, quantities, (), cast(Any, None))
     figure = diagnosis_figures.misfit_figure(course, course, "a roller")
     FigureCanvasAgg(figure).draw()
-    *axes, _ = figure.axes
+    axes = figure.axes
     taken = [ax.get_tightbbox().padded(-1) for ax in axes] + [text.get_window_extent() for text in figure.texts]
     taken += [legend.get_window_extent() for legend in figure.legends]
     assert len(axes) == 6
