@@ -221,7 +221,7 @@ def describe_campaign(s: Summary) -> Description:
     if s["within_s"] is not None:
         limit += f" and {s['within_s']:g} s in all"
     if s["reached"]:
-        headline = f"After {length}, {s['total_s'] / 60:.2g} min of driving, {what} (target {target})."
+        headline = f"After {length}, {format_number(s['total_s'] / 60, 2)} min of driving, {what} (target {target})."
     else:
         headline = (
             f"Not reachable within {limit}, as far as this search finds: the best is {length}, after which {what}"

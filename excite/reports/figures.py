@@ -215,7 +215,7 @@ def sensors_figure(values: Sequence[SensorValue], title: str) -> Figure:
         ax.plot([getattr(v, key) for v in changes][::-1], names, mark, color=COLOURS[k], label=f"{label} parameter")
     ax.set_xscale("log")
     ax.xaxis.set_major_formatter("{x:g}")
-    ax.xaxis.set_minor_formatter("{x:.2g}")
+    ax.xaxis.set_minor_formatter(lambda x, place: format_number(x, 2))
     ax.tick_params(axis="x", which="minor", labelsize=7)
     ax.set_xlabel("attainable standard deviation [% of the nominal value]")
     ax.grid(axis="x", which="both", alpha=0.3)
@@ -251,7 +251,7 @@ def draw_campaign(ax: Axes, summary: Mapping[str, Any]) -> None:
     ax.set_yscale("log")
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter("{x:.2g}")
+        axis.set_minor_formatter(lambda x, place: format_number(x, 2))
     ax.tick_params(which="minor", labelsize=7)
     ax.set_xlabel("driving [min]")
     ax.set_ylabel(f"{'worst parameter' if summary['objective'] == 'worst' else summary['objective']} [%]")

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from excite.identification import SlipFit, SlipLaw
 from excite.logs import SlipTable
 from excite.reports.figures import COLOURS, STYLES, escape_dollar
+from excite.text import format_number
 
 MAX_BARS = 10  # laws whose errors are drawn; chosen
 ANGLES_DIFFER = np.radians(2)  # chosen
@@ -89,7 +90,7 @@ def _bars(ax: Axes, fit: SlipFit, soil: SlipLaw | None) -> None:
     ax.barh(places, [x.rms_left_out for x in laws], color=colours, height=0.6)
     for y, law in zip(places, laws, strict=True):
         at = law.rms_left_out, y
-        ax.annotate(f"{at[0]:.3g}", at, xytext=(3, 0), textcoords="offset points", va="center", fontsize=8)
+        ax.annotate(format_number(at[0], 3), at, xytext=(3, 0), textcoords="offset points", va="center", fontsize=8)
     ax.set_yticks(places, [x.name.replace(" + ", "\n+ ") for x in laws], fontsize=7)
     known = [r for r in fit.repeatability.values() if r is not None]
     if known:
