@@ -277,7 +277,7 @@ def slip(
     Raises LogError for an unusable table, UsageError for an unknown `per` or contact, NotIdentifiableError for too few
     settings.
     """
-    workflows.require_known("per", per, ("rim", "larger"))
+    workflows.require_known("per", per, readers.SLIP_PER)
     fit = fit_slip_laws(readers.read_slip_table(table, columns, units, per, radius))
     return ShownSlip.of(fit, partial(workflows.slip_account, fit, soil, machine, where))
 

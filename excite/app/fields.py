@@ -21,7 +21,7 @@ UPLOAD = """async (event) => {
 
 
 class Page(Protocol):
-    """What fields need of the page: to be brought up to date."""
+    """The page, which fields bring up to date."""
 
     def tick(self) -> None: ...
 

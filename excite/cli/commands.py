@@ -667,6 +667,7 @@ def slip(
     """
     from math import radians
 
+    from excite.logs import SLIP_PER
     from excite.model.mechanics import SoilConstants
 
     given = (cohesion, friction_angle, shear_modulus, contact_length, width, load)
@@ -681,7 +682,7 @@ def slip(
             soil = SoilConstants(c, radians(phi), K, length, wide, weight)
         except ValueError as err:
             raise UsageError(f"soil: {err}") from None
-    workflows.require_known("--per", per, ("rim", "larger"))
+    workflows.require_known("--per", per, SLIP_PER)
     columns, units = (_pairs(option, x or []) for option, x in (("--column", column), ("--unit", unit)))
     out = out or Path(f"results/slip-{table.stem if table else 'soil'}")
     inputs = [*([table] if table else []), *(_machine_file(machine) if machine else [])]

@@ -54,7 +54,7 @@ class SlipLaw:
 
     @property
     def parts(self) -> frozenset[object]:
-        """What the law has beyond the linear one."""
+        """The law's additions to the linear one."""
         return frozenset((*self.effects, *(("by load",) if self.by_load else ())))
 
     def forces(self, table: SlipTable) -> np.ndarray:

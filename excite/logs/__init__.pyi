@@ -31,5 +31,10 @@ from .profile import (
     torque_column as torque_column,
 )
 from .repair import NEEDED as NEEDED, examine as examine, moves as moves
-from .slip_table import SLIP_ROLES as SLIP_ROLES, SlipTable as SlipTable, read_slip_table as read_slip_table
+from .slip_table import (
+    SLIP_PER as SLIP_PER,
+    SLIP_ROLES as SLIP_ROLES,
+    SlipTable as SlipTable,
+    read_slip_table as read_slip_table,
+)
 from .tables import read_table as read_table

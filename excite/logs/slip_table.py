@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from excite.text import count
 
 @dataclass(frozen=True)
 class Role:
-    """What a column of the table may be: its SI unit, the quantities of its units, and the names it goes by."""
+    """A kind of column: its SI unit, the quantities of its units, the names it goes by, its meaning."""
 
     unit: str
     quantities: tuple[str, ...]
@@ -82,7 +82,7 @@ SAME_ANGLE = math.radians(2)  # [rad] the same of slip angles; chosen
 SAME_LOAD = 0.1  # the same of loads, of their mean; chosen
 SWEEP_LEVELS = 12  # stretches of slip that a continuous sweep is divided into; chosen
 MIN_RIM_SHARE = 0.05  # rim speed over forward speed, below which slip divided by the rim speed says nothing; chosen
-PER = ("rim", "larger")
+SLIP_PER = ("rim", "larger")  # speeds that slips may be divided by
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def _rows(t: SlipTable, at: np.ndarray, notes: tuple[str, ...]) -> SlipTable:
     forces = {k: v[at] for k, v in t.forces.items()}
     _, level = np.unique(t.level[at], return_inverse=True)
     load = None if t.load is None else t.load[at]
-    return SlipTable(t.source, t.Vx[at], t.Vy[at], t.rim[at], load, forces, level, t.per, notes)
+    return replace(t, Vx=t.Vx[at], Vy=t.Vy[at], rim=t.rim[at], load=load, forces=forces, level=level, notes=notes)
 
 
 def _require_usable(t: SlipTable) -> SlipTable:
@@ -232,11 +232,12 @@ class _Column:
             name, sign = best[0], 1.0
         unit = (units.get(role) or said.get(name) or _split(name)[1] or "").strip("[]() ")
         values = sign * pd.to_numeric(table[name], errors="coerce").to_numpy(float)
-        return cls(name, values * _size(source, role, name, unit, values), unit or SLIP_ROLES[role].unit, _remark(sign))
-
-
-def _remark(sign: float) -> str:
-    return "" if sign > 0 else ", sign turned"
+        return cls(
+            name,
+            values * _size(source, role, name, unit, values),
+            unit or SLIP_ROLES[role].unit,
+            "" if sign > 0 else ", sign turned",
+        )
 
 
 def _size(source: str, role: str, name: str, unit: str, values: np.ndarray) -> float:

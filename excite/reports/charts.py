@@ -50,7 +50,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Panel:
-    """What one axes of a figure shows. outlines: of shaded bands, each with colour and opacity."""
+    """The content of one axes of a figure. outlines: of shaded bands, each with colour and opacity."""
 
     x_label: str
     y_label: str
@@ -72,7 +72,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Explorable:
-    """What of a figure a chart shows; whole: whether that is all of it, but for colour bars."""
+    """The part of a figure that a chart shows; whole: whether that is all of it, but for colour bars."""
 
     panels: tuple[Panel, ...]
     whole: bool

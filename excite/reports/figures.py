@@ -21,7 +21,7 @@ from excite.model import Model, signal_descriptions
 from excite.model.machine import Problem
 from excite.reports.charts import EXPLORE, Explorable, explorable
 from excite.simulation import Motion
-from excite.text import format_number
+from excite.text import count, format_number
 from excite.trajectories import DESIGNED, ComparisonRow, SensorValue
 
 # Okabe-Ito colours, distinct for the colour-blind; line styles are distinct in black and white.
@@ -32,7 +32,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
 LINEAR_UP_TO = 5.0  # errors [%] up to which their axis is linear; chosen
 UNIT_OF_COLUMN = re.compile(r"_(Nm|N|(rad|m)(_s)?)$")  # at the end of a profile's columns
-POINTS_PER_INCH = 72
+POINTS_PER_INCH = 72  # pt/in, definition
 TITLE_SIZE = 11  # pt; chosen
 LETTER = 0.58  # width of a letter as a share of its size, on average
 LEGEND_WIDTH, LEGEND_HANDLE = 470.0, 38.0  # pt: of a legend above a plot, and of an entry without its letters; chosen
@@ -207,7 +207,7 @@ def sensors_figure(values: Sequence[SensorValue], title: str) -> Figure:
     now, *changes = values
     figure = Figure(figsize=(8, 1.4 + 0.27 * len(changes)), layout="constrained")
     ax = figure.subplots()
-    figure.suptitle(escape_dollar(title), fontsize=11)
+    set_title(figure, title)
     names = [f"{v.sensor}, {v.change}" for v in changes][::-1]
     of = {"worst": ("worst_percent", "o"), "median": ("median_percent", "s")}
     for k, (label, (key, mark)) in enumerate(of.items()):
@@ -240,10 +240,10 @@ def draw_campaign(ax: Axes, summary: Mapping[str, Any]) -> None:
     repeats = max(first["duration_s"] * max(1.0, first["percent"] / target) ** 2, most)
     t = np.geomspace(first["duration_s"], 1.05 * repeats, 50)
     ax.plot(t / 60, first["percent"] * np.sqrt(first["duration_s"] / t), color="0.65", label="first drive repeated")
-    for k, count in enumerate(sorted({t["drives"] for t in trials})):
-        own = sorted((t["duration_s"], t["percent"]) for t in trials if t["drives"] == count)
-        minutes = [count * seconds / 60 for seconds, _ in own]
-        label = f"{count} drive{'s' if count > 1 else ''}"
+    for k, drives in enumerate(sorted({t["drives"] for t in trials})):
+        own = sorted((t["duration_s"], t["percent"]) for t in trials if t["drives"] == drives)
+        minutes = [drives * seconds / 60 for seconds, _ in own]
+        label = count(drives, "drive")
         ax.plot(minutes, [percent for _, percent in own], marker="o", markersize=4, **_style(k), label=label)
     ax.axhline(target, color="k", linestyle=":", linewidth=1)
     ax.plot(summary["total_s"] / 60, summary["attained_percent"], "kD", fillstyle="none", markersize=9, label="answer")

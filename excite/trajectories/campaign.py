@@ -30,7 +30,7 @@ EXPONENTS = (0.5, 3.0)  # least and greatest exponent: 0.5 is repetition; chosen
 
 @dataclass(frozen=True)
 class CampaignTrial:
-    """What drives of one duration [s] each attain together [%]; inf if no drive keeps the limits."""
+    """The accuracy [%] that drives of one duration [s] attain together; inf if no drive keeps the limits."""
 
     drives: int
     duration_s: float

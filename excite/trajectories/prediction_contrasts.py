@@ -1,4 +1,4 @@
-"""What a drive must show so that another one can be predicted: sensitivities of predicted signals to the parameters."""
+"""Sensitivities of predicted signals to the parameters: a drive must show these to predict another one."""
 
 from __future__ import annotations
 

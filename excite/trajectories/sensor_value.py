@@ -1,4 +1,4 @@
-"""What each sensor buys along a drive: attainable accuracy without it, with it, and with half its noise."""
+"""Accuracy along a drive without each sensor, with it, and with half its noise."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from excite.errors import MachineError
 from excite.model.effects import sizes
-from excite.model.effects.effect import SampleView, Shape, Values
+from excite.model.effects.effect import SampleView, Shape, Values, unit_size
 
 MAP_NODES = 11  # rows of the table; chosen
 SIGNALS = ("angle", "speed", "torque")  # in the order of the shape `signal`
@@ -32,7 +32,7 @@ def map_shapes() -> dict[str, Shape]:
 
 
 def _constant(unit: str, default: float, meaning: str = "", only: tuple[float, ...] = ()) -> Shape:
-    size = sizes.coulomb(0.05) if unit == "N m" else sizes.constant(1.0)
+    size = sizes.coulomb(0.05) if unit == "N m" else unit_size
     return Shape(unit, default, (default,), size, whole=True, meaning=meaning, only=only, either_sign=True)
 
 

@@ -19,6 +19,7 @@ from .machine import (
     shipped_machines as shipped_machines,
 )
 from .meanings import MEANINGS as MEANINGS
+from .places import key_lines as key_lines, named as named
 from .records import (
     FileRecord as FileRecord,
     Number as Number,
