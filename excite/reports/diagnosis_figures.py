@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,7 @@ def figure_calls(place: Path, d: Diagnosis | TorqueDiagnosis, title: str) -> lis
     """
     if isinstance(d, TorqueDiagnosis):
         return [partial(_save, draw, place / file) for file, draw in figures_by_file(d, title).items()]
-    return [partial(_draw, place, d, title, kind) for kind in KINDS]
+    return [partial(_draw, place, d, title, kinds) for kinds in TOGETHER]
 
 
 def figures_by_file(d: Diagnosis | TorqueDiagnosis, title: str) -> dict[str, Callable[[], Figure]]:
@@ -65,29 +66,29 @@ def _file(kind: str, k: int, n: int) -> str:
 
 
 def _one(d: Diagnosis, title: str, kind: str, k: int) -> Figure:
-    return list(_figures(d, title, kind))[k]
+    return next(islice(_figures(d, title, (kind,)), k, None))[1]
 
 
-def _draw(place: Path, d: Diagnosis, title: str, kind: str) -> dict[str, Explorable]:
-    """Draw one of the figures of every log."""
-    figures = list(_figures(d, title, kind))
-    files = [_file(kind, k, len(figures)) for k in range(len(figures))]
-    return {file: save(one, place / file) for file, one in zip(files, figures, strict=True)}
+def _draw(place: Path, d: Diagnosis, title: str, kinds: Sequence[str]) -> dict[str, Explorable]:
+    """Draw some of the figures of every log."""
+    return {file: save(one, place / file) for file, one in _figures(d, title, kinds)}
 
 
-def _figures(d: Diagnosis, title: str, kind: str) -> Iterator[Figure]:
-    """Yield one of the figures for every log."""
+def _figures(d: Diagnosis, title: str, kinds: Sequence[str]) -> Iterator[tuple[str, Figure]]:
+    """Yield some of the figures for every log, each with its file."""
     before, after = d.before, d.after
-    if kind != "when" and before.exact != after.exact:
+    if "when" not in kinds and before.exact != after.exact:
         # Show forces that one of the two models needs for the other as well.
         before, after = diagnosis.refit_with_process_noise(before), diagnosis.refit_with_process_noise(after)
     without = diagnosis.residuals_of_logs(before)
     beside = diagnosis.residuals_of_logs(after) if d.stages else [None] * len(without)
-    figure = KINDS[kind]
-    if kind == "when":
-        figure = partial(when_figure, words=signal_descriptions(before.machine))
-    for old, new in zip(without, beside, strict=True):
-        yield figure(old, new, f"{title}: {Path(old.source).name}")
+    draws: dict[str, Callable[..., Figure]] = {
+        **KINDS,
+        "when": partial(when_figure, words=signal_descriptions(before.machine)),
+    }
+    for k, (old, new) in enumerate(zip(without, beside, strict=True)):
+        for kind in kinds:
+            yield _file(kind, k, len(without)), draws[kind](old, new, f"{title}: {Path(old.source).name}")
 
 
 Evidence = dict[str, dict[str, float]]  # strength of the dependence of each torque or force on each quantity
@@ -258,6 +259,7 @@ def _map(ax: Axes, course: LogResiduals, norm: LogNorm) -> None:
 
 
 KINDS = {"clearest": clearest_figure, "misfit": misfit_figure, "when": when_figure}  # figures of each log
+TOGETHER = (("clearest", "misfit"), ("when",))  # kinds that are drawn from the same fits
 
 
 def _edges(x: np.ndarray) -> np.ndarray:
