@@ -25,7 +25,6 @@ from excite.model.machine import load_machine
 
 Hidden = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 SECONDS, VOLTS_PER_NEWTON = 25.0, 1 / 35.1507
-GROUPS = Path(__file__).parents[2] / "results" / "intervals"  # the machine files of the robots
 
 
 def rig_log(seed: int, hidden: Hidden | None = None, error: float = 2.0) -> pd.DataFrame:
@@ -204,7 +203,7 @@ def test_a_six_joint_robot_has_corrections_that_pay(tmp_path: Path) -> None:
     data = SHARED / "ur10e" / "20_02_19_14harm50sec.csv"
     if not data.is_file():
         pytest.skip(f"{data} is missing")
-    summary = run_command(GROUPS / "ur10e.toml", data, tmp_path / "diagnosis")
+    summary = run_command("ur10e", data, tmp_path / "diagnosis")
     assert summary["verdict"] == "unexplained"
     assert summary["findings"]
     assert all(f["kind"] == "correction" for f in summary["findings"])  # type: ignore[attr-defined]
