@@ -14,6 +14,7 @@ import tomli_w
 from excite import identification, interrupt
 from excite.diagnosis import hold_out, residuals, separating_run, torque_regression
 from excite.diagnosis.acceptance import reason_against, widen
+from excite.diagnosis.clean_simulation import Remainder, measure_remainder
 from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.diagnosis import MIN_EXPLAINED_SHARE, Diagnosis, Finding, NearestEffect, anomaly_lines, diagnose
 from excite.diagnosis.fits import ExtendedFit, with_true_sensor_noise
@@ -35,7 +36,7 @@ MIN_NEAREST_SHARE = 0.05  # share of the misfit above which the nearest effect i
 MAX_FOLLOWED_JOINTS = 3  # driven joints of a machine without slips whose motion is followed in open loop; chosen
 SMOOTHING_SHARE = 0.6  # of a budget of time, where regression may follow; chosen
 DIAGNOSE_SHARE = 0.8  # of the progress; gains take the rest; chosen
-FULL_EXPLANATION_SHARE = 0.9  # share of the misfit below which the answer gives it; chosen
+FULL_EXPLANATION_SHARE = 0.99  # share of the misfit below which the answer gives it; chosen
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ class Assessment:
     logs. before, after: size of each signal's innovations without and with the findings. located: where the misfit is.
     separating_run: the run that would separate tied causes. cut_short: what ended the search, "" if it ended by itself.
     differences: between logs of which each alone is explained, None if there are none; no effect is sought then.
+    remainder: misfit beyond that of clean logs of the fitted machine, None where it cannot be told.
     """
 
     diagnosis: Diagnosis | TorqueDiagnosis
@@ -57,6 +59,7 @@ class Assessment:
     separating_run: str | None
     cut_short: str = ""
     differences: Agreement | None = None
+    remainder: Remainder | None = None
 
 
 def assess(
@@ -95,9 +98,30 @@ def assess(
             *residuals.locate_misfit(measured),
             *other_lines[FIRST_ANOMALY_LINES:],
         )
+    remainder = None if deadline.is_over() else measure_remainder(d.after, runner)
+    if remainder is not None and remainder.chi2 > 0:
+        if d.findings:
+            d = _with_remainder(d, remainder.chi2)
+        elif d.verdict == "clean":
+            d = replace(d, verdict="unexplained", share=0.0)
+            located = (f"{format_number(remainder.chi2, 3)} of chi-squared beyond noise, {remainder}",)
     return Assessment(
-        d, total_gain, gains, before, after, tuple(dict.fromkeys(located)), separating_run.recommend_run(d)
+        d,
+        total_gain,
+        gains,
+        before,
+        after,
+        tuple(dict.fromkeys(located)),
+        separating_run.recommend_run(d),
+        remainder=remainder,
     )
+
+
+def _with_remainder(d: Diagnosis, chi2: float) -> Diagnosis:
+    """Count the shares that findings explain against the misfit that they leave."""
+    gained = sum(f.likelihood_ratio for f in d.findings) * d.after.dispersion
+    factor = min(1.0, gained / (gained + chi2) / max(sum(f.share for f in d.findings), 1e-12))
+    return replace(d, share=factor * d.share, findings=tuple(replace(f, share=factor * f.share) for f in d.findings))
 
 
 Entry = tuple[Finding, ExtendedFit]
@@ -288,6 +312,7 @@ def summarise(a: Assessment) -> dict[str, Any]:
         "signals": signal_table(a),
         "separating_run": a.separating_run,
         "share_explained": d.share,
+        "remainder": _remainder_row(a.remainder),
         "located": list(a.located),
         "nearest": {
             "effect": d.nearest.name,
@@ -316,6 +341,20 @@ def _finding_row(f: Finding, g: HoldOutGain | None) -> dict[str, Any]:
         "chi2_gain": f.likelihood_ratio,
         "gain_percent": g.percent if g else None,
         "gain_ci95": _interval_list(g),
+    }
+
+
+def _remainder_row(r: Remainder | None) -> dict[str, Any] | None:
+    """Tabulate the misfit that is left: sum of squared innovations beyond noise, its place and its size."""
+    if r is None:
+        return None
+    return {
+        "chi2": r.chi2,
+        "chi2_std": r.std,
+        "signal": r.signal or None,
+        "signal_share_percent": 100 * r.share,
+        "times_noise": r.ratio,
+        "where": list(r.where),
     }
 
 
@@ -414,11 +453,19 @@ def answer_text(a: Assessment) -> str:
             f" On withheld stretches the error of the model with it is {change}; most in {largest[1]}, by"
             f" {100 * largest[0]:.0f} %."
         )
-    if d.share < FULL_EXPLANATION_SHARE:
-        remark = f" That is {100 * d.share:.0f} % of the misfit; the rest is unexplained.{remark}"
+    if a.remainder is not None and a.remainder.chi2 > 0:
+        remark = f" That is {format_share(d.share)} of the misfit; the rest is unexplained, {a.remainder}.{remark}"
+    elif d.share < FULL_EXPLANATION_SHARE:
+        remark = f" That is {format_share(d.share)} of the misfit; the rest is unexplained.{remark}"
     if d.verdict == "tied":
         return f"{logs} {named}: the data cannot tell which.{remark}"
     return f"{logs} {named}: {'; '.join(format_magnitude(r) for r in rows)}.{remark}"
+
+
+def format_share(share: float) -> str:
+    """Format a share (0 to 1) in per cent, never as all of it if something is left."""
+    percent = 100 * share
+    return f"{format_number(percent, 3 if percent > 99 else 2)} %"
 
 
 def _with_rivals(row: Mapping[str, Any]) -> str:

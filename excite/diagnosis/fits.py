@@ -245,7 +245,7 @@ def fit_machine(
     All attempts start at once where there are processes for them. extra_torque_noise: see `Measurements`. Raises
     NotConvergedError.
     """
-    data = _prepare(machine, logs, filter, extra_torque_noise)
+    data = prepare_data(machine, logs, filter, extra_torque_noise)
     calls: list[Callable[[], Any]] = [
         partial(_fit_exact_from_start, data),
         partial(fit_reducing_process_noise, machine, data, identification.PROCESS_NOISE_LEVELS[0]),
@@ -657,9 +657,10 @@ def _build_space(machine: Machine, logs: Sequence[Log]) -> StateSpace:
     return build_state_space(model, common_sensors(model, logs))
 
 
-def _prepare(
+def prepare_data(
     machine: Machine, logs: Sequence[Log], filter: Filter, extra_torque_noise: Sequence[np.ndarray] | None = None
 ) -> FitData:
+    """Prepare logs for a machine; extra_torque_noise: see `Measurements`."""
     space = _build_space(machine, logs)
     measurements, starts = prepare_logs(space, logs, filter, extra_torque_noise=extra_torque_noise)
     return FitData(

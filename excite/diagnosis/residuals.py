@@ -304,7 +304,7 @@ def locate_misfit(stage: ExtendedFit) -> tuple[str, ...]:
             parts = [
                 f"innovations {np.sqrt(size.mean_square):.2f} times,"
                 f" slow ones {np.sqrt(size.slow_mean_square):.2f} times what noise gives",
-                *_concentrations(log_residuals, z),
+                *concentrations(log_residuals, z),
             ]
             peak = _spectral_peak(log_residuals, z)
             if peak is not None:
@@ -323,7 +323,7 @@ def locate_misfit(stage: ExtendedFit) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _concentrations(log_residuals: LogResiduals, z: np.ndarray) -> list[str]:
+def concentrations(log_residuals: LogResiduals, z: np.ndarray) -> list[str]:
     """Describe up to two ranges of quantities that hold most of the excess of innovations z (N,) in few samples."""
     block = log_residuals.block
     n = len(z) // block

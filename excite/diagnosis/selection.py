@@ -79,6 +79,7 @@ MIN_GAIN_SHARE_MAPPED = 0.02  # beside effects on a map of the ground; two maps 
 TIE_LIKELIHOOD_RATIO = 10.0  # likelihood ratio; chosen
 TIE_EXCESS_SHARE = 0.3  # share of the excess cost that the best effect leaves; chosen
 TIE_GAIN_SHARE_WITH_NOISE = 0.02  # share of the gain with process noise, which absorbs differences; chosen
+COMPARED_GAIN_SHARE = 0.1  # the same up to which trials are compared without process noise if that is possible; chosen
 
 TRANSITION = "friction_transition"  # has no meaning where friction near rest is free
 MIN_MAGNITUDE_STDS = 0.3  # standard deviations from zero below which a positive magnitude fell to zero; chosen
@@ -347,11 +348,14 @@ def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runne
         {s.candidate.name: stage for s, stage in trials if not stage.exact},
     )
     ties = _tied_trials(trials, gain)
-    exact, unknown = _trials_without_noise(ties, runner)
+    compared = _tied_trials(trials, gain, COMPARED_GAIN_SHARE) if with_noise else ties
+    exact, unknown = _trials_without_noise(compared, runner)
+    names = {s.candidate.name for s, _ in ties}
+    unknown = [x for x in unknown if x[0].candidate.name in names]
     lowest = trials[0][1].fit.cost
     if with_noise and exact and not exact[0][1].is_close:
         # Process noise hid that the best does not explain the logs: try those that were a little worse with it.
-        left = [x for x in trials if x[0].candidate.name not in {s.candidate.name for s, _ in ties}]
+        left = [x for x in trials if x[0].candidate.name not in {s.candidate.name for s, _ in compared}]
         others, _ = _trials_without_noise(
             [x for x in left if x[1].fit.cost - lowest <= (1 - VARIANT_SCORE_SHARE) * gain], runner
         )

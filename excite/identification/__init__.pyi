@@ -6,7 +6,11 @@ from .agreement import (
     describe_changes as describe_changes,
     summarise_agreement as summarise_agreement,
 )
-from .bias import SIGNIFICANT_BIAS as SIGNIFICANT_BIAS
+from .bias import (
+    SIGNIFICANT_BIAS as SIGNIFICANT_BIAS,
+    measured_again as measured_again,
+    simulate_along_log as simulate_along_log,
+)
 from .consistency import possible_standard as possible_standard
 from .delays import describe_late_channels as describe_late_channels
 from .estimate import Estimate as Estimate

@@ -16,7 +16,7 @@ from excite.identification.noise_propagation import measure_again
 from excite.logs import Log, Samples, lowpass, samples, white_noise
 from excite.model import Model
 from excite.model.machine import Filter
-from excite.simulation import Motion, exact_readings, respond
+from excite.simulation import Motion, delivered_torques, exact_readings, respond
 from excite.text import format_percent
 
 RUNS = 8  # simulated logs; chosen
@@ -122,7 +122,8 @@ def simulate_along_log(model: Model, log: Log, X: np.ndarray, filter: Filter) ->
     """
     s = samples(model, log, filter)
     rows, n_q = list(model.actuated), len(model.coordinates)
-    torque = lowpass(s.Y[rows], float(model.machine.sampling_hz), filter).T - model.offsets @ X
+    read = lowpass(s.Y[rows], float(model.machine.sampling_hz), filter).T
+    torque = delivered_torques(log.t, read, [x.full() for x in model.channels(log.t[None], X)])
     speed = s.nu[rows].T
     gain = _inertia(model, s, X, rows) / HOLD_TIME
 
@@ -137,7 +138,8 @@ def _inertia(model: Model, s: Samples, X: np.ndarray, rows: Sequence[int]) -> np
     a = np.eye(len(model.coordinates))
     q, nu = (np.repeat(v[:, :1], len(a), axis=1) for v in (s.q, s.nu))
     p = model.expand @ X
-    M = model.predict(q, nu, a, p).full() - model.predict(q, nu, 0 * a, p).full()
+    beside = () if model.plain else (np.zeros((len(model.inputs), 1)), model.initial_memory[:, None])
+    M = model.predict(q, nu, a, p, *beside).full() - model.predict(q, nu, 0 * a, p, *beside).full()
     return np.abs(np.diag(M)[list(rows)])
 
 

@@ -123,6 +123,18 @@ def _relief_loss(s: SampleView, k: int, p: Values) -> ca.SX:
     return -p["A"] * over
 
 
+def _square_loss(s: SampleView, k: int, p: Values) -> ca.SX:
+    """Return the torque lost as the square of the torque."""
+    u, width = s.u[k], TORQUE_SMOOTHING * s.large_torque[k]
+    return -p["A"] * u * ca.sqrt(u**2 + width**2) / s.large_torque[k]
+
+
+def _mass_change(s: SampleView, p: Values) -> dict[str, ca.SX]:
+    """Return the changes of mass, first moment and yaw inertia due to mass that leaves or comes at a steady rate."""
+    mass = p["A"] * s.time
+    return {"M": mass, "MX": mass * p["ahead"], "ZZ": mass * p["ahead"] ** 2}
+
+
 def _payload_trials(site: Site) -> list[dict[str, float]]:
     """Return trials of a load that slides at each of the instants, or is put on or taken off at every sixth.
 
@@ -309,6 +321,27 @@ _declare(
         sizes.constant(0.03),
         positive=True,
         channel=lambda t, p: Channel(delay=p["A"]),
+    ),
+    Effect(
+        "clock_drift",
+        ("drives",),
+        "-",
+        "the torque channel's clock runs slow by A: it is late by A t",
+        "torque errors proportional to the torque's rate of change that grow with time",
+        "IEEE Std 1588: drift of free-running clocks",
+        sizes.constant(5e-4),
+        channel=lambda t, p: Channel(delay=p["A"] * t),
+        timed=True,
+    ),
+    Effect(
+        "torque_nonlinearity",
+        ("drives",),
+        "-",
+        "a large torque is delivered less by the share A, smaller ones by less: u (1 - A abs(u) / large torque)",
+        "a loss of torque that grows with the square of the torque",
+        "losses that grow with pressure, Merritt, Hydraulic Control Systems, 1967, ch. 4; sensors, Doebelin, ch. 5",
+        sizes.constant(0.05),
+        torque=_square_loss,
     ),
     Effect(
         "torque_gain",
@@ -580,6 +613,18 @@ _declare(
         inertia=_payload_change,
         recoil="recoil",
         extra_trials=_payload_trials,
+        timed=True,
+    ),
+    Effect(
+        "mass_drift",
+        ("machine",),
+        "kg/s",
+        "the mass of the last chassis grows by A a second, ahead of its joint; what comes or goes has the speed there",
+        "inertial forces that grow or fade steadily",
+        "Meshchersky's equation of a body of variable mass, 1897; a tank that empties",
+        sizes.load_rate,
+        {"ahead": Shape("m", -1.0, (-2.0, -1.0, -0.5), either_sign=True)},
+        inertia=_mass_change,
         timed=True,
     ),
     # Articulation

@@ -88,6 +88,11 @@ def weight(share: float) -> Callable[[Site], float]:
     return lambda site: share * GRAVITY * _machine_mass(site.machine)
 
 
+def load_rate(site: Site) -> float:
+    """Rate of mass [kg/s]: 0.1 % of the machine's mass a second (chosen)."""
+    return 0.001 * _machine_mass(site.machine)
+
+
 def load_moment(site: Site) -> float:
     """First moment [kg m] of 5 % of the machine's mass at 1 m (chosen)."""
     return 0.05 * _machine_mass(site.machine)

@@ -161,7 +161,7 @@ def pressure_leakage(t: Trial, size: float, draw: Draw) -> Key:
     """A share of the torque that grows with pressure is lost. Source: Merritt, Hydraulic Control Systems, 1967."""
     place = _roll(draw)
     t.scene.torque[JOINTS[place]].append(lambda U: U * (1 - 0.35 * size * ca.sqrt(U**2 + 100.0) / 5000))
-    return Key(related=(f"relief_valve@{place}",))
+    return Key(((f"torque_nonlinearity@{place}",),), related=(f"relief_valve@{place}",))
 
 
 def friction_memory(t: Trial, size: float, draw: Draw) -> Key:
@@ -335,7 +335,7 @@ def tank_empties(t: Trial, size: float, draw: Draw) -> Key:
     mass = 2500.0 * size * (1 - s.t / 60)
     s.point(mass, "rear", x, 0.0)
     s.push("rear", x, 0.0, ca.jacobian(mass, s.t) * s.velocity(s.place("rear", x, 0.0)))  # water leaves with its speed
-    return Key(related=("payload_shift@machine",))
+    return Key((("mass_drift@machine",),))
 
 
 def belt_creep(t: Trial, size: float, draw: Draw) -> Key:
@@ -476,7 +476,7 @@ def clocks_apart(t: Trial, size: float, draw: Draw) -> Key:
     """One torque channel's clock runs up to 0.2 % slow: later and later. Source: IEEE 1588, drift of free clocks."""
     place = _joint(draw)
     t.sensed(TORQUE_COLUMN[place], lambda at, x: np.interp(at * (1 - 0.002 * size), at, x))
-    return Key(related=(f"channel_delay@{place}",))
+    return Key(((f"clock_drift@{place}",),))
 
 
 def late_encoder(t: Trial, size: float, draw: Draw) -> Key:

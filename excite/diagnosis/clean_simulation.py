@@ -1,0 +1,113 @@
+"""Misfit that a fit leaves, beside what clean logs of the fitted machine leave.
+
+The fitted machine is simulated along the log, read by sensors like the log's, and fitted again: a parametric bootstrap
+(Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 6). The cost of such a fit is what noise, counts
+and the sampling leave, several per cent less or more than one for each reading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from excite import identification, smoothing
+from excite.diagnosis.fits import ExtendedFit, iterate, prepare_data
+from excite.diagnosis.parallel import CallRunner, run_in_turn
+from excite.diagnosis.residuals import concentrations, residuals_of_logs
+from excite.errors import SimulationError
+from excite.logs import Log
+from excite.smoothing import NotConvergedError
+from excite.text import format_number
+
+RUNS = 2  # simulated logs, which runs of two processes give in the time of one; chosen
+MIN_STDS = 4.0  # standard deviations beyond clean logs from which a misfit is significant; chosen
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """Misfit beyond noise that a fit leaves.
+
+    chi2: sum of squared innovations beyond that of clean logs, 0 if it is not significant. std: its standard deviation.
+    signal: the one with the largest part. share: of the misfit in this signal, 0 to 1. ratio: root mean square of this
+    signal's innovations over those of clean logs. where: times or states of the machine that hold most of it.
+    """
+
+    chi2: float
+    std: float
+    signal: str = ""
+    share: float = 0.0
+    ratio: float = 1.0
+    where: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        """Describe a significant misfit."""
+        places = f" ({'; '.join(self.where)})" if self.where else ""
+        return (
+            f"{format_number(100 * self.share, 2)} % of it in {self.signal}, whose residuals are"
+            f" {format_number(self.ratio, 3)} times noise{places}"
+        )
+
+
+def measure_remainder(stage: ExtendedFit, runner: CallRunner = run_in_turn, seed: int = 0) -> Remainder | None:
+    """Compare the misfit of a fit with that of clean logs of the fitted machine.
+
+    Return None where it cannot be told: process noise or inflated sensor noise absorbs a misfit, friction sticks, or
+    the fitted machine cannot be simulated.
+    """
+    if not (stage.estimated and stage.exact) or stage.data.sticks:
+        return None
+    calls = [partial(_clean_squares, stage, seed + k) for k in range(RUNS)]
+    found = [squares for squares in runner(calls) if squares is not None]
+    if not found:
+        return None
+    own, counts = _squares(stage)
+    clean = np.mean([squares / np.maximum(n, 1) for squares, n in found], axis=0) * counts
+    left, total = own - clean, float(counts.sum())
+    std = float(np.sqrt(2 * total * (1 + 1 / len(found))))
+    chi2 = float(left.sum())
+    if chi2 < MIN_STDS * std:
+        return Remainder(0.0, std)
+    j = int(left.argmax())
+    name = stage.data.space.sensors[j].name
+    return Remainder(
+        chi2,
+        std,
+        name,
+        float(left[j] / np.maximum(left, 0).sum()),
+        float(np.sqrt(own[j] / max(clean[j], 1e-300))),
+        tuple(dict.fromkeys(line for r in residuals_of_logs(stage) for line in concentrations(r, r.innovations[:, j]))),
+    )
+
+
+def simulate_clean(stage: ExtendedFit, seed: int) -> list[Log]:
+    """Simulate logs of the fitted machine along the logs of a fit. Raises SimulationError."""
+    model, X, filter = stage.model, stage.fit.X, stage.machine.filter
+    rng = np.random.default_rng(seed)
+    motions = [identification.simulate_along_log(model, log, X, filter) for log in stage.data.logs]
+    return [
+        identification.measured_again(model, log, motion, X, rng)
+        for log, motion in zip(stage.data.logs, motions, strict=True)
+    ]
+
+
+def _clean_squares(stage: ExtendedFit, seed: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Fit simulated logs; return sums of squared innovations (m,) and numbers of readings (m,)."""
+    try:
+        data = prepare_data(stage.machine, simulate_clean(stage, seed), stage.machine.filter)
+        fit = iterate(data, stage.fit.trajectories, stage.fit.X, 0.0, smoothing.RESUMED_DAMPING)
+    except (SimulationError, NotConvergedError):
+        return None
+    return _sum_squares([x.innovations for x in fit.linear])
+
+
+def _squares(stage: ExtendedFit) -> tuple[np.ndarray, np.ndarray]:
+    return _sum_squares([x.innovations for x in stage.fit.linear])
+
+
+def _sum_squares(innovations: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return sums of squares (m,) and numbers (m,) of innovations (N, m) of several logs."""
+    each = np.concatenate(innovations)
+    return np.nansum(each**2, axis=0), np.isfinite(each).sum(axis=0).astype(float)

@@ -1,0 +1,83 @@
+"""The misfit that a fit leaves beyond what clean logs of the fitted machine leave."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.attacks import attack, simulate as attacked
+from support.blind import ask, blind, case
+from support.logs import make_log
+
+from excite.diagnosis.clean_simulation import MIN_STDS, measure_remainder
+from excite.diagnosis.fits import fit_machine, refit
+from excite.logs import Log, from_table
+from excite.model import Model
+from excite.simulation import Motion
+
+
+@pytest.fixture(scope="module")
+def clean(straight: Model, straight_motion: Motion) -> Log:
+    return make_log(straight, straight_motion, seed=5)
+
+
+def test_a_clean_log_leaves_nothing(straight: Model, clean: Log) -> None:
+    stage = fit_machine(straight.machine, [clean], straight.machine.filter)
+    found = measure_remainder(stage)
+    assert found is not None
+    assert found.chi2 == 0.0
+    # the cost is far from one for each reading, and as far in the simulated logs
+    assert abs(stage.fit.cost - stage.expected_cost) > found.std
+
+
+def test_an_error_of_one_sensor_is_found_in_that_sensor(straight: Model, clean: Log) -> None:
+    """Vibration of a measuring wheel, too small for any test of anomalies, is stated with its sensor."""
+    shaken = clean.values["thetal"] + 2e-4 * np.random.default_rng(0).standard_normal(len(clean))
+    log = replace(clean, values={**clean.values, "thetal": shaken})
+    stage = fit_machine(straight.machine, [log], straight.machine.filter)
+    found = measure_remainder(stage)
+    assert found is not None
+    assert found.chi2 > MIN_STDS * found.std
+    assert found.signal == "thetal"
+    assert found.ratio > 1.05
+    assert "thetal" in str(found)
+
+
+def test_process_noise_hides_what_is_left(straight: Model, clean: Log) -> None:
+    stage = fit_machine(straight.machine, [clean], straight.machine.filter)
+    assert measure_remainder(refit(straight.machine, stage, 1.0)) is None
+
+
+@pytest.mark.slow
+def test_clean_logs_of_the_second_roller_leave_nothing(va12: Model) -> None:
+    for k in (5003, 5006, 5014):
+        log = from_table(blind(case("nothing", "", k)).log, va12.machine)
+        found = measure_remainder(fit_machine(va12.machine, [log], va12.machine.filter))
+        assert found is not None
+        assert found.chi2 == 0.0, f"case {k}"
+
+
+@pytest.mark.slow
+def test_what_a_strong_cause_hides_is_stated() -> None:
+    """A relief valve that takes 99 % of the misfit hides a saturation of the soil a hundred times above noise."""
+    said = ask(attacked(attack("strong_and_weak", 602)).log)
+    assert said["findings"][0]["effect"] == "relief_valve"
+    assert said["findings"][0]["share_percent"] < 99.9
+    assert said["remainder"]["chi2"] > 1000
+    assert "the rest is unexplained" in said["answer"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "number", "label"),
+    [
+        ("tank_empties", 601, "mass_drift@machine"),
+        ("clocks_apart", 601, "clock_drift@rear_roll"),
+        ("pressure_leakage", 601, "torque_nonlinearity@front_roll"),
+    ],
+)
+def test_what_grows_with_time_or_torque_has_a_name(name: str, number: int, label: str) -> None:
+    said = ask(attacked(attack(name, number)).log)
+    assert said["verdict"] == "named"
+    assert [f"{f['effect']}@{f['where']}" for f in said["findings"]] == [label]
