@@ -593,6 +593,15 @@ def diagnose(
         float | None,
         typer.Option("--budget", help="begin nothing new after this many seconds: the best answer so far"),
     ] = None,
+    false_alarms: Annotated[
+        int,
+        typer.Option(
+            "--false-alarms",
+            min=0,
+            help="also diagnose so many clean simulated logs of the fitted machine, and say how many get a name"
+            " (some ten seconds each)",
+        ),
+    ] = 0,
     accept: AcceptOption = None,
     out: OutOption = None,
     json: JsonOption = False,
@@ -609,7 +618,9 @@ def diagnose(
     out = out or Path(f"results/diagnose-{load_machine(machine).name}")
     _check_logs_and_filter(logs, filtering)
     with _result(out, json, partial(terminal.show, "diagnose"), [*_machine_file(machine), *logs]) as (place, summary):
-        summary |= workflows.diagnose(place, machine, logs, filtering, design_next, terminal.bar, budget, accept)
+        summary |= workflows.diagnose(
+            place, machine, logs, filtering, design_next, terminal.bar, budget, accept, false_alarms
+        )
 
 
 @app.command()

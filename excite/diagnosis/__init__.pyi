@@ -1,5 +1,6 @@
 from .curves import Curve as Curve
 from .diagnosis import Diagnosis as Diagnosis, diagnose as diagnose
+from .false_alarms import FalseAlarms as FalseAlarms, count_false_alarms as count_false_alarms
 from .findings import (
     Assessment as Assessment,
     assess as assess,

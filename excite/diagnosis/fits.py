@@ -467,6 +467,19 @@ def refit_all(
     return (None if fit is None else assemble_fit(machine, p, fit) for p, (machine, _, _), fit in answers)
 
 
+def fit_all_from_start(
+    requests: Sequence[RefitRequest], runner: CallRunner, cost_limit: float = np.inf
+) -> Iterator[ExtendedFit | None]:
+    """Fit several machines side by side from the initial trajectories of the logs; None for each that fails."""
+    data = [adapt_data(machine, previous) for machine, previous, _ in requests]
+    calls = [
+        partial(fit_from_start, p, process_noise, min(cost_limit, LOST_COST_RATIO * p.n_readings))
+        for p, (_, _, process_noise) in zip(data, requests, strict=True)
+    ]
+    answers = zip(data, requests, runner(calls), strict=True)
+    return (None if fit is None else assemble_fit(machine, p, fit) for p, (machine, _, _), fit in answers)
+
+
 def refit_and_drop_noise(
     machine: Machine, previous: ExtendedFit, runner: CallRunner
 ) -> tuple[ExtendedFit | None, ExtendedFit]:

@@ -26,6 +26,7 @@ from excite.diagnosis.fits import (
     ExtendedFit,
     drop_process_noise,
     exact_if_close,
+    fit_all_from_start,
     refit,
     refit_all,
     refit_and_drop_noise,
@@ -51,6 +52,7 @@ MIN_SCORE_SHARE = 0.4, 0.15  # share of the best score; chosen
 MAX_CANDIDATES = 5  # number of candidates, beside further variants of the likeliest names; chosen
 VARIANT_SCORE_SHARE = 0.7  # share of the best score of its name at which a variant is fitted, too; chosen
 PLAIN_VARIANT_SCORE_SHARE = 0.5  # the same for the variant without signed shapes, which others may mimic; chosen
+RESTART_SCORE_SHARE = 0.9  # share of the best score from which a candidate without a fit is fitted anew; chosen
 MAX_RESTARTS = 12  # candidates that are fitted from initial trajectories if nothing was found; chosen
 FIRST_BATCH = 2  # candidates that are fitted before others are compared with them; chosen
 CANDIDATE_PROGRESS_SHARE = 0.5  # share of the required or best gain that a fit must reach in a few passes; chosen
@@ -643,7 +645,23 @@ def _fit_candidates(
             and shortlist[0].candidate.name not in _unique_names(others)
         ):
             break
+    known = {s.candidate.name for s, _ in trials} | implausible
+    likely = [s for s in shortlist if s.likelihood_ratio >= RESTART_SCORE_SHARE * shortlist[0].likelihood_ratio]
+    trials += _fit_anew(stage, [s for s in likely if s.candidate.name not in known], runner, cost_limit)
     return _best_variants(trials), implausible
+
+
+def _fit_anew(
+    stage: ExtendedFit, missing: Sequence[score_test.Score], runner: CallRunner, cost_limit: float
+) -> list[_Trial]:
+    """Fit the best variant of each likely candidate from initial trajectories, as none was found from the fit before.
+
+    A cause that found no fit would lose to a rival that did.
+    """
+    first = list({s.candidate.name: s for s in reversed(missing)}.values())
+    requests = [(effects.with_effects(stage.machine, _start_entry(s)), stage, stage.fit.process_noise) for s in first]
+    found = zip(first, fit_all_from_start(requests, runner, cost_limit), strict=True) if first else ()
+    return [(s, x) for s, x in found if x is not None and _is_effective(s.candidate.name, x)]
 
 
 def _unique_names(scores: Sequence[score_test.Score]) -> list[str]:
@@ -725,6 +743,10 @@ def _trials_without_noise(trials: Sequence[_Trial], runner: CallRunner) -> tuple
     good = [x for x in trials if x[1].exact or x[1].is_close]
     without = drop_process_noise([s for _, s in good if not s.exact], runner)
     found = [(x, x[1] if x[1].exact else next(without)) for x in good]
+    missing = [exact is None and not stage.exact_fit for (_, stage), exact in found]
+    requests = [(stage.machine, stage, 0.0) for ((_, stage), _), yes in zip(found, missing, strict=True) if yes]
+    anew = fit_all_from_start(requests, runner) if requests else iter(())
+    found = [(x, next(anew) if yes else exact) for (x, exact), yes in zip(found, missing, strict=True)]
     found = [(x, None if s is None or _fell_to_zero(x[0].candidate.name, s) else s) for x, s in found]
     exact = [(score, stage) for (score, _), stage in found if stage is not None]
     return sorted(exact, key=lambda x: x[1].fit.cost), [x for x, stage in found if stage is None]

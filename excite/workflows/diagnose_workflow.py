@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -92,12 +92,14 @@ def diagnose(
     bar: Bar = no_bar,
     budget_s: float | None = None,
     accepted: str | None = None,
+    false_alarms: int = 0,
 ) -> dict[str, Any]:
     """Diagnose logs into a folder: report, figures, and machine.toml if a cause is named; return the summary.
 
     machine: a shipped name or a path. filtering: a name of `FILTERS`. design_next: design the drive that separates
     tied causes. budget_s [s]: ends the search with the best answer so far. accepted: why doubts about the logs may
-    stand. Raises LogError, MachineError, NoEstimateError.
+    stand. false_alarms: number of clean simulated logs of the fitted machine that are diagnosed as well.
+    Raises LogError, MachineError, NoEstimateError.
     """
     model = requests.build_model(machine)
     with bar("diagnosing") as advance:
@@ -105,8 +107,26 @@ def diagnose(
         found = diagnose_from(
             ready.model, ready.logs, filtering, lambda share: advance(round(1000 * share), 1000, None), budget_s
         )
+    counted, note = _count_false_alarms(found, false_alarms, bar) if false_alarms else (None, "")
     drive = separating_drive(place, ready.model.machine, rivals(found), design_next, bar)
-    return diagnose_account(machine, ready, found, drive, accepted).write(place)
+    found = replace(found, notes=[*found.notes, *([note] if note else [])])
+    account = diagnose_account(machine, ready, found, drive, accepted)
+    return replace(account, summary={**account.summary, "false_alarms": counted}).write(place)
+
+
+def _count_false_alarms(found: DiagnoseResult, runs: int, bar: Bar) -> tuple[dict[str, Any] | None, str]:
+    """Diagnose clean simulated logs of the fitted machine; return the counts and a sentence."""
+    d = found.assessment.diagnosis
+    if not isinstance(d, Diagnosis):
+        return None, "no false alarms were counted: the torques were explained by regression along the measured motion"
+    try:
+        with bar("diagnosing clean logs") as advance:
+            counted = diagnosis.count_false_alarms(
+                d, runs, lambda share, what: advance(round(1000 * share), 1000, None), run_forked
+            )
+    except (NotIdentifiableError, SimulationError) as err:
+        return None, str(err)
+    return counted.summary(), str(counted)
 
 
 def rivals(found: DiagnoseResult) -> Sequence[RivalPair]:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from support.attacks import attack, simulate as attacked
 from support.blind import ask, blind, case
-from support.logs import make_log
+from support.drives import designed
+from support.logs import logged, make_log
 
+from excite.diagnosis import diagnose, run_forked
 from excite.diagnosis.clean_simulation import MIN_STDS, measure_remainder
 from excite.diagnosis.fits import fit_machine, refit
-from excite.logs import Log, from_table
+from excite.logs import Log, from_table, read_log
 from excite.model import Model
 from excite.simulation import Motion
 
@@ -81,3 +84,13 @@ def test_what_grows_with_time_or_torque_has_a_name(name: str, number: int, label
     said = ask(attacked(attack(name, number)).log)
     assert said["verdict"] == "named"
     assert [f"{f['effect']}@{f['where']}" for f in said["findings"]] == [label]
+
+
+@pytest.mark.slow
+def test_a_cause_whose_refit_fails_does_not_lose_to_one_whose_refit_succeeds(straight: Model, tmp_path: Path) -> None:
+    """On a straight line front and rear rolling resistance are the same; a radius explains nearly as much."""
+    log = logged(straight, designed("S40", straight), tmp_path / "log.csv", 4, "rolling_resistance@front_roll=200")
+    d = diagnose(straight, [read_log(log, straight.machine)], straight.machine.filter, runner=run_forked)
+    assert d.verdict == "tied"
+    (found,) = d.findings
+    assert {found.name, *found.tied_with} == {"rolling_resistance@front_roll", "rolling_resistance@rear_roll"}

@@ -787,6 +787,7 @@ def test_where_exact_dynamics_find_no_way_a_known_fit_with_forces_is_gone_on_wit
     best = next(s for s in selection.score_effects(stage, run_in_turn) if s.values["A"] != 0)
     scores = [replace(best, likelihood_ratio=1000.0)]
     monkeypatch.setattr(selection, "refit_all", lambda wishes, *given: [None for _ in wishes])
+    monkeypatch.setattr(selection, "fit_all_from_start", lambda wishes, *given: iter([None for _ in wishes]))
     monkeypatch.setattr(selection, "refit", refitted)
     monkeypatch.setattr(selection.score_test, "score_candidates", scanned)
     for loose, again in ((small, False), (large, True), (None, True)):

@@ -1,0 +1,90 @@
+"""How often a diagnosis names something on clean logs of the fitted machine: its level for this machine and drive."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+from excite import interrupt
+from excite.diagnosis import selection
+from excite.diagnosis.clean_simulation import simulate_clean
+from excite.diagnosis.diagnosis import Diagnosis, diagnose
+from excite.diagnosis.findings import assess
+from excite.diagnosis.parallel import CallRunner, run_in_turn
+from excite.diagnosis.selection import ProgressCallback
+from excite.errors import NoEstimateError, NotIdentifiableError
+from excite.model import build, effects
+from excite.text import count
+
+FIRST_SEED = 100  # of the simulated logs, apart from those that measure the remainder; chosen
+
+
+@dataclass(frozen=True)
+class FalseAlarms:
+    """Answers to clean simulated logs.
+
+    verdicts: number of logs by verdict; failed: logs without an answer. names: number of logs by effect@where.
+    """
+
+    verdicts: dict[str, int]
+    failed: int
+    names: dict[str, int]
+
+    @property
+    def runs(self) -> int:
+        return sum(self.verdicts.values()) + self.failed
+
+    @property
+    def named(self) -> int:
+        """Number of logs in which something was named, a false alarm."""
+        return self.verdicts.get("named", 0) + self.verdicts.get("tied", 0)
+
+    def __str__(self) -> str:
+        others = [
+            f"{n} {what}"
+            for n, what in ((self.verdicts.get("unexplained", 0), "unexplained"), (self.failed, "without an answer"))
+            if n
+        ]
+        names = f" ({', '.join(self.names)})" if self.names else ""
+        rest = f"; {' and '.join(others)}" if others else ""
+        return (
+            f"Of {count(self.runs, 'clean simulated log')} of the fitted machine along this drive,"
+            f" {self.named or 'none'} got a name{names}{rest}."
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Return the counts, ready for JSON."""
+        return {"runs": self.runs, "named": self.named, "failed": self.failed, **self.verdicts, "names": self.names}
+
+
+def count_false_alarms(
+    d: Diagnosis, runs: int, progress: ProgressCallback | None = None, runner: CallRunner = run_in_turn
+) -> FalseAlarms:
+    """Diagnose clean logs of the machine that a diagnosis ends with, its findings included.
+
+    A first Ctrl-C ends the count with the logs diagnosed so far. Raises NotIdentifiableError if no machine follows the
+    logs with exact dynamics, SimulationError if it cannot be simulated along them.
+    """
+    if not (d.after.estimated and d.after.exact) or d.sticks:
+        raise NotIdentifiableError("no false alarms were counted: no model follows the logs that could be simulated")
+    report = progress or (lambda share, what: None)
+    machine = d.after.machine
+    for e in d.after.model.effects:
+        machine = effects.with_effects(effects.without_effect(machine, e.name), selection.fitted_entry(d.after, e.name))
+    model = build(machine)
+    verdicts, names, failed = Counter[str](), Counter[str](), 0
+    with interrupt.note_first_interrupt() as asked:
+        for k in range(runs):
+            report(k / runs, f"diagnosing clean log {k + 1} of {runs}")
+            logs = simulate_clean(d.after, FIRST_SEED + k)
+            try:
+                found = assess(diagnose(model, logs, machine.filter, runner=runner), runner=runner).diagnosis
+            except NoEstimateError:
+                failed += 1
+                continue
+            if asked.stop:
+                break
+            verdicts[found.verdict] += 1
+            names.update(f.name for f in found.findings if f.kind == "cause")
+    return FalseAlarms(dict(verdicts), failed, dict(names))
