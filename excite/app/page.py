@@ -176,7 +176,7 @@ class Window:
         what = STEPS.get(job.step, job.step)
         if job.running:
             best = "" if job.best is None else f", best so far: {_score(job)}"
-            self.doing.text = f"{what}: {'stopping' if job.stops else job.label}"
+            self.doing.text = f"{what}: {'stopping' if job.stops else job.doing or job.label}"
             self.numbers.text = f"{job.elapsed_s:.0f} s{best}"
             self.progress.props(f"{'indeterminate' if not job.total else ':indeterminate=false'}")
             self.progress.value = job.done / job.total if job.total else 0.0

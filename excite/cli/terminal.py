@@ -61,7 +61,7 @@ def fail(message: str, code: int) -> NoReturn:
     sys.exit(code)
 
 
-Advance = Callable[[int, int, float | None], None]
+Advance = Callable[[int, int, float | str | None], None]  # done, total, best score so far or what is being done
 
 
 @contextmanager
@@ -69,9 +69,10 @@ def bar(label: str) -> Iterator[Advance]:
     """Show a progress bar on stderr; lines of JSON if `PROGRESS_VARIABLE` asks for them, nothing without a terminal."""
     if os.environ.get(workflows.PROGRESS_VARIABLE) == "json":
 
-        def write(done: int, total: int, best: float | None) -> None:
-            finite = best is not None and math.isfinite(best)
-            said = {"label": label, "done": done, "total": total, "best": best if finite else None}
+        def write(done: int, total: int, note: float | str | None) -> None:
+            best = note if note is not None and not isinstance(note, str) and math.isfinite(note) else None
+            doing = note if isinstance(note, str) else None
+            said = {"label": label, "done": done, "total": total, "best": best, "doing": doing}
             sys.stderr.write(f"{json.dumps(said)}\n")
             sys.stderr.flush()
 
@@ -86,8 +87,12 @@ def bar(label: str) -> Iterator[Advance]:
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
         task = progress.add_task(label, total=None)
 
-        def advance(done: int, total: int, best: float | None) -> None:
-            text = label if best is None or best == float("inf") else f"{label}, best so far {best:.2f}"
+        def advance(done: int, total: int, note: float | str | None) -> None:
+            text = label
+            if isinstance(note, str):
+                text = f"{label}: {note}"
+            elif note is not None and math.isfinite(note):
+                text = f"{label}, best so far {note:.2f}"
             progress.update(task, completed=done, total=total, description=text)
 
         yield advance

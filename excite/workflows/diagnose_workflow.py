@@ -60,20 +60,19 @@ def diagnose_from(
     model: Model,
     logs: Sequence[Log],
     filtering: str = "machine",
-    report: Callable[[float], None] = lambda share: None,
+    report: Callable[[float, str], None] = lambda share, what: None,
     budget_s: float | None = None,
 ) -> DiagnoseResult:
     """Diagnose checked logs and measure the gain of each finding.
 
-    filtering: a name of `FILTERS`, used for the first guess. report(share of the work): called now and then.
+    filtering: a name of `FILTERS`, used for the first guess.
+    report(share of the work, what is being done): called now and then.
     budget_s [s]: ends the search with the best answer so far.
     Raises LogError, NotIdentifiableError, NoEstimateError.
     """
     prepared = _prepare_logs(model, logs, filtering)
     with doubts_in_errors(prepared.doubts):
-        assessment = diagnosis.explain(
-            model, prepared.logs, prepared.filter, lambda share, what: report(share), run_forked, budget_s
-        )
+        assessment = diagnosis.explain(model, prepared.logs, prepared.filter, report, run_forked, budget_s)
     notes = [*prepared.notes, *_baseline_note(assessment.diagnosis)]
     if assessment.cut_short:
         notes.append(
@@ -105,7 +104,7 @@ def diagnose(
     with bar("diagnosing") as advance:
         ready = prepare(model, logs, identification.needed_sensors(model, "joint"))
         found = diagnose_from(
-            ready.model, ready.logs, filtering, lambda share: advance(round(1000 * share), 1000, None), budget_s
+            ready.model, ready.logs, filtering, lambda share, what: advance(round(1000 * share), 1000, what), budget_s
         )
     counted, note = _count_false_alarms(found, false_alarms, bar) if false_alarms else (None, "")
     drive = separating_drive(place, ready.model.machine, rivals(found), design_next, bar)
@@ -122,7 +121,7 @@ def _count_false_alarms(found: DiagnoseResult, runs: int, bar: Bar) -> tuple[dic
     try:
         with bar("diagnosing clean logs") as advance:
             counted = diagnosis.count_false_alarms(
-                d, runs, lambda share, what: advance(round(1000 * share), 1000, None), run_forked
+                d, runs, lambda share, what: advance(round(1000 * share), 1000, what), run_forked
             )
     except (NotIdentifiableError, SimulationError) as err:
         return None, str(err)
