@@ -368,6 +368,14 @@ def drive(
             help="seconds that every phase lasts at least: a person needs about 2 s to read and follow one",
         ),
     ] = 2.0,
+    need: Annotated[
+        float | None,
+        typer.Option(
+            "--need",
+            help="judge the drive by this standard deviation of the worst parameter, in per cent, instead of by the"
+            " torques played back",
+        ),
+    ] = None,
     seed: SeedOption = 0,
     serve: Annotated[
         bool,
@@ -410,11 +418,12 @@ def drive(
     except ValueError:
         raise UsageError(f"--host {host}: is no address, give one such as 0.0.0.0 or 192.168.1.7") from None
 
+    workflows.require_positive("--need", need, "%")
     name = trajectories.read_design_summary(design_dir)["machine"]
     out = out or Path(f"results/drive-{name}")
     with _result(out, json, partial(terminal.show, "drive"), [design_dir]) as (place, summary):
         with terminal.bar("driving") as advance:
-            made = operator.prepare(trajectories.read_design(design_dir), phases, shortest, seed, advance)
+            made = operator.prepare(trajectories.read_design(design_dir), phases, shortest, seed, advance, need)
         summary |= {"machine": name, "design": str(design_dir), "seed": seed, **operator.write(made, place)}
         summary["versions"] = workflows.package_versions()
         output.write_summary(place, summary)

@@ -36,11 +36,17 @@ PLAYED_BACK, TRACED, PHASED = "torques played back", "a person on the design's o
 
 
 def prepare(
-    design: SavedDesign, most: int | None = None, shortest: float = 2.0, seed: int = 0, progress: Progress | None = None
+    design: SavedDesign,
+    most: int | None = None,
+    shortest: float = 2.0,
+    seed: int = 0,
+    progress: Progress | None = None,
+    needed: float | None = None,
 ) -> Sheet:
     """Make the sheet of a design: phases, paths, ground, warnings, and the accuracy that a person keeps.
 
-    most: largest number of phases, None to choose. shortest [s]: shortest phase.
+    most: largest number of phases, None to choose. shortest [s]: shortest phase. needed [%]: largest standard deviation
+    of any parameter that is good enough, the design's `sigma_max` if it has one.
     Raises UndrivableError for a machine that nobody drives, SimulationError if no person can follow the phases.
     """
     model, motion, problem = design.model, design.motion, design.problem
@@ -94,7 +100,7 @@ def prepare(
         fewer=most is not None,
         over=over,
         slower=_slower_drive(model, problem, trace, motion.q[0], seed) if over else None,
-        asked=design.summary.get("sigma_max"),
+        asked=design.summary.get("sigma_max") if needed is None else needed,
     )
     return Sheet(
         design.title,
@@ -103,7 +109,7 @@ def prepare(
         motions,
         room,
         lane,
-        tuple(_warnings(model, trace, motions, room)),
+        tuple(_warnings(model, trace, motions, room, lane)),
         tuple(scores),
         said,
     )
@@ -129,14 +135,14 @@ def verdict(
 
     by_hand: the design was made with `--driver`. fewer: `--phases` replaced its phases. over: limits that people
     exceed, as shares of their range. slower: share of the speeds at which simulated people keep them, and what they
-    attain then. asked [%]: largest standard deviation that the design may have; without it the torques played back are
-    the measure. Advice that nothing has simulated is called untried.
+    attain then. asked [%]: largest standard deviation that is good enough; without it the torques played back are the
+    measure. Advice that nothing has simulated is called untried.
     """
     worst, median = person.worst_percent / played.worst_percent, person.median_percent / played.median_percent
     ratio = max(worst, median)
     again = _what_to_ask(trajectories.is_condition_number(objective), by_hand, fewer)
     if asked is not None:
-        reached = f"the worst parameter comes to {format_percent(person.worst_percent)}, asked are {asked:g} %"
+        reached = f"the worst parameter comes to {format_percent(person.worst_percent)}, needed are {asked:g} %"
         enough = person.worst_percent <= asked
         said = f"accurate enough, {reached}" if enough else f"not accurate enough, {reached}; {again} (untried)"
     elif ratio <= 1.1:
@@ -208,12 +214,14 @@ def _slower_drive(
     return None
 
 
-def _warnings(model: Model, trace: Trace, motions: tuple[Motion, ...], room: ground.TouchedGround) -> list[str]:
-    free = (np.ceil(room.length + 2 * sheet.FREE_MARGIN_M), np.ceil(room.width + 2 * sheet.FREE_MARGIN_M))
+def _warnings(
+    model: Model, trace: Trace, motions: tuple[Motion, ...], room: ground.TouchedGround, lane: tuple[float, float]
+) -> list[str]:
+    free, said = room.free, room.words(lane)
     lines = [
         f"Keep everybody off {free[0]:.0f} m x {free[1]:.0f} m: the machine touches {room.length:.1f} m x"
-        f" {room.width:.1f} m of ground, {sheet.FREE_MARGIN_M:g} m are left all around for overhangs and for stopping."
-        " Stop at once if anybody comes near.",
+        f" {room.width:.1f} m of ground, {ground.FREE_MARGIN_M:g} m are left all around for overhangs and for stopping."
+        f"{' ' * bool(said)}{said} Stop at once if anybody comes near.",
         "Engine speed and drive settings the same all along, whatever else shakes or moves off; ground level and firm.",
     ]
     turns = len(ground.reversal_times(trace))
@@ -248,7 +256,7 @@ def summarise_sheet(made: Sheet) -> dict[str, Any]:
         "start": ground.start_words(made.model, made.motions[0], trace),
         "phases": ground.trace_table(trace),
         "direction_changes_s": ground.reversal_times(trace),
-        "room_m": [made.room.length, made.room.width],
+        **made.room.summary(made.lane),
         "tolerance": {
             "speed_m_s": ground.BAND_SPEED,
             "angle_rad": float(ground.BAND_ANGLE),

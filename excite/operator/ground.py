@@ -30,6 +30,7 @@ LIMIT_SHARE = 0.93  # of speed and rate limits that a trace uses, as a person ov
 BAND_S = 1.0  # [s]
 BAND_SPEED = 0.1  # [m/s]
 BAND_ANGLE = np.deg2rad(2)  # [rad]
+FREE_MARGIN_M = 3.0  # free ground around what the machine touches, for overhangs and stopping [m]; chosen
 MAX_ERROR_RATIO = 2.0  # person's error over that of torques played back, up to which a drive is worth it; chosen
 
 
@@ -100,6 +101,42 @@ class TouchedGround:
     length: float
     width: float
     corner: tuple[float, float]
+
+    @property
+    def free(self) -> tuple[float, float]:
+        """Length and width [m] to keep free: what is touched with FREE_MARGIN_M all around, in whole metres."""
+        length, width = (float(np.ceil(side + 2 * FREE_MARGIN_M - 1e-9)) for side in (self.length, self.width))
+        return length, width
+
+    def summary(self, lane: tuple[float, float]) -> dict[str, Any]:
+        """Return touched and free ground, lane, and touched ground beyond the lane [m]; no lane if it is infinite."""
+        found: dict[str, Any] = {"room_m": [self.length, self.width], "free_ground_m": list(self.free)}
+        if np.isfinite(lane).all():
+            found |= {"lane_m": list(lane), "beyond_lane_m": list(self.beyond(lane))}
+        return found
+
+    def beyond(self, lane: tuple[float, float]) -> tuple[float, float]:
+        """Return how far touched ground lies beyond the ends and beyond the sides of a lane [m], negative within it."""
+        ends = zip(self.corner, (self.length, self.width), lane, strict=True)
+        over = [max(-side / 2 - low, low + size - side / 2) for low, size, side in ends]
+        return over[0], over[1]
+
+    def words(self, lane: tuple[float, float]) -> str:
+        """Compare the ground that a person needs with a lane (length, width) [m]; empty without a lane."""
+        if not np.isfinite(lane).all():
+            return ""
+        size = f"the lane of {lane[0]:g} m x {lane[1]:g} m"
+        over = self.beyond(lane)
+        sides = [
+            f"{FREE_MARGIN_M + metres:.1f} m beyond its {name}"
+            for metres, name in zip(over, ("ends", "sides"), strict=True)
+            if metres + FREE_MARGIN_M > 0.05
+        ]
+        if max(over) > 0.05:
+            return f"The machine leaves {size}, by {max(over):.1f} m: keep {' and '.join(sides)} free."
+        if sides:
+            return f"The machine stays on {size}, but keep {' and '.join(sides)} free."
+        return f"That lies within {size}."
 
 
 def find_levers(model: Model) -> tuple[Lever, ...]:
@@ -449,31 +486,18 @@ def touched_ground(model: Model, motions: Sequence[Motion]) -> TouchedGround:
 
 
 def place_in_lane(model: Model, problem: Problem, motions: Sequence[Motion]) -> tuple[Motion, ...]:
-    """Move drives with a common start so that the first lies best in the lane; one that keeps the lane stays.
+    """Move drives with a common start so that it points along the lane, if they all stay in the lane then.
 
-    On flat ground a motion does not depend on its start.
+    Otherwise move them so that the first lies best in the lane; one that keeps the lane stays. On flat ground a motion
+    does not depend on its start.
     """
     first = motions[0]
-    if trajectories.lane_excess(trajectories.check_limits(model, problem, first)) == 0:
-        return tuple(motions)
-    return tuple(move_motion(model, m, trajectories.place_on_lane(model, problem, first)) for m in motions)
-
-
-def move_motion(model: Model, motion: Motion, start: np.ndarray) -> Motion:
-    """Turn and shift a motion over the ground, to begin at the place and heading of `start` (n_q,)."""
-    names = model.machine.body[0].coordinates
-    x, y, head = (model.coordinates.index(c) if c in model.coordinates else None for c in names)
-    q = motion.q.copy()
-    turn = 0.0 if head is None else float(start[head] - q[0, head])
-    c, s = np.cos(turn), np.sin(turn)
-    flat = np.column_stack([q[:, k] if k is not None else np.zeros(len(q)) for k in (x, y)])
-    flat = (flat - flat[0]) @ np.array([[c, s], [-s, c]])
-    for k, values in ((x, flat[:, 0]), (y, flat[:, 1])):
-        if k is not None:
-            q[:, k] = values + start[k]
-    if head is not None:
-        q[:, head] += turn
-    return replace(motion, q=q)
+    start = trajectories.place_along_lane(model, problem, motions)
+    if start is None:
+        if trajectories.lane_excess(trajectories.check_limits(model, problem, first)) == 0:
+            return tuple(motions)
+        start = trajectories.place_on_lane(model, problem, first)
+    return tuple(trajectories.move_motion(model, m, start) for m in motions)
 
 
 def tolerance_band(t: np.ndarray, value: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:

@@ -25,9 +25,9 @@ from excite.errors import SimulationError, UndrivableError
 from excite.model import Model
 from excite.model.machine import Problem
 from excite.operator import ground
-from excite.operator.ground import ANGLE_STEP, GRID_S, SPEED_STEP, DriveQuality, Trace
+from excite.operator.ground import ANGLE_STEP, GRID_S, SPEED_STEP, DriveQuality, TouchedGround, Trace
 from excite.simulation import STEADY_DRIVER, Motion, track_motion
-from excite.trajectories import CompositeObjective, Design, Manoeuvre, process_count
+from excite.trajectories import CompositeObjective, Design, Limit, Manoeuvre, process_count
 
 PEOPLE = 3  # simulated people who drive the result; chosen
 MEAN_PHASE_RATIO = 1.3  # least mean length of a phase over the shortest one; chosen
@@ -45,6 +45,8 @@ STEP_SIZES = (1.0, 0.2, 0.1)  # largest changes in the first round: [s], [m/s], 
 EXCESS_PRICE = 30.0  # of a limit's excess (share of its range), in units of the objective; chosen
 MIN_MARGIN = 0.01  # least margin of a limit, as a share of its range; chosen
 REST_WEIGHT = 0.1  # weight of an excess over a tolerance for rest; chosen
+START_AMPLITUDES = (1.0, 0.85, 0.7)  # of the smoothed design's speeds and angles, that the search tries; chosen
+SAFE_AMPLITUDES = (1.0, 0.95, 0.9, 0.8)  # of the result's, to try until people keep every limit; chosen
 VALVE_LIMITS = ("torque", "torque_rate")  # limits that the machine's valves keep, whoever drives
 
 Report = Callable[[int, int, float], None]
@@ -59,6 +61,7 @@ class PhasedDrive:
     scores, attained: of the designed torques played back, of people on the smoothed design, of people on this trace
     (the median of PEOPLE).
     over: limits that anybody exceeds, with the excess.
+    room: the ground that the contacts touch when any of them drives. lane: length and width [m].
     """
 
     trace: Trace
@@ -67,6 +70,8 @@ class PhasedDrive:
     scores: tuple[float, float, float]
     attained: tuple[DriveQuality, DriveQuality, DriveQuality]
     over: dict[str, float]
+    room: TouchedGround
+    lane: tuple[float, float]
     complete: bool
 
 
@@ -94,7 +99,8 @@ def design_phases(
     total = ROUNDS + LEVELS + POLISHES + 1
     with joblib.parallel_config("loky", inner_max_num_threads=1):
         run = joblib.Parallel(n_jobs=process_count())
-        found = [t for t in try_traces(search, [begin, *random_traces(search, begin, seed)], run) if t is not None]
+        scaled = [scale_levels(search, begin, share) for share in START_AMPLITUDES]
+        found = [t for t in try_traces(search, [*scaled, *random_traces(search, begin, seed)], run) if t is not None]
         if not found:
             raise SimulationError("no drive made of phases can be followed on this machine; make phases longer")
         # Calibrate the surrogate of the variances by the Cramer-Rao bound of a typical drive.
@@ -121,10 +127,10 @@ def design_phases(
             else:
                 sharp = SHARPNESS[0] * (SHARPNESS[1] / SHARPNESS[0]) ** (min(k, ROUNDS - 1) / (ROUNDS - 1))
                 best, reach = improve_by_program(search, best, room, reach, sharp, k < ROUNDS, run)
-    trace = ground.merge_straight_phases(snap_levels(search, snap_times(search, best.trace)))
+    way = reduce_levels(search, snap_times(search, best.trace), seed)
     if progress is not None:
         progress(total, total, merit(search, best, room))
-    return _rate_trace(replace(search, aim=aim), trace, begin, designed, seed, whole)
+    return _rate_way(replace(search, aim=aim), way, begin, designed, seed, whole)
 
 
 def check_phase_length(model: Model, problem: Problem, shortest: float) -> None:
@@ -152,11 +158,18 @@ def as_design(model: Model, problem: Problem, free: Design, made: PhasedDrive) -
     )
 
 
-def _rate_trace(
-    search: PhaseSearch, trace: Trace, begin: Trace, designed: Motion, seed: int, whole: bool
-) -> PhasedDrive:
-    """Simulate a steady person and people with errors from one start, and score each way of driving."""
-    model, aim = search.model, search.aim
+@dataclass(frozen=True)
+class DrivenWay:
+    """A trace with its motions in the lane, a steady person's first, and the limits that any of them exceeds."""
+
+    trace: Trace
+    motions: tuple[Motion, ...]
+    over: dict[str, float]
+
+
+def drive_way(search: PhaseSearch, trace: Trace, seed: int) -> DrivenWay:
+    """Simulate a steady person and people with errors from one start; name the limits that they exceed."""
+    model = search.model
     ways = (_drive_steadily(search, trace), *(ground.follow_trace(model, trace, None, seed + k) for k in range(PEOPLE)))
     motions = ground.place_in_lane(model, search.problem, ways)
     over: dict[str, float] = {}
@@ -164,6 +177,33 @@ def _rate_trace(
         for name, value in trajectories.check_limits(model, search.problem, m).items():
             if value > trajectories.TOLERANCE:
                 over[name] = max(over.get(name, 0.0), value)
+    return DrivenWay(trace, motions, over)
+
+
+def reduce_levels(search: PhaseSearch, trace: Trace, seed: int) -> DrivenWay:
+    """Reduce speeds and angles until people keep every limit, then merge straight phases.
+
+    Return the way with the least excess if none keeps them.
+    """
+    ways: list[DrivenWay] = []
+    for share in SAFE_AMPLITUDES:
+        merged = ground.merge_straight_phases(scale_levels(search, trace, share))
+        try:
+            ways.append(drive_way(search, merged, seed))
+        except SimulationError:
+            if share == SAFE_AMPLITUDES[0]:
+                raise
+            continue
+        if not ways[-1].over:
+            break
+    return min(ways, key=lambda way: max(way.over.values(), default=0.0))
+
+
+def _rate_way(
+    search: PhaseSearch, way: DrivenWay, begin: Trace, designed: Motion, seed: int, whole: bool
+) -> PhasedDrive:
+    """Score each way of driving."""
+    model, aim, trace, motions = search.model, search.aim, way.trace, way.motions
 
     def worth(motion: Motion, by: Callable[[Model], Motion]) -> float:
         return trajectories.score_motions(aim, [(model, motion), *((m, by(m)) for m in aim.machines[1:])]).score
@@ -177,7 +217,8 @@ def _rate_trace(
     after = people(trace, motions[1:])
     played = worth(designed, lambda m: track_motion(m, model, designed)), ground.rate_motion(model, designed)
     scores, attained = (played[0], before[0], after[0]), (played[1], before[1], after[1])
-    return PhasedDrive(trace, motions[0], motions[1:], scores, attained, over, whole)
+    room = ground.touched_ground(model, motions)
+    return PhasedDrive(trace, motions[0], motions[1:], scores, attained, way.over, room, search.problem.lane, whole)
 
 
 # ------------------------------------------------------------------------------------------------ traces
@@ -249,6 +290,11 @@ def snap_levels(search: PhaseSearch, trace: Trace) -> Trace:
     return replace(
         trace, speed=v + 0.0, angle=ground.limit_steering_rate(trace.times, a, search.swing, ZERO_KNOTS) + 0.0
     )
+
+
+def scale_levels(search: PhaseSearch, trace: Trace, share: float) -> Trace:
+    """Reduce all speeds and angles to a share, and round them to dial steps."""
+    return snap_levels(search, replace(trace, speed=share * trace.speed, angle=share * trace.angle))
 
 
 def _vector(trace: Trace) -> np.ndarray:
@@ -343,7 +389,7 @@ def _drive_steadily(search: PhaseSearch, trace: Trace) -> Motion:
 def _place_in_lane(search: PhaseSearch, motions: Sequence[Motion]) -> list[Motion]:
     """Move drives so that the first lies best in the lane, even if it keeps the lane already."""
     start = trajectories.place_on_lane(search.model, search.problem, motions[0])
-    return [ground.move_motion(search.model, m, start) for m in motions]
+    return [trajectories.move_motion(search.model, m, start) for m in motions]
 
 
 def _information(search: PhaseSearch, motion: Motion) -> list[np.ndarray]:
@@ -352,10 +398,14 @@ def _information(search: PhaseSearch, motion: Motion) -> list[np.ndarray]:
     return [THINNING * A for A in trajectories.information_matrices(search.aim, search.model, thin)]
 
 
+def _driver_limits(search: PhaseSearch) -> list[Limit]:
+    return [g for g in trajectories.machine_limits(search.model, search.problem) if g.kind not in VALVE_LIMITS]
+
+
 @lru_cache(maxsize=2)
 def _limits(search: PhaseSearch) -> tuple[ca.Function, np.ndarray, np.ndarray, np.ndarray]:
     """Stack the limits that a driver can break: function of (q, nu, u, du), low, high, range."""
-    every = [g for g in trajectories.machine_limits(search.model, search.problem) if g.kind not in VALVE_LIMITS]
+    every = _driver_limits(search)
     low, high, size = np.array([(g.low, g.high, g.range) for g in every]).reshape(-1, 3).T
     return trajectories.stack_limits(search.model, every), low, high, size
 
@@ -386,7 +436,20 @@ def _required_margin(search: PhaseSearch, trace: Trace, seed: int) -> np.ndarray
         *(ground.follow_trace(search.model, trace, None, seed + k) for k in range(PEOPLE)),
     ]
     every = np.array([_limit_excess(search, m).max(axis=1) for m in _place_in_lane(search, ways)])
-    return np.maximum(every[1:].max(axis=0) - every[0], MIN_MARGIN)
+    least = np.full(every.shape[1], MIN_MARGIN)
+    overhang = contact_overhang(search)
+    least[: len(overhang)] = np.maximum(overhang, MIN_MARGIN)
+    return np.maximum(every[1:].max(axis=0) - every[0], least)
+
+
+def contact_overhang(search: PhaseSearch) -> np.ndarray:
+    """Return by how much contacts reach beyond the points that each limit of the lane counts (n_limits,), else 0.
+
+    Half the widest contact, as a share of the limit's range, so that people stay in the lane with the whole contact.
+    """
+    half = max(float(b.contact.width) for b in search.model.machine.contacts if b.contact is not None) / 2
+    every = _driver_limits(search)
+    return np.array([half / g.range if trajectories.is_lane_limit(g.name) else 0.0 for g in every])
 
 
 def merit(search: PhaseSearch, trial: TraceTrial, room: np.ndarray) -> float:

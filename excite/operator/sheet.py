@@ -26,7 +26,6 @@ A4 = (8.27, 11.69)
 LEFT, RIGHT = 0.08, 0.95
 GAP = 0.02  # between columns, as a share of the page's width
 MAX_COARSER = 1.5  # scale of a map of the whole lane over one of the touched ground; chosen
-FREE_MARGIN_M = 3.0  # free ground around what the machine touches, for overhangs and stopping [m]; chosen
 
 
 @dataclass(frozen=True)
@@ -69,13 +68,9 @@ def drive_facts(sheet: Sheet) -> list[tuple[str, str]]:
     ]
     tops = np.abs(trace.degrees).max(axis=0)
     rows += [(f"{lever.name} up to", f"{top:.0f}°") for lever, top in zip(trace.levers, tops, strict=True)]
-    rows.append(
-        (
-            "free ground",
-            f"{np.ceil(sheet.room.length + 2 * FREE_MARGIN_M):.0f} x"
-            f" {np.ceil(sheet.room.width + 2 * FREE_MARGIN_M):.0f} m",
-        )
-    )
+    rows.append(("free ground", "{:.0f} x {:.0f} m".format(*sheet.room.free)))
+    if np.isfinite(sheet.lane).all():
+        rows.append(("lane", f"{sheet.lane[0]:g} x {sheet.lane[1]:g} m"))
     return rows
 
 
@@ -192,7 +187,7 @@ def _view(ax: Axes, sheet: Sheet) -> float:
     """Set equal axes over the touched ground, or the whole lane if not much larger; return half the metres per inch."""
     size = np.array([ax.get_position().width, ax.get_position().height]) * A4
     touched = np.array([sheet.room.corner, np.add(sheet.room.corner, (sheet.room.length, sheet.room.width))])
-    touched += [[-0.7 * FREE_MARGIN_M], [0.7 * FREE_MARGIN_M]]
+    touched += [[-0.7 * ground.FREE_MARGIN_M], [0.7 * ground.FREE_MARGIN_M]]
     half = np.array(sheet.lane) / 2 + 0.5
     both = np.array([np.minimum(touched[0], -half), np.maximum(touched[1], half)])
     near, far = (float((np.ptp(box, axis=0) / 2 / size).max()) for box in (touched, both))

@@ -328,6 +328,17 @@ WAYS_OF_DRIVING = {
 }
 
 
+def _ground_remarks(d: Summary) -> list[str]:
+    """Describe the ground that people touch, beside the lane where there is one."""
+    if "room_m" not in d:  # designs of earlier versions
+        return []
+    said = "People touch {:.1f} m x {:.1f} m of ground".format(*d["room_m"])
+    if "lane_m" not in d:
+        return [f"{said}."]
+    over, lane = max(d["beyond_lane_m"]), "the lane of {:g} m x {:g} m".format(*d["lane_m"])
+    return [f"{said}, up to {over:.1f} m beyond {lane}." if over > 0.05 else f"{said}, all of it on {lane}."]
+
+
 def _describe_by_hand(s: Summary) -> tuple[list[str], list[Table]]:
     """Describe what people keep of a design that was made for them: remarks and tables."""
     d = s["driver"]
@@ -344,6 +355,7 @@ def _describe_by_hand(s: Summary) -> tuple[list[str], list[Table]]:
         f"In the hands of {people} these limits are exceeded: {over} of their range."
         if over
         else f"In the hands of {people} every limit is kept.",
+        *_ground_remarks(d),
         "The accuracy of single parameters is of a steady person; `excite drive` makes the driver's sheet and page of"
         " this drive.",
     ]

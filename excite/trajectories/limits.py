@@ -7,7 +7,7 @@ MOTION_LIMITS holds limits on a whole motion. An excess is a fraction of the lim
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -383,26 +383,77 @@ def travel_directions(motion: Motion, most: int) -> np.ndarray:
 
 def place_on_lane(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
     """Return start coordinates (n_q,) that turn and shift the drive into the lane as well as possible."""
-    start = motion.q[0].copy()
     if not model.machine.planar or not problem.lane_points:
-        return start
-    axes = {c: model.coordinates.index(c) for c in model.machine.body[0].coordinates if c in model.coordinates}
-    x, y, heading = model.machine.body[0].coordinates
-    places = model.kinematics(motion.q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), -1)
-    bodies = [b.index for b in model.machine.body]
-    path = places[:2][:, :, [bodies.index(i) for i in problem.lane_points]].reshape(2, -1)
+        return motion.q[0].copy()
+    path = _lane_path(model, problem, motion)
     fit = _fit_polygon if problem.lane_polygon_m else _fit_box
     best, chosen = np.inf, (0.0, np.zeros(2))
     whole = 2 * np.pi if problem.lane_polygon_m else np.pi  # a box is symmetric under half a turn
-    for turn in np.linspace(0, whole, HEADINGS)[:-1] if heading in axes else (0.0,):
-        c, s = np.cos(turn), np.sin(turn)
-        used, shift = fit(problem, np.array([[c, -s], [s, c]]) @ path)
-        if used < best - 1e-9:
-            best, chosen = used, (float(turn), shift)
-    turn, shift = chosen
-    at = np.array([start[axes[c]] if c in axes else 0.0 for c in (x, y)])
+    turns = model.machine.body[0].coordinates[2] in model.coordinates
+    for turn in np.linspace(0, whole, HEADINGS)[:-1] if turns else (0.0,):
+        excess, shift = fit(problem, _turned(path, turn))
+        if excess < best - 1e-9:
+            best, chosen = excess, (float(turn), shift)
+    return _moved_start(model, motion, *chosen)
+
+
+def place_along_lane(model: Model, problem: Problem, motions: Sequence[Motion]) -> np.ndarray | None:
+    """Return start coordinates (n_q,) that point along the lane and from which every motion stays in the lane.
+
+    motions: drives with a common start. None if they leave the lane from every such start, if the machine does not
+    turn on the plane, and if forces depend on the place.
+    """
+    first, frame = motions[0], model.machine.body[0].coordinates
+    if not model.machine.planar or not problem.lane_points or not set(frame) <= set(model.coordinates):
+        return None
+    if set(frame) & set(model.active_coordinates):
+        return None
+    path = np.hstack([_lane_path(model, problem, m) for m in motions])
+    fit = _fit_polygon if problem.lane_polygon_m else _fit_box
+    heading = float(first.q[0, model.coordinates.index(frame[2])])
+    for goal in (0.0, np.pi):
+        excess, shift = fit(problem, _turned(path, goal - heading))
+        if excess <= 0:
+            return _moved_start(model, first, goal - heading, shift)
+    return None
+
+
+def move_motion(model: Model, motion: Motion, start: np.ndarray) -> Motion:
+    """Turn and shift a motion over the ground, to begin at the place and heading of `start` (n_q,)."""
+    names = model.machine.body[0].coordinates
+    x, y, head = (model.coordinates.index(c) if c in model.coordinates else None for c in names)
+    q = motion.q.copy()
+    turn = 0.0 if head is None else float(start[head] - q[0, head])
+    flat = np.array([q[:, k] if k is not None else np.zeros(len(q)) for k in (x, y)])
+    flat = _turned(flat - flat[:, :1], turn)
+    for k, values in zip((x, y), flat, strict=True):
+        if k is not None:
+            q[:, k] = values + start[k]
+    if head is not None:
+        q[:, head] += turn
+    return replace(motion, q=q)
+
+
+def _lane_path(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
+    """Return the ground track (2, K) [m] of all points that the lane limits."""
+    places = model.kinematics(motion.q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), -1)
+    bodies = [b.index for b in model.machine.body]
+    return np.asarray(places[:2][:, :, [bodies.index(i) for i in problem.lane_points]].reshape(2, -1))
+
+
+def _turned(path: np.ndarray, turn: float) -> np.ndarray:
+    """Turn points (2, K) about the origin by an angle [rad]."""
     c, s = np.cos(turn), np.sin(turn)
-    moved = np.array([[c, -s], [s, c]]) @ at + shift
+    return np.asarray(np.array([[c, -s], [s, c]]) @ path)
+
+
+def _moved_start(model: Model, motion: Motion, turn: float, shift: np.ndarray) -> np.ndarray:
+    """Return the start coordinates (n_q,) of a motion turned about the origin [rad], then shifted (2,) [m]."""
+    start = motion.q[0].copy()
+    axes = {c: model.coordinates.index(c) for c in model.machine.body[0].coordinates if c in model.coordinates}
+    x, y, heading = model.machine.body[0].coordinates
+    at = np.array([[start[axes[c]] if c in axes else 0.0] for c in (x, y)])
+    moved = _turned(at, turn)[:, 0] + shift
     for k, name in enumerate((x, y)):
         if name in axes:
             start[axes[name]] = moved[k]
@@ -422,9 +473,9 @@ def simulate_on_lane(model: Model, problem: Problem, torque: np.ndarray, nu0: np
 
 
 def _fit_box(problem: Problem, path: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the share of the lane that a path (2, K) needs, and the shift (2,) [m] that centres it."""
+    """Return the share of the lane that a path (2, K) needs beyond it, and the shift (2,) [m] that centres it."""
     low, high = path.min(axis=1), path.max(axis=1)
-    return float(((high - low) / np.array(problem.lane)).max()), -(low + high) / 2
+    return float(((high - low) / np.array(problem.lane)).max()) - 1, -(low + high) / 2
 
 
 def _fit_polygon(problem: Problem, path: np.ndarray) -> tuple[float, np.ndarray]:

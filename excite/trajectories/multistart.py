@@ -43,6 +43,7 @@ from excite.trajectories.continuation import (
     start_from_multisine,
 )
 from excite.trajectories.excitation import Manoeuvre
+from excite.trajectories.limits import move_motion, place_along_lane
 
 Report = Callable[[int, int, float], None]
 MIN_LATER_STEPS = len(STAGES) - SCREENING_STAGES + 1  # progress reports of a selected start, at least
@@ -141,6 +142,8 @@ def design(
         raise _infeasible(composite, best.best, complete)
     drive = best.best
     motion = simulate(model, drive.manoeuvre.sample(float(model.machine.sampling_hz)), q0=drive.start)
+    along = place_along_lane(model, problem, [motion])
+    motion = motion if along is None else move_motion(model, motion, along)
     return Design(
         composite.name,
         drive.manoeuvre,

@@ -271,7 +271,7 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
 
 
 def _by_hand(request: DesignRequest, aim: CompositeObjective, made: PhasedDrive) -> dict[str, Any]:
-    """Summarise a design for people: phases, scores of three ways of driving, limits that people exceed."""
+    """Summarise a design for people: phases, scores of three ways of driving, limits that people exceed, ground."""
     ways = ("played_back", "smoothed", "by_hand")
     scores = {
         way: {
@@ -288,6 +288,7 @@ def _by_hand(request: DesignRequest, aim: CompositeObjective, made: PhasedDrive)
         "people": len(made.people),
         **scores,
         "limits_broken": made.over,
+        **made.room.summary(made.lane),
         "complete": made.complete,
         "phases": operator.trace_table(made.trace),
     }

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from support.commands import Excite
 
+from excite import trajectories
 from excite.errors import UndrivableError
 from excite.model import Model, build
 from excite.model.machine import load_machine
@@ -278,12 +279,47 @@ def test_edges_turn_with_the_articulation(va12: Model) -> None:
     assert rear.mean(axis=0) == pytest.approx([-1.45 - 1.75 * np.cos(0.5), -1.75 * np.sin(0.5)])
 
 
+@pytest.mark.parametrize("degrees", [0.0, 50.0, 170.0])
+def test_a_drive_starts_along_the_lane_where_it_fits(va12: Model, va12_motion: Motion, degrees: float) -> None:
+    """Whatever the heading it was found with; on a lane that is too narrow for that it lies as before."""
+    start = va12_motion.q[0].copy()
+    start[:3] = 3.0, -1.0, np.deg2rad(degrees)
+    motion = trajectories.move_motion(va12, va12_motion, start)
+    problem = va12.machine.problems["R60"].model_copy(update={"lane_m": (40.0, 20.0)})
+    (placed,) = ground.place_in_lane(va12, problem, (motion,))
+    assert placed.q[0, 2] == pytest.approx(0, abs=1e-9)
+    assert trajectories.lane_excess(trajectories.check_limits(va12, problem, placed)) == 0
+    assert placed.nu is motion.nu  # moved, not driven anew
+    path = placed.q[:, :2] - placed.q[0, :2]
+    assert np.hypot(*path.T) == pytest.approx(np.hypot(*(motion.q[:, :2] - motion.q[0, :2]).T))
+
+    used = np.ptp(placed.q[:, :2], axis=0)
+    narrow = problem.model_copy(update={"lane_m": (used[0] + 3, 0.8 * used[1])})
+    assert trajectories.place_along_lane(va12, narrow, [motion]) is None
+
+
+@pytest.mark.parametrize(
+    ("length", "words"),
+    [
+        (20.0, "That lies within the lane of 40 m x 20 m."),
+        (38.0, "The machine stays on the lane of 40 m x 20 m, but keep 2.0 m beyond its ends free."),
+        (44.0, "The machine leaves the lane of 40 m x 20 m, by 2.0 m: keep 5.0 m beyond its ends free."),
+    ],
+)
+def test_the_ground_that_a_person_needs_is_compared_with_the_lane(length: float, words: str) -> None:
+    room = ground.TouchedGround(length, 6.0, (-length / 2, -3.0))
+    assert room.words((40.0, 20.0)) == words
+    assert room.summary((40.0, 20.0))["beyond_lane_m"] == pytest.approx([length / 2 - 20, -7])
+    assert room.words((np.inf, np.inf)) == ""
+    assert "lane_m" not in room.summary((np.inf, np.inf))
+
+
 def test_moved_motion_is_the_same_motion_elsewhere(va12: Model, va12_motion: Motion) -> None:
     """The equations don't know the place: driving the same torques from the new start gives the moved path."""
     start = va12_motion.q[0].copy()
     start[:3] = [3.0, -2.0, 0.7]
     short = simulate(va12, va12_motion.u[:801], q0=start)
-    assert ground.move_motion(va12, va12_motion, start).q[:801] == pytest.approx(short.q, abs=1e-6)
+    assert trajectories.move_motion(va12, va12_motion, start).q[:801] == pytest.approx(short.q, abs=1e-6)
 
 
 def first_page(model: Model, lane: tuple[float, float], speed: float = 1.5) -> Figure:
@@ -423,7 +459,7 @@ def test_a_person_is_judged_by_the_accuracy_that_is_asked() -> None:
     """Three times the error of torques played back is good if 3.5 % were asked, and bad if 2 % were."""
     assert "accurate enough, the worst parameter comes to 3 %" in driving_aids.verdict(PLAYED, LOST, asked=3.5)
     said = driving_aids.verdict(PLAYED, LOST, asked=2.0)
-    assert "not accurate enough, the worst parameter comes to 3 %, asked are 2 %; design again with --driver" in said
+    assert "not accurate enough, the worst parameter comes to 3 %, needed are 2 %; design again with --driver" in said
 
 
 @pytest.mark.parametrize(

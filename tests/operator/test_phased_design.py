@@ -160,3 +160,31 @@ def test_one_step_improves_a_poor_drive(straight: Model) -> None:
     assert reach > 0.1
     assert fits(task, phased_design.snap_times(task, best.trace))
     assert phased_design.merit(task, replace(best, over=best.over + 1.0), room) > phased_design.merit(task, best, room)
+
+
+def test_levels_are_reduced_until_people_keep_the_limits(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing changes for a slow drive; of one that is too long for the lane the speeds fall, not the phases."""
+    task = task_of(straight, 16.0, 2.0)
+    short = task.problem.model_copy(update={"lane_m": (15.0, 20.0), "lane_points": (0, 4)})
+    task = replace(task, problem=short)
+    times = np.array([0.0, 3, 6, 9, 12, 16])
+    slow = Trace(times, np.array([0.0, 0.5, 0.6, 0.4, 0, 0]), np.zeros((6, 0)), ground.find_levers(straight))
+    kept = phased_design.reduce_levels(task, slow, 0)
+    assert not kept.over
+    assert kept.trace.speed == pytest.approx(slow.speed)
+    assert len(kept.motions) == 1 + phased_design.PEOPLE
+    monkeypatch.setattr(phased_design, "PEOPLE", 1)
+    fast = replace(slow, speed=np.array([0.0, 1.0, 1.0, 0.6, 0, 0]) * task.fastest)
+    assert phased_design.drive_way(task, fast, 0).over
+    reduced = phased_design.reduce_levels(task, fast, 0)
+    assert max(reduced.over.values(), default=0) < max(phased_design.drive_way(task, fast, 0).over.values())
+    assert reduced.trace.speed.max() < fast.speed.max()
+    assert reduced.trace.times[-1] == 16.0
+
+
+def test_the_lane_has_room_for_the_whole_contact(va12: Model) -> None:
+    """Half a roll, 1.05 m, is kept free at every side of the lane, as shares of 40 m and 20 m."""
+    task = task_of(va12, 60.0, 3.0)
+    width = max(float(b.contact.width) for b in va12.machine.contacts if b.contact is not None)
+    shares = sorted(set(phased_design.contact_overhang(task)))
+    assert shares == pytest.approx([0.0, width / 2 / 40, width / 2 / 20])
