@@ -21,6 +21,7 @@ from excite.cli.options import (
     CommandWithChoices,
     CondSlackOption,
     DesignArgument,
+    DrawingCommand,
     DurationOption,
     JsonOption,
     KitOption,
@@ -132,7 +133,7 @@ def machines(json: JsonOption = False) -> None:
     terminal.say(table)
 
 
-@app.command(cls=CommandWithChoices)
+@app.command(cls=DrawingCommand)
 def design(
     machine: MachineArgument,
     problem: ProblemOption = None,
@@ -213,7 +214,7 @@ def design(
         raise typer.Exit(1)
 
 
-@app.command(cls=CommandWithChoices)
+@app.command(cls=DrawingCommand)
 def verify(
     design_dir: DesignArgument,
     runs: RunsOption = 50,
@@ -237,7 +238,7 @@ def verify(
         summary |= workflows.verify(place, design_dir, runs, method, kit, seed, bar=terminal.bar)
 
 
-@app.command(cls=CommandWithChoices)
+@app.command(cls=DrawingCommand)
 def compare(
     machine: MachineArgument,
     problem: ProblemOption = None,
@@ -275,7 +276,7 @@ def compare(
         summary |= workflows.compare(place, machine, problem, samples, tuple(against or ()), seed, budget, terminal.bar)
 
 
-@app.command(cls=CommandWithChoices)
+@app.command(cls=DrawingCommand)
 def score(
     machine: MachineArgument,
     profile: Annotated[
@@ -303,7 +304,7 @@ def score(
         summary |= workflows.score(place, machine, profile, problem, sensors, kit)
 
 
-@app.command(cls=CommandWithChoices)
+@app.command(cls=DrawingCommand)
 def run(
     machine: MachineArgument,
     problem: ProblemOption = None,
@@ -509,7 +510,7 @@ def simulate(
             terminal.say(line)
 
 
-@app.command(cls=CommandWithChoices)
+@app.command(cls=DrawingCommand)
 def identify(
     machine: MachineArgument,
     logs: LogsArgument,
@@ -554,7 +555,7 @@ def identify(
         raise typer.Exit(1)
 
 
-@app.command()
+@app.command(cls=DrawingCommand)
 def predict(
     result: Annotated[Path, typer.Argument(metavar="RESULT", help="folder that `excite identify` wrote")],
     target: Annotated[
@@ -580,7 +581,7 @@ def predict(
         summary |= workflows.predict(place, result, target, terminal.bar)
 
 
-@app.command()
+@app.command(cls=DrawingCommand)
 def diagnose(
     machine: MachineArgument,
     logs: LogsArgument,
@@ -632,7 +633,7 @@ def diagnose(
         )
 
 
-@app.command()
+@app.command(cls=DrawingCommand)
 def slip(
     table: Annotated[
         Path | None,
@@ -722,7 +723,7 @@ logs = typer.Typer(help="Check or convert a log.", rich_markup_mode=None)
 app.add_typer(logs, name="log")
 
 
-@logs.command("check")
+@logs.command("check", cls=DrawingCommand)
 def check_log(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="a log (.csv, .txt, .parquet, .mat, .mf4)")],
     machine: Annotated[
@@ -895,7 +896,7 @@ def write_urdf(
         terminal.say(f"- {line}")
 
 
-@machine_files.command("check")
+@machine_files.command("check", cls=DrawingCommand)
 def check_machine(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="a machine file (.toml)")],
     out: OutOption = None,
@@ -967,7 +968,7 @@ def docs(out: OutOption = None, json: JsonOption = False) -> None:
         output.write_summary(place, summary)
 
 
-@app.command()
+@app.command(cls=DrawingCommand)
 def study(
     file: Annotated[
         Path, typer.Argument(metavar="STUDY.toml", help="study file: what to vary and what to do (see `excite docs`)")

@@ -37,6 +37,54 @@ class CommandWithChoices(typer.core.TyperCommand):
         super().format_help(ctx, formatter)
 
 
+def _figure_options(
+    figures: Annotated[
+        str,
+        typer.Option(
+            "--figures",
+            metavar="FORMATS",
+            help="formats of the figures, such as png,svg,pdf; the png is always written, report.html shows it",
+        ),
+    ] = "png",
+    figure_width: Annotated[
+        str | None,
+        typer.Option(
+            "--figure-width",
+            metavar="WIDTH",
+            help="width of every figure in print, with its unit, such as 88mm or 8.8cm, with letters of at least 6 pt"
+            " where they fit; as wide as it needs by default",
+        ),
+    ] = None,
+) -> None:
+    """Declare the options of `DrawingCommand`."""
+
+
+class DrawingCommand(CommandWithChoices):
+    """A command that writes figures: it takes the options of their files, its function need not know them."""
+
+    def __init__(self, *args: Any, **settings: Any) -> None:
+        super().__init__(*args, **settings)
+        only = typer.Typer(add_completion=False)
+        only.command()(_figure_options)
+        own: list[Any] = [p for p in typer.main.get_command(only).params if p.name in ("figures", "figure_width")]
+        before = next((k for k, p in enumerate(self.params) if p.name == "out"), len(self.params))
+        self.params[before:before] = own
+
+    def invoke(self, ctx: Any) -> Any:
+        formats, width = ctx.params.pop("figures"), ctx.params.pop("figure_width")
+        if formats == "png" and width is None:
+            return super().invoke(ctx)
+        from excite import reports
+
+        files = reports.FigureFiles(
+            reports.read_formats("--figures", formats),
+            None if width is None else reports.read_width("--figure-width", width),
+            lambda line: typer.echo(line, err=True),
+        )
+        with reports.writing_figures(files):
+            return super().invoke(ctx)
+
+
 MachineArgument = Annotated[
     str,
     typer.Argument(

@@ -13,6 +13,13 @@ from .diagnosis_figures import (
     figures_by_file as figures_by_file,
     signals_figure as signals_figure,
 )
+from .figure_files import (
+    FigureFiles as FigureFiles,
+    read_formats as read_formats,
+    read_width as read_width,
+    text_faults as text_faults,
+    writing_figures as writing_figures,
+)
 from .figures import (
     COLOURS as COLOURS,
     campaign_figure as campaign_figure,

@@ -20,6 +20,7 @@ from excite.logs import Inspection
 from excite.model import Model, signal_descriptions
 from excite.model.machine import Problem
 from excite.reports.charts import EXPLORE, Explorable, explorable
+from excite.reports.figure_files import wrap_title, write_figure
 from excite.simulation import Motion
 from excite.text import count, format_number
 from excite.trajectories import DESIGNED, ComparisonRow, SensorValue
@@ -32,7 +33,6 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
 LINEAR_UP_TO = 5.0  # errors [%] up to which their axis is linear; chosen
 UNIT_OF_COLUMN = re.compile(r"_(Nm|N|(rad|m)(_s)?)$")  # at the end of a profile's columns
-POINTS_PER_INCH = 72  # pt/in, definition
 TITLE_SIZE = 11  # pt; chosen
 LETTER = 0.58  # width of a letter as a share of its size, on average
 LEGEND_WIDTH, LEGEND_HANDLE = 470.0, 38.0  # pt: of a legend above a plot, and of an entry without its letters; chosen
@@ -43,12 +43,13 @@ TICKED_DECADES = 3  # of a logarithmic axis, up to which it has ticks between po
 
 
 def save(figure: Figure, path: Path) -> Explorable:
-    """Write a figure at print resolution without a date: the same data give the same bytes.
+    """Write a figure (.png) and its other formats as `writing_figures` states, and return what of it a chart shows.
 
-    Return what of it a chart shows.
+    Files have no date: the same data give the same bytes.
     """
-    figure.savefig(path, dpi=160, metadata={"Software": None} if path.suffix == ".png" else None)
-    return explorable(figure)
+    shown = explorable(figure)
+    write_figure(figure, path)
+    return shown
 
 
 def escape_dollar(text: str) -> str:
@@ -58,8 +59,7 @@ def escape_dollar(text: str) -> str:
 
 def set_title(figure: Figure, text: str) -> None:
     """Write a title above a figure, in as many lines as its width asks for."""
-    letters = int(figure.get_figwidth() * POINTS_PER_INCH / (LETTER * TITLE_SIZE))
-    figure.suptitle(escape_dollar("\n".join(textwrap.wrap(text, letters))), fontsize=TITLE_SIZE)
+    figure.suptitle(escape_dollar(wrap_title(figure, text, TITLE_SIZE)), fontsize=TITLE_SIZE)
 
 
 def _style(k: int) -> dict[str, Any]:

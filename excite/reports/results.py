@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -16,7 +17,7 @@ from excite.errors import UsageError
 from excite.identification import Estimate, Prediction, SlipFit, Verification
 from excite.logs import Log, profile_of
 from excite.model import Model
-from excite.reports import figures, pages, plain_text
+from excite.reports import figure_files, figures as drawings, pages, plain_text
 from excite.reports.charts import Explorable
 from excite.reports.descriptions import Description, describe
 from excite.reports.html import result_fragment
@@ -51,7 +52,7 @@ class Account:
             file(place)
         explorable = {} if self.draw is None else dict(self.draw(place))
         for name, draw in self.figures.items():
-            explorable[name] = figures.save(draw(), place / name)
+            explorable[name] = drawings.save(draw(), place / name)
         pages.write_report(place, self.kind, self.summary, command, explorable)
         return self.summary
 
@@ -102,8 +103,15 @@ class Shown:
         """
         return self.account.frame()
 
-    def plot(self, name: str | None = None) -> Figure:
-        """Return a figure of the report: the main one, or that of a name such as "sigma". Raises UsageError."""
+    def plot(
+        self, name: str | None = None, *, file: str | Path | None = None, figure_width: str | None = None
+    ) -> Figure:
+        """Return a figure of the report: the main one, or that of a name such as "sigma". Raises UsageError.
+
+        file: also write it into this file (.png, .svg, .pdf). figure_width: its width in print, such as "88mm".
+        """
+        if figure_width is not None and file is None:
+            raise UsageError("figure_width: is that of the file, give one")
         every = {**self.account.figures, **self.account.drawn}
         drawn = {file.removesuffix(".png"): draw for file, draw in every.items()}
         if not drawn:
@@ -111,14 +119,30 @@ class Shown:
         name = name or next(iter(drawn))
         if name not in drawn:
             raise UsageError(f"plot: {name} is unknown, allowed: {', '.join(drawn)}")
-        return drawn[name]()
+        figure = drawn[name]()
+        if file is not None:
+            figure_files.write_at_width(figure, Path(file), figure_width, warn)
+        return figure
 
-    def save(self, folder: str | Path) -> Path:
-        """Write the files that the command writes, into a folder that is complete or not there. Raises FolderError."""
+    def save(
+        self, folder: str | Path, *, figures: str | Sequence[str] = ("png",), figure_width: str | None = None
+    ) -> Path:
+        """Write the files that the command writes, into a folder that is complete or not there. Raises FolderError.
+
+        figures: formats of the figures, png, svg or pdf; the png is always written. figure_width: of every figure in
+        print, such as "88mm". Raises UsageError for an unknown format or unit.
+        """
         out = Path(folder)
-        with output.new_folder(out, "folder") as place:
+        width = None if figure_width is None else figure_files.read_width("figure_width", figure_width)
+        files = figure_files.FigureFiles(figure_files.read_formats("figures", figures), width, warn)
+        with output.new_folder(out, "folder") as place, figure_files.writing_figures(files):
             self.account.write(place, f"excite.{CALLS.get(self.account.kind, self.account.kind)}(...) in Python")
         return out
+
+
+def warn(line: str) -> None:
+    """Warn of a figure whose letters are small."""
+    warnings.warn(line, stacklevel=2)
 
 
 CALLS = {"log": "read_log"}  # kinds whose function has another name

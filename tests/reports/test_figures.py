@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 
 from excite.model import Model, build, signal_descriptions
 from excite.model.machine import load_machine
-from excite.reports import diagnosis_figures, figures
+from excite.reports import diagnosis_figures, figures, text_faults
 from excite.simulation import simulate
 
 LONG = "long names"
 MACHINES = ("va12", "emps", "tandem", "pendulum_loader")
-TOUCH = 1.0  # px by which boxes of texts may overlap: letters don't fill theirs
 
 
 def long_names() -> Model:
@@ -37,31 +33,6 @@ def long_names() -> Model:
 @lru_cache
 def model_of(name: str) -> Model:
     return long_names() if name == LONG else build(load_machine(name))
-
-
-def faults(figure: Figure) -> Iterator[str]:
-    """Yield each visible text that is cut off or lies on another one."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    renderer = canvas.get_renderer()
-    texts = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip()]  # type: ignore[union-attr]
-    hidden = {id(t) for ax in figure.axes if not (ax.get_visible() and ax.axison) for t in ax.findobj(Text)}
-    ticks = {}
-    for ax in figure.axes:
-        for axis, limits in ((ax.xaxis, ax.get_xlim()), (ax.yaxis, ax.get_ylim())):
-            low, high = sorted(limits)
-            for tick in [*axis.get_major_ticks(), *axis.get_minor_ticks()]:
-                if not low - 1e-9 * abs(low) <= tick.get_loc() <= high + 1e-9 * abs(high):
-                    ticks[id(tick.label1)] = ticks[id(tick.label2)] = True
-    boxes = [(t.get_text(), t.get_window_extent(renderer)) for t in texts if id(t) not in hidden and id(t) not in ticks]
-    whole = figure.bbox
-    for text, box in boxes:
-        if box.x0 < whole.x0 - 1 or box.x1 > whole.x1 + 1 or box.y0 < whole.y0 - 1 or box.y1 > whole.y1 + 1:
-            yield f"cut off: {text!r}"
-    for (one, a), (other, b) in itertools.combinations(boxes, 2):
-        wide, high = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
-        if wide > TOUCH and high > TOUCH:
-            yield f"{one!r} lies on {other!r}"
 
 
 def design(model: Model) -> Figure:
@@ -119,7 +90,7 @@ def test_no_text_is_cut_off_or_lies_on_another(kind: str, machine: str) -> None:
     model = model_of(machine)
     if kind == "design" and not model.machine.problems:
         pytest.skip("has no design problem")
-    assert list(faults(KINDS[kind](model))) == []
+    assert list(text_faults(KINDS[kind](model))) == []
 
 
 def test_the_check_finds_what_cannot_be_read() -> None:
@@ -127,6 +98,6 @@ def test_the_check_finds_what_cannot_be_read() -> None:
     ax = figure.subplots()
     ax.set_xticks([0.0, 0.01, 1.0], ["a long name", "another long one", "x"])
     figure.text(0.9, 0.5, "beyond the edge of the paper")
-    found = list(faults(figure))
+    found = list(text_faults(figure))
     assert "cut off: 'beyond the edge of the paper'" in found
     assert "'a long name' lies on 'another long one'" in found

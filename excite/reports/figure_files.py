@@ -1,0 +1,241 @@
+"""Files of figures: their formats, and a stated width in print with letters that stay readable.
+
+A command or `save` sets the files once (`writing_figures`), for every figure that is drawn inside.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import textwrap
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.backends import backend_mixed, backend_pdf
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from excite.errors import UsageError
+from excite.text import format_number
+
+FORMATS = ("png", "svg", "pdf")
+MM_PER_INCH = 25.4  # definition
+UNITS_MM = {"mm": 1.0, "cm": 10.0}
+WIDTH = re.compile(r"(\d+(?:\.\d*)?)\s*(mm|cm)")
+MIN_WIDTH_MM, MAX_WIDTH_MM = 60.0, 420.0  # narrower than a column of any paper; long side of A3
+SCREEN_DPI, PRINT_DPI = 160, 300  # of a PNG without and with a stated width; chosen
+MIN_LETTERS_PT = 6.0  # smallest letters that journals print; chosen from guides that ask for 5 to 8 pt
+LEAST_SAID = 0.98  # share of MIN_LETTERS_PT below which a figure's letters are said to be small; chosen
+STEP = 1.08  # between widths at which a figure is laid out until its texts fit; chosen
+TOUCH_PX = 1.0  # by which boxes of texts may overlap: letters don't fill theirs
+TITLE_LETTER = 0.58  # width of a letter of the title as a share of its size, on average
+POINTS_PER_INCH = 72  # pt/in, definition
+# without dates and random names: the same data give the same bytes
+METADATA: dict[str, dict[str, Any]] = {
+    "png": {"Software": None},
+    "svg": {"Date": None},
+    "pdf": {"CreationDate": None},
+}
+
+
+@dataclass(frozen=True)
+class FigureFiles:
+    """Formats of the figures that are written, and their width in print [mm]; None for each figure's own width.
+
+    The PNG is always written: reports and the window show it. tell: takes a line on a figure whose letters can't be as
+    large as `MIN_LETTERS_PT` at that width.
+    """
+
+    formats: tuple[str, ...] = ("png",)
+    width_mm: float | None = None
+    tell: Callable[[str], None] = lambda line: None
+
+
+_files: ContextVar[FigureFiles | None] = ContextVar("figure files", default=None)
+
+
+def read_formats(option: str, given: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the formats of figures, PNG first. given: names, or a text with commas. Raises UsageError."""
+    names = given.split(",") if isinstance(given, str) else list(given)
+    cleaned = [name.strip().lower().removeprefix(".") for name in names]
+    for name in cleaned:
+        if name not in FORMATS:
+            raise UsageError(f"{option}: {name or 'an empty name'} is unknown, allowed: {', '.join(FORMATS)}")
+    return tuple(name for name in FORMATS if name == "png" or name in cleaned)
+
+
+def read_width(option: str, given: str) -> float:
+    """Return a width [mm] from a number with its unit, such as 88mm or 8.8cm. Raises UsageError."""
+    found = WIDTH.fullmatch(given.strip().lower())
+    if found is None:
+        raise UsageError(f"{option}: must be a number with its unit, such as 88mm or 8.8cm (got {given})")
+    width = float(found[1]) * UNITS_MM[found[2]]
+    if not MIN_WIDTH_MM <= width <= MAX_WIDTH_MM:
+        raise UsageError(f"{option}: must be {MIN_WIDTH_MM:g} to {MAX_WIDTH_MM:g} mm (got {width:g} mm)")
+    return width
+
+
+@contextmanager
+def writing_figures(files: FigureFiles) -> Iterator[None]:
+    """Write every figure that is saved inside the block into these files."""
+    before = _files.set(files)
+    try:
+        yield
+    finally:
+        _files.reset(before)
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG at `path` and in the other formats beside it, at the width that `writing_figures` states.
+
+    A figure without a stated width is written as it is. Otherwise it is laid out anew, as narrow as its texts allow,
+    and scaled to the width.
+    """
+    files = _files.get() or FigureFiles()
+    scale = None if files.width_mm is None else _fit_width(figure, files.width_mm, path.stem, files.tell)
+    for kind in files.formats:
+        write_file(figure, path.with_suffix(f".{kind}"), scale)
+
+
+def write_at_width(figure: Figure, path: Path, width: str | None, tell: Callable[[str], None]) -> None:
+    """Write a figure into a file (.png, .svg, .pdf) of a width in print, such as 88mm. Raises UsageError."""
+    read_formats("file", [path.suffix])
+    width_mm = None if width is None else read_width("figure_width", width)
+    write_file(figure, path, None if width_mm is None else _fit_width(figure, width_mm, path.stem, tell))
+
+
+def write_file(figure: Figure, path: Path, scale: float | None = None) -> None:
+    """Write a figure into a file (.png, .svg, .pdf), scaled as a whole for print; None for the screen."""
+    kind = path.suffix.lower().removeprefix(".")
+    if kind == "pdf":
+        _write_pdf(figure, path, scale or 1.0)
+    elif kind == "svg":
+        with mpl.rc_context({"svg.hashsalt": "excite"}):
+            figure.savefig(path, metadata=METADATA["svg"])
+        _scale_svg(path, figure, scale or 1.0)
+    elif scale is None:
+        figure.savefig(path, dpi=SCREEN_DPI, metadata=METADATA["png"])
+    else:
+        density = {"dpi": (PRINT_DPI, PRINT_DPI)}
+        figure.savefig(path, dpi=PRINT_DPI * scale, metadata=METADATA["png"], pil_kwargs=density)
+
+
+def text_faults(figure: Figure) -> Iterator[str]:
+    """Yield each visible text that is cut off or lies on another one."""
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()
+    renderer = canvas.get_renderer()
+    found = figure.findobj(Text)
+    texts = [t for t in found if isinstance(t, Text) and t.get_visible() and t.get_text().strip()]
+    hidden = {id(t) for ax in figure.axes if not (ax.get_visible() and ax.axison) for t in ax.findobj(Text)}
+    for ax in figure.axes:
+        for axis, limits in ((ax.xaxis, ax.get_xlim()), (ax.yaxis, ax.get_ylim())):
+            low, high = sorted(limits)
+            for tick in [*axis.get_major_ticks(), *axis.get_minor_ticks()]:
+                if not low - 1e-9 * abs(low) <= tick.get_loc() <= high + 1e-9 * abs(high):
+                    hidden |= {id(tick.label1), id(tick.label2)}
+    boxes = [(t.get_text(), t.get_window_extent(renderer)) for t in texts if id(t) not in hidden]
+    whole = figure.bbox
+    for text, box in boxes:
+        if box.x0 < whole.x0 - 1 or box.x1 > whole.x1 + 1 or box.y0 < whole.y0 - 1 or box.y1 > whole.y1 + 1:
+            yield f"cut off: {text!r}"
+    for (one, a), (other, b) in itertools.combinations(boxes, 2):
+        wide, high = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
+        if wide > TOUCH_PX and high > TOUCH_PX:
+            yield f"{one!r} lies on {other!r}"
+
+
+def wrap_title(figure: Figure, text: str, size: float) -> str:
+    """Return a title in as many lines as the width of the figure asks for. size [pt]."""
+    letters = int(figure.get_figwidth() * POINTS_PER_INCH / (TITLE_LETTER * size))
+    return "\n".join(textwrap.wrap(text, letters))
+
+
+def _fit_width(figure: Figure, width_mm: float, name: str, tell: Callable[[str], None]) -> float:
+    """Lay a figure out for a width in print, and return the scale that gives it.
+
+    tell: takes a line if the smallest letters can't be as large as `MIN_LETTERS_PT`; name: what it calls the figure.
+    """
+    width_in = width_mm / MM_PER_INCH
+    own_width, own_height = (float(x) for x in figure.get_size_inches())
+    texts = [t for t in figure.findobj(Text) if isinstance(t, Text) and t.get_visible() and t.get_text().strip()]
+    smallest = min((float(t.get_fontsize()) for t in texts), default=MIN_LETTERS_PT)
+    narrowest = width_in * max(1.0, smallest / MIN_LETTERS_PT)
+    layout = max(own_width, narrowest)
+    _lay_out(figure, layout, own_height)
+    # From wide to narrow: a layout that has failed leaves its traces in the figure.
+    while layout > narrowest:
+        _lay_out(figure, max(layout / STEP, narrowest), own_height)
+        if _has_faults(figure):
+            _lay_out(figure, layout, own_height)
+            break
+        layout = max(layout / STEP, narrowest)
+    scale = width_in / float(figure.get_figwidth())
+    letters = smallest * scale
+    if letters < LEAST_SAID * MIN_LETTERS_PT:
+        enough = width_mm * MIN_LETTERS_PT / letters
+        tell(
+            f"{name}: letters of {format_number(letters, 2)} pt at {width_mm:g} mm; {MIN_LETTERS_PT:g} pt need"
+            f" {enough:.0f} mm"
+        )
+    return scale
+
+
+def _lay_out(figure: Figure, width_in: float, height_in: float) -> None:
+    figure.set_size_inches(width_in, height_in)
+    title = figure.get_suptitle()
+    if title:
+        size = float(figure._suptitle.get_fontsize())  # type: ignore[attr-defined]
+        figure.suptitle(wrap_title(figure, " ".join(title.split()), size), fontsize=size)
+
+
+def _has_faults(figure: Figure) -> bool:
+    """Say whether texts are cut off or overlap, or a plot has no room left."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = next(text_faults(figure), None)
+    return found is not None or any("layout" in str(one.message) for one in said)  # no room for the plots
+
+
+def _scale_svg(path: Path, figure: Figure, scale: float) -> None:
+    """Scale an SVG as a whole: its stated size changes, its coordinates don't."""
+    width, height = (POINTS_PER_INCH * scale * float(x) for x in figure.get_size_inches())
+    text = path.read_text(encoding="utf-8")
+    head, rest = text.split("<svg ", 1)
+    tag, rest = rest.split(">", 1)
+    for name, value in (("width", width), ("height", height)):
+        tag = re.sub(rf'\b{name}="[\d.]+pt"', f'{name}="{value:.6g}pt"', tag)
+    path.write_text(f"{head}<svg {tag}>{rest}", encoding="utf-8")
+
+
+def _write_pdf(figure: Figure, path: Path, scale: float) -> None:
+    """Write a PDF scaled as a whole; matplotlib has no scale of its own."""
+    if scale == 1.0:
+        figure.savefig(path, metadata=METADATA["pdf"])
+        return
+    pdf: Any = backend_pdf  # it has no types
+    mixed: Any = backend_mixed
+    pdf.FigureCanvasPdf(figure)
+    dpi = figure.dpi
+    figure.dpi = POINTS_PER_INCH  # a PDF's coordinates
+    width, height = (float(x) for x in figure.get_size_inches())
+    file = pdf.PdfFile(path, metadata=METADATA["pdf"])
+    try:
+        file.newPage(width * scale, height * scale)
+        file.width, file.height = width, height  # paths are clipped to it before they are scaled
+        file.output(scale, 0, 0, scale, 0, 0, pdf.Op.concat_matrix)
+        inner = pdf.RendererPdf(file, PRINT_DPI, height, width)
+        renderer = mixed.MixedModeRenderer(figure, width, height, PRINT_DPI, inner)
+        figure.draw(renderer)
+        renderer.finalize()
+        file.finalize()
+    finally:
+        file.close()
+        figure.dpi = dpi
