@@ -96,6 +96,7 @@ def design(
     seed: int = 0,
     budget: float | None = None,
     solver: str = "own",
+    trajectory: str | None = None,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> ShownDesign:
     """Design a test drive that makes the parameters of a machine identifiable.
@@ -111,6 +112,7 @@ def design(
     starts, seed: starting guesses and their random seed.
     budget [s]: time after which the search stops.
     solver: a name of `excite.trajectories.SOLVERS`: `own`, or `ipopt` for a check.
+    trajectory: of an arm, a name of `excite.trajectories.TRAJECTORIES`: `free`, the default, or `fourier`.
     progress(done, total, best score): called during the search.
     Raises InfeasibleError with the limit that can't be kept, SolverError if the solver finds no optimum, UsageError for
     an unknown name.
@@ -127,6 +129,7 @@ def design(
         cond_slack=cond_slack,
         solver=solver,
         of=None if of is None else Path(of),
+        trajectory=trajectory,
     )
     model, name, chosen = workflows.prepare_design(_as_given(machine), problem, duration, request)
     begin = time.perf_counter()
@@ -200,9 +203,9 @@ def simulate(
     model = load(machine)
     workflows.require_known("kit", kit, simulation.KITS)
     workflows.require_known("friction", friction, simulation.FRICTION_LAWS)
-    torque, q0, nu0 = _torques(model, drive)
-    true = workflows.with_effects(model, effects, len(torque))
-    motion = simulation.simulate(true, torque, q0=q0, nu0=nu0, friction=friction)
+    given = _planned(model, drive)
+    true = workflows.with_effects(model, effects, len(given.torque))
+    motion = simulation.play_back(true, given.torque, given.q0, given.nu0, given.planned, friction=friction)
     return reports.log_frame(simulation.measure(true, motion, kit=kit, seed=seed, noise=noise), true.machine)
 
 
@@ -319,7 +322,8 @@ def score(
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
     name, chosen = workflows.choose_problem(model.machine, problem, None)
     workflows.require_noise_figures(model)
-    found = trajectories.score(model, chosen, *_torques(model, drive, any_rate=True))
+    given = _planned(model, drive, any_rate=True)
+    found = trajectories.score(model, chosen, given.torque, given.start, given.nu0, given.planned)
     workflows.require_known("kit", kit, simulation.KITS)
     called = _called(drive, "the drive")
     valued = kit if sensors else None
@@ -379,35 +383,29 @@ def _several(logs: Source | Sequence[Source]) -> list[Source]:
 
 def _target(model: Model, target: Source | Drive) -> Source | PlannedDrive:
     """Return what a prediction is along: a log or profile as it is, any other drive with its planned motion."""
-    if isinstance(target, np.ndarray):
-        rest = np.zeros(len(model.coordinates))
-        return PlannedDrive(target, rest, rest)
-    if isinstance(target, Design | Motion):
-        motion = target.motion if isinstance(target, Design) else target
-        return PlannedDrive(motion.u, motion.q[0], motion.nu[0], motion.q, motion.nu)
+    if isinstance(target, np.ndarray | Design | Motion):
+        return _planned(model, target)
     if isinstance(target, str | Path) and (Path(target) / "profile.csv").is_file():
         return Path(target) / "profile.csv"
     return target
 
 
-def _torques(
-    model: Model, drive: Drive, any_rate: bool = False
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Return the torques (N, n_u) [N m] of a drive and the state at its start, None if it may begin anywhere.
+def _planned(model: Model, drive: Drive, any_rate: bool = False) -> PlannedDrive:
+    """Return the torques of a drive, the state at its start and the motion that it expects.
 
     any_rate: as for `excite.logs.read_drive`.
     """
     if isinstance(drive, np.ndarray):
-        return drive, None, None
+        rest = np.zeros(len(model.coordinates))
+        return PlannedDrive(drive, rest, rest, placed=False)
     if isinstance(drive, Design):
         drive = drive.motion
     if isinstance(drive, Motion):
-        return drive.u, drive.q[0], drive.nu[0]
+        return PlannedDrive(drive.u, drive.q[0], drive.nu[0], drive.q, drive.nu)
     path = Path(drive)
-    planned = readers.read_drive(path / "profile.csv" if path.is_dir() else path, model, any_rate)
-    return planned.torque, planned.start if any_rate else planned.q0, planned.nu0
+    return readers.read_drive(path / "profile.csv" if path.is_dir() else path, model, any_rate)
 
 
 def _motion(model: Model, drive: Drive) -> Motion:
-    torque, q0, nu0 = _torques(model, drive)
-    return simulation.simulate(model, torque, q0=q0, nu0=nu0)
+    given = _planned(model, drive)
+    return simulation.play_back(model, given.torque, given.q0, given.nu0, given.planned)

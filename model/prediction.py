@@ -185,6 +185,19 @@ class Model:
         own = [m.initial_std for e in self.effects for _, m in e.memory.values()]
         return np.array([1e-6] * ("time" in self.memory) + own)
 
+    @property
+    def fully_driven(self) -> bool:
+        """True if each joint is driven and none touches the ground: any smooth motion of the joints is possible."""
+        return len(self.actuated) == len(self.coordinates) and not self.machine.contacts
+
+    @cached_property
+    def follows_positions(self) -> bool:
+        """True for an arm: fully driven, with forces that depend on positions.
+
+        Torques alone do not keep such a machine on its path. Its drives are motions that position controllers follow.
+        """
+        return self.fully_driven and bool(self.active_coordinates)
+
     @cached_property
     def rows(self) -> tuple[str, ...]:
         """Names of the equations, one per coordinate."""
@@ -256,6 +269,13 @@ class Model:
             change = np.maximum(change, np.abs(at).max(axis=0))
         floor = 1e-9 * float(np.abs(self.nominal).max())
         return tuple(c for c, size in zip(self.coordinates, change, strict=True) if size > floor)
+
+    @cached_property
+    def mass_matrix(self) -> ca.Function:
+        """(q, X) -> mass matrix (n_q, n_q)."""
+        q, nu, _ = self.symbols()
+        X = ca.SX.sym("X", len(self.base.names))
+        return ca.Function("mass_matrix", [q, X], [self.equations(q, nu, X)[0]], ["q", "X"], ["M"])
 
     @cached_property
     def pivots(self) -> ca.Function:

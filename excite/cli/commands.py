@@ -37,6 +37,7 @@ from excite.cli.options import (
     SigmaMaxOption,
     SolverOption,
     StartsOption,
+    TrajectoryOption,
 )
 from excite.errors import InputError, UsageError
 from excite.text import count, format_number
@@ -177,15 +178,18 @@ def design(
     seed: SeedOption = 0,
     budget: BudgetOption = None,
     solver: SolverOption = "own",
+    trajectory: TrajectoryOption = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
     """Design a test drive within the machine's limits.
 
-    Finds the torques over time that make every parameter identifiable, and states the attainable accuracy.
+    Finds the torques over time that make every parameter identifiable, and states the attainable accuracy. An arm
+    under gravity gets a motion of its joints with the torques that it takes.
 
     Example: excite design va12 --duration 30 --objective accuracy
     Example: excite design va12 --target 0.5 --drives 3
+    Example: excite design ur10 --trajectory fourier
     """
     from excite.workflows import CampaignRequest, DesignRequest
 
@@ -197,7 +201,20 @@ def design(
         raise UsageError("--phase-min needs --driver as well")
     earlier, pair = tuple(after or ()), tuple(between or ())
     request = DesignRequest(
-        objective, sigma_max, robust, earlier, starts, seed, budget, pair, driver, phase_min, cond_slack, solver, of
+        objective,
+        sigma_max,
+        robust,
+        earlier,
+        starts,
+        seed,
+        budget,
+        pair,
+        driver,
+        phase_min,
+        cond_slack,
+        solver,
+        of,
+        trajectory,
     )
     out = out or Path(f"results/design-{workflows.machine_stem(machine)}")
     inputs = [*_machine_file(machine), *(after or []), *([] if of is None else [of])]
@@ -469,7 +486,6 @@ def simulate(
     """
     from excite import output, reports, simulation
     from excite.logs import read_drive
-    from excite.simulation import simulate as drive
 
     if noise not in ("on", "off"):
         raise UsageError(f"--noise: {noise} is unknown, allowed: on, off")
@@ -483,7 +499,9 @@ def simulate(
     nominal, model = model, workflows.with_effects(model, effect or (), len(planned.torque))
     doubts = [f"--effect {line}" for line in workflows.doubtful_effects(nominal, model)]
     with output.new_file(out) as path:
-        motion = drive(model, planned.torque, q0=planned.start, nu0=planned.nu0, friction=friction)
+        motion = simulation.play_back(
+            model, planned.torque, planned.start, planned.nu0, planned.planned, friction=friction
+        )
         table = simulation.measure(model, motion, kit=kit, seed=seed, noise=noise == "on")
         TABLE_WRITERS[out.suffix.lower()](table, path)
     summary = {

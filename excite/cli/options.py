@@ -133,6 +133,15 @@ SolverOption = Annotated[
         "--solver", help="solver of the search, `ipopt` for a check by another one", autocompletion=names("solver")
     ),
 ]
+TrajectoryOption = Annotated[
+    str | None,
+    typer.Option(
+        "--trajectory",
+        help="for arms under gravity, whose designs are motions of the joints: `free` (splines, the default) or"
+        " `fourier` (series of five harmonics)",
+        autocompletion=names("trajectory"),
+    ),
+]
 StartsOption = Annotated[
     int,
     typer.Option(

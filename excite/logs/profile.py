@@ -64,6 +64,11 @@ class PlannedDrive:
     placed: bool = True
 
     @property
+    def planned(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """The expected motion q, nu (N, n_q), None if the profile has not all of it."""
+        return None if self.q is None or self.nu is None else (self.q, self.nu)
+
+    @property
     def start(self) -> np.ndarray | None:
         """The pose (n_q,) that it starts from, None if the drive may begin anywhere on the lane."""
         return self.q0 if self.placed else None

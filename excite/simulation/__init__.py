@@ -7,6 +7,9 @@ the levers, a `Driver` with preview, delay and slow errors. `measure` turns a mo
 `delivered_torques` convert between the motors' torques and the readings of their channels. `share_outside_law` says how
 much of a motion lies beyond the linear soil law.
 
+`play_back` simulates a drive as its machine follows it: arms under gravity follow positions (`follow_positions`,
+`inverse_dynamics`, `motion_along`), others torques.
+
 For robust design, `perturbed_machines` draws machines around the nominal one, and `track_motion` simulates how each
 follows a nominal motion. The integrator is the Rosenbrock method RODAS; its coefficients (`GAMMA`, `A_ROWS`, ...) and
 linear solves are public for the smoother's linearisation.

@@ -6,6 +6,12 @@ from .integrator import (
     respond as respond,
     simulate as simulate,
 )
+from .position_control import (
+    follow_positions as follow_positions,
+    inverse_dynamics as inverse_dynamics,
+    motion_along as motion_along,
+    play_back as play_back,
+)
 from .rosenbrock import (
     A_ROWS as A_ROWS,
     C_ROWS as C_ROWS,

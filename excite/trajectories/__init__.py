@@ -10,6 +10,8 @@
 - `read_design` reads the folder of a design back (`SavedDesign`).
 - The module `bound` computes how low cond(Phi) can be at best.
 
+- `design_joint_motion` designs arms under gravity, as motions of their joints (`TRAJECTORIES`).
+
 A design is a direct collocation (`collocation`), solved by an interior-point method (`interior_point`) in stages from a
 smooth problem to the real machine (`continuation`). Every score is that of a fresh simulation.
 """

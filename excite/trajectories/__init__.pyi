@@ -22,6 +22,12 @@ from .composite_objective import (
 )
 from .continuation import SOLVERS as SOLVERS
 from .excitation import Manoeuvre as Manoeuvre, multisine as multisine, scale_torques as scale_torques
+from .joint_motion import JointMotion as JointMotion, MotionProgram as MotionProgram, between_samples as between_samples
+from .joint_search import (
+    TRAJECTORIES as TRAJECTORIES,
+    check_joint_motion as check_joint_motion,
+    design_joint_motion as design_joint_motion,
+)
 from .limits import (
     DURATION_LIMIT as DURATION_LIMIT,
     LIMITS as LIMITS,

@@ -231,6 +231,31 @@ def exact_derivatives(
     return total, slope, hessian
 
 
+def directional_derivatives(
+    objective: CompositeObjective, A: np.ndarray, directions: np.ndarray, sharpness: float
+) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    """Return value, slope (m,) and Hessian (m, m) along changes of all information matrices A (n_blocks, n, n).
+
+    directions (n_blocks, m, n, n). The fourth result is the gradient (n_blocks, n, n) in the matrices.
+    """
+    m = directions.shape[1]
+    total, slope, hessian, gradient = 0.0, np.zeros(m), np.zeros((m, m)), np.zeros_like(A)
+    for term in objective.terms:
+        by = term.column_scale * term.column_scale[:, None]
+        J = _accumulated(term, A[term.block])
+        x, g, H, G = objectives.directional_derivatives(
+            term.objective, J, directions[term.block] * by, sharpness, term.contrasts
+        )
+        push, bend = 1.0, 0.0
+        if term.ceiling is not None:
+            x, push, bend = _smooth_hinge(x - term.ceiling)
+        total += term.weight * x
+        slope += term.weight * push * g
+        hessian += term.weight * (push * H + bend * np.outer(g, g))
+        gradient[term.block] += term.weight * push * by * G
+    return total, slope, hessian, gradient
+
+
 def _accumulated(term: Term, A: np.ndarray) -> np.ndarray:
     """Return J = D (A + prior) D."""
     J = A if term.prior is None else A + term.prior

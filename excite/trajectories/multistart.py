@@ -11,7 +11,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -56,7 +56,8 @@ class Design:
     cond_phi, cond_w: condition numbers over every sample of `motion`. cond_phi_start: of the best random start.
     violations: excess by limit, as a fraction of its range, 0 where kept. scores: the objective of every start as
     reported, inf for an infeasible one. complete: False if interrupted or cut short by the budget. solver: a name in
-    SOLVERS; iterations: of the solver, from the start that won to this drive.
+    SOLVERS; iterations: of the solver, from the start that won to this drive. trajectory: kind of joint motion, a name
+    in TRAJECTORIES, None for torques; limits of a joint motion are also judged between samples.
     """
 
     objective: str
@@ -71,6 +72,7 @@ class Design:
     complete: bool
     solver: str = "own"
     iterations: int = 0
+    trajectory: str | None = None
 
 
 def design(
@@ -111,8 +113,8 @@ def design(
     guesses: list[int | Manoeuvre] = [*(int(s) for s in seeds), *warm]
     states: dict[int, SearchState] = {}
     with (
-        _stop_file() as stop,
-        _progress_reports(stop.parent, progress, starts * SCREENING_STAGES + kept * MIN_LATER_STEPS),
+        stop_file() as stop,
+        progress_reports(stop.parent, progress, starts * SCREENING_STAGES + kept * MIN_LATER_STEPS),
         joblib.parallel_config("loky", inner_max_num_threads=1),
     ):
         # loky even for one start: only its workers can limit the threads of the linear algebra
@@ -120,7 +122,7 @@ def design(
         call = joblib.delayed(_run_start)
 
         def gather(calls: Iterator[Any]) -> None:
-            with _ignore_killed_workers(stop):
+            with ignore_killed_workers(stop):
                 for state in run(calls):
                     if state is not None:
                         states[state.number] = state
@@ -139,7 +141,7 @@ def design(
     if best.failure is not None:
         raise _no_optimum(solver, best, len(guesses))
     if not best.best.feasible:
-        raise _infeasible(composite, best.best, complete)
+        raise infeasible_error(composite, best.best.violations, complete)
     drive = best.best
     motion = simulate(model, drive.manoeuvre.sample(float(model.machine.sampling_hz)), q0=drive.start)
     along = place_along_lane(model, problem, [motion])
@@ -161,7 +163,7 @@ def design(
 
 
 @contextmanager
-def _ignore_killed_workers(stop: Path) -> Iterator[None]:
+def ignore_killed_workers(stop: Path) -> Iterator[None]:
     """Ignore workers that Ctrl-C kills before they handle it."""
     try:
         yield
@@ -195,10 +197,10 @@ def _no_optimum(solver: str, best: SearchState, starts: int) -> SolverError:
     )
 
 
-def _infeasible(objective: CompositeObjective, best: ScoredDrive, complete: bool) -> InfeasibleError:
+def infeasible_error(objective: CompositeObjective, violations: Mapping[str, float], complete: bool) -> InfeasibleError:
     """Build the error that names the limit with the largest excess."""
-    name = max(best.violations, key=lambda limit: best.violations[limit])
-    excess = best.excess
+    name = max(violations, key=lambda limit: violations[limit])
+    excess = violations[name]
     cut = "the search was cut short, give more time"
     if name == SIGMA_MAX and objective.sigma_max is not None:
         return InfeasibleError(
@@ -222,7 +224,7 @@ def _score(objective: CompositeObjective, c: ScoredDrive) -> float:
 
 
 @contextmanager
-def _stop_file() -> Iterator[Path]:
+def stop_file() -> Iterator[Path]:
     """Yield the path of a file that appears on Ctrl-C; searches look for it and stop."""
     with tempfile.TemporaryDirectory(prefix="excite-") as folder:
         stop = Path(folder) / "stop"
@@ -237,7 +239,7 @@ def _stop_file() -> Iterator[Path]:
 
 
 @contextmanager
-def _progress_reports(folder: Path, progress: Report | None, total: int) -> Iterator[None]:
+def progress_reports(folder: Path, progress: Report | None, total: int) -> Iterator[None]:
     """Call `progress` as workers write files START-STAGE with their best score."""
     if progress is None:
         yield

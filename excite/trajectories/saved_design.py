@@ -13,7 +13,7 @@ from excite import logs, output
 from excite.errors import DesignFolderError
 from excite.model import Model, build
 from excite.model.machine import Machine, Problem
-from excite.simulation import Motion, simulate
+from excite.simulation import Motion, play_back
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,11 @@ def read_design(design_dir: Path) -> SavedDesign:
     except (AttributeError, TypeError, ValueError):
         raise DesignFolderError(f"{design_dir / output.SUMMARY}: damaged, design again") from None
     model = replace(model, nominal=np.array([nominal[n] for n in model.base.names]))
-    torque, q0, nu0 = logs.read_profile(design_dir / "profile.csv", model)
+    drive = logs.read_drive(design_dir / "profile.csv", model)
+    torque = drive.torque
     if len(torque) != round(seconds * float(model.machine.sampling_hz)) + 1:
         raise DesignFolderError(
             f"{design_dir / 'profile.csv'}: {len(torque)} rows do not make {seconds:g} s, design again"
         )
     problem = model.machine.problems.get(str(before.get("problem")))
-    return SavedDesign(before, model, problem, simulate(model, torque, q0=q0, nu0=nu0))
+    return SavedDesign(before, model, problem, play_back(model, torque, drive.q0, drive.nu0, drive.planned))

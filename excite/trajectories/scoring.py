@@ -8,7 +8,7 @@ import numpy as np
 
 from excite.model import Model
 from excite.model.machine import Problem
-from excite.simulation import Motion, share_outside_law, simulate
+from excite.simulation import Motion, play_back, share_outside_law
 from excite.trajectories import objective
 from excite.trajectories.composite_objective import compose_objective, sigma_percent
 from excite.trajectories.limits import DURATION_LIMIT, check_limits, simulate_on_lane
@@ -53,15 +53,24 @@ class Score:
 
 
 def score(
-    model: Model, problem: Problem, torque: np.ndarray, q0: np.ndarray | None = None, nu0: np.ndarray | None = None
+    model: Model,
+    problem: Problem,
+    torque: np.ndarray,
+    q0: np.ndarray | None = None,
+    nu0: np.ndarray | None = None,
+    planned: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Score:
     """Simulate torques (N, n_u) [N m] at the machine's sampling rate afresh, and judge the motion as a design.
 
     q0, nu0 (n_q,): state at the start, at rest by default. Without q0 the drive is placed on the lane as a design is.
+    planned: q, nu (N, n_q) that the drive expects, which an arm follows (`simulation.play_back`).
 
     Raises SimulationError, and ValueError for a sensor without noise or counts.
     """
-    motion = simulate_on_lane(model, problem, torque, nu0) if q0 is None else simulate(model, torque, q0=q0, nu0=nu0)
+    if q0 is None and not (planned is not None and model.follows_positions):
+        motion = simulate_on_lane(model, problem, torque, nu0)
+    else:
+        motion = play_back(model, torque, q0, nu0, planned)
     return score_motion(model, problem, motion)
 
 

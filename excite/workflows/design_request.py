@@ -16,12 +16,15 @@ from typing import Any
 import numpy as np
 
 from excite import identification, logs, operator, simulation, text as wording, trajectories
-from excite.errors import InfeasibleError, MachineError, SolverError
+from excite.errors import InfeasibleError, MachineError, SolverError, UsageError
 from excite.model import Model, build, effects
-from excite.model.machine import EffectEntry, Problem
+from excite.model.machine import EffectEntry, Problem, Quantity
 from excite.operator import PhasedDrive
 from excite.trajectories import CompositeObjective, Design, design
 
+DEFAULT_TRAJECTORY = "free"  # of an arm
+ASSUMED_TORQUE_NOISE = 0.005  # of the torque limit, standard deviation, without a figure of the sensor; chosen
+ASSUMED_COUNTS_PER_TURN = 65536.0  # of an encoder without a figure; chosen
 POOR_PERCENT = 5.0  # attainable standard deviation [%] above which the summary gives advice; chosen
 ROBUST_MACHINES = 5  # machines of a robust design; chosen
 ROBUST_SPREAD = 0.2  # share of the nominal values by which these machines may be off; chosen
@@ -38,6 +41,7 @@ class DesignRequest:
     starts, seed: starting guesses and their random seed.
     budget_s [s]: time after which the search stops.
     between: two effects or more, NAME[@WHERE]=MAGNITUDE, that the drive must separate.
+    trajectory: kind of joint motion of an arm, a name of `TRAJECTORIES`; None for the usual one, or torques of others.
     of: profile (.csv) or design folder of the drive to predict, for the objectives of a prediction.
     driver: design for people, in phases of phase_min_s [s] or more.
     cond_slack [%]: with objective cond, by how much cond(Phi) may grow for the most accurate drive; 0 for the lowest.
@@ -57,6 +61,7 @@ class DesignRequest:
     cond_slack: float = 12.0
     solver: str = "own"
     of: Path | None = None
+    trajectory: str | None = None
 
     @property
     def second_step(self) -> bool:
@@ -135,7 +140,7 @@ def contrasts(model: Model, request: DesignRequest) -> np.ndarray | None:
         return None
     path = request.of / "profile.csv" if request.of.is_dir() else request.of
     drive = logs.read_drive(path, model)
-    motion = simulation.simulate(model, drive.torque, q0=drive.q0, nu0=drive.nu0)
+    motion = simulation.play_back(model, drive.torque, drive.q0, drive.nu0, drive.planned)
     return trajectories.prediction_contrasts(model, motion)
 
 
@@ -152,6 +157,8 @@ def design_from(
     Raises MachineError for sensors of unknown noise, UndrivableError for a drive that no person can follow, and the
     errors of `trajectories.design`, `logs.prepare` and `identification.identify`.
     """
+    if request.trajectory is not None or model.follows_positions:
+        return _design_arm(model, problem, request, progress)
     if request.driver:
         operator.check_phase_length(model, problem, request.phase_min_s)
     require_noise_figures(model)
@@ -178,6 +185,51 @@ def design_from(
         model, problem, aim, free.motion, request.phase_min_s, request.seed, out_of_time, progress
     )
     return DesignResult(model, aim, operator.as_design(model, problem, free, made), made, contrasts=judged)
+
+
+def _design_arm(
+    model: Model, problem: Problem, request: DesignRequest, progress: Callable[[int, int, float], None] | None
+) -> DesignResult:
+    """Design the joint motion of an arm. Raises UsageError for options of torque profiles, else as `design_from`."""
+    trajectory = request.trajectory or DEFAULT_TRAJECTORY
+    trajectories.check_joint_motion(model, trajectory)
+    for option, given in (
+        ("--driver", request.driver),
+        ("--robust", request.robust),
+        ("--between", bool(request.between)),
+        ("--of", request.of is not None),
+    ):
+        if given:
+            raise UsageError(f"{option}: not for {model.machine.name}, an arm, whose designs are motions of its joints")
+    model = with_assumed_noise(model)
+    require_noise_figures(model)
+    model, prior = with_earlier_logs(model, request.after)
+    aim = trajectories.compose_objective(model, request.objective, request.sigma_max, prior)
+    found = trajectories.design_joint_motion(
+        model, problem, aim, request.starts, request.seed, request.budget_s, progress, trajectory
+    )
+    return DesignResult(model, aim, found)
+
+
+def with_assumed_noise(model: Model) -> Model:
+    """Return a model whose sensors all have noise figures, assumed ones where the machine file has none."""
+    machine = model.machine
+    found = {}
+    for s in machine.sensor:
+        if s.has_noise_figure or s.kind in ("x", "y"):
+            continue
+        limit = None if s.body is None else machine.find(s.body).limit.torque
+        if s.kind == "torque" and limit is not None:
+            noise = Quantity(value=ASSUMED_TORQUE_NOISE * float(limit), source="assumed")
+            found[s.name] = s.model_copy(update={"noise": noise})
+        elif s.kind == "angle":
+            found[s.name] = s.model_copy(
+                update={"counts_per_turn": Quantity(value=ASSUMED_COUNTS_PER_TURN, source="assumed")}
+            )
+    if not found:
+        return model
+    sensors = tuple(found.get(s.name, s) for s in machine.sensor)
+    return replace(model, machine=machine.model_copy(update={"sensor": sensors}))
 
 
 def _make_accurate(
@@ -235,6 +287,7 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
         "starts": request.starts,
         "seed": request.seed,
         "solver": drive.solver,
+        "trajectory": drive.trajectory,
         "iterations": drive.iterations,
     }
     if result.first is not None:

@@ -49,6 +49,8 @@ def prepare_design(
         model = design_request.add_rival_effects(model, request.between, float(chosen.duration_s))
     requests.require_objective(request.objective, model.machine, request.of)
     requests.require_known("--solver", request.solver, tuple(trajectories.SOLVERS))
+    if request.trajectory is not None:
+        requests.require_known("--trajectory", request.trajectory, tuple(trajectories.TRAJECTORIES))
     requests.require_positive("--budget", request.budget_s, "s")
     requests.require_positive("--sigma-max", request.sigma_max, "%")
     return model, name, chosen
@@ -117,7 +119,9 @@ def read_rivals(
     if twice:
         raise UsageError(f"{option}: two files are called {twice[0]}, rename one: a row is named after its file")
     drives = {f.name: read_drive(f, model, any_rate=True) for f in files}
-    return usual, {n: trajectories.score(model, problem, d.torque, d.start, d.nu0) for n, d in drives.items()}
+    return usual, {
+        n: trajectories.score(model, problem, d.torque, d.start, d.nu0, d.planned) for n, d in drives.items()
+    }
 
 
 def compare(

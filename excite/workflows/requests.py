@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from excite.model.machine import Machine, Problem
 
 LONGEST_DRIVE_S = 3600.0  # [s]; chosen
+ARM_DURATION_S = 8.0  # of an arm's drive, without a design problem in its file; usual in the field
+ARM_KNOT_S = 0.2  # distance of the knots of its free motion; chosen
 
 
 def build_model(name: str, fit_sensor_effects: bool = True) -> Model:
@@ -33,18 +35,32 @@ def build_model(name: str, fit_sensor_effects: bool = True) -> Model:
 def choose_problem(machine: Machine, name: str | None, duration: float | None) -> tuple[str, Problem]:
     """Return a machine's design problem by name, None for its own, with another duration [s] if given."""
     name = name or machine.problem
-    if name is None or not machine.problems:
+    problems = machine.problems or arm_problems(machine)
+    if not machine.problems:
+        name = name or next(iter(problems), None)
+    if name is None or not problems:
         raise UsageError(
             f"{machine.name} has no design problem of its own, give its machine file one ([problems.NAME])"
         )
-    require_known("--problem", name, tuple(machine.problems))
-    found = machine.problems[name]
+    require_known("--problem", name, tuple(problems))
+    found = problems[name]
     if duration is not None:
         knot = float(found.knot_s)
         if not 4 * knot <= duration <= LONGEST_DRIVE_S:
             raise UsageError(f"--duration: must be between {4 * knot:g} and {LONGEST_DRIVE_S:g} s (got {duration:g})")
         found = found.lasting(duration)
     return name, found
+
+
+def arm_problems(machine: Machine) -> dict[str, Problem]:
+    """Return the design problem of an arm whose file has none, by name: from rest to rest; {} for other machines."""
+    from excite.model import build_cached
+    from excite.model.machine import Problem, Quantity
+
+    if not build_cached(machine.model_dump_json()).follows_positions:
+        return {}
+    duration, knot = (Quantity(value=x, source="assumed") for x in (ARM_DURATION_S, ARM_KNOT_S))
+    return {f"A{ARM_DURATION_S:g}": Problem(source="assumed", duration_s=duration, knot_s=knot)}
 
 
 def choose_method(name: str | None, model: Model, kit: str | None = None) -> str:
@@ -66,6 +82,7 @@ def choose_method(name: str | None, model: Model, kit: str | None = None) -> str
 CHOICES = {
     "objective": ("excite.trajectories", "OBJECTIVES"),
     "solver": ("excite.trajectories", "SOLVERS"),
+    "trajectory": ("excite.trajectories", "TRAJECTORIES"),
     "method": ("excite.identification", "METHODS"),
     "against": ("excite.trajectories", "BASELINES"),
     "kit": ("excite.simulation", "KITS"),

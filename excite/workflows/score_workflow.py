@@ -30,7 +30,7 @@ def score(
     name, chosen = requests.choose_problem(model.machine, problem, None)
     design_request.require_noise_figures(model)
     drive = read_drive(profile, model, any_rate=True)
-    found = trajectories.score(model, chosen, drive.torque, drive.start, drive.nu0)
+    found = trajectories.score(model, chosen, drive.torque, drive.start, drive.nu0, drive.planned)
     requests.require_known("--kit", kit, KITS)
     return score_account(model, name, chosen, found, str(profile), kit if sensors else None).write(place)
 

@@ -1,0 +1,294 @@
+"""Search for the motion of an arm that shows its parameters best, from several random starts in parallel processes.
+
+A start is the best of many random Fourier series within the limits. Its coefficients are optimised in stages of a
+sharper and sharper maximum; a free motion then goes on from the Fourier series as a spline. Scores and limits are those
+of the machine file, the limits at DENSE_PER_SAMPLE points per sample; limits that are exceeded between the program's
+samples get a margin, and the last stage is repeated.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import joblib
+import numpy as np
+
+from excite.errors import MachineError
+from excite.model import Model
+from excite.model.machine import Problem
+from excite.trajectories import composite_objective, objective as objectives
+from excite.trajectories.composite_objective import SIGMA_MAX, CompositeObjective
+from excite.trajectories.excitation import Manoeuvre
+from excite.trajectories.joint_motion import (
+    BASES,
+    JointMotion,
+    MotionProgram,
+    all_violations,
+    with_smooth_friction,
+)
+from excite.trajectories.limits import TOLERANCE, end_poses
+from excite.trajectories.multistart import (
+    Design,
+    Report,
+    ignore_killed_workers,
+    infeasible_error,
+    process_count,
+    progress_reports,
+    stop_file,
+)
+
+GUESSES = 200  # random series of which the best is a start; chosen
+GUESS_REACH = 0.9  # share of the limits on position and speed that a guess may use; chosen
+REPAIR_ITERATIONS = 12  # of a solve with larger margins; chosen
+ROUNDING = 1e-6  # excess that counts as none, share of a limit's range; chosen
+REPAIRS = 4  # solves with larger margins; chosen
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One solve: of a basis, with a sharpness of the objective's maximum, in so many iterations at most."""
+
+    basis: str
+    sharpness: float
+    iterations: int
+
+
+FOURIER_STAGES = (Stage("fourier", 10, 40), Stage("fourier", 30, 40))
+TRAJECTORIES: dict[str, tuple[Stage, ...]] = {  # stages by the kind of motion; iterations chosen for a minute
+    "free": (*FOURIER_STAGES, Stage("free", 30, 50), Stage("free", 100, 40)),
+    "fourier": (*FOURIER_STAGES, Stage("fourier", 100, 40), Stage("fourier", 300, 30)),
+}
+
+
+@dataclass(frozen=True)
+class ScoredMotion:
+    """A motion by its coefficients (n_q, n_c) in a basis. score: of the objective; violations: excess by limit."""
+
+    basis: str
+    coefficients: np.ndarray
+    score: float
+    violations: dict[str, float]
+
+    @property
+    def excess(self) -> float:
+        return max(self.violations.values(), default=0.0)
+
+    @property
+    def rank(self) -> tuple[int, float]:
+        """Order motions: those that keep every limit, by score, those within the tolerance, and others by excess."""
+        group = int(self.excess > ROUNDING) + int(self.excess > TOLERANCE)
+        return group, self.score if group < 2 else self.excess
+
+
+@dataclass(frozen=True)
+class MotionState:
+    """The best motion of a start. complete: False if cut short. start_cond_phi: of the guess."""
+
+    number: int
+    best: ScoredMotion
+    start_cond_phi: float
+    iterations: int
+    complete: bool
+
+
+def check_joint_motion(model: Model, trajectory: str) -> None:
+    """Raise MachineError for a machine whose designs are no joint motions, KeyError for an unknown trajectory."""
+    if trajectory not in TRAJECTORIES:
+        raise KeyError(f"no trajectory {trajectory}, allowed: {', '.join(TRAJECTORIES)}")
+    name = model.machine.name
+    if not model.follows_positions:
+        raise MachineError(
+            f"{name}: designs are torques over time here, joint motions are for arms, whose joints are all driven and"
+            " whose torques depend on positions; leave out --trajectory"
+        )
+    if not model.plain:
+        effects = ", ".join(e.name for e in model.effects)
+        raise MachineError(
+            f"{name}: an arm is designed without effects; take out {effects} (in the machine file, or --between)"
+        )
+
+
+def design_joint_motion(
+    model: Model,
+    problem: Problem,
+    objective: str | CompositeObjective = "cond",
+    starts: int = 2,
+    seed: int = 0,
+    budget_s: float | None = None,
+    progress: Report | None = None,
+    trajectory: str = "free",
+) -> Design:
+    """Design the excitation of an arm as a motion of its joints: the best of several random starts.
+
+    trajectory: a name in TRAJECTORIES. Other arguments and Ctrl-C as in `multistart.design`, its errors too, and
+    MachineError for a machine that is no arm.
+    """
+    check_joint_motion(model, trajectory)
+    composite = composite_objective.compose_objective(model, objective) if isinstance(objective, str) else objective
+    if starts < 1:
+        raise ValueError(f"starts must be at least 1, got {starts}")
+    deadline = None if budget_s is None else time.time() + budget_s
+    seeds = np.random.SeedSequence(seed).generate_state(starts)
+    states: dict[int, MotionState] = {}
+    with (
+        stop_file() as stop,
+        progress_reports(stop.parent, progress, starts * len(TRAJECTORIES[trajectory])),
+        joblib.parallel_config("loky", inner_max_num_threads=1),
+    ):
+        run = joblib.Parallel(n_jobs=process_count(), return_as="generator_unordered")
+        call = joblib.delayed(_run_start)
+        with ignore_killed_workers(stop):
+            for state in run(
+                call(model, problem, composite, trajectory, k, int(s), deadline, stop) for k, s in enumerate(seeds)
+            ):
+                if state is not None:
+                    states[state.number] = state
+        interrupted = stop.exists()
+    if not states:
+        raise KeyboardInterrupt
+    best = min(states.values(), key=lambda t: (*t.best.rank, t.number))
+    complete = len(states) == starts and all(t.complete for t in states.values())
+    if best.best.excess > TOLERANCE:
+        if interrupted:
+            raise KeyboardInterrupt
+        raise infeasible_error(composite, best.best.violations, complete)
+    made = _as_motion(model, problem, best.best.basis, best.best.coefficients)
+    motion = made.sample(model)
+    return Design(
+        composite.name,
+        Manoeuvre(motion.t, motion.u),
+        motion,
+        objectives.cond_phi(model, motion),
+        objectives.cond_w(model, motion),
+        min(t.start_cond_phi for t in states.values()),
+        dict(best.best.violations),
+        best.best.excess,
+        tuple(_reported(composite, states[k].best) if k in states else float("inf") for k in range(starts)),
+        complete,
+        "ipopt",
+        best.iterations,
+        trajectory,
+    )
+
+
+def _reported(objective: CompositeObjective, found: ScoredMotion) -> float:
+    kept = found.excess <= TOLERANCE
+    return objectives.reported_value(objective.name, found.score) if kept else float("inf")
+
+
+def _as_motion(model: Model, problem: Problem, basis: str, coefficients: np.ndarray) -> JointMotion:
+    return JointMotion(BASES[basis](problem, *end_poses(model, problem)), coefficients)
+
+
+def score_joint_motion(
+    model: Model, problem: Problem, objective: CompositeObjective, basis: str, coefficients: np.ndarray
+) -> ScoredMotion:
+    """Score a motion by the machine file: the objective on all samples, every limit between samples too."""
+    made = _as_motion(model, problem, basis, coefficients)
+    motion = made.sample(model)
+    found = composite_objective.score_motions(objective, [(model, motion)])
+    violations = all_violations(model, problem, made)
+    if objective.sigma_max is not None:
+        violations[SIGMA_MAX] = max(0.0, found.worst_percent / objective.sigma_max - 1)
+    score = found.score if np.isfinite(found.score) else float("inf")
+    return ScoredMotion(basis, coefficients, score, violations)
+
+
+def _run_start(
+    model: Model,
+    problem: Problem,
+    objective: CompositeObjective,
+    trajectory: str,
+    number: int,
+    seed: int,
+    deadline: float | None,
+    stop: Path,
+) -> MotionState | None:
+    """Run one start in a worker process; None if time is up before it begins, start 0 always runs."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, lambda *_: stop.touch() if stop.parent.exists() else None)
+
+    def should_stop() -> bool:
+        return stop.exists() or (deadline is not None and time.time() > deadline)
+
+    if number > 0 and should_stop():
+        return None
+    state = None
+    for k, found in enumerate(search(model, problem, objective, trajectory, seed, should_stop)):
+        state = replace(found, number=number)
+        fresh = stop.parent / f".{number}"
+        fresh.write_text(repr(_reported(objective, state.best)), encoding="ascii")
+        fresh.replace(stop.parent / f"{number}-{k}")
+    return state
+
+
+def search(
+    model: Model,
+    problem: Problem,
+    objective: CompositeObjective,
+    trajectory: str,
+    seed: int,
+    should_stop: Callable[[], bool],
+) -> Iterator[MotionState]:
+    """Yield the best motion so far after every stage of a start."""
+    smooth = with_smooth_friction(model)
+    poses = end_poses(model, problem)
+    stages = TRAJECTORIES[trajectory]
+    program = MotionProgram(smooth, problem, objective, BASES[stages[0].basis](problem, *poses))
+    x = best_guess(program, seed, should_stop)
+    best = score_joint_motion(model, problem, objective, stages[0].basis, _shaped(program, x))
+    guess = _as_motion(model, problem, stages[0].basis, best.coefficients).sample(model)
+    first = objectives.cond_phi(model, guess)
+    multipliers, iterations = None, 0
+    for stage in stages:
+        if program.basis.kind != stage.basis:
+            before = program
+            program = MotionProgram(smooth, problem, objective, BASES[stage.basis](problem, *poses))
+            x, multipliers = _carried_over(before, program, x), None
+        program.sharpness = stage.sharpness
+        for repair in range(1 + REPAIRS):
+            found = program.solve(x, should_stop, REPAIR_ITERATIONS if repair else stage.iterations, multipliers)
+            iterations += found.iterations
+            x, multipliers = found.x, found.multipliers
+            scored = score_joint_motion(model, problem, objective, stage.basis, _shaped(program, x))
+            best = min(best, scored, key=lambda s: s.rank)
+            if stage is not stages[-1] or scored.excess <= ROUNDING or should_stop():
+                break
+            program.widen_margins(scored.violations)
+            multipliers = None
+        yield MotionState(0, best, first, iterations, not should_stop())
+        if should_stop():
+            return
+
+
+def _shaped(program: MotionProgram, x: np.ndarray) -> np.ndarray:
+    return x.reshape(program.n_q, program.n_c)
+
+
+def _carried_over(before: MotionProgram, program: MotionProgram, x: np.ndarray) -> np.ndarray:
+    """Return the coefficients of the program's basis that follow those of another one best."""
+    t = np.linspace(0, program.basis.duration, 8 * program.n_c)
+    target = JointMotion(before.basis, _shaped(before, x)).at(t) - program.basis.path(t, 0)
+    return np.asarray(np.linalg.lstsq(program.basis.evaluate(t, 0), target, rcond=None)[0].T.ravel())
+
+
+def best_guess(program: MotionProgram, seed: int, should_stop: Callable[[], bool]) -> np.ndarray:
+    """Return the best of GUESSES random motions (n_x,), each joint scaled into its limits on position and speed."""
+    rng = np.random.default_rng(seed)
+    best, chosen = float("inf"), None
+    for _ in range(GUESSES):
+        x = rng.normal(size=(program.n_q, program.n_c)) * rng.uniform(0.3, 1.0, (program.n_q, 1))
+        used = program.reach(x.ravel())
+        x *= np.where(used > GUESS_REACH, GUESS_REACH / np.maximum(used, 1e-9), 1.0)[:, None]
+        value = program.value(x.ravel())
+        if chosen is None or value < best:
+            best, chosen = value if np.isfinite(value) else float("inf"), x.ravel()
+        if should_stop():
+            break
+    assert chosen is not None
+    return np.asarray(chosen)
