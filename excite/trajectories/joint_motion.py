@@ -1,9 +1,9 @@
 """Excitation of arms as joint motions q(t), which position controllers follow; torques come from inverse dynamics.
 
-An arm under gravity falls under torques alone, so its design varies the motion: q_j(t) = path_j(t) + basis(t) c_j, linear
-in the coefficients c. The basis is a Fourier series or a spline; with `rest` every function of it ends at rest, and the
-path leads from the start pose to the end pose. Limits on position, speed, torque, torque rate and power are functions
-of the motion and its derivatives.
+An arm under gravity falls under torques alone, so its design varies the motion, linear in the coefficients c:
+q_j(t) = path_j(t) + basis(t) c_j. The basis is a Fourier series or a spline; with `rest` every function of it ends at
+rest, and the path leads from the start pose to the end pose. Limits on position, speed, torque, torque rate and power
+are functions of the motion and its derivatives.
 
 The program minimises the objective of the information matrix A = sum Phi' Phi over c by Ipopt. All derivatives are
 exact: with G the gradient of the objective in A, d2F = H_F[dA, dA] + 2 <G, dPhi' dPhi + Phi' d2Phi>.
@@ -32,7 +32,7 @@ from excite.trajectories import composite_objective
 from excite.trajectories.collocation import MappedFunction
 from excite.trajectories.composite_objective import CompositeObjective
 from excite.trajectories.ipopt import OPTIONS, WARM, Evaluation, Pattern, Watch
-from excite.trajectories.limits import Limit, check_limits, end_poses, machine_limits, stack_limits
+from excite.trajectories.limits import Limit, check_limits, machine_limits, stack_limits
 
 HARMONICS = 5  # of a Fourier series; usual in the field
 SPLINE_DEGREE = 5  # torque rates are continuous; chosen
@@ -235,10 +235,7 @@ class MotionProgram:
         y = ca.vertcat(z, jerk)
         centre = np.array([_centre(g) for g in self.limits])
         half = np.array([_half(g) for g in self.limits])
-        if self.n_g:
-            values = (stack_limits(model, self.limits)(q, nu, u, du) - centre) / half
-        else:
-            values = ca.SX(0, 1)
+        values = (stack_limits(model, self.limits)(q, nu, u, du) - centre) / half if self.n_g else ca.SX(0, 1)
         multipliers = ca.SX.sym("m", self.n_g)
         slope = ca.jacobian(values, y)
         pattern = np.array(ca.DM(slope.sparsity(), 1).full(), bool).reshape(self.n_g, 4, n_q)
@@ -259,6 +256,14 @@ class MotionProgram:
         self._jacobian = Pattern((self.sizes[1], n_x), k * self.n_g + i, j * self.n_c + c)
         self._upper = np.triu_indices(n_x)
         self._hessian = Pattern((n_x, n_x), *self._upper)
+
+    @property
+    def jacobian_sparsity(self) -> ca.Sparsity:
+        return self._jacobian.sparsity
+
+    @property
+    def hessian_sparsity(self) -> ca.Sparsity:
+        return self._hessian.sparsity
 
     # ------------------------------------------------------------------------------------------ objective
 
@@ -422,13 +427,13 @@ class MotionProgram:
         jac_g = Evaluation(
             "nlp_jac_g",
             [at, p],
-            [g, ("jac_g_x", self._jacobian.sparsity)],
+            [g, ("jac_g_x", self.jacobian_sparsity)],
             lambda x, p: (self.constraints(x), self.jacobian(x)),
         )
         hess_lag = Evaluation(
             "nlp_hess_l",
             [at, p, ("lam_f", 1), m],
-            [("triu_hess_gamma_x_x", self._hessian.sparsity)],
+            [("triu_hess_gamma_x_x", self.hessian_sparsity)],
             lambda x, p, factor, multipliers: (self.hessian(x, float(factor[0]), multipliers),),
         )
         watch = Watch(n_x, n_g, should_stop)
