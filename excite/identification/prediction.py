@@ -21,7 +21,7 @@ from excite.identification.validation import covariance_root, validate_torques
 from excite.logs import Log, PlannedDrive, derivative, motion_columns, remember, torque_column
 from excite.model import Model
 from excite.model.machine import Filter
-from excite.simulation import simulate
+from excite.simulation import play_back
 
 NORMAL95 = 1.959964  # half width of a 95 % interval in standard deviations of normal noise
 
@@ -109,7 +109,7 @@ def predict_torques(model: Model, logs: Sequence[Log], estimate: Estimate, filte
 
 
 def predict_motion(model: Model, drive: PlannedDrive, estimate: Estimate) -> Prediction:
-    """Predict the motion under the torques of a profile, in open loop from its first state.
+    """Predict the motion under the torques of a profile, in open loop from its first state; an arm follows positions.
 
     If the machine has no slips and the profile holds a motion, the torques that this motion needs come first.
     Raises SimulationError if the estimate is no machine, or its uncertainty is so large that none nearby is.
@@ -119,7 +119,7 @@ def predict_motion(model: Model, drive: PlannedDrive, estimate: Estimate) -> Pre
     forces = model.inputs if planned else ()
 
     def signals(X: np.ndarray) -> np.ndarray:
-        motion = simulate(model, drive.torque, X, drive.q0, drive.nu0)
+        motion = play_back(model, drive.torque, drive.q0, drive.nu0, drive.planned, X)
         needed = [_delivered_torques(model, *planned, drive.torque, X)] if planned else []
         return np.concatenate([*needed, motion.nu.T, motion.q.T])
 

@@ -50,6 +50,10 @@ def prepare(
     Raises UndrivableError for a machine that nobody drives, SimulationError if no person can follow the phases.
     """
     model, motion, problem = design.model, design.motion, design.problem
+    if design.summary.get("trajectory"):
+        raise UndrivableError(
+            f"{model.machine.name}: an arm follows the joint positions in profile.csv, no person drives it"
+        )
     if problem is None:
         raise UndrivableError(f"{model.machine.name}: has no problem {design.summary.get('problem')}, design again")
     made = design.summary.get("driver") if most is None else None  # of `excite design --driver`: phases already

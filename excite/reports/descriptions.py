@@ -187,6 +187,16 @@ def describe_design(s: Summary) -> Description:
         by_hand_remarks, by_hand_tables = _describe_by_hand(s)
         remarks = [*by_hand_remarks, *remarks]
         tables = [*by_hand_tables, *tables]
+    elif s.get("trajectory"):
+        if s.get("assumed_noise"):
+            remarks.append(
+                f"Accuracies rest on assumed noise of {', '.join(s['assumed_noise'])}, of which the machine file says"
+                " nothing: torques 0.5 % of their limit, encoders 65536 counts per turn."
+            )
+        kept = " Limits are kept between the samples, too." if s["max_violation"] == 0 else ""
+        remarks.append(
+            "The arm follows the joint positions in profile.csv; the torques there are those that this takes." + kept
+        )
     else:
         remarks.append(
             "A person at the levers drives something else: `excite drive` makes phases of this drive and says what they"

@@ -44,6 +44,7 @@ from excite.trajectories.multistart import (
 
 GUESSES = 200  # random series of which the best is a start; chosen
 GUESS_REACH = 0.9  # share of the limits on position and speed that a guess may use; chosen
+SHRINK, SHRINKS = 0.85, 12  # factor of a guess outside of its limits, and how often it is applied; chosen
 REPAIR_ITERATIONS = 12  # of a solve with larger margins; chosen
 ROUNDING = 1e-6  # excess that counts as none, share of a limit's range; chosen
 REPAIRS = 4  # solves with larger margins; chosen
@@ -278,16 +279,27 @@ def _carried_over(before: MotionProgram, program: MotionProgram, x: np.ndarray) 
 
 
 def best_guess(program: MotionProgram, seed: int, should_stop: Callable[[], bool]) -> np.ndarray:
-    """Return the best of GUESSES random motions (n_x,), each joint scaled into its limits on position and speed."""
+    """Return the best of GUESSES random motions (n_x,), scaled into the limits where that can be done.
+
+    Each joint is scaled into its limits on position and speed, then all together.
+    """
     rng = np.random.default_rng(seed)
-    best, chosen = float("inf"), None
+    low, high = program.bounds()
+    best, chosen = (True, float("inf")), None
     for _ in range(GUESSES):
         x = rng.normal(size=(program.n_q, program.n_c)) * rng.uniform(0.3, 1.0, (program.n_q, 1))
         used = program.reach(x.ravel())
         x *= np.where(used > GUESS_REACH, GUESS_REACH / np.maximum(used, 1e-9), 1.0)[:, None]
+        for _ in range(SHRINKS):
+            limits = program.constraints(x.ravel())
+            over = bool((limits > high).any() or (limits < low).any())
+            if not over:
+                break
+            x *= SHRINK
         value = program.value(x.ravel())
-        if chosen is None or value < best:
-            best, chosen = value if np.isfinite(value) else float("inf"), x.ravel()
+        found = over, value if np.isfinite(value) else float("inf")
+        if chosen is None or found < best:
+            best, chosen = found, x.ravel()
         if should_stop():
             break
     assert chosen is not None

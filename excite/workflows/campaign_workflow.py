@@ -71,6 +71,8 @@ def check_campaign(request: CampaignRequest, model: Model, problem: Problem) -> 
     allowed = [n for n, o in trajectories.OBJECTIVES.items() if o.shown_as == "percent"]
     if objective not in allowed:
         raise UsageError(f"--target: needs an --objective in per cent: {', '.join(allowed)} (got {objective})")
+    if model.follows_positions:
+        raise UsageError(f"--target: not for {model.machine.name}, an arm, whose designs are motions of its joints")
     if one.driver or one.robust or one.sigma_max is not None:
         raise UsageError("--target: does not go with --driver, --robust or --sigma-max")
     if request.parameters and objective != DEFAULT_OBJECTIVE:

@@ -78,6 +78,7 @@ class DesignResult:
     contrasts (n_base, m): combinations of relative errors that the objective judges, None for each parameter.
     phased: the phases of a design for people; `design` is then the motion of a steady driver.
     first: the drive of lowest cond(Phi), if `design` is the most accurate one near it.
+    assumed_noise: sensors of an arm whose noise figure is assumed, as its machine file has none.
     """
 
     model: Model
@@ -86,6 +87,7 @@ class DesignResult:
     phased: PhasedDrive | None = None
     first: Design | None = None
     contrasts: np.ndarray | None = None
+    assumed_noise: tuple[str, ...] = ()
 
 
 def add_rival_effects(model: Model, between: tuple[str, ...], duration: float) -> Model:
@@ -201,14 +203,15 @@ def _design_arm(
     ):
         if given:
             raise UsageError(f"{option}: not for {model.machine.name}, an arm, whose designs are motions of its joints")
-    model = with_assumed_noise(model)
+    known, model = model, with_assumed_noise(model)
     require_noise_figures(model)
+    assumed = tuple(s.name for s, k in zip(model.machine.sensor, known.machine.sensor, strict=True) if s != k)
     model, prior = with_earlier_logs(model, request.after)
     aim = trajectories.compose_objective(model, request.objective, request.sigma_max, prior)
     found = trajectories.design_joint_motion(
         model, problem, aim, request.starts, request.seed, request.budget_s, progress, trajectory
     )
-    return DesignResult(model, aim, found)
+    return DesignResult(model, aim, found, assumed_noise=assumed)
 
 
 def with_assumed_noise(model: Model) -> Model:
@@ -300,6 +303,8 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
             "worst_percent": float(first.max()),
             "median_percent": float(np.median(first)),
         }
+    if result.assumed_noise:
+        summary["assumed_noise"] = list(result.assumed_noise)
     if result.phased is not None:
         summary["driver"] = _by_hand(request, result.aim, result.phased)
     if request.of is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,8 @@ def prepare_design(
     """
     model = machine if isinstance(machine, Model) else requests.build_model(machine, fit_sensor_effects=False)
     name, chosen = requests.choose_problem(model.machine, problem, duration)
+    if name not in model.machine.problems:
+        model = replace(model, machine=model.machine.model_copy(update={"problem": name, "problems": {name: chosen}}))
     if request.between:
         model = design_request.add_rival_effects(model, request.between, float(chosen.duration_s))
     requests.require_objective(request.objective, model.machine, request.of)
@@ -109,8 +112,14 @@ def read_rivals(
 ) -> tuple[tuple[str, ...], dict[str, Score]]:
     """Split what a design is compared with into names of `BASELINES`, and scores of profiles by their files' names.
 
-    option: as an error begins. Raises UsageError for an unknown name or two files of one name, LogError.
+    option: as an error begins. Raises UsageError for an unknown name or two files of one name, MachineError for an
+    arm, LogError.
     """
+    if model.follows_positions:
+        raise MachineError(
+            f"{model.machine.name}: is an arm, and falls under the torques of the usual drives; compare designs by"
+            " `excite score` instead"
+        )
     usual = tuple(name for name in against if not Path(name).suffix)
     files = [Path(name) for name in against if Path(name).suffix]
     for name in usual:

@@ -172,8 +172,15 @@ class StoredDrive:
 def _stored_drive(plan: StudyPlan, folder: Path, number: int) -> StoredDrive:
     drive = plan.drives[number]
     model = build_cached(plan.machines[drive.machine].model_dump_json())
-    torque, q0, nu0 = logs.read_profile(folder / _drive_name(number) / "profile.csv", model)
-    stored = TorqueInput(np.ascontiguousarray(torque, float).tobytes(), torque.shape[1], tuple(q0), tuple(nu0))
+    planned = logs.read_drive(folder / _drive_name(number) / "profile.csv", model)
+    torque, expected = planned.torque, planned.planned
+    stored = TorqueInput(
+        np.ascontiguousarray(torque, float).tobytes(),
+        torque.shape[1],
+        tuple(planned.q0),
+        tuple(planned.nu0),
+        b"" if expected is None else np.array(expected, float).tobytes(),
+    )
     path = folder / _drive_name(number) / output.SUMMARY
     summary = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     return StoredDrive(stored, (len(torque) - 1) / float(model.machine.sampling_hz), summary)

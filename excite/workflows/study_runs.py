@@ -18,7 +18,7 @@ from excite.errors import InfeasibleError, LogError, MachineError, NoEstimateErr
 from excite.logs import Log, examine, prepare, profile_of
 from excite.model import Model, build, build_cached
 from excite.model.machine import Machine, Problem
-from excite.simulation import Motion, simulate
+from excite.simulation import Motion, play_back
 from excite.workflows import design_request
 from excite.workflows.design_request import DesignRequest
 
@@ -30,12 +30,16 @@ _CASADI_LOCK = threading.Lock()  # CasADi's functions are not safe in the thread
 
 @dataclass(frozen=True)
 class TorqueInput:
-    """Torques (N, n_u) [N m] as bytes of float64, and the state q0, nu0 (n_q,) at their start."""
+    """Torques (N, n_u) [N m] as bytes of float64, and the state q0, nu0 (n_q,) at their start.
+
+    planned: positions and speeds (2, N, n_q) that an arm follows, as bytes of float64, empty for torques alone.
+    """
 
     torque: bytes
     inputs: int
     q0: tuple[float, ...]
     nu0: tuple[float, ...]
+    planned: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,11 @@ class RunBatch:
 @lru_cache(maxsize=4)
 def _motion(machine: str, drive: TorqueInput) -> Motion:
     torque = np.frombuffer(drive.torque).reshape(-1, drive.inputs)
-    return simulate(build_cached(machine), torque, q0=np.array(drive.q0), nu0=np.array(drive.nu0))
+    planned = None
+    if drive.planned:
+        q, nu = np.frombuffer(drive.planned).reshape(2, len(torque), -1)
+        planned = q, nu
+    return play_back(build_cached(machine), torque, np.array(drive.q0), np.array(drive.nu0), planned)
 
 
 def run_batch(batch: RunBatch) -> tuple[str, list[tuple[int, Row]]]:
