@@ -20,7 +20,7 @@ from excite import diagnosis
 from excite.diagnosis import Diagnosis, LogResiduals, TorqueDiagnosis
 from excite.model import signal_descriptions
 from excite.reports.charts import EXPLORE, Explorable
-from excite.reports.figures import COLOURS, escape_dollar, save, set_title
+from excite.reports.figures import COLOURS, escape_dollar, save, set_title, wrap_label
 from excite.reports.torque_figures import torque_figures_by_file
 from excite.text import format_number
 
@@ -32,6 +32,8 @@ PANEL = 2.9, 1.8  # width and height with labels
 INSET = 0.52, 0.4, 0.08, 0.14  # room for labels: left, below, right, above
 HEAD = 0.28  # above the panels of one torque or force
 EDGE = 0.35  # for the title, and for the legend
+MISSING_LETTERS = 36  # of the label of a missing torque in a line; chosen
+MAP_INTERVALS = 3  # between ticks of speed, at most; chosen
 PLAIN_POWERS = -3, 5  # powers of ten that axes write without an exponent; chosen
 CLEAR_STRENGTH = 4.0  # strength of a dependence from which its panel gets a thick frame; chosen
 MAX_CLEAR, MIN_CLEAR = 4, 2  # dependences drawn large: that are clear, if none is; chosen
@@ -112,7 +114,7 @@ def clearest_figure(before: LogResiduals, after: LogResiduals | None, title: str
     for ax, (row, quantity) in zip(axes, clear, strict=False):
         _against(ax, before, after, row, quantity)
         ax.set_gid(EXPLORE)
-        ax.set_ylabel(f"missing {row} [{before.missing[row][1]}]", fontsize=9)
+        ax.set_ylabel(wrap_label(f"missing {row} [{before.missing[row][1]}]", MISSING_LETTERS), fontsize=9)
         ax.xaxis.label.set_fontsize(9)
         ax.tick_params(which="both", labelsize=8)
     for ax in axes[len(clear) :]:
@@ -254,6 +256,7 @@ def _map(ax: Axes, course: LogResiduals, norm: LogNorm) -> None:
     ax.set_gid(EXPLORE)
     ax.pcolormesh(*bins, mean.T, norm=norm, cmap="inferno_r", rasterized=True)
     ax.set_title("where, over all signals", fontsize=9, loc="left")
+    ax.locator_params("x", nbins=MAP_INTERVALS)
     ax.set_xlabel(f"speed [{x_unit}]")
     ax.set_ylabel(f"{up.replace('_', ' ')} [{y_unit}]", fontsize=9)
 

@@ -62,6 +62,11 @@ def set_title(figure: Figure, text: str) -> None:
     figure.suptitle(escape_dollar(wrap_title(figure, text, TITLE_SIZE)), fontsize=TITLE_SIZE)
 
 
+def wrap_label(text: str, letters: int = LABEL_LETTERS) -> str:
+    """Return the label of an axis in lines of so many letters."""
+    return escape_dollar("\n".join(textwrap.wrap(text, letters)))
+
+
 def _style(k: int) -> dict[str, Any]:
     """Return colour and dashes of the k-th of several lines."""
     return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[k % len(STYLES)]}
@@ -375,7 +380,7 @@ def comparison_figure(model: Model, c: SignalComparison, title: str) -> Figure:
     for name, b in zip(model.inputs, model.machine.actuated, strict=True):
         words[name] = f"{'torque' if b.joint == 'revolute' else 'force'}, {b.where.replace('_', ' ')}"
     for k, (name, unit) in enumerate(zip(c.names, c.units, strict=True)):
-        label = "\n".join(textwrap.wrap(escape_dollar(words.get(name, name)), LABEL_LETTERS))
+        label = wrap_label(words.get(name, name))
         _lines(axes[2 * k], c.t, {"measured": c.measured[k], "predicted": c.predicted[k]}, f"{label}\n[{unit}]")
         if c.expected is not None:
             band = 1.96 * c.expected[k]
@@ -443,7 +448,7 @@ def compare_figure(rows: Sequence[ComparisonRow], title: str) -> Figure:
     values = ([r.cond_phi for r in rows], [r.worst_std_percent for r in rows])
     places = np.arange(len(rows))
     for ax, x, label in zip(
-        axes, values, ("cond(Phi)", "worst parameter: attainable standard deviation [%]"), strict=True
+        axes, values, ("cond(Phi)", "worst parameter: attainable\nstandard deviation [%]"), strict=True
     ):
         finite = [value for value in x if np.isfinite(value)] or [1.0]
         for y, (r, value) in enumerate(zip(rows, x, strict=True)):

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from excite.diagnosis import Curve, TorqueDiagnosis
-from excite.reports.figures import COLOURS, escape_dollar
+from excite.reports.figures import COLOURS, escape_dollar, set_title, wrap_label
 
 BEFORE, AFTER = COLOURS[1], COLOURS[0]
 MAX_TORQUES = 4  # with the largest errors, in the figure; chosen
@@ -52,14 +52,14 @@ def misfit_of_torques(d: TorqueDiagnosis, title: str) -> Figure:
             over_speed.plot(at, mean, ".-", color=colour, label=label)
         over_time.axhline(after.lowest[row], color="0.5", linestyle="--", label="sensors' noise")
         over_speed.axhline(0.0, color="0.5", linewidth=0.8)
-        over_time.set_ylabel(escape_dollar(f"rms error of {name} [{unit}]"))
+        over_time.set_ylabel(wrap_label(f"rms error of {name} [{unit}]"))
         over_time.set_ylim(bottom=0.0)
-        over_speed.set_ylabel(escape_dollar(f"mean error of {name} [{unit}]"))
+        over_speed.set_ylabel(wrap_label(f"mean error of {name} [{unit}]"))
         over_speed.set_xlabel(escape_dollar(f"speed of {body.where.replace('_', ' ')} [{'rad/s' if turns else 'm/s'}]"))
     axes[-1, 0].set_xlabel("time [s]" if len(d.sources) == 1 else "time, one log after the other [s]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
-    figure.suptitle(escape_dollar(f"{title}: errors of the torques along the measured motion"))
+    set_title(figure, f"{title}: errors of the torques along the measured motion")
     return figure
 
 

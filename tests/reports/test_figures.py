@@ -11,10 +11,14 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from excite import trajectories
+from excite.diagnosis import LogResiduals
+from excite.identification import Prediction, Verification
+from excite.logs import inspect, motion_columns, torque_column
 from excite.model import Model, build, signal_descriptions
 from excite.model.machine import load_machine
-from excite.reports import diagnosis_figures, figures, text_faults
-from excite.simulation import simulate
+from excite.reports import diagnosis_figures, figures, text_faults, torque_figures
+from excite.simulation import measure, simulate
 
 LONG = "long names"
 MACHINES = ("va12", "emps", "tandem", "pendulum_loader")
@@ -74,6 +78,98 @@ def signals(model: Model) -> Figure:
     return diagnosis_figures.signals_figure(dict.fromkeys(words, row), True, model.machine.title, words)
 
 
+def verification(model: Model) -> Figure:
+    n, runs = len(model.base.names), 20
+    error = np.random.default_rng(1).normal(size=(runs, n)) * np.geomspace(1e-4, 0.3, n)
+    value, std = model.nominal * (1 + error), np.abs(model.nominal) * np.geomspace(1e-4, 0.3, n)
+    ends = value[:, None] + 1.96 * std * np.array([-1, 1])[:, None]
+    units = ("",) * n
+    found = Verification(
+        "joint", "full", model.base.names, units, model.nominal, np.abs(model.nominal), value, 0 * value + std, ends, {}
+    )
+    return figures.verify_figure(found, f"{model.machine.title}: joint, kit full, 20 runs")
+
+
+def comparison(model: Model) -> Figure:
+    machine = model.machine
+    problem = machine.problems[str(machine.problem)] if machine.problem else next(iter(machine.problems.values()))
+    broken = max((bound.name for bound in trajectories.machine_limits(model, problem)), key=len)
+    names = (trajectories.DESIGNED, *trajectories.BASELINES, "a/long/path/to/a_drive_of_my_own_on_gravel.csv")
+    rows = [
+        SimpleNamespace(name=name, cond_phi=17.0 * 3**k, worst_std_percent=0.8 * 2**k, breaks=broken if k % 2 else None)
+        for k, name in enumerate(names)
+    ]
+    return figures.compare_figure(rows, f"{machine.title}: designed and usual drives")  # type: ignore[arg-type]
+
+
+def prediction(model: Model, along_log: bool) -> Figure:
+    """Torques along a log, or the motion of a profile."""
+    units = {"_N": "N", "_Nm": "N m"}
+    names = [torque_column(model, name) for name in model.inputs]
+    kinds = [units[name[name.rindex("_") :]] for name in names]
+    if not along_log:
+        columns = motion_columns(model)
+        turns = ["rad" if place.endswith("_rad") else "m" for place, _ in columns]
+        names = [rate for _, rate in columns] + [place for place, _ in columns]
+        kinds = [f"{unit}/s" for unit in turns] + turns
+    t = np.linspace(0, 60, 300)
+    value = 12345.6 * np.sin(t + np.arange(len(names))[:, None])
+    band = 0 * value + 100
+    measured = {"measured": value + 80, "reading_band": 2 * band} if along_log else {}
+    found = Prediction(tuple(names), tuple(kinds), t, value, band, band, tuple(names[-1:]), **measured)
+    return figures.prediction_figure(found, f"{model.machine.title}: by joint, along results/a_long_folder/a_log.csv")
+
+
+def log_check(model: Model) -> Figure:
+    """A log with a gap and a dead stretch."""
+    torque = np.array([0.2 * float(b.limit.torque or 1.0) for b in model.machine.actuated])
+    table = measure(model, simulate(model, torque * np.ones((800, 1))), kit="full", seed=0)
+    table = table.drop(index=range(300, 420)).reset_index(drop=True)
+    table.loc[500:640, table.columns[1]] = table.loc[500, table.columns[1]]
+    return figures.log_figure(inspect(table, model.machine), "a/long/folder/of/logs/log_of_the_third_drive.csv")
+
+
+def residuals(model: Model, size: float) -> Any:
+    """Residuals of a log as `diagnosis.residuals_of_logs` names them."""
+    machine, rng, t = model.machine, np.random.default_rng(2), np.arange(3000) / 100
+    missing, quantities = {}, {}
+    for name, b in zip(model.inputs, machine.actuated, strict=True):
+        label = f"{'torque' if b.joint == 'revolute' else 'force'} {name}, {b.where.replace('_', ' ')}"
+        missing[label] = (size * 12345.6 * np.sin(t), "N m" if b.joint == "revolute" else "N", 50.0)
+    if machine.planar:
+        missing["force to the left"] = (size * 2345.6 * np.cos(t), "N", float("nan"))
+    units = {"time": "s", "speed": "m/s", "distance": "m", "rotation": "rad", "torque": "N m", "slip": "-"}
+    units |= {f"{b.where} angle": "rad" for b in machine.actuated if b.contact is None}
+    for name, unit in units.items():
+        x = t if name == "time" else 1e-3 * np.cumsum(rng.normal(size=len(t)))
+        quantities[name] = (unit, dict.fromkeys(missing, x))
+    sensors = tuple(s.name for s in machine.sensors("full"))
+    linear = SimpleNamespace(innovations=size * rng.normal(size=(len(t), len(sensors))))
+    return LogResiduals("log.csv", t, missing, quantities, sensors, linear)  # type: ignore[arg-type]
+
+
+def missing(model: Model, kind: str) -> Figure:
+    draw: Callable[..., Figure] = diagnosis_figures.KINDS[kind]
+    more = {"words": signal_descriptions(model.machine)} if kind == "when" else {}
+    return draw(residuals(model, 2.0), residuals(model, 1.0), f"{model.machine.title}: a_log.csv", **more)
+
+
+def torques(model: Model) -> Any:
+    """A diagnosis by regression."""
+    machine, n = model.machine, 600
+    t, rng = np.arange(n) / 100, np.random.default_rng(3)
+    shape = (len(model.coordinates), n)
+    rows = SimpleNamespace(t=t, at=np.arange(n), used=np.ones(shape, bool), nu=rng.normal(size=shape).T)
+    level = dict.fromkeys(model.actuated, 1234.5)
+    made = SimpleNamespace(model=model, rows=[rows], residual=[rng.normal(size=shape)], level=level, lowest=level)
+    names = tuple((s.name, "N m") for s in machine.sensors("full") if s.kind == "torque")
+    curve = {"at": t, "value": 12345.6 * np.sin(t), "std": 0 * t + 100, "signal": (f"the speed of {LONG}", "rad/s")}
+    curves = [SimpleNamespace(row=row, **curve) for row in names]
+    return SimpleNamespace(
+        before=made, after=made, torques=names, findings=("one",), sources=("log.csv",), curves=curves
+    )
+
+
 KINDS: dict[str, Callable[[Model], Figure]] = {
     "design": design,
     "sigma": sigma,
@@ -81,6 +177,16 @@ KINDS: dict[str, Callable[[Model], Figure]] = {
     "correlation": lambda m: figures.correlation_figure(estimate(m), m.machine.title),
     "prior": lambda m: figures.prior_figure(estimate(m), m.nominal, m.machine.title),
     "signals": signals,
+    "verify": verification,
+    "compare": comparison,
+    "prediction of a log": lambda m: prediction(m, along_log=True),
+    "prediction of a drive": lambda m: prediction(m, along_log=False),
+    "log": log_check,
+    "clearest": lambda m: missing(m, "clearest"),
+    "misfit": lambda m: missing(m, "misfit"),
+    "when": lambda m: missing(m, "when"),
+    "misfit of torques": lambda m: torque_figures.misfit_of_torques(torques(m), m.machine.title),
+    "curves": lambda m: torque_figures.curves_figure(torques(m), m.machine.title),
 }
 
 
@@ -88,7 +194,7 @@ KINDS: dict[str, Callable[[Model], Figure]] = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_text_is_cut_off_or_lies_on_another(kind: str, machine: str) -> None:
     model = model_of(machine)
-    if kind == "design" and not model.machine.problems:
+    if kind in ("design", "compare") and not model.machine.problems:
         pytest.skip("has no design problem")
     assert list(text_faults(KINDS[kind](model))) == []
 
