@@ -33,6 +33,7 @@ def run_readme_example(place: Path, library: Path | None) -> str:
     return str(Path(file).parents[1])
 
 
+@pytest.mark.slow
 def test_example_runs_beside_an_own_model_py(tmp_path: Path) -> None:
     run_readme_example(tmp_path, None)
 

@@ -449,7 +449,7 @@ def test_a_diagnosis_names_what_a_robot_has(biased: tuple[Motion, Diagnosis]) ->
     "cause",
     [
         pytest.param("rolling_resistance@front_roll=300", marks=pytest.mark.slow),
-        "shear_saturation@front_roll=0.2",
+        pytest.param("shear_saturation@front_roll=0.2", marks=pytest.mark.slow),
     ],
 )
 def test_a_diagnosis_names_what_a_roll_has_that_nothing_drives(cause: str) -> None:

@@ -1128,6 +1128,7 @@ def test_a_file_that_is_far_off_is_no_cause(straight: Model, share: float, seed:
     assert found.verdict == "clean"
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_search_and_keeps_the_answer_so_far(sloping: Path, straight: Model) -> None:
     ready = prepare(straight, [sloping], needed_sensors(straight, "joint"))
     before = signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -364,6 +364,7 @@ def test_steps_that_stay_large_end_a_fit(
     assert len(seen) == spent
 
 
+@pytest.mark.slow
 def test_what_takes_too_little_of_a_beginning_is_not_fitted_to_the_whole(
     straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -795,6 +796,7 @@ def test_smaller_forces_are_tried_where_the_model_is_near(
         np.testing.assert_allclose(told.fit.X, straight.nominal, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_what_begins_anew_beside_exact_dynamics_must_take_a_good_part_of_the_misfit(
     straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:

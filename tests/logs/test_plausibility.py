@@ -231,7 +231,7 @@ def test_a_measuring_wheel_that_counts_backward_is_told(va12: Model, va12_motion
     assert line == f"column {name}_rad: turns against theta1_rad, theta4_rad: is its sign right?"
 
 
-@pytest.mark.parametrize("name", [pytest.param("u1", marks=pytest.mark.slow), "theta1", "thetal"])
+@pytest.mark.parametrize("name", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("u1", "thetal")), "theta1"])
 def test_a_dead_channel_is_named_where_no_estimate_is_found(va12: Model, va12_motion: Motion, name: str) -> None:
     one = checked(va12, va12_motion)
     dead = Log("dead", one.t, one.values | {name: np.full(len(one), one.values[name][0])})

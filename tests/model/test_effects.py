@@ -654,6 +654,7 @@ def test_what_a_map_tells_is_identified_and_designed_with(straight: Model) -> No
     assert np.abs(entries[-3:, amount]).max() > 100 * np.abs(entries[:3, amount]).max()
 
 
+@pytest.mark.slow
 def test_every_log_begins_on_ground_of_its_own(straight: Model) -> None:
     """Two logs of the same ways tell the amount as two of one map each; put onto one map, the second would begin on
     what the first has left, and tell another one."""

@@ -296,7 +296,7 @@ def test_a_straight_drive_names_what_it_does_not_show(straight: Model) -> None:
     np.testing.assert_allclose(estimate.std, std, rtol=0.15)
 
 
-@pytest.mark.parametrize("kit", ["full", "paper"])
+@pytest.mark.parametrize("kit", [pytest.param("full", marks=pytest.mark.slow), "paper"])
 def test_without_steering_the_hidden_parameters_are_named(va12: Model, kit: str) -> None:
     """The whole machine driven straight: what only turning shows has no number, the rest has an honest one."""
     X = perturbed(va12, 3)
@@ -400,6 +400,7 @@ def test_a_log_of_something_else_gives_no_number(va12: Model) -> None:
         identify(va12, [Log("shuffled", good.t, values)], "joint")
 
 
+@pytest.mark.slow
 def test_noise_is_found_in_the_log_not_taken_on_trust(va12: Model) -> None:
     motion = simulate(va12, energetic(), va12.nominal)
     log = measured(va12, motion, va12.nominal)

@@ -51,6 +51,7 @@ def result(straight: Model, problem: Problem) -> Comparison:
     return compare(straight, problem, samples=3, seed=1, budget_s=60.0, baselines=KINDS)
 
 
+@pytest.mark.slow
 def test_every_kind_has_its_rows(result: Comparison) -> None:
     assert [r.name for r in result.rows] == [
         DESIGNED,
@@ -61,6 +62,7 @@ def test_every_kind_has_its_rows(result: Comparison) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_the_designed_drive_beats_the_usual_ones(result: Comparison) -> None:
     ours, *others = result.rows
     assert ours.breaks is None
@@ -68,6 +70,7 @@ def test_the_designed_drive_beats_the_usual_ones(result: Comparison) -> None:
     assert result.ratio_equal_time > 1
 
 
+@pytest.mark.slow
 def test_every_score_is_that_of_a_fresh_simulation(straight: Model, problem: Problem, result: Comparison) -> None:
     for r in result.rows:
         motion = simulate(straight, r.manoeuvre.sample(100.0), q0=r.start)
@@ -78,6 +81,7 @@ def test_every_score_is_that_of_a_fresh_simulation(straight: Model, problem: Pro
         assert 0 < r.median_std_percent <= r.worst_std_percent
 
 
+@pytest.mark.slow
 def test_time_to_an_equal_score(result: Comparison, straight: Model, problem: Problem) -> None:
     """Samples count one after the other, shared among the processes; infeasible ones take time and don't count."""
     ours, *others = result.rows

@@ -139,6 +139,7 @@ def test_more_than_two_rivals(straight: Model, straight_motion: Motion) -> None:
     assert scores[1] >= scores[0]
 
 
+@pytest.mark.slow
 def test_sensors_are_worth_what_another_machine_file_says(va12: Model, va12_motion: Motion) -> None:
     """Machine files with half the noise, twice the counts or without a sensor give the same bounds."""
     motion = simulate(va12, va12_motion.u[:1500])

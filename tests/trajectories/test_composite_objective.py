@@ -156,6 +156,7 @@ def test_another_machine_follows_the_nominal_motion(va12: Model) -> None:
     assert np.abs(same.nu - wanted.nu).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_limits_hold_for_every_machine_of_a_robust_design(straight: Model) -> None:
     problem = shorter(straight, 12.0)
     aim = aims.compose_objective(straight, "cond", machines=scenarios.perturbed_machines(straight, 3, 0.2))

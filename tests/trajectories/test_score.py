@@ -31,7 +31,7 @@ def table_of(model: Model, torque: np.ndarray, every: int = 1) -> pd.DataFrame:
     return pd.DataFrame({"t_s": np.arange(len(torque)) / 100, **columns})[::every]
 
 
-@pytest.mark.parametrize("name", ["R60", "S40"])
+@pytest.mark.parametrize("name", [pytest.param("R60", marks=pytest.mark.slow), "S40"])
 def test_a_design_scores_as_its_summary_says(excite: Excite, tmp_path: Path, name: str) -> None:
     design = RESULTS / name / "design"
     said = json.loads((design / "summary.json").read_text())

@@ -52,6 +52,7 @@ def test_a_design_says_score_and_accuracy(excite: Excite, tmp_path: Path) -> Non
     assert (summary["advice"] is not None) == (spread.max() > POOR_PERCENT)
 
 
+@pytest.mark.slow
 def test_condition_number_then_accuracy(excite: Excite, tmp_path: Path) -> None:
     """The lowest cond(Phi) first, then the most accurate drive near it; `--cond-slack 0` stops after the first."""
     options = "va12_straight", "--duration", 12, "--starts", 1, "--seed", 3, "--json"

@@ -301,6 +301,7 @@ def test_the_page_says_which_cell_is_best_and_what_made_it(tmp_path: Path) -> No
     )
 
 
+@pytest.mark.slow
 def test_each_row_tells_how_to_repeat_it(
     tiny: Callable[..., StudyPlan], tmp_path: Path, excite: Excite, monkeypatch: pytest.MonkeyPatch
 ) -> None:
