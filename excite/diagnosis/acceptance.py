@@ -44,8 +44,9 @@ def reason_against(
         amount = format_uncertain(finding.magnitude, finding.magnitude_std, finding.unit)
         return f"its size is uncertain ({amount})"
     if finding.kind == "cause":
-        gain = predictive_gain(before, after, stage.dispersion)
-        return "" if gain is None or gain.low > 0 else "it does not predict withheld data better"
+        gain, seen = predictive_gain(before, after, stage.dispersion), hold_out_gain(before, after)
+        worse = seen is not None and seen.interval is not None and seen.interval[1] < 0
+        return "it does not predict withheld data better" if worse or (gain is not None and gain.low <= 0) else ""
     shown = hold_out_gain(before, after)
     if shown is None or shown.interval is None:
         return "no data could be withheld to test it"

@@ -177,7 +177,7 @@ _declare(
         " Wit, Olsson, Astrom, Lischinsky, IEEE TAC 40 (1995), (1) to (4)",
         sizes.coulomb(0.5),
         {
-            "decay": Shape("rad/s", 15.0, (4.0, 12.0, 36.0), sizes.friction_smoothing),
+            "decay": Shape("rad/s", 15.0, (4.0, 12.0, 36.0), sizes.stick_slip_rate, within=(1.0, 1e4)),
             "power": Shape("-", 2.0, (1.0, 2.0), whole=True),
             "bristles": _form_choice(
                 "0: friction turns with the speed; 1: all of it as bristles bend (LuGre without damping)"

@@ -37,9 +37,9 @@ def bristle_rate(s: SampleView, k: int, p: Values) -> ca.SX:
 
 def bristle_trials(site: Site) -> list[dict[str, float]]:
     """Return trials with bristles; a fixed power of 1.5 keeps them from explaining other causes."""
-    smooth = sizes.friction_smoothing(site)
+    smooth, rate = sizes.friction_smoothing(site), sizes.stick_slip_rate(site)
     return [
-        {"decay": x * smooth, "power": 1.5, "bristles": 1.0, "presliding": far * smooth}
+        {"decay": x * rate, "power": 1.5, "bristles": 1.0, "presliding": far * smooth}
         for x in (4.0, 12.0, 36.0)
         for far in (0.05, 0.2)
     ]

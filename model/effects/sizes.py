@@ -33,6 +33,17 @@ def friction_smoothing(site: Site) -> float:
     return float(site.body.friction.smoothing) if site.body.friction is not None else 1.0
 
 
+def stick_slip_rate(site: Site) -> float:
+    """Rate [rad/s] near standstill: 0.7 % of that at which viscous friction equals Fs (chosen), at least the smoothing.
+
+    Speeds over which friction falls are some per cent of those of work, however sharply the machine file lets it turn.
+    """
+    friction = site.body.friction
+    if friction is None or not (friction.Fv and friction.Fs):
+        return friction_smoothing(site)
+    return max(friction_smoothing(site), 0.007 * float(friction.Fs) / float(friction.Fv))
+
+
 def angle_limit(site: Site) -> float:
     """A joint's position limit [rad], 0.6 if it has none (chosen)."""
     return site.body.limit.reach or 0.6

@@ -127,3 +127,13 @@ def test_an_attack_end_to_end(name: str) -> None:
     one = attack(name, 1, 30.0 if name == "wheel_radius" else None)
     seen = simulate(one)
     assert score(seen.key, ask(seen.log, one.machine)) in ("right", "partly", "honest")
+
+
+@pytest.mark.slow
+def test_a_rig_that_sticks_has_stribeck_friction_only_where_it_is_hidden() -> None:
+    """Friction that falls within micrometres a second of rest is sticking under another name."""
+    assert ask(simulate(attack("sticks_noisily", 700)).log, "emps")["verdict"] == "clean"
+    one = attack("sticks_stribeck", 700)
+    (found,) = ask(simulate(one).log, "emps")["findings"]
+    assert (found["effect"], found["kind"]) == ("stribeck_friction", "cause")
+    assert abs(found["amount"] - 15 * one.size) < 2 * found["amount_std"]
