@@ -231,29 +231,21 @@ def exact_derivatives(
     return total, slope, hessian
 
 
-def directional_derivatives(
-    objective: CompositeObjective, A: np.ndarray, directions: np.ndarray, sharpness: float
-) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Return value, slope (m,) and Hessian (m, m) along changes of all information matrices A (n_blocks, n, n).
+def matrix_gradient(objective: CompositeObjective, A: np.ndarray, sharpness: float) -> tuple[float, np.ndarray]:
+    """Return the objective and its gradient (n_blocks, n, n) in the information matrices A (n_blocks, n, n).
 
-    directions (n_blocks, m, n, n). The fourth result is the gradient (n_blocks, n, n) in the matrices.
+    Raises LinAlgError for a singular matrix.
     """
-    m = directions.shape[1]
-    total, slope, hessian, gradient = 0.0, np.zeros(m), np.zeros((m, m)), np.zeros_like(A)
+    total, gradient = 0.0, np.zeros_like(A)
     for term in objective.terms:
-        by = term.column_scale * term.column_scale[:, None]
         J = _accumulated(term, A[term.block])
-        x, g, H, G = objectives.directional_derivatives(
-            term.objective, J, directions[term.block] * by, sharpness, term.contrasts
-        )
-        push, bend = 1.0, 0.0
+        x, G = objectives.matrix_gradient(term.objective, J, sharpness, term.contrasts)
+        push = 1.0
         if term.ceiling is not None:
-            x, push, bend = _smooth_hinge(x - term.ceiling)
+            x, push, _ = _smooth_hinge(x - term.ceiling)
         total += term.weight * x
-        slope += term.weight * push * g
-        hessian += term.weight * (push * H + bend * np.outer(g, g))
-        gradient[term.block] += term.weight * push * by * G
-    return total, slope, hessian, gradient
+        gradient[term.block] += term.weight * push * G * np.outer(term.column_scale, term.column_scale)
+    return total, gradient
 
 
 def _accumulated(term: Term, A: np.ndarray) -> np.ndarray:

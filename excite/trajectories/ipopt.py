@@ -68,7 +68,7 @@ class Optimum:
         return self.status in CONVERGED
 
 
-class Pattern:
+class _Pattern:
     """Sum triplets at fixed places into the non-zeros of a CasADi matrix."""
 
     def __init__(self, shape: tuple[int, int], rows: np.ndarray, columns: np.ndarray) -> None:
@@ -82,7 +82,7 @@ class Pattern:
         return np.bincount(self._place, weights=values, minlength=self.size)
 
 
-class Evaluation(ca.Callback):  # type: ignore[misc]
+class _Evaluation(ca.Callback):  # type: ignore[misc]
     """A numeric function of vectors for CasADi, whose non-zeros are passed as NumPy arrays."""
 
     def __init__(
@@ -125,7 +125,7 @@ class Evaluation(ca.Callback):  # type: ignore[misc]
         return 0
 
 
-class Watch(ca.Callback):  # type: ignore[misc]
+class _Watch(ca.Callback):  # type: ignore[misc]
     """Ask `should_stop` after every iteration of Ipopt, and count them."""
 
     def __init__(self, n_x: int, n_g: int, should_stop: Callable[[], bool]) -> None:
@@ -200,10 +200,10 @@ class Program:
             (shared.ravel(), np.broadcast_to(at[:, None], (K, n_a, n_y)).ravel()),
             (begins[3] + np.arange(n_a), entries_at),
         ]
-        self._jacobian = Pattern((self.n_g, self.n_x), *(np.concatenate(x) for x in zip(*parts, strict=True)))
+        self._jacobian = _Pattern((self.n_g, self.n_x), *(np.concatenate(x) for x in zip(*parts, strict=True)))
         self._upper = np.triu_indices(n_y)
         self._entry_upper = np.triu_indices(n_a)
-        self._hessian = Pattern(
+        self._hessian = _Pattern(
             (self.n_x, self.n_x),
             np.concatenate([at[:, self._upper[0]].ravel(), entries_at[self._entry_upper[0]]]),
             np.concatenate([at[:, self._upper[1]].ravel(), entries_at[self._entry_upper[1]]]),
@@ -312,26 +312,26 @@ class Program:
         """Return the solver as a CasADi function, and what must live as long as it."""
         x, p, m = ("x", self.n_x), ("p", 0), ("lam_g", self.n_g)
         f, g = ("f", ca.Sparsity.dense(1, 1)), ("g", ca.Sparsity.dense(self.n_g, 1))
-        program = Evaluation("nlp", [x, p], [f, g], lambda x, p: (self.value(x), self.equations(x)))
-        grad_f = Evaluation(
+        program = _Evaluation("nlp", [x, p], [f, g], lambda x, p: (self.value(x), self.equations(x)))
+        grad_f = _Evaluation(
             "nlp_grad_f",
             [x, p],
             [f, ("grad_f_x", ca.Sparsity.dense(self.n_x, 1))],
             lambda x, p: (self.value(x), self.gradient(x)),
         )
-        jac_g = Evaluation(
+        jac_g = _Evaluation(
             "nlp_jac_g",
             [x, p],
             [g, ("jac_g_x", self.jacobian_sparsity)],
             lambda x, p: (self.equations(x), self.jacobian(x)),
         )
-        hess_lag = Evaluation(
+        hess_lag = _Evaluation(
             "nlp_hess_l",
             [x, p, ("lam_f", 1), m],
             [("triu_hess_gamma_x_x", self.hessian_sparsity)],
             lambda x, p, factor, multipliers: (self.hessian(x, float(factor[0]), multipliers),),
         )
-        watch = Watch(self.n_x, self.n_g, should_stop)
+        watch = _Watch(self.n_x, self.n_g, should_stop)
         every = (
             OPTIONS | options | {"grad_f": grad_f, "jac_g": jac_g, "hess_lag": hess_lag, "iteration_callback": watch}
         )

@@ -5,8 +5,8 @@ q_j(t) = path_j(t) + basis(t) c_j. The basis is a Fourier series or a spline; wi
 rest, and the path leads from the start pose to the end pose. Limits on position, speed, torque, torque rate and power
 are functions of the motion and its derivatives.
 
-The program minimises the objective of the information matrix A = sum Phi' Phi over c by Ipopt. All derivatives are
-exact: with G the gradient of the objective in A, d2F = H_F[dA, dA] + 2 <G, dPhi' dPhi + Phi' d2Phi>.
+The program minimises the objective of the information matrix A = sum Phi' Phi over c by SLSQP. Gradients are exact:
+with G the gradient of the objective in A, dF = 2 <Phi G, dPhi>. Ipopt with the exact Hessian took five times as long.
 
 Dry friction turns within milliseconds at a reversal, too fast for the samples. The program smooths it over
 `FRICTION_RATE`; scores and limits of the result are those of the machine file.
@@ -24,6 +24,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from scipy.interpolate import BSpline
+from scipy.optimize import minimize
 
 from excite.model import Model, build
 from excite.model.machine import Problem, Quantity
@@ -31,7 +32,6 @@ from excite.simulation import Motion, inverse_dynamics, motion_along
 from excite.trajectories import composite_objective
 from excite.trajectories.collocation import MappedFunction
 from excite.trajectories.composite_objective import CompositeObjective
-from excite.trajectories.ipopt import OPTIONS, WARM, Evaluation, Pattern, Watch
 from excite.trajectories.limits import Limit, check_limits, machine_limits, stack_limits
 
 HARMONICS = 5  # of a Fourier series; usual in the field
@@ -45,9 +45,9 @@ FIRST_MARGIN = 2e-3  # share of a limit's range kept free in the program, for wh
 REPAIR_FACTOR = 1.2  # further margin over the excess that it is for; chosen
 LEAST_REPAIR = 1e-3  # least further margin, share of half a limit's range; chosen
 MAX_MARGIN = 0.8  # largest margin, share of half a limit's range; chosen
-SOLVED_EXCESS = 1e-6  # of scaled limits at which a point counts as one that keeps them; chosen
-SOLVER_TOLERANCE = 1e-4  # of Ipopt; chosen
-WARM_BARRIER = 1e-4  # barrier parameter of a warm start; chosen
+SOLVER_TOLERANCE = 1e-6  # of SLSQP, in the objective; chosen
+RESTART_GAIN = 1e-3  # gain of the objective that justifies another beginning; chosen
+SINGULAR_VALUE = 1e3  # objective where no parameter set is identifiable, above any other; chosen
 USUAL_AMPLITUDE = 1.0  # rad or m, amplitude of a guess for a joint without limits; chosen
 
 
@@ -185,202 +185,134 @@ def with_smooth_friction(model: Model, least: float = FRICTION_RATE) -> Model:
 
 
 class MotionProgram:
-    """The nonlinear program of a joint motion: x (n_q n_c,) the coefficients, limits g scaled to -1 ... 1.
+    """The program of a joint motion in x (n_q n_c,), its coefficients: an objective and limits scaled to -1 ... 1.
 
-    sharpness: of the objective. margins (n_g,): share of each limit's half range that is kept free.
+    sharpness: of the objective's maximum. margins (n_g,): share of each limit's half range that is kept free.
     """
 
     def __init__(self, model: Model, problem: Problem, objective: CompositeObjective, basis: Basis) -> None:
         self.basis, self.objective = basis, objective
         self.sharpness = 10.0
-        self.model = model
         self.n_q, self.n_c, self.n_b = len(model.coordinates), basis.count, len(model.base.names)
         self.limits = machine_limits(model, problem)
         self.n_g = len(self.limits)
         self.margins = np.full(self.n_g, FIRST_MARGIN)
         rate, T = float(model.machine.sampling_hz), basis.duration
         n_w = round(T * min(OBJECTIVE_HZ, rate)) + 1
-        self.share = (round(T * rate) + 1) / n_w  # samples of the log per sample here
-        self._column_scale = objective.scale * np.sqrt(self.share)
+        # samples of the log per sample of the program
+        self._column_scale = objective.scale * np.sqrt((round(T * rate) + 1) / n_w)
         self._path, self._B = self._tables(np.linspace(0, T, n_w), 3)
-        self.times = np.linspace(0, T, round(T * LIMITS_HZ[basis.kind]) + 1)
-        self._limit_path, self._limit_B = self._tables(self.times, 4)
-        self._functions()
-        self._places()
-        # Work space of the Hessian, which is larger than what the allocator keeps
-        self._moved = np.empty((n_w, 3, self.n_b, self.n_b))
-        self._pulled = np.empty((n_w, 3 * self.n_q, self.n_b, self.n_q))
+        self._limit_path, self._limit_B = self._tables(np.linspace(0, T, round(T * LIMITS_HZ[basis.kind]) + 1), 4)
+        self._bounded = np.array([np.isfinite(g.low) for g in self.limits], bool)
+        self._functions(model)
 
     def _tables(self, t: np.ndarray, orders: int) -> tuple[np.ndarray, np.ndarray]:
         """Return path (N, orders, n_q) and basis (N, orders, n_c) with their derivatives."""
         path = np.stack([self.basis.path(t, k) for k in range(orders)], axis=1)
         return path, np.stack([self.basis.evaluate(t, k) for k in range(orders)], axis=1)
 
-    def _functions(self) -> None:
-        model, n_q = self.model, self.n_q
+    def _functions(self, model: Model) -> None:
+        """Build the regressor, the limits and their derivatives over all samples."""
+        n_q = self.n_q
         q, nu, a = model.symbols()
         jerk = ca.SX.sym("j", n_q)
+        z, y = ca.vertcat(q, nu, a), ca.vertcat(q, nu, a, jerk)
         W = model.regressor(q, nu, a)
-        z = ca.vertcat(q, nu, a)
         C = ca.SX.sym("C", *W.shape)
-        picked = ca.sum1(ca.sum2(W * C))
-        N, n_b, n = len(self._path), self.n_b, 3 * n_q
-        slope, bent = ca.gradient(picked, z), ca.hessian(picked, z)[0]
-        self._W = _mapped([z], ca.densify(W), N, (n_b, n_q))
-        self._W_slope = _mapped([z, C], ca.densify(slope), N, (n,))
-        self._W_jacobian = _mapped([z], ca.densify(ca.jacobian(ca.vec(W), z)), N, (n, n_b, n_q))
-        self._W_hessian = _mapped([z, C], ca.densify(bent), N, (n, n))
+        N = len(self._path)
+        self._W = _mapped([z], W, N, (self.n_b, n_q))
+        self._W_slope = _mapped([z, C], ca.gradient(ca.sum1(ca.sum2(W * C)), z), N, (3 * n_q,))
         u = inverse_dynamics(model)(q, nu, a, model.nominal)
         du = ca.jtimes(u, z, ca.vertcat(nu, a, jerk))
-        y = ca.vertcat(z, jerk)
-        centre = np.array([_centre(g) for g in self.limits])
-        half = np.array([_half(g) for g in self.limits])
+        centre, half = np.array([_centre(g) for g in self.limits]), np.array([_half(g) for g in self.limits])
         values = (stack_limits(model, self.limits)(q, nu, u, du) - centre) / half if self.n_g else ca.SX(0, 1)
-        multipliers = ca.SX.sym("m", self.n_g)
         slope = ca.jacobian(values, y)
         pattern = np.array(ca.DM(slope.sparsity(), 1).full(), bool).reshape(self.n_g, 4, n_q)
         self._depends: np.ndarray = np.asarray(pattern.any(axis=1))
-        N, n = len(self._limit_path), 4 * n_q
-        self._g = _mapped([y], ca.densify(values), N, (self.n_g,))
-        self._g_jacobian = _mapped([y], ca.densify(slope), N, (n, self.n_g))
-        bent = ca.densify(ca.hessian(ca.dot(multipliers, values), y)[0])
-        self._g_hessian = _mapped([y, multipliers], bent, N, (n, n))
-
-    def _places(self) -> None:
-        """Lay out the sparse Jacobian: limit by joint by basis function where neither is always zero."""
-        used = np.abs(self._limit_B).max(axis=1) > 0  # (N, n_c)
-        k, i, j, c = np.nonzero(self._depends[None, :, :, None] & used[:, None, None, :])
-        self._entries = (k, i, j, c)
-        n_x = self.n_q * self.n_c
-        self.sizes = (n_x, len(self.times) * self.n_g)
-        self._jacobian = Pattern((self.sizes[1], n_x), k * self.n_g + i, j * self.n_c + c)
-        self._upper = np.triu_indices(n_x)
-        self._hessian = Pattern((n_x, n_x), *self._upper)
+        N = len(self._limit_path)
+        self._g = _mapped([y], values, N, (self.n_g,))
+        self._g_jacobian = _mapped([y], slope, N, (4 * n_q, self.n_g))
 
     @property
-    def jacobian_sparsity(self) -> ca.Sparsity:
-        return self._jacobian.sparsity
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self.n_q * self.n_c
 
     @property
-    def hessian_sparsity(self) -> ca.Sparsity:
-        return self._hessian.sparsity
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Path (N, 3, n_q) and basis (N, 3, n_c) with their derivatives where the information is summed."""
+        return self._path, self._B
 
-    # ------------------------------------------------------------------------------------------ objective
+    @property
+    def limit_samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Path (N, 4, n_q) and basis (N, 4, n_c) with their derivatives where limits are kept."""
+        return self._limit_path, self._limit_B
 
     def _states(self, x: np.ndarray, path: np.ndarray, B: np.ndarray) -> np.ndarray:
         """Return q and its derivatives (N, orders n_q) at all samples."""
         return np.asarray((path + B @ x.reshape(self.n_q, self.n_c).T).reshape(len(path), -1))
+
+    # ------------------------------------------------------------------------------------------ objective
 
     def _regressor(self, z: np.ndarray) -> np.ndarray:
         """Return W in the scale of the objective (N, n_q, n_b)."""
         (W,) = self._W(z)
         return np.asarray(W.transpose(0, 2, 1) * self._column_scale)
 
-    def matrices(self, x: np.ndarray) -> np.ndarray:
-        """Return the information matrices (n_blocks, n_b, n_b) of a full log."""
-        return self._gram(self._regressor(self._states(x, self._path, self._B)))
-
     def _gram(self, W: np.ndarray) -> np.ndarray:
         weighted = [(W * w[:, None]).reshape(-1, self.n_b) for w in self.objective.row_weights]
         return np.stack([P.T @ P for P in weighted])
 
-    def value(self, x: np.ndarray) -> float:
-        """Return the objective, NaN where the information is singular: Ipopt then takes a shorter step."""
-        found = composite_objective.score_matrices(self.objective, self.matrices(x), self.sharpness)
-        return found if np.isfinite(found) else float("nan")
+    def matrices(self, x: np.ndarray) -> np.ndarray:
+        """Return the information matrices (n_blocks, n_b, n_b) of a full log."""
+        return self._gram(self._regressor(self._states(x, self._path, self._B)))
 
-    def gradient(self, x: np.ndarray) -> np.ndarray:
-        """Return the gradient (n_x,) of the objective, NaN where the information is singular."""
+    def value(self, x: np.ndarray) -> float:
+        """Return the objective, SINGULAR_VALUE if the information is singular."""
+        found = composite_objective.score_matrices(self.objective, self.matrices(x), self.sharpness)
+        return found if np.isfinite(found) else SINGULAR_VALUE
+
+    def value_and_gradient(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the objective and its gradient (n_x,); SINGULAR_VALUE and zero if the information is singular."""
         z = self._states(x, self._path, self._B)
         W = self._regressor(z)
         try:
-            G = self._derivatives(self._gram(W), np.zeros((len(self.objective.row_weights), 1, self.n_b, self.n_b)))[3]
+            value, G = composite_objective.matrix_gradient(self.objective, self._gram(W), self.sharpness)
         except np.linalg.LinAlgError:
-            return np.full(self.sizes[0], np.nan)
-        (slope,) = self._W_slope(z, self._cotangent(W, G))
-        slope = slope.reshape(-1, self.n_q)  # (3 N, n_q)
-        return np.asarray((slope.T @ self._B.reshape(-1, self.n_c)).ravel())
-
-    def _derivatives(self, A: np.ndarray, directions: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        return composite_objective.directional_derivatives(self.objective, A, directions, self.sharpness)
-
-    def _cotangent(self, W: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return dF/dW' of the plain regressor (N, n_b, n_q)."""
+            return SINGULAR_VALUE, np.zeros(self.size)
         C = np.zeros_like(W)
         for w, g in zip(self.objective.row_weights, G, strict=True):
             C += 2 * w[:, None] ** 2 * (W.reshape(-1, self.n_b) @ g).reshape(W.shape)
-        return np.asarray((C * self._column_scale).transpose(0, 2, 1))
-
-    def hessian_of_objective(self, x: np.ndarray) -> np.ndarray:
-        """Return the Hessian (n_x, n_x) of the objective."""
-        z = self._states(x, self._path, self._B)
-        W = self._regressor(z)
-        n, N, n_b = 3 * self.n_q, len(W), self.n_b
-        (J,) = self._W_jacobian(z)  # (N, 3 n_q, n_b, n_q), of W'
-        J *= self._column_scale[:, None]
-        weights = self.objective.row_weights
-        directions = np.empty((len(weights), self.n_q * self.n_c, n_b, n_b))
-        flat = np.ascontiguousarray(self._B.transpose(2, 0, 1)).reshape(self.n_c, -1)
-        for b, w in enumerate(weights):
-            right = (W * w[:, None] ** 2)[:, None]
-            for j in range(self.n_q):
-                moved = np.matmul(J[:, j :: self.n_q], right, out=self._moved)
-                dA = (flat @ moved.reshape(N * 3, -1)).reshape(self.n_c, n_b, n_b)
-                directions[b, j * self.n_c : (j + 1) * self.n_c] = dA + dA.transpose(0, 2, 1)
-        _, _, H, G = self._derivatives(self._gram(W), directions)
-        (local,) = self._W_hessian(z, self._cotangent(W, G))
-        rows = J.reshape(N, n, -1)
-        for w, g in zip(weights, G, strict=True):
-            pulled = np.matmul(g, J, out=self._pulled)
-            pulled *= 2 * w**2
-            local += np.matmul(pulled.reshape(N, n, -1), rows.transpose(0, 2, 1))
-        return np.asarray(H + self._spread(local, self._B))
-
-    def _spread(self, local: np.ndarray, B: np.ndarray) -> np.ndarray:
-        """Return sum_k T_k' L_k T_k (n_x, n_x) of local Hessians L (N, orders n_q, orders n_q), T from basis B."""
-        N, orders, n_c = B.shape
-        found = np.empty((self.n_q, n_c, self.n_q, n_c))
-        blocks = local.reshape(N, orders, self.n_q, orders, self.n_q)
-        flat = B.reshape(N * orders, n_c)
-        for i in range(self.n_q):
-            for j in range(i, self.n_q):
-                half = np.matmul(blocks[:, :, i, :, j], B).reshape(N * orders, n_c)
-                found[i, :, j] = flat.T @ half
-                found[j, :, i] = found[i, :, j].T
-        return found.reshape(self.n_q * n_c, -1)
+        (slope,) = self._W_slope(z, (C * self._column_scale).transpose(0, 2, 1))
+        return value, np.asarray((slope.reshape(-1, self.n_q).T @ self._B.reshape(-1, self.n_c)).ravel())
 
     # ------------------------------------------------------------------------------------------ limits
 
-    def constraints(self, x: np.ndarray) -> np.ndarray:
-        """Return the limits (N n_g,), scaled to -1 ... 1, at all their samples."""
-        return np.asarray(self._g(self._states(x, self._limit_path, self._limit_B))[0].ravel())
+    def limit_values(self, x: np.ndarray) -> np.ndarray:
+        """Return the limits (N, n_g), scaled to -1 ... 1, at all their samples."""
+        return np.asarray(self._g(self._states(x, self._limit_path, self._limit_B))[0])
 
-    def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """Return the non-zeros of the Jacobian of the limits."""
+    def slack(self, x: np.ndarray) -> np.ndarray:
+        """Return what is left of every limit (2 n_g,) at its highest and lowest sample, negative where exceeded."""
+        g = self.limit_values(x)
+        below = np.where(self._bounded, g.min(axis=0) + 1 - self.margins, 1.0)
+        return np.concatenate([1 - self.margins - g.max(axis=0), below])
+
+    def slack_jacobian(self, x: np.ndarray) -> np.ndarray:
+        """Return the derivative (2 n_g, n_x) of `slack`, at the samples that are highest and lowest."""
         y = self._states(x, self._limit_path, self._limit_B)
+        g = self._g(y)[0]
         (J,) = self._g_jacobian(y)
-        J = J.reshape(len(self.times), 4, self.n_q * self.n_g).transpose(0, 2, 1)
-        k, i, j, c = self._entries
-        full = np.matmul(J, self._limit_B).reshape(len(self.times), self.n_q, self.n_g, self.n_c).transpose(0, 2, 1, 3)
-        return self._jacobian.gather(full[k, i, j, c])
-
-    def hessian(self, x: np.ndarray, factor: float, multipliers: np.ndarray) -> np.ndarray:
-        """Return the non-zeros of the Lagrangian's Hessian on and above its diagonal."""
-        found = np.zeros((self.sizes[0], self.sizes[0]))
-        if factor:
-            try:
-                found += factor * self.hessian_of_objective(x)
-            except np.linalg.LinAlgError:
-                found[:] = np.nan
-        if self.n_g:
-            y = self._states(x, self._limit_path, self._limit_B)
-            (local,) = self._g_hessian(y, multipliers.reshape(len(self.times), self.n_g))
-            found += self._spread(local, self._limit_B)
-        return self._hessian.gather(found[self._upper])
+        sample = np.concatenate([g.argmax(axis=0), g.argmin(axis=0)])
+        limit = np.tile(np.arange(self.n_g), 2)
+        local = J[sample, :, limit].reshape(-1, 4, self.n_q)
+        full = np.matmul(local.transpose(0, 2, 1), self._limit_B[sample]).reshape(-1, self.size)
+        sign = np.concatenate([-np.ones(self.n_g), np.where(self._bounded, 1.0, 0.0)])
+        return np.asarray(sign[:, None] * full)
 
     def reach(self, x: np.ndarray) -> np.ndarray:
         """Return the share (n_q,) of its limits on position and speed that each joint uses; amplitude without them."""
-        used = np.abs(self.constraints(x)).reshape(-1, self.n_g).max(axis=0, initial=0.0)
+        used = np.abs(self.limit_values(x)).max(axis=0, initial=0.0)
         found = np.zeros(self.n_q)
         for k, g in enumerate(self.limits):
             if g.kind in ("position", "rate"):
@@ -394,82 +326,69 @@ class MotionProgram:
         more = np.where(over > 0, REPAIR_FACTOR * over + LEAST_REPAIR, 0.0)
         self.margins = np.minimum(self.margins + more, MAX_MARGIN)
 
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the bounds (N n_g,) of the limits."""
-        low = np.array([-1.0 if np.isfinite(g.low) else -np.inf for g in self.limits]) + self.margins
-        return np.tile(low, len(self.times)), np.tile(1 - self.margins, len(self.times))
-
     # ------------------------------------------------------------------------------------------ solve
 
-    def solve(
-        self,
-        x: np.ndarray,
-        should_stop: Callable[[], bool],
-        max_iterations: int,
-        multipliers: dict[str, Any] | None = None,
-    ) -> MotionOptimum:
-        """Solve from x (n_x,), warm with the multipliers of another solve. Raises nothing: see `MotionOptimum`."""
-        n_x, n_g = self.sizes
-        at, p, m = ("x", n_x), ("p", 0), ("lam_g", n_g)
-        f, g = ("f", ca.Sparsity.dense(1, 1)), ("g", ca.Sparsity.dense(n_g, 1))
+    def solve(self, x: np.ndarray, should_stop: Callable[[], bool], max_iterations: int) -> MotionOptimum:
+        """Minimise the objective from x (n_x,) under the limits, in so many iterations at most.
+
+        SLSQP gives up where the highest sample of a limit changes; it then begins anew from there.
+        """
         best: list[tuple[float, np.ndarray]] = []
-        low, high = self.bounds()
+        latest, done = np.array(x), 0
 
-        def slope(x: np.ndarray, p: np.ndarray) -> tuple[float, np.ndarray]:
-            value, limits = self.value(x), self.constraints(x)
-            kept = bool((limits <= high + SOLVED_EXCESS).all() and (limits >= low - SOLVED_EXCESS).all())
-            if kept and np.isfinite(value) and (not best or value < best[0][0]):
-                best[:] = [(value, np.array(x))]
-            return value, self.gradient(x)
+        def keep(x: np.ndarray) -> None:
+            nonlocal latest, done
+            latest, done = np.array(x), done + 1
+            value = self.value(latest)
+            if (self.slack(latest) > -self.tolerated).all() and (not best or value < best[0][0]):
+                best[:] = [(value, latest)]
+            if should_stop() or done >= max_iterations:
+                raise _StopSearch
 
-        program = Evaluation("nlp", [at, p], [f, g], lambda x, p: (self.value(x), self.constraints(x)))
-        grad_f = Evaluation("nlp_grad_f", [at, p], [f, ("grad_f_x", ca.Sparsity.dense(n_x, 1))], slope)
-        jac_g = Evaluation(
-            "nlp_jac_g",
-            [at, p],
-            [g, ("jac_g_x", self.jacobian_sparsity)],
-            lambda x, p: (self.constraints(x), self.jacobian(x)),
-        )
-        hess_lag = Evaluation(
-            "nlp_hess_l",
-            [at, p, ("lam_f", 1), m],
-            [("triu_hess_gamma_x_x", self.hessian_sparsity)],
-            lambda x, p, factor, multipliers: (self.hessian(x, float(factor[0]), multipliers),),
-        )
-        watch = Watch(n_x, n_g, should_stop)
-        given = {"grad_f": grad_f, "jac_g": jac_g, "hess_lag": hess_lag, "iteration_callback": watch}
-        own = {"ipopt.max_iter": max_iterations, "ipopt.tol": SOLVER_TOLERANCE, "ipopt.acceptable_iter": 5}
-        own |= {"ipopt.acceptable_tol": 10 * SOLVER_TOLERANCE, "ipopt.acceptable_obj_change_tol": 1e-4}
-        warm = {} if multipliers is None else WARM | {"ipopt.mu_init": WARM_BARRIER}
-        solver = ca.nlpsol("ipopt", "ipopt", program, OPTIONS | own | warm | given)
-        found = solver(x0=x, lbg=low, ubg=high, **(multipliers or {}))
-        slope(found["x"].full().ravel(), np.zeros(0))
-        stats = solver.stats()
-        return MotionOptimum(
-            best[0][1] if best else found["x"].full().ravel(),
-            bool(best),
-            {"lam_x0": found["lam_x"], "lam_g0": found["lam_g"]},
-            str(stats["return_status"]),
-            int(stats["iter_count"]),
-        )
+        limits = {"type": "ineq", "fun": self.slack, "jac": self.slack_jacobian}
+        constraints = [limits] if self.n_g else []
+        before = float("inf")
+        slsqp: Any = minimize  # its types know no callback that ends it
+        try:
+            while True:
+                slsqp(
+                    self.value_and_gradient,
+                    latest,
+                    jac=True,
+                    method="SLSQP",
+                    constraints=constraints,
+                    callback=keep,
+                    options={"maxiter": max_iterations, "ftol": SOLVER_TOLERANCE},
+                )
+                now = best[0][0] if best else float("inf")
+                if not now < before - RESTART_GAIN:
+                    break
+                before = now
+        except _StopSearch:
+            pass
+        return MotionOptimum(best[0][1] if best else latest, latest, done)
+
+    @property
+    def tolerated(self) -> np.ndarray:
+        """Excess (2 n_g,) over the margins that still keeps the limits at their samples."""
+        return np.tile(self.margins, 2)
+
+
+class _StopSearch(Exception):
+    """Raised in a callback to end a minimisation."""
 
 
 @dataclass(frozen=True)
 class MotionOptimum:
-    """The best point x (n_x,) of a solve that keeps the program's limits, the last one if none does (feasible False).
-
-    multipliers: of the last point, for `MotionProgram.solve`. status: as Ipopt names it.
-    """
+    """Result of a solve: the best point (n_x,) that keeps the limits at their samples, or the last; and the last."""
 
     x: np.ndarray
-    feasible: bool
-    multipliers: dict[str, Any]
-    status: str
+    last: np.ndarray
     iterations: int
 
 
 def _mapped(inputs: list[ca.SX], output: ca.SX, samples: int, shape: tuple[int, ...]) -> MappedFunction:
-    return MappedFunction(ca.Function("mapped", inputs, [output], {"cse": True}), samples, [shape])
+    return MappedFunction(ca.Function("mapped", inputs, [ca.densify(output)], {"cse": True}), samples, [shape])
 
 
 def _half(g: Limit) -> float:

@@ -45,7 +45,8 @@ from excite.trajectories.multistart import (
 GUESSES = 200  # random series of which the best is a start; chosen
 GUESS_REACH = 0.9  # share of the limits on position and speed that a guess may use; chosen
 SHRINK, SHRINKS = 0.85, 12  # factor of a guess outside of its limits, and how often it is applied; chosen
-REPAIR_ITERATIONS = 12  # of a solve with larger margins; chosen
+DRAWN_BACK = (0.995, 0.98, 0.95, 0.9, 0.8)  # factors of coefficients that keep limits in the end; chosen
+REPAIR_ITERATIONS = 60  # of a solve with larger margins; chosen
 ROUNDING = 1e-6  # excess that counts as none, share of a limit's range; chosen
 REPAIRS = 4  # solves with larger margins; chosen
 
@@ -59,10 +60,10 @@ class Stage:
     iterations: int
 
 
-FOURIER_STAGES = (Stage("fourier", 10, 40), Stage("fourier", 30, 40))
+FIRST_STAGE = Stage("fourier", 30, 200)
 TRAJECTORIES: dict[str, tuple[Stage, ...]] = {  # stages by the kind of motion; iterations chosen for a minute
-    "free": (*FOURIER_STAGES, Stage("free", 30, 50), Stage("free", 100, 40)),
-    "fourier": (*FOURIER_STAGES, Stage("fourier", 100, 40), Stage("fourier", 300, 30)),
+    "free": (FIRST_STAGE, Stage("free", 30, 150), Stage("free", 100, 500)),
+    "fourier": (FIRST_STAGE, Stage("fourier", 100, 300), Stage("fourier", 300, 300)),
 }
 
 
@@ -171,7 +172,7 @@ def design_joint_motion(
         best.best.excess,
         tuple(_reported(composite, states[k].best) if k in states else float("inf") for k in range(starts)),
         complete,
-        "ipopt",
+        "slsqp",
         best.iterations,
         trajectory,
     )
@@ -245,26 +246,34 @@ def search(
     best = score_joint_motion(model, problem, objective, stages[0].basis, _shaped(program, x))
     guess = _as_motion(model, problem, stages[0].basis, best.coefficients).sample(model)
     first = objectives.cond_phi(model, guess)
-    multipliers, iterations = None, 0
+    iterations = 0
     for stage in stages:
         if program.basis.kind != stage.basis:
             before = program
             program = MotionProgram(smooth, problem, objective, BASES[stage.basis](problem, *poses))
-            x, multipliers = _carried_over(before, program, x), None
+            x = _carried_over(before, program, x)
         program.sharpness = stage.sharpness
-        for repair in range(1 + REPAIRS):
-            found = program.solve(x, should_stop, REPAIR_ITERATIONS if repair else stage.iterations, multipliers)
+        for repair in range(1 + (REPAIRS if stage is stages[-1] else 1)):
+            found = program.solve(x, should_stop, REPAIR_ITERATIONS if repair else stage.iterations)
             iterations += found.iterations
-            x, multipliers = found.x, found.multipliers
+            x = found.x
             scored = score_joint_motion(model, problem, objective, stage.basis, _shaped(program, x))
-            best = min(best, scored, key=lambda s: s.rank)
-            if stage is not stages[-1] or scored.excess <= ROUNDING or should_stop():
+            best = min(best, scored, _drawn_back(model, problem, objective, scored), key=lambda s: s.rank)
+            if scored.excess <= ROUNDING or should_stop():
                 break
             program.widen_margins(scored.violations)
-            multipliers = None
         yield MotionState(0, best, first, iterations, not should_stop())
         if should_stop():
             return
+
+
+def _drawn_back(model: Model, problem: Problem, objective: CompositeObjective, found: ScoredMotion) -> ScoredMotion:
+    """Return a motion that exceeds a limit with its coefficients reduced until it keeps all of them, or as it is."""
+    for share in DRAWN_BACK if found.excess > ROUNDING else ():
+        less = score_joint_motion(model, problem, objective, found.basis, share * found.coefficients)
+        if less.excess <= ROUNDING:
+            return less
+    return found
 
 
 def _shaped(program: MotionProgram, x: np.ndarray) -> np.ndarray:
@@ -284,15 +293,13 @@ def best_guess(program: MotionProgram, seed: int, should_stop: Callable[[], bool
     Each joint is scaled into its limits on position and speed, then all together.
     """
     rng = np.random.default_rng(seed)
-    low, high = program.bounds()
     best, chosen = (True, float("inf")), None
     for _ in range(GUESSES):
         x = rng.normal(size=(program.n_q, program.n_c)) * rng.uniform(0.3, 1.0, (program.n_q, 1))
         used = program.reach(x.ravel())
         x *= np.where(used > GUESS_REACH, GUESS_REACH / np.maximum(used, 1e-9), 1.0)[:, None]
         for _ in range(SHRINKS):
-            limits = program.constraints(x.ravel())
-            over = bool((limits > high).any() or (limits < low).any())
+            over = bool((program.slack(x.ravel()) < 0).any())
             if not over:
                 break
             x *= SHRINK

@@ -186,8 +186,7 @@ def local_model(
         return LocalModel(value, slope, factor_positive_part(curvature))
     n = len(A)
     x, V = np.linalg.eigh(A)
-    value, g, H, ratio = _spectral_derivatives(objective, x, sharpness)
-    E = _unit_entries(V, rows, columns)
+    value, g, H, E, ratio = _spectral_derivatives(objective, x, V, rows, columns, sharpness)
     slope = np.einsum("lii,i->l", E, g)
     e, U = np.linalg.eigh(x[:, None] * H * x)
     root = (U * np.sqrt(np.maximum(e, 0))).T / x
@@ -196,27 +195,23 @@ def local_model(
     return LocalModel(value, slope, factor_positive_part(factor.T @ factor))
 
 
-def _unit_entries(V: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the symmetric unit matrices of entries in the axes of V (n_a, n, n)."""
-    E = np.einsum("li,lj->lij", V[rows], V[columns])
-    return np.where((rows != columns)[:, None, None], E + E.transpose(0, 2, 1), E)
-
-
 def _spectral_derivatives(
-    objective: str, x: np.ndarray, sharpness: float
-) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Return value, slope and Hessian in the eigenvalues x (n,), and difference quotients.
+    objective: str, x: np.ndarray, V: np.ndarray, rows: np.ndarray, columns: np.ndarray, sharpness: float
+) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return value, slope and Hessian in the eigenvalues x, unit entries in the axes of V, and difference quotients.
 
-    Quotients (F_i - F_j) / (x_i - x_j) (n (n - 1) / 2,) of the pairs i < j.
+    Entries E (n_a, n, n); quotients (F_i - F_j) / (x_i - x_j) (n (n - 1) / 2,) of the pairs i < j.
     """
     n = len(x)
     out = _derivatives(objective, n)(x, sharpness)
     g, H = out[1].full().ravel(), out[2].full()
+    E = np.einsum("li,lj->lij", V[rows], V[columns])
+    E = np.where((rows != columns)[:, None, None], E + E.transpose(0, 2, 1), E)
     i, j = np.triu_indices(n, 1)
     gap = x[j] - x[i]
     close = gap < 1e-7 * x[j]
     ratio = np.where(close, H[j, j] - H[i, j], (g[j] - g[i]) / np.where(close, 1, gap))
-    return float(out[0]), g, H, ratio
+    return float(out[0]), g, H, E, ratio
 
 
 def exact_derivatives(
@@ -233,40 +228,34 @@ def exact_derivatives(
     """
     if OBJECTIVES[objective].of == "variances":
         return _derivatives_of_variances(objective, A, rows, columns, sharpness, contrasts)
+    n = len(A)
     x, V = np.linalg.eigh(A)
-    return _along(objective, x, _unit_entries(V, rows, columns), sharpness)
-
-
-def _along(objective: str, x: np.ndarray, E: np.ndarray, sharpness: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return value, slope (m,) and Hessian (m, m) of an objective of eigenvalues x, along E (m, n, n) in its axes."""
-    value, g, H, ratio = _spectral_derivatives(objective, x, sharpness)
+    value, g, H, E, ratio = _spectral_derivatives(objective, x, V, rows, columns, sharpness)
     own = np.einsum("lii->li", E)
-    pairs = E[:, *np.triu_indices(len(x), 1)]
+    pairs = E[:, *np.triu_indices(n, 1)]
     return value, own @ g, own @ H @ own.T + (pairs * (2 * ratio)) @ pairs.T
 
 
-def directional_derivatives(
-    objective: str, A: np.ndarray, directions: np.ndarray, sharpness: float, contrasts: np.ndarray | None = None
-) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Return value, slope (m,), Hessian (m, m) along symmetric matrices (m, n, n), and the gradient (n, n) in A.
+def matrix_gradient(
+    objective: str, A: np.ndarray, sharpness: float, contrasts: np.ndarray | None = None
+) -> tuple[float, np.ndarray]:
+    """Return the value of an objective and its gradient (n, n) in the information matrix A (n, n).
 
-    The formulas of `local_model` without dropping negative curvature. Raises LinAlgError for a singular A.
+    Raises LinAlgError for a singular A.
     """
     if OBJECTIVES[objective].of == "eigenvalues":
         x, V = np.linalg.eigh(A)
-        g = _spectral_derivatives(objective, x, sharpness)[1]
-        return *_along(objective, x, V.T @ directions @ V, sharpness), (V * g) @ V.T
+        if x[0] <= 1e-14 * x[-1]:
+            raise np.linalg.LinAlgError("singular")
+        value, g, *_ = _derivatives(objective, len(x))(x, sharpness)
+        return float(value), np.asarray((V * g.full().ravel()) @ V.T)
     C = np.linalg.inv(A)
-    through = C if contrasts is None else C @ contrasts  # c_i
+    through = C if contrasts is None else C @ contrasts  # C g_i
     variances = contrast_variances(C, contrasts)
-    out = _derivatives(objective, len(variances))(variances, sharpness)
-    g, H = out[1].full().ravel(), out[2].full()
-    moved = directions @ through  # D c_i
-    own = np.einsum("ji,lji->li", through, moved)  # c_i' D c_i
-    half = np.linalg.cholesky((C + C.T) / 2).T @ moved
-    flat = half.reshape(len(directions), -1)
-    curvature = own @ H @ own.T + (2 * half * g).reshape(flat.shape) @ flat.T
-    return float(out[0]), -own @ g, curvature, -(through * g) @ through.T
+    if not (variances > 0).all():
+        raise np.linalg.LinAlgError("singular")
+    value, g, *_ = _derivatives(objective, len(variances))(variances, sharpness)
+    return float(value), np.asarray(-(through * g.full().ravel()) @ through.T)
 
 
 def _derivatives_of_variances(

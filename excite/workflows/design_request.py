@@ -200,6 +200,7 @@ def _design_arm(
         ("--robust", request.robust),
         ("--between", bool(request.between)),
         ("--of", request.of is not None),
+        (f"--solver {request.solver}", request.solver != "own"),
     ):
         if given:
             raise UsageError(f"{option}: not for {model.machine.name}, an arm, whose designs are motions of its joints")

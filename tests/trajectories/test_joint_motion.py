@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
 
@@ -106,32 +105,20 @@ def test_limits_are_judged_between_samples(arm: Model, problem: Problem) -> None
 @pytest.mark.parametrize("kind", joint_motion.BASES)
 @pytest.mark.parametrize("objective", ["cond", "accuracy", "D"])
 def test_derivatives_are_exact(arm: Model, problem: Problem, kind: str, objective: str) -> None:
-    aim = trajectories.compose_objective(arm, objective)
+    aim = trajectories.compose_objective(arm, objective, sigma_max=5.0)
     program = MotionProgram(joint_motion.with_smooth_friction(arm), problem, aim, basis_of(arm, problem, kind))
     rng = np.random.default_rng(2)
-    n_x, n_g = program.sizes
-    x, d, m = 0.1 * rng.normal(size=n_x), rng.normal(size=n_x), rng.normal(size=n_g)
-
-    def jacobian(x: np.ndarray) -> ca.DM:
-        return ca.DM(program.jacobian_sparsity, program.jacobian(x)).sparse()
-
-    def pulled(x: np.ndarray) -> np.ndarray:
-        return np.asarray(ca.mtimes(jacobian(x).T, ca.DM(m)).full().ravel())
-
-    assert program.gradient(x) @ d == pytest.approx(differences(lambda x: np.array(program.value(x)), x, d), rel=1e-5)
-    bent = program.hessian_of_objective(x) @ d
-    assert bent == pytest.approx(differences(program.gradient, x, d), rel=1e-4, abs=1e-4 * np.abs(bent).max())
-    moved = ca.mtimes(jacobian(x), ca.DM(d)).full().ravel()
-    assert moved == pytest.approx(differences(program.constraints, x, d), abs=1e-5 * np.abs(moved).max())
-    upper = ca.DM(program.hessian_sparsity, program.hessian(x, 2.0, m)).full()
-    whole = (upper + np.triu(upper, 1).T) @ d
-    expected = differences(lambda x: 2.0 * program.gradient(x) + pulled(x), x, d)
-    assert whole == pytest.approx(expected, rel=1e-4, abs=1e-4 * np.abs(whole).max())
+    x, d = 0.1 * rng.normal(size=program.size), rng.normal(size=program.size)
+    value, gradient = program.value_and_gradient(x)
+    assert value == pytest.approx(program.value(x))
+    assert gradient @ d == pytest.approx(differences(lambda x: np.array(program.value(x)), x, d), rel=1e-5)
+    moved = program.slack_jacobian(x) @ d
+    assert moved == pytest.approx(differences(program.slack, x, d), abs=1e-5 * np.abs(moved).max())
 
 
 @pytest.mark.parametrize(("kind", "most"), [("fourier", 26.0), ("free", 25.0)])
 def test_design_of_two_joints_reaches_a_figure(arm: Model, problem: Problem, kind: str, most: float) -> None:
-    """Measured 24.6 and 23.7; the best of 200 random series has 58."""
+    """Measured 25.4 and 23.6; the best of 200 random series has 64."""
     aim = trajectories.compose_objective(arm, "cond")
     *_, state = joint_search.search(arm, problem, aim, kind, 0, lambda: False)
     assert np.exp(state.best.score / 2) < most
@@ -194,7 +181,7 @@ def test_only_arms_have_joint_motions(arm: Model) -> None:
 
 @pytest.mark.slow
 def test_ur10_is_designed_by_itself() -> None:
-    """Measured 4.7; SLSQP with finite differences reaches 6.90 with limits exceeded by 0.5 % between samples."""
+    """Measured 4.5; SLSQP with finite differences reaches 6.90 with limits exceeded by 0.5 % between samples."""
     model, _, problem = prepare_design("ur10", None, None, DesignRequest())
     found = design_from(model, problem, DesignRequest(starts=1, trajectory="fourier")).design
     assert found.cond_phi < 6.5
