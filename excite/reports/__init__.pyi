@@ -1,13 +1,12 @@
 from .charts import Explorable as Explorable
-from .descriptions import (
+from .description import (
     Description as Description,
     Table as Table,
     as_sentence as as_sentence,
-    describe as describe,
     describe_drive_faults as describe_drive_faults,
     format_sum as format_sum,
-    with_sentences as with_sentences,
 )
+from .descriptions import describe as describe, with_sentences as with_sentences
 from .diagnosis_figures import (
     figure_calls as figure_calls,
     figures_by_file as figures_by_file,

@@ -14,7 +14,7 @@ import jinja2
 from markupsafe import Markup, escape
 
 from excite.reports import charts
-from excite.reports.descriptions import Description, Table, as_sentence
+from excite.reports.description import Description, Table, as_sentence
 
 COMMAND = re.compile("`([^`]+)`")
 

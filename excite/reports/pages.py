@@ -10,7 +10,8 @@ from pathlib import Path
 from excite import output
 from excite.reports import charts
 from excite.reports.charts import Explorable
-from excite.reports.descriptions import Summary, describe
+from excite.reports.description import Summary
+from excite.reports.descriptions import describe
 from excite.reports.html import Picture, report_page
 from excite.text import format_number
 

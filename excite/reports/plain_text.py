@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from excite.reports.descriptions import Description, Table, as_sentence
+from excite.reports.description import Description, Table, as_sentence
 from excite.text import count
 
 # Rich is imported inside, so that --help is there at once.

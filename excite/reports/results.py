@@ -19,7 +19,8 @@ from excite.logs import Log, profile_of
 from excite.model import Model
 from excite.reports import figure_files, figures as drawings, pages, plain_text
 from excite.reports.charts import Explorable
-from excite.reports.descriptions import Description, describe
+from excite.reports.description import Description
+from excite.reports.descriptions import describe
 from excite.reports.html import result_fragment
 from excite.simulation import Motion
 from excite.trajectories import Campaign, Comparison, Design, Score
