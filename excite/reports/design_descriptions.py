@@ -52,6 +52,14 @@ def describe_design(s: Summary) -> Description:
             f" to {format_percent(lowest['worst_percent'])}; this drive is the most accurate one within"
             f" {s['cond_slack_percent']:g} % of it (`--cond-slack 0` gives the other)."
         )
+    if s.get("bound"):
+        b = s["bound"]
+        what = "the worst parameter" if b["of"] == "worst" else "worst and mean parameter (geometric mean)"
+        remarks.append(
+            f"No drive of this problem identifies {what} better than {format_percent(b['certified_percent'], 3)}"
+            f" (numerical bound): this drive attains {format_percent(b['attained_percent'], 3)},"
+            f" {format_percent(b['gap_percent'])} above it."
+        )
     if s.get("prediction"):
         p = s["prediction"]
         remarks.append(

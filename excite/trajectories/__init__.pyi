@@ -1,3 +1,8 @@
+from .accuracy_bound import (
+    AccuracyBound as AccuracyBound,
+    bound_accuracy as bound_accuracy,
+    bound_refusal as bound_refusal,
+)
 from .baselines import (
     BASELINES as BASELINES,
     DESIGNED as DESIGNED,

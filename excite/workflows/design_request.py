@@ -20,11 +20,16 @@ from excite.errors import InfeasibleError, MachineError, SolverError, UsageError
 from excite.model import Model, build, effects
 from excite.model.machine import EffectEntry, Problem, Quantity
 from excite.operator import PhasedDrive
-from excite.trajectories import CompositeObjective, Design, design
+from excite.trajectories import AccuracyBound, CompositeObjective, Design, design
 
 DEFAULT_TRAJECTORY = "free"  # of an arm
 ASSUMED_TORQUE_NOISE = 0.005  # of the torque limit, standard deviation, without a figure of the sensor; chosen
 ASSUMED_COUNTS_PER_TURN = 65536.0  # of an encoder without a figure; chosen
+# Objectives with a bound, as functions of the relative standard deviations [%].
+BOUNDED: dict[str, Callable[[np.ndarray], float]] = {
+    "worst": lambda sigma: float(sigma.max()),
+    "accuracy": lambda sigma: float(np.sqrt(sigma.max() * sigma.mean())),
+}
 POOR_PERCENT = 5.0  # attainable standard deviation [%] above which the summary gives advice; chosen
 ROBUST_MACHINES = 5  # machines of a robust design; chosen
 ROBUST_SPREAD = 0.2  # share of the nominal values by which these machines may be off; chosen
@@ -79,6 +84,7 @@ class DesignResult:
     phased: the phases of a design for people; `design` is then the motion of a steady driver.
     first: the drive of lowest cond(Phi), if `design` is the most accurate one near it.
     assumed_noise: sensors of an arm whose noise figure is assumed, as its machine file has none.
+    bound: below which no drive comes, where it is cheap to compute.
     """
 
     model: Model
@@ -88,6 +94,7 @@ class DesignResult:
     first: Design | None = None
     contrasts: np.ndarray | None = None
     assumed_noise: tuple[str, ...] = ()
+    bound: AccuracyBound | None = None
 
 
 def add_rival_effects(model: Model, between: tuple[str, ...], duration: float) -> Model:
@@ -174,7 +181,7 @@ def design_from(
         budget = request.budget_s if not request.second_step or request.budget_s is None else request.budget_s / 2
         lowest = design(model, problem, aim, request.starts, request.seed, budget, progress, solver=request.solver)
         if not request.second_step:
-            return DesignResult(model, aim, lowest, contrasts=judged)
+            return DesignResult(model, aim, lowest, contrasts=judged, bound=_cheap_bound(model, problem, request))
         return _make_accurate(model, problem, request, aim, lowest, prior, budget)
     begin = time.time()
     half = None if request.budget_s is None else request.budget_s / 2
@@ -267,6 +274,26 @@ def _make_accurate(
     return DesignResult(model, aim, found, first=lowest)
 
 
+def _cheap_bound(model: Model, problem: Problem, request: DesignRequest) -> AccuracyBound | None:
+    """Compute the bound on what was asked for, None if there is none that takes seconds."""
+    extra = request.sigma_max is not None or request.robust or request.between or request.after
+    if extra or request.objective not in BOUNDED or trajectories.bound_refusal(model, problem) is not None:
+        return None
+    return trajectories.bound_accuracy(model, problem, request.objective)
+
+
+def _bound_summary(result: DesignResult, bound: AccuracyBound) -> dict[str, Any]:
+    """Compare what a design attains with the bound."""
+    sigma = trajectories.sigma_percent(result.aim, result.model, result.design.motion)
+    attained = BOUNDED[bound.of](sigma)
+    return {
+        "of": bound.of,
+        "certified_percent": bound.certified_percent,
+        "attained_percent": attained,
+        "gap_percent": bound.gap_percent(attained),
+    }
+
+
 def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, Any]:
     """Summarise a design: request, scores, attainable accuracy, limits."""
     names, drive = result.model.base.names, result.design
@@ -306,6 +333,8 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
         }
     if result.assumed_noise:
         summary["assumed_noise"] = list(result.assumed_noise)
+    if result.bound is not None:
+        summary["bound"] = _bound_summary(result, result.bound)
     if result.phased is not None:
         summary["driver"] = _by_hand(request, result.aim, result.phased)
     if request.of is not None:

@@ -53,6 +53,24 @@ def test_a_design_says_score_and_accuracy(excite: Excite, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
+def test_a_design_says_how_far_above_the_bound_it_is(excite: Excite, tmp_path: Path) -> None:
+    """For a rig with one joint, in summary and report."""
+    rig = Path(__file__).parents[1] / "support" / "rig.toml"
+    code, shown, err = excite(
+        "design", rig, "--starts", 1, "--json", "--objective", "worst", "--out", tmp_path / "worst"
+    )
+    assert code == 0, err
+    summary = json.loads(shown)
+    bound = summary["bound"]
+    assert bound["attained_percent"] == pytest.approx(summary["worst_percent"])
+    assert 0 < bound["gap_percent"] < 5
+    assert bound["gap_percent"] == pytest.approx(100 * (bound["attained_percent"] / bound["certified_percent"] - 1))
+    assert "No drive of this problem identifies the worst parameter better than" in (
+        tmp_path / "worst" / "report.html"
+    ).read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
 def test_condition_number_then_accuracy(excite: Excite, tmp_path: Path) -> None:
     """The lowest cond(Phi) first, then the most accurate drive near it; `--cond-slack 0` stops after the first."""
     options = "va12_straight", "--duration", 12, "--starts", 1, "--seed", 3, "--json"
