@@ -1,0 +1,112 @@
+"""Bound the accuracy of every drive of a test rig with one joint, and compare designs with it.
+
+python results/bound_rig/study.py [--degree 4] rebuilds summary.json and bound.png beside this file.
+"""
+
+from __future__ import annotations
+
+# ruff: noqa: E402  (threads are set before numpy loads)
+import argparse
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from excite import output
+from excite.model import prediction
+from excite.model.machine import machine
+from excite.reports import COLOURS, save
+from excite.trajectories import bound_accuracy, compose_objective, design, sigma_percent
+from excite.workflows import package_versions
+
+HERE = Path(__file__).parent
+RIG = HERE.parents[1] / "tests" / "support" / "rig.toml"
+OBJECTIVES = ("accuracy", "worst", "A", "D")
+MIDDLE = ("Fv", "Fc")  # parameters whose mean bounds the median, see README.md
+Values = dict[str, float]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--degree", type=int, default=4, help="degree of the polynomials")
+    parser.add_argument("--starts", type=int, default=6, help="starts of each design")
+    options = parser.parse_args()
+    model = prediction.build(machine.load_machine(str(RIG)))
+    problem = model.machine.problems["T10"]
+    bounds: Values = {}
+    mixtures: Values = {}
+    begin = time.monotonic()
+    for name, of, parameters in (
+        ("accuracy", "accuracy", None),
+        ("worst", "worst", None),
+        ("mean", "mean", None),
+        ("median", "mean", MIDDLE),
+    ):
+        found = bound_accuracy(model, problem, of, parameters, options.degree)
+        bounds[name], mixtures[name] = found.certified_percent, found.mixture_percent
+        print(name, found, flush=True)
+    # If another parameter than the offset is the least accurate, the median is at least half of the offset's.
+    bounds["median"] = min(bounds["median"], bounds["worst"] / 2)
+    seconds = time.monotonic() - begin
+    designs: dict[str, Values] = {}
+    for name in OBJECTIVES:
+        aim = compose_objective(model, name)
+        sigma = sigma_percent(aim, model, design(model, problem, aim, options.starts, 0).motion)
+        designs[name] = {
+            "accuracy": float(np.sqrt(sigma.max() * sigma.mean())),
+            "worst": float(sigma.max()),
+            "mean": float(sigma.mean()),
+            "median": float(np.median(sigma)),
+            **{f"sigma {n}": float(s) for n, s in zip(model.base.names, sigma, strict=True)},
+        }
+        print(name, designs[name], flush=True)
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=HERE).stdout
+    summary = {
+        "command": " ".join(["python results/bound_rig/study.py", *sys.argv[1:]]),
+        "seed": 0,
+        "degree": options.degree,
+        "starts": options.starts,
+        "bounds_percent": bounds,
+        "mixtures_percent": mixtures,
+        "bounds_wall_s": seconds,
+        "load_average": os.getloadavg()[0],
+        "designs": designs,
+        "gaps_percent": {k: 100 * (min(d[k] for d in designs.values()) / b - 1) for k, b in bounds.items()},
+        "commit": commit.strip(),
+        "versions": package_versions(),
+    }
+    save(figure(bounds, designs), HERE / "bound.png")
+    with output.new_file(HERE / "summary.json") as place:
+        place.write_text(output.to_json(summary), encoding="utf-8")
+
+
+def figure(bounds: Values, designs: dict[str, Values]) -> Figure:
+    """Plot designs over the bounds, for each way to judge them."""
+    fig = Figure(figsize=(7.5, 4.0), layout="constrained")
+    ax = fig.subplots()
+    width = 0.8 / len(designs)
+    for k, (name, values) in enumerate(designs.items()):
+        above = [100 * (values[of] / bound - 1) for of, bound in bounds.items()]
+        at = np.arange(len(bounds)) + (k - (len(designs) - 1) / 2) * width
+        bars = ax.bar(at, above, width, color=COLOURS[k], edgecolor="black", label=f"design for {name}")
+        ax.bar_label(bars, fmt="%.1f", fontsize=7)
+    words = {"accuracy": "worst and mean\n(geometric mean)", "worst": "worst", "mean": "mean", "median": "median"}
+    ax.set_xticks(range(len(bounds)), [f"{words[of]}\nbound {bound:.4f} %" for of, bound in bounds.items()])
+    ax.set_yscale("log")
+    ax.set_ylim(0.1, None)
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.set_ylabel("standard deviation above the bound [%]")
+    ax.grid(axis="y", alpha=0.3)
+    ax.legend(fontsize=8, loc="upper left")
+    return fig
+
+
+if __name__ == "__main__":
+    main()
