@@ -54,8 +54,14 @@ class FalseAlarms:
         )
 
     def summary(self) -> dict[str, Any]:
-        """Return the counts, ready for JSON."""
-        return {"runs": self.runs, "named": self.named, "failed": self.failed, **self.verdicts, "names": self.names}
+        """Return the counts, ready for JSON; "named" counts logs of verdict `tied`, too."""
+        return {
+            "runs": self.runs,
+            "named": self.named,
+            "failed": self.failed,
+            "verdicts": self.verdicts,
+            "names": self.names,
+        }
 
 
 def count_false_alarms(
@@ -81,10 +87,12 @@ def count_false_alarms(
             try:
                 found = assess(diagnose(model, logs, machine.filter, runner=runner), runner=runner).diagnosis
             except NoEstimateError:
-                failed += 1
-                continue
+                found = None
             if asked.stop:
                 break
+            if found is None:
+                failed += 1
+                continue
             verdicts[found.verdict] += 1
             names.update(f.name for f in found.findings if f.kind == "cause")
     return FalseAlarms(dict(verdicts), failed, dict(names))
