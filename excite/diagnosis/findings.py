@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -463,9 +464,9 @@ def answer_text(a: Assessment) -> str:
 
 
 def format_share(share: float) -> str:
-    """Format a share (0 to 1) in per cent, never as all of it if something is left."""
+    """Format a share (0 to 1) in per cent, above 99 % rounded down: never as all of it if something is left."""
     percent = 100 * share
-    return f"{format_number(percent, 3 if percent > 99 else 2)} %"
+    return f"{math.floor(100 * percent) / 100:g} %" if percent > 99 else f"{format_number(percent, 2)} %"
 
 
 def _with_rivals(row: Mapping[str, Any]) -> str:
