@@ -73,7 +73,7 @@ def read_formats(option: str, given: str | Sequence[str]) -> tuple[str, ...]:
 
 def read_width(option: str, given: str) -> float:
     """Return a width [mm] from a number with its unit, such as 88mm or 8.8cm. Raises UsageError."""
-    found = WIDTH.fullmatch(given.strip().lower())
+    found = WIDTH.fullmatch(str(given).strip().lower())  # a number without a unit, too
     if found is None:
         raise UsageError(f"{option}: must be a number with its unit, such as 88mm or 8.8cm (got {given})")
     width = float(found[1]) * UNITS_MM[found[2]]

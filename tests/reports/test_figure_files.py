@@ -81,6 +81,8 @@ def test_formats_and_widths_are_read() -> None:
     assert read_formats("--figures", "pdf, .SVG") == ("png", "svg", "pdf")
     assert read_width("--figure-width", "8.8cm") == pytest.approx(88.0)
     assert read_width("--figure-width", "88 mm") == pytest.approx(88.0)
+    with pytest.raises(UsageError, match="with its unit"):
+        read_width("figure_width", 88)  # type: ignore[arg-type]
     for wrong, why in (("88", "with its unit, such as 88mm or 8.8cm"), ("5mm", "60 to 420 mm"), ("3in", "unit")):
         with pytest.raises(UsageError, match=why):
             read_width("--figure-width", wrong)
