@@ -65,7 +65,10 @@ def read_targets(targets: Sequence[str]) -> tuple[float | None, dict[str, float]
 
 
 def check_campaign(request: CampaignRequest, model: Model, problem: Problem) -> CampaignRequest:
-    """Return a request with its objective chosen. Raises UsageError for options that do not go together."""
+    """Return a request with its objective chosen.
+
+    Raises UsageError for options that do not go together, MachineError for a trajectory of a machine that is no arm.
+    """
     one = request.design
     objective = DEFAULT_OBJECTIVE if one.objective == "cond" else one.objective
     allowed = [n for n, o in trajectories.OBJECTIVES.items() if o.shown_as == "percent"]
@@ -73,6 +76,8 @@ def check_campaign(request: CampaignRequest, model: Model, problem: Problem) -> 
         raise UsageError(f"--target: needs an --objective in per cent: {', '.join(allowed)} (got {objective})")
     if model.follows_positions:
         raise UsageError(f"--target: not for {model.machine.name}, an arm, whose designs are motions of its joints")
+    if one.trajectory is not None:
+        trajectories.check_joint_motion(model, one.trajectory)
     if one.driver or one.robust or one.sigma_max is not None:
         raise UsageError("--target: does not go with --driver, --robust or --sigma-max")
     if request.parameters and objective != DEFAULT_OBJECTIVE:
