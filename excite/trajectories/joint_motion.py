@@ -104,7 +104,10 @@ def fourier_basis(problem: Problem, start: np.ndarray, end: np.ndarray) -> Basis
 
 
 def spline_basis(problem: Problem, start: np.ndarray, end: np.ndarray) -> Basis:
-    """Return B-splines with knots `knot_s` apart; with `rest`, those that are at rest at both ends."""
+    """Return B-splines with knots `knot_s` apart, further in a long drive (MAX_SPLINE_PIECES pieces at most).
+
+    With `rest`, those that are at rest at both ends.
+    """
     T, rest = float(problem.duration_s), problem.rest
     pieces = min(MAX_SPLINE_PIECES, max(8, round(T / float(problem.knot_s))))
     knots = np.concatenate([np.zeros(SPLINE_DEGREE), np.linspace(0, T, pieces + 1), np.full(SPLINE_DEGREE, T)])
