@@ -205,6 +205,7 @@ def separating_drive(
 ) -> dict[str, Any] | None:
     """Return the first pair of tied causes that a drive can separate; None without such a pair or a design problem.
 
+    None for an arm, too, which is designed without effects.
     design_next: design that drive into the folder `next`. A failed design gives its reason: the diagnosis is kept.
     """
     if machine.problem is None:
@@ -215,6 +216,8 @@ def separating_drive(
             model = design_request.with_rivals(build(pair.machine, fit_sensor_effects=False), pair.between)
         except MachineError:
             continue  # a sensor's effect: no equation of motion shows it
+        if model.follows_positions:
+            return None
         between = tuple(f"{e.label}={float(e.amount):.5g}" for e in pair.between)
         drive: dict[str, Any] = {"between": list(between), "folder": None}
         if design_next:
