@@ -480,8 +480,8 @@ def _fit_box(problem: Problem, path: np.ndarray) -> tuple[float, np.ndarray]:
 
 def _fit_polygon(problem: Problem, path: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the largest excess over box and polygon and the shift (2,) [m] that minimises it (linear program)."""
-    length, width = problem.lane
-    box = [(length / 2, width / 2), (-length / 2, width / 2), (-length / 2, -width / 2), (length / 2, -width / 2)]
+    x, y = problem.lane[0] / 2, problem.lane[1] / 2
+    box = [(x, y), (-x, y), (-x, -y), (x, -y)] if problem.lane_m else []
     sides = polygon_edges(box) + polygon_edges(problem.lane_polygon_m)
     rows = [[*outward / (high - low), -1.0] for outward, low, high in sides]
     most = [(high - float((outward @ path).max())) / (high - low) for outward, low, high in sides]

@@ -297,6 +297,13 @@ def test_a_drive_starts_along_the_lane_where_it_fits(va12: Model, va12_motion: M
     narrow = problem.model_copy(update={"lane_m": (used[0] + 3, 0.8 * used[1])})
     assert trajectories.place_along_lane(va12, narrow, [motion]) is None
 
+    corners = ((-20.0, -10.0), (20.0, -10.0), (20.0, 10.0), (-20.0, 10.0))
+    area = problem.model_copy(update={"lane_m": None, "lane_polygon_m": corners})
+    start = trajectories.place_along_lane(va12, area, [motion])
+    assert start is not None
+    moved = trajectories.move_motion(va12, motion, start)
+    assert trajectories.lane_excess(trajectories.check_limits(va12, area, moved)) == 0
+
 
 @pytest.mark.parametrize(
     ("length", "words"),
