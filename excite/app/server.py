@@ -88,7 +88,7 @@ async def _refuse(scope: Scope, receive: Receive, send: Send) -> None:
 
 def web_app(day: Day) -> Any:
     """Return the web application of a day: the page, files of results, and a way to hand over a log."""
-    from fastapi import FastAPI, Request
+    from fastapi import FastAPI
     from fastapi.responses import FileResponse, PlainTextResponse
     from nicegui import ui
 
@@ -104,9 +104,8 @@ def web_app(day: Day) -> Any:
         policy = {} if found.suffix == ".pdf" else {"Content-Security-Policy": FILE_POLICY}  # a viewer needs no sandbox
         return FileResponse(found, headers={"Cache-Control": "no-cache", **policy})
 
-    @web.post("/log/{name}")
-    async def log(name: str, request: Request) -> Any:
-        name = Path(name.replace("\\", "/")).name
+    async def log(request: Any) -> Any:
+        name = Path(request.path_params["name"].replace("\\", "/")).name
         path = day.folder / name
         if not name or name.startswith(".") or path.suffix in (".toml", ".json", ".html"):
             return PlainTextResponse(f"{name}: is no name for a log", 400)
@@ -125,6 +124,8 @@ def web_app(day: Day) -> Any:
         day.logs = [str(path)]
         day.save()
         return PlainTextResponse(str(path))
+
+    web.add_route("/log/{name}", log, methods=["POST"])
 
     @ui.page("/")
     def page() -> None:

@@ -120,6 +120,14 @@ def tabbed(page: Any) -> dict[str, bool]:
     return found
 
 
+def reaches(page: Any, *names: str) -> None:
+    """Check that Tab reaches these, that all it reaches has a name, and that the focus shows on it."""
+    reached = tabbed(page)
+    assert [name for name, shows in reached.items() if not shows] == []
+    assert "" not in reached
+    assert {"Skip to the step", *names} <= set(reached)
+
+
 class Hand:
     """A person at the page, with the keyboard alone."""
 
@@ -131,6 +139,18 @@ class Hand:
         button.focus()
         self.page.wait_for_function("b => !b.disabled", arg=button.element_handle())
         self.page.keyboard.press("Enter")
+
+    def write(self, label: str, text: str) -> None:
+        field = self.page.get_by_label(label)
+        field.focus()
+        self.page.keyboard.press("Control+A")
+        self.page.keyboard.type(text)
+
+    def pick(self, file: Path) -> None:
+        """Open the picker of files, and choose one in it."""
+        with self.page.expect_file_chooser() as opened:
+            self.page.locator("#step input[type=file]").press("Enter")
+        opened.value.set_files(file)
 
     def choose(self, label: str, option: str) -> None:
         self.page.get_by_label(label, exact=True).press("Enter")
@@ -154,7 +174,8 @@ class Hand:
 @pytest.mark.slow
 def test_a_test_day_from_machine_to_named_cause(tmp_path: Path, browser: Any, straight: Model) -> None:
     motion = simulate(straight, drive(straight, 12, 1, {"u1": 1500, "u4": 1500}))
-    logged(straight, motion, tmp_path / "log.csv", 3, "roll_unbalance@front_roll=300")
+    (tmp_path / "logger").mkdir()
+    logged(straight, motion, tmp_path / "logger" / "log.csv", 3, "roll_unbalance@front_roll=300")
     with window(tmp_path) as (address, _):
         page = browser.new_page(viewport={"width": 1400, "height": 900})
         elsewhere: list[str] = []
@@ -163,17 +184,15 @@ def test_a_test_day_from_machine_to_named_cause(tmp_path: Path, browser: Any, st
         hand = Hand(page)
         hand.choose("Machine", "va12_straight")
         page.get_by_role("button", name="Check the machine").wait_for()
-        reached = tabbed(page)
-        assert all(reached.values()), [name for name, shows in reached.items() if not shows]
-        assert "" not in reached
-        assert {"Skip to the step", "Machine", "Check the machine", "Take the machine file"} <= set(reached)
+        reaches(page, "Machine", "Check the machine", "Take the machine file")
         hand.press("Check the machine")
         hand.done("Machine", 60)
 
         hand.step("Design")
-        page.get_by_label("Length of the drive").fill("12")
-        page.get_by_label("Starting guesses").fill("1")
+        hand.write("Length of the drive", "12")
+        hand.write("Starting guesses", "1")
         hand.choose("Minimise", "accuracy")
+        reaches(page, "Length of the drive [s]", "Minimise", "Design the drive")
         hand.press("Design the drive")
         page.get_by_text("best so far").wait_for(timeout=60_000)
         page.close()  # closed in the middle of the design, and opened again, by two browsers
@@ -190,22 +209,29 @@ def test_a_test_day_from_machine_to_named_cause(tmp_path: Path, browser: Any, st
         assert design["max_violation"] < 1e-3
 
         hand.step("Drive")
+        reaches(page, "Make sheet and page")
         hand.press("Make sheet and page")
         hand.done("Drive", 60)
         assert (tmp_path / "results/drive-va12_straight/sheet.pdf").read_bytes().startswith(b"%PDF")
         page.get_by_role("link", name="page for the cab").wait_for()
 
         hand.step("Log")
-        page.get_by_label("Path of another log").fill("log.csv")
+        hand.write("Path of another log", "nothing.csv")
         hand.press("Take the log")
-        page.get_by_text("a log: log.csv").wait_for()
+        page.get_by_role("alert").get_by_text("nothing.csv").wait_for()
+        hand.pick(tmp_path / "logger" / "log.csv")
+        page.get_by_text("a log: results/log.csv").wait_for()
+        assert (tmp_path / "results/log.csv").read_bytes() == (tmp_path / "logger/log.csv").read_bytes()
+        reaches(page, "Path of another log", "Take the log", "Check the log")
         hand.press("Check the log")
         hand.done("Log", 60)
 
         hand.step("Identify")
+        reaches(page, "Method", "Identify")
         hand.press("Identify")
         hand.done("Identify", 60)
         hand.step("Diagnose")
+        reaches(page, "Diagnose")
         hand.press("Diagnose")
         hand.done("Diagnose", 120)
         found = json.loads((tmp_path / "results/diagnose-va12_straight/summary.json").read_text())
