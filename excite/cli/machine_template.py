@@ -133,7 +133,9 @@ def _explained(line: str, says: str | None) -> str:
     if says is None:
         return line
     there = COMMENT.match(line)
-    code, rest = (there[1].rstrip(), f"; {there[2]}") if there else (line, "")
+    if there and there[2] and there[2] in says:
+        line, there = there[1], None  # the meaning has the comment's words
+    code, rest = (there[1].rstrip(), f"; {there[2]}") if there else (line.rstrip(), "")
     return f"{code} # {says}{rest}"
 
 

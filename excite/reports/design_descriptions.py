@@ -167,11 +167,16 @@ def describe_score(s: Summary) -> Description:
     hidden = [n for n, v in sigma.items() if v > 100 * MAX_IDENTIFIABLE_STD]
     shown = f"identify every parameter to {format_percent(s['worst_percent'])} or better"
     if hidden:
-        shown = f"do not show {len(hidden)} of {count(len(sigma), 'parameter')} ({join_some(hidden)})"
+        most = format_percent(100 * MAX_IDENTIFIABLE_STD)
+        few = f"{len(hidden)} of {count(len(sigma), 'parameter')} ({join_some(hidden)})"
+        shown = f"do not show {few}, whose error stays above {most}"
     over = describe_violations(s["violations"])
     limits = f"limits broken: {over}" if over else "every limit is kept"
+    worst = f"worst {s['worst_parameter']}"
+    if hidden:
+        worst += f" {format_percent(s['worst_percent'])}"
     headline = (
-        f"These {s['duration_s']:g} s {shown} (one standard deviation, Cramer-Rao bound; worst {s['worst_parameter']},"
+        f"These {s['duration_s']:g} s {shown} (one standard deviation, Cramer-Rao bound; {worst},"
         f" median {format_percent(s['median_percent'])}); {limits}."
     )
     remarks = (

@@ -411,7 +411,13 @@ class Sensor(FileRecord):
             key = "cylinders" if self.cylinders else "displacement"
             raise ValueError(f"{key}: makes a torque of pressures, not kind {self.kind}")
         measured = ("pressure",) if pressed else units.QUANTITIES_BY_KIND[self.kind]
-        if self.factor is None and units.UNITS.get(self.unit, ("",))[0] not in measured:
+        quantity = units.UNITS.get(self.unit, ("",))[0]
+        if self.factor is None and self.kind == "torque" and not pressed and quantity == "pressure":
+            raise ValueError(
+                f"unit: {self.unit!r} is a pressure: a torque of pressures needs return_column, the column of the other"
+                " side, and displacement [m3 per turn of the joint], or cylinders"
+            )
+        if self.factor is None and quantity not in measured:
             raise ValueError(
                 f"unit: {self.unit!r} is no {' or '.join(measured)}, allowed for kind {self.kind}:"
                 f" {units.units_of(measured)}, or any with its factor (the SI value of one)"
@@ -426,7 +432,7 @@ class Sensor(FileRecord):
         if self.zero is not None and (self.kind != "angle" or self.is_rate):
             raise ValueError("zero: is for the position of a joint, kind angle without a rate's unit")
         if self.is_rate and self.counts_per_turn is not None:
-            raise ValueError("counts_per_turn: is for a column that counts, not for a rate")
+            raise ValueError("counts_per_turn: is for a column that counts, not for a rate; give its noise instead")
         if self.kind == "wheel" and (self.radius is None or self.lateral is None):
             raise ValueError(f"{'lateral' if self.radius else 'radius'}: a measuring wheel needs radius and lateral")
         for key, kinds in SENSOR_PLACE_KEYS.items():
@@ -916,6 +922,9 @@ def _find(name: str) -> Path:
         return MACHINES / f"{name}.toml"
     path = Path(name)
     if path.suffix != ".toml":
+        own = Path(f"{name}.toml")
+        if own.is_file():
+            raise MachineError(f"{name}: is no shipped machine; for the file beside it write {own}")
         raise MachineError(
             f"{name}: no such machine, allowed: {', '.join(shipped_machines())}, or a path to a .toml file"
         )

@@ -595,6 +595,11 @@ def test_a_name_that_is_no_machine(name: str, says: str) -> None:
     assert says in complaint(lambda: load_machine(name), MachineError)
 
 
+def test_a_file_without_its_ending_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path, 'extends = "va12"\n', "mine.toml")
+    assert f"for the file beside it write {path}" in complaint(lambda: load_machine(tmp_path / "mine"), MachineError)
+
+
 def test_a_folder_is_no_machine(tmp_path: Path) -> None:
     (tmp_path / "folder.toml").mkdir()
     assert "no such file" in complaint(lambda: load_machine(tmp_path / "folder.toml"), MachineError)

@@ -380,6 +380,28 @@ def test_new_then_check(tmp_path: Path, excite: Excite) -> None:
     assert "exists already" in stderr
 
 
+def test_a_copied_roller_is_led_to_a_logger_in_rpm_and_bar(tmp_path: Path, excite: Excite) -> None:
+    """Each message says what to write, and the file that follows them is right."""
+    path = tmp_path / "my_roller.toml"
+    assert excite("machine", "new", "my_roller", "--from", "tandem", "--out", path)[0] == 0
+    text = path.read_text()
+    assert "near zero; of parameters" not in text
+    for old, new in (("front_drum_rad", "rpm"), ("front_drum_Nm", "bar")):
+        text = re.sub(rf'(column = "{old}".*\nunit = )"[^"]*"', rf'\1"{new}"', text)
+    path.write_text(text)
+    code, stdout, _ = excite("machine", "check", path, "--out", tmp_path / "out")
+    said = " ".join(stdout.split())
+    assert code == 2
+    assert "counts_per_turn: is for a column that counts, not for a rate; give its noise instead" in said
+    assert "unit: 'bar' is a pressure: a torque of pressures needs return_column" in said
+    rate = r'(column = "front_drum_rad".*\nunit = .*\n)counts_per_turn.*\n'
+    text = re.sub(rate, r'\1noise = { value = 0.01, source = "data sheet" }\n', text)
+    pressures = 'return_column = "return_bar"\ndisplacement = { value = 0.00126, source = "data sheet" }\n'
+    path.write_text(text.replace('column = "front_drum_Nm"', f'{pressures}column = "front_drum_Nm"'))
+    code, stdout, _ = excite("machine", "check", path, "--out", tmp_path / "out")
+    assert code == 0, stdout
+
+
 def test_a_faulty_file_ends_with_2_and_a_missing_one_too(tmp_path: Path, excite: Excite) -> None:
     path = spoilt(tmp_path, ("body.1.limit.torque.value", 90))
     code, stdout, _ = excite("machine", "check", path, "--out", tmp_path / "out")
