@@ -179,6 +179,17 @@ def test_only_arms_have_joint_motions(arm: Model) -> None:
         design_from(arm, problem, DesignRequest(robust=True))
 
 
+def test_arm_without_problem_and_noise_figures_is_designed(arm: Model) -> None:
+    """Duration and poses are the usual ones, noise is assumed and named."""
+    silent = tuple(s.model_copy(update={"noise": None, "counts_per_turn": None}) for s in arm.machine.sensor)
+    machine = arm.machine.model_copy(update={"sensor": silent, "problems": {}, "problem": None})
+    model, name, problem = prepare_design(build(machine), None, 4.0, DesignRequest())
+    assert (name, float(problem.duration_s)) == ("A8", 4.0)
+    found = design_from(model, problem, DesignRequest(starts=1, trajectory="fourier", budget_s=5.0))
+    assert found.assumed_noise == ("q1", "u1", "q2", "u2")
+    assert found.model.machine.sensor[1].noise.value == pytest.approx(0.005 * 40)
+
+
 @pytest.mark.slow
 def test_ur10_is_designed_by_itself() -> None:
     """Measured 4.5; SLSQP with finite differences reaches 6.90 with limits exceeded by 0.5 % between samples."""
