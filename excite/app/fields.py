@@ -63,16 +63,17 @@ def row() -> ui.element:
 def design(day: Day, page: Page) -> None:
     """Fields of the design."""
     form, machine = day.forms["design"], day.load()
-    if machine is None or not machine.problems:
+    arm = {} if machine is None else workflows.arm_problems(machine)
+    if machine is None or not (machine.problems or arm):
         ui.label("The machine file has no design problem ([problems.NAME]); give it one in step Machine.")
         return
     problems = {
         name: f"{name}: {float(p.duration_s):g} s" + (f" on {p.lane_m[0]:g} m x {p.lane_m[1]:g} m" if p.lane_m else "")
-        for name, p in machine.problems.items()
+        for name, p in (machine.problems or arm).items()
     }
     if form["problem"] not in problems:
         form["problem"] = machine.problem or next(iter(problems))
-    usual = float(machine.problems[form["problem"]].duration_s)
+    usual = float((machine.problems or arm)[form["problem"]].duration_s)
     with row():
         choice(form, "problem", "Design problem", problems, "of the machine file")
         number(form, "duration", "Length of the drive [s]", f"empty: the problem's own, {usual:g} s", min=1)
@@ -80,9 +81,10 @@ def design(day: Day, page: Page) -> None:
         number(form, "starts", "Starting guesses", "more may find a better drive", min=1, precision=0)
         number(form, "budget", "Time for the search [s]", "empty: until it converges", min=1)
         words(form, "out", "Name of the result", "empty: a new name")
-    with row():
-        tick_box(form, "driver", "for a person at the levers, in phases")
-        tick_box(form, "robust", "for machines up to 20 % off as well")
+    if not arm:  # whose designs are motions of its joints
+        with row():
+            tick_box(form, "driver", "for a person at the levers, in phases")
+            tick_box(form, "robust", "for machines up to 20 % off as well")
     with ui.expansion("More settings").classes("more-settings"), row():
         number(form, "sigma_max", "Largest standard deviation allowed [%]", "empty: no bound", min=0)
         number(form, "seed", "Seed", "same seed, same result", min=0, precision=0)

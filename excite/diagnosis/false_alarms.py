@@ -13,7 +13,7 @@ from excite.diagnosis.diagnosis import Diagnosis, diagnose
 from excite.diagnosis.findings import assess
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.selection import ProgressCallback
-from excite.errors import NoEstimateError, NotIdentifiableError
+from excite.errors import NoEstimateError, NotIdentifiableError, SimulationError
 from excite.model import build, effects
 from excite.text import count
 
@@ -70,7 +70,7 @@ def count_false_alarms(
     """Diagnose clean logs of the machine that a diagnosis ends with, its findings included.
 
     A first Ctrl-C ends the count with the logs diagnosed so far. Raises NotIdentifiableError if no machine follows the
-    logs with exact dynamics, SimulationError if it cannot be simulated along them.
+    logs with exact dynamics.
     """
     if not (d.after.estimated and d.after.exact) or d.sticks:
         raise NotIdentifiableError("no false alarms were counted: no model follows the logs that could be simulated")
@@ -83,10 +83,10 @@ def count_false_alarms(
     with interrupt.note_first_interrupt() as asked:
         for k in range(runs):
             report(k / runs, f"diagnosing clean log {k + 1} of {runs}")
-            logs = simulate_clean(d.after, FIRST_SEED + k)
             try:
+                logs = simulate_clean(d.after, FIRST_SEED + k)
                 found = assess(diagnose(model, logs, machine.filter, runner=runner), runner=runner).diagnosis
-            except NoEstimateError:
+            except (NoEstimateError, SimulationError):
                 found = None
             if asked.stop:
                 break

@@ -99,7 +99,8 @@ def assess(
             *residuals.locate_misfit(measured),
             *other_lines[FIRST_ANOMALY_LINES:],
         )
-    remainder = None if deadline.is_over() else measure_remainder(d.after, runner)
+    differs = d.verdict == "named" and not d.findings  # several logs, of which each alone is explained
+    remainder = None if differs or deadline.is_over() else measure_remainder(d.after, runner)
     if remainder is not None and remainder.chi2 > 0:
         if d.findings:
             d = _with_remainder(d, remainder.chi2)
@@ -426,7 +427,8 @@ def answer_text(a: Assessment) -> str:
             return f"{logs} a misfit; the search for its cause was ended by {a.cut_short} before it found one."
         if rows:
             taken = ", ".join(
-                f"{_with_rivals(r)} of {format_magnitude(r)} takes {r['share_percent']:.0f} %" for r in rows
+                f"{_with_rivals(r)} of {format_magnitude(r)} takes {format_share(r['share_percent'] / 100)}"
+                for r in rows
             )
             text += f"; as a correction, {taken} of it"
             if a.total_gain:

@@ -36,6 +36,7 @@ from .machine_check import check_machine as check_machine
 from .predict_workflow import predict as predict, predict_account as predict_account, predict_from as predict_from
 from .progress import PROGRESS_VARIABLE as PROGRESS_VARIABLE
 from .requests import (
+    arm_problems as arm_problems,
     build_model as build_model,
     choices as choices,
     choose_method as choose_method,

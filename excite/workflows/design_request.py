@@ -30,6 +30,7 @@ BOUNDED: dict[str, Callable[[np.ndarray], float]] = {
     "worst": lambda sigma: float(sigma.max()),
     "accuracy": lambda sigma: float(np.sqrt(sigma.max() * sigma.mean())),
 }
+SINGULAR_COND = 1e12  # cond(Phi) from which an arm's information matrix is singular to working accuracy; chosen
 POOR_PERCENT = 5.0  # attainable standard deviation [%] above which the summary gives advice; chosen
 ROBUST_MACHINES = 5  # machines of a robust design; chosen
 ROBUST_SPREAD = 0.2  # share of the nominal values by which these machines may be off; chosen
@@ -211,22 +212,26 @@ def _design_arm(
     ):
         if given:
             raise UsageError(f"{option}: not for {model.machine.name}, an arm, whose designs are motions of its joints")
-    known, model = model, with_assumed_noise(model)
+    model, assumed = with_assumed_noise(model)
     require_noise_figures(model)
-    assumed = tuple(s.name for s, k in zip(model.machine.sensor, known.machine.sensor, strict=True) if s != k)
     model, prior = with_earlier_logs(model, request.after)
     aim = trajectories.compose_objective(model, request.objective, request.sigma_max, prior)
     found = trajectories.design_joint_motion(
         model, problem, aim, request.starts, request.seed, request.budget_s, progress, trajectory
     )
+    if not found.cond_phi < SINGULAR_COND:
+        raise np.linalg.LinAlgError(f"cond(Phi) {found.cond_phi:g}")
     return DesignResult(model, aim, found, assumed_noise=assumed)
 
 
-def with_assumed_noise(model: Model) -> Model:
-    """Return a model whose sensors all have noise figures, assumed ones where the machine file has none."""
+def with_assumed_noise(model: Model) -> tuple[Model, tuple[str, ...]]:
+    """Return a model whose sensors all have noise figures, and the names of those that are assumed.
+
+    Noise is assumed for an arm where the machine file has none; other machines stay as they are.
+    """
     machine = model.machine
     found = {}
-    for s in machine.sensor:
+    for s in machine.sensor if model.follows_positions else ():
         if s.has_noise_figure or s.kind in ("x", "y"):
             continue
         limit = None if s.body is None else machine.find(s.body).limit.torque
@@ -238,9 +243,9 @@ def with_assumed_noise(model: Model) -> Model:
                 update={"counts_per_turn": Quantity(value=ASSUMED_COUNTS_PER_TURN, source="assumed")}
             )
     if not found:
-        return model
+        return model, ()
     sensors = tuple(found.get(s.name, s) for s in machine.sensor)
-    return replace(model, machine=machine.model_copy(update={"sensor": sensors}))
+    return replace(model, machine=machine.model_copy(update={"sensor": sensors})), tuple(found)
 
 
 def _make_accurate(

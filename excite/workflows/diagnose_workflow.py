@@ -123,7 +123,7 @@ def _count_false_alarms(found: DiagnoseResult, runs: int, bar: Bar) -> tuple[dic
             counted = diagnosis.count_false_alarms(
                 d, runs, lambda share, what: advance(round(1000 * share), 1000, what), run_forked
             )
-    except (NotIdentifiableError, SimulationError) as err:
+    except NotIdentifiableError as err:
         return None, str(err)
     return counted.summary(), str(counted)
 

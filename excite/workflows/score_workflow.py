@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,11 +29,15 @@ def score(
     """
     model = requests.build_model(machine, fit_sensor_effects=False)
     name, chosen = requests.choose_problem(model.machine, problem, None)
+    model, assumed = design_request.with_assumed_noise(model)
     design_request.require_noise_figures(model)
     drive = read_drive(profile, model, any_rate=True)
     found = trajectories.score(model, chosen, drive.torque, drive.start, drive.nu0, drive.planned)
     requests.require_known("--kit", kit, KITS)
-    return score_account(model, name, chosen, found, str(profile), kit if sensors else None).write(place)
+    account = score_account(model, name, chosen, found, str(profile), kit if sensors else None)
+    if assumed:
+        account = replace(account, summary={**account.summary, "assumed_noise": list(assumed)})
+    return account.write(place)
 
 
 def score_account(

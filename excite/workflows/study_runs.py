@@ -183,6 +183,8 @@ def _design_drive(job: DesignJob) -> DesignOutcome:
         return DesignOutcome("", {}, f"{DEFECT}: {type(err).__name__}: {_one_line(err)}")
     if not result.design.complete:
         raise KeyboardInterrupt
+    if result.assumed_noise:  # runs of a study are simulated with the machine file's noise
+        return DesignOutcome("", {}, f"the machine file gives no noise of {', '.join(result.assumed_noise)}: add it")
     summary = {
         "machine": model.machine.name,
         "problem": job.name,

@@ -12,7 +12,7 @@ from support.blind import ask, blind, case
 from support.drives import designed
 from support.logs import logged, make_log
 
-from excite.diagnosis import diagnose, run_forked
+from excite.diagnosis import count_false_alarms, diagnose, run_forked
 from excite.diagnosis.clean_simulation import MIN_STDS, measure_remainder
 from excite.diagnosis.fits import fit_machine, refit
 from excite.logs import Log, from_table, read_log
@@ -94,3 +94,11 @@ def test_a_cause_whose_refit_fails_does_not_lose_to_one_whose_refit_succeeds(str
     assert d.verdict == "tied"
     (found,) = d.findings
     assert {found.name, *found.tied_with} == {"rolling_resistance@front_roll", "rolling_resistance@rear_roll"}
+
+
+@pytest.mark.slow
+def test_false_alarms_are_counted_on_clean_logs_of_the_fitted_machine(straight: Model, clean: Log) -> None:
+    d = diagnose(straight, [clean], straight.machine.filter, runner=run_forked)
+    found = count_false_alarms(d, 2, runner=run_forked)
+    assert found.summary() == {"runs": 2, "named": 0, "failed": 0, "verdicts": {"clean": 2}, "names": {}}
+    assert str(found).endswith("none got a name.")
