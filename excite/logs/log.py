@@ -322,7 +322,7 @@ def unwrapped(table: pd.DataFrame, machine: Machine) -> pd.DataFrame:
 def what_of(sensor: Sensor, machine: Machine) -> str:
     where = sensor.place or machine.find(sensor.body).where
     kind = {"angle": "angle", "wheel": "angle", "torque": "torque"}.get(sensor.kind, sensor.kind.replace("_", " "))
-    kind = "rate" if sensor.is_rate else kind
+    kind = "rate" if sensor.is_rate else "pressure" if sensor.return_column is not None else kind
     return f"{kind} of {where.replace('_', ' ')}"
 
 
