@@ -192,8 +192,8 @@ def _lay_out(figure: Figure, width_in: float, height_in: float) -> None:
     figure.set_size_inches(width_in, height_in)
     title = figure.get_suptitle()
     if title:
-        size = float(figure._suptitle.get_fontsize())  # type: ignore[attr-defined]
-        figure.suptitle(wrap_title(figure, " ".join(title.split()), size), fontsize=size)
+        text: Text = figure._suptitle  # type: ignore[attr-defined]
+        text.set_text(wrap_title(figure, " ".join(title.split()), float(text.get_fontsize())))
 
 
 def _has_faults(figure: Figure) -> bool:
