@@ -100,7 +100,8 @@ def assess(
             *other_lines[FIRST_ANOMALY_LINES:],
         )
     differs = d.verdict == "named" and not d.findings  # several logs, of which each alone is explained
-    remainder = None if differs or deadline.is_over() else measure_remainder(d.after, runner)
+    unsure = d.verdict == "clean" or not deadline.is_over()
+    remainder = measure_remainder(d.after, runner) if unsure and not differs else None
     if remainder is not None and remainder.chi2 > 0:
         if d.findings:
             d = _with_remainder(d, remainder.chi2)
@@ -414,6 +415,8 @@ def answer_text(a: Assessment) -> str:
         if not a.differences.explained:
             return f"{each} in more than {len(a.differences.changed)} parameters: diagnose each by itself."
         return f"{each}. {identification.describe_changes(a.differences)}."
+    if d.verdict == "clean" and a.cut_short:
+        return f"{logs} no misfit that stands out of noise, but the search for effects was ended by {a.cut_short}."
     if d.verdict == "clean":
         return f"{logs} nothing that the model lacks: the residuals are noise."
     rows = [_finding_row(f, g) for f, g in zip(d.findings, a.gains, strict=True)]
