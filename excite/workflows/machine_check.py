@@ -352,7 +352,7 @@ def _scales(model: Model) -> Iterator[str]:
     mass = sum(float(b.inertia.mass) for b in model.machine.body if b.inertia is not None)
     for k, name in enumerate(base.names):
         first = base.units[k] == "kg m"
-        if first and name not in model.machine.scale and reference[k] < 5e-3 * mass:
+        if first and model.machine.planar and name not in model.machine.scale and reference[k] < 5e-3 * mass:
             yield (
                 f"{name}: {format_number(model.nominal[k], 3)} kg m, a centre of mass"
                 f" {format_number(1e3 * abs(model.nominal[k]) / mass, 2)} mm off: errors relative to it mean little,"
