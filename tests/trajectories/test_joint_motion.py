@@ -192,7 +192,7 @@ def test_arm_without_problem_and_noise_figures_is_designed(arm: Model) -> None:
 
 @pytest.mark.slow
 def test_ur10_is_designed_by_itself() -> None:
-    """Measured 4.5; SLSQP with finite differences reaches 6.90 with limits exceeded by 0.5 % between samples."""
+    """Measured 4.5; results/duel has what other solvers reach from the same start."""
     model, _, problem = prepare_design("ur10", None, None, DesignRequest())
     found = design_from(model, problem, DesignRequest(starts=1, trajectory="fourier")).design
     assert found.cond_phi < 6.5
