@@ -33,10 +33,10 @@ from scipy.optimize import minimize
 
 from excite import trajectories, workflows
 from excite.reports import COLOURS, save
+from excite.simulation import inverse_dynamics
 from excite.text import format_number
 from excite.trajectories import JointMotion, MotionProgram, joint_motion, joint_search
-from excite.trajectories.joint_motion import inverse_dynamics
-from excite.trajectories.limits import stack_limits
+from excite.trajectories.limits import end_poses, stack_limits
 
 HERE = Path(__file__).parent
 PENALTY = 100.0  # of CMA-ES, on the sum of excesses; chosen
@@ -54,7 +54,7 @@ class Task:
         self.model = workflows.build_model(machine, fit_sensor_effects=False)
         _, self.problem = workflows.choose_problem(self.model.machine, None, None)
         self.objective = trajectories.compose_objective(self.model, "cond")
-        self.poses = joint_search.end_poses(self.model, self.problem)
+        self.poses = end_poses(self.model, self.problem)
         self.smooth = joint_motion.with_smooth_friction(self.model)
         basis = joint_motion.BASES["fourier"](self.problem, *self.poses)
         self.program = MotionProgram(self.smooth, self.problem, self.objective, basis)
