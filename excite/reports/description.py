@@ -12,9 +12,8 @@ from excite.trajectories import TOLERANCE
 
 Summary = Mapping[str, Any]
 
-WORD = re.compile(
-    r"a|no|[a-z]{3,},?"
-)  # a word that a sentence may begin with in a capital letter; a name stays as it is
+# A word that a sentence may begin with in a capital letter; a name stays as it is.
+WORD = re.compile(r"a|no|[a-z]{3,},?")
 NUMBER = re.compile(r"[<≤]?\s*[-+−]?\d")
 
 
