@@ -85,7 +85,7 @@ class DesignResult:
     phased: the phases of a design for people; `design` is then the motion of a steady driver.
     first: the drive of lowest cond(Phi), if `design` is the most accurate one near it.
     assumed_noise: sensors of an arm whose noise figure is assumed, as its machine file has none.
-    bound: below which no drive comes, where it is cheap to compute.
+    bound: numerical lower bound of every drive, for objectives in BOUNDED of a machine with one driven joint.
     """
 
     model: Model
@@ -280,11 +280,14 @@ def _make_accurate(
 
 
 def _cheap_bound(model: Model, problem: Problem, request: DesignRequest) -> AccuracyBound | None:
-    """Compute the bound on what was asked for, None if there is none that takes seconds."""
+    """Compute the bound on the objective of a request; None without one, or if its linear program fails."""
     extra = request.sigma_max is not None or request.robust or request.between or request.after
     if extra or request.objective not in BOUNDED or trajectories.bound_refusal(model, problem) is not None:
         return None
-    return trajectories.bound_accuracy(model, problem, request.objective)
+    try:
+        return trajectories.bound_accuracy(model, problem, request.objective)
+    except RuntimeError:  # the design stands without its bound
+        return None
 
 
 def _bound_summary(result: DesignResult, bound: AccuracyBound) -> dict[str, Any]:
