@@ -355,7 +355,7 @@ def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runne
     names = {s.candidate.name for s, _ in ties}
     unknown = [x for x in unknown if x[0].candidate.name in names]
     if not any(s.candidate.name in names for s, _ in exact):
-        exact = []  # the best are known with process noise only: those behind them are not compared otherwise
+        exact = []  # none of the best trials has an exact fit: compare all with process noise
     lowest = trials[0][1].fit.cost
     if with_noise and exact and not exact[0][1].is_close:
         # Process noise hid that the best does not explain the logs: try those that were a little worse with it.
