@@ -85,7 +85,7 @@ def describe_design(s: Summary) -> Description:
             )
         kept = " Limits are kept between the samples, too." if s["max_violation"] == 0 else ""
         remarks.append(
-            "The arm follows the joint positions in profile.csv; the torques there are those that this takes." + kept
+            "The arm follows the joint positions in profile.csv; the torques there are what the motion takes." + kept
         )
     else:
         remarks.append(
