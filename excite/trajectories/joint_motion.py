@@ -6,7 +6,7 @@ rest, and the path leads from the start pose to the end pose. Limits on position
 are functions of the motion and its derivatives.
 
 The program minimises the objective of the information matrix A = sum Phi' Phi over c by SLSQP. Gradients are exact:
-with G the gradient of the objective in A, dF = 2 <Phi G, dPhi>. Ipopt with the exact Hessian took five times as long.
+with G the gradient of the objective in A, dF = 2 <Phi G, dPhi>.
 
 Dry friction turns within milliseconds at a reversal, too fast for the samples. The program smooths it over
 `FRICTION_RATE`; scores and limits of the result are those of the machine file.

@@ -182,7 +182,8 @@ def design_from(
         budget = request.budget_s if not request.second_step or request.budget_s is None else request.budget_s / 2
         lowest = design(model, problem, aim, request.starts, request.seed, budget, progress, solver=request.solver)
         if not request.second_step:
-            return DesignResult(model, aim, lowest, contrasts=judged, bound=_cheap_bound(model, problem, request))
+            bound = _bound_on_objective(model, problem, request) if lowest.complete else None
+            return DesignResult(model, aim, lowest, contrasts=judged, bound=bound)
         return _make_accurate(model, problem, request, aim, lowest, prior, budget)
     begin = time.time()
     half = None if request.budget_s is None else request.budget_s / 2
@@ -279,14 +280,14 @@ def _make_accurate(
     return DesignResult(model, aim, found, first=lowest)
 
 
-def _cheap_bound(model: Model, problem: Problem, request: DesignRequest) -> AccuracyBound | None:
-    """Compute the bound on the objective of a request; None without one, or if its linear program fails."""
+def _bound_on_objective(model: Model, problem: Problem, request: DesignRequest) -> AccuracyBound | None:
+    """Compute the bound on the objective of a request; None without one, after Ctrl-C, or if its program fails."""
     extra = request.sigma_max is not None or request.robust or request.between or request.after
     if extra or request.objective not in BOUNDED or trajectories.bound_refusal(model, problem) is not None:
         return None
     try:
         return trajectories.bound_accuracy(model, problem, request.objective)
-    except RuntimeError:  # the design stands without its bound
+    except (RuntimeError, KeyboardInterrupt):  # the design stands without its bound
         return None
 
 
