@@ -176,6 +176,7 @@ def test_a_second_cause_with_which_exact_dynamics_follow_is_no_flaw_of_the_first
     assert found is not None
     assert (found.name, found.stage.exact, found.stage.is_close) == ("ground_slope@machine", True, True)
     monkeypatch.setattr("excite.diagnosis.selection.drop_process_noise", lambda found, together: (None for _ in found))
+    monkeypatch.setattr(selection, "fit_all_from_start", lambda wishes, *given: iter([None] * len(wishes)))
     assert selection.choose_effect(stage, scores, [first], run_in_turn, lambda share, what: None, 0.0) is None
 
 
