@@ -8,7 +8,7 @@ and the sampling leave, several per cent less or more than one for each reading.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -87,10 +87,13 @@ def simulate_clean(stage: ExtendedFit, seed: int) -> list[Log]:
     model, X, filter = stage.model, stage.fit.X, stage.machine.filter
     rng = np.random.default_rng(seed)
     motions = [identification.simulate_along_log(model, log, X, filter) for log in stage.data.logs]
-    return [
+    read = [
         identification.measured_again(model, log, motion, X, rng)
         for log, motion in zip(stage.data.logs, motions, strict=True)
     ]
+    half = {s.name: 0.5 * s.resolution for s in stage.machine.sensors("full") if s.resolution is not None}
+    # whole counts, whose edges a log shows
+    return [replace(x, values={n: v + half.get(n, 0.0) for n, v in x.values.items()}) for x in read]
 
 
 def _clean_squares(stage: ExtendedFit, seed: int) -> tuple[np.ndarray, np.ndarray] | None:

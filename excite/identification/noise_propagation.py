@@ -28,7 +28,7 @@ class FilteredNoise:
 def measure_again(sensor: Sensor, exact: np.ndarray, level: float, rng: np.random.Generator) -> np.ndarray:
     """Simulate a reading (N,) of an exact signal: whole counts from a random start, or white noise of a level."""
     if sensor.resolution is not None:
-        return np.floor(exact / sensor.resolution + rng.uniform()) * sensor.resolution
+        return (np.floor(exact / sensor.resolution + rng.uniform()) - 0.5) * sensor.resolution
     level = max(level, sensor.least_noise)
     return exact + level * rng.standard_normal(len(exact))
 

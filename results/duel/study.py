@@ -98,7 +98,7 @@ def slsqp(task: Task) -> tuple[str, np.ndarray]:
     """SLSQP of SciPy with finite differences, one inequality for each limit's largest value."""
     latest = [task.start]
 
-    def timed(f: Callable[[np.ndarray], Any]) -> Callable[[np.ndarray], Any]:
+    def timed(f: Callable[[np.ndarray], Any]) -> Any:
         def call(x: np.ndarray) -> Any:
             if task.spent():
                 raise OutOfTimeError
@@ -171,7 +171,7 @@ def opti(task: Task) -> tuple[str, np.ndarray]:
     problem.subject_to(problem.bounded(-1 + joint_motion.FIRST_MARGIN, ca.vec(g), 1 - joint_motion.FIRST_MARGIN))
     first = task.start.reshape(n_q, n_c).T
     problem.set_initial(C, first)
-    latest = [first]
+    latest: list[Any] = [first]
 
     def watch(_: int) -> None:
         latest[0] = problem.debug.value(C)
