@@ -109,15 +109,14 @@ def slsqp(task: Task) -> tuple[str, np.ndarray]:
     def keep(x: np.ndarray) -> None:
         latest[0] = np.array(x)
 
+    settings: dict[str, Any] = {
+        "method": "SLSQP",
+        "constraints": {"type": "ineq", "fun": timed(task.slack)},
+        "callback": keep,
+        "options": {"maxiter": 10000, "ftol": 1e-6},
+    }
     try:
-        done = minimize(
-            timed(task.log_cond),
-            task.start,
-            method="SLSQP",
-            constraints={"type": "ineq", "fun": timed(task.slack)},
-            callback=keep,
-            options={"maxiter": 10000, "ftol": 1e-6},
-        )
+        done = minimize(timed(task.log_cond), task.start, **settings)
         return "fourier", done.x
     except OutOfTimeError:
         return "fourier", latest[0]
@@ -177,7 +176,12 @@ def opti(task: Task) -> tuple[str, np.ndarray]:
         latest[0] = problem.debug.value(C)
 
     problem.callback(watch)
-    options = {"hessian_approximation": "limited-memory", "print_level": 0, "max_iter": 3000, "sb": "yes"}
+    options: dict[str, Any] = {
+        "hessian_approximation": "limited-memory",
+        "print_level": 0,
+        "max_iter": 3000,
+        "sb": "yes",
+    }
     options["max_cpu_time"] = max(1.0, task.seconds - (time.process_time() - task.begin))
     problem.solver("ipopt", {"print_time": False}, options)
     try:
