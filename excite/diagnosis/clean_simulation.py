@@ -7,7 +7,6 @@ and the sampling leave, several per cent less or more than one for each reading.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -19,7 +18,7 @@ from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.residuals import concentrations, residuals_of_logs
 from excite.errors import SimulationError
 from excite.logs import Log
-from excite.smoothing import NotConvergedError
+from excite.smoothing import Fit, NotConvergedError
 from excite.text import format_number
 
 RUNS = 2  # simulated logs, which runs of two processes give in the time of one; chosen
@@ -51,19 +50,24 @@ class Remainder:
         )
 
 
+def can_be_simulated(stage: ExtendedFit) -> bool:
+    """Tell if a fit is one of exact dynamics, of which clean logs can be simulated: without friction that sticks."""
+    return stage.estimated and stage.exact and not stage.data.sticks
+
+
 def measure_remainder(stage: ExtendedFit, runner: CallRunner = run_in_turn, seed: int = 0) -> Remainder | None:
     """Compare the misfit of a fit with that of clean logs of the fitted machine.
 
     Return None where it cannot be told: process noise or inflated sensor noise absorbs a misfit, friction sticks, or
     the fitted machine cannot be simulated.
     """
-    if not (stage.estimated and stage.exact) or stage.data.sticks:
+    if not can_be_simulated(stage):
         return None
     calls = [partial(_clean_squares, stage, seed + k) for k in range(RUNS)]
     found = [squares for squares in runner(calls) if squares is not None]
     if not found:
         return None
-    own, counts = _squares(stage)
+    own, counts = _sum_squares(stage.fit)
     clean = np.mean([squares / np.maximum(n, 1) for squares, n in found], axis=0) * counts
     left, total = own - clean, float(counts.sum())
     std = float(np.sqrt(2 * total * (1 + 1 / len(found))))
@@ -103,14 +107,10 @@ def _clean_squares(stage: ExtendedFit, seed: int) -> tuple[np.ndarray, np.ndarra
         fit = iterate(data, stage.fit.trajectories, stage.fit.X, 0.0, smoothing.RESUMED_DAMPING)
     except (SimulationError, NotConvergedError):
         return None
-    return _sum_squares([x.innovations for x in fit.linear])
+    return _sum_squares(fit)
 
 
-def _squares(stage: ExtendedFit) -> tuple[np.ndarray, np.ndarray]:
-    return _sum_squares([x.innovations for x in stage.fit.linear])
-
-
-def _sum_squares(innovations: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return sums of squares (m,) and numbers (m,) of innovations (N, m) of several logs."""
-    each = np.concatenate(innovations)
+def _sum_squares(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Return sums of squares (m,) and numbers (m,) of the innovations of all logs."""
+    each = np.concatenate([x.innovations for x in fit.linear])
     return np.nansum(each**2, axis=0), np.isfinite(each).sum(axis=0).astype(float)

@@ -1,4 +1,4 @@
-"""How often a diagnosis names something on clean logs of the fitted machine: its level for this machine and drive."""
+"""Count what a diagnosis names on clean simulated logs of the fitted machine: its level for this machine and drive."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 
 from excite import interrupt
 from excite.diagnosis import selection
-from excite.diagnosis.clean_simulation import simulate_clean
+from excite.diagnosis.clean_simulation import can_be_simulated, simulate_clean
 from excite.diagnosis.diagnosis import Diagnosis, diagnose
 from excite.diagnosis.findings import assess
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.selection import ProgressCallback
 from excite.errors import NoEstimateError, NotIdentifiableError, SimulationError
-from excite.model import build, effects
+from excite.model import build
 from excite.text import count
 
 FIRST_SEED = 100  # of the simulated logs, apart from those that measure the remainder; chosen
@@ -72,12 +72,10 @@ def count_false_alarms(
     A first Ctrl-C ends the count with the logs diagnosed so far. Raises NotIdentifiableError if no machine follows the
     logs with exact dynamics.
     """
-    if not (d.after.estimated and d.after.exact) or d.sticks:
+    if not can_be_simulated(d.after):
         raise NotIdentifiableError("no false alarms were counted: no model follows the logs that could be simulated")
     report = progress or (lambda share, what: None)
-    machine = d.after.machine
-    for e in d.after.model.effects:
-        machine = effects.with_effects(effects.without_effect(machine, e.name), selection.fitted_entry(d.after, e.name))
+    machine = selection.fitted_machine(d.after)
     model = build(machine)
     verdicts, names, failed = Counter[str](), Counter[str](), 0
     with interrupt.note_first_interrupt() as asked:

@@ -18,7 +18,7 @@ from excite import identification, smoothing
 from excite.diagnosis import selection
 from excite.diagnosis.fits import ExtendedFit
 from excite.logs import filtered_regression
-from excite.model import build, effects
+from excite.model import build
 from excite.model.machine import Machine
 from excite.smoothing import Fit, NotConvergedError, predict_readings
 
@@ -131,9 +131,7 @@ def hold_out_torques(stage: ExtendedFit) -> HoldOutErrors | None:
     """
     if stage.model.slips:
         return None
-    machine, n_u = stage.machine, len(stage.model.inputs)
-    for e in stage.model.effects:
-        machine = effects.with_effects(effects.without_effect(machine, e.name), selection.fitted_entry(stage, e.name))
+    machine, n_u = selection.fitted_machine(stage), len(stage.model.inputs)
     model = build(machine)
     if any(e.name in model.nonlinear or e.effect.sensor_only for e in model.effects):
         return None

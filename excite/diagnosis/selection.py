@@ -38,7 +38,7 @@ from excite.diagnosis.screening import fit_screened
 from excite.logs import Log
 from excite.model import effects
 from excite.model.effects import Effect, PlacedEffect
-from excite.model.machine import EffectEntry, Quantity
+from excite.model.machine import EffectEntry, Machine, Quantity
 from excite.smoothing import NotConvergedError
 
 # Significance. Logs without any effect stay below a likelihood ratio of 16. By chi-squared and Bonferroni, at most
@@ -209,6 +209,14 @@ def fitted_entry(stage: ExtendedFit, name: str) -> EffectEntry:
     if placed.effect.positive:  # a machine file must not have zero here
         magnitude = max(magnitude, 2 * SMALLEST_VALUE)
     return identified_entry(placed.effect.name, placed.where, magnitude, values)
+
+
+def fitted_machine(stage: ExtendedFit) -> Machine:
+    """Return the machine with magnitudes and shapes of its effects as fitted."""
+    machine = stage.machine
+    for e in stage.model.effects:
+        machine = effects.with_effects(effects.without_effect(machine, e.name), fitted_entry(stage, e.name))
+    return machine
 
 
 def _fitted_values(stage: ExtendedFit, placed: PlacedEffect) -> dict[str, float]:

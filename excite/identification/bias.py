@@ -13,7 +13,7 @@ import numpy as np
 from excite.errors import NotIdentifiableError, SimulationError
 from excite.identification.estimate import Estimate, add_notes
 from excite.identification.noise_propagation import measure_again
-from excite.logs import Log, Samples, lowpass, samples, white_noise
+from excite.logs import Log, lowpass, samples, white_noise
 from excite.model import Model
 from excite.model.machine import Filter
 from excite.simulation import Motion, delivered_torques, exact_readings, respond
@@ -125,22 +125,13 @@ def simulate_along_log(model: Model, log: Log, X: np.ndarray, filter: Filter) ->
     read = lowpass(s.Y[rows], float(model.machine.sampling_hz), filter).T
     torque = delivered_torques(log.t, read, [x.full() for x in model.channels(log.t[None], X)])
     speed = s.nu[rows].T
-    gain = _inertia(model, s, X, rows) / HOLD_TIME
+    inertia = np.diag(model.mass_matrix(s.q[:, 0], X).full())[rows]  # of each joint's own acceleration
+    gain = np.abs(inertia) / HOLD_TIME
 
     def driven(k: int, state: np.ndarray) -> np.ndarray:
         return torque[k] + gain * (speed[max(k - 1, 0)] - state[n_q:][rows])
 
     return respond(model, len(log), driven, X, s.q[:, 0], s.nu[:, 0])
-
-
-def _inertia(model: Model, s: Samples, X: np.ndarray, rows: Sequence[int]) -> np.ndarray:
-    """Inertia (n_u,) of each actuated joint's own acceleration, from the mass matrix at the first sample."""
-    a = np.eye(len(model.coordinates))
-    q, nu = (np.repeat(v[:, :1], len(a), axis=1) for v in (s.q, s.nu))
-    p = model.expand @ X
-    beside = () if model.plain else (np.zeros((len(model.inputs), 1)), model.initial_memory[:, None])
-    M = model.predict(q, nu, a, p, *beside).full() - model.predict(q, nu, 0 * a, p, *beside).full()
-    return np.abs(np.diag(M)[list(rows)])
 
 
 def measured_again(model: Model, log: Log, motion: Motion, X: np.ndarray, rng: np.random.Generator) -> Log:

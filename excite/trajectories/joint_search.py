@@ -8,8 +8,6 @@ samples get a margin, and the last stage is repeated.
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -35,11 +33,13 @@ from excite.trajectories.limits import TOLERANCE, end_poses
 from excite.trajectories.multistart import (
     Design,
     Report,
+    begin_worker,
     ignore_killed_workers,
     infeasible_error,
     process_count,
     progress_reports,
     stop_file,
+    write_stage,
 )
 
 GUESSES = 200  # random series of which the best is a start; chosen
@@ -212,20 +212,13 @@ def _run_start(
     stop: Path,
 ) -> MotionState | None:
     """Run one start in a worker process; None if time is up before it begins, start 0 always runs."""
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, lambda *_: stop.touch() if stop.parent.exists() else None)
-
-    def should_stop() -> bool:
-        return stop.exists() or (deadline is not None and time.time() > deadline)
-
+    should_stop = begin_worker(stop, deadline)
     if number > 0 and should_stop():
         return None
     state = None
     for k, found in enumerate(search(model, problem, objective, trajectory, seed, should_stop)):
         state = replace(found, number=number)
-        fresh = stop.parent / f".{number}"
-        fresh.write_text(repr(_reported(objective, state.best)), encoding="ascii")
-        fresh.replace(stop.parent / f"{number}-{k}")
+        write_stage(stop, number, k, _reported(objective, state.best))
     return state
 
 

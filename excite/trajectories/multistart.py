@@ -267,6 +267,20 @@ def progress_reports(folder: Path, progress: Report | None, total: int) -> Itera
         look()
 
 
+def begin_worker(stop: Path, deadline: float | None) -> Callable[[], bool]:
+    """Let Ctrl-C make the stop file; return a function that tells if a worker must stop, also past a deadline."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, lambda *_: stop.touch() if stop.parent.exists() else None)
+    return lambda: stop.exists() or (deadline is not None and time.time() > deadline)
+
+
+def write_stage(stop: Path, number: int, stage: int, score: float) -> None:
+    """Write the best score of a start after a stage beside the stop file, for `progress_reports`."""
+    fresh = stop.parent / f".{number}"
+    fresh.write_text(repr(score), encoding="ascii")
+    fresh.replace(stop.parent / f"{number}-{stage}")
+
+
 def _run_start(
     model: Model,
     problem: Problem,
@@ -282,17 +296,11 @@ def _run_start(
 
     Returns None if time is up before the start begins; start 0 always runs.
     """
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, lambda *_: stop.touch() if stop.parent.exists() else None)
+    should_stop = begin_worker(stop, deadline)
     stages = itertools.count(0 if state is None else SCREENING_STAGES)
 
-    def should_stop() -> bool:
-        return stop.exists() or (deadline is not None and time.time() > deadline)
-
     def report_stage(state: SearchState) -> None:
-        fresh = stop.parent / f".{number}"
-        fresh.write_text(repr(_score(objective, state.best)), encoding="ascii")
-        fresh.replace(stop.parent / f"{number}-{next(stages)}")
+        write_stage(stop, number, next(stages), _score(objective, state.best))
 
     if state is None:
         if number > 0 and should_stop():
