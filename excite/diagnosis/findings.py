@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,7 +36,6 @@ MACHINE_FILE_DIGITS = 8  # significant digits of magnitudes in a machine file; c
 FIRST_ANOMALY_LINES = 3  # lines about anomalies that precede all others; chosen
 MIN_NEAREST_SHARE = 0.05  # share of the misfit above which the nearest effect is mentioned; chosen
 MAX_FOLLOWED_JOINTS = 3  # driven joints of a machine without slips whose motion is followed in open loop; chosen
-SMOOTHING_SHARE = 0.6  # of a budget of time, where regression may follow; chosen
 DIAGNOSE_SHARE = 0.8  # of the progress; gains take the rest; chosen
 FULL_EXPLANATION_SHARE = 0.99  # share of the misfit below which the answer gives it; chosen
 
@@ -223,10 +223,9 @@ def explain(
         )
         return replace(assess(plain, progress, runner), located=(), differences=differences)
     with interrupt.note_first_interrupt() as asked:
-        limits = (budget_s, None if budget_s is None else SMOOTHING_SHARE * budget_s)
-        whole, smoothing = (Deadline(seconds, lambda: asked.stop) for seconds in limits)
-        found = _explain(model, logs, filter, progress, runner, whole, smoothing)
-    if not (whole.reached or smoothing.reached):
+        deadline = Deadline(budget_s, lambda: asked.stop)
+        found = _explain(model, logs, filter, progress, runner, deadline)
+    if not deadline.reached:
         return found
     by = "Ctrl-C" if asked.stop else f"its budget of {format_number(budget_s or 0.0, 3)} s"
     return replace(found, cut_short=by)
@@ -249,31 +248,35 @@ def _explain(
     progress: ProgressCallback | None,
     runner: CallRunner,
     deadline: Deadline,
-    smoothing_deadline: Deadline,
 ) -> Assessment:
-    """Diagnose as `explain` does; smoothing leaves regression some time."""
+    """Diagnose as `explain` does. Within a budget regression comes first: it takes seconds, smoothing may take all."""
     report = progress or (lambda share, what: None)
     driven = len(model.actuated) == len(model.coordinates)
     by_torques = driven and not model.slips and model.plain and not model.known
 
-    def regress() -> Assessment:
+    def regress(report: ProgressCallback = report) -> Assessment:
         return assess_torques(*torque_regression.diagnose_torques(model, logs, filter, report, deadline))
 
     if by_torques and len(model.actuated) > MAX_FOLLOWED_JOINTS:
         return regress()
-    limit = smoothing_deadline if by_torques else deadline
+    regression: Assessment | None = None
+    if by_torques and deadline.seconds is not None:
+        with contextlib.suppress(NotIdentifiableError):
+            regression = regress(lambda share, what: report(0.0, what))
     try:
-        found = diagnose(model, logs, filter, lambda share, what: report(DIAGNOSE_SHARE * share, what), runner, limit)
+        found = diagnose(
+            model, logs, filter, lambda share, what: report(DIAGNOSE_SHARE * share, what), runner, deadline
+        )
     except NoEstimateError:
         if not by_torques:
             raise
-        return regress()
+        return regression or regress()
     left = 1 - DIAGNOSE_SHARE
-    account = assess(found, lambda share, what: report(DIAGNOSE_SHARE + left * share, what), runner, limit)
+    account = assess(found, lambda share, what: report(DIAGNOSE_SHARE + left * share, what), runner, deadline)
     if not by_torques or account.diagnosis.verdict != "unexplained":
         return account
     try:
-        other = regress()
+        other = regression or regress()
     except NotIdentifiableError:
         return account
     return other if other.diagnosis.findings and _least_gain(other) > _least_gain(account) else account
