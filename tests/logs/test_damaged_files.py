@@ -12,7 +12,7 @@ from excite.errors import LogError
 from excite.logs import tables
 
 WANTED = ("t_s", "theta1_rad", "u1_Nm", "/joint_states/position[0]", "/motor/torque/data", "Encoder.Angle", "Angle")
-SIZES = [pytest.param(1, id="few"), pytest.param(60, id="many", marks=pytest.mark.slow)]  # files of each format
+SIZES = [pytest.param(1, id="few"), pytest.param(20, id="many", marks=pytest.mark.slow)]  # files of each format
 
 
 @pytest.fixture(scope="module")

@@ -244,13 +244,15 @@ def test_errors_are_as_large_as_it_says(va12: Model, drive: str, kit: str) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("drive", "middle", "kit"), [("energetic", 0.25, "paper"), ("human", 0.4, "full")])
-def test_coverage(va12: Model, drive: str, kit: str, middle: float) -> None:
+def test_coverage(va12: Model) -> None:
     """Another machine, drive and noise each time, started from a file up to 20 % off: errors as large as said."""
-    z, percent, _ = errors(va12, drive, kit, range(50))
-    rms = np.sqrt(np.mean(percent**2, axis=0))
+    told = []
+    for drive, kit, middle in (("energetic", "paper", 0.25), ("human", "full", 0.4)):
+        z, percent, _ = errors(va12, drive, kit, range(25))
+        assert np.median(np.sqrt(np.mean(percent**2, axis=0))) < middle
+        told.append(z)
+    z = np.concatenate(told)
     inside = np.mean(np.abs(z) < 1.96, axis=0)
-    assert np.median(rms) < middle
     assert 0.9 < np.sqrt(np.mean(z**2)) < 1.15
     assert 0.93 < inside.mean() < 0.97
     assert inside.min() >= 0.84  # of 22 parameters in 50 runs the least falls below that by chance in 2 % of tests
