@@ -128,11 +128,12 @@ def test_half_known_constants_are_refused() -> None:
 )
 def test_published_numbers_of_base_parameters(name: str, rotors: bool, inertial: int) -> None:
     """UR10e: 40 with rotor inertia, 36 without (Mamedov); Panda: 43 (Gaz et al., RA-L 2019)."""
-    machine = load_machine(name)
-    if rotors:
-        drive = {"drive": {"rotor_inertia": quantity(0.5)}}
-        bodies = [b.model_dump(mode="json", exclude_none=True) | drive for b in machine.body]
-        machine = Machine.model_validate(machine.model_dump(mode="json", exclude_none=True) | {"body": bodies})
+    raw = load_machine(name).model_dump(mode="json", exclude_none=True)
+    for body in raw["body"]:
+        body.pop("drive", None)
+        if rotors:
+            body["drive"] = {"rotor_inertia": quantity(0.5)}
+    machine = Machine.model_validate(raw)
     model = build(machine)
     joint = [n for n in model.base.names if n.startswith(("Fv", "Fs", "u"))]
     assert len(model.base.names) - len(joint) == inertial
