@@ -99,7 +99,10 @@ class NearestEffect:
 
 @dataclass(frozen=True)
 class ParameterChange:
-    """A base parameter [unit] and its standard deviation without and with the findings."""
+    """A base parameter [unit] and its standard deviation without and with the findings.
+
+    A deviation is nan where the logs cannot tell the parameter and it stays at the machine file's value.
+    """
 
     name: str
     unit: str
@@ -142,13 +145,13 @@ class Diagnosis:
     @property
     def parameters(self) -> list[ParameterChange]:
         """Base parameters; without a standard deviation before if no model without the findings followed the logs."""
-        after = dict(
-            zip(self.after.model.base.names, zip(self.after.fit.X, self.after.fit.std, strict=True), strict=True)
-        )
-        base, fit, known = self.before.model.base, self.before.fit, self.before.estimated
+        before, after = (np.where(f.fit.unidentifiable, np.nan, f.fit.std) for f in (self.before, self.after))
+        known = before if self.before.estimated else np.full_like(before, np.nan)
+        found = dict(zip(self.after.model.base.names, zip(self.after.fit.X, after, strict=True), strict=True))
+        base, X = self.before.model.base, self.before.fit.X
         return [
-            ParameterChange(name, unit, value, std if known else float("nan"), *after[name])
-            for name, unit, value, std in zip(base.names, base.units, fit.X, fit.std, strict=True)
+            ParameterChange(name, unit, float(value), float(std), *map(float, found[name]))
+            for name, unit, value, std in zip(base.names, base.units, X, known, strict=True)
         ]
 
     @property

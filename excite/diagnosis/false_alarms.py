@@ -9,6 +9,7 @@ from typing import Any
 from excite import interrupt
 from excite.diagnosis import selection
 from excite.diagnosis.clean_simulation import can_be_simulated, simulate_clean
+from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.diagnosis import Diagnosis, diagnose
 from excite.diagnosis.findings import assess
 from excite.diagnosis.parallel import CallRunner, run_in_turn
@@ -65,12 +66,16 @@ class FalseAlarms:
 
 
 def count_false_alarms(
-    d: Diagnosis, runs: int, progress: ProgressCallback | None = None, runner: CallRunner = run_in_turn
+    d: Diagnosis,
+    runs: int,
+    progress: ProgressCallback | None = None,
+    runner: CallRunner = run_in_turn,
+    budget_s: float | None = None,
 ) -> FalseAlarms:
     """Diagnose clean logs of the machine that a diagnosis ends with, its findings included.
 
-    A first Ctrl-C ends the count with the logs diagnosed so far. Raises NotIdentifiableError if no machine follows the
-    logs with exact dynamics.
+    budget_s [s]: no log is begun after it, None for no end. A first Ctrl-C ends the count with the logs diagnosed so
+    far. Raises NotIdentifiableError if no machine follows the logs with exact dynamics.
     """
     if not can_be_simulated(d.after):
         raise NotIdentifiableError("no false alarms were counted: no model follows the logs that could be simulated")
@@ -79,7 +84,10 @@ def count_false_alarms(
     model = build(machine)
     verdicts, names, failed = Counter[str](), Counter[str](), 0
     with interrupt.note_first_interrupt() as asked:
+        deadline = Deadline(budget_s, lambda: asked.stop)
         for k in range(runs):
+            if deadline.is_over():
+                break
             report(k / runs, f"diagnosing clean log {k + 1} of {runs}")
             try:
                 logs = simulate_clean(d.after, FIRST_SEED + k)

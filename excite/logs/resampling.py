@@ -290,8 +290,9 @@ def _notes(
     if not even or drifting:
         low, high = 1e3 * float(np.quantile(dt, 0.01)), 1e3 * float(np.quantile(dt, 0.99))
         slow = ", and the steps drift" if even else ""
+        few, many = format_number(low, 3), format_number(high, 3)
         notes.append(
-            f"{source}: rows are {format_number(low, 3)} to {format_number(high, 3)} ms apart{slow}, interpolated at"
+            f"{source}: rows are {few if few == many else f'{few} to {many}'} ms apart{slow}, interpolated at"
             f" their own times onto {format_number(1e3 / grid, 4)} ms"
         )
     elif lost and not sparse:

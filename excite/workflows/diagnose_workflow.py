@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -96,24 +97,29 @@ def diagnose(
     """Diagnose logs into a folder: report, figures, and machine.toml if a cause is named; return the summary.
 
     machine: a shipped name or a path. filtering: a name of `FILTERS`. design_next: design the drive that separates
-    tied causes. budget_s [s]: ends the search with the best answer so far. accepted: why doubts about the logs may
-    stand. false_alarms: number of clean simulated logs of the fitted machine that are diagnosed as well.
+    tied causes. budget_s [s]: ends the search with the best answer so far, and the count of false alarms. accepted:
+    why doubts about the logs may stand. false_alarms: number of clean simulated logs of the fitted machine that are
+    diagnosed as well.
     Raises LogError, MachineError, NoEstimateError.
     """
+    begin = time.monotonic()
     model = requests.build_model(machine)
     with bar("diagnosing") as advance:
         ready = prepare(model, logs, identification.needed_sensors(model, "joint"))
         found = diagnose_from(
             ready.model, ready.logs, filtering, lambda share, what: advance(round(1000 * share), 1000, what), budget_s
         )
-    counted, note = _count_false_alarms(found, false_alarms, bar) if false_alarms else (None, "")
+    left = None if budget_s is None else budget_s - (time.monotonic() - begin)
+    counted, note = _count_false_alarms(found, false_alarms, bar, left) if false_alarms else (None, "")
     drive = separating_drive(place, ready.model.machine, rivals(found), design_next, bar)
     found = replace(found, notes=[*found.notes, *([note] if note else [])])
     account = diagnose_account(machine, ready, found, drive, accepted)
     return replace(account, summary={**account.summary, "false_alarms": counted}).write(place)
 
 
-def _count_false_alarms(found: DiagnoseResult, runs: int, bar: Bar) -> tuple[dict[str, Any] | None, str]:
+def _count_false_alarms(
+    found: DiagnoseResult, runs: int, bar: Bar, budget_s: float | None
+) -> tuple[dict[str, Any] | None, str]:
     """Diagnose clean simulated logs of the fitted machine; return the counts and a sentence."""
     d = found.assessment.diagnosis
     if not isinstance(d, Diagnosis):
@@ -121,10 +127,12 @@ def _count_false_alarms(found: DiagnoseResult, runs: int, bar: Bar) -> tuple[dic
     try:
         with bar("diagnosing clean logs") as advance:
             counted = diagnosis.count_false_alarms(
-                d, runs, lambda share, what: advance(round(1000 * share), 1000, what), run_forked
+                d, runs, lambda share, what: advance(round(1000 * share), 1000, what), run_forked, budget_s
             )
     except NotIdentifiableError as err:
         return None, str(err)
+    if not counted.runs:
+        return None, "no false alarms were counted: the budget was spent"
     return counted.summary(), str(counted)
 
 

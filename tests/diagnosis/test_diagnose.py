@@ -507,6 +507,18 @@ def test_an_amount_is_as_unsure_as_shapes_that_a_log_hardly_tells(straight: Mode
         ) == more
 
 
+def test_a_parameter_that_the_logs_cannot_tell_has_no_deviation(straight: Model) -> None:
+    """Its deviation in the fit is that of what holds it at the machine file's value, and says nothing about it."""
+    n = len(straight.base.names)
+    fit = SimpleNamespace(X=straight.nominal, std=np.full(n, 0.1), unidentifiable=np.arange(n) == 1)
+    stage: Any = SimpleNamespace(model=straight, fit=fit, estimated=True)
+    rows = findings.parameter_table(diagnosis.Diagnosis("clean", (), stage, stage, 0.0, (), (stage,)))
+    untold, *told = rows.pop(straight.base.names[1]), *rows.values()
+    assert np.isnan([untold["std_before"], untold["std_after"]]).all()
+    assert untold["moved"] is None
+    assert all(row["std_before"] == row["std_after"] == 0.1 for row in told)
+
+
 def test_a_figure_says_that_nothing_could_be_withheld() -> None:
     """In place of an axis without bars."""
     for rms, shown in ((1e-3, True), (np.nan, False), (None, False)):

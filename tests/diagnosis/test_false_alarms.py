@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import time
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
-from excite.diagnosis import FalseAlarms
+from excite.diagnosis import FalseAlarms, false_alarms
 from excite.diagnosis.findings import format_share
+from excite.errors import NoEstimateError
 
 
 def test_a_tied_log_counts_as_named() -> None:
@@ -16,6 +21,21 @@ def test_a_tied_log_counts_as_named() -> None:
     assert summary["verdicts"] == {"named": 1, "tied": 2, "clean": 4}
     assert "Of 8 clean simulated logs" in str(counted)
     assert "3 got a name (ground_slope@machine); 1 without an answer" in str(counted)
+
+
+def test_no_log_is_begun_after_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    def diagnosed(*given: Any, **more: Any) -> Any:
+        time.sleep(0.2)
+        raise NoEstimateError("a log like this has no answer")
+
+    for name in ("can_be_simulated", "build"):
+        monkeypatch.setattr(false_alarms, name, lambda stage: True)
+    monkeypatch.setattr(false_alarms, "simulate_clean", diagnosed)
+    monkeypatch.setattr(false_alarms.selection, "fitted_machine", lambda stage: None)
+    d: Any = SimpleNamespace(after=None)
+    assert false_alarms.count_false_alarms(d, 2).runs == 2
+    assert false_alarms.count_false_alarms(d, 100, budget_s=0.3).runs == 2
+    assert false_alarms.count_false_alarms(d, 100, budget_s=-1.0).runs == 0
 
 
 @pytest.mark.parametrize(
