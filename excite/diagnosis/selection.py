@@ -373,6 +373,7 @@ def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runne
         )
         exact = sorted([*exact, *others], key=lambda x: x[1].fit.cost)
     judged = [*_tied_trials(exact, gain, MIN_GAIN_SHARE if with_noise else MIN_WALD_SHARE), *unknown] if exact else ties
+    judged = _without_needless_magnitudes(judged)
     if judged[0][1].is_dead_end:
         judged = [x for x in judged if x[1].exact and x[1].is_close and not x[1].impossible] or judged
     score, best = judged[0]
@@ -743,6 +744,21 @@ def _tied_trials(trials: Sequence[_Trial], gain: float, share: float | None = No
         # With process noise it gains less than without.
         margin = max(margin, min(MIN_WALD_SHARE * wald_statistic(score.candidate.name, best), MAX_FORMULA_RATIO))
     return [x for x in trials if x[1].fit.cost - best.fit.cost < margin]
+
+
+def _without_needless_magnitudes(trials: Sequence[_Trial]) -> list[_Trial]:
+    """Return trials without those that gain no more over the effect that they come to at zero than chance does.
+
+    Friction by bristles that bend is presliding where no Stribeck friction adds to it.
+    """
+    costs = {s.candidate.name: stage.fit.cost for s, stage in trials}
+    least = MIN_LIKELIHOOD_RATIO * trials[0][1].dispersion
+
+    def is_needless(trial: _Trial) -> bool:
+        simpler = trial[0].candidate.placed.simpler
+        return simpler is not None and costs.get(simpler, np.inf) - trial[1].fit.cost < least
+
+    return [x for x in trials if not is_needless(x)]
 
 
 def _trials_without_noise(trials: Sequence[_Trial], runner: CallRunner) -> tuple[list[_Trial], list[_Trial]]:

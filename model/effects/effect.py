@@ -224,6 +224,7 @@ class Effect:
     torque [N m]; extra_radius [m], which all effects see; soil; push: forces [N] along and across a contact;
     gravity [m/s2] along the ground; inertia: changes of standard parameters of the payload body;
     reading: error of a sensor; channel: of a torque sensor over time.
+    simpler: in the form that never sticks, the effect that it comes to where A is zero.
     recoil: the shape that gives the share of `inertia` due to a load that slides along x and pushes its body back.
     shaking: 0 to 1 over time, while the torque sensor shakes; without shaking something else acts.
     file_value: the value of the machine file that the magnitude corrects, for an effect that is an error of the file.
@@ -255,6 +256,7 @@ class Effect:
     memory: Mapping[str, Memory] = field(default_factory=dict)
     map_form: Form | None = None
     unsticking: Form | bool = False
+    simpler: str | None = None
     timed: bool = False
     angle_only: bool = False
     file_value: Callable[[Body], float] | None = None
@@ -341,6 +343,11 @@ class PlacedEffect:
         """True if its form here replaces the joint's dry friction by a law that never sticks."""
         form = self.effect.unsticking
         return form if isinstance(form, bool) else self._in_form(form)
+
+    @property
+    def simpler(self) -> str | None:
+        """Name, with its place, of the effect that this one comes to at zero; None if there is none."""
+        return f"{self.effect.simpler}@{self.where}" if self.effect.simpler and self.unsticking else None
 
     def shaking(self, t: np.ndarray) -> np.ndarray:
         """Return how much the effect shakes a torque sensor (N,), 0 to 1, at times t (N,) [s]."""

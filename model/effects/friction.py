@@ -23,6 +23,17 @@ def stribeck(s: SampleView, k: int, p: Values) -> ca.SX:
     return -(1 - p["bristles"]) * p["A"] * s.sign(k) * _stribeck_decay(s, k, p) - p["bristles"] * bent
 
 
+def presliding(s: SampleView, k: int, p: Values) -> ca.SX:
+    """Return the torque by which friction of bristles that bend differs from Fs tanh(w / w_s)."""
+    return s.coulomb[k] * (s.sign(k) - s.z["bent"])
+
+
+def presliding_rate(s: SampleView, k: int, p: Values) -> ca.SX:
+    """Return the rate of the bristles' deflection, in shares of the one at which they hold Fs. Source: Dahl 1968."""
+    w = s.w[k]
+    return (w - ca.sqrt(w**2 + (0.001 * s.friction_smoothing[k]) ** 2) * s.z["bent"]) / p["A"]
+
+
 def bristle_rate(s: SampleView, k: int, p: Values) -> ca.SX:
     """Return the rate of the bristles' deflection, in shares of the one at which they hold Fs + A.
 

@@ -33,6 +33,11 @@ def friction_smoothing(site: Site) -> float:
     return float(site.body.friction.smoothing) if site.body.friction is not None else 1.0
 
 
+def presliding(site: Site) -> float:
+    """Angle [rad] within which bristles bend: 0.2 s at the rate over which friction turns (chosen)."""
+    return 0.2 * friction_smoothing(site)
+
+
 def stick_slip_rate(site: Site) -> float:
     """Rate [rad/s] near standstill: 0.7 % of that at which viscous friction equals Fs (chosen), at least the smoothing.
 

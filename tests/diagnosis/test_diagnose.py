@@ -860,6 +860,22 @@ def promising(stage: fits.ExtendedFit, *names: str) -> list[Any]:
     return [replace(best[name], likelihood_ratio=1000.0 - k) for k, name in enumerate(names)]
 
 
+@pytest.mark.parametrize("gain", [15.0, 40.0])
+def test_an_amount_that_gains_nothing_clear_names_nothing(gain: float) -> None:
+    """Friction by bristles is presliding unless Stribeck friction adds to it, whichever of the two fits better."""
+
+    def trial(name: str, simpler: str | None, cost: float) -> Any:
+        placed = SimpleNamespace(simpler=simpler)
+        candidate = SimpleNamespace(name=name, placed=placed)
+        return SimpleNamespace(candidate=candidate), SimpleNamespace(fit=SimpleNamespace(cost=cost), dispersion=1.0)
+
+    bristles = trial("stribeck_friction@load", "presliding@load", 100.0)
+    bends = trial("presliding@load", None, 100.0 + gain)
+    kept = selection._without_needless_magnitudes([bristles, bends])
+    assert kept == ([bends] if gain < selection.MIN_LIKELIHOOD_RATIO else [bristles, bends])
+    assert selection._without_needless_magnitudes([bristles]) == [bristles]
+
+
 def test_an_amount_at_zero_can_be_written(straight: Model) -> None:
     """As a machine may have it: zero of what makes sense above it only is refused."""
     machine = placing.with_effects(

@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from support.drives import designed, gentle
 from support.logs import make_log
 
@@ -267,6 +268,28 @@ def test_bristles_bend_before_a_joint_slides(va12: Model) -> None:
         assert rubs(w, steady) == pytest.approx(np.sign(w) * slides + Fv * w, rel=1e-3)
 
 
+def test_friction_builds_up_over_the_presliding_angle(va12: Model) -> None:
+    """Dahl: x after a reversal from steady sliding friction is Fs (1 - 2 exp(-x / A)) against the motion."""
+    angle = 0.004
+    model = build(placing.with_effects(VA12, shaped(f"presliding@rear_roll={angle}", {})))
+    p, still, u = model.expand @ model.nominal, np.zeros(6), np.zeros(3)
+    Fs, Fv = (float(p[model.base.standard.index(n)]) for n in ("Fs4", "Fv4"))
+    soft = np.where([n.startswith("K") for n in model.base.standard], 0, p)
+    for w in (0.05, -2.0):
+        nu, far = w * np.eye(6)[5], np.linspace(0, 5 * angle, 9)
+        bent = solve_ivp(
+            lambda t, z, nu=nu: [float(model.flow(still, nu, u, z, model.nominal)[0])],
+            (0.0, far[-1] / abs(w)),
+            [-np.sign(w)],
+            t_eval=far / abs(w),
+            rtol=1e-8,
+            atol=1e-8,
+        ).y[0]
+        rubs = [float(model.balance(still, nu, still, soft, u, [z])[5]) for z in bent]
+        want = np.sign(w) * Fs * (1 - 2 * np.exp(-far / angle)) + Fv * w
+        np.testing.assert_allclose(rubs, want, atol=2e-3 * Fs)
+
+
 @pytest.mark.parametrize(("second", "share"), [(0.0, 0.0), (1.0, 0.5), (2.0, 1.0), (3.0, 0.5), (4.0, 0.0)])
 def test_a_brake_drags_between_its_instants(second: float, share: float, va12: Model) -> None:
     """Dry friction larger by its amount, against the motion either way."""
@@ -372,7 +395,10 @@ def test_an_effect_of_no_size_changes_nothing(effect: Effect, va12: Model) -> No
     """A motion of a few seconds, and what all sensors read of it: as without; with a typical amount it differs."""
     t = np.arange(400) / 100
     torque = np.column_stack([1500 * np.sin(1.5 * t), 4000 * np.sin(0.8 * t), 1500 * np.sin(1.5 * t)])
-    plain = sensors.exact_readings(va12, simulate(va12, torque))
+    place = where(effect)
+    at_once = shaped(f"friction_transition@{place}=6", {})  # as friction that builds up over no angle turns
+    without = build(placing.with_effects(VA12, at_once)) if effect.name == "presliding" else va12
+    plain = sensors.exact_readings(without, simulate(without, torque))
 
     def change(amount: float) -> float:
         model = extended(effect, amount, WITHIN.get(effect.name, {}))

@@ -729,13 +729,13 @@ RigAttacking = Callable[[Rig, float, Draw], Key]
 
 def sticks(rig: Rig, size: float, draw: Draw) -> Key:
     """Dry friction that truly sticks, nothing else. Source: Coulomb, Theorie des machines simples, 1785."""
-    return Key(related=("friction_transition@carriage", "stribeck_friction@carriage"))
+    return Key(related=("friction_transition@carriage", "presliding@carriage", "stribeck_friction@carriage"))
 
 
 def sticks_noisily(rig: Rig, size: float, draw: Draw) -> Key:
     """Friction sticks, and the position sensor is coarse. Source: see above."""
     rig.noise_m, rig.noise_N = 2e-5 * size, 1.0
-    return Key(related=("friction_transition@carriage", "stribeck_friction@carriage"))
+    return Key(related=("friction_transition@carriage", "presliding@carriage", "stribeck_friction@carriage"))
 
 
 def sticks_stribeck(rig: Rig, size: float, draw: Draw) -> Key:
