@@ -320,6 +320,7 @@ def score(
     SimulationError for a motion that can't be integrated.
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
+    model, _ = workflows.without_hidden_zeros(model)
     name, chosen = workflows.choose_problem(model.machine, problem, None)
     workflows.require_noise_figures(model)
     given = _planned(model, drive, any_rate=True)

@@ -8,6 +8,8 @@ from .prediction import (
     Model as Model,
     build as build,
     build_cached as build_cached,
+    hidden_zeros as hidden_zeros,
     required_signs as required_signs,
     standard_parameters as standard_parameters,
+    with_given_zeros as with_given_zeros,
 )

@@ -28,6 +28,7 @@ class SymbolicSample:
 
     q, nu, a, u, p, wheels: coordinates, velocities, accelerations, torques, standard parameters, measuring wheels.
     at, rate: coordinates and velocities by name, zero for locked ones. by_name: standard parameters.
+    read: coordinates as the encoders read them: `at` is less by the zeros that are sought.
     frames: motion of each body; gravity (3,) in the root's axes; heading of the root [rad].
     sign: sgn of each joint's rate in its dry friction, by index of the body.
     """
@@ -40,6 +41,7 @@ class SymbolicSample:
     p: ca.SX
     wheels: ca.SX
     at: dict[str, ca.SX]
+    read: dict[str, ca.SX]
     rate: dict[str, ca.SX]
     by_name: dict[str, ca.SX]
     frames: dict[int, mechanics.Frame]
@@ -140,10 +142,14 @@ def symbolic_sample(
     q, nu, a = ca.SX.sym("q", n), ca.SX.sym("nu", n), ca.SX.sym("a", n)
     p = ca.SX.sym("p", len(standard))
     full = {c: ca.SX(0) for b in machine.body for c in b.coordinates}
-    at = full | dict(zip(names, ca.vertsplit(q), strict=True))
+    by_name = dict(zip(standard, ca.vertsplit(p), strict=True))
+    read = full | dict(zip(names, ca.vertsplit(q), strict=True))
+    at = dict(read)
+    for name, sensor in machine.sought_zeros.items():
+        at[machine.coordinate(machine.find(sensor.body))] -= by_name.get(name, 0)
     rate = full | dict(zip(names, ca.vertsplit(nu), strict=True))
     accel = full | dict(zip(names, ca.vertsplit(a), strict=True))
-    for moving in (at, rate, accel):
+    for moving in (at, read, rate, accel):
         for b in machine.body:
             if b.moves_with is not None:
                 moving[b.coordinates[0]] = machine.ratio(b) * moving[machine.coordinate(b)]
@@ -167,8 +173,9 @@ def symbolic_sample(
         p,
         ca.SX.sym("wheels", sum(s.kind == "wheel" for s in machine.sensor)),
         at,
+        read,
         rate,
-        dict(zip(standard, ca.vertsplit(p), strict=True)),
+        by_name,
         mechanics.body_motions(machine, at, rate, accel, gravity),
         gravity,
         heading,
@@ -514,7 +521,7 @@ def _readings(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX,
         if sensor.kind == "torque":
             continue
         if sensor.kind == "angle":
-            value = s.at[body.coordinates[0]]
+            value = s.read[body.coordinates[0]]
         elif sensor.kind == "wheel":
             value = s.wheels[wheels.index(sensor.name)]
         elif sensor.kind == "yaw_rate":

@@ -63,6 +63,20 @@ class KnownValues:
                 found[k] = np.linalg.norm(combination) / size[k]
         return found
 
+    def with_zeros(self, machine: Machine, names: Sequence[str]) -> KnownValues:
+        """Add what is known of the encoder zeros that are sought; names (n_base)."""
+        given = {n: s for n, s in machine.sought_zeros.items() if isinstance(s.zero, Quantity)}
+        if not given:
+            return self
+        std = np.array([float(s.zero.known) for s in given.values() if isinstance(s.zero, Quantity)])
+        rows = np.eye(len(names))[[names.index(n) for n in given]] / std[:, None]
+        return KnownValues(
+            np.concatenate([self.rows, rows]),
+            np.concatenate([self.values, np.zeros(len(std))]),
+            (*self.quantities, *(f"sensor.{s.name}.zero" for s in given.values())),
+            scipy.linalg.block_diag(self.pull, np.eye(len(std))),
+        )
+
     def extended(self, n: int) -> KnownValues:
         """Return the same for n further parameters, of which nothing is known."""
         return KnownValues(np.pad(self.rows, ((0, 0), (0, n))), self.values, self.quantities, self.pull)

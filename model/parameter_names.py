@@ -64,6 +64,7 @@ def _body_descriptions(body: Body) -> dict[str, str]:
     turned = INERTIA | ({"ZZ": "about the vertical"} if body.joint == "planar" else {})
     table |= {f"{letters}{k}": f"inertia {about}, {own}" for letters, about in turned.items()}
     table |= {f"{letters}{k}": f"{what}, {place}" for letters, what in ACTING.items()}
+    table[f"q{k}0"] = f"encoder zero, {place}"
     return table | {f"u{k}0": f"{'force' if body.joint == 'prismatic' else 'torque'} offset, {place}"}
 
 

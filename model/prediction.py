@@ -8,7 +8,7 @@ physics is written once. Effects of the machine file are part of the prediction;
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -21,19 +21,26 @@ from excite.model.base_parameters import BaseParameters, append_parameters, base
 from excite.model.effects import GroundMap, PlacedEffect, Site, place_effect
 from excite.model.equations import Equations, contact_lines, edge_slips, equations, kinematics, signed_balance
 from excite.model.known_values import KnownValues, known_values
-from excite.model.machine import PER_FORCE_CONSTANT, PER_TORQUE_CONSTANT, Body, Machine
+from excite.model.machine import PER_FORCE_CONSTANT, PER_TORQUE_CONSTANT, Body, Machine, Quantity
 
 SCALE_SAMPLES = 400  # random samples from which the default scale is taken; chosen
 USUAL_SPEED = 1.0  # rad/s or m/s, of a joint without a limit; chosen
 USUAL_FREQUENCY = 3.0  # rad/s, acceleration over speed: half a turn a second; chosen
+ZERO_SIZES = (0.02, 0.002)  # rad, m; of an encoder's zero that is sought; chosen
+HIDDEN_SHARE = 1e-6  # of a column beyond the others, over its size, from which motions show it; chosen
 MIN_SHOWN_SHARE = 1e-3  # share of the torques (rms) from which a value shows; chosen
 
 
 def standard_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
-    """Return nominal value [SI] and unit of every standard parameter: bodies first, then joints.
+    """Return nominal value [SI] and unit of every standard parameter: bodies, joints, encoder zeros that are sought.
 
     The order decides which column of a dependent set stands for it, and it is the order of every table.
     """
+    return _linear_parameters(machine) | {n: (value, unit) for n, (value, unit, _) in encoder_zeros(machine).items()}
+
+
+def _linear_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
+    """Return nominal value [SI] and unit of the standard parameters that the prediction is linear in."""
     chassis: dict[str, tuple[float, str]] = {}
     joints: dict[str, tuple[float, str]] = {}
     for body in machine.body:
@@ -67,6 +74,15 @@ def standard_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
         name: (value, per_constant.get(unit, f"{unit} A/({'N m' if turns else 'N'})"))
         for name, (value, unit) in every.items()
     }
+
+
+def encoder_zeros(machine: Machine) -> dict[str, tuple[float, str, float]]:
+    """Return nominal value, unit and size of every encoder zero that is sought, beyond what its file subtracts.
+
+    The readings are the coordinates; forces act at coordinate - zero.
+    """
+    straight = {n: machine.find(s.body).joint == "prismatic" for n, s in machine.sought_zeros.items()}
+    return {n: (0.0, "m" if slides else "rad", ZERO_SIZES[slides]) for n, slides in straight.items()}
 
 
 def required_signs(machine: Machine) -> dict[str, float]:
@@ -147,6 +163,11 @@ class Model:
     def initial_memory(self) -> np.ndarray:
         """Memory states of the effects at rest, before a log begins (n_z,)."""
         return np.zeros(len(self.memory))
+
+    @cached_property
+    def zeros(self) -> np.ndarray:
+        """Indices of the encoder zeros that are sought among the base parameters."""
+        return np.array([self.base.names.index(name) for name in self.machine.sought_zeros], int)
 
     @cached_property
     def positive(self) -> np.ndarray:
@@ -371,7 +392,7 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
     fit_shapes: shapes of effects are parameters, too.
     Raises MachineError if no parameter is left, or for an effect that the machine can't have.
     """
-    table = standard_parameters(machine)
+    table = _linear_parameters(machine)
     _check_names(machine, tuple(table))
     placed = tuple(place_effect(machine, entry) for entry in machine.effect)
     twice = sorted({e.name for e in placed if [f.name for f in placed].count(e.name) > 1})
@@ -385,16 +406,19 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
     stated = np.array([float(machine.scale[s]) if s in machine.scale else np.nan for s in base.names])
     scale = np.where(np.isnan(stated), _default_scale(machine, found, base, nominal, ~np.isnan(stated)), stated)
     known = known_values(machine, base.names, base.matrix, base.standard, nominal, scale)
-    if placed:
+    plain, zeros = found, encoder_zeros(machine)
+    if placed or zeros:
         magnitudes = _effect_parameters(machine, placed, fit_shapes)
         if not fit_sensor_effects:
-            shown = _visible_parameters(equations(machine, (*table, *magnitudes), placed))
+            shown = _visible_parameters(equations(machine, (*table, *zeros, *magnitudes), placed))
             magnitudes = {name: row for name, row in magnitudes.items() if name in shown}
-        base = append_parameters(base, magnitudes)
-        known = known.extended(len(magnitudes))
-        nominal = np.concatenate([nominal, [v for v, _, _ in magnitudes.values()]])
-        scale = np.concatenate([scale, [size for _, _, size in magnitudes.values()]])
+        added = zeros | magnitudes
+        base = append_parameters(base, added)
+        known = known.extended(len(added)).with_zeros(machine, base.names)
+        nominal = np.concatenate([nominal, [v for v, _, _ in added.values()]])
+        scale = np.concatenate([scale, [float(machine.scale.get(n, size)) for n, (_, _, size) in added.items()]])
         found = equations(machine, base.standard, placed)
+    motion = kinematics(plain.sample, plain.slips)
     return Model(
         machine,
         machine.coordinates,
@@ -405,17 +429,17 @@ def build(machine: Machine, fit_sensor_effects: bool = True, fit_shapes: bool = 
         scale,
         found.predict,
         found.standard_regressor,
-        kinematics(found.sample, found.slips),
-        *edge_slips(found.sample),
+        motion,
+        *edge_slips(plain.sample),
         found.nonlinear,
         found.balance,
         _as_base_function(found.flow, base),
-        _as_base_function(_with_rate_readings(machine, found), base),
+        _as_base_function(_with_rate_readings(machine, found, motion), base),
         _as_base_function(found.channels, base),
         found.reading_names,
         found.memory,
         found.map_inputs,
-        contact_lines(found.sample),
+        contact_lines(plain.sample),
         placed,
         fit_sensor_effects,
         fit_shapes,
@@ -490,14 +514,48 @@ def _effect_parameters(
     return found | magnitudes
 
 
-def _with_rate_readings(machine: Machine, found: Equations) -> ca.Function:
+def hidden_zeros(model: Model, by_known: bool = True) -> dict[str, tuple[str, ...]]:
+    """Find the encoder zeros that are sought though no motion shows them, at the nominal values.
+
+    by_known: what the machine file calls known counts, too. Returns by name the parameters that show only together with
+    it, none for a zero that changes no torque.
+    """
+    rng, names, n = np.random.default_rng(0), model.base.names, len(model.coordinates)
+    beside = [rng.uniform(-1, 1, (x.numel(), SCALE_SAMPLES)) for x in model.effect_symbols()]
+    W = model.stacked_regressor(*rng.uniform(-1, 1, (3, n, SCALE_SAMPLES)), *beside).reshape(-1, len(names))
+    every = np.concatenate([W, model.known.rows]) * model.scale if by_known else W * model.scale
+    size = np.linalg.norm(every, axis=0)
+    found: dict[str, tuple[str, ...]] = {}
+    for k in model.zeros:
+        others = [j for j in np.flatnonzero(size > HIDDEN_SHARE * size.max()) if j != k]
+        if size[k] <= HIDDEN_SHARE * size.max():
+            found[names[k]] = ()
+            continue
+        A, column = every[:, others] / size[others], every[:, k] / size[k]
+        share = np.linalg.lstsq(A, column, rcond=1e-12)[0]
+        if np.linalg.norm(column - A @ share) < HIDDEN_SHARE:
+            found[names[k]] = tuple(names[j] for j, x in zip(others, share, strict=True) if abs(x) > HIDDEN_SHARE)
+    return found
+
+
+def with_given_zeros(model: Model, names: Collection[str]) -> Model:
+    """Return the model with encoder zeros that are no longer sought, but those of the machine file."""
+    given = {s.name for name, s in model.machine.sought_zeros.items() if name in names}
+    sensors = tuple(
+        s.model_copy(update={"zero": Quantity(value=s.shift, source="definition")}) if s.name in given else s
+        for s in model.machine.sensor
+    )
+    return model.for_machine(model.machine.model_copy(update={"sensor": sensors})) if given else model
+
+
+def _with_rate_readings(machine: Machine, found: Equations, motion: ca.Function) -> ca.Function:
     """Return the readings; a rate sensor reads the time derivative of its angle and of the angle's error."""
     rates = {s.name for s in machine.sensor if s.is_rate}
     if not rates & set(found.reading_names):
         return found.read
     q, nu, wheels, u, z, p = found.read.sx_in()
     reading = found.read(q, nu, wheels, u, z, p)
-    dq, _, rolled, *_ = kinematics(found.sample, found.slips)(q, nu)
+    dq, _, rolled, *_ = motion(q, nu)
     for k, name in enumerate(found.reading_names):
         if name in rates:
             reading[k] = ca.jtimes(reading[k], ca.vertcat(q, wheels), ca.vertcat(dq, rolled))
@@ -521,7 +579,7 @@ def _check_names(machine: Machine, standard: tuple[str, ...]) -> None:
             )
     groups = {s + "R" for s in standard} | set(machine.parameter_names.values())
     for name in machine.scale:
-        if name not in standard and name not in groups:
+        if name not in standard and name not in groups and name not in machine.sought_zeros:
             raise MachineError(
                 f"{machine.name}: scale.{name}: no such parameter, allowed: {', '.join(standard)}, with R for a group"
             )

@@ -95,7 +95,8 @@ def needed_torques(model: Model, r: TorqueRows, X: np.ndarray) -> np.ndarray:
     found = []
     for first in range(0, len(r.t), BLOCK):
         at = slice(first, first + BLOCK)
-        found.append(model.stacked_regressor(r.q[at].T, r.nu[at].T, r.a[at].T)[:, list(model.actuated)] @ X)
+        torque = model.predict(r.q[at].T, r.nu[at].T, r.a[at].T, model.expand @ X).full()
+        found.append(torque[list(model.actuated)].T)
     return np.concatenate(found) - model.offsets @ X
 
 

@@ -245,7 +245,7 @@ def _build_estimate(
         measured, error = np.zeros((2, len(model.rows), len(u)))
         measured[list(model.actuated)], error[list(model.actuated)] = data.torque.T, -trajectory.sampled_torque_error.T
         if plain_with_noise:
-            error = measured - (rows @ fit.X).T
+            error = measured - model.predict(q.T, nu.T, a.T, model.expand @ fit.X).full()
         Y.append(decimate(measured, filter.decimation))
         errors.append(decimate(error, filter.decimation))
     # Blocks that fit the cache are ten times faster than all rows at once.

@@ -18,6 +18,7 @@ import scipy
 from excite.model.mechanics import independent_columns
 
 DEPENDENCE_TOLERANCE = 1e-10  # relative distance from a combination of other columns, below which a column is dependent
+ROUNDING = 1e-13  # size of a column of rounding errors over the largest one; chosen
 BLOCK_ROWS = 20_000  # rows of a tall matrix that are reduced at once; chosen
 MAX_COLUMN_RATIO = 10.0  # largest ratio of a dropped column to a kept one; chosen
 CLUSTERS = 10  # stretches of a log between which residuals are independent; chosen
@@ -119,12 +120,14 @@ def exchange_columns(A: np.ndarray, kept: Sequence[int], dropped: Sequence[int])
 def solve(triangle: Triangle, tolerance: float = DEPENDENCE_TOLERANCE, scale: np.ndarray | None = None) -> Solution:
     """Solve least squares from a triangle; drop columns within `tolerance` of a combination of others.
 
-    scale (n,): sizes of the unknowns, by which `exchange_columns` chooses the columns to keep. Columns are scaled to
-    unit length first, so the units have no influence.
+    scale (n,): sizes of the unknowns, by which `exchange_columns` chooses the columns to keep, and by which columns of
+    rounding errors are told from others. Columns are scaled to unit length first, so the units have no influence.
     """
     n = triangle.columns
     A, y = triangle.R[:, :n], triangle.R[:, n]
     size = np.linalg.norm(A, axis=0)
+    if scale is not None:
+        size[size * scale <= ROUNDING * (size * scale).max()] = 0.0
     scaled = A / np.where(size > 0, size, 1.0)
     kept, dropped = independent_columns(scaled, tolerance)
     if scale is not None:

@@ -213,17 +213,47 @@ def restrict_to_possible(plain: Estimator) -> Estimator:
         """The linear method restricted to physically possible machines: the nearest one, by a convex program."""
         from excite.identification.consistency import constrained_estimate  # cvxpy takes a second to load
 
-        return constrained_estimate(model, plain(model, logs, filter), filtered_blocks(model, logs, filter))
+        estimate = plain(model, logs, filter)
+        at = replace(model, nominal=estimate.value_or(model.nominal)) if len(model.zeros) else model
+        return constrained_estimate(model, estimate, filtered_blocks(at, logs, filter))
 
     return method
 
 
+def relinearise(plain: Estimator) -> Estimator:
+    """Repeat a linear method along the regressor of its own estimate, for encoder zeros that are sought.
+
+    The torques are linear in all other parameters, and in a zero only near the values at which they are linearised
+    (Gauss-Newton). Raises NotIdentifiableError if the values don't settle.
+    """
+
+    def method(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
+        """The linear method, linearised at its own estimate."""
+        estimate = plain(model, logs, filter)
+        if not len(model.zeros):
+            return estimate
+        for _ in range(MAX_LINEARISATIONS):
+            at = estimate.value_or(model.nominal)
+            estimate = plain(replace(model, nominal=at), logs, filter)
+            step = np.abs(estimate.value - at) / estimate.std
+            if not np.nanmax(step, initial=0.0) > SETTLED_STEP:
+                return estimate
+        raise NotIdentifiableError(
+            f"{estimate.method}: the encoder zeros that are sought don't settle: give their values in the machine file,"
+            " or use joint"
+        )
+
+    return method
+
+
+MAX_LINEARISATIONS = 20  # of a linear method for encoder zeros; chosen
+SETTLED_STEP = 0.01  # standard deviations; chosen
 LINEAR_KINDS = ("angle", "torque", "wheel", "forward_speed", "lateral_speed")  # of sensors that every method uses
 LINEAR_METHODS: dict[str, Method] = {
-    "ols": Method(ols, effects="linear", biased=True),
-    "wls": Method(wls, biased=True),
-    "iv": Method(iv, simulates=True, optimistic=True),
-    "tls": Method(tls, optimistic=True),
+    "ols": Method(relinearise(ols), effects="linear", biased=True),
+    "wls": Method(relinearise(wls), biased=True),
+    "iv": Method(relinearise(iv), simulates=True, optimistic=True),
+    "tls": Method(relinearise(tls), optimistic=True),
 }
 METHODS: dict[str, Method] = {
     **LINEAR_METHODS,

@@ -41,7 +41,8 @@ def regression(model: Model, s: Samples, filter: Filter, block: int = BLOCK) -> 
     reaches."""
     first, last = filter.drop[0], s.q.shape[1] - filter.drop[1]
     W = np.concatenate(list(_blocks(model, s, first, last, filter.decimation, block)), axis=1)
-    return W, decimate(s.Y[:, first:last], filter.decimation)
+    # Linearised at the nominal values, the prediction is W X less the columns of encoder zeros times these.
+    return W, decimate(s.Y[:, first:last], filter.decimation) + W[:, :, model.zeros] @ model.nominal[model.zeros]
 
 
 def _blocks(model: Model, s: Samples, first: int, last: int, factor: int, block: int) -> Iterator[np.ndarray]:

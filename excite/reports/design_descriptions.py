@@ -67,6 +67,11 @@ def describe_design(s: Summary) -> Description:
             f" {format_percent(p['mean_percent'])} of each signal's own size in the root mean square,"
             f" {format_percent(p['max_percent'])} at most."
         )
+    if s.get("given_zeros"):
+        remarks.append(
+            f"No torque shows the encoder zeros {', '.join(s['given_zeros'])} apart from other parameters: the drive is"
+            " judged with those of the machine file."
+        )
     remarks += describe_outside_law(s.get("share_outside_law"))
     if not s["complete"]:
         remarks.append("Cut short: this is the best drive so far, more time may find a better one.")

@@ -10,6 +10,7 @@ from .design_request import (
     DesignRequest as DesignRequest,
     design_from as design_from,
     require_noise_figures as require_noise_figures,
+    without_hidden_zeros as without_hidden_zeros,
 )
 from .design_workflow import (
     compare as compare,

@@ -17,7 +17,7 @@ import numpy as np
 
 from excite import identification, logs, operator, simulation, text as wording, trajectories
 from excite.errors import InfeasibleError, MachineError, SolverError, UsageError
-from excite.model import Model, build, effects
+from excite.model import Model, build, effects, hidden_zeros, with_given_zeros
 from excite.model.machine import EffectEntry, Problem, Quantity
 from excite.operator import PhasedDrive
 from excite.trajectories import AccuracyBound, CompositeObjective, Design, design
@@ -85,6 +85,7 @@ class DesignResult:
     phased: the phases of a design for people; `design` is then the motion of a steady driver.
     first: the drive of lowest cond(Phi), if `design` is the most accurate one near it.
     assumed_noise: sensors of an arm whose noise figure is assumed, as its machine file has none.
+    given_zeros: encoder zeros that are sought, but that no torque shows by itself: the design takes the file's.
     bound: numerical lower bound of every drive, for objectives in BOUNDED of a machine with one driven joint.
     """
 
@@ -95,6 +96,7 @@ class DesignResult:
     first: Design | None = None
     contrasts: np.ndarray | None = None
     assumed_noise: tuple[str, ...] = ()
+    given_zeros: tuple[str, ...] = ()
     bound: AccuracyBound | None = None
 
 
@@ -167,6 +169,14 @@ def design_from(
     Raises MachineError for sensors of unknown noise, UndrivableError for a drive that no person can follow, and the
     errors of `trajectories.design`, `logs.prepare` and `identification.identify`.
     """
+    model, given = without_hidden_zeros(model)
+    return replace(_design(model, problem, request, progress), given_zeros=given)
+
+
+def _design(
+    model: Model, problem: Problem, request: DesignRequest, progress: Callable[[int, int, float], None] | None
+) -> DesignResult:
+    """Design a drive for a model all of whose encoder zeros show in it; errors as of `design_from`."""
     if request.trajectory is not None or model.follows_positions:
         return _design_arm(model, problem, request, progress)
     if request.driver:
@@ -223,6 +233,12 @@ def _design_arm(
     if not found.cond_phi < SINGULAR_COND:
         raise np.linalg.LinAlgError(f"cond(Phi) {found.cond_phi:g}")
     return DesignResult(model, aim, found, assumed_noise=assumed)
+
+
+def without_hidden_zeros(model: Model) -> tuple[Model, tuple[str, ...]]:
+    """Return a model that takes the file's values of encoder zeros that no torque shows by itself, and their names."""
+    hidden = tuple(hidden_zeros(model, by_known=False))
+    return with_given_zeros(model, hidden), hidden
 
 
 def with_assumed_noise(model: Model) -> tuple[Model, tuple[str, ...]]:
@@ -342,6 +358,8 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
         }
     if result.assumed_noise:
         summary["assumed_noise"] = list(result.assumed_noise)
+    if result.given_zeros:
+        summary["given_zeros"] = list(result.given_zeros)
     if result.bound is not None:
         summary["bound"] = _bound_summary(result, result.bound)
     if result.phased is not None:

@@ -16,7 +16,15 @@ import numpy as np
 
 from excite import identification, reports, smoothing, trajectories
 from excite.errors import MachineError, SimulationError
-from excite.model import Model, build, effects, mechanics, parameter_descriptions, standard_parameters
+from excite.model import (
+    Model,
+    build,
+    effects,
+    hidden_zeros,
+    mechanics,
+    parameter_descriptions,
+    standard_parameters,
+)
 from excite.model.effects import GRAVITY
 from excite.model.machine import Problem, Quantity, find_faults, machine_tables, with_line
 from excite.simulation import simulate
@@ -385,6 +393,23 @@ def describe_invisible(model: Model) -> Iterator[str]:
             )
     if left:
         yield f"no motion {'on the plane ' if machine.planar else ''}reveals {', '.join(left)}"
+    yield from _hidden_zeros(model)
+
+
+def _hidden_zeros(model: Model) -> Iterator[str]:
+    """Yield the encoder zeros that are sought though no motion shows them, or only together with others."""
+    for name, others in hidden_zeros(model).items():
+        where = model.machine.find(model.machine.sought_zeros[name].body).where
+        if others:
+            yield (
+                f"{name}: the encoder zero of {where} shows only together with {', '.join(others)}: give what is known"
+                " of them (known = true at a centre of mass that lies on an axis), or its zero"
+            )
+        else:
+            yield (
+                f"{name}: no motion shows the encoder zero of {where}, as turning it changes nothing (an axis along"
+                " gravity, or a body that is the same all round): give its zero"
+            )
 
 
 def _standard(model: Model) -> list[float]:

@@ -29,14 +29,15 @@ def score(
     """
     model = requests.build_model(machine, fit_sensor_effects=False)
     name, chosen = requests.choose_problem(model.machine, problem, None)
+    model, given = design_request.without_hidden_zeros(model)
     model, assumed = design_request.with_assumed_noise(model)
     design_request.require_noise_figures(model)
     drive = read_drive(profile, model, any_rate=True)
     found = trajectories.score(model, chosen, drive.torque, drive.start, drive.nu0, drive.planned)
     requests.require_known("--kit", kit, KITS)
     account = score_account(model, name, chosen, found, str(profile), kit if sensors else None)
-    if assumed:
-        account = replace(account, summary={**account.summary, "assumed_noise": list(assumed)})
+    more = {"assumed_noise": list(assumed), "given_zeros": list(given)}
+    account = replace(account, summary=account.summary | {key: names for key, names in more.items() if names})
     return account.write(place)
 
 

@@ -288,11 +288,22 @@ class Body(FileRecord):
         return self
 
 
+def _sought_or_value(value: Any, handler: ValidatorFunctionWrapHandler) -> Any:
+    """Check a quantity that may be sought. Raises ValueError that says what is allowed."""
+    if isinstance(value, (dict, Quantity)):
+        return Quantity.model_validate(value)
+    try:
+        return handler(value)
+    except ValidationError:
+        raise ValueError(f'must be "sought" or a table {{ value = ..., source = "..." }} (got {value!r})') from None
+
+
 class Sensor(FileRecord):
     """One column of a log, in `unit` (see `units`). SI value = `gain` x (number in the column).
 
     `factor`: SI value of the number 1 in the column, in place of the unit's; needed for units without one, such as V.
-    `zero`: SI reading of an encoder where the joint's coordinate is 0; it is subtracted.
+    `zero`: SI reading of an encoder where the joint's coordinate is 0; it is subtracted. "sought", or a value that is
+    `known` with a standard deviation: what is missing to it is a parameter (`Machine.sought_zeros`).
 
     kind `angle`: encoder of a joint; `wheel`: measuring wheel of `radius` [m] at `lateral` [m] (+ left) on the axis
     through the body's origin (32); `torque`: delivered torque or force + u0; `yaw_rate`: of the body; `forward_speed`,
@@ -331,7 +342,7 @@ class Sensor(FileRecord):
     displacement: Positive | None = None
     torque_constant: Quantity | None = None
     gear_ratio: Quantity | None = None
-    zero: Quantity | None = None
+    zero: Annotated[Quantity | Literal["sought"] | None, WrapValidator(_sought_or_value)] = None
     cylinders: tuple[hydraulics.Cylinder, ...] = ()
     kits: tuple[Literal["paper", "full"], ...] = ("paper", "full")
     place: Annotated[str | None, Field(pattern=r"^[a-z][a-z0-9_]*$")] = None
@@ -370,7 +381,12 @@ class Sensor(FileRecord):
     @property
     def shift(self) -> float:
         """SI reading where the coordinate is 0: coordinate = gain x number - shift."""
-        return 0.0 if self.zero is None else float(self.zero)
+        return float(self.zero) if isinstance(self.zero, Quantity) else 0.0
+
+    @property
+    def zero_is_sought(self) -> bool:
+        """True if its zero is a parameter to be estimated."""
+        return self.zero == "sought" or (isinstance(self.zero, Quantity) and not isinstance(self.zero.known, bool))
 
     @property
     def is_bare_current(self) -> bool:
@@ -648,6 +664,11 @@ class Machine(FileRecord):
         return 1.0 if body.moves_with is None else float(body.moves_with.ratio)
 
     @property
+    def sought_zeros(self) -> dict[str, Sensor]:
+        """Encoders of free joints whose zero is sought, by name of the parameter: q10 of joint 1."""
+        return {f"q{s.body}0": s for s in self.sensor if s.zero_is_sought and self.is_free(self.find(s.body))}
+
+    @property
     def rubbing(self) -> tuple[Body, ...]:
         """Bodies with dry friction whose coordinate is free; a joint that moves with another sticks with it."""
         return tuple(b for b in self.body if b.friction is not None and b.moves_with is None and self.is_free(b))
@@ -827,6 +848,8 @@ class Machine(FileRecord):
                 )
             if sensor.cylinders:
                 self._check_cylinders(f"sensor[{k}].cylinders", sensor)
+            if sensor.zero_is_sought:
+                self._check_sought_zero(f"sensor[{k}].zero", sensor)
             twin = (sensor.kind, sensor.body)
             if sensor.kind in ("angle", "torque") and twin in measured:
                 raise ValueError(
@@ -836,6 +859,16 @@ class Machine(FileRecord):
             names.add(sensor.name)
         if self.in_ratios:
             self._check_ratios()
+
+    def _check_sought_zero(self, key: str, sensor: Sensor) -> None:
+        """Check that a zero is sought of the encoder that gives a joint's coordinate."""
+        body = self.find(sensor.body)
+        if body.moves_with is not None:
+            raise ValueError(
+                f"{key}: joint {body.index} moves with joint {body.moves_with.joint}: seek that one's zero alone"
+            )
+        if any(c.anchor is not None for s in self.sensor if s.body == sensor.body for c in s.cylinders):
+            raise ValueError(f"{key}: can't be sought, the lever of the cylinders at joint {body.index} depends on it")
 
     def _check_ratios(self) -> None:
         """Check that nothing of a machine whose torques are bare currents asks for torques in N m."""

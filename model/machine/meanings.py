@@ -87,7 +87,7 @@ MEANINGS: dict[str, dict[str, str]] = {
         "unit": "unit of that column: deg, rpm, bar, ... are converted",
         "factor": "[SI unit] of the number 1 in the column, in place of the unit's",
         "return_column": "column of the pressure on the other side, with displacement or cylinders",
-        "zero": "[rad; m if it slides] reading where the joint's coordinate is 0; subtracted",
+        "zero": "[rad; m if it slides] reading at the joint's coordinate 0, subtracted; or 'sought', to estimate it",
         "torque_constant": "[N m/A at the motor] makes a torque of its current",
         "gear_ratio": "turns of the motor per turn of the joint",
         "displacement": "[m3 per turn of the joint, gear included] of a hydraulic motor; 1 cc = 1e-6 m3",

@@ -197,3 +197,13 @@ def test_ur10_is_designed_by_itself() -> None:
     found = design_from(model, problem, DesignRequest(starts=1, trajectory="fourier")).design
     assert found.cond_phi < 6.5
     assert found.max_violation == 0
+
+
+def test_design_takes_zeros_that_no_torque_shows_from_the_file(arm: Model, problem: Problem) -> None:
+    """The zero of the upper arm shows and counts; that of the forearm is a turn of its own centre of mass."""
+    sought = tuple(s.model_copy(update={"zero": "sought"}) if s.kind == "angle" else s for s in arm.machine.sensor)
+    both = arm.for_machine(arm.machine.model_copy(update={"sensor": sought}))
+    found = design_from(both, problem, DesignRequest("accuracy", starts=1, budget_s=5))
+    assert found.given_zeros == ("q20",)
+    assert found.model.base.names == (*arm.base.names, "q10")
+    assert found.design.cond_phi < 1e4

@@ -1,0 +1,180 @@
+"""Encoder zeros that are sought: hidden ones are found with honest intervals, and those that no log shows are named."""
+
+from __future__ import annotations
+
+import copy
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from excite.identification import Estimate, identify, needed_sensors
+from excite.logs import prepare
+from excite.model import Model, build, hidden_zeros, with_given_zeros
+from excite.model.machine import Machine, load_machine
+from excite.simulation import follow_positions, measure, motion_along
+
+ARM = Path(__file__).parents[1] / "support" / "two_joints.toml"
+HIDDEN = np.array([0.02, -0.02])
+SEEDS = range(4)
+
+
+def arm(zero: Any = "sought", known_com: bool = True, mass: float = 1.0, **changes: Any) -> Model:
+    """Two links whose centres of mass lie on their axes, or lie anywhere; mass: factor on the file's."""
+    table: Any = copy.deepcopy(tomllib.loads(ARM.read_text()))
+    for body in table["body"]:
+        com = body["inertia"]["com"]
+        if known_com:
+            com |= {"value": [com["value"][0], 0, 0], "known": True}
+        body["inertia"]["mass"]["value"] *= mass
+    for sensor in table["sensor"]:
+        if sensor["kind"] == "angle" and zero is not None:
+            sensor["zero"] = zero
+    return build(Machine.model_validate(table | changes))
+
+
+def pendulum(zero: Any = "sought", mass: float = 1.0) -> Model:
+    machine = load_machine("pendulum")
+    (body,) = machine.body
+    assert body.inertia is not None
+    inertia = body.inertia.model_dump()
+    inertia["mass"]["value"] *= mass
+    inertia["com"]["known"] = True
+    table = machine.model_dump() | {"sampling_hz": {"value": 100, "source": "definition"}}
+    table["body"] = [body.model_dump() | {"inertia": inertia}]
+    noise = {"angle": {"value": 1e-4, "source": "assumed"}, "torque": {"value": 0.02, "source": "assumed"}}
+    table["sensor"] = [s.model_dump() | {"noise": noise[s.kind]} for s in machine.sensor]
+    if zero is not None:
+        table["sensor"][0]["zero"] = zero
+    return build(Machine.model_validate(table))
+
+
+def truth_of(model: Model) -> np.ndarray:
+    X = model.nominal.copy()
+    X[model.zeros] = HIDDEN[: len(model.zeros)]
+    return X
+
+
+def log_of(model: Model, seed: int) -> pd.DataFrame:
+    """A log of 20 s of slow sums of sines, by a machine whose encoders read HIDDEN too much."""
+    rng, n = np.random.default_rng(seed), len(model.coordinates)
+    t = np.arange(0, 20, 1 / float(model.machine.sampling_hz))
+    q, v, a = np.zeros((3, len(t), n))
+    for k in range(1, 6):
+        w, size, phase = 0.65 * k, 0.6, rng.uniform(0, 2 * np.pi, n)
+        q += size * np.sin(w * t[:, None] + phase)
+        v += size * w * np.cos(w * t[:, None] + phase)
+        a -= size * w**2 * np.sin(w * t[:, None] + phase)
+    X = truth_of(model)
+    motion = follow_positions(model, motion_along(model, t, q, v, a).u, q, v, X)
+    return measure(model, motion, X, seed=seed)
+
+
+def estimate_by(method: str, model: Model, log: pd.DataFrame) -> Estimate:
+    ready = prepare(model, [log], needed_sensors(model, method))
+    return identify(ready.model, ready.logs, method)
+
+
+@pytest.mark.parametrize("zero", [0.02, -0.3])
+def test_forces_act_at_the_reading_less_the_zero(zero: float) -> None:
+    model = arm()
+    q, nu, a = np.random.default_rng(0).uniform(-1, 1, (3, 2, 20))
+    X = model.nominal.copy()
+    expected = model.predict(q - zero, nu, a, model.expand @ X).full()
+    X[model.zeros] = zero
+    assert model.predict(q, nu, a, model.expand @ X).full() == pytest.approx(expected)
+    read = model.read(q, nu, np.zeros((0, 20)), np.zeros((2, 20)), np.zeros((0, 20)), X).full()
+    assert read == pytest.approx(q)
+
+
+@pytest.mark.parametrize("method", ["wls", "joint"])
+@pytest.mark.parametrize("machine", [pendulum, arm])
+def test_hidden_zeros_are_found(machine: Any, method: str) -> None:
+    """From bodies 30 % too heavy; without the zero the centre of mass is off by many deviations, or the fit doubted."""
+    truth, guess = machine(), machine(mass=1.3)
+    z = []
+    for seed in SEEDS:
+        log = log_of(truth, seed)
+        found = estimate_by(method, guess, log)
+        assert found.status == "valid"
+        at = guess.zeros
+        z.append((found.value[at] - truth_of(truth)[at]) / found.std[at])
+        assert (found.std[at] < 0.005).all()
+        others = np.delete((found.value - truth_of(truth)) / found.std, at)
+        assert np.abs(others).max() < 4.5
+    assert np.abs(z).max() < 3.5
+    assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.7
+    without = estimate_by(method, machine(zero=None, mass=1.3), log)
+    assert without.relative_error_percent > 1.2 * found.relative_error_percent
+
+
+@pytest.mark.parametrize("method", ["ols", "tls", "wls+consistent"])
+def test_other_linear_methods_find_zeros(method: str) -> None:
+    truth, guess = arm(), arm(mass=1.3)
+    found = estimate_by(method, guess, log_of(truth, 1))
+    assert found.value[guess.zeros] == pytest.approx(HIDDEN, abs=0.005)
+
+
+@pytest.mark.parametrize("method", ["wls", "joint"])
+def test_axis_along_gravity_says_that_no_log_shows_its_zero(method: str) -> None:
+    model = arm(gravity=[0.0, 0.0, -9.81])
+    found = estimate_by(method, model, log_of(model, 1))
+    assert list(found.unidentifiable) == ["q10"]
+    assert "nothing in this log depends on it" in found.unidentifiable["q10"]
+    k = model.base.names.index("q20")  # the coupling of both joints shows it, as the centre of mass is known
+    assert abs(found.value[k] - HIDDEN[1]) < 3.5 * found.std[k]
+    assert hidden_zeros(model) == {"q10": ()}
+
+
+@pytest.mark.parametrize("method", ["wls", "joint"])
+def test_last_joint_shows_its_zero_only_together_with_the_centre_of_mass(method: str) -> None:
+    model = arm(known_com=False)
+    found = estimate_by(method, model, log_of(model, 1))
+    assert list(found.unidentifiable) == ["q20"]
+    assert "MY2 -" in found.unidentifiable["q20"]
+    assert hidden_zeros(model) == {"q20": ("MX2", "MY2")}
+    assert with_given_zeros(model, ["q20"]).base.names == model.base.names[:-1]
+
+
+def test_what_is_known_of_a_zero_counts() -> None:
+    """A zero known to 0.01 rad that the log does not show keeps its deviation."""
+    model = arm({"value": 0.3, "source": "measured", "known": 0.01}, known_com=False)
+    log = log_of(model, 1)
+    assert log["q1_rad"].mean() == pytest.approx(log_of(arm(known_com=False), 1)["q1_rad"].mean() + 0.3)
+    found = estimate_by("wls", model, log)
+    assert not found.unidentifiable
+    k = model.base.names.index("q20")
+    assert found.std[k] == pytest.approx(0.01, rel=1e-3)
+    assert abs(found.value[k]) < 1e-6
+    exact = arm({"value": 0.3, "source": "measured", "known": True})
+    assert not len(exact.zeros)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "zero", "message"),
+    [
+        (0, "unknown", 'must be "sought" or a table'),
+        (0, 0.02, 'must be "sought" or a table'),
+        (0, {"value": 0.0, "source": "measured", "known": -1}, "a standard deviation > 0"),
+        (1, "sought", "is for the position of a joint"),
+    ],
+)
+def test_impossible_zeros_are_refused(sensor: int, zero: Any, message: str) -> None:
+    table: Any = tomllib.loads(ARM.read_text())
+    table["sensor"][sensor]["zero"] = zero
+    with pytest.raises(ValueError, match=message):
+        Machine.model_validate(table)
+
+
+def test_a_joint_that_moves_with_another_has_no_zero_of_its_own() -> None:
+    table: Any = tomllib.loads(ARM.read_text())
+    del table["body"][1]["actuated"]
+    table["body"][1]["moves_with"] = {"joint": 1}
+    table["sensor"] = [
+        s | ({"zero": "sought"} if s["name"] == "q2" else {}) for s in table["sensor"] if s["name"] != "u2"
+    ]
+    with pytest.raises(ValueError, match="moves with joint 1: seek that one's zero alone"):
+        Machine.model_validate(table)
