@@ -380,15 +380,23 @@ def _friction_torque(s: SymbolicSample, body: Body) -> ca.SX:
 
 
 def _joint_torque(s: SymbolicSample, body: Body) -> ca.SX:
-    """Return Ia q" + Fv w + Fs sgn w + Ks q - Ts [N m] of a joint: rotor, friction, spring."""
-    c, k, torque = body.coordinates[0], body.index, ca.SX(0)
+    """Return Ia q" + Fv w + Fs sgn w [N m] of a joint: rotor and friction."""
+    k, torque = body.index, ca.SX(0)
     if body.drive is not None:
         torque += s.by_name[f"Ia{k}"] * s.machine.ratio(body) * s.a[s.row(body)]
     if body.friction is not None:
         torque += _friction_torque(s, body)
-    if body.spring is not None:
-        torque += s.by_name[f"Ks{k}"] * s.at[c] - s.by_name[f"Ts{k}"]
     return torque
+
+
+def _spring_torque(s: SymbolicSample, body: Body) -> ca.SX:
+    """Return Ks q - Ts + Ds q' [N m] that stretches the spring of a joint, q from its other end."""
+    assert body.spring is not None
+    c, k, bent = body.coordinates[0], body.index, [s.at[body.coordinates[0]], s.rate[body.coordinates[0]]]
+    if body.spring.joint is not None:
+        other = s.machine.find(body.spring.joint).coordinates[0]
+        bent = [s.at[c] - s.at[other], s.rate[c] - s.rate[other]]
+    return s.by_name[f"Ks{k}"] * bent[0] - s.by_name[f"Ts{k}"] + s.by_name.get(f"Ds{k}", 0) * bent[1]
 
 
 def _balance(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, dict[str, ca.SX]]:
@@ -399,6 +407,11 @@ def _balance(s: SymbolicSample, acting: Sequence[ActiveEffect]) -> tuple[ca.SX, 
     for body in machine.body:
         if body.joint in ("revolute", "prismatic") and machine.is_free(body):
             force[s.row(body)] += machine.ratio(body) * _joint_torque(s, body)
+            if body.spring is not None:
+                stretch = _spring_torque(s, body)
+                force[s.row(body)] += machine.ratio(body) * stretch
+                if body.spring.joint is not None:
+                    force[s.row(machine.find(body.spring.joint))] -= stretch
     for e in acting:
         force -= _effect_force(s, e, inertia)
     slips: dict[str, ca.SX] = {}

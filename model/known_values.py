@@ -168,6 +168,8 @@ def _quantities(body: Body) -> Iterator[tuple[str, bool | float, Slopes]]:
         stiffness, rest = body.spring.stiffness, body.spring.rest
         yield f"{where}.spring.stiffness", stiffness.known, {f"Ks{k}": 1.0, f"Ts{k}": float(rest)}
         yield f"{where}.spring.rest", rest.known, {f"Ts{k}": float(stiffness)}
+        if body.spring.damping is not None:
+            yield f"{where}.spring.damping", body.spring.damping.known, {f"Ds{k}": 1.0}
     if body.inertia is None:
         return
     for key in ("mass", "com.x", "com.y", "com.z", *INERTIA_KEYS):

@@ -11,6 +11,7 @@ ACTING = {
     "Ia": "rotor inertia",
     "Ks": "stiffness of the spring",
     "Ts": "spring torque at zero",
+    "Ds": "damping of the spring",
     "Fv": "viscous friction",
     "Fs": "dry friction",
     "Kx": "lengthwise force per slip",

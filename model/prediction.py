@@ -60,6 +60,8 @@ def _linear_parameters(machine: Machine) -> dict[str, tuple[float, str]]:
             stiffness = float(body.spring.stiffness)
             joints[f"Ks{k}"] = (stiffness, "N m/rad" if turn else "N/m")
             joints[f"Ts{k}"] = (stiffness * float(body.spring.rest), "N m" if turn else "N")
+            if body.spring.damping is not None:
+                joints[f"Ds{k}"] = (float(body.spring.damping), "N m s" if turn else "N s/m")
         if body.contact is not None:
             joints[f"Kx{k}"] = (float(body.contact.Kx), "N")
             joints[f"Ky{k}"] = (float(body.contact.Ky), "N")
@@ -95,6 +97,8 @@ def required_signs(machine: Machine) -> dict[str, float]:
             found[f"Ia{body.index}"] = 1.0
         if body.spring is not None:
             found[f"Ks{body.index}"] = 1.0
+            if body.spring.damping is not None:
+                found[f"Ds{body.index}"] = 1.0
         if body.contact is not None:
             found |= dict.fromkeys((f"Kx{body.index}", f"Ky{body.index}"), -1.0)
     return found

@@ -124,6 +124,15 @@ def require_sensors(model: Model, method: str = "joint") -> None:
                     f"{machine.name}: sensor: none of kind {kind} on joint {body.index} ({body.where}): identification"
                     " needs one"
                 )
+    for body in machine.body:
+        if body.spring is None or body.spring.joint is None:
+            continue
+        for end in (body, machine.find(body.spring.joint)):
+            if ("angle", machine.coordinate(end)) not in present:
+                raise MachineError(
+                    f"{machine.name}: sensor: none of kind angle on joint {end.index} ({end.where}): the spring of"
+                    f" {body.where} bends between two encoders"
+                )
     if not machine.planar:
         return
     sensors = machine.sensors("full")
@@ -186,8 +195,12 @@ def add_bias(
 
 
 def recommend_method(model: Model) -> str:
-    """Recommend joint smoothing for a machine with effects, or with slips (a noisy regressor), else wls."""
-    return "joint" if model.slips or not model.plain else "wls"
+    """Recommend joint smoothing for a machine with effects, or with a noisy regressor, else wls.
+
+    Slips are noisy, and so are springs between joints, which bend by small differences of two angles.
+    """
+    bent = any(b.spring is not None and b.spring.joint is not None for b in model.machine.body)
+    return "joint" if model.slips or bent or not model.plain else "wls"
 
 
 def needed_sensors(model: Model, method: str) -> tuple[str, ...]:

@@ -62,7 +62,8 @@ def vary_machine(machine: Machine, spread: float, rng: np.random.Generator, corn
             if record is not None:
                 update[table] = record.model_copy(update={n: changed(getattr(record, n)) for n in names})
         if b.spring is not None:
-            update["spring"] = b.spring.model_copy(update={"stiffness": changed(b.spring.stiffness)})
+            keys = [n for n in ("stiffness", "damping") if getattr(b.spring, n) is not None]
+            update["spring"] = b.spring.model_copy(update={n: changed(getattr(b.spring, n)) for n in keys})
         return b.model_copy(update=update)
 
     return machine.model_copy(update={"body": tuple(body(b) for b in machine.body)})

@@ -137,13 +137,19 @@ class Drive(FileRecord):
 
 
 class Spring(FileRecord):
-    """A spring at a joint, such as a gravity balancer: torque -stiffness (q - rest) on the body.
+    """A spring at a joint, such as a gravity balancer: torque -stiffness (q - rest) - damping q' on the body.
 
-    stiffness [N m/rad, N/m]; rest [rad, m]: where it exerts nothing.
+    stiffness [N m/rad, N/m], damping [N m s, N s/m]; rest [rad, m]: where it exerts nothing.
+
+    joint: the spring's other end sits on that joint, q is then the difference of both coordinates, and the spring pulls
+    at both: a flexible gear between a motor and its link, both with the coordinate that a stiff gear would have.
+    Source: Spong, "Modeling and control of elastic joint robots", Journal of Dynamic Systems 109 (1987).
     """
 
     stiffness: Positive
-    rest: Quantity
+    rest: Quantity = Field(default_factory=_zero)
+    damping: NotNegative | None = None
+    joint: Index | None = None
 
 
 class Contact(FileRecord):
@@ -317,6 +323,8 @@ class Sensor(FileRecord):
     `displacement` [m3 per turn of the joint, gear included], u = displacement / (2 pi) (p - p_return), or those of
     `cylinders` (see `hydraulics`). `factor` is then the pressure of the number 1 [Pa], 4e6 for 0-10 V over 0-400 bar.
 
+    gear_ratio: turns of the motor per turn of the joint, of an encoder (`counts_per_turn` of the motor) or a current.
+
     A torque may be given as the current of its motor: u = `torque_constant` [N m/A at the motor] x `gear_ratio` x
     current. Without the constant all torques must be such currents of motors of one kind; results are then divided by
     that constant (`Machine.in_ratios`).
@@ -362,8 +370,10 @@ class Sensor(FileRecord):
 
     @property
     def resolution(self) -> float | None:
-        """One count [SI unit of the column], None for an analogue sensor."""
-        return None if self.counts_per_turn is None else 2 * math.pi / self.counts_per_turn.value
+        """One count [SI unit of the coordinate], None for an analogue sensor."""
+        if self.counts_per_turn is None:
+            return None
+        return 2 * math.pi / (self.counts_per_turn.value * abs(float(self.gear_ratio or 1.0)))
 
     @property
     def has_noise_figure(self) -> bool:
@@ -376,7 +386,8 @@ class Sensor(FileRecord):
         one = float(self.factor) if self.factor is not None else units.UNITS[self.unit][1]
         if self.displacement is not None:
             one *= float(self.displacement) / (2 * math.pi)
-        return one * float(self.torque_constant or 1.0) * float(self.gear_ratio or 1.0)
+        gear = float(self.gear_ratio or 1.0)
+        return one / gear if self.kind == "angle" else one * float(self.torque_constant or 1.0) * gear
 
     @property
     def shift(self) -> float:
@@ -441,8 +452,10 @@ class Sensor(FileRecord):
             )
         for key in ("torque_constant", "gear_ratio"):
             given = getattr(self, key)
-            if given is not None and (units.UNITS.get(self.unit, ("",))[0] != "current" or self.factor is not None):
-                raise ValueError(f"{key}: makes a torque of a current, unit A or mA without factor")
+            current = units.UNITS.get(self.unit, ("",))[0] == "current" and self.factor is None
+            if given is not None and not current and (self.kind, key) != ("angle", "gear_ratio"):
+                also = ", or an angle of that of a motor" if key == "gear_ratio" else ""
+                raise ValueError(f"{key}: makes a torque of a current, unit A or mA without factor{also}")
             if given is not None and given.value == 0:
                 raise ValueError(f"{key}: must not be 0")
         if self.zero is not None and (self.kind != "angle" or self.is_rate):
@@ -711,6 +724,7 @@ class Machine(FileRecord):
     def _consistent(self) -> Machine:
         self._check_tree()
         self._check_couplings()
+        self._check_springs()
         self._check_locked()
         self._check_sensors()
         if self.problem is not None and self.problem not in self.problems:
@@ -791,6 +805,20 @@ class Machine(FileRecord):
                 for one in (body, other) if key == "moves_with" else ():
                     if one.coordinates[0] in self.locked:
                         raise ValueError(f"locked: {one.coordinates[0]} is coupled by {key}, take one of both out")
+
+    def _check_springs(self) -> None:
+        """Check that springs between joints join two that move on their own."""
+        moving = [b for b in self.body if b.joint in ("revolute", "prismatic") and b.moves_with is None]
+        for k, body in enumerate(self.body):
+            if body.spring is None or body.spring.joint is None:
+                continue
+            allowed = [b.index for b in moving if b is not body and b.coordinates[0] not in self.locked]
+            if body.spring.joint not in allowed:
+                raise ValueError(f"body[{k}].spring.joint: no other free joint {body.spring.joint}, allowed: {allowed}")
+            if body.joint != self.find(body.spring.joint).joint:
+                raise ValueError(f"body[{k}].spring.joint: joins a joint that turns with one that slides")
+            if body not in moving or body.coordinates[0] in self.locked:
+                raise ValueError(f"body[{k}].spring.joint: joint {body.index} doesn't move on its own")
 
     def _check_locked(self) -> None:
         """Check that locked coordinates exist and leave a machine that can be driven."""

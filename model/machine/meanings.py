@@ -53,6 +53,8 @@ MEANINGS: dict[str, dict[str, str]] = {
     "Spring": {
         "stiffness": "[N m/rad; N/m if it slides] of a spring at the joint, such as a gravity balancer",
         "rest": "[rad; m if it slides] where it exerts nothing",
+        "damping": "[N m s/rad; N s/m if it slides] of the spring",
+        "joint": "index of the joint at its other end, such as the motor of a flexible gear; the ground without one",
     },
     "Friction": {
         "Fv": "[N m s/rad; N s/m if it slides] viscous friction: torque per rate",
@@ -89,7 +91,7 @@ MEANINGS: dict[str, dict[str, str]] = {
         "return_column": "column of the pressure on the other side, with displacement or cylinders",
         "zero": "[rad; m if it slides] reading at the joint's coordinate 0, subtracted; or 'sought', to estimate it",
         "torque_constant": "[N m/A at the motor] makes a torque of its current",
-        "gear_ratio": "turns of the motor per turn of the joint",
+        "gear_ratio": "turns of the motor per turn of the joint, of a motor's current or encoder",
         "displacement": "[m3 per turn of the joint, gear included] of a hydraulic motor; 1 cc = 1e-6 m3",
         "cylinders": "[m2, m] areas and levers or pins of the cylinders that turn the joint",
         "kits": 'sets of sensors that it belongs to, "full" always',
