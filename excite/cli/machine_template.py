@@ -106,6 +106,7 @@ RECORDS = {  # of the tables of a machine file, by their headers
     "body.contact": "Contact",
     "body.limit": "JointLimit",
     "sensor": "Sensor",
+    "sensor.loop": "ForceLoop",
     "filter": "Filter",
     "problems": "Problem",
     "effect": "EffectEntry",

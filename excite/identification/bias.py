@@ -13,7 +13,7 @@ import numpy as np
 from excite.errors import NotIdentifiableError, SimulationError
 from excite.identification.estimate import Estimate, add_notes
 from excite.identification.noise_propagation import measure_again
-from excite.logs import Log, lowpass, samples, white_noise
+from excite.logs import Log, lowpass, samples
 from excite.model import Model
 from excite.model.machine import Filter
 from excite.simulation import Motion, delivered_torques, exact_readings, respond
@@ -138,7 +138,7 @@ def measured_again(model: Model, log: Log, motion: Motion, X: np.ndarray, rng: n
     """Simulate the log that the log's own sensors would record of a motion."""
     exact = exact_readings(model, motion, X)
     values = {
-        s.name: measure_again(s, exact[s.name], white_noise(log.values[s.name]), rng)
+        s.name: measure_again(s, exact[s.name], log.white_noise(s.name), rng)
         for s in model.machine.sensors("full")
         if s.name in log.values
     }

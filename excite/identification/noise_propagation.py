@@ -9,7 +9,7 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
-from excite.logs import Log, Samples, decimate, kept_samples, lowpass, regression, samples, white_noise
+from excite.logs import Log, Samples, decimate, kept_samples, lowpass, regression, samples
 from excite.model import Model
 from excite.model.machine import Filter, Sensor
 
@@ -44,7 +44,7 @@ def simulate_rereadings(
     rng = np.random.default_rng(seed)
     present = [s for s in model.machine.sensors("full") if s.name in log.values]
     truth = {s.name: lowpass(log.values[s.name], rate, filter) for s in present}
-    level = {s.name: white_noise(log.values[s.name]) for s in present}
+    level = {s.name: log.white_noise(s.name) for s in present}
     yield Log(log.source, log.t, truth)
     for _ in range(count):
         yield Log(log.source, log.t, {s.name: measure_again(s, truth[s.name], level[s.name], rng) for s in present})

@@ -155,7 +155,7 @@ def _torque_noise(model: Model, logs: Sequence[Log]) -> np.ndarray:
         next(s.name for s in model.machine.sensor if s.kind == "torque" and s.body == b.index)
         for b in model.machine.actuated
     ]
-    return np.array([np.sqrt(np.mean([white_noise(log.values[n]) ** 2 for log in logs])) for n in names])
+    return np.array([np.sqrt(np.mean([log.white_noise(n) ** 2 for log in logs])) for n in names])
 
 
 def _sensor_noise(step: float | None, values: Sequence[np.ndarray]) -> float:

@@ -10,7 +10,7 @@ import scipy
 
 from excite.identification.estimate import Estimate
 from excite.identification.noise_propagation import REREADINGS, measure_again, simulate_rereadings
-from excite.logs import BLOCK, Log, lowpass, samples, white_noise
+from excite.logs import BLOCK, Log, lowpass, samples
 from excite.model import Model
 from excite.model.machine import Filter
 from excite.simulation import Motion, delivered_torques, exact_readings, simulate
@@ -227,7 +227,7 @@ def _smoothing_errors(
     exact = {sensor.name: reading[:, j, 0] for j, sensor in enumerate(space.sensors)}
     exact |= {torque_sensor(model, b.index).name: true[:, k] for k, b in enumerate(model.machine.actuated)}
     present = [s for s in model.machine.sensors("full") if s.name in exact]
-    level = {s.name: white_noise(log.values[s.name]) for s in present}
+    level = {s.name: log.white_noise(s.name) for s in present}
     rate = float(model.machine.sampling_hz)
     residual, prediction = list[np.ndarray](), list[np.ndarray]()
     for _ in range(REREADINGS):

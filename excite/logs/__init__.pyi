@@ -15,10 +15,15 @@ from .filtered import (
     remember as remember,
     samples as samples,
     unmeasured as unmeasured,
-    white_noise as white_noise,
 )
 from .inspection import Inspection as Inspection, guess_machine as guess_machine, inspect as inspect
-from .log import Log as Log, from_table as from_table, read_log as read_log, table_of as table_of
+from .log import (
+    Log as Log,
+    from_table as from_table,
+    read_log as read_log,
+    table_of as table_of,
+    white_noise as white_noise,
+)
 from .plausibility import doubts_in_errors as doubts_in_errors
 from .preparation import Prepared as Prepared, prepare as prepare, read_stretches as read_stretches
 from .profile import (

@@ -45,8 +45,8 @@ def table_from(machine: Machine, log: Log, si: bool = False) -> pd.DataFrame:
 
 
 def _in_file_units(machine: Machine, sensor: Sensor, x: np.ndarray) -> dict[str, np.ndarray]:
-    """Build the columns of a sensor; the pressures of cylinders, which no torque tells, become the torque in SI."""
-    if sensor.cylinders:
+    """Build the columns of a sensor; pressures of cylinders and commands of drives become the torque in SI."""
+    if sensor.cylinders or sensor.loop is not None:
         return {f"{sensor.name} [{machine.si_unit(sensor)}]": x}
     columns = {sensor.column: (x + sensor.shift) / sensor.gain}
     if sensor.return_column is not None:

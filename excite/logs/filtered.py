@@ -284,8 +284,3 @@ def smooth(x: np.ndarray, factor: int) -> np.ndarray:
     """The low-pass before a decimation along axis 1."""
     b, a = scipy.signal.cheby1(8, 0.05, 0.8 / factor)
     return np.asarray(scipy.signal.filtfilt(b, a, x, axis=1, padlen=24))
-
-
-def white_noise(x: np.ndarray) -> float:
-    """Standard deviation of the white part of a signal, from the median size of its third differences."""
-    return float(np.median(np.abs(np.diff(x, 3)))) / (0.6744897501960817 * np.sqrt(20))

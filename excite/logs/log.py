@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +14,15 @@ from excite.logs import tables
 from excite.logs.plausibility import rated_speed
 from excite.logs.tables import MDF_TIME, UNCLEAR
 from excite.logs.times import has_time, seconds
-from excite.model.machine import UNITS, Machine, Sensor, load_machine, shipped_machines, torque_per_pressure
+from excite.model.machine import (
+    UNITS,
+    Machine,
+    Sensor,
+    behind_loop,
+    load_machine,
+    shipped_machines,
+    torque_per_pressure,
+)
 from excite.text import count, format_number
 
 SHORTEST = 100  # samples: below this no filter and no estimate makes sense
@@ -28,7 +36,8 @@ class Log:
 
     interpolated: rows were uneven and are readings between those of the file. sampled: by sensor name the rows (N,) at
     which a channel was read, if not in all; the readings between are interpolated. edges: by encoder (N,) the edges
-    that it passed, moved to the rows' times, NaN where it passed none; for rows that were uneven. doubts: why an
+    that it passed, moved to the rows' times, NaN where it passed none; for rows that were uneven. noise: by sensor name
+    the white noise [SI] of a command whose response is in `values`, the machine file's at least. doubts: why an
     estimate from it is doubtful.
     """
 
@@ -38,6 +47,7 @@ class Log:
     interpolated: bool = False
     sampled: dict[str, np.ndarray] = field(default_factory=dict)
     edges: dict[str, np.ndarray] = field(default_factory=dict)
+    noise: dict[str, float] = field(default_factory=dict)
     doubts: tuple[str, ...] = ()
 
     def read_in(self, sensor: str) -> np.ndarray:
@@ -47,6 +57,10 @@ class Log:
     def readings(self, sensor: str) -> np.ndarray:
         """The readings (M,) of a sensor at the rows where it was read."""
         return self.values[sensor][self.sampled.get(sensor, slice(None))]
+
+    def white_noise(self, sensor: str) -> float:
+        """Standard deviation [SI] of the white noise on a channel; on a command before its loop."""
+        return self.noise.get(sensor) or white_noise(self.values[sensor])
 
     def __len__(self) -> int:
         return len(self.t)
@@ -84,13 +98,23 @@ def with_drives_off(table: pd.DataFrame, machine: Machine) -> pd.DataFrame:
     return table
 
 
+def white_noise(x: np.ndarray) -> float:
+    """Standard deviation of the white part of a signal, from the median size of its third differences."""
+    return float(np.median(np.abs(np.diff(x, 3)))) / (0.6744897501960817 * np.sqrt(20))
+
+
 def from_table(
-    table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), source: str = "log", t: np.ndarray | None = None
+    table: pd.DataFrame,
+    machine: Machine,
+    needs: Sequence[str] = (),
+    source: str = "log",
+    t: np.ndarray | None = None,
+    sampled: Mapping[str, np.ndarray] | None = None,
 ) -> Log:
-    """Check a table of even rows and return it as a Log.
+    """Check a table of even rows and return it as a Log; commands become what their loops deliver.
 
     t (N,) [s]: times that are known to be even; by default those of the time column, which must be at the machine
-    file's rate. Raises LogError.
+    file's rate. sampled: as in a `Log`. Raises LogError.
     """
     wanted = machine.sensors("full")
     known = require_columns(table, machine, needs, source)
@@ -112,7 +136,13 @@ def from_table(
                     f"{source}: column {s.column}: moves by {format_number(np.ptp(moved), 2)} {machine.si_unit(s)},"
                     f" {machine.name} holds it still; is this a log of another machine?"
                 )
-    return Log(source, np.arange(len(t)) / rate if given is None else t, values)
+    t, sampled, noise = np.arange(len(t)) / rate if given is None else t, dict(sampled or {}), {}
+    for s in known:
+        if s.loop is not None:
+            read = values[s.name][sampled.get(s.name, slice(None))]
+            noise[s.name] = max(white_noise(read), float(s.noise or 0))  # what the drive adds, no command shows
+            values[s.name] = behind_loop(s.loop, values[s.name], float(t[1] - t[0]))
+    return Log(source, t, values, sampled=sampled, noise=noise)
 
 
 def require_columns(table: pd.DataFrame, machine: Machine, needs: Sequence[str], source: str) -> list[Sensor]:

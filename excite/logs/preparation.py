@@ -328,11 +328,11 @@ def as_log(stretch: Stretch, machine: Machine, needs: Sequence[str], source: str
     """A stretch as a checked log. Raises LogError."""
     table = stretch.table.assign(**{machine.time_column: 0.0})
     table.attrs = {}
-    made = log.from_table(table, machine, needs, source, np.arange(len(table)) / stretch.rate)
+    sampled = {s.name: stretch.sampled[s.column] for s in machine.sensors("full") if s.column in stretch.sampled}
+    made = log.from_table(table, machine, needs, source, np.arange(len(table)) / stretch.rate, sampled)
     counted = [s for s in machine.sensors("full") if s.column in stretch.edges]
     edges = {s.name: s.gain * stretch.edges[s.column] - s.shift for s in counted}
-    sampled = {s.name: stretch.sampled[s.column] for s in machine.sensors("full") if s.column in stretch.sampled}
-    return replace(made, interpolated=stretch.interpolated, sampled=sampled, edges=edges, doubts=stretch.doubts)
+    return replace(made, interpolated=stretch.interpolated, edges=edges, doubts=stretch.doubts)
 
 
 def without_rests(one: Log, machine: Machine, notes: list[str]) -> list[Log]:

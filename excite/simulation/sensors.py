@@ -23,7 +23,7 @@ def measure(
 
     X (n_base,): parameters, with the torque offsets u0. noise: False for exact readings, which keep these offsets.
     An encoder counts whole steps from a random phase between two edges; noise is white and normal. A sensor slower than
-    the log has no number in the rows between its readings.
+    the log has no number in the rows between its readings. The column of a drive with a known loop holds its command.
     Raises ValueError for an unknown kit.
     """
     if kit not in KITS:
@@ -32,7 +32,11 @@ def measure(
     rng = np.random.default_rng([seed, SENSOR_STREAM])
     columns = {model.machine.time_column: motion.t / UNITS[model.machine.time_unit][1]}
     for sensor in model.machine.sensors(kit):
-        read = _with_sensor_errors(sensor, exact[sensor.name], rng) if noise else exact[sensor.name]
+        read = exact[sensor.name]
+        if sensor.loop is not None:
+            read = machine.before_loop(sensor.loop, read, 1 / float(model.machine.sampling_hz))
+        if noise:
+            read = _with_sensor_errors(sensor, read, rng)
         if sensor.rate_hz is not None:
             read = np.where(_reads_in_row(motion.t, float(sensor.rate_hz)), read, np.nan)
         columns |= _as_columns(sensor, read, _joint_angle(model, motion, sensor))

@@ -155,7 +155,7 @@ def prepare_measurements(space: StateSpace, log: Log, unbiased: bool = False) ->
     rows_per_reading = [N / max(len(log.readings(s.name)), 1) for s in torques]
     torque_noise = np.array(
         [
-            np.sqrt(k) * max(white_noise(log.readings(s.name)), 1e-3 * float(s.noise or 1))
+            np.sqrt(k) * max(log.noise.get(s.name) or white_noise(log.readings(s.name)), 1e-3 * float(s.noise or 1))
             for k, s in zip(rows_per_reading, torques, strict=True)
         ]
     )

@@ -29,6 +29,7 @@ SPIN_SHARE = 0.1  # least spin inertia of a wheel over mass x radius^2; a hoop h
 MAX_DISPLACEMENT = 0.1  # [m3 per turn of the joint]
 MAX_AREA = 0.5  # [m2] of a cylinder
 PRESSURE = (20 * BAR, 1000 * BAR)  # that a limit of torque may ask for
+SLOWEST_LOOP = 0.5  # usual time constant and dead time of a drive's loop [s]; chosen
 FULL_SCALE = {"V": 10.0, "mV": 10e3, "mA": 20.0}  # largest reading of sensors with a factor
 SCALE_TIMES = 8.0  # times that a sensor's range may exceed the pressure at the limit of torque
 COLUMN_UNITS = {"angle": "rad", "yaw_rate": "rad/s"}
@@ -178,6 +179,10 @@ def _readings(machine: Machine) -> Iterator[str]:
             )
         if s.counts_per_turn is not None and float(s.counts_per_turn) < 8:
             yield f"sensor {s.name}: counts_per_turn: {float(s.counts_per_turn):g}: the size of a count, or a ratio?"
+        for key in ("time_constant", "dead_time") if s.loop is not None else ():
+            value = float(getattr(s.loop, key) or 0.0)
+            if value > SLOWEST_LOOP:
+                yield f"sensor {s.name}: loop.{key}: {value:g} s, usual are {SLOWEST_LOOP:g} at most: in ms?"
     if float(machine.sampling_hz) < 2:
         yield f"sampling_hz: {float(machine.sampling_hz):g} Hz: a time step in s?"
 

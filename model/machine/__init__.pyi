@@ -1,4 +1,5 @@
 from .faults import find_faults as find_faults, with_line as with_line
+from .force_loop import ForceLoop as ForceLoop, before_loop as before_loop, behind_loop as behind_loop
 from .hydraulics import torque_per_pressure as torque_per_pressure
 from .machine import (
     LOG_CHECKS as LOG_CHECKS,

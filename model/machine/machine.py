@@ -17,6 +17,7 @@ from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapV
 
 from excite.errors import MachineError
 from excite.model.machine import extends, hydraulics, units
+from excite.model.machine.force_loop import ForceLoop
 from excite.model.machine.records import (
     BodyPoint,
     FileRecord,
@@ -329,6 +330,8 @@ class Sensor(FileRecord):
     current. Without the constant all torques must be such currents of motors of one kind; results are then divided by
     that constant (`Machine.in_ratios`).
 
+    `loop`: the column holds the torque, force or current that the drive was commanded, and this loop delivers it.
+
     `step`: smallest step of a reading [SI]. `rate_hz`: readings per second, if it has fewer than the log has rows.
 
     `zero_if_absent`: a log without this torque's column is one with the drive off: a free decay, a coast-down.
@@ -350,6 +353,7 @@ class Sensor(FileRecord):
     displacement: Positive | None = None
     torque_constant: Quantity | None = None
     gear_ratio: Quantity | None = None
+    loop: ForceLoop | None = None
     zero: Annotated[Quantity | Literal["sought"] | None, WrapValidator(_sought_or_value)] = None
     cylinders: tuple[hydraulics.Cylinder, ...] = ()
     kits: tuple[Literal["paper", "full"], ...] = ("paper", "full")
@@ -458,6 +462,13 @@ class Sensor(FileRecord):
                 raise ValueError(f"{key}: makes a torque of a current, unit A or mA without factor{also}")
             if given is not None and given.value == 0:
                 raise ValueError(f"{key}: must not be 0")
+        if self.loop is not None and (self.kind != "torque" or pressed):
+            raise ValueError("loop: is for a commanded torque, force or current, kind torque without pressures")
+        if self.loop is not None and self.noise is None:
+            raise ValueError(
+                "noise: is missing beside loop: by how much [SI] the delivered torque or force differs from the"
+                " loop's response, which no log of commands shows"
+            )
         if self.zero is not None and (self.kind != "angle" or self.is_rate):
             raise ValueError("zero: is for the position of a joint, kind angle without a rate's unit")
         if self.is_rate and self.counts_per_turn is not None:

@@ -92,6 +92,7 @@ MEANINGS: dict[str, dict[str, str]] = {
         "zero": "[rad; m if it slides] reading at the joint's coordinate 0, subtracted; or 'sought', to estimate it",
         "torque_constant": "[N m/A at the motor] makes a torque of its current",
         "gear_ratio": "turns of the motor per turn of the joint, of a motor's current or encoder",
+        "loop": "time_constant, dead_time of the drive whose command the column holds",
         "displacement": "[m3 per turn of the joint, gear included] of a hydraulic motor; 1 cc = 1e-6 m3",
         "cylinders": "[m2, m] areas and levers or pins of the cylinders that turn the joint",
         "kits": 'sets of sensors that it belongs to, "full" always',
@@ -104,6 +105,10 @@ MEANINGS: dict[str, dict[str, str]] = {
         "time_column": "column of time of a logger with a clock of its own",
         "time_unit": "unit of that column",
         "time_offset": "[s] added to the times of this sensor",
+    },
+    "ForceLoop": {
+        "time_constant": "[s] of its first-order lag: 1 / (2 pi bandwidth in Hz)",
+        "dead_time": "[s] from a command to the first response",
     },
     "Cylinder": {
         "area": "[m2] of the piston",
