@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from support.drives import drive
 
 from excite.identification import Estimate, identify, needed_sensors
 from excite.logs import prepare
 from excite.model import Model, build, hidden_zeros, with_given_zeros
 from excite.model.machine import Machine, load_machine
-from excite.simulation import follow_positions, measure, motion_along
+from excite.simulation import follow_positions, measure, motion_along, simulate
 
 ARM = Path(__file__).parents[1] / "support" / "two_joints.toml"
 HIDDEN = np.array([0.02, -0.02])
@@ -109,6 +110,19 @@ def test_hidden_zeros_are_found(machine: Any, method: str) -> None:
     assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.7
     without = estimate_by(method, machine(zero=None, mass=1.3), log)
     assert without.relative_error_percent > 1.2 * found.relative_error_percent
+
+
+@pytest.mark.slow
+def test_a_roller_shows_the_zero_of_its_articulation() -> None:
+    machine = load_machine("va12")
+    sensors = tuple(s.model_copy(update={"zero": "sought"}) if s.name == "theta2" else s for s in machine.sensor)
+    model = build(machine.model_copy(update={"sensor": sensors}))
+    X = truth_of(model)
+    motion = simulate(model, drive(model, 40, 1, {"u1": 2500, "u4": 2500, "u2": 6000}), X)
+    found = estimate_by("joint", model, measure(model, motion, X, seed=1))
+    assert found.status == "valid"
+    assert found.std[-1] < 0.001
+    assert abs(found.value[-1] - HIDDEN[0]) < 3.5 * found.std[-1]
 
 
 @pytest.mark.parametrize("method", ["ols", "tls", "wls+consistent"])
