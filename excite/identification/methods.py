@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -12,7 +12,7 @@ import numpy as np
 from excite.errors import MachineError, NoEstimateError, NotIdentifiableError
 from excite.identification import bias
 from excite.identification.bias import Estimator
-from excite.identification.estimate import Estimate, add_notes
+from excite.identification.estimate import Estimate, add_notes, held_note
 from excite.identification.identifiability import add_advice
 from excite.identification.instrumental_variables import iv
 from excite.identification.joint import joint
@@ -20,9 +20,10 @@ from excite.identification.linear_methods import filtered_blocks, ols, tls, wls
 from excite.identification.output_error import oe
 from excite.identification.status import assess
 from excite.logs import NEEDED, Log, doubts_in_errors, examine, planar_speed_sensors, samples, unmeasured
-from excite.model import Model
+from excite.model import Model, with_given_zeros
 from excite.model.machine import Filter
 from excite.simulation import outside_law
+from excite.text import format_number
 
 RATIOS_NOTE = (
     "no torque constant is given, so torques are currents and every value is divided by that constant (N m/A at the"
@@ -237,26 +238,59 @@ def relinearise(plain: Estimator) -> Estimator:
     """Repeat a linear method along the regressor of its own estimate, for encoder zeros that are sought.
 
     The torques are linear in all other parameters, and in a zero only near the values at which they are linearised
-    (Gauss-Newton). Raises NotIdentifiableError if the values don't settle.
+    (Gauss-Newton). A zero that the logs show less well than its size, the first time, would run away: it is held at the
+    machine file's value. Raises NotIdentifiableError if the values don't settle.
     """
 
     def method(model: Model, logs: Sequence[Log], filter: Filter) -> Estimate:
         """The linear method, linearised at its own estimate."""
         estimate = plain(model, logs, filter)
-        if not len(model.zeros):
-            return estimate
-        for _ in range(MAX_LINEARISATIONS):
+        free = [k for k in model.zeros if np.isnan(model.known.std[k])]
+        poor = {model.base.names[k]: estimate.std[k] for k in free if estimate.std[k] > model.scale[k]}
+        if poor:
+            rest = with_given_zeros(model, poor)
+            kept = [model.base.names.index(n) for n in rest.base.names]
+            found = method(replace(rest, nominal=model.nominal[kept]), logs, filter)
+            return _with_held_zeros(model, found, poor)
+        for _ in range(MAX_LINEARISATIONS if len(model.zeros) else 0):
             at = estimate.value_or(model.nominal)
             estimate = plain(replace(model, nominal=at), logs, filter)
             step = np.abs(estimate.value - at) / estimate.std
             if not np.nanmax(step, initial=0.0) > SETTLED_STEP:
                 return estimate
-        raise NotIdentifiableError(
-            f"{estimate.method}: the encoder zeros that are sought don't settle: give their values in the machine file,"
-            " or use joint"
-        )
+        if len(model.zeros):
+            raise NotIdentifiableError(
+                f"{estimate.method}: the encoder zeros that are sought don't settle: give their values in the machine"
+                " file, or use joint"
+            )
+        return estimate
 
     return method
+
+
+def _with_held_zeros(model: Model, found: Estimate, poor: Mapping[str, float]) -> Estimate:
+    """Return an estimate for all parameters of a model from one without some encoder zeros.
+
+    poor: standard deviation of these zeros by name.
+    """
+    n, at = len(model.base.names), [model.base.names.index(name) for name in found.names]
+    value, covariance = np.full(n, np.nan), np.full((n, n), np.nan)
+    value[at], covariance[np.ix_(at, at)] = found.value, found.covariance
+    units = dict(zip(model.base.names, model.base.units, strict=True))
+    reasons = {
+        name: f"hardly identifiable from this log: known to {format_number(std, 2)} {units[name]} only, which"
+        " is no help to find an encoder's zero"
+        for name, std in poor.items()
+    }
+    return replace(
+        found,
+        names=model.base.names,
+        units=model.base.units,
+        value=value,
+        covariance=covariance,
+        unidentifiable={**found.unidentifiable, **reasons},
+        notes=(*found.notes, held_note(list(poor))),
+    )
 
 
 MAX_LINEARISATIONS = 20  # of a linear method for encoder zeros; chosen

@@ -192,3 +192,17 @@ def test_a_joint_that_moves_with_another_has_no_zero_of_its_own() -> None:
     ]
     with pytest.raises(ValueError, match="moves with joint 1: seek that one's zero alone"):
         Machine.model_validate(table)
+
+
+def test_a_zero_that_a_log_hardly_shows_is_held() -> None:
+    """In a louder log the first estimate of q10 is known to more than its size of 0.02 rad: it would run away."""
+    model = arm(known_com=False)
+    log, rng = log_of(model, 1), np.random.default_rng(0)
+    loud = log.assign(**{c: log[c] + 1.5 * rng.standard_normal(len(log)) for c in ("tau1_Nm", "tau2_Nm")})
+    found = estimate_by("wls", model, loud)
+    assert set(found.unidentifiable) == {"q10", "q20"}
+    assert "hardly identifiable from this log: known to 0.0" in found.unidentifiable["q10"]
+    assert found.names == model.base.names
+    assert np.isnan(found.value[model.zeros]).all()
+    assert np.isfinite(np.delete(found.value, model.zeros)).all()
+    assert any("held at the machine file's value: q10" in note for note in found.notes)
