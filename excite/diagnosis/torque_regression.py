@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import scipy.stats
@@ -20,7 +21,7 @@ import scipy.stats
 from excite import identification
 from excite.diagnosis.curves import Curve, find_curves
 from excite.diagnosis.deadline import Deadline
-from excite.diagnosis.diagnosis import Finding, NearestEffect, ParameterChange
+from excite.diagnosis.diagnosis import MIN_EXPLAINED_SHARE, Finding, NearestEffect, ParameterChange
 from excite.diagnosis.hold_out import HoldOutErrors, torque_names
 from excite.diagnosis.score_test import Candidate
 from excite.diagnosis.selection import ProgressCallback, identified_entry
@@ -119,19 +120,18 @@ def diagnose_torques(
     between = [before.with_terms(after.terms[:k]) for k in range(1, len(after.terms))]
     stages = [before, *between, after] if after.terms else [before]
     withheld = [stage.hold_out(before)[1] for stage in stages]
-    explained = _explains(after)
-    total = _excess(before)
-    findings = []
-    for old, new, term in zip(stages, stages[1:], after.terms, strict=False):
-        share = (_excess(old) - _excess(new)) / total if total > 0 else 1.0
-        findings.append(_finding(search, after, term, share, "cause" if explained else "correction"))
+    explained, total = _explains(after), _excess(before)
+    shares = [(_excess(a) - _excess(b)) / total if total > 0 else 1.0 for a, b in pairwise(stages)]
+    named = explained or sum(shares) >= MIN_EXPLAINED_SHARE
+    kind = "cause" if named else "correction"
+    findings = [_finding(search, after, *each, kind) for each in zip(after.terms, shares, strict=True)]
     verdict = "unexplained"
-    if explained:
+    if named:
         tied = any(f.rivals for f in findings)
         verdict = "clean" if not findings else "tied" if tied else "named"
     curves = [] if explained or deadline.is_over() else find_curves(after, search.torques, report)
     located = [] if explained else [*_what_is_left(after), *map(str, curves)]
-    share = 1.0 if explained else sum(f.share for f in findings)
+    share = 1.0 if explained else sum(shares)
     found = TorqueDiagnosis(
         verdict, tuple(findings), before, after, share, tuple(located), tuple(curves), solution, tuple(reasons)
     )

@@ -80,6 +80,14 @@ def test_what_is_hidden_under_a_slow_error_is_a_correction(emps: Model, effect: 
     assert found.findings[0].magnitude_std < 0.3 * abs(size)
 
 
+def test_what_takes_nearly_all_of_the_misfit_is_the_cause_and_the_rest_is_said(emps: Model) -> None:
+    found = diagnosed(emps, rig_log(0, lambda q, v, F: -80 * np.abs(v)))
+    assert found.verdict == "named"
+    assert [(f.effect, f.kind) for f in found.findings] == [("asymmetric_viscous", "cause")]
+    assert 0.85 < found.share < 1
+    assert "times its noise" in found.located[0]
+
+
 @pytest.mark.parametrize(("late", "seed"), [(0.01, 0), (0.03, 1)])
 def test_a_late_channel_is_no_friction(emps: Model, late: float, seed: int) -> None:
     """It moves the step of the force at every reversal, as friction near rest would."""
