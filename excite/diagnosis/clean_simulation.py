@@ -12,13 +12,23 @@ from functools import partial
 
 import numpy as np
 
-from excite import identification, smoothing
-from excite.diagnosis.fits import ExtendedFit, iterate, prepare_data
+from excite import identification
+from excite.diagnosis.fits import ExtendedFit
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.residuals import concentrations, residuals_of_logs
 from excite.errors import SimulationError
 from excite.logs import Log
-from excite.smoothing import Fit, NotConvergedError
+from excite.simulation import Motion
+from excite.smoothing import (
+    ACCEPTABLE_STEP,
+    RESUMED_DAMPING,
+    Fit,
+    NotConvergedError,
+    StateSpace,
+    Trajectory,
+    fit_logs,
+    prepare_logs,
+)
 from excite.text import format_number
 
 RUNS = 2  # simulated logs, which runs of two processes give in the time of one; chosen
@@ -86,8 +96,8 @@ def measure_remainder(stage: ExtendedFit, runner: CallRunner = run_in_turn, seed
     )
 
 
-def simulate_clean(stage: ExtendedFit, seed: int) -> list[Log]:
-    """Simulate logs of the fitted machine along the logs of a fit. Raises SimulationError."""
+def simulate_clean(stage: ExtendedFit, seed: int) -> tuple[list[Log], list[Motion]]:
+    """Simulate logs of the fitted machine along the logs of a fit, and their motions. Raises SimulationError."""
     model, X, filter = stage.model, stage.fit.X, stage.machine.filter
     rng = np.random.default_rng(seed)
     motions = [identification.simulate_along_log(model, log, X, filter) for log in stage.data.logs]
@@ -97,17 +107,37 @@ def simulate_clean(stage: ExtendedFit, seed: int) -> list[Log]:
     ]
     half = {s.name: 0.5 * s.resolution for s in stage.machine.sensors("full") if s.resolution is not None}
     # whole counts, whose edges a log shows
-    return [replace(x, values={n: v + half.get(n, 0.0) for n, v in x.values.items()}) for x in read]
+    return [replace(x, values={n: v + half.get(n, 0.0) for n, v in x.values.items()}) for x in read], motions
 
 
 def _clean_squares(stage: ExtendedFit, seed: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Fit simulated logs; return sums of squared innovations (m,) and numbers of readings (m,)."""
+    """Fit simulated logs from their true motions; return sums of squared innovations (m,) and numbers of readings."""
+    space, X = stage.data.space, stage.fit.X
     try:
-        data = prepare_data(stage.machine, simulate_clean(stage, seed), stage.machine.filter)
-        fit = iterate(data, stage.fit.trajectories, stage.fit.X, 0.0, smoothing.RESUMED_DAMPING)
+        logs, motions = simulate_clean(stage, seed)
+        measurements, starts = prepare_logs(space, logs, stage.machine.filter)
+        true = [_true_trajectory(space, motion, start) for motion, start in zip(motions, starts, strict=True)]
+        fit = fit_logs(
+            space,
+            measurements,
+            true,
+            X,
+            starts,
+            0.0,
+            stage.data.held,
+            RESUMED_DAMPING,
+            sufficient_step=ACCEPTABLE_STEP,  # one standard deviation of a parameter is one of the cost
+            patient=False,
+        )
     except (SimulationError, NotConvergedError):
         return None
     return _sum_squares(fit)
+
+
+def _true_trajectory(space: StateSpace, motion: Motion, start: Trajectory) -> Trajectory:
+    """Return a simulated motion as the trajectory of its log, with the encoders' counts where `start` has them."""
+    state, ground = space.from_full_state(np.hstack([motion.q, motion.nu, motion.wheels, motion.memory]))
+    return replace(start, state=state, ground_inputs=ground)
 
 
 def _sum_squares(fit: Fit) -> tuple[np.ndarray, np.ndarray]:

@@ -90,7 +90,7 @@ def count_false_alarms(
                 break
             report(k / runs, f"diagnosing clean log {k + 1} of {runs}")
             try:
-                logs = simulate_clean(d.after, FIRST_SEED + k)
+                logs, _ = simulate_clean(d.after, FIRST_SEED + k)
                 found = assess(diagnose(model, logs, machine.filter, runner=runner), runner=runner).diagnosis
             except (NoEstimateError, SimulationError):
                 found = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +14,12 @@ from support.drives import designed
 from support.logs import logged, make_log
 
 from excite.diagnosis import count_false_alarms, diagnose, run_forked
-from excite.diagnosis.clean_simulation import MIN_STDS, measure_remainder
+from excite.diagnosis.clean_simulation import MIN_STDS, RUNS, measure_remainder
 from excite.diagnosis.fits import fit_machine, refit
 from excite.logs import Log, from_table, read_log
 from excite.model import Model
 from excite.simulation import Motion
+from excite.smoothing import gauss_newton
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +47,20 @@ def test_an_error_of_one_sensor_is_found_in_that_sensor(straight: Model, clean: 
     assert found.signal == "thetal"
     assert found.ratio > 1.05
     assert "thetal" in str(found)
+
+
+def test_simulated_logs_are_fitted_from_their_motions_in_few_passes(
+    straight: Model, clean: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage, passes, true = fit_machine(straight.machine, [clean], straight.machine.filter), [], gauss_newton.newton_step
+
+    def counted(*args: Any) -> Any:
+        passes.append(args)
+        return true(*args)
+
+    monkeypatch.setattr(gauss_newton, "newton_step", counted)
+    assert measure_remainder(stage) is not None
+    assert len(passes) <= 3 * RUNS
 
 
 def test_process_noise_hides_what_is_left(straight: Model, clean: Log) -> None:
