@@ -133,10 +133,10 @@ Entry = tuple[Finding, ExtendedFit]
 def _hold_out(
     stages: Sequence[ExtendedFit], every_turn: bool, runner: CallRunner, report: ProgressCallback
 ) -> list[HoldOutErrors | None]:
-    """Predict withheld stretches with each model, side by side."""
+    """Predict withheld stretches with each model, side by side. A single one needs no likelihood to be compared."""
     done = list[HoldOutErrors | None]()
     report(0.0, "measuring the gain")
-    for errors in runner([partial(hold_out.hold_out_errors, s, every_turn) for s in stages]):
+    for errors in runner([partial(hold_out.hold_out_errors, s, every_turn, len(stages) > 1) for s in stages]):
         done.append(errors)
         report(len(done) / (len(stages) + 1), "measuring the gain")
     return done

@@ -42,7 +42,7 @@ class HoldOutErrors:
     number of readings. signal_variance (m,): mean variance of a signal within a stretch. noise_variance (m,): variance
     of a reading. turn (stretches,): stretches of one turn are hidden at once. log_likelihood (stretches,): of the
     readings of a stretch given all before them, with the parameters of the rest, by level of process noise
-    (stretches, LIKELIHOOD_LEVELS); NaN if there is none.
+    (stretches, LIKELIHOOD_LEVELS); NaN if there is none or it was not asked for.
     """
 
     sensors: tuple[tuple[str, str], ...]
@@ -96,11 +96,12 @@ class HoldOutGain:
     signals: Mapping[str, tuple[float, float, str]]
 
 
-def hold_out_errors(stage: ExtendedFit, every_turn: bool = False) -> HoldOutErrors | None:
+def hold_out_errors(stage: ExtendedFit, every_turn: bool = False, likelihood: bool = False) -> HoldOutErrors | None:
     """Predict withheld stretches of a fit's logs with its model.
 
-    every_turn: withhold every part of the logs once, not WANTED_STRETCHES only. The machine file's parameters are used
-    if none were estimated. Return None if no fit to the rest is found or the logs are too short.
+    every_turn: withhold every part of the logs once, not WANTED_STRETCHES only. likelihood: find `log_likelihood`, too.
+    The machine file's parameters are used if none were estimated. Return None if no fit to the rest is found or the
+    logs are too short.
     """
     data, fit = stage.data, stage.fit
     held = data.held | fit.unidentifiable if stage.estimated or data.noise_inflation > 1 else np.ones_like(data.held)
@@ -113,7 +114,7 @@ def hold_out_errors(stage: ExtendedFit, every_turn: bool = False) -> HoldOutErro
     parts = []
     for turn in range(turns):
         stretches = [_stretches(n, rate, turn / turns) for n in lengths]
-        part = _errors_of_turn(stage, held, stretches, turn) if any(stretches) else None
+        part = _errors_of_turn(stage, held, stretches, turn, likelihood) if any(stretches) else None
         if part is not None:
             parts.append(part)
     if not parts:
@@ -176,7 +177,7 @@ def torque_names(machine: Machine) -> tuple[tuple[str, str], ...]:
 
 
 def _errors_of_turn(
-    stage: ExtendedFit, held: np.ndarray, stretches: Sequence[Sequence[tuple[int, int]]], turn: int
+    stage: ExtendedFit, held: np.ndarray, stretches: Sequence[Sequence[tuple[int, int]]], turn: int, likelihood: bool
 ) -> HoldOutErrors | None:
     """Hide some stretches of each log at once, and predict them; None if no fit to the rest is found."""
     data, fit = stage.data, stage.fit
@@ -227,21 +228,22 @@ def _errors_of_turn(
         np.mean(motion, axis=0),
         np.mean(noise, axis=0),
         np.full(len(squares), turn),
-        _likelihood_of_stretches(stage, rest, stretches),
+        _likelihood_of_stretches(stage, rest, stretches, LIKELIHOOD_LEVELS if likelihood else ()),
     )
 
 
 def _likelihood_of_stretches(
-    stage: ExtendedFit, rest: Fit, stretches: Sequence[Sequence[tuple[int, int]]]
+    stage: ExtendedFit, rest: Fit, stretches: Sequence[Sequence[tuple[int, int]]], levels: Sequence[float]
 ) -> np.ndarray:
-    """Return the log-likelihood (stretches, levels) with the parameters of a fit, for each level of process noise.
+    """Return the log-likelihood (stretches, LIKELIHOOD_LEVELS) with the parameters of a fit, for the first levels of
+    process noise, as long as it grows with them.
 
     Every reading counts given those before it, by the innovations of a filter along all readings. A model that explains
     the logs has no process noise.
     """
     data = stage.data
     found = np.full((sum(len(own) for own in stretches), len(LIKELIHOOD_LEVELS)), np.nan)
-    for k, level in enumerate(LIKELIHOOD_LEVELS):
+    for k, level in enumerate(levels):
         if level > 0 and rest.process_noise == 0 and stage.is_close:
             break
         linear = smoothing.linearise_logs(data.space, data.measurements, rest.trajectories, data.starts, rest.X, level)
@@ -255,6 +257,8 @@ def _likelihood_of_stretches(
             each = -0.5 * (x.innovations**2 + np.log(variance))
             likelihood += [float(np.nansum(each[a:b])) for a, b in own]
         found[:, k] = likelihood
+        if k and found[:, k].sum() < found[:, k - 1].sum():
+            break
     return found
 
 

@@ -904,6 +904,16 @@ def test_stretches_are_withheld_from_fits_that_are_near_enough(
     assert set(asked) == {(0.0, gauss_newton.SUFFICIENT_STEP), (0.1, gauss_newton.ACCEPTABLE_STEP)}
 
 
+def test_the_likelihood_of_withheld_stretches_is_found_up_to_the_level_that_suits_best(straight: Model) -> None:
+    stage = calm(straight)
+    assert np.isnan(hold_out.hold_out_errors(stage).log_likelihood).all()  # only where it is asked for
+    noisy = replace(stage, fit=replace(stage.fit, process_noise=0.1))
+    total = hold_out.hold_out_errors(noisy, likelihood=True).log_likelihood.sum(axis=0)
+    known = total[np.isfinite(total)]
+    assert len(known) < len(total)
+    assert np.argmax(known) == max(len(known) - 2, 0)
+
+
 def test_candidates_are_scored_once_along_a_fit(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Along another one anew, however alike."""
     stage, scans = calm(straight), list[gauss_newton.Fit]()
