@@ -14,26 +14,23 @@ import scipy.ndimage
 import scipy.signal
 import scipy.stats
 
-from excite.diagnosis.spectrum import line_ratios
+from excite.diagnosis.spectrum import FALSE_ALARM_PROBABILITY, strongest_line
 from excite.logs import Log, white_noise
 from excite.model.machine import Machine, Sensor
 from excite.smoothing import Fit
 
-FALSE_ALARM_PROBABILITY = 1e-4  # of each test in one log; chosen
 MIN_READINGS = 50  # readings of a signal that are tested; chosen
 OUTLIER_MARGIN = 1.6  # factor on the threshold of outliers, as encoder edges have no normal errors; chosen
 
 WINDOWS_S = 0.5, 2.0  # lengths of windows [s]; chosen
 MIN_WINDOWS = 3  # windows in a log that are tested; chosen
 MIN_WINDOW_READINGS = 10  # readings in a window that counts; chosen
-MIN_WINDOW_MEAN_SQUARE = 1.6  # mean square of innovations of a burst, however significant; chosen
+MIN_SYSTEMATIC_MEAN_SQUARE = 1.6  # mean square of innovations that are no noise, however significant; chosen
 BURST_MARGIN = 1.3  # factor on the threshold of the normalised sum of squares; chosen
 DRIFT_MARGIN = 1.2  # factor on the threshold of the normalised sum; chosen
 
-SPECTRUM_NEIGHBOURS = 201  # ordinates of the periodogram whose median is the level about a peak; chosen
-TONE_BAND = 0.0, 0.5  # band of tones in innovations, shares of the sampling rate: all
 TONE_MARGIN = 1.3  # factor on the threshold of tones in innovations; chosen
-TORQUE_TONE_BAND = 0.2, 0.48  # the same above an actuator's bandwidth; chosen
+TORQUE_TONE_BAND = 0.2, 0.48  # above an actuator's bandwidth, shares of the sampling rate; chosen
 TORQUE_TONE_MARGIN = 2.0  # factor on the threshold of tones in a torque channel; chosen
 
 MIN_STUCK_COUNTS = 3.0  # counts before and after a sample without any that make it stuck; chosen
@@ -132,7 +129,7 @@ def _innovation_anomalies(name: str, t: np.ndarray, z: np.ndarray, rate: float, 
     for width in WINDOWS_S:
         yield from _window_anomalies(name, t, own, valid, round(width * rate), square_variance)
     if not counts:
-        yield from _tone(name, own, rate, TONE_BAND, TONE_MARGIN)
+        yield from _tone(name, own, rate, (0.0, np.inf), TONE_MARGIN)
 
 
 def _window_anomalies(
@@ -160,7 +157,8 @@ def _window_anomalies(
     chi2_limit = (float(scipy.stats.chi2.isf(FALSE_ALARM_PROBABILITY / n, freedom)) / freedom - 1) * np.sqrt(
         freedom / 2
     )
-    if burst_statistic[k] > max(limit * BURST_MARGIN, chi2_limit) and squares[k] > MIN_WINDOW_MEAN_SQUARE * counts[k]:
+    systematic = squares[k] > MIN_SYSTEMATIC_MEAN_SQUARE * counts[k]
+    if systematic and burst_statistic[k] > max(limit * BURST_MARGIN, chi2_limit):
         yield Anomaly(name, "burst", t[k * width], t[(k + 1) * width - 1], None, burst_statistic[k] / limit)
     drift_statistic = np.where(enough, np.abs(sums) / np.sqrt(np.maximum(counts, 1)), 0.0)
     k = int(np.argmax(drift_statistic))
@@ -173,12 +171,9 @@ def _tone(name: str, x: np.ndarray, rate: float, band: tuple[float, float], marg
 
     margin: factor on the threshold, for spectra not quite flat.
     """
-    f, ratio, _ = line_ratios(x, rate, "boxcar", SPECTRUM_NEIGHBOURS, skip=2)
-    ratio = np.where((f >= band[0] * rate) & (f <= band[1] * rate), ratio, 0.0)
-    limit = float(np.log(len(f) / FALSE_ALARM_PROBABILITY)) * margin
-    k = int(np.argmax(ratio))
-    if ratio[k] > limit:
-        yield Anomaly(name, "tone", 0.0, len(x) / rate, float(f[k]), ratio[k] / limit)
+    line = strongest_line(x, rate, band[0] * rate, band[1] * rate, margin)
+    if line is not None:
+        yield Anomaly(name, "tone", 0.0, len(x) / rate, *line)
 
 
 def _stuck_counts(sensor: Sensor, t: np.ndarray, value: np.ndarray) -> Iterator[Anomaly]:
@@ -235,5 +230,5 @@ def _torque_anomalies(name: str, t: np.ndarray, u: np.ndarray, rate: float) -> I
         np.exp(scipy.stats.norm.isf(FALSE_ALARM_PROBABILITY / n) * LOG_MEDIAN_SQUARE_SCATTER / np.sqrt(width))
     )
     k = int(np.argmax(level))
-    if level[k] > limit and level[k] > MIN_WINDOW_MEAN_SQUARE:
+    if level[k] > limit and level[k] > MIN_SYSTEMATIC_MEAN_SQUARE:
         yield Anomaly(name, "burst", t[k * width], t[(k + 1) * width - 1], None, level[k] / limit)

@@ -16,7 +16,8 @@ import scipy
 from excite import identification
 from excite.diagnosis.fits import ExtendedFit, refit_all, with_true_sensor_noise
 from excite.diagnosis.parallel import run_in_turn
-from excite.diagnosis.spectrum import line_ratios
+from excite.diagnosis.residual_tests import MIN_SYSTEMATIC_MEAN_SQUARE, TONE_MARGIN
+from excite.diagnosis.spectrum import strongest_line
 from excite.smoothing import LinearisedLog, advance, differentiate, state_scale
 from excite.text import format_number
 
@@ -28,11 +29,8 @@ MIN_RANGE_SHARE = 0.02  # share of a log below which a range is given by its tim
 CONCENTRATED_EXCESS = 0.6  # share of the excess in a range that is reported; chosen
 CONCENTRATED_SAMPLES = 0.3  # largest share of the samples in such a range; chosen
 MAX_CONCENTRATIONS = 2  # ranges that are reported for a signal; chosen
-MIN_PEAK_RATIO = 15.0  # periodogram over its level at a peak, plus log(ordinates); chosen: noise stays below 11
 MIN_PEAK_HZ = 2.0  # frequency [Hz] below which the motion itself has peaks; chosen
-PEAK_NEIGHBOURS = 101  # ordinates of the periodogram whose median is the level about a peak; chosen
 SPECTRUM_SEGMENT_S = 10.24  # length of the segments of a spectrum [s]; chosen: 1024 samples at 100 Hz
-MAX_NOISE_MEAN_SQUARE = 1.6  # mean square of innovations above which they are systematic; chosen: above all null logs
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ class InnovationLevel:
         worst = max(self.mean_square, self.slow_mean_square)
         if not np.isfinite(worst):
             return float("nan")
-        return 100 * (1 - 1 / worst) if worst > MAX_NOISE_MEAN_SQUARE else 0.0
+        return 100 * (1 - 1 / worst) if worst > MIN_SYSTEMATIC_MEAN_SQUARE else 0.0
 
 
 def refit_with_process_noise(stage: ExtendedFit) -> ExtendedFit:
@@ -298,7 +296,7 @@ def locate_misfit(stage: ExtendedFit) -> tuple[str, ...]:
     lines: list[str] = []
     for log_residuals in residuals_of_logs(stage):
         for name, size in innovation_levels(log_residuals).items():
-            if not max(size.mean_square, size.slow_mean_square) > MAX_NOISE_MEAN_SQUARE:
+            if not max(size.mean_square, size.slow_mean_square) > MIN_SYSTEMATIC_MEAN_SQUARE:
                 continue
             z = log_residuals.innovations[:, log_residuals.sensors.index(name)]
             parts = [
@@ -394,13 +392,8 @@ def _spectral_peak(log_residuals: LogResiduals, z: np.ndarray) -> float | None:
     if valid.mean() < 0.5:
         return None
     z = scipy.signal.detrend(np.where(valid, z, 0.0))
-    f, ratio, level = line_ratios(z, log_residuals.rate, "hann", PEAK_NEIGHBOURS)
-    high = (f > MIN_PEAK_HZ) & (level > 0)
-    if not high.any():
-        return None
-    ratio = np.where(high, ratio, 0.0)
-    k = int(np.argmax(ratio))
-    return float(f[k]) if ratio[k] > MIN_PEAK_RATIO + np.log(len(f)) else None
+    line = strongest_line(z, log_residuals.rate, MIN_PEAK_HZ, np.inf, TONE_MARGIN, "hann")
+    return None if line is None else line[0]
 
 
 def mean_innovation_levels(logs: Sequence[LogResiduals]) -> dict[str, InnovationLevel]:
