@@ -36,7 +36,6 @@ from excite.model.machine import EffectEntry, Filter
 from excite.smoothing import NotConvergedError
 
 MAX_EFFECTS = 4  # number of effects; so many kinds without a main cause are a patchwork; chosen
-MAIN_CAUSE_SHARE = 0.7  # share of the misfit that a main cause explains; chosen
 MIN_EXPLAINED_SHARE = 0.85  # of the excess misfit, for a name; right causes in results/diagnosis explain 0.85 or more
 MIN_GAIN_SHARE_OF_NEXT = 0.1  # share of the next effect's score that an effect with process noise must gain; chosen
 MIN_COST_PER_ANOMALY = 50.0  # cost that an anomaly counts at least; chosen
@@ -323,7 +322,7 @@ def _largest_of_patchwork(chosen: Sequence[Choice], anomalies: Sequence[str]) ->
         return None
     most, gained = max(chosen, key=lambda x: x.likelihood_ratio), sum(x.likelihood_ratio for x in chosen)
     share = _explained_share(gained, chosen[-1].stage, anomalies) * most.likelihood_ratio / gained
-    return NearestEffect(most.name, share) if share < MAIN_CAUSE_SHARE else None
+    return NearestEffect(most.name, share) if share < selection.MAIN_CAUSE_SHARE else None
 
 
 def review_effects(before: ExtendedFit, chosen: Sequence[Choice], runner: CallRunner = run_in_turn) -> list[Choice]:

@@ -48,7 +48,11 @@ IMPOSSIBLE_SIGN_SHARE = 0.5  # share of the parameter's scale beyond zero, likew
 RESUMED_PASSES = 14  # largest number of passes of a fit that continues another; chosen
 SENSOR_NOISE_INFLATIONS = 10.0, 30.0  # factors on the sensors' standard deviations, tried in turn; chosen
 PROCESS_NOISE_REDUCTIONS = 0.1, 0.3  # shares of a fit's process noise that are tried next, in turn; chosen
-MIN_PROCESS_NOISE = PROCESS_NOISE_REDUCTIONS[0] * identification.PROCESS_NOISE_LEVELS[0]  # derived: the least tried
+PROCESS_NOISE_LADDER = (  # all levels that are tried
+    *(share * identification.PROCESS_NOISE_LEVELS[0] for share in PROCESS_NOISE_REDUCTIONS),
+    *identification.PROCESS_NOISE_LEVELS,
+)
+MIN_PROCESS_NOISE = PROCESS_NOISE_LADDER[0]
 
 
 @dataclass(frozen=True)

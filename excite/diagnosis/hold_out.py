@@ -16,22 +16,21 @@ import scipy.stats
 
 from excite import identification, smoothing
 from excite.diagnosis import selection
-from excite.diagnosis.fits import ExtendedFit
+from excite.diagnosis.fits import MIN_PROCESS_NOISE, PROCESS_NOISE_LADDER, ExtendedFit
 from excite.logs import filtered_regression
 from excite.model import build
 from excite.model.machine import Machine
 from excite.smoothing import Fit, NotConvergedError, predict_readings
 
 STRETCH_S = 2.0  # length of a withheld stretch [s]; chosen
-PERIOD_S = 6.0  # distance from stretch to stretch [s]; chosen
 WANTED_STRETCHES = 20  # number of stretches; chosen
 MAX_TURNS = 3  # fits to a short log, each without other stretches; chosen
-FALLBACK_PROCESS_NOISE = 0.1, 1.0, 4.0  # levels for a wrong model that finds no fit to the rest, tried in turn; chosen
+PERIOD_S = MAX_TURNS * STRETCH_S  # distance from stretch to stretch [s], so that the turns withhold every part once
 BOOTSTRAP_DRAWS = 2000  # chosen
 
 
 OF_STRETCHES = "squares", "counts", "turn", "log_likelihood"  # fields with a row for each stretch
-LIKELIHOOD_LEVELS = 0.0, 0.1, 0.3, 1.0, 4.0, 16.0  # of process noise, the best of which a wrong model may have; chosen
+LIKELIHOOD_LEVELS = 0.0, *PROCESS_NOISE_LADDER  # of process noise, the best of which a wrong model may have
 
 
 @dataclass(frozen=True)
@@ -188,7 +187,8 @@ def _errors_of_turn(
             used[a:b] = 0.0
         masked.append(replace(r, used=used))
     rest: Fit | None = None
-    for process_noise in (fit.process_noise, *(x for x in FALLBACK_PROCESS_NOISE if x > fit.process_noise)):
+    levels = MIN_PROCESS_NOISE, *identification.PROCESS_NOISE_LEVELS[:-1]  # for a wrong model without a fit to the rest
+    for process_noise in (fit.process_noise, *(x for x in levels if x > fit.process_noise)):
         try:
             rest = smoothing.fit_logs(
                 space,

@@ -38,7 +38,7 @@ BRIEF_PASSES = 2  # passes after which a useless effect is recognised; chosen
 MIN_BRIEF_REDUCTION = 0.1  # share by which an effect must reduce the cost by then; chosen
 BEGINNING_SHARES = 0.25, 0.33, 0.4, 0.5  # shares of the logs that are tried as their beginning, in turn; chosen
 MIN_EXCESS_SHARE_OF_BEGINNING = 0.15  # share of the excess cost that the beginning must contain; chosen
-BEGINNING_GAIN_SHARE = 0.5  # share of the required reduction that is asked of the beginning; chosen
+CANDIDATE_PROGRESS_SHARE = 0.5  # share of the required gain that is asked of a few passes or the beginning; chosen
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def _test_of_tracking(previous: ExtendedFit, lengths: Sequence[tuple[int, ...]])
 
 def _test_of_gain(previous: ExtendedFit, lengths: Sequence[tuple[int, ...]], max_cost: float) -> ScreeningTest | None:
     """Use the shortest beginning with a fair part of the excess cost, which a fit must reduce as well as the whole."""
-    part = BEGINNING_GAIN_SHARE * (previous.fit.cost - max_cost) / max(previous.excess_cost, 1e-9)
+    part = CANDIDATE_PROGRESS_SHARE * (previous.fit.cost - max_cost) / max(previous.excess_cost, 1e-9)
     squares = [np.square(log.white.E[:, :, 0]).sum(axis=1, dtype=float) for log in previous.fitted_logs]
     for samples in lengths:
         beginning = _cut_data(previous.data, samples)

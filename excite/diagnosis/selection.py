@@ -34,7 +34,7 @@ from excite.diagnosis.fits import (
 )
 from excite.diagnosis.parallel import CallRunner
 from excite.diagnosis.residual_tests import is_shaking
-from excite.diagnosis.screening import fit_screened
+from excite.diagnosis.screening import CANDIDATE_PROGRESS_SHARE, fit_screened
 from excite.logs import Log
 from excite.model import effects
 from excite.model.effects import Effect, PlacedEffect
@@ -55,7 +55,6 @@ PLAIN_VARIANT_SCORE_SHARE = 0.5  # the same for the variant without signed shape
 RESTART_SCORE_SHARE = 0.9  # share of the best score from which a candidate without a fit is fitted anew; chosen
 MAX_RESTARTS = 12  # candidates that are fitted from initial trajectories if nothing was found; chosen
 FIRST_BATCH = 2  # candidates that are fitted before others are compared with them; chosen
-CANDIDATE_PROGRESS_SHARE = 0.5  # share of the required or best gain that a fit must reach in a few passes; chosen
 MAX_RATIO_OVER_SCORE = 2.5  # largest likelihood ratio of a fit over the candidate's score; chosen
 REFINEMENT_REACHES = 1.0, 0.35  # shares of the way to the next trial values, refined in turn; chosen
 TIME_TRIAL_SHARE = 12  # duration over the distance of refined trial instants: a grid of quarters, in thirds
@@ -64,7 +63,7 @@ INSTANT_ACCURACY_S = 0.5  # [s] to which instants are refined, as fits find them
 # Effects that are worth a place: share of the excess cost that they must explain.
 MIN_EXCESS_SHARE = 0.05, 0.15  # for exact dynamics close to the logs, and otherwise; chosen
 MIN_EXCESS_SHARE_OF_FIRST = 0.3  # of the first effect, or far from the logs: the largest of three; chosen
-MIN_SHARE_FOR_PROCESS_NOISE = 0.7  # with inflated sensor noise, to try process noise with the true one; chosen
+MAIN_CAUSE_SHARE = 0.7  # share of the misfit that a main cause explains; chosen
 LARGE_EXCESS_RATIO = 0.1  # excess over expected cost that no error of a formula removes entirely; chosen
 
 # Nature is never exactly the formula. Share of the gain of the effects chosen that a further effect must exceed.
@@ -413,7 +412,7 @@ def choose_with_inflated_noise(stage: ExtendedFit, runner: CallRunner) -> tuple[
     tracking: list[_Trial] = []
     for process_noise in (
         (0.0, identification.PROCESS_NOISE_LEVELS[0])
-        if gain >= MIN_SHARE_FOR_PROCESS_NOISE * (gain + best.excess_cost)
+        if gain >= MAIN_CAUSE_SHARE * (gain + best.excess_cost)
         else (0.0,)
     ):
         sharp = zip(
