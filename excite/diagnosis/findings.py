@@ -78,12 +78,14 @@ def assess(
     entries = list(zip(d.findings, d.stages, strict=True)) or list(d.dropped)
     entries = [(widen(f, stage), stage) for f, stage in entries]
     stages = [d.before, *(stage for _, stage in entries)]
-    held = _hold_out(stages, False, runner, report)
+    has_causes = any(f.kind == "cause" for f, _ in entries)  # only these are judged by their likelihood
     shown = [hold_out.hold_out_torques(stage) for stage in stages]
+    held = _hold_out(stages, False, has_causes, runner, report) if has_causes or None in shown else shown
     shown = held if None in shown else shown
     reasons = _reasons_against(entries, held, shown)
-    if any(reasons) and held[0] is not None and not deadline.is_over():  # withhold every part before a name is given up
-        reasons = _reasons_against(entries, _hold_out(stages, True, runner, report), shown)
+    if has_causes and any(reasons) and held[0] is not None and not deadline.is_over():
+        # withhold every part before a name is given up
+        reasons = _reasons_against(entries, _hold_out(stages, True, True, runner, report), shown)
     count = next((k for k, reason in enumerate(reasons) if reason), len(entries))
     d = _with_findings(d, entries[:count], reasons[count] if count < len(entries) else "")
     gains = tuple(hold_out.hold_out_gain(a, b) for a, b in pairwise(shown[: 1 + count]))
@@ -131,12 +133,12 @@ Entry = tuple[Finding, ExtendedFit]
 
 
 def _hold_out(
-    stages: Sequence[ExtendedFit], every_turn: bool, runner: CallRunner, report: ProgressCallback
+    stages: Sequence[ExtendedFit], every_turn: bool, likelihood: bool, runner: CallRunner, report: ProgressCallback
 ) -> list[HoldOutErrors | None]:
-    """Predict withheld stretches with each model, side by side. A single one needs no likelihood to be compared."""
+    """Predict withheld stretches with each model, side by side."""
     done = list[HoldOutErrors | None]()
     report(0.0, "measuring the gain")
-    for errors in runner([partial(hold_out.hold_out_errors, s, every_turn, len(stages) > 1) for s in stages]):
+    for errors in runner([partial(hold_out.hold_out_errors, s, every_turn, likelihood) for s in stages]):
         done.append(errors)
         report(len(done) / (len(stages) + 1), "measuring the gain")
     return done

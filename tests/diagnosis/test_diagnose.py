@@ -914,6 +914,24 @@ def test_the_likelihood_of_withheld_stretches_is_found_up_to_the_level_that_suit
     assert np.argmax(known) == max(len(known) - 2, 0)
 
 
+def test_stretches_are_withheld_only_for_what_is_asked(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a cause nobody asks for a likelihood; where torques tell the error, nobody for that of the motion."""
+    stage, asked, true = calm(straight), list[bool](), hold_out.hold_out_errors
+    d = diagnosis.conclude(stage, stage, [], (), 0.0)
+
+    def noted(stage: fits.ExtendedFit, every_turn: bool, likelihood: bool) -> hold_out.HoldOutErrors | None:
+        asked.append(likelihood)
+        return true(stage, every_turn, likelihood)
+
+    monkeypatch.setattr(hold_out, "hold_out_errors", noted)
+    first = findings.assess(d).total_gain
+    assert asked == [False]
+    known = true(stage)
+    monkeypatch.setattr(hold_out, "hold_out_torques", lambda stage: known)
+    assert findings.assess(d).total_gain == first
+    assert asked == [False]
+
+
 def test_candidates_are_scored_once_along_a_fit(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Along another one anew, however alike."""
     stage, scans = calm(straight), list[gauss_newton.Fit]()
