@@ -126,7 +126,7 @@ def _clean_squares(stage: ExtendedFit, seed: int) -> tuple[np.ndarray, np.ndarra
             0.0,
             stage.data.held,
             RESUMED_DAMPING,
-            sufficient_step=ACCEPTABLE_STEP,  # one standard deviation of a parameter is one of the cost
+            sufficient_step=ACCEPTABLE_STEP,  # such a step changes the cost by about one
             patient=False,
         )
     except (SimulationError, NotConvergedError):
