@@ -7,6 +7,7 @@ scaled to about one.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -32,6 +33,9 @@ from excite.trajectories.limits import (
 DEGREE = 3  # of the state polynomials: Radau IIA of order 5
 REST_SHARE = 0.25  # share of the tolerance for rest that the program uses, as the simulation differs; chosen
 MAX_RESIDUAL = 1e-7  # accepted residual of the equations of motion, scaled; chosen
+SMALL_RESIDUAL = 1e-9  # residual, scaled, at which Newton's method ends; chosen
+MAX_JOINT_STEPS = 12  # of Newton's method in all intervals at once; chosen
+SLOW = 0.1  # ratio of successive residuals above which the slope is computed anew; chosen
 NO_BOUND = 1e3  # half ranges, in place of an infinite bound; chosen
 
 
@@ -72,8 +76,13 @@ class Transcription:
     rest_states, rest_band: states that are zero at the end, and their tolerance. free_states: states free at the start.
     sample_map (J, n_s, n_z + J n_z + 2 n_u): samples from an interval's left state, node states, left and right torque.
     map_values (K J, n_over): values of a map of the ground at the nodes, taken as known.
+    entry_of, entry_by (n_d,): entry and component of s of each derivative of the entries that can be non-zero, by
+        component.
     values: (s, map values) to the residual (n_z,) of the equations of motion, limits (n_g,) scaled to -1..1 and entries
-        (n_a,) of the information matrices. first_derivatives, lagrangian_hessian, residual_slope: their derivatives.
+        (n_a,) of the information matrices. first_derivatives, lagrangian_hessian: their derivatives, of the entries
+        the n_d non-zero ones.
+    residual: (s, map values) to the residual alone; residual_slope: with its slope (n_z, n_s); interval_slope: the
+        same for the samples of one interval.
     """
 
     intervals: int
@@ -99,10 +108,14 @@ class Transcription:
     free_states: np.ndarray
     sample_map: np.ndarray
     map_values: np.ndarray
+    entry_of: np.ndarray
+    entry_by: np.ndarray
     values: MappedFunction = field(repr=False)
     first_derivatives: MappedFunction = field(repr=False)
     lagrangian_hessian: MappedFunction = field(repr=False)
+    residual: MappedFunction = field(repr=False)
     residual_slope: MappedFunction = field(repr=False)
+    interval_slope: MappedFunction = field(repr=False)
 
     @property
     def n_z(self) -> int:
@@ -139,6 +152,17 @@ class Transcription:
         A[:, self.columns, self.rows] = each
         return A
 
+    def entry_slopes(self, derivatives: np.ndarray, by: np.ndarray) -> np.ndarray:
+        """Return the slopes (K J, n_s, m) of by' a, a (n_a,) the entries at a node.
+
+        derivatives (K J, n_d): of the entries. by (n_a, m).
+        """
+        slopes = np.zeros((len(derivatives), self.n_s, by.shape[1]))
+        ends = np.searchsorted(self.entry_by, np.arange(self.n_s + 1))
+        for k, (first, last) in enumerate(itertools.pairwise(ends)):
+            slopes[:, k] = derivatives[:, first:last] @ by[self.entry_of[first:last]]
+        return slopes
+
 
 def _sample_map(node_position: np.ndarray, derivative: np.ndarray, n_z: int, n_u: int) -> np.ndarray:
     """Build the map (J, n_s, n_z + J n_z + 2 n_u) to node samples; see `Transcription`."""
@@ -152,10 +176,14 @@ def _sample_map(node_position: np.ndarray, derivative: np.ndarray, n_z: int, n_u
 
 
 def solve_states(tr: Transcription, start: np.ndarray, U: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Solve the equations of motion for the node states (K, J, n_z) under torques U (K + 1, n_u), interval by interval.
+    """Solve the equations of motion for the node states (K, J, n_z) under torques U (K + 1, n_u).
 
+    First in all intervals at once. A guess that is too far from a motion for that is solved interval by interval.
     Raises CollocationError if Newton's method fails both from the guess and from a constant state.
     """
+    together = _solve_together(tr, start, U, guess)
+    if together is not None:
+        return together
     Z = np.empty_like(guess)
     left = start
     for k in range(tr.intervals):
@@ -170,6 +198,50 @@ def solve_states(tr: Transcription, start: np.ndarray, U: np.ndarray, guess: np.
     return Z
 
 
+def _solve_together(tr: Transcription, start: np.ndarray, U: np.ndarray, Z: np.ndarray) -> np.ndarray | None:
+    """Solve all intervals by Newton's method with an old slope as long as it serves; None if the residual grows."""
+    K, n = tr.intervals, tr.nodes * tr.n_z
+    steps: tuple[np.ndarray, np.ndarray] | None = None
+    before = np.inf
+    for _ in range(MAX_JOINT_STEPS):
+        s = tr.samples(start, Z, U)
+        (c,) = tr.residual(s, tr.map_values)
+        size = float(np.abs(c).max(initial=0.0))
+        if size < SMALL_RESIDUAL:
+            return Z
+        if not size < before:
+            return None
+        if steps is None or size > SLOW * before:
+            try:
+                steps = _interval_steps(tr, s)
+            except np.linalg.LinAlgError:
+                return None
+        inverse, onward = steps
+        dZ = -np.matmul(inverse, c.reshape(K, n, 1))[:, :, 0]
+        d = np.zeros(tr.n_z)
+        for k in range(K):
+            dZ[k] += onward[k] @ d
+            d = dZ[k, -tr.n_z :]
+        Z, before = Z + dZ.reshape(Z.shape), size
+    return None
+
+
+def _interval_steps(tr: Transcription, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the inverse slopes (K, J n_z, J n_z) of the residuals in an interval's node states.
+
+    And the steps (K, J n_z, n_z) of the node states per step of the left state.
+    """
+    K, J, n_z = tr.intervals, tr.nodes, tr.n_z
+    _, slope = tr.residual_slope(s, tr.map_values)
+    by_state, by_rate = np.split(slope.reshape(K, J, n_z, tr.n_s)[..., : 2 * n_z], 2, axis=3)
+    full = tr.derivative[None, :, None, :, None] * by_rate[:, :, :, None]  # K, J, n_z, J + 1, n_z
+    for j in range(J):
+        full[:, j, :, j + 1] += by_state[:, j]
+    full = full.reshape(K, J * n_z, (J + 1) * n_z)
+    inverse = np.linalg.inv(full[:, :, n_z:])
+    return inverse, -np.matmul(inverse, full[:, :, :n_z])
+
+
 def _solve_interval(
     tr: Transcription, left: np.ndarray, x: np.ndarray, u: np.ndarray, map_values: np.ndarray
 ) -> tuple[np.ndarray, float]:
@@ -177,15 +249,15 @@ def _solve_interval(
     n_z, J = tr.n_z, tr.nodes
     L, inner = tr.sample_map, tr.sample_map[:, :, n_z : n_z * (J + 1)]
     known = L @ np.concatenate([left, np.zeros(J * n_z), u])
-    c, slope = tr.residual_slope(known + inner @ x, map_values)
+    c, slope = tr.interval_slope(known + inner @ x, map_values)
     size = float(np.abs(c).max())
     for _ in range(25):
-        if size < 1e-9:
+        if size < SMALL_RESIDUAL:
             break
         dx = np.linalg.solve(np.matmul(slope, inner).reshape(J * n_z, -1), -c.ravel())
         share = 1.0
         for _ in range(8):
-            c, slope = tr.residual_slope(known + inner @ (x + share * dx), map_values)
+            c, slope = tr.interval_slope(known + inner @ (x + share * dx), map_values)
             trial = float(np.abs(c).max())
             if trial < size:
                 break
@@ -287,8 +359,12 @@ def transcribe(
     samples = float(problem.duration_s) * float(model.machine.sampling_hz)
     options = {"cse": True}
     values = ca.Function("values", [sample, map_values], [residual, g, entries], options)
-    slopes = [ca.densify(ca.jacobian(x, sample).T) for x in (residual, g, entries)]
-    first_derivatives = ca.Function("first", [sample, map_values], [residual, g, entries, *slopes], options)
+    slopes = [ca.densify(ca.jacobian(x, sample).T) for x in (residual, g)]
+    entry_slope = ca.jacobian(entries, sample)
+    entry_of, entry_by = (np.array(x, int) for x in entry_slope.sparsity().get_triplet())
+    nonzeros = ca.vertcat(*entry_slope.nonzeros(), ca.SX(0, 1))
+    first_derivatives = ca.Function("first", [sample, map_values], [residual, g, entries, *slopes, nonzeros], options)
+    residual_slope = ca.Function("step", [sample, map_values], [residual, slopes[0]], options)
     lagrangian_hessian = ca.Function("second", [sample, map_values, multipliers], [ca.densify(H)], options)
 
     nodes = ((np.arange(intervals)[:, None] + node_position) * interval_s).ravel()
@@ -324,14 +400,14 @@ def transcribe(
         np.array([k for k, c in enumerate(names) if c in pose and k not in resting_states], int),
         _sample_map(node_position, derivative, n_z, n_u),
         np.array([np.interp(nodes, motion.t, x) for x in told.T]).T.reshape(N, -1),
+        entry_of,
+        entry_by,
         MappedFunction(values, N, [(n_z,), (n_g,), (n_a,)]),
-        MappedFunction(first_derivatives, N, [(n_z,), (n_g,), (n_a,), (n_z, n_s), (n_g, n_s), (n_a, n_s)]),
+        MappedFunction(first_derivatives, N, [(n_z,), (n_g,), (n_a,), (n_z, n_s), (n_g, n_s), (len(entry_of),)]),
         MappedFunction(lagrangian_hessian, N, [(n_s, n_s)]),
-        MappedFunction(
-            ca.Function("step", [sample, map_values], [residual, slopes[0]], options),
-            len(node_position),
-            [(n_z,), (n_z, n_s)],
-        ),
+        MappedFunction(ca.Function("residual", [sample, map_values], [residual], options), N, [(n_z,)]),
+        MappedFunction(residual_slope, N, [(n_z,), (n_z, n_s)]),
+        MappedFunction(residual_slope, len(node_position), [(n_z,), (n_z, n_s)]),
     )
 
 

@@ -99,16 +99,16 @@ class IterateValues:
 class QuadraticModel:
     """Quadratic model in the steps r = (left state, left torque, right torque) (K, n_r) of the intervals.
 
-    h'r + r'Q r / 2: cost of an interval. A r: the next (state, torque). information_step' r: change of the entries of
-    A, with curvature F F'. terminal: quadratic cost of the final (state, torque). T, sample_step: from r to node states
-    and node samples. limit_slopes: of the limits, by node sample.
+    h'r + r'Q r / 2: cost of an interval. A r: the next (state, torque). |sum_k border' r|^2 / 2: curvature of the
+    objective in the entries of the information matrix, border (K, n_r, n_f). slope (K, n_r): of the objective.
+    terminal: quadratic cost of the final (state, torque). T, sample_step: from r to node states and node samples.
+    limit_slopes: of the limits, by node sample.
     """
 
     Q: np.ndarray
     h: np.ndarray
     A: np.ndarray
-    information_step: np.ndarray
-    F: np.ndarray
+    border: np.ndarray
     terminal: tuple[np.ndarray, np.ndarray]
     free_states: np.ndarray
     T: np.ndarray
@@ -229,15 +229,15 @@ def _barrier_terms(
 
 
 def _linearise(tr: Transcription, task: Subproblem, point: Iterate, level: BarrierLevel) -> QuadraticModel:
-    K, J, n_z, n_u, n_a, mu = tr.intervals, tr.nodes, tr.n_z, tr.n_u, tr.n_a, level.barrier
+    K, J, n_z, n_u, mu = tr.intervals, tr.nodes, tr.n_z, tr.n_u, level.barrier
     n_g = point.slack.shape[2]
     n_y, n_r = n_z + n_u, n_z + 2 * n_u
     L = tr.sample_map
     outer, inner = np.r_[0:n_z, n_z * (J + 1) : n_z * (J + 1) + 2 * n_u], np.r_[n_z : n_z * (J + 1)]
     s = tr.samples(point.start, point.Z, point.U)
-    _, g, a, cs, gs, as_ = tr.first_derivatives(s, tr.map_values)
+    _, g, a, cs, gs, entry_derivatives = tr.first_derivatives(s, tr.map_values)
     values = _values(tr, task, point.Z, point.U, g, tr.weight @ a, level.sharpness)
-    slope, F = np.zeros(n_a), np.zeros((n_a, 0))
+    slope, F = np.zeros(tr.n_a), np.zeros((tr.n_a, 0))
     if task.objective is not None:
         local = composite_objective.local_model(
             task.objective, tr.matrices(values.entries), tr.rows, tr.columns, level.sharpness
@@ -261,7 +261,8 @@ def _linearise(tr: Transcription, task: Subproblem, point: Iterate, level: Barri
     _, hinge, bend = _soft_penalty(task, values.limits, mu)
 
     # Hessian of the Lagrangian, with the multipliers of the dynamics from the adjoint
-    pulled = np.matmul(slope[None, None], as_)[:, 0] * tr.weight[:, None]
+    counted = tr.entry_slopes(entry_derivatives, np.column_stack([slope, F])) * tr.weight[:, None, None]
+    pulled = counted[:, :, 0]
     y = (point.high - point.low + hinge).reshape(K * J, n_g)
     grad = pulled + np.matmul(y[:, None], gs)[:, 0]
     lam = _adjoint(tr, CZ, T, grad.reshape(K, J, -1), (point.rest_high - point.rest_low) / tr.rest_band)
@@ -277,8 +278,7 @@ def _linearise(tr: Transcription, task: Subproblem, point: Iterate, level: Barri
     back = flat.transpose(0, 2, 1)
     Q = np.matmul(back, np.matmul(H.reshape(K, J, tr.n_s, tr.n_s), sample_step).reshape(K, -1, n_r))
     h = np.matmul(back, node.reshape(K, -1, 1))[:, :, 0]
-    counted = (as_ * tr.weight[:, None, None]).reshape(K, J, n_a, tr.n_s)
-    information_step = np.matmul(back, counted.transpose(0, 1, 3, 2).reshape(K, J * tr.n_s, n_a))
+    along = np.matmul(back, counted.reshape(K, J * tr.n_s, -1))
     Q[:, n_z:, n_z:] += np.matmul(tr.torque_rows.T * torque_stiffness[:, None], tr.torque_rows)
     h[:, n_z:] += (torque_force + torque_stiffness * (values.torque_values - point.torque_slack)) @ tr.torque_rows
     if task.goal is not None:
@@ -290,7 +290,9 @@ def _linearise(tr: Transcription, task: Subproblem, point: Iterate, level: Barri
     terminal = np.zeros((n_y, n_y)), np.zeros(n_y)
     terminal[0][tr.rest_states, tr.rest_states] = rest_stiffness / tr.rest_band**2
     terminal[1][tr.rest_states] = (rest_force + rest_stiffness * (values.rest_errors - point.rest_slack)) / tr.rest_band
-    return QuadraticModel(Q, h, A, information_step, F, terminal, tr.free_states, T, sample_step, gs, slope, values)
+    return QuadraticModel(
+        Q, h, A, along[:, :, 1:], terminal, tr.free_states, T, sample_step, gs, along[:, :, 0], values
+    )
 
 
 def _adjoint(tr: Transcription, CZ: np.ndarray, T: np.ndarray, grad: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -310,9 +312,7 @@ def _descent_step(near: QuadraticModel, regularisation: float) -> tuple[np.ndarr
     """Return a Newton step (K, n_r) that descends and the regularisation it took; None if none does."""
     tried = 0.0 if regularisation == 0 else max(1e-10, regularisation / 3)
     for _ in range(25):
-        dr = solve_newton_system(
-            near.Q, near.h, near.A, near.information_step, near.F, near.terminal, near.free_states, tried
-        )
+        dr = solve_newton_system(near.Q, near.h, near.A, near.border, near.terminal, near.free_states, tried)
         if dr is not None:
             return dr, tried
         tried = max(1e-8, regularisation / 3, tried * (8 if regularisation else 30))
@@ -323,25 +323,24 @@ def solve_newton_system(
     Q: np.ndarray,
     h: np.ndarray,
     A: np.ndarray,
-    information_step: np.ndarray,
-    F: np.ndarray,
+    border: np.ndarray,
     terminal: tuple[np.ndarray, np.ndarray],
     free_states: np.ndarray,
     regularisation: float,
 ) -> np.ndarray | None:
-    """Minimise sum_k h'r + r'Q r / 2 + |F' sum_k information_step' r|^2 / 2 + terminal over the steps r (K, n_r).
+    """Minimise sum_k h'r + r'Q r / 2 + |sum_k border' r|^2 / 2 + terminal over the steps r (K, n_r).
 
     Riccati recursion over the band; the inertia of band plus border by Sylvester's law. The last torque is fixed, and
     of the start only `free_states` move. Returns None if there is no minimum.
     """
     K, n_y, n_r = A.shape
-    n_v, columns = n_r - n_y, 1 + information_step.shape[2]
+    n_v, columns = n_r - n_y, 1 + border.shape[2]
     P, p = terminal[0], np.zeros((n_y, columns))
     p[:, 0] = terminal[1]
     gains, feeds, slopes = np.zeros((K, n_v, n_y)), np.zeros((K, n_v, columns)), np.zeros((K, n_v, columns))
     roots = np.tile(np.eye(n_v), (K, 1, 1))
     extra = regularisation * np.eye(n_v)
-    sides = np.concatenate([h[:, :, None], information_step], axis=2)
+    sides = np.concatenate([h[:, :, None], border], axis=2)
     for k in range(K - 1, -1, -1):
         back = A[k].T
         M = back @ P @ A[k] + Q[k]
@@ -361,11 +360,11 @@ def solve_newton_system(
     feed = -np.linalg.solve(root, p[free_states])
     negative = int((np.linalg.eigvalsh(roots) <= 0).sum() + (np.linalg.eigvalsh(root) <= 0).sum())
     S = -np.tensordot(slopes, feeds, axes=([0, 1], [0, 1])) - p[free_states].T @ feed  # sides' K^-1 sides
-    B = np.eye(F.shape[1]) + F.T @ S[1:, 1:] @ F
+    B = np.eye(columns - 1) + S[1:, 1:]
     B = 0.5 * (B + B.T)
     if int((np.linalg.eigvalsh(B) <= 0).sum()) != negative:
         return None
-    chosen = np.concatenate([[1.0], -F @ np.linalg.solve(B, F.T @ S[1:, 0])])
+    chosen = np.concatenate([[1.0], -np.linalg.solve(B, S[1:, 0])])
     along = feeds @ chosen
     y, dr = np.zeros(n_y), np.empty((K, n_r))
     y[free_states] = feed @ chosen
@@ -389,7 +388,7 @@ def _direction(
     dt = dg + near.values.limits - point.slack
     dtc = np.concatenate([dU[:-1], dU[1:]], axis=1) @ tr.torque_rows.T + near.values.torque_values - point.torque_slack
     dte = dZ[-1, -1, tr.rest_states] / tr.rest_band + near.values.rest_errors - point.rest_slack
-    slope = float(near.slope @ np.einsum("kra,kr->a", near.information_step, dr))
+    slope = float((near.slope * dr).sum())
     slope += float((_soft_penalty(task, near.values.limits, mu)[1] * dg).sum())
     if task.goal is not None:
         slope += task.goal_weight * float(((point.U - task.goal) * dU).sum())

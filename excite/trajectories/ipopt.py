@@ -278,13 +278,13 @@ class Program:
         tr = self.tr
         start, Z, U, _ = self.split(x)
         K, J = tr.intervals, tr.nodes
-        *_, cs, gs, as_ = tr.first_derivatives(tr.samples(start, Z, U), tr.map_values)
+        *_, cs, gs, derivatives = tr.first_derivatives(tr.samples(start, Z, U), tr.map_values)
         L = tr.sample_map[None]
         motion = np.matmul(cs.reshape(K, J, -1, tr.n_s), L)
         limits = np.matmul(gs.reshape(K, J, -1, tr.n_s), L)
-        counted = (as_ * (tr.weight[:, None, None] / self.entry_size[:, None])).reshape(K, J, -1, tr.n_s)
+        counted = tr.entry_slopes(derivatives, np.diag(1 / self.entry_size)) * tr.weight[:, None, None]
         information = np.matmul(
-            counted.transpose(0, 2, 1, 3).reshape(K, tr.n_a, J * tr.n_s), tr.sample_map.reshape(J * tr.n_s, -1)
+            counted.reshape(K, J * tr.n_s, -1).transpose(0, 2, 1), tr.sample_map.reshape(J * tr.n_s, -1)
         )
         torque = np.broadcast_to(self._torque_rows, (K, *self._torque_rows.shape))
         return self._jacobian.gather(

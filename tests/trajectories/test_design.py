@@ -303,7 +303,7 @@ def test_newton_step_is_the_dense_one() -> None:
         dense[1:, 1:] += (regular - max(regular, 1e-8)) * np.eye(n - 1)
         positive = bool((np.linalg.eigvalsh(dense) > 0).all())
         seen.add(positive)
-        step = interior_point.solve_newton_system(Q, h, A, border, F, last, loose, regular)
+        step = interior_point.solve_newton_system(Q, h, A, border @ F, last, loose, regular)
         assert (step is not None) == positive
         if step is not None:
             expected = np.einsum("krn,n->kr", D, -np.linalg.solve(dense, g))
@@ -318,7 +318,12 @@ def test_settled_states_follow_the_accurate_simulation(roller: Model) -> None:
     sizes = dict.fromkeys(roller.coordinates, 1.0) | {c + "'": 1.0 for c in roller.coordinates}
     tr = collocation.transcribe(roller, problem, sizes, 30, motion, elements=4)
     at = (np.arange(30)[:, None] + tr.node_position) * tr.interval_s
-    Z = collocation.solve_states(tr, np.zeros(tr.n_z), 0.3 * drive.torque / tr.torque_scale, np.zeros((30, 12, tr.n_z)))
+    start, U = np.zeros(tr.n_z), 0.3 * drive.torque / tr.torque_scale
+    Z = collocation.solve_states(tr, start, U, np.zeros((30, 12, tr.n_z)))
+    near = Z + 0.01 * np.random.default_rng(0).normal(size=Z.shape)
+    assert np.abs(collocation.solve_states(tr, start, U, near) - Z).max() < 1e-7
+    far = Z + 1e3 * np.random.default_rng(0).normal(size=Z.shape)
+    assert np.abs(collocation.solve_states(tr, start, U, far) - Z).max() < 1e-7
     for k, name in enumerate(tr.state_names):
         if name.endswith("'"):
             true = motion.nu[:, roller.coordinates.index(name[:-1])]
