@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.files import RESULTS
+from support.drives import held_straight
 
 import excite
 
@@ -24,8 +24,7 @@ HIDDEN = {
 def test_golden_log(name: str) -> None:
     """Values to a thousandth of their deviation: other processors differ in rounding."""
     effects, seed = HIDDEN[name]
-    drive = RESULTS / "S40" / "design"
-    log = excite.simulate("va12_straight", drive, seed=seed, effects=effects)
+    log = excite.simulate("va12_straight", held_straight(), seed=seed, effects=effects)
     if name == "surprise":
         log["theta4_rad"] += 0.004 * np.sin(2 * np.pi * log["t_s"] ** 1.5 / 20)
     want = GOLDEN[name]

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import pandas as pd
 from support.files import RESULTS
 
 from excite.logs import profile
@@ -25,6 +28,13 @@ def designed(name: str, model: Model) -> Motion:
     """A committed design, its torques on a machine."""
     torque, q0, nu0 = profile.read_profile(RESULTS / name / "design" / "profile.csv", model)
     return simulate(model, torque, q0=q0, nu0=nu0)
+
+
+def held_straight() -> np.ndarray:
+    """Torques (4001, 2) [N m] of a straight drive of 40 s, a design of S40 that stays when its study is rebuilt."""
+    knots = pd.read_csv(Path(__file__).parent / "straight_drive.csv")
+    t = np.arange(4001) / 100
+    return np.column_stack([np.interp(t, knots["t_s"], knots[name]) for name in ("u1_Nm", "u4_Nm")])
 
 
 def gentle(model: Model, seconds: float) -> Motion:
