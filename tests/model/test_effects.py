@@ -395,9 +395,9 @@ def test_an_effect_of_no_size_changes_nothing(effect: Effect, va12: Model) -> No
     """A motion of a few seconds, and what all sensors read of it: as without; with a typical amount it differs."""
     t = np.arange(400) / 100
     torque = np.column_stack([1500 * np.sin(1.5 * t), 4000 * np.sin(0.8 * t), 1500 * np.sin(1.5 * t)])
-    place = where(effect)
-    at_once = shaped(f"friction_transition@{place}=6", {})  # as friction that builds up over no angle turns
-    without = build(placing.with_effects(VA12, at_once)) if effect.name == "presliding" else va12
+    without = va12
+    if effect.name == "presliding":  # friction that builds up over no angle turns at once
+        without = build(placing.with_effects(VA12, shaped(f"friction_transition@{where(effect)}=6", {})))
     plain = sensors.exact_readings(without, simulate(without, torque))
 
     def change(amount: float) -> float:
