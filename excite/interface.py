@@ -320,7 +320,7 @@ def score(
     SimulationError for a motion that can't be integrated.
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
-    model, _ = workflows.without_hidden_zeros(model)
+    model, zeros = workflows.without_hidden_zeros(model)
     name, chosen = workflows.choose_problem(model.machine, problem, None)
     workflows.require_noise_figures(model)
     given = _planned(model, drive, any_rate=True)
@@ -328,7 +328,7 @@ def score(
     workflows.require_known("kit", kit, simulation.KITS)
     called = _called(drive, "the drive")
     valued = kit if sensors else None
-    return ShownScore.of(found, partial(workflows.score_account, model, name, chosen, found, called, valued))
+    return ShownScore.of(found, partial(workflows.score_account, model, name, chosen, found, called, valued, zeros))
 
 
 def compare(
@@ -348,6 +348,7 @@ def compare(
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
     name, chosen = workflows.choose_problem(model.machine, problem, None)
+    model, _ = workflows.without_hidden_zeros(model)
     workflows.require_noise_figures(model)
     usual, own = workflows.read_rivals("against", against, model, chosen)
     found = trajectories.compare(model, chosen, samples, seed, budget, None, usual, own)

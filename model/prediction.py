@@ -524,17 +524,20 @@ def hidden_zeros(model: Model, by_known: bool = True) -> dict[str, tuple[str, ..
     by_known: what the machine file calls known counts, too. Returns by name the parameters that show only together with
     it, none for a zero that changes no torque.
     """
+    if not len(model.zeros):
+        return {}
     rng, names, n = np.random.default_rng(0), model.base.names, len(model.coordinates)
     beside = [rng.uniform(-1, 1, (x.numel(), SCALE_SAMPLES)) for x in model.effect_symbols()]
     W = model.stacked_regressor(*rng.uniform(-1, 1, (3, n, SCALE_SAMPLES)), *beside).reshape(-1, len(names))
+    moves = np.linalg.norm(W * model.scale, axis=0)
     every = np.concatenate([W, model.known.rows]) * model.scale if by_known else W * model.scale
     size = np.linalg.norm(every, axis=0)
     found: dict[str, tuple[str, ...]] = {}
     for k in model.zeros:
-        others = [j for j in np.flatnonzero(size > HIDDEN_SHARE * size.max()) if j != k]
-        if size[k] <= HIDDEN_SHARE * size.max():
+        if moves[k] <= HIDDEN_SHARE * moves.max():
             found[names[k]] = ()
             continue
+        others = [j for j in np.flatnonzero(size > HIDDEN_SHARE * moves.max()) if j != k]
         A, column = every[:, others] / size[others], every[:, k] / size[k]
         share = np.linalg.lstsq(A, column, rcond=1e-12)[0]
         if np.linalg.norm(column - A @ share) < HIDDEN_SHARE:
@@ -545,11 +548,12 @@ def hidden_zeros(model: Model, by_known: bool = True) -> dict[str, tuple[str, ..
 def with_given_zeros(model: Model, names: Collection[str]) -> Model:
     """Return the model with encoder zeros that are no longer sought, but those of the machine file."""
     given = {s.name for name, s in model.machine.sought_zeros.items() if name in names}
+    scale = {name: x for name, x in model.machine.scale.items() if name not in names}
     sensors = tuple(
         s.model_copy(update={"zero": Quantity(value=s.shift, source="definition")}) if s.name in given else s
         for s in model.machine.sensor
     )
-    return model.for_machine(model.machine.model_copy(update={"sensor": sensors})) if given else model
+    return model.for_machine(model.machine.model_copy(update={"sensor": sensors, "scale": scale})) if given else model
 
 
 def _with_rate_readings(machine: Machine, found: Equations, motion: ca.Function) -> ca.Function:

@@ -750,12 +750,12 @@ def _without_needless_magnitudes(trials: Sequence[_Trial]) -> list[_Trial]:
 
     Friction by bristles that bend is presliding where no Stribeck friction adds to it.
     """
-    costs = {s.candidate.name: stage.fit.cost for s, stage in trials}
+    costs = {(s.candidate.name, stage.fit.process_noise): stage.fit.cost for s, stage in trials}
     least = MIN_LIKELIHOOD_RATIO * trials[0][1].dispersion
 
     def is_needless(trial: _Trial) -> bool:
-        simpler = trial[0].candidate.placed.simpler
-        return simpler is not None and costs.get(simpler, np.inf) - trial[1].fit.cost < least
+        simpler, fit = trial[0].candidate.placed.simpler, trial[1].fit
+        return simpler is not None and costs.get((simpler, fit.process_noise), np.inf) - fit.cost < least
 
     return [x for x in trials if not is_needless(x)]
 

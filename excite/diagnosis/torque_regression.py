@@ -76,7 +76,7 @@ class TorqueDiagnosis:
         model, shown = self.before.model, []
         blocks = [(r.W * r.used[:, :, None], r.Y * r.used) for r in self.before.rows]
         for f in (self.before, self.after):
-            value, std = model.nominal.copy(), np.full(len(model.nominal), np.inf)
+            value, std = model.nominal.copy(), np.full(len(model.nominal), np.nan)
             n = len(f.kept)
             value[f.kept], std[f.kept] = f.x[:n], np.sqrt(np.diag(f.covariance)[:n])
             shown.append((identification.restore_tied_parameters(model, blocks, self.solution, value), std))
@@ -122,7 +122,7 @@ def diagnose_torques(
     withheld = [stage.hold_out(before)[1] for stage in stages]
     explained, total = _explains(after), _excess(before)
     shares = [(_excess(a) - _excess(b)) / total if total > 0 else 1.0 for a, b in pairwise(stages)]
-    named = explained or sum(shares) >= MIN_EXPLAINED_SHARE
+    named = explained or (len(shares) == 1 and shares[0] >= MIN_EXPLAINED_SHARE)  # several would be a patchwork
     kind = "cause" if named else "correction"
     findings = [_finding(search, after, *each, kind) for each in zip(after.terms, shares, strict=True)]
     verdict = "unexplained"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -325,14 +326,22 @@ def at_rate_of(machine: Machine, rate: float) -> Machine:
 
 
 def as_log(stretch: Stretch, machine: Machine, needs: Sequence[str], source: str) -> Log:
-    """A stretch as a checked log. Raises LogError."""
+    """A stretch as a checked log, from where the loops of commanded drives have forgotten what came before it.
+
+    Raises LogError.
+    """
     table = stretch.table.assign(**{machine.time_column: 0.0})
     table.attrs = {}
     sampled = {s.name: stretch.sampled[s.column] for s in machine.sensors("full") if s.column in stretch.sampled}
     made = log.from_table(table, machine, needs, source, np.arange(len(table)) / stretch.rate, sampled)
     counted = [s for s in machine.sensors("full") if s.column in stretch.edges]
     edges = {s.name: s.gain * stretch.edges[s.column] - s.shift for s in counted}
-    return replace(made, interpolated=stretch.interpolated, edges=edges, doubts=stretch.doubts)
+    made = replace(made, interpolated=stretch.interpolated, edges=edges, doubts=stretch.doubts)
+    loops = [s.loop for s in machine.sensors("full") if s.loop is not None and s.name in made.values]
+    settling = math.ceil(stretch.rate * max((loop.settling_s for loop in loops), default=0.0))
+    if line := log.too_short(len(made) - settling, machine) if settling else "":
+        raise LogError(f"{source}: {line} after the first {settling} rows, in which the drive's loop settles")
+    return _part(made, settling, len(made) - 1) if settling else made
 
 
 def without_rests(one: Log, machine: Machine, notes: list[str]) -> list[Log]:
@@ -366,13 +375,14 @@ def without_rests(one: Log, machine: Machine, notes: list[str]) -> list[Log]:
         f"{one.source}: the machine stands still for {format_number((end / rate) - used, 4)} s, which is left out"
     )
     return [
-        replace(
-            one,
-            source=one.source if len(parts) == 1 else f"{one.source} from row {a + 1}",
-            t=np.arange(b - a + 1) / rate,
-            values={n: v[a : b + 1] for n, v in one.values.items()},
-            sampled={n: v[a : b + 1] for n, v in one.sampled.items()},
-            edges={n: v[a : b + 1] for n, v in one.edges.items()},
-        )
+        replace(_part(one, a, b), source=one.source if len(parts) == 1 else f"{one.source} from row {a + 1}")
         for a, b in parts
     ]
+
+
+def _part(one: Log, first: int, last: int) -> Log:
+    """The rows of a log from one to another, that one included, with times from zero."""
+    values, sampled, edges = (
+        {n: v[first : last + 1] for n, v in own.items()} for own in (one.values, one.sampled, one.edges)
+    )
+    return replace(one, t=one.t[first : last + 1] - one.t[first], values=values, sampled=sampled, edges=edges)

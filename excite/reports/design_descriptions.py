@@ -67,11 +67,7 @@ def describe_design(s: Summary) -> Description:
             f" {format_percent(p['mean_percent'])} of each signal's own size in the root mean square,"
             f" {format_percent(p['max_percent'])} at most."
         )
-    if s.get("given_zeros"):
-        remarks.append(
-            f"No torque shows the encoder zeros {', '.join(s['given_zeros'])} apart from other parameters: the drive is"
-            " judged with those of the machine file."
-        )
+    remarks += _describe_given_zeros(s)
     remarks += describe_outside_law(s.get("share_outside_law"))
     if not s["complete"]:
         remarks.append("Cut short: this is the best drive so far, more time may find a better one.")
@@ -166,6 +162,16 @@ def describe_campaign(s: Summary) -> Description:
     return Description(f"Campaign for {s['machine']}, problem {s['problem']}", headline, tables, tuple(remarks))
 
 
+def _describe_given_zeros(s: Summary) -> list[str]:
+    """Say which encoder zeros that are sought a drive is judged without, if any."""
+    if not s.get("given_zeros"):
+        return []
+    return [
+        f"No torque shows the encoder zeros {', '.join(s['given_zeros'])} apart from other parameters: the drive is"
+        " judged with those of the machine file."
+    ]
+
+
 def describe_score(s: Summary) -> Description:
     """Describe a drive that is judged as a design: attainable accuracy, limits, condition numbers."""
     sigma = s["sigma_percent"]
@@ -186,6 +192,7 @@ def describe_score(s: Summary) -> Description:
     )
     remarks = (
         f"Condition number of Phi {_condition(s['cond_phi'])}, of W {_condition(s['cond_w'])}.",
+        *_describe_given_zeros(s),
         *describe_outside_law(s["share_outside_law"]),
     )
     tables = (*_sensors_table(s), _sigma_table(s), *_violations_table(s))

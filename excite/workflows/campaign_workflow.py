@@ -114,6 +114,7 @@ def campaign_from(
     """
     one = request.design
     design_request.require_noise_figures(model)
+    model, _ = design_request.without_hidden_zeros(model)
     model, prior = design_request.with_earlier_logs(model, one.after)
     contrasts = design_request.contrasts(model, one)
     if request.parameters:

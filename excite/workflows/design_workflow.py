@@ -151,6 +151,7 @@ def compare(
     """
     model = requests.build_model(machine, fit_sensor_effects=False)
     name, chosen = requests.choose_problem(model.machine, problem, None)
+    model, _ = design_request.without_hidden_zeros(model)
     design_request.require_noise_figures(model)
     requests.require_positive("--budget", budget, "s")
     usual, own = read_rivals("--against", against, model, chosen)

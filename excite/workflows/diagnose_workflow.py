@@ -132,7 +132,7 @@ def _count_false_alarms(
     except NotIdentifiableError as err:
         return None, str(err)
     if not counted.runs:
-        return None, "no false alarms were counted: the budget was spent"
+        return None, "no false alarms were counted: stopped before the first simulated log was diagnosed"
     return counted.summary(), str(counted)
 
 

@@ -87,10 +87,11 @@ def check_file(path: Path) -> MachineCheck:
     silent = any(not s.has_noise_figure for s in model.machine.sensors("full"))  # no accuracy can be said
     fast = float(model.machine.sampling_hz) > MAX_SAMPLING_HZ
     sigma = {} if faults or silent or fast else _random_drive_sigma(model)
+    hidden = hidden_zeros(model)  # of which a line of their own says why
     doubts += [
         f"{name}: random drives leave it uncertain by {value:.0f} %: hardly any drive shows it apart from the others"
         for name, value in sigma.items()
-        if value > POORLY_IDENTIFIABLE
+        if value > POORLY_IDENTIFIABLE and name not in hidden
     ]
     remarks = () if faults else tuple(describe_invisible(model))
     return MachineCheck(tuple(faults), tuple(doubts), remarks, None if read.lines else model, sigma)

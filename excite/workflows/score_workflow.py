@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -35,18 +35,25 @@ def score(
     drive = read_drive(profile, model, any_rate=True)
     found = trajectories.score(model, chosen, drive.torque, drive.start, drive.nu0, drive.planned)
     requests.require_known("--kit", kit, KITS)
-    account = score_account(model, name, chosen, found, str(profile), kit if sensors else None)
-    more = {"assumed_noise": list(assumed), "given_zeros": list(given)}
-    account = replace(account, summary=account.summary | {key: names for key, names in more.items() if names})
+    account = score_account(model, name, chosen, found, str(profile), kit if sensors else None, given)
+    if assumed:
+        account = replace(account, summary=account.summary | {"assumed_noise": list(assumed)})
     return account.write(place)
 
 
 def score_account(
-    model: Model, name: str, problem: Problem, found: Score, profile: str, kit: str | None = None
+    model: Model,
+    name: str,
+    problem: Problem,
+    found: Score,
+    profile: str,
+    kit: str | None = None,
+    given_zeros: Sequence[str] = (),
 ) -> Account:
     """Give an account of a drive judged on a problem of some name.
 
-    profile: what the drive is called. kit: whose sensors are valued, None for none.
+    profile: what the drive is called. kit: whose sensors are valued, None for none. given_zeros: encoder zeros that
+    are sought, but that no torque shows by itself: those of the machine file are taken.
     """
     summary: dict[str, Any] = {
         "machine": model.machine.name,
@@ -65,6 +72,8 @@ def score_account(
         "meanings": parameter_descriptions(model),
         "versions": requests.package_versions(),
     }
+    if given_zeros:
+        summary["given_zeros"] = list(given_zeros)
     title = f"{model.machine.title}: {name}, {Path(profile).name}"
     figures = {
         "design.png": partial(reports.design_figure, model, problem, found.motion, title),

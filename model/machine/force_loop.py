@@ -12,6 +12,8 @@ from pydantic import model_validator
 
 from excite.model.machine.records import FileRecord, NotNegative
 
+SETTLING_LAGS = 5.0  # time constants; chosen
+
 
 class ForceLoop(FileRecord):
     """Loop between a command and the delivered torque or force; both values [s] count as exact.
@@ -27,6 +29,11 @@ class ForceLoop(FileRecord):
         if self.time_constant is None and self.dead_time is None:
             raise ValueError("time_constant: give it [s], or dead_time, or both")
         return self
+
+    @property
+    def settling_s(self) -> float:
+        """Time [s] after which what was commanded before a log's first row no longer shows, to 0.7 %."""
+        return float(self.dead_time or 0.0) + SETTLING_LAGS * float(self.time_constant or 0.0)
 
 
 def behind_loop(loop: ForceLoop, command: np.ndarray, step: float) -> np.ndarray:

@@ -89,7 +89,7 @@ MEANINGS: dict[str, dict[str, str]] = {
         "unit": "unit of that column: deg, rpm, bar, ... are converted",
         "factor": "[SI unit] of the number 1 in the column, in place of the unit's",
         "return_column": "column of the pressure on the other side, with displacement or cylinders",
-        "zero": "[rad; m if it slides] reading at the joint's coordinate 0, subtracted; or 'sought', to estimate it",
+        "zero": "[rad; m if it slides] reading, behind gear_ratio, at the joint's coordinate 0; or 'sought'",
         "torque_constant": "[N m/A at the motor] makes a torque of its current",
         "gear_ratio": "turns of the motor per turn of the joint, of a motor's current or encoder",
         "loop": "time_constant, dead_time of the drive whose command the column holds",

@@ -864,16 +864,17 @@ def promising(stage: fits.ExtendedFit, *names: str) -> list[Any]:
 def test_an_amount_that_gains_nothing_clear_names_nothing(gain: float) -> None:
     """Friction by bristles is presliding unless Stribeck friction adds to it, whichever of the two fits better."""
 
-    def trial(name: str, simpler: str | None, cost: float) -> Any:
-        placed = SimpleNamespace(simpler=simpler)
-        candidate = SimpleNamespace(name=name, placed=placed)
-        return SimpleNamespace(candidate=candidate), SimpleNamespace(fit=SimpleNamespace(cost=cost), dispersion=1.0)
+    def trial(name: str, simpler: str | None, cost: float, process_noise: float = 0.0) -> Any:
+        candidate = SimpleNamespace(name=name, placed=SimpleNamespace(simpler=simpler))
+        fit = SimpleNamespace(cost=cost, process_noise=process_noise)
+        return SimpleNamespace(candidate=candidate), SimpleNamespace(fit=fit, dispersion=1.0)
 
     bristles = trial("stribeck_friction@load", "presliding@load", 100.0)
     bends = trial("presliding@load", None, 100.0 + gain)
     kept = selection._without_needless_magnitudes([bristles, bends])
     assert kept == ([bends] if gain < selection.MIN_LIKELIHOOD_RATIO else [bristles, bends])
-    assert selection._without_needless_magnitudes([bristles]) == [bristles]
+    with_noise = trial("presliding@load", None, 60.0, 1.0)  # whose cost is lower for that alone
+    assert selection._without_needless_magnitudes([bristles, with_noise]) == [bristles, with_noise]
 
 
 def test_an_amount_at_zero_can_be_written(straight: Model) -> None:

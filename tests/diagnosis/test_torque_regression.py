@@ -86,6 +86,9 @@ def test_what_takes_nearly_all_of_the_misfit_is_the_cause_and_the_rest_is_said(e
     assert [(f.effect, f.kind) for f in found.findings] == [("asymmetric_viscous", "cause")]
     assert 0.85 < found.share < 1
     assert "times its noise" in found.located[0]
+    two = diagnosed(emps, rig_log(0, lambda q, v, F: -80 * np.abs(v) - 30 * np.sign(v) * np.exp(-np.abs(v) / 0.05)))
+    assert two.verdict == "unexplained"
+    assert {f.kind for f in two.findings} == {"correction"}
 
 
 @pytest.mark.parametrize(("late", "seed"), [(0.01, 0), (0.03, 1)])

@@ -104,6 +104,22 @@ def test_the_known_loop_takes_the_bias_away(method: str, honest: int) -> None:
     assert np.abs(plain.value / truth - 1)[:2].max() > 0.2  # mass or viscous friction
 
 
+def test_what_was_commanded_before_a_stretch_is_left_out() -> None:
+    """A log of a motion that the drive has not begun, and one with a gap, have no wrong forces in their first rows."""
+    model = rig(mass=110.0)
+    t = np.arange(6 * RATE) / RATE
+    u = sum(20 * np.sin(2 * np.pi * f * t + k) for k, f in enumerate(np.geomspace(0.3, 6, 5)))
+    motion = simulate(rig(), u[:, None])
+    log, truth = measure(rig(), motion, seed=1), rig().nominal
+    found = estimate_by("joint", model, log)
+    assert found.status == "valid"
+    assert np.abs((found.value - truth) / found.std).max() < 3.5
+    log, truth = log_of(1)
+    found = estimate_by("joint", model, log.drop(index=range(1200, 1500)))
+    assert found.status == "valid"
+    assert np.abs((found.value - truth) / found.std).max() < 3.5
+
+
 def test_noise_is_that_of_the_command() -> None:
     """Behind the loop its third differences are small, but slow noise is passed on as it is."""
     log, _ = log_of(0)

@@ -206,3 +206,16 @@ def test_a_zero_that_a_log_hardly_shows_is_held() -> None:
     assert np.isnan(found.value[model.zeros]).all()
     assert np.isfinite(np.delete(found.value, model.zeros)).all()
     assert any("held at the machine file's value: q10" in note for note in found.notes)
+
+
+def test_a_light_arm_shows_its_zeros_as_a_heavy_one_does() -> None:
+    """What is known exactly of a body is large beside small torques, and says nothing about what motions show."""
+    assert hidden_zeros(arm()) == {}
+    assert hidden_zeros(arm(mass=1e-3)) == {}
+    assert set(hidden_zeros(arm(known_com=False))) == set(hidden_zeros(arm(known_com=False, mass=1e-3))) == {"q20"}
+
+
+def test_the_scale_of_a_zero_goes_with_it() -> None:
+    model = arm(known_com=False, scale={"q20": {"value": 0.05, "source": "definition"}})
+    assert "q20" in model.base.names
+    assert "q20" not in with_given_zeros(model, ["q20"]).base.names
