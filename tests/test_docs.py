@@ -59,7 +59,9 @@ def test_the_page_on_sensors_has_the_study_s_table() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("study", sorted((ROOT / "results").glob("*/study.py")), ids=lambda path: path.parent.name)
+@pytest.mark.parametrize(
+    "study", sorted((ROOT / "results").glob("*/*.py")), ids=lambda path: f"{path.parent.name}-{path.stem}"
+)
 def test_a_study_calls_the_program_as_it_is(study: Path, tmp_path: Path) -> None:
     """Names that are gone, arguments that are missing: what would stop a study that nobody has run for long."""
     (tmp_path / "mypy.ini").write_text("[mypy]\ncheck_untyped_defs = true\nignore_missing_imports = true\n")

@@ -136,7 +136,7 @@ def _clean_squares(stage: ExtendedFit, seed: int) -> tuple[np.ndarray, np.ndarra
 
 def _true_trajectory(space: StateSpace, motion: Motion, start: Trajectory) -> Trajectory:
     """Return a simulated motion as the trajectory of its log, with the encoders' counts where `start` has them."""
-    state, ground = space.from_full_state(np.hstack([motion.q, motion.nu, motion.wheels, motion.memory]))
+    state, ground = space.from_motion(motion)
     return replace(start, state=state, ground_inputs=ground)
 
 

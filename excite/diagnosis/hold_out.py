@@ -235,11 +235,11 @@ def _errors_of_turn(
 def _likelihood_of_stretches(
     stage: ExtendedFit, rest: Fit, stretches: Sequence[Sequence[tuple[int, int]]], levels: Sequence[float]
 ) -> np.ndarray:
-    """Return the log-likelihood (stretches, LIKELIHOOD_LEVELS) with the parameters of a fit, for the first levels of
-    process noise, as long as it grows with them.
+    """Return the log-likelihood (stretches, LIKELIHOOD_LEVELS) with the parameters of a fit, NaN where not found.
 
-    Every reading counts given those before it, by the innovations of a filter along all readings. A model that explains
-    the logs has no process noise.
+    levels: of process noise, the first of LIKELIHOOD_LEVELS, found as long as the likelihood grows with them. Every
+    reading counts given those before it, by the innovations of a filter along all readings. A model that explains the
+    logs has no process noise.
     """
     data = stage.data
     found = np.full((sum(len(own) for own in stretches), len(LIKELIHOOD_LEVELS)), np.nan)

@@ -125,10 +125,8 @@ def require_sensors(model: Model, method: str = "joint") -> None:
                     f"{machine.name}: sensor: none of kind {kind} on joint {body.index} ({body.where}): identification"
                     " needs one"
                 )
-    for body in machine.body:
-        if body.spring is None or body.spring.joint is None:
-            continue
-        for end in (body, machine.find(body.spring.joint)):
+    for body, other in machine.joined_by_springs:
+        for end in (body, other):
             if ("angle", machine.coordinate(end)) not in present:
                 raise MachineError(
                     f"{machine.name}: sensor: none of kind angle on joint {end.index} ({end.where}): the spring of"
@@ -200,8 +198,7 @@ def recommend_method(model: Model) -> str:
 
     Slips are noisy, and so are springs between joints, which bend by small differences of two angles.
     """
-    bent = any(b.spring is not None and b.spring.joint is not None for b in model.machine.body)
-    return "joint" if model.slips or bent or not model.plain else "wls"
+    return "joint" if model.slips or model.machine.joined_by_springs or not model.plain else "wls"
 
 
 def needed_sensors(model: Model, method: str) -> tuple[str, ...]:

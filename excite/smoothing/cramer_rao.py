@@ -54,8 +54,7 @@ def cramer_rao(
                 f"{model.machine.name}: sensor {s.name}: give noise or counts_per_turn in the machine file"
             )
     space = build_state_space(model, tuple(s.name for s in model.machine.sensors("full") if s in sensors))
-    full = np.hstack([motion.q, motion.nu, motion.wheels, motion.memory])
-    state, over = space.from_full_state(full)
+    state, over = space.from_motion(motion)
     counts = np.array([s.resolution is not None for s in space.sensors])
     torques = [torque_sensor(model, b.index) for b in model.machine.actuated]
     noise = SensorNoise(

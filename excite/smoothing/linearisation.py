@@ -24,6 +24,7 @@ from excite.simulation import (
     GAMMA,
     STAGE_TIMES,
     TIME_DERIVATIVE_WEIGHTS,
+    Motion,
     delivered_torques,
     lu,
     lu_solve,
@@ -283,6 +284,10 @@ class StateSpace:
         """Split the simulator's states (N, full_size) into states (N, n) and inputs from a map of the ground (N,
         n_ground)."""
         return full[:, self.index], full[:, self.full_size - len(self.model.map_inputs) :]
+
+    def from_motion(self, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+        """Return the states (N, n) and inputs from a map of the ground (N, n_ground) of a simulated motion."""
+        return self.from_full_state(np.hstack([motion.q, motion.nu, motion.wheels, motion.memory]))
 
     def inputs(self, torque: np.ndarray, ground: np.ndarray) -> np.ndarray:
         """Join torques (N, n_u) and inputs from a map of the ground (N, n_ground)."""

@@ -152,6 +152,15 @@ class Transcription:
         A[:, self.columns, self.rows] = each
         return A
 
+    def interval_slopes(self, slopes: np.ndarray) -> np.ndarray:
+        """Return slopes (K, J m, n_z + J n_z + 2 n_u) by what `sample_map` takes.
+
+        slopes (K J, m, n_s): by the node samples.
+        """
+        K, J = self.intervals, self.nodes
+        each = np.matmul(slopes.reshape(K, J, -1, self.n_s), self.sample_map)
+        return each.reshape(K, -1, self.sample_map.shape[2])
+
     def entry_slopes(self, derivatives: np.ndarray, by: np.ndarray) -> np.ndarray:
         """Return the slopes (K J, n_s, m) of by' a, a (n_a,) the entries at a node.
 
@@ -231,15 +240,11 @@ def _interval_steps(tr: Transcription, s: np.ndarray) -> tuple[np.ndarray, np.nd
 
     And the steps (K, J n_z, n_z) of the node states per step of the left state.
     """
-    K, J, n_z = tr.intervals, tr.nodes, tr.n_z
+    n_z = tr.n_z
     _, slope = tr.residual_slope(s, tr.map_values)
-    by_state, by_rate = np.split(slope.reshape(K, J, n_z, tr.n_s)[..., : 2 * n_z], 2, axis=3)
-    full = tr.derivative[None, :, None, :, None] * by_rate[:, :, :, None]  # K, J, n_z, J + 1, n_z
-    for j in range(J):
-        full[:, j, :, j + 1] += by_state[:, j]
-    full = full.reshape(K, J * n_z, (J + 1) * n_z)
-    inverse = np.linalg.inv(full[:, :, n_z:])
-    return inverse, -np.matmul(inverse, full[:, :, :n_z])
+    slope = tr.interval_slopes(slope)
+    inverse = np.linalg.inv(slope[:, :, n_z : (tr.nodes + 1) * n_z])
+    return inverse, -np.matmul(inverse, slope[:, :, :n_z])
 
 
 def _solve_interval(

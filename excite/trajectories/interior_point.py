@@ -245,7 +245,7 @@ def _linearise(tr: Transcription, task: Subproblem, point: Iterate, level: Barri
         slope, F = local.slope, local.factor
 
     # Node states as linear functions of the interval's ends
-    C = np.matmul(cs.reshape(K, J, n_z, -1), L[None]).reshape(K, J * n_z, -1)
+    C = tr.interval_slopes(cs)
     CZ = C[:, :, inner]
     T = -np.linalg.solve(CZ, C[:, :, outer])
     sample_step = np.matmul(L[None, :, :, inner], T[:, None]) + L[None][:, :, :, outer]

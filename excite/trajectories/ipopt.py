@@ -279,9 +279,7 @@ class Program:
         start, Z, U, _ = self.split(x)
         K, J = tr.intervals, tr.nodes
         *_, cs, gs, derivatives = tr.first_derivatives(tr.samples(start, Z, U), tr.map_values)
-        L = tr.sample_map[None]
-        motion = np.matmul(cs.reshape(K, J, -1, tr.n_s), L)
-        limits = np.matmul(gs.reshape(K, J, -1, tr.n_s), L)
+        motion, limits = tr.interval_slopes(cs), tr.interval_slopes(gs)
         counted = tr.entry_slopes(derivatives, np.diag(1 / self.entry_size)) * tr.weight[:, None, None]
         information = np.matmul(
             counted.reshape(K, J * tr.n_s, -1).transpose(0, 2, 1), tr.sample_map.reshape(J * tr.n_s, -1)

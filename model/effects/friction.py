@@ -30,8 +30,14 @@ def presliding(s: SampleView, k: int, p: Values) -> ca.SX:
 
 def presliding_rate(s: SampleView, k: int, p: Values) -> ca.SX:
     """Return the rate of the bristles' deflection, in shares of the one at which they hold Fs. Source: Dahl 1968."""
+    return _bend(s, k, 1.0, p["A"])
+
+
+def _bend(s: SampleView, k: int, held: ca.SX | float, angle: ca.SX) -> ca.SX:
+    """Return the rate of bristles that bend within an angle [rad] and hold a share of their friction in sliding."""
     w = s.w[k]
-    return (w - ca.sqrt(w**2 + (0.001 * s.friction_smoothing[k]) ** 2) * s.z["bent"]) / p["A"]
+    sliding = ca.sqrt(w**2 + (0.001 * s.friction_smoothing[k]) ** 2) / held
+    return (w - sliding * s.z["bent"]) / angle
 
 
 def bristle_rate(s: SampleView, k: int, p: Values) -> ca.SX:
@@ -40,10 +46,9 @@ def bristle_rate(s: SampleView, k: int, p: Values) -> ca.SX:
     In steady sliding they hold the share (Fs + A exp(-(w/decay)^power)) / (Fs + A), with the sign of the speed.
     Source: LuGre without damping (Canudas de Wit et al., IEEE TAC 40, 1995).
     """
-    w, most = s.w[k], s.coulomb[k] + p["A"]
+    most = s.coulomb[k] + p["A"]
     held = (s.coulomb[k] + p["A"] * _stribeck_decay(s, k, p)) * most / (most**2 + 1e-6)
-    sliding = ca.sqrt(w**2 + (0.001 * s.friction_smoothing[k]) ** 2) / ca.fmax(held, MIN_BRISTLE_SHARE)
-    return (w - sliding * s.z["bent"]) / p["presliding"]
+    return _bend(s, k, ca.fmax(held, MIN_BRISTLE_SHARE), p["presliding"])
 
 
 def bristle_trials(site: Site) -> list[dict[str, float]]:

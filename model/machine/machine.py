@@ -693,6 +693,12 @@ class Machine(FileRecord):
         return {f"q{s.body}0": s for s in self.sensor if s.zero_is_sought and self.is_free(self.find(s.body))}
 
     @property
+    def joined_by_springs(self) -> tuple[tuple[Body, Body], ...]:
+        """Bodies with a spring to another joint, each with the body of that joint."""
+        springs = [(b, b.spring.joint) for b in self.body if b.spring is not None]
+        return tuple((b, self.find(joint)) for b, joint in springs if joint is not None)
+
+    @property
     def rubbing(self) -> tuple[Body, ...]:
         """Bodies with dry friction whose coordinate is free; a joint that moves with another sticks with it."""
         return tuple(b for b in self.body if b.friction is not None and b.moves_with is None and self.is_free(b))

@@ -94,7 +94,8 @@ def make(name: str, place: Path, work: Path) -> dict[str, dict[str, Any]]:
         path = place / f"{kind}.json"
         if not path.is_file():
             summary = excite(kind, *words, "--out", work / kind)
-            summary["logs"] = [*one.logs, *one.validated] if kind == "identify" else []
+            if kind == "identify":
+                summary["logs"] = [*one.logs, *one.validated]
             for validation, log in zip(summary.get("validation") or [], one.validated, strict=False):
                 validation["log"] = log
             said = {k: v for k, v in summary.items() if k not in ("notes", "design")}

@@ -75,7 +75,7 @@ def test_response_to_a_step_is_that_of_a_lag_with_dead_time() -> None:
 
 
 def test_simulated_logs_hold_the_command_that_the_motion_takes() -> None:
-    """What is read back from the column is the delivered force with its offset, but for corners and both ends."""
+    """Reading the column back gives the delivered force with its offset, but for corners and both ends."""
     model = rig()
     t = np.arange(1000) / RATE
     u = 50 * np.sin(2 * np.pi * 1.3 * t)

@@ -209,7 +209,7 @@ def test_a_zero_that_a_log_hardly_shows_is_held() -> None:
 
 
 def test_a_light_arm_shows_its_zeros_as_a_heavy_one_does() -> None:
-    """What is known exactly of a body is large beside small torques, and says nothing about what motions show."""
+    """Values that are known exactly are large beside small torques, but say nothing of what motions show."""
     assert hidden_zeros(arm()) == {}
     assert hidden_zeros(arm(mass=1e-3)) == {}
     assert set(hidden_zeros(arm(known_com=False))) == set(hidden_zeros(arm(known_com=False, mass=1e-3))) == {"q20"}
