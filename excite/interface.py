@@ -348,11 +348,12 @@ def compare(
     """
     model = workflows.build_model(str(machine), fit_sensor_effects=False) if not isinstance(machine, Model) else machine
     name, chosen = workflows.choose_problem(model.machine, problem, None)
-    model, _ = workflows.without_hidden_zeros(model)
+    model, zeros = workflows.without_hidden_zeros(model)
     workflows.require_noise_figures(model)
     usual, own = workflows.read_rivals("against", against, model, chosen)
     found = trajectories.compare(model, chosen, samples, seed, budget, None, usual, own)
-    return ShownComparison.of(found, partial(workflows.compare_account, model, name, found, samples, seed, budget))
+    account = partial(workflows.compare_account, model, name, found, samples, seed, budget, zeros)
+    return ShownComparison.of(found, account)
 
 
 def _as_given(machine: Machine) -> str | Model:

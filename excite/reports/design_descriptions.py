@@ -139,6 +139,7 @@ def describe_campaign(s: Summary) -> Description:
         remarks.append(f"The longest shorter ones tried, {near['duration_s']:g} s each, {got}.")
     if s["max_violation"] > TOLERANCE:
         remarks.append(f"Limits are exceeded by {100 * s['max_violation']:.2f} % of their range.")
+    remarks += _describe_given_zeros(s)
     remarks.append(
         "Each folder is a design, which `excite drive` and `excite verify` take; `excite identify` takes the logs of"
         " all drives together."
@@ -167,7 +168,7 @@ def _describe_given_zeros(s: Summary) -> list[str]:
     if not s.get("given_zeros"):
         return []
     return [
-        f"No torque shows the encoder zeros {', '.join(s['given_zeros'])} apart from other parameters: the drive is"
+        f"No torque shows the encoder zeros {', '.join(s['given_zeros'])} apart from other parameters: drives are"
         " judged with those of the machine file."
     ]
 
@@ -343,7 +344,12 @@ def describe_compare(s: Summary) -> Description:
     )
     ours = tuple(k for k, d in enumerate(s["designs"]) if d["name"].startswith("designed"))
     table = Table(caption, (*names, "as good in s"), rows, ours, (2, 7, 8))
-    return Description(f"Drives compared for {s['machine']}, problem {s['problem']}", headline, (table,), remarks)
+    return Description(
+        f"Drives compared for {s['machine']}, problem {s['problem']}",
+        headline,
+        (table,),
+        (*remarks, *_describe_given_zeros(s)),
+    )
 
 
 def _equal_score(d: Mapping[str, Any]) -> str:

@@ -96,10 +96,14 @@ def check_campaign(request: CampaignRequest, model: Model, problem: Problem) -> 
 
 @dataclass(frozen=True)
 class CampaignResult:
-    """Drives designed together for a model; with earlier logs, its nominal values are their estimate."""
+    """Drives designed together for a model; with earlier logs, its nominal values are their estimate.
+
+    given_zeros: as in `DesignResult`.
+    """
 
     model: Model
     campaign: Campaign
+    given_zeros: tuple[str, ...] = ()
 
 
 def campaign_from(
@@ -114,7 +118,7 @@ def campaign_from(
     """
     one = request.design
     design_request.require_noise_figures(model)
-    model, _ = design_request.without_hidden_zeros(model)
+    model, zeros = design_request.without_hidden_zeros(model)
     model, prior = design_request.with_earlier_logs(model, one.after)
     contrasts = design_request.contrasts(model, one)
     if request.parameters:
@@ -137,7 +141,7 @@ def campaign_from(
         progress,
         one.solver,
     )
-    return CampaignResult(model, found)
+    return CampaignResult(model, found, zeros)
 
 
 def campaign(
@@ -208,6 +212,8 @@ def campaign_account(
         "wall_s": wall_s,
         "versions": requests.package_versions(),
     }
+    if found.given_zeros:
+        summary["given_zeros"] = list(found.given_zeros)
     if request.design.after:
         summary["after"] = [str(p) for p in request.design.after]
     title = f"{model.machine.title}: {name}"

@@ -151,19 +151,25 @@ def compare(
     """
     model = requests.build_model(machine, fit_sensor_effects=False)
     name, chosen = requests.choose_problem(model.machine, problem, None)
-    model, _ = design_request.without_hidden_zeros(model)
+    model, zeros = design_request.without_hidden_zeros(model)
     design_request.require_noise_figures(model)
     requests.require_positive("--budget", budget, "s")
     usual, own = read_rivals("--against", against, model, chosen)
     with bar("comparing") as advance:
         result = trajectories.compare(model, chosen, samples, seed, budget, advance, usual, own)
-    return compare_account(model, name, result, samples, seed, budget).write(place)
+    return compare_account(model, name, result, samples, seed, budget, zeros).write(place)
 
 
 def compare_account(
-    model: Model, name: str, result: Comparison, samples: int, seed: int, budget: float | None
+    model: Model,
+    name: str,
+    result: Comparison,
+    samples: int,
+    seed: int,
+    budget: float | None,
+    given_zeros: Sequence[str] = (),
 ) -> Account:
-    """Give an account of a comparison on a problem of some name; options as in `compare`."""
+    """Give an account of a comparison on a problem of some name; options as in `compare`, zeros as in a score."""
     designs = [
         {
             "name": row.name,
@@ -194,6 +200,8 @@ def compare_account(
         "ratio_equal_time": result.ratio_equal_time,
         "versions": requests.package_versions(),
     }
+    if given_zeros:
+        summary["given_zeros"] = list(given_zeros)
     title = f"{model.machine.title}: {name}, the designed drive and the usual ones"
     shown = {str(d["name"]): {k: v for k, v in d.items() if k not in ("name", "start", "knots")} for d in designs}
     return Account(

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from support.commands import Excite
 
+import excite as program
 from excite.errors import InfeasibleError
 from excite.model import Model, prediction
+from excite.model.machine import load_machine
 from excite.simulation import Motion, simulate
 from excite.smoothing import cramer_rao
 from excite.trajectories import campaign, objective, prediction_contrasts, read_design, rival_contrasts, value_sensors
@@ -169,3 +171,18 @@ def test_sensors_are_worth_what_another_machine_file_says(va12: Model, va12_moti
     assert paper[0].worst_percent == pytest.approx(100 * sigma.max())
     assert {v.sensor for v in paper if v.change == "added"} == {"yaw_rate", "vy"}
     assert all(v.error_ratio <= 1 + 1e-6 for v in paper if v.change != "left out")
+
+
+@pytest.mark.parametrize("way", ["compare", "campaign"])
+def test_zeros_that_no_torque_shows_are_named(way: str) -> None:
+    """The zero of a level slide changes no force: drives are judged without it, and the summary says so."""
+    rig = prediction.build(load_machine(Path(__file__).parents[1] / "support" / "rig.toml"))
+    sensors = tuple(s.model_copy(update={"zero": "sought"}) if s.kind == "angle" else s for s in rig.machine.sensor)
+    sought = rig.for_machine(rig.machine.model_copy(update={"sensor": sensors}))
+    found = (
+        program.compare(sought, against=["multisine"], samples=1, budget=20)
+        if way == "compare"
+        else program.campaign(sought, 50.0, duration=5.0, starts=1, budget=20)
+    )
+    assert found.summary["given_zeros"] == ["q10"]
+    assert "No torque shows the encoder zeros q10" in str(found)
