@@ -120,7 +120,8 @@ class Model:
     nominal, scale (n_base,): of the base parameters X; magnitudes of effects come last.
     predict: (q, nu, a, p, u, z) -> Y (n_q,), p the standard parameters; standard_regressor: its Jacobian to p.
     balance: as predict, but the torques delivered, without gain, offset and delay of the torque sensors.
-    kinematics: (q, nu) -> dq, slips, wheel rates, and per body position, velocity and angular velocity.
+    kinematics: (q, nu) -> dq, slips, wheel rates, and per body position, velocity and angular velocity. Like all
+        geometry, these hold at true coordinates: `true_coordinates` takes the encoder zeros off q.
     edge_slips: (q, nu) -> slips g_x, g_y (2, n_places) at `edges`: body and edge "left" or "right" of each contact, or
         "" for a contact that slips alike all over. The resultant is largest there.
     nonlinear: standard parameters in which the prediction is not linear.
@@ -173,6 +174,21 @@ class Model:
         """Indices of the encoder zeros that are sought among the base parameters."""
         return np.array([self.base.names.index(name) for name in self.machine.sought_zeros], int)
 
+    def true_coordinates(self, q: np.ndarray, X: np.ndarray) -> np.ndarray:
+        """Return coordinates (..., n_q) [rad, m] less the encoder zeros that are sought, as X (n_base,) has them.
+
+        q (..., n_q): coordinates as the encoders read them, or symbols of them.
+        """
+        return q - self._zero_places @ X if len(self.zeros) else q
+
+    @cached_property
+    def _zero_places(self) -> np.ndarray:
+        """Matrix (n_q, n_base) that selects the encoder zero of each coordinate."""
+        places = np.zeros((len(self.coordinates), len(self.base.names)))
+        for k, sensor in zip(self.zeros, self.machine.sought_zeros.values(), strict=True):
+            places[self.coordinates.index(self.machine.coordinate(self.machine.find(sensor.body))), k] = 1
+        return places
+
     @cached_property
     def positive(self) -> np.ndarray:
         """Mask (n_base,) of parameters that must be above zero: some magnitudes, and unsigned shapes."""
@@ -183,7 +199,7 @@ class Model:
     def new_ground_map(self) -> Callable[[np.ndarray], np.ndarray]:
         """Return a function that enters contacts on a new map of the ground, one sample of a motion after another.
 
-        It takes coordinates (n_q,) and returns the map's inputs (n_contacts MAX_PASSES,).
+        It takes true coordinates (n_q,) and returns the map's inputs (n_contacts MAX_PASSES,).
         """
         contacts = [b.contact for b in self.machine.contacts if b.contact is not None]
         ground = GroundMap([float(c.width) for c in contacts])

@@ -235,7 +235,7 @@ def _build_estimate(
     W, Y, errors, outside = [], [], [], []
     for data, trajectory in zip(measurements, fit.trajectories, strict=True):
         q, nu, z, u, a = smoothed_motion(space, data, trajectory, fit.X)
-        outside.append(outside_law(model, q, nu))
+        outside.append(outside_law(model, q, nu, fit.X))
         effect_inputs = () if model.plain else (u.T, z.T)
         plain_with_noise = fit.process_noise > 0 and model.plain
         if plain_with_noise:  # accelerations by process noise are not the model's

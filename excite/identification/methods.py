@@ -94,21 +94,24 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
         estimate = replace(estimate, doubt=doubt)
     estimate = assess(model, repaired, estimate, filter)
     if estimate.share_outside_law is None:
-        estimate = replace(estimate, share_outside_law=_share_outside_law(model, repaired, filter))
+        estimate = replace(estimate, share_outside_law=_share_outside_law(model, repaired, filter, estimate))
     ratios = (RATIOS_NOTE,) if model.machine.in_ratios else ()
     unused = unused_sensors(model, method, repaired)
     said = [f"{method} does not use {', '.join(unused)}"] if unused else []
     return add_notes(estimate, *ratios, *said, *(note for e in examined for note in e.notes), *doubts)
 
 
-def _share_outside_law(model: Model, logs: Sequence[Log], filter: Filter) -> float | None:
-    """Return the share of filtered samples outside the linear soil law; None if a speed is not measured."""
+def _share_outside_law(model: Model, logs: Sequence[Log], filter: Filter, estimate: Estimate) -> float | None:
+    """Return the share of filtered samples outside the linear soil law at the estimated encoder zeros.
+
+    None if a speed is not measured.
+    """
     if any(unmeasured(model, log) for log in logs):
         return None
     outside = []
     for log in logs:  # one at a time, for the memory's sake
         motion = samples(model, log, filter)
-        outside.append(outside_law(model, motion.q.T, motion.nu.T))
+        outside.append(outside_law(model, motion.q.T, motion.nu.T, estimate.value_or(model.nominal)))
     return float(np.concatenate(outside).mean())
 
 

@@ -203,11 +203,11 @@ def _smoothed_parameter_band(
         raise NotConvergedError("the smoothed motion can't be linearised")
     n, Z, rate = len(X), linear[0].chain.Z[1:, 1:], float(space.model.machine.sampling_hz)
     offsets = -np.linalg.pinv(Z[n:, n:]) @ Z[n:, :n]  # most likely offsets of the encoders for a step of parameters
-    still = apply_step(space, data, trajectory, linear[0], np.zeros(len(Z))).sampled_torque_error
+    still = apply_step(space, data, trajectory, linear[0], np.zeros(len(Z)), X).sampled_torque_error
     variance = np.zeros_like(still.T)
     for step in (covariance_root(covariance) / space.model.scale[:, None]).T:
         if step.any():
-            moved = apply_step(space, data, trajectory, linear[0], np.concatenate([step, offsets @ step]))
+            moved = apply_step(space, data, trajectory, linear[0], np.concatenate([step, offsets @ step]), X)
             variance += lowpass((moved.sampled_torque_error - still).T, rate, filter) ** 2
     return np.sqrt(variance)
 

@@ -115,13 +115,13 @@ def remember(model: Model, q: np.ndarray, nu: np.ndarray, u: np.ndarray, X: np.n
     n_q, n_u, sample = len(model.coordinates), len(model.inputs), 1 / float(model.machine.sampling_hz)
     at, z = ca.SX.sym("at", 2 * n_q + n_u), ca.SX.sym("z", len(model.memory))
     rate = model.flow(at[:n_q], at[n_q : 2 * n_q], at[2 * n_q :], z, ca.DM(X))
-    over = passes(model, q, nu, sample) if model.map_inputs else np.zeros((len(q), 0))
+    over = passes(model, model.true_coordinates(q, X), nu, sample) if model.map_inputs else np.zeros((len(q), 0))
     return implicit(ca.Function("flow", [z, at], [rate]), model.initial_memory, np.hstack([q, nu, u]), sample, over)
 
 
 def passes(model: Model, q: np.ndarray, nu: np.ndarray, step: float) -> np.ndarray:
     """Return the inputs from a map of the ground (N, n_contacts MOST) along a motion with samples `step` [s] apart,
-    whose pose follows from its velocities."""
+    whose pose follows from its velocities; q (N, n_q): true coordinates."""
     if not model.machine.contacts:
         return np.zeros((len(q), 0))
     at = integrate_pose(model, q, nu, step)

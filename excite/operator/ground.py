@@ -449,7 +449,8 @@ def broken_limits(model: Model, problem: Problem, motion: Motion) -> dict[str, f
 def contact_edges(model: Model, motion: Motion) -> np.ndarray:
     """Return ground tracks (n_contacts, 2, N, 2) [m] of the right and left end of every contact line."""
     machine = model.machine
-    places = model.kinematics(motion.q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), len(machine.body))
+    q = model.true_coordinates(motion.q, model.nominal)
+    places = model.kinematics(q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), len(machine.body))
     heading = _headings(model, motion)
     tracks = []
     for b in machine.contacts:
@@ -465,7 +466,7 @@ def contact_edges(model: Model, motion: Motion) -> np.ndarray:
 def _headings(model: Model, motion: Motion) -> np.ndarray:
     """Return the heading (n_bodies, N) [rad] of every body, summed over the vertical joints from the root."""
     machine = model.machine
-    at = {c: motion.q[:, k] for k, c in enumerate(model.coordinates)}
+    at = dict(zip(model.coordinates, model.true_coordinates(motion.q, model.nominal).T, strict=True))
     still = np.zeros(len(motion.t))
     heading: dict[int, np.ndarray] = {}
     for b in machine.body:

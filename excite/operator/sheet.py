@@ -125,7 +125,7 @@ def _lane(ax: Axes, sheet: Sheet) -> None:
         if (v > 0 if ahead else v < 0).any():
             part = np.where((forward == ahead)[:, None], centre, np.nan)
             ax.plot(*part.T, color=colour, linestyle=style, linewidth=1.8, label=name, zorder=3)
-    start = dict(zip(model.coordinates, motion.q[0], strict=True))
+    start = dict(zip(model.coordinates, model.true_coordinates(motion.q[0], model.nominal), strict=True))
     for outline in reports.footprints(model.machine, start):  # the machine at the start
         ax.add_patch(Polygon(outline, closed=True, facecolor="white", edgecolor="black", zorder=4))
     ax.plot(*edges.mean(axis=1)[:, 0].T, color="black", linewidth=1.5, zorder=4)

@@ -100,7 +100,9 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
     machine, t = model.machine, motion.t
     moving = [b for b in machine.actuated if b.limit.position_range is not None]
     slips: dict[str, np.ndarray] = {}
-    for (index, _), x in zip(model.edges, simulation.resultant_slips(model, motion.q, motion.nu).T, strict=True):
+    for (index, _), x in zip(
+        model.edges, simulation.resultant_slips(model, motion.q, motion.nu, model.nominal).T, strict=True
+    ):
         name = machine.find(index).where.replace("_", " ")
         slips[name] = np.maximum(slips.get(name, x), x)
     panels = 2 + bool(moving) + bool(slips)
@@ -166,7 +168,8 @@ def design_figure(model: Model, problem: Problem, motion: Motion, title: str) ->
 
 
 def _path(ax: Axes, model: Model, problem: Problem, motion: Motion) -> None:
-    places = model.kinematics(motion.q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), len(model.machine.body))
+    q = model.true_coordinates(motion.q, model.nominal)
+    places = model.kinematics(q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), len(model.machine.body))
     for k, i in enumerate(problem.lane_points):
         body = model.machine.find(i)
         x, y, _ = places[:, :, model.machine.body.index(body)]

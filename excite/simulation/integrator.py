@@ -102,7 +102,7 @@ def respond(
     state[n_q : 2 * n_q] = 0.0 if nu0 is None else nu0
     state[2 * n_q + n_w :] = model.initial_memory
     driven = np.empty((samples, n_u))
-    history = _integrate(step, state, driven, torque, parameters, 1.0 / rate, _map_updater(model), sticking)
+    history = _integrate(step, state, driven, torque, parameters, 1.0 / rate, _map_updater(model, parameters), sticking)
     finite = np.isfinite(history).all(axis=1)  # the maximum norm of the error can miss a NaN
     if not finite.all():
         raise SimulationError(
@@ -194,14 +194,14 @@ def _integrate(
     return history
 
 
-def _map_updater(model: Model) -> Callable[[np.ndarray], None]:
+def _map_updater(model: Model, X: np.ndarray) -> Callable[[np.ndarray], None]:
     """Return a function that enters the contacts on a map of the ground and updates the map inputs in a state."""
     if not model.map_inputs:
         return lambda state: None
     ground, n_q = model.new_ground_map(), len(model.coordinates)
 
     def look(state: np.ndarray) -> None:
-        state[len(state) - len(model.map_inputs) :] = ground(state[:n_q])
+        state[len(state) - len(model.map_inputs) :] = ground(model.true_coordinates(state[:n_q], X))
 
     return look
 

@@ -10,15 +10,19 @@ from excite.simulation.integrator import Motion
 BATCH = 8192  # samples evaluated at a time
 
 
-def resultant_slips(model: Model, q: np.ndarray, nu: np.ndarray) -> np.ndarray:
-    """Return the resultant slips |g| (N, n_edges) [-] at the model's `edges`; q, nu (N, n_q)."""
-    slips = model.edge_slips(q.T, nu.T).full().reshape(2, len(q), len(model.edges))
+def resultant_slips(model: Model, q: np.ndarray, nu: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """Return the resultant slips |g| (N, n_edges) [-] at the model's `edges`; q, nu (N, n_q).
+
+    X (n_base,): base parameters, of which the encoder zeros matter.
+    """
+    slips = model.edge_slips(model.true_coordinates(q, X).T, nu.T).full().reshape(2, len(q), len(model.edges))
     return np.asarray(np.hypot(*slips))
 
 
-def outside_law(model: Model, q: np.ndarray, nu: np.ndarray) -> np.ndarray:
-    """Return the samples (N,), bool, in which a contact slips more than its linear law allows; q, nu (N, n_q).
+def outside_law(model: Model, q: np.ndarray, nu: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """Return the samples (N,), bool, in which a contact slips more than its linear law allows.
 
+    Arguments are those of `resultant_slips`.
     What counts is the resultant slip at both edges against `slip_limit`. Contacts of another law, or without a limit,
     do not count.
     """
@@ -29,12 +33,12 @@ def outside_law(model: Model, q: np.ndarray, nu: np.ndarray) -> np.ndarray:
     ]
     return np.concatenate(
         [
-            (resultant_slips(model, q[k : k + BATCH], nu[k : k + BATCH]) > np.array(limits)).any(axis=1)
+            (resultant_slips(model, q[k : k + BATCH], nu[k : k + BATCH], X) > np.array(limits)).any(axis=1)
             for k in range(0, len(q), BATCH)
         ]
     )
 
 
 def share_outside_law(model: Model, motion: Motion) -> float:
-    """Return the share of a motion's samples that lie outside the linear soil law (see `outside_law`)."""
-    return float(outside_law(model, motion.q, motion.nu).mean())
+    """Return the share of a nominal motion's samples that lie outside the linear soil law (see `outside_law`)."""
+    return float(outside_law(model, motion.q, motion.nu, model.nominal).mean())

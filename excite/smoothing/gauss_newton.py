@@ -417,12 +417,13 @@ def fit_logs(
             m[: len(X)] = np.where(unidentifiable, m[: len(X)], np.maximum(own, lowest))
         taken = moves[0][: len(X)]
         remaining = np.where(np.abs(share * wanted) > limit, wanted - taken, 0.0)
+        moved = X + taken * model.scale
         proposed = (
             [
-                apply_step(space, data, trajectory, found, m)
+                apply_step(space, data, trajectory, found, m, moved)
                 for data, trajectory, found, m in zip(measurements, trajectories, linear, moves, strict=True)
             ],
-            X + moves[0][: len(X)] * model.scale,
+            moved,
         )
         # Sum of the steps to come, if they shrink at the present rate.
         ratio = min(max(step / before, 1 - fraction), 0.9)
@@ -643,15 +644,20 @@ def covariance_in_si(space: StateSpace, covariance: np.ndarray) -> np.ndarray:
 
 
 def apply_step(
-    space: StateSpace, data: Measurements, trajectory: Trajectory, linear: LinearisedLog, move: np.ndarray
+    space: StateSpace,
+    data: Measurements,
+    trajectory: Trajectory,
+    linear: LinearisedLog,
+    move: np.ndarray,
+    X: np.ndarray,
 ) -> Trajectory:
-    """Return the trajectory after a scaled step of parameters and offsets, with its most likely states."""
+    """Return the trajectory after a scaled step of parameters and offsets to X, with its most likely states."""
     x, slope = linear.chain.states(move)
     torque_error = (linear.gain.transpose(0, 2, 1) @ slope[1:, :, None])[:, :, 0] * linear.noise
     offset = move[len(move) - len(data.offset_sensors) :]
     state = trajectory.state + x * state_scale(space)
     return Trajectory(
-        state, torque_error, trajectory.offset + offset * offset_scale(space, data), ground_inputs(space, state)
+        state, torque_error, trajectory.offset + offset * offset_scale(space, data), ground_inputs(space, state, X)
     )
 
 

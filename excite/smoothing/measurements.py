@@ -250,12 +250,12 @@ def _on_the_ground(space: StateSpace, data: Measurements, q: np.ndarray) -> np.n
     return q
 
 
-def ground_inputs(space: StateSpace, state: np.ndarray) -> np.ndarray:
-    """Compute the inputs from a map of the ground (N, n_ground) along states (N, n)."""
+def ground_inputs(space: StateSpace, state: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """Compute the inputs from a map of the ground (N, n_ground) along states (N, n), at parameters X (n_base,)."""
     if not space.model.map_inputs:
         return np.zeros((len(state), 0))
     q, nu, _ = space.unpack(state)
-    return passes(space.model, q, nu, 1 / float(space.model.machine.sampling_hz))
+    return passes(space.model, space.model.true_coordinates(q, X), nu, 1 / float(space.model.machine.sampling_hz))
 
 
 def smoothed_motion(

@@ -195,7 +195,7 @@ def profile_widths(
         if not (X[space.model.positive] > 0).all():
             return 1.0, 1.0
         trajectories = [
-            apply_step(space, data, trajectory, log, distance * step[columns])
+            apply_step(space, data, trajectory, log, distance * step[columns], X)
             for data, trajectory, log, columns in zip(
                 measurements, fit.trajectories, fit.linear, parameter_indices(space, measurements), strict=True
             )

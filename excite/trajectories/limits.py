@@ -124,7 +124,7 @@ def _slip(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedE
 
     |g| is replaced by sqrt((1 - r^2) |g|^2 + r^2 limit^2), r = SLIP_ROUNDING: smooth at rest, exact at the limit.
     """
-    slips = model.edge_slips(s.q, s.nu)
+    slips = model.edge_slips(model.true_coordinates(s.q, model.nominal), s.nu)
     for k, (index, edge) in enumerate(model.edges):
         body = model.machine.find(index)
         if body.contact is not None and body.contact.slip_limit is not None:
@@ -150,7 +150,7 @@ def _lane(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[BoundedE
     """Points of the machine that stay inside the lane's length and width, `lane_m` of the problem."""
     if not model.machine.planar:
         return
-    places = model.kinematics(s.q, s.nu)[3]
+    places = model.kinematics(model.true_coordinates(s.q, model.nominal), s.nu)[3]
     bodies = [b.index for b in model.machine.body]
     for index in problem.lane_points:
         point = places[:, bodies.index(index)]
@@ -167,7 +167,7 @@ def _polygon(model: Model, problem: Problem, s: SampleSymbols) -> Iterator[Bound
     """
     if not model.machine.planar:
         return
-    places = model.kinematics(s.q, s.nu)[3]
+    places = model.kinematics(model.true_coordinates(s.q, model.nominal), s.nu)[3]
     bodies = [b.index for b in model.machine.body]
     for k, (outward, low, high) in enumerate(polygon_edges(problem.lane_polygon_m), 1):
         for index in problem.lane_points:
@@ -436,7 +436,8 @@ def move_motion(model: Model, motion: Motion, start: np.ndarray) -> Motion:
 
 def _lane_path(model: Model, problem: Problem, motion: Motion) -> np.ndarray:
     """Return the ground track (2, K) [m] of all points that the lane limits."""
-    places = model.kinematics(motion.q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), -1)
+    q = model.true_coordinates(motion.q, model.nominal)
+    places = model.kinematics(q.T, motion.nu.T)[3].full().reshape(3, len(motion.t), -1)
     bodies = [b.index for b in model.machine.body]
     return np.asarray(places[:2][:, :, [bodies.index(i) for i in problem.lane_points]].reshape(2, -1))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,17 @@ from support.drives import drive
 from excite.identification import Estimate, identify, needed_sensors
 from excite.logs import prepare
 from excite.model import Model, build, hidden_zeros, with_given_zeros
-from excite.model.machine import Machine, load_machine
-from excite.simulation import follow_positions, measure, motion_along, simulate
+from excite.model.machine import Machine, Quantity, load_machine
+from excite.simulation import (
+    Motion,
+    follow_positions,
+    measure,
+    motion_along,
+    outside_law,
+    resultant_slips,
+    simulate,
+)
+from excite.trajectories import check_limits
 
 ARM = Path(__file__).parents[1] / "support" / "two_joints.toml"
 HIDDEN = np.array([0.02, -0.02])
@@ -112,11 +122,64 @@ def test_hidden_zeros_are_found(machine: Any, method: str) -> None:
     assert without.relative_error_percent > 1.2 * found.relative_error_percent
 
 
-@pytest.mark.slow
-def test_a_roller_shows_the_zero_of_its_articulation() -> None:
+def roller(**slip_limits: float) -> Model:
+    """The roller whose articulation has an encoder zero that is sought; slip limits by name of the roll."""
     machine = load_machine("va12")
     sensors = tuple(s.model_copy(update={"zero": "sought"}) if s.name == "theta2" else s for s in machine.sensor)
-    model = build(machine.model_copy(update={"sensor": sensors}))
+    limits = {n: {"slip_limit": Quantity(value=x, source="definition")} for n, x in slip_limits.items()}
+    bodies = tuple(
+        b.model_copy(update={"contact": b.contact.model_copy(update=limits[b.name])})
+        if b.contact is not None and b.name in limits
+        else b
+        for b in machine.body
+    )
+    return build(machine.model_copy(update={"sensor": sensors, "body": bodies}))
+
+
+def test_slips_places_and_wheels_are_those_of_the_true_angles(va12: Model) -> None:
+    model, rng = roller(), np.random.default_rng(0)
+    X = truth_of(model)
+    q, nu = rng.uniform(-0.5, 0.5, (2, 40, 6))
+    read = q.copy()
+    read[:, va12.coordinates.index("theta2")] += HIDDEN[0]
+    assert model.true_coordinates(read, X) == pytest.approx(q)
+    slips = resultant_slips(va12, q, nu, va12.nominal)
+    assert resultant_slips(model, read, nu, X) == pytest.approx(slips)
+    assert np.abs(resultant_slips(model, read, nu, model.nominal) - slips).max() > 0.01
+
+    def motion(q: np.ndarray) -> Motion:
+        t, none = np.arange(40) * 0.01, np.zeros((40, 3))
+        return Motion(t, q, nu, np.zeros_like(nu), none, none[:, :2], none[:, :0])
+
+    problem, known = model.machine.problems["R60"], replace(model, nominal=X)
+    by_reading = {name for name in check_limits(va12, problem, motion(q)) if "theta2" in name or "position" in name}
+    expected = {n: x for n, x in check_limits(va12, problem, motion(q)).items() if n not in by_reading}
+    found = {n: x for n, x in check_limits(known, problem, motion(read)).items() if n not in by_reading}
+    assert found == pytest.approx(expected)
+    assert any(n.startswith("slip") and x > 0 for n, x in found.items())
+    assert any(n.startswith("lane") for n in found)
+    # Measuring wheels are on the first chassis, before every joint: no zero changes their rates.
+    wheels = (model.kinematics(angles.T, nu.T)[2].full() for angles in (q, read))
+    np.testing.assert_array_equal(*wheels)
+
+
+def test_a_fit_takes_slips_at_the_zero_that_it_finds() -> None:
+    """The rear roll's slips stay below its limit, though not those that the read angle of the articulation gives."""
+    guess = roller()
+    X = truth_of(guess)
+    X[guess.zeros] = 0.05
+    motion = simulate(guess, drive(guess, 15, 1, {"u1": 2500, "u4": 2500, "u2": 6000}), X)
+    slips = resultant_slips(guess, motion.q, motion.nu, X)[:, [place == 4 for place, _ in guess.edges]]
+    model = roller(front_roll=1e3, rear_roll=float(slips.max()))
+    true, read = (outside_law(model, motion.q, motion.nu, x).mean() for x in (X, model.nominal))
+    assert true == 0 < 0.05 < read
+    found = estimate_by("joint", model, measure(model, motion, X, seed=1))
+    assert found.share_outside_law == pytest.approx(true, abs=abs(read - true) / 3)
+
+
+@pytest.mark.slow
+def test_a_roller_shows_the_zero_of_its_articulation() -> None:
+    model = roller()
     X = truth_of(model)
     motion = simulate(model, drive(model, 40, 1, {"u1": 2500, "u4": 2500, "u2": 6000}), X)
     found = estimate_by("joint", model, measure(model, motion, X, seed=1))

@@ -27,10 +27,10 @@ def steer_at_standstill(model: Model) -> Motion:
 def test_edges_are_outside_the_law_where_the_middle_is_not(va12: Model) -> None:
     motion = steer_at_standstill(va12)
     middle = np.abs(va12.kinematics(motion.q.T, motion.nu.T)[1].full()).reshape(2, 2, -1)
-    edges = resultant_slips(va12, motion.q, motion.nu)
+    edges = resultant_slips(va12, motion.q, motion.nu, va12.nominal)
     assert np.hypot(middle[:, 0], middle[:, 1]).max() < 0.15 < edges.max()
     beyond = edges.max(axis=1) > 0.15
-    np.testing.assert_array_equal(outside_law(va12, motion.q, motion.nu), beyond)
+    np.testing.assert_array_equal(outside_law(va12, motion.q, motion.nu, va12.nominal), beyond)
     assert 0.01 < share_outside_law(va12, motion) == beyond.mean() < 0.9
     excess = check_limits(va12, va12.machine.problems["R60"], motion)
     for k, name in enumerate(("front_roll right", "front_roll left", "rear_roll right", "rear_roll left")):
@@ -68,7 +68,7 @@ def test_a_design_keeps_its_edges_within_the_law(va12: Model, monkeypatch: pytes
         state = continuation.repair(va12, problem, aim, state, lambda: False)
         assert state.best.feasible
         motion = simulate(va12, state.best.manoeuvre.sample(100.0), q0=state.best.start)
-        return float(resultant_slips(va12, motion.q, motion.nu).max())
+        return float(resultant_slips(va12, motion.q, motion.nu, va12.nominal).max())
 
     assert 0.1 < largest_slip() <= 0.15 * 1.001
     monkeypatch.setitem(LIMITS, "slip", LimitKind(_middles))

@@ -165,7 +165,7 @@ def test_limits_hold_for_every_machine_of_a_robust_design(straight: Model) -> No
     assert found.feasible
     for m in aim.machines[1:]:
         driven = scenarios.track_motion(m, straight, motion)
-        assert resultant_slips(m, driven.q, driven.nu).max() <= 0.15 * (1 + 3e-3)
+        assert resultant_slips(m, driven.q, driven.nu, m.nominal).max() <= 0.15 * (1 + 3e-3)
         assert np.abs(0.65 * driven.nu[:, 1:]).max() <= 2.0 * (1 + 3e-3)
 
 
