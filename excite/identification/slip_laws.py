@@ -19,6 +19,7 @@ from excite.model.effects import CATALOGUE, ContactMotion, SampleView, Soil
 from excite.model.machine import Contact, Quantity
 
 LARGEST_SATURATION = 30.0  # saturation slip over the largest slip, above which the law is linear here; chosen
+MIN_SHARE = 1e-3  # least traction per slip, as a share of the largest traction; chosen
 RULED_OUT = 0.05  # chance against the best law, below which a law is ruled out; chosen
 DRAWS = 2000  # Bayesian bootstrap; chosen
 FTOL = 1e-6  # relative change of the sum of squares at which a fit ends; chosen
@@ -90,7 +91,8 @@ def fit_slip_laws(table: SlipTable) -> SlipFit:
     A law's score is that of its errors on settings left out, as normal ones of unknown size; its chance against the
     best law is the mean over a Bayesian bootstrap of the settings (pseudo-BMA+: Yao et al., Bayesian Analysis 13,
     2018). Laws of a chance above 0.05 are supported, without those that add effects to another such law.
-    Raises NotIdentifiableError if there are fewer settings than parameters of the linear law.
+    Raises NotIdentifiableError if there are fewer settings than parameters of the linear law, or if the best law has no
+    traction that grows with slip.
     """
     sided = "side" in table.forces and float(np.ptp(table.Vy / table.norm)) > BOTH_WAYS
     levels = int(table.level.max()) + 1
@@ -104,6 +106,12 @@ def fit_slip_laws(table: SlipTable) -> SlipFit:
     laws.sort(key=lambda law: law.rms_left_out)
     laws = [replace(law, chance=_chance(law.left_out, laws[0].left_out)) for law in laws]
     load = None if table.load is None else float(np.mean(table.load))
+    traction = float(np.abs(table.forces["traction"]).max()) if "traction" in table.forces else 0.0
+    if abs(_supported(laws)[0].parameters["Kx"][0]) < MIN_SHARE * traction:
+        raise NotIdentifiableError(
+            f"{table.source}: the traction does not grow with slip, so there is no contact law: is it the right column"
+            f" (traction=COLUMN)? {'; '.join(n for n in table.notes if n.startswith('columns'))}"
+        )
     return SlipFit(table, tuple(laws), _supported(laws), _repeatability(table), load)
 
 

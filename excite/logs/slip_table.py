@@ -196,7 +196,10 @@ def _require_usable(t: SlipTable) -> SlipTable:
             continue
         if sign * np.corrcoef(slip[at], force[at])[0, 1] < -0.5:
             way = "grow with slip" if sign > 0 else "be against the lateral motion"
-            raise LogError(f"{t.source}: {role}: the force must {way}, here it does the opposite; give {role}=-COLUMN")
+            raise LogError(
+                f"{t.source}: {role}: the force must {way}, here it does the opposite; give {role}=-COLUMN,"
+                f" or the right column ({role}=COLUMN)"
+            )
     return t
 
 

@@ -14,7 +14,7 @@ from support.commands import Excite
 from support.files import SHARED
 
 import excite as interface
-from excite.errors import LogError
+from excite.errors import LogError, NotIdentifiableError
 from excite.logs import read_slip_table
 from excite.model import build
 from excite.model.machine import load_machine
@@ -66,6 +66,12 @@ def test_laws_that_noise_hides_are_a_tie() -> None:
     fit = interface.slip(wheel(exponential(SLIPS, -120.0, 0.25), noise=2.0))
     assert fit.named is None
     assert "can't tell" in repr(fit)
+
+
+def test_forces_that_do_not_grow_with_slip_are_no_contact_law() -> None:
+    """As of a column that is not the traction: no law, no contact to paste."""
+    with pytest.raises(NotIdentifiableError, match=r"does not grow with slip.*traction from Fx"):
+        interface.slip(wheel(5.0 - SLIPS, noise=1.0))
 
 
 def test_side_forces_and_slip_angles() -> None:
