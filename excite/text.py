@@ -49,10 +49,15 @@ def format_uncertain(value: float, std: float, unit: str = "") -> str:
     return f"{format_rounded(value, std)} +- {format_rounded(std, std)}{tail}"
 
 
+def closest(name: object, allowed: Iterable[str]) -> str | None:
+    """Return the allowed name that is most like a wrong one, None if none is."""
+    return next(iter(difflib.get_close_matches(str(name), list(allowed), n=1)), None)
+
+
 def did_you_mean(name: object, allowed: Iterable[str]) -> str:
     """Return " (did you mean X?)" for the allowed name that is most like a wrong one, "" if none is."""
-    like = difflib.get_close_matches(str(name), list(allowed), n=1)
-    return f" (did you mean {like[0]}?)" if like else ""
+    like = closest(name, allowed)
+    return f" (did you mean {like}?)" if like else ""
 
 
 def count(n: int, one: str, many: str = "") -> str:

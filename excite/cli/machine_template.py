@@ -51,7 +51,9 @@ def whole(name: str, file: Path, origin: str) -> str:
         f'# that may be added. To write only what differs, begin a file with extends = "{origin}" instead.',
         "",
     ]
-    text, tables = machine.machine_tables(origin)
+    text, tables, wrong = machine.machine_tables(origin)
+    for one in wrong:
+        raise MachineError(f"{one.path}: {'.'.join(one.where)}: {one.message}")
     return "\n".join([*lines, *_with_meanings(name, _dumped(tables) if EXTENDS.search(text) else text)]) + "\n"
 
 

@@ -69,8 +69,8 @@ class MachineCheck:
 
 def check_file(path: Path) -> MachineCheck:
     """Check a machine file. Raises MachineError for a file that can't be read."""
-    text, tables = machine_tables(str(path))
-    read = find_faults(text, tables)
+    text, tables, wrong = machine_tables(str(path))
+    read = find_faults(text, tables, wrong)
     faults = list(read.lines)
     if read.machine is None:
         return MachineCheck(tuple(faults), (), (), None, {})

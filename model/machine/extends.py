@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from excite.model.machine.places import LISTS
 from excite.model.machine.records import read_toml
-from excite.text import did_you_mean
+from excite.text import closest, did_you_mean
 
 MAX_DEPTH = 4  # files that one file may extend in a chain; chosen
-NAMED_LISTS = ("body", "sensor")  # lists of tables with a name
 
 
 def file_names(folder: Path) -> tuple[str, ...]:
@@ -30,12 +31,25 @@ def chain(path: Path, shipped: Path) -> list[tuple[Path, dict[str, Any]]]:
     return found
 
 
-def read(path: Path, shipped: Path) -> dict[str, Any]:
-    """Read a TOML file merged over those that it extends (see `chain`). Raises ValueError, one line."""
+@dataclass(frozen=True)
+class WrongName:
+    """A table [body.NAME] or [sensor.NAME] of a file for which there is none to change; where: its key."""
+
+    path: Path
+    where: tuple[str, str]
+    message: str
+
+
+def read(path: Path, shipped: Path) -> tuple[dict[str, Any], tuple[WrongName, ...]]:
+    """Read a TOML file merged over those that it extends (see `chain`), and its wrong names, read as probably meant.
+
+    Raises ValueError, one line.
+    """
     whole: dict[str, Any] = {}
+    wrong: list[WrongName] = []
     for one, raw in reversed(chain(path, shipped)):
-        whole = _override(one, whole, raw, raw.pop("extends", None))
-    return whole
+        whole = _override(one, whole, raw, raw.pop("extends", None), wrong)
+    return whole, tuple(wrong)
 
 
 def _base(path: Path, parent: object, shipped: Path) -> Path | None:
@@ -51,8 +65,10 @@ def _base(path: Path, parent: object, shipped: Path) -> Path | None:
     return base
 
 
-def _override(path: Path, whole: dict[str, Any], raw: dict[str, Any], parent: str | None) -> dict[str, Any]:
-    """Merge a file over the one that it extends. Raises ValueError."""
+def _override(
+    path: Path, whole: dict[str, Any], raw: dict[str, Any], parent: str | None, wrong: list[WrongName]
+) -> dict[str, Any]:
+    """Merge a file over the one that it extends, add its wrong names. Raises ValueError."""
     own, listed = (x if isinstance(x, list) else [] for x in (raw.get("sensor"), whole.get("sensor")))
     sensors = [x.get("name") for x in listed if isinstance(x, dict)]
     if any(isinstance(x, dict) and x.get("name") in sensors and "kind" not in x for x in own):
@@ -60,23 +76,26 @@ def _override(path: Path, whole: dict[str, Any], raw: dict[str, Any], parent: st
             f"{path}: sensor: a list replaces that of {parent}, so every sensor needs all its keys;"
             " [sensor.NAME] changes one, `excite machine new NAME --like` writes all"
         )
-    for key in NAMED_LISTS:
+    for key in LISTS:
         if isinstance(raw.get(key), dict) and isinstance(whole.get(key), list):
-            raw[key] = _change_named(path, key, whole[key], raw[key])
+            raw[key] = _change_named(path, key, whole[key], raw[key], wrong)
     return _merge(whole, raw)
 
 
-def _change_named(path: Path, key: str, known: list[Any], changes: dict[str, Any]) -> list[Any]:
-    """Change some of a list's named tables, each by the table of its name. Raises ValueError."""
-    names = [x.get("name") if isinstance(x, dict) else None for x in known]
+def _change_named(path: Path, key: str, known: list[Any], changes: dict[str, Any], wrong: list[WrongName]) -> list[Any]:
+    """Change some of a list's named tables, each by the table of its name; add wrong names. Raises ValueError."""
+    names = [str(x.get("name")) if isinstance(x, dict) else "" for x in known]
+    meant: dict[str, Any] = {}
     for name, change in changes.items():
-        if name not in names:
-            allowed = ", ".join(str(x) for x in names)
-            hint = did_you_mean(name, map(str, names))
-            raise ValueError(f"{path}: {key}.{name}: no such {key}, allowed: {allowed}{hint}")
         if not isinstance(change, dict):
             raise ValueError(f"{path}: {key}.{name}: must be a table of the keys that differ (got {change!r})")
-    return [_merge(x, changes[n]) if n in changes else x for n, x in zip(names, known, strict=True)]
+        if name not in names:
+            hint = did_you_mean(name, names)
+            wrong.append(WrongName(path, (key, name), f"no such {key}, allowed: {', '.join(names)}{hint}"))
+            name = closest(name, names)
+        if name is not None:
+            meant[name] = _merge(meant.get(name, {}), change)
+    return [_merge(x, meant[n]) if n in meant else x for n, x in zip(names, known, strict=True)]
 
 
 def _merge(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import difflib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,9 +11,11 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
+from excite.model.machine.extends import WrongName
 from excite.model.machine.machine import Machine
 from excite.model.machine.places import Path, key_lines, line_of, named
 from excite.model.machine.records import error_text, record_at
+from excite.text import closest
 
 ROUNDS = 10  # of putting right and reading again; chosen
 KEY = re.compile(r"^(\w+(?:\[\d+\]|\.\w+)*): ")
@@ -34,11 +35,18 @@ class FileFaults:
     complete: bool
 
 
-def find_faults(text: str, tables: dict[str, Any]) -> FileFaults:
-    """Return all faults of a machine file. text: the file itself; tables: its content, with what it extends."""
+def find_faults(text: str, tables: dict[str, Any], wrong: Sequence[WrongName] = ()) -> FileFaults:
+    """Return all faults of a machine file. text: the file itself; tables: its content, with what it extends.
+
+    wrong: names in it of which there is nothing to change, read as probably meant.
+    """
     raw, complete = copy.deepcopy(tables), True
     lines = key_lines(text)
     found: dict[str, None] = {}
+    for name in wrong:
+        number = lines.get(name.where)
+        said = f"{'.'.join(name.where)}: {name.message}"
+        found[said if number is None else f"line {number}: {said}"] = None
     for _ in range(ROUNDS):
         try:
             return FileFaults(tuple(found), Machine.model_validate(raw), complete)
@@ -110,9 +118,9 @@ def _meant(one: ErrorDetails) -> str | None:
     """Return the key or name that a misspelt one was probably meant to be, None for none."""
     if one["type"] == "extra_forbidden":
         allowed: Sequence[str] = list(record_at(one["loc"][:-1], Machine).model_fields)
-        return next(iter(difflib.get_close_matches(str(one["loc"][-1]), allowed, n=1)), None)
+        return closest(one["loc"][-1], allowed)
     allowed = re.findall(r"'([^']*)'", one.get("ctx", {}).get("expected", ""))
-    return next(iter(difflib.get_close_matches(str(one["input"]), allowed, n=1)), None)
+    return closest(one["input"], allowed)
 
 
 def _mend(raw: dict[str, Any], one: ErrorDetails, where: Path) -> bool:

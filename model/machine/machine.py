@@ -961,23 +961,25 @@ def load_machine(name: str | Path) -> Machine:
     """
     path = _find(str(name))
     try:
-        raw = extends.read(path, MACHINES)
+        raw, wrong = extends.read(path, MACHINES)
     except ValueError as err:
         raise MachineError(str(err)) from None
+    for one in wrong:
+        raise MachineError(f"{one.path}: {'.'.join(one.where)}: {one.message}")
     try:
         return Machine.model_validate(raw)
     except ValidationError as err:
         raise MachineError(error_line(path, err, Machine)) from None
 
 
-def machine_tables(name: str) -> tuple[str, dict[str, Any]]:
-    """Return the text of a machine's own file, and its tables merged over those that it extends. Raises MachineError.
+def machine_tables(name: str) -> tuple[str, dict[str, Any], tuple[extends.WrongName, ...]]:
+    """Return the text of a machine's own file, its tables merged over those that it extends, and wrong names in them.
 
-    name: a shipped name, or a path.
+    name: a shipped name, or a path. Raises MachineError.
     """
     path = _find(name)
     try:
-        return path.read_text(encoding="utf-8-sig", errors="replace"), extends.read(path, MACHINES)
+        return path.read_text(encoding="utf-8-sig", errors="replace"), *extends.read(path, MACHINES)
     except ValueError as err:
         raise MachineError(str(err)) from None
 

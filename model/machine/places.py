@@ -9,13 +9,15 @@ from typing import Any
 HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]#]+?)\s*\]\]?\s*(#.*)?$")
 KEY = re.compile(r"""^\s*((?:[\w-]+|"[^"]*")(?:\s*\.\s*(?:[\w-]+|"[^"]*"))*)\s*=""")
 STRINGS = re.compile(r"""\"(?:\\.|[^"\\])*\"|'[^']*'|#.*""")
+LISTS = ("body", "sensor")  # lists of tables, of whose items one may be named: [body.NAME]
 Path = tuple[int | str, ...]
 
 
 def key_lines(text: str) -> dict[Path, int]:
     """Return the line, from 1, of every table and key of a TOML file that is valid.
 
-    A table of a list has its number in the path: ("body", 1, "inertia", "mass").
+    A table of a list has its number in the path: ("body", 1, "inertia", "mass"). A table without a header of its own
+    has the line of the first one in it; `body` and `sensor` have none.
     """
     lines: dict[Path, int] = {}
     counts: dict[Path, int] = {}
@@ -40,6 +42,8 @@ def key_lines(text: str) -> dict[Path, int]:
                 counts[whole] = counts.get(whole, -1) + 1
             table = resolved(parts)
             lines[table] = number
+            for n in range(2 if table[0] in LISTS else 1, len(table)):
+                lines.setdefault(table[:n], number)
         elif key is not None:
             lines[(*table, *_parts(key[1]))] = number
         if header is None:

@@ -66,7 +66,7 @@ def test_a_name_that_cannot_be_one_is_refused(name: str) -> None:
 @pytest.mark.parametrize("name", shipped_machines())
 def test_a_shipped_machine_is_copied_whole_with_its_keys_explained(name: str) -> None:
     text = machine_template.whole("mine", Path("mine.toml"), name)
-    _, tables = machine_tables(name)
+    _, tables, _ = machine_tables(name)
     assert tomllib.loads(text) == tables | {"name": "mine"}
     known = {key for record in MEANINGS.values() for key in record}
     for line in text.splitlines():
@@ -109,6 +109,25 @@ def test_what_is_wrong_is_said(case: str, tmp_path: Path) -> None:
     found = machine_check.check_file(spoilt(tmp_path, *changes))
     assert [line for line in found.faults if says in line], found.faults
     assert found.sigma_percent == {}
+
+
+def test_wrong_names_of_a_file_that_extends_another_are_all_said_with_their_lines(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    wrong = ("[body.front_rol.friction]", "[body.rear_roll.frictoin]", "[sensor.yawrate]", "[senso.u1]")
+    file.write_text(
+        f'extends = "va12"\nname = "mine"\n{wrong[0]}\nFv = 3\n' + "\nx = 1\n".join(wrong[1:]) + "\nx = 1\n"
+    )
+    found = machine_check.check_file(file).faults
+    for line, said in (
+        (3, "body.front_rol: no such body, allowed: front_chassis, .*did you mean front_roll"),
+        (5, "rear_roll: frictoin: no such key.*did you mean friction"),
+        (7, "sensor.yawrate: no such sensor.*did you mean yaw_rate"),
+        (9, "senso: no such key.*did you mean sensor"),
+    ):
+        assert [one for one in found if re.search(rf"^line {line}: {said}", one)], (line, found)
+    assert any(one.startswith("front_roll: friction.Fv: ") for one in found)  # read as probably meant
+    with pytest.raises(MachineError, match=r"mine.toml: body.front_rol: no such body.*did you mean front_roll"):
+        load_machine(str(file))
 
 
 DOUBTFUL = {
@@ -273,7 +292,7 @@ SLIPS: dict[str, tuple[str, float | list[float], str]] = {  # key, its value in 
 @pytest.mark.parametrize("slip", SLIPS)
 def test_a_value_in_another_unit_is_doubted(slip: str) -> None:
     """One change of an otherwise undoubted machine, its drums driven by motors of 1000 cc a turn, 251 bar at most."""
-    _, raw = machine_tables("tandem")
+    _, raw, _ = machine_tables("tandem")
     raw["sensor"][7] = copy.deepcopy(HYDRAULIC)
     key, value, says = SLIPS[slip]
     assert [line for rule in machine_units.UNIT_DOUBTS for line in rule(Machine.model_validate(raw))] == []
