@@ -92,9 +92,9 @@ def _change_named(path: Path, key: str, known: list[Any], changes: dict[str, Any
         if name not in names:
             hint = did_you_mean(name, names)
             wrong.append(WrongName(path, (key, name), f"no such {key}, allowed: {', '.join(names)}{hint}"))
-            name = closest(name, names)
-        if name is not None:
-            meant[name] = _merge(meant.get(name, {}), change)
+        one = name if name in names else closest(name, names)
+        if one is not None:
+            meant[one] = _merge(meant.get(one, {}), change)
     return [_merge(x, meant[n]) if n in meant else x for n, x in zip(names, known, strict=True)]
 
 
