@@ -83,9 +83,9 @@ def describe_outside_law(share: float | None) -> tuple[str, ...]:
     )
 
 
-def describe_violations(violations: Mapping[str, float]) -> str:
+def describe_violations(violations: Mapping[str, float], tolerance: float = TOLERANCE) -> str:
     """Name the limits that are exceeded by more than the tolerance, the worst first, "" if there is none."""
-    over = sorted(((v, n) for n, v in violations.items() if v > TOLERANCE), reverse=True)
+    over = sorted(((v, n) for n, v in violations.items() if v > tolerance), reverse=True)
     shown = ", ".join(f"{n} by {format_percent(100 * v)}" for v, n in over[:MAX_NAMES])
     rest = f" and {len(over) - MAX_NAMES} more" if len(over) > MAX_NAMES else ""
     return f"{shown}{rest} of the range" if over else ""

@@ -84,9 +84,9 @@ def describe_design(s: Summary) -> Description:
                 f"Accuracies rest on assumed noise of {', '.join(s['assumed_noise'])}, of which the machine file says"
                 " nothing: torques 0.5 % of their limit, encoders 65536 counts per turn."
             )
-        kept = " Limits are kept between the samples, too." if s["max_violation"] == 0 else ""
         remarks.append(
-            "The arm follows the joint positions in profile.csv; the torques there are what the motion takes." + kept
+            "The arm follows the joint positions in profile.csv; the torques there are what the motion takes."
+            + _describe_kept_limits(s)
         )
     else:
         remarks.append(
@@ -161,6 +161,19 @@ def describe_campaign(s: Summary) -> Description:
         _sigma_table(s),
     )
     return Description(f"Campaign for {s['machine']}, problem {s['problem']}", headline, tables, tuple(remarks))
+
+
+def _describe_kept_limits(s: Summary) -> str:
+    """Say what holds of the limits of a joint motion between samples and under a position controller."""
+    if s["max_violation"] > 0:
+        return ""
+    followed = s.get("followed")
+    if followed is None:
+        return " Limits are kept between the samples, too."
+    over = describe_violations(followed, SHOWN_VIOLATION)
+    if not over:
+        return " Limits are kept between the samples, too, and where a position controller follows the motion."
+    return f" Limits are kept between the samples, too; as a position controller follows the motion, it exceeds {over}."
 
 
 def _describe_given_zeros(s: Summary) -> list[str]:

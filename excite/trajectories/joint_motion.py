@@ -26,9 +26,10 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.optimize import minimize
 
+from excite.errors import SimulationError
 from excite.model import Model, build
 from excite.model.machine import Problem, Quantity
-from excite.simulation import Motion, inverse_dynamics, motion_along
+from excite.simulation import Motion, inverse_dynamics, motion_along, play_back
 from excite.trajectories import composite_objective
 from excite.trajectories.collocation import MappedFunction
 from excite.trajectories.composite_objective import CompositeObjective
@@ -48,6 +49,7 @@ MAX_MARGIN = 0.8  # largest margin, share of half a limit's range; chosen
 SOLVER_TOLERANCE = 1e-6  # of SLSQP, in the objective; chosen
 RESTART_GAIN = 1e-3  # gain of the objective that justifies another beginning; chosen
 SINGULAR_VALUE = 1e3  # objective where no parameter set is identifiable, above any other; chosen
+FOLLOWING = "following the motion"  # the limit that a motion exceeds whose simulation under a controller fails
 USUAL_AMPLITUDE = 1.0  # rad or m, amplitude of a guess for a joint without limits; chosen
 
 
@@ -171,6 +173,20 @@ def all_violations(model: Model, problem: Problem, motion: JointMotion) -> dict[
     found = check_limits(model, problem, motion.sample(model))
     between = between_samples(model, problem, motion)
     return {name: max(x, between.get(name, 0.0)) for name, x in found.items()}
+
+
+def violations_as_followed(model: Model, problem: Problem, motion: Motion) -> dict[str, float]:
+    """Return the largest excess over every limit of machine and problem where a position controller follows a motion.
+
+    As a fraction of the limit's range. Rest at the ends does not count. A motion that the controller cannot follow
+    exceeds FOLLOWING without bound.
+    """
+    try:
+        followed = play_back(model, motion.u, motion.q[0], motion.nu[0], (motion.q, motion.nu))
+    except SimulationError:
+        return {FOLLOWING: np.inf}
+    names = {g.name for g in machine_limits(model, problem)}
+    return {n: x for n, x in check_limits(model, problem, followed).items() if n in names}
 
 
 def with_smooth_friction(model: Model, least: float = FRICTION_RATE) -> Model:

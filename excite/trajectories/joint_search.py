@@ -3,7 +3,8 @@
 A start is the best of many random Fourier series within the limits. Its coefficients are optimised in stages of a
 sharper and sharper maximum; a free motion then goes on from the Fourier series as a spline. Scores and limits are those
 of the machine file, the limits at DENSE_PER_SAMPLE points per sample; limits that are exceeded between the program's
-samples get a margin, and the last stage is repeated.
+samples get a margin, and the last stage is repeated. The best motion is made a little smaller if it exceeds limits
+where a position controller follows it.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from excite.trajectories.joint_motion import (
     JointMotion,
     MotionProgram,
     all_violations,
+    violations_as_followed,
     with_smooth_friction,
 )
 from excite.trajectories.limits import TOLERANCE, end_poses
@@ -46,6 +48,7 @@ GUESSES = 200  # random series of which the best is a start; chosen
 GUESS_REACH = 0.9  # share of the limits on position and speed that a guess may use; chosen
 SHRINK, SHRINKS = 0.85, 12  # factor of a guess outside of its limits, and how often it is applied; chosen
 DRAWN_BACK = (0.995, 0.98, 0.95, 0.9, 0.8)  # factors of coefficients that keep limits in the end; chosen
+DRAWN_BACK_FOLLOWED = (0.998, 0.995, 0.99, 0.98, 0.95)  # those that keep limits as followed; chosen
 REPAIR_ITERATIONS = 60  # of a solve with larger margins; chosen
 ROUNDING = 1e-6  # excess that counts as none, share of a limit's range; chosen
 REPAIRS = 4  # solves with larger margins; chosen
@@ -69,16 +72,24 @@ TRAJECTORIES: dict[str, tuple[Stage, ...]] = {  # stages by the kind of motion; 
 
 @dataclass(frozen=True)
 class ScoredMotion:
-    """A motion by its coefficients (n_q, n_c) in a basis. score: of the objective; violations: excess by limit."""
+    """A motion by its coefficients (n_q, n_c) in a basis. score: of the objective; violations: excess by limit.
+
+    followed: excess by limit where a position controller follows the motion, None if that was not simulated.
+    """
 
     basis: str
     coefficients: np.ndarray
     score: float
     violations: dict[str, float]
+    followed: dict[str, float] | None = None
 
     @property
     def excess(self) -> float:
         return max(self.violations.values(), default=0.0)
+
+    @property
+    def followed_excess(self) -> float:
+        return max((self.followed or {}).values(), default=0.0)
 
     @property
     def rank(self) -> tuple[int, float]:
@@ -159,8 +170,8 @@ def design_joint_motion(
         if interrupted:
             raise KeyboardInterrupt
         raise infeasible_error(composite, best.best.violations, complete)
-    made = _as_motion(model, problem, best.best.basis, best.best.coefficients)
-    motion = made.sample(model)
+    chosen = keep_as_followed(model, problem, composite, best.best)
+    motion = _as_motion(model, problem, chosen.basis, chosen.coefficients).sample(model)
     return Design(
         composite.name,
         Manoeuvre(motion.t, motion.u),
@@ -168,13 +179,14 @@ def design_joint_motion(
         objectives.cond_phi(model, motion),
         objectives.cond_w(model, motion),
         min(t.start_cond_phi for t in states.values()),
-        dict(best.best.violations),
-        best.best.excess,
+        dict(chosen.violations),
+        chosen.excess,
         tuple(_reported(composite, states[k].best) if k in states else float("inf") for k in range(starts)),
         complete,
         "slsqp",
         best.iterations,
         trajectory,
+        chosen.followed,
     )
 
 
@@ -267,6 +279,28 @@ def _drawn_back(model: Model, problem: Problem, objective: CompositeObjective, f
         if less.excess <= ROUNDING:
             return less
     return found
+
+
+def keep_as_followed(
+    model: Model, problem: Problem, objective: CompositeObjective, found: ScoredMotion
+) -> ScoredMotion:
+    """Return a motion with what it exceeds as followed, its coefficients reduced if that keeps all limits.
+
+    A motion that exceeds limits as planned, or that no reduction helps, stays as it is.
+    """
+
+    first = _with_followed(model, problem, found)
+    for share in DRAWN_BACK_FOLLOWED if first.excess <= ROUNDING < first.followed_excess else ():
+        less = score_joint_motion(model, problem, objective, first.basis, share * first.coefficients)
+        less = _with_followed(model, problem, less)
+        if max(less.excess, less.followed_excess) <= ROUNDING:
+            return less
+    return first
+
+
+def _with_followed(model: Model, problem: Problem, found: ScoredMotion) -> ScoredMotion:
+    motion = _as_motion(model, problem, found.basis, found.coefficients).sample(model)
+    return replace(found, followed=violations_as_followed(model, problem, motion))
 
 
 def _shaped(program: MotionProgram, x: np.ndarray) -> np.ndarray:

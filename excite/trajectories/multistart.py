@@ -57,7 +57,8 @@ class Design:
     violations: excess by limit, as a fraction of its range, 0 where kept. scores: the objective of every start as
     reported, inf for an infeasible one. complete: False if interrupted or cut short by the budget. solver: a name in
     SOLVERS; iterations: of the solver, from the start that won to this drive. trajectory: kind of joint motion, a name
-    in TRAJECTORIES, None for torques; limits of a joint motion are also judged between samples.
+    in TRAJECTORIES, None for torques; limits of a joint motion are also judged between samples. followed: excess over
+    them where a position controller follows the motion, None if that was not simulated.
     """
 
     objective: str
@@ -73,6 +74,7 @@ class Design:
     solver: str = "own"
     iterations: int = 0
     trajectory: str | None = None
+    followed: dict[str, float] | None = None
 
 
 def design(

@@ -346,6 +346,8 @@ def summarise_result(request: DesignRequest, result: DesignResult) -> dict[str, 
         "trajectory": drive.trajectory,
         "iterations": drive.iterations,
     }
+    if drive.followed is not None:
+        summary["followed"] = dict(drive.followed)
     if result.first is not None:
         first = trajectories.sigma_percent(result.aim, result.model, result.first.motion)
         summary["cond_slack_percent"] = request.cond_slack

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from excite import simulation, trajectories
+from excite import reports, simulation, trajectories, workflows
 from excite.errors import MachineError, UsageError
 from excite.model import Model, build
 from excite.model.machine import Problem, load_machine
@@ -155,9 +155,25 @@ def test_arm_follows_its_design_under_position_control(arm: Model, problem: Prob
     assert np.abs(alone.q - motion.q).max() > 0.5
 
 
-def test_design_folder_is_played_back_by_positions(arm: Model, tmp_path: Path) -> None:
-    from excite import workflows
+def test_design_keeps_its_limits_where_a_controller_follows_it(arm: Model, problem: Problem) -> None:
+    """A slow controller overshoots: a design for the planned motion alone exceeds a position by 2.6 %."""
+    rows = arm.machine.sampling_hz.model_copy(update={"value": 20.0})
+    slow = arm.for_machine(arm.machine.model_copy(update={"sampling_hz": rows}))
+    request = DesignRequest(starts=1, trajectory="fourier")
+    found = design_from(slow, problem, request)
+    motion = found.design.motion
+    driven = simulation.follow_positions(slow, motion.u, motion.q, motion.nu)
+    over = trajectories.check_limits(slow, problem, driven)
+    assert found.design.followed == {n: x for n, x in over.items() if not n.startswith("rest")}
+    assert max(found.design.followed.values()) <= 1e-6
+    assert found.design.cond_phi < 1.1 * 25.29  # that of the planned motion alone
+    summary = workflows.design_account(found, "A4", problem, request, 0.0).summary
+    assert "and where a position controller follows the motion" in str(reports.describe("design", summary).remarks)
+    summary["followed"] = {"rate forearm": 0.0024}
+    assert "it exceeds rate forearm by 0.24 % of the range" in str(reports.describe("design", summary).remarks)
 
+
+def test_design_folder_is_played_back_by_positions(arm: Model, tmp_path: Path) -> None:
     place = tmp_path / "design"
     place.mkdir()
     request = DesignRequest(starts=1, trajectory="fourier")
