@@ -1,7 +1,8 @@
 """Compare with what others use: the excitation of an arm, and the identification of a rig (see `identification`).
 
-python results/duel/study.py [--seconds 60] [--runs 20] [--seed 0] [--out FOLDER] rebuilds summary.json, table.md and
-duel.png beside this file. Needs the extra `duel`; a contender whose package is missing is said to be missing.
+python results/duel/study.py [--seconds 60] [--runs 20] [--seed 0] [--out FOLDER] writes summary.json, table.md and
+duel.png, by default into results/.duel: the published ones stay as they are. Needs the extra `duel`; a contender whose
+package is missing is left out with a line that says so.
 
 Excitation: SLSQP with finite differences, CMA-ES, and Opti with Ipopt. All get the same task: machine file, limits,
 regressor, poses at both ends, start (the best of 200 random Fourier series), and the same processor time on one core.
@@ -19,6 +20,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +94,8 @@ class Task:
 
 def own(task: Task, trajectory: str) -> tuple[str, np.ndarray]:
     *_, found = joint_search.search(task.model, task.problem, task.objective, trajectory, task.seed, task.spent)
-    return found.best.basis, found.best.coefficients
+    best = joint_search.keep_as_followed(task.model, task.problem, task.objective, found.best)
+    return best.basis, best.coefficients
 
 
 def slsqp(task: Task) -> tuple[str, np.ndarray]:
@@ -202,8 +206,6 @@ CONTENDERS: dict[str, tuple[Callable[[Task], tuple[str, np.ndarray]], str | None
 
 def contend(machine: str, seconds: float, seed: int, name: str) -> dict[str, Any]:
     """Let one contender solve the task and judge its result."""
-    from importlib.util import find_spec
-
     solve, package = CONTENDERS[name]
     if package is not None and find_spec(package) is None:
         return {"name": name, "missing": package}
@@ -237,13 +239,24 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def rig_table(rows: list[dict[str, Any]]) -> str:
     names = identification.NAMES
-    lines = [f"| contender | RMSE of {', '.join(names)} [%] | 95 % intervals that hold | failed | time per log |"]
-    lines.append("|---|---|---|---|---|")
+    lines = [
+        f"| contender | RMSE of {', '.join(names)} [%] | 95 % intervals that hold | logs | failed | time per log |"
+    ]
+    lines.append("|---|---|---|---|---|---|")
     for r in rows:
+        if "missing" in r:
+            lines.append(f"| {r['name']} | package {r['missing']} is missing | | | | |")
+            continue
         errors = ", ".join(f"{r['rmse_percent'][n]:.3f}" for n in names)
         held, seconds = f"{100 * r['coverage95']:.0f} %", f"{r['processor_s_per_log']:.1f} s"
-        lines.append(f"| {r['name']} | {errors} | {held} | {r['failed']} | {seconds} |")
+        lines.append(f"| {r['name']} | {errors} | {held} | {r['runs']} | {r['failed']} | {seconds} |")
     return "\n".join(lines) + "\n"
+
+
+def contender_versions() -> dict[str, str]:
+    """Return the versions of the contenders' packages that are installed."""
+    needed = [package for _, package in (*CONTENDERS.values(), *identification.CONTENDERS.values()) if package]
+    return {package: version(package) for package in needed if find_spec(package) is not None}
 
 
 def figure(rows: list[dict[str, Any]]) -> Figure:
@@ -268,7 +281,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=20, help="logs of the rig to identify from")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", default=list(CONTENDERS))
-    parser.add_argument("--out", type=Path, default=HERE)
+    parser.add_argument("--out", type=Path, default=HERE.parent / ".duel", help="folder that is written")
     parser.add_argument("--case", default=None, help="one contender, printed as JSON")
     options = parser.parse_args()
     if options.case is not None:
@@ -283,16 +296,20 @@ def main() -> None:
             raise SystemExit(f"{name} failed:\n{done.stderr}")
         rows.append(json.loads(done.stdout.splitlines()[-1]))
         print(table(rows[-1:]).splitlines()[-1], flush=True)
-    rig = identification.contend(options.runs, options.seed)
+    tables = identification.simulate_logs(options.runs, options.seed)
+    rig = []
+    for name in identification.CONTENDERS:
+        rig.append(identification.contend(name, tables))
+        print(rig_table(rig[-1:]).splitlines()[-1], flush=True)
     options.out.mkdir(parents=True, exist_ok=True)
     summary = {
-        "command": "python results/duel/study.py",
+        "command": "python results/duel/study.py --out results/duel",
         "machine": options.machine,
         "processor_s": options.seconds,
         "seed": options.seed,
         "excitation": rows,
         "identification": {"runs": options.runs, "contenders": rig},
-        "versions": workflows.package_versions(),
+        "versions": {**workflows.package_versions(), **contender_versions()},
     }
     (options.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     (options.out / "table.md").write_text(table(rows) + "\n" + rig_table(rig), encoding="utf-8")

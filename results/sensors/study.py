@@ -1,6 +1,7 @@
 """Measure what each sensor buys: the accuracy that a drive allows with some sensors left out.
 
-python results/sensors/study.py [--out FOLDER] rebuilds summary.json and table.md beside this file in seconds.
+python results/sensors/study.py [--out FOLDER] writes summary.json and table.md in seconds, by default into
+results/.sensors: the published ones stay as they are.
 The drive is results/R60_accuracy, the accuracy the Cramer-Rao bound of the sensors that are left.
 """
 
@@ -37,8 +38,9 @@ COARSER = 8.0  # times fewer counts of every encoder
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=HERE)
+    parser.add_argument("--out", type=Path, default=HERE.parent / ".sensors", help="folder that is written")
     place = parser.parse_args().out
+    place.mkdir(parents=True, exist_ok=True)
     made = trajectories.read_design(DRIVE)
     machine = made.model.machine
     rows: list[dict[str, Any]] = []
