@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import importlib
 import json
@@ -17,6 +18,7 @@ from typing import Any
 
 import pytest
 import typer
+from support import studies
 from support.commands import Excite
 
 import excite as interface
@@ -27,6 +29,13 @@ from excite.model.machine import units
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+
+
+STUDIES = sorted((ROOT / "results").glob("*/study.py"))
+
+
+def named(script: Path) -> str:
+    return f"{script.parent.name}-{script.stem}"
 
 
 def blocks(path: Path) -> list[tuple[str, str]]:
@@ -59,9 +68,7 @@ def test_the_page_on_sensors_has_the_study_s_table() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "study", sorted((ROOT / "results").glob("*/*.py")), ids=lambda path: f"{path.parent.name}-{path.stem}"
-)
+@pytest.mark.parametrize("study", sorted((ROOT / "results").glob("*/*.py")), ids=named)
 def test_a_study_calls_the_program_as_it_is(study: Path, tmp_path: Path) -> None:
     """Names that are gone, arguments that are missing: what would stop a study that nobody has run for long."""
     (tmp_path / "mypy.ini").write_text("[mypy]\ncheck_untyped_defs = true\nignore_missing_imports = true\n")
@@ -76,6 +83,42 @@ def test_a_study_calls_the_program_as_it_is(study: Path, tmp_path: Path) -> None
         env=ENVIRONMENT | {"MYPYPATH": str(ROOT / "tests")},
     )
     assert ran.returncode == 0, ran.stdout
+
+
+@pytest.mark.parametrize("study", [p for p in STUDIES if p.parent.name not in ("duel", "machines")], ids=named)
+def test_a_study_writes_where_it_is_told(study: Path) -> None:
+    """Its options come with `--out`, and its own folder is only read."""
+    text = study.read_text(encoding="utf-8")
+    assert "studies.parse(parser, __file__" in text
+    assert "parse_args" not in text
+    writing = r"(?:save|new_file|open|mkdir|write_\w+)\("
+    assert not re.findall(rf"{writing}[^\n]*HERE|HERE[^\n]*\.{writing}", text)
+
+
+def test_a_study_leaves_published_results_alone_by_default(tmp_path: Path) -> None:
+    script = str(ROOT / "results" / "cost" / "study.py")
+    assert studies.default_out(script) == ROOT / "results" / "cost-rebuilt"
+    assert "/results/*-*/" in (ROOT / ".gitignore").read_text(encoding="utf-8").split()
+    given = studies.parse(argparse.ArgumentParser(), script, ["--out", str(tmp_path / "a" / "b")])
+    assert given.out == tmp_path / "a" / "b"
+    assert given.out.is_dir()
+
+
+def test_a_study_s_summary_says_how_it_was_made() -> None:
+    made = studies.origin(str(ROOT / "results" / "cost" / "study.py"), 3)
+    assert made["command"].startswith("python results/cost/study.py")
+    assert made["seed"] == 3
+    assert made["versions"]["excite"] == interface.__version__
+    assert re.fullmatch(r"[0-9a-f]{7,}|", made["commit"])  # none outside a repository
+
+
+def test_every_command_of_a_study_says_what_it_writes() -> None:
+    page = (ROOT / "results" / "README.md").read_text(encoding="utf-8")
+    commands = re.findall(r"`(python results/[^`]+|excite [^`]+)`", page.split("## Rebuild")[1])
+    assert len(commands) > 18
+    for command in commands:
+        if not command.startswith("python results/machines/"):
+            assert re.search(r" --out results/\w+", command), command
 
 
 def test_a_study_can_be_rebuilt_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:

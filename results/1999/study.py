@@ -1,7 +1,6 @@
 """Read the table printed in 1999 by its own formula (33), and search for simulated tests that reproduce it.
 
-python results/1999/study.py [--out DIR] [--jobs 1] writes summary.json and the figures into DIR, by default
-results/1999-rebuilt.
+python results/1999/study.py [--out FOLDER] [--jobs 1] writes summary.json and the figures.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -20,10 +18,14 @@ from pathlib import Path
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parents[1] / "tests"))
+
 import joblib
 import numpy as np
 import scipy.linalg
 from matplotlib.figure import Figure
+from support import studies
 
 from excite import output
 from excite.identification import summarise_runs, verify
@@ -32,9 +34,7 @@ from excite.model import Model, build
 from excite.model.machine import Filter, Machine, machine as machines
 from excite.reports import COLOURS, save
 from excite.simulation import Motion, follow, sensors
-from excite.workflows import package_versions
 
-HERE = Path(__file__).parent
 SEED = 0  # the first of the search
 SEEDS = range(SEED, SEED + 3)  # of the search; chosen
 FRESH_SEEDS = range(SEED + 3, SEED + 11)  # on which cells that the search picked are repeated; chosen
@@ -513,15 +513,10 @@ def _plain(x: object) -> object:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, default=HERE.parent / "1999-rebuilt", help="folder that is written")
     parser.add_argument("--jobs", type=int, default=1, help="parallel processes")
-    given = parser.parse_args()
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=HERE, capture_output=True, text=True, check=False)
+    given = studies.parse(parser, __file__)
     result: dict[str, object] = {
-        "command": "python results/1999/study.py" + "".join(f" {a}" for a in sys.argv[1:]),
-        "seed": SEED,
-        "versions": package_versions(),
-        "commit": commit.stdout.strip(),
+        **studies.origin(__file__, SEED),
         "printed": {"values": dict(zip(NAMES, X, strict=True)), "std_percent": dict(zip(NAMES, PERCENT, strict=True))}
         | {"cond_w": COND_W, "cond_phi": COND_PHI},
         "algebra": algebra(),
@@ -538,7 +533,6 @@ def main() -> None:
     result["resolution"] = {law: resolution(*cell) for law, cell in nearest.items()}
     print("recommended method", flush=True)
     result["instead"] = instead(nearest["v_n"][0], given.jobs)
-    given.out.mkdir(parents=True, exist_ok=True)
     output.write_summary(given.out, _plain(result))
     save(pattern_figure(found), given.out / "pattern.png")
     save(mechanism_figure(result["resolution"]), given.out / "mechanism.png")

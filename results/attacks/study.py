@@ -1,10 +1,9 @@
 """Attack the diagnosis with logs that it was not made for, and score the answers against keys written beforehand.
 
-python results/attacks/study.py [--per-attack 1] [--first 0] [--jobs 1] [--only KIND ...] [--out results/.attacks]
-runs the cases from number `--first` on: numbers that were never run are fresh logs. Writes summary.json and README.md
-to `--out`. Each case is stored in results/.attacks/ when done, so an interrupted study resumes; cases of other versions
-of the program or the attacks are not reused. `--jobs 0` reports the stored cases. To publish a round, give
-`--out=results/attacks`.
+python results/attacks/study.py [--per-attack 1] [--first 0] [--jobs 1] [--only KIND ...] [--out FOLDER] runs the cases
+from number `--first` on: numbers that were never run are fresh logs. Writes summary.json and README.md. Each case is
+stored in results/.attacks/ when done, so an interrupted study resumes; cases of other versions of the program or the
+attacks are not reused. `--jobs 0` reports the stored cases.
 """
 
 from __future__ import annotations
@@ -29,6 +28,7 @@ KEPT = ROOT / "results" / ".attacks"
 sys.path.insert(0, str(ROOT / "tests"))
 
 import joblib
+from support import studies
 from support.attacks import ATTACKS, KINDS, OUTCOMES, Attack, attack, key_of, score, simulate
 from support.blind import ask
 from support.rounds import program_version, store
@@ -177,7 +177,6 @@ rebuilds this page; program version {s["program"]}. All cases are in [summary.js
 
 def report(rows: Sequence[Row], planned: int, program: str, out: Path, command: str) -> None:
     s = summary(rows, planned, program)
-    out.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").write_text(json.dumps(s, indent=1, default=float) + "\n")
     (out / "README.md").write_text(readme(s, command))
 
@@ -188,8 +187,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--first", type=int, default=0, help="number of each attack's first case")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--only", nargs="+", choices=KINDS, default=list(KINDS), help="kinds of attacks to run")
-    parser.add_argument("--out", type=Path, default=KEPT)
-    given = parser.parse_args(argv)
+    given = studies.parse(parser, __file__, argv)
     program = program_version(SUPPORT)
     kept = KEPT / program
     kept.mkdir(parents=True, exist_ok=True)
@@ -207,7 +205,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             )
     files = [kept / f"{one.label}.json" for one in wanted]
     rows = [json.loads(file.read_text()) for file in files if file.is_file()]
-    options = f"--per-attack {given.per_attack} --first {given.first} --out=results/attacks"
+    options = f"--per-attack {given.per_attack} --first {given.first} --out results/attacks"
     if set(given.only) != set(KINDS):
         options += f" --only {' '.join(given.only)}"
     report(rows, len(wanted), program, given.out, f"python results/attacks/study.py {options}")

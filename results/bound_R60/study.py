@@ -1,6 +1,7 @@
 """Compute a lower bound on cond(Phi) of R60 (`excite.trajectories.bound`), from the states of the designed drives.
 
-python results/bound_R60/study.py [--rounds 80] [--minutes 45] rebuilds summary.json and bound.png beside this file.
+python results/bound_R60/study.py [--rounds 80] [--minutes 45] [--out FOLDER] writes summary.json, certificate.json and
+bound.png.
 """
 
 from __future__ import annotations
@@ -10,14 +11,19 @@ import argparse
 import dataclasses
 import json
 import os
+import sys
 import time
 from pathlib import Path
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parents[1] / "tests"))
+
 import numpy as np
 from matplotlib.figure import Figure
+from support import studies
 
 from excite import output
 from excite.logs import profile
@@ -28,7 +34,6 @@ from excite.simulation import Motion, simulate
 from excite.trajectories import Manoeuvre, objective, place_on_lane
 from excite.trajectories.bound import Bound, bound
 
-HERE = Path(__file__).parent
 DESIGNS = HERE.parent / "R60" / "design", HERE.parent / "R60_accuracy" / "design"
 
 
@@ -38,7 +43,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=45, help="no new round begins after this time")
     parser.add_argument("--degree", type=int, default=2, help="degree of the polynomials")
     parser.add_argument("--polished", type=int, default=12, help="states refined by local search in each round")
-    options = parser.parse_args()
+    options = studies.parse(parser, __file__)
     model = prediction.build(machine.load_machine("va12"))
     motions = drives(model)
     path: list[Bound] = []
@@ -64,6 +69,7 @@ def main() -> None:
     )
     best = min(objective.cond_phi(model, m) for m in motions)
     summary = {
+        **studies.origin(__file__, 0),
         "machine": "va12",
         "problem": "R60",
         "designed_cond_phi": best,
@@ -73,13 +79,13 @@ def main() -> None:
         "certified_by_round": [f.certified for f in path],
         "mixture_by_round": [f.mixture for f in path],
     }
-    save(figure(path, found, best), HERE / "bound.png")
+    save(figure(path, found, best), options.out / "bound.png")
     certificate = found.certificate
     assert certificate is not None
     matrices = {k: getattr(certificate, k) for k in ("U", "V", "m", "a", "b")}
-    with output.new_file(HERE / "certificate.json") as place:
+    with output.new_file(options.out / "certificate.json") as place:
         place.write_text(json.dumps(matrices, default=lambda x: np.asarray(x).tolist()) + "\n", encoding="utf-8")
-    with output.new_file(HERE / "summary.json") as place:
+    with output.new_file(options.out / "summary.json") as place:
         place.write_text(output.to_json(summary), encoding="utf-8")
 
 

@@ -1,6 +1,6 @@
 """Bound the accuracy of every drive of a test rig with one joint, and compare designs with it.
 
-python results/bound_rig/study.py [--degree 4] rebuilds summary.json and bound.png beside this file.
+python results/bound_rig/study.py [--degree 4] [--out FOLDER] writes summary.json and bound.png.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 # ruff: noqa: E402  (threads are set before numpy loads)
 import argparse
 import os
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -16,17 +15,19 @@ from pathlib import Path
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parents[1] / "tests"))
+
 import numpy as np
 from matplotlib.figure import Figure
+from support import studies
 
 from excite import output
 from excite.model import prediction
 from excite.model.machine import machine
 from excite.reports import COLOURS, save
 from excite.trajectories import bound_accuracy, compose_objective, design, sigma_percent
-from excite.workflows import package_versions
 
-HERE = Path(__file__).parent
 RIG = HERE.parents[1] / "tests" / "support" / "rig.toml"
 OBJECTIVES = ("accuracy", "worst", "A", "D")
 MIDDLE = ("Fv", "Fc")  # parameters whose mean bounds the median, see README.md
@@ -37,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--degree", type=int, default=4, help="degree of the polynomials")
     parser.add_argument("--starts", type=int, default=6, help="starts of each design")
-    options = parser.parse_args()
+    options = studies.parse(parser, __file__)
     model = prediction.build(machine.load_machine(str(RIG)))
     problem = model.machine.problems["T10"]
     bounds: Values = {}
@@ -67,10 +68,8 @@ def main() -> None:
             **{f"sigma {n}": float(s) for n, s in zip(model.base.names, sigma, strict=True)},
         }
         print(name, designs[name], flush=True)
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=HERE).stdout
     summary = {
-        "command": " ".join(["python results/bound_rig/study.py", *sys.argv[1:]]),
-        "seed": 0,
+        **studies.origin(__file__, 0),
         "degree": options.degree,
         "starts": options.starts,
         "bounds_percent": bounds,
@@ -79,11 +78,9 @@ def main() -> None:
         "load_average": os.getloadavg()[0],
         "designs": designs,
         "gaps_percent": {k: 100 * (min(d[k] for d in designs.values()) / b - 1) for k, b in bounds.items()},
-        "commit": commit.strip(),
-        "versions": package_versions(),
     }
-    save(figure(bounds, designs), HERE / "bound.png")
-    with output.new_file(HERE / "summary.json") as place:
+    save(figure(bounds, designs), options.out / "bound.png")
+    with output.new_file(options.out / "summary.json") as place:
         place.write_text(output.to_json(summary), encoding="utf-8")
 
 

@@ -1,7 +1,7 @@
 """Measure how much driving a stated accuracy of the worst parameter takes, on the full model and the straight line.
 
-python results/campaign/study.py [--targets 2 1 0.5] [--budget 900] rebuilds summary.json and campaign.png beside this
-file. Campaigns that summary.json already has for the same options are not repeated.
+python results/campaign/study.py [--targets 2 1 0.5] [--budget 900] [--out FOLDER] writes summary.json and campaign.png.
+Campaigns that summary.json already has for the same options are not repeated.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -19,15 +18,17 @@ from typing import Any
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parents[1] / "tests"))
+
 from matplotlib.figure import Figure
+from support import studies
 
 from excite import output, trajectories
 from excite.model import Model, prediction
 from excite.model.machine import Problem, machine
 from excite.reports import COLOURS, save
-from excite.workflows import package_versions
 
-HERE = Path(__file__).parent
 MACHINES = ("va12_straight", "va12")
 MOST_DRIVES = 4
 STARTS = 2
@@ -39,12 +40,12 @@ def main() -> None:
     parser.add_argument("--targets", type=float, nargs="*", default=[2.0, 1.0, 0.5], help="worst parameter [%%]")
     parser.add_argument("--budget", type=float, default=900.0, help="longest search of one campaign [s]")
     parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    place = HERE / "summary.json"
+    options = studies.parse(parser, __file__)
+    place = options.out / "summary.json"
+    origin = studies.origin(__file__, options.seed)
     asked = {"starts": STARTS, "most_drives": MOST_DRIVES, "seed": options.seed, "budget_s": options.budget}
     known = json.loads(place.read_text()) if place.is_file() else {}
     rows: list[Row] = known["campaigns"] if all(known.get(k) == v for k, v in asked.items()) else []
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=HERE).stdout
     for name in MACHINES:
         model = prediction.build(machine.load_machine(name))
         problem = model.machine.problems[model.machine.problem or ""]
@@ -54,16 +55,14 @@ def main() -> None:
             rows.append(campaign(model, problem, target, options.seed, options.budget))
             print(describe(rows[-1]), flush=True)
             summary = {
-                "command": " ".join(["python results/campaign/study.py", *sys.argv[1:]]),
+                **origin,
                 **asked,
                 "load_average": os.getloadavg()[0],
                 "campaigns": rows,
-                "commit": commit.strip(),
-                "versions": package_versions(),
             }
             with output.new_file(place) as fresh:
                 fresh.write_text(output.to_json(summary), encoding="utf-8")
-    save(figure(rows), HERE / "campaign.png")
+    save(figure(rows), options.out / "campaign.png")
 
 
 def campaign(model: Model, problem: Problem, target: float, seed: int, budget_s: float) -> Row:

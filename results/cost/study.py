@@ -1,6 +1,6 @@
 """Measure time and memory of a design against duration, knot interval and number of parameters.
 
-python results/cost/study.py [--seconds 20 40 60 120] rebuilds summary.json, table.md and cost.png beside this file.
+python results/cost/study.py [--seconds 20 40 60 120] [--out FOLDER] writes summary.json, table.md and cost.png.
 Each case is one start with all stages, in a process of its own. Times include the profiler.
 """
 
@@ -22,8 +22,12 @@ from pathlib import Path
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parents[1] / "tests"))
+
 import numpy as np
 from matplotlib.figure import Figure
+from support import studies
 
 from excite import output
 from excite.model import prediction
@@ -32,7 +36,6 @@ from excite.reports import COLOURS, save
 from excite.reports.figures import STYLES
 from excite.trajectories import collocation, composite_objective, continuation, interior_point
 
-HERE = Path(__file__).parent
 PARTS = {  # function: its part of the time; none of them calls another
     collocation.transcribe: "derivatives built",
     interior_point._linearise: "derivatives evaluated",
@@ -47,7 +50,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, nargs="*", default=[20, 40, 60, 120])
     parser.add_argument("--case", nargs=3, default=None, help="machine, seconds, knot: one case, printed as JSON")
-    options = parser.parse_args()
+    options = studies.parse(parser, __file__)
     if options.case is not None:
         print(json.dumps(case(options.case[0], float(options.case[1]), float(options.case[2]))))
         return
@@ -55,17 +58,18 @@ def main() -> None:
     wanted += [("va12", t, 0.4) for t in options.seconds]
     rows = []
     for name, seconds, knot in wanted:
-        command = [sys.executable, __file__, "--case", name, str(seconds), str(knot)]
+        command = [sys.executable, __file__, "--case", name, str(seconds), str(knot), "--out", str(options.out)]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         rows.append(json.loads(done.stdout.splitlines()[-1]))
         print(
             f"{name}, {seconds:g} s, knots {knot:g} s: {rows[-1]['wall_s']:.0f} s, {rows[-1]['memory_MB']:.0f} MB",
             flush=True,
         )
-    (HERE / "table.md").write_text(table(rows))
-    save(figure(rows), HERE / "cost.png")
-    summary = {"load_average": os.getloadavg()[0], "cores": os.cpu_count(), "cases": rows}
-    with output.new_file(HERE / "summary.json") as place:
+    (options.out / "table.md").write_text(table(rows))
+    save(figure(rows), options.out / "cost.png")
+    cores = {"load_average": os.getloadavg()[0], "cores": os.cpu_count()}
+    summary = studies.origin(__file__, 0) | cores | {"cases": rows}
+    with output.new_file(options.out / "summary.json") as place:
         place.write_text(output.to_json(summary), encoding="utf-8")
 
 

@@ -1,7 +1,8 @@
 """Measure the coverage of the 95 % intervals of joint smoothing over hundreds of simulated runs.
 
-python results/coverage/study.py [--jobs 2] resumes from runs.jsonl, then rebuilds summary.json and README.md beside
-this file. `--runs 10`: a trial of ten runs of each set. `--jobs 0`: report the stored runs only.
+python results/coverage/study.py [--jobs 2] [--out FOLDER] writes summary.json and README.md, and stores the runs in
+runs.jsonl, from which it resumes. `--runs 10`: a trial of ten runs of each set. `--jobs 0`: report the stored runs
+only.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import argparse
 import json
 import multiprocessing
 import os
+import sys
 import time
 import warnings
 from collections.abc import Mapping, Sequence
@@ -22,9 +24,13 @@ from pathlib import Path
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parents[1] / "tests"))
+
 import numpy as np
 import pandas as pd
 import scipy.signal
+from support import studies
 
 from excite.errors import NoEstimateError
 from excite.identification import identify
@@ -39,8 +45,7 @@ from excite.smoothing import cramer_rao
 from excite.trajectories import relative_std_percent
 from excite.trajectories.objective import reference_values
 
-HERE = Path(__file__).parent
-RUNS = HERE / "runs.jsonl"
+RUNS = "runs.jsonl"
 START_ERROR = 0.2  # largest relative error of bodies, friction and contacts in the starting machine file; chosen
 FAR_START_ERROR = 0.5  # relative error of every value in the sets "far"; chosen
 SLOPE = 0.002  # slope of the ground in the sets "slope"; chosen
@@ -153,12 +158,12 @@ def _run(job: tuple[Set, int]) -> dict[str, object]:
     return run(*job)
 
 
-def stored_runs() -> list[dict[str, object]]:
+def stored_runs(kept: Path) -> list[dict[str, object]]:
     """Read the stored runs; a truncated line counts as not run."""
-    if not RUNS.exists():
+    if not kept.exists():
         return []
     rows = []
-    for line in RUNS.read_text().splitlines():
+    for line in kept.read_text().splitlines():
         try:
             row = json.loads(line)
         except json.JSONDecodeError:
@@ -225,9 +230,9 @@ TEXT = """
 **Result.** On drives by the driver model (human), 400 runs each, the intervals cover 96 % with either sensor kit, and
 every parameter at least 95 %. Logs with an effect outside the model are always flagged, and no others.
 
-`python results/coverage/study.py --jobs 2` resumes from `runs.jsonl` (not in the repository) and rebuilds this page and
-`summary.json`. Each run simulates the nominal `va12`, measures it with quantisation and noise, and identifies with
-`--method joint`.
+`python results/coverage/study.py --jobs 2 --out results/coverage` rebuilds this page and `summary.json`, resuming from
+`runs.jsonl` (not in the repository). Each run simulates the nominal `va12`, measures it with quantisation and noise,
+and identifies with `--method joint`.
 
 | term | meaning |
 |---|---|
@@ -300,28 +305,30 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--jobs", type=int, default=2, help="parallel processes; 0: report the stored runs only")
     parser.add_argument("--runs", type=int, help="runs of each set, for a trial")
-    options = parser.parse_args()
+    options = studies.parse(parser, __file__)
+    kept = options.out / RUNS
     sets = [replace(s, runs=min(s.runs, options.runs or s.runs)) for s in SETS]
-    have = {(r["set"], r["seed"]) for r in stored_runs()}
+    have = {(r["set"], r["seed"]) for r in stored_runs(kept)}
     todo = [(s, seed) for s in sets for seed in range(s.runs) if (s.name, seed) not in have]
     # Sets grow together, so an interrupted study has runs of each.
     todo.sort(key=lambda x: x[1] / x[0].runs)
     if options.jobs:
         # Forked workers keep the models that this file has built. A killed worker ends the study, which can resume.
         fork = multiprocessing.get_context("fork")
-        with ProcessPoolExecutor(options.jobs, mp_context=fork) as pool, RUNS.open("a") as out:
+        with ProcessPoolExecutor(options.jobs, mp_context=fork) as pool, kept.open("a") as out:
             try:
                 for row in as_completed([pool.submit(_run, job) for job in todo]):
                     out.write(json.dumps(row.result()) + "\n")
                     out.flush()
             finally:
                 pool.shutdown(cancel_futures=True)
-    rows = {s: [r for r in stored_runs() if r["set"] == s.name and int(str(r["seed"])) < s.runs] for s in sets}
+    rows = {s: [r for r in stored_runs(kept) if r["set"] == s.name and int(str(r["seed"])) < s.runs] for s in sets}
     found = [summarise(s, own) for s, own in rows.items() if any("value" in r for r in own)]
     if not found:
-        raise SystemExit(f"{RUNS} holds no run: the report stays as it is")
-    (HERE / "summary.json").write_text(json.dumps(_plain({"off": START_ERROR, "sets": found}), indent=1) + "\n")
-    (HERE / "README.md").write_text(report(found))
+        raise SystemExit(f"{kept} holds no run: the report stays as it is")
+    summary = studies.origin(__file__, 0) | {"off": START_ERROR, "sets": found}
+    (options.out / "summary.json").write_text(json.dumps(_plain(summary), indent=1) + "\n")
+    (options.out / "README.md").write_text(report(found))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Diagnose blind logs of a second roller that shares no code with the program, and score the answers.
 
 python results/diagnosis/study.py [--per-cause 6] [--nothing 200] [--per-surprise 2] [--pairs 12] [--jobs 2]
-rebuilds summary.json, cases.csv, confusion.png and README.md beside this file from held-out cases. `--seen` runs the
+[--out FOLDER] writes summary.json, cases.csv, confusion.png and README.md from held-out cases. `--seen` runs the
 cases that the diagnosis was developed on instead. Each case is stored in results/.diagnosis/ when done, so an
 interrupted study resumes; cases of other versions of the program are not reused. `--jobs 0` reports the stored cases.
 """
@@ -33,6 +33,7 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 from matplotlib.figure import Figure
+from support import studies
 from support.blind import Case, ask, blind, case, score
 from support.causes import CAUSES
 from support.rounds import file_hash, program_version, store
@@ -291,8 +292,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--drive", action="store_true", help="simulate the logs only")
     parser.add_argument("--only", default="", help="run cases whose key begins with this, and print them")
-    parser.add_argument("--out", type=Path, default=HERE)
-    given = parser.parse_args(argv)
+    given = studies.parse(parser, __file__, argv)
     kept = KEPT / program_version(ROLLER)
     kept.mkdir(parents=True, exist_ok=True)
     many = {"nothing": given.nothing, "cause": given.per_cause, "surprise": given.per_surprise, "pair": given.pairs}
@@ -310,7 +310,6 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(pd.DataFrame(rows).reindex(columns=shown).to_string(index=False))
         return
     s = summary(rows)
-    given.out.mkdir(parents=True, exist_ok=True)
     flat = pd.DataFrame(rows).drop(columns=["findings", "located"], errors="ignore")
     for column in ("hidden", "amount"):
         flat[column] = [" ".join(map(str, values)) for values in flat[column]]
@@ -318,7 +317,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     confusion(rows).savefig(given.out / "confusion.png", dpi=110, metadata={"Software": None})
     (given.out / "summary.json").write_text(json.dumps(s, indent=1) + "\n")
     names = ("nothing", "per_cause", "per_surprise", "pairs")
-    options = [f"--{name.replace('_', '-')} {getattr(given, name)}" for name in names]
+    options = [*(f"--{name.replace('_', '-')} {getattr(given, name)}" for name in names), f"--out {given.out}"]
     (given.out / "README.md").write_text(readme(s, len(wanted), [*options, *(["--seen"] if given.seen else [])]))
 
 

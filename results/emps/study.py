@@ -1,19 +1,25 @@
 """Identify EMPS by every method, and simulate the rig with each estimate in its own closed loop.
 
-python results/emps/study.py [DATA_EMPS.mat] rebuilds methods.json and README.md beside this file.
+python results/emps/study.py [DATA_EMPS.mat] [--out FOLDER] writes methods.json and README.md.
 """
 
 from __future__ import annotations
 
+# ruff: noqa: E402  (the folder of shared helpers comes first)
 import argparse
 import json
+import sys
 import textwrap
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parents[1] / "tests"))
+
 import numpy as np
 import scipy.io
+from support import studies
 
 from excite.errors import NoEstimateError
 from excite.identification import METHODS, identify
@@ -22,7 +28,6 @@ from excite.model import Model, build
 from excite.model.machine import machine
 from excite.simulation import Motion, respond
 
-HERE = Path(__file__).parent
 DATA = HERE.parents[1] / ".." / "shared" / "data" / "emps" / "DATA_EMPS.mat"
 Control = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
 KP = 160.18  # 1/s: position gain of the rig's controller; its authors
@@ -135,9 +140,10 @@ def readme(found: dict[str, dict[str, object]], own: dict[str, float], late: dic
         "**Result.** The methods agree within 2 %, and least squares reproduces the published estimates. The standard",
         "deviations published with them are 3.8 to 5.2 times too small: filtered residuals are autocorrelated.",
         "",
-        "`python results/emps/study.py` rebuilds this page and `methods.json`; [identify](identify) is the output of",
-        "`excite identify`. Cells: value (standard deviation). Residual: 100 |Y - W X| / |Y|. Last four columns:",
-        "errors of the rig simulated in closed loop from its reference alone, 100 |measured - simulated| / |measured|.",
+        "`python results/emps/study.py --out results/emps` rebuilds this page and `methods.json`; [identify](identify)",
+        "is the output of `excite identify`. Cells: value (standard deviation). Residual: 100 |Y - W X| / |Y|. Last",
+        "four columns: errors of the rig simulated in closed loop from its reference alone, 100 |measured - simulated|",
+        "/ |measured|.",
         "",
         "| method | " + " | ".join(names) + " | residual | position | velocity | acceleration | force |",
         "|---" * (len(names) + 6) + "|",
@@ -185,7 +191,8 @@ def _bullet(text: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path, nargs="?", default=DATA)
-    path = parser.parse_args().data
+    options = studies.parse(parser, __file__)
+    path = options.data
     model = build(machine.load_machine("emps"))
     one = log.read_log(path, model.machine)
     raw = {k: np.ravel(v) for k, v in scipy.io.loadmat(path).items() if not k.startswith("_")}
@@ -206,9 +213,9 @@ def main() -> None:
     own = loop(raw)
     late = closed_loop(model, raw, np.array(list(found["ols"]["value"].values())), late=True)  # type: ignore[attr-defined]
     rounded = {name: {k: float(f"{v:.4g}") for k, v in r.items()} for name, r in (("loop", own), ("late", late))}
-    content = {"published": PUBLISHED, "methods": found, **rounded}
-    (HERE / "methods.json").write_text(json.dumps(content, indent=1) + "\n")
-    (HERE / "README.md").write_text(readme(found, own, late))
+    content = {**studies.origin(__file__, 0), "published": PUBLISHED, "methods": found, **rounded}
+    (options.out / "methods.json").write_text(json.dumps(content, indent=1) + "\n")
+    (options.out / "README.md").write_text(readme(found, own, late))
 
 
 if __name__ == "__main__":

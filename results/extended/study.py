@@ -1,7 +1,7 @@
 """Measure how much an identified effect improves the parameters and the next drive.
 
-python results/extended/study.py [--runs 20] [--jobs 2] rebuilds summary.json, figure.png and README.md beside this
-file. Finished effects are stored in results/.extended, so an interrupted study resumes. The true roller has an effect
+python results/extended/study.py [--runs 20] [--jobs 2] [--out FOLDER] writes summary.json, figure.png and README.md.
+Finished effects are stored in results/.extended, so an interrupted study resumes. The true roller has an effect
 that its machine file lacks. One log of the drive R60_accuracy is diagnosed, and a drive is designed for the resulting
 machine file. The true machine drives both drives many times, and the logs are identified with the old and the new file.
 Of a tie the new file has the first effect.
@@ -9,28 +9,30 @@ Of a tie the new file has the first effect.
 
 from __future__ import annotations
 
+# ruff: noqa: E402  (threads are set before numpy loads)
 import argparse
 import json
 import os
+import sys
 import textwrap
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-# ruff: noqa: E402  (threads are set before numpy loads)
-from excite import smoothing
-from excite.errors import InfeasibleError
-
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parents[1] / "tests"))
 
 import joblib
 import numpy as np
 from matplotlib.figure import Figure
+from support import studies
 
-from excite import output
+from excite import output, smoothing
 from excite.diagnosis import diagnosis, run_forked
-from excite.errors import NoEstimateError, SimulationError
+from excite.errors import InfeasibleError, NoEstimateError, SimulationError
 from excite.identification import methods, monte_carlo
 from excite.logs import Log, log, profile, repair
 from excite.model import Model, prediction
@@ -41,7 +43,6 @@ from excite.simulation import Motion, sensors, simulate
 from excite.text import format_number
 from excite.trajectories import composite_objective, limits, multistart, objective
 
-HERE = Path(__file__).parent
 DRIVE = HERE.parent / "R60_accuracy" / "design" / "profile.csv"
 HIDDEN = (
     "torque_deadband@rear_roll=80",
@@ -63,7 +64,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--kept", type=Path, default=HERE.parent / ".extended", help="folder of finished effects")
-    options = parser.parse_args()
+    options = studies.parse(parser, __file__)
     options.kept.mkdir(exist_ok=True)
     rows = []
     for hidden in HIDDEN:
@@ -73,10 +74,11 @@ def main() -> None:
                 place.write_text(output.to_json(study_effect(hidden, options.runs, options.jobs)), encoding="utf-8")
         rows.append(json.loads(path.read_text(encoding="utf-8")))
         print(f"{hidden}: done", flush=True)
-    save(figure(rows), HERE / "figure.png")
-    with output.new_file(HERE / "summary.json") as place:
-        place.write_text(output.to_json({"runs": options.runs, "rows": rows}), encoding="utf-8")
-    with output.new_file(HERE / "README.md") as place:
+    save(figure(rows), options.out / "figure.png")
+    summary = studies.origin(__file__, 0) | {"runs": options.runs, "rows": rows}
+    with output.new_file(options.out / "summary.json") as place:
+        place.write_text(output.to_json(summary), encoding="utf-8")
+    with output.new_file(options.out / "README.md") as place:
         place.write_text(readme(rows, options.runs), encoding="utf-8")
 
 
@@ -206,7 +208,8 @@ def readme(rows: list[dict[str, Any]], runs: int) -> str:
         "",
         "With the old file, identification can also fail altogether.",
         "",
-        "`python results/extended/study.py` rebuilds this page; [summary.json](summary.json) has every parameter.",
+        "`python results/extended/study.py --out results/extended` rebuilds this page; [summary.json](summary.json)",
+        "has every parameter.",
         "",
         "- **Old file, old drive**: `va12` and the drive [R60_accuracy](../R60_accuracy).",
         "- **New file**: the machine file that `excite diagnose` makes from one log. **New drive**: `accuracy` on R60,",

@@ -1,8 +1,7 @@
 """Trace the front between condition number and accuracy on R60: lowest cond(Phi) for a bound on the worst parameter.
 
-python results/front_R60/study.py [--sigma-max 1 1.5 2 3 5] rebuilds summary.json, front.png and the designs' knots
-beside this file, from the designs of the studies R60 and R60_accuracy. Designs in `drives/` are
-not repeated.
+python results/front_R60/study.py [--sigma-max 1 1.5 2 3 5] [--out FOLDER] writes summary.json, front.png and the
+designs' knots (`drives/`), from the designs of the studies R60 and R60_accuracy. Designs in `drives/` are not repeated.
 """
 
 from __future__ import annotations
@@ -10,14 +9,19 @@ from __future__ import annotations
 # ruff: noqa: E402  (threads are set before numpy loads)
 import argparse
 import os
+import sys
 import time
 from pathlib import Path
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parents[1] / "tests"))
+
 import numpy as np
 from matplotlib.figure import Figure
+from support import studies
 
 from excite import output
 from excite.errors import InfeasibleError
@@ -29,7 +33,6 @@ from excite.trajectories import Manoeuvre, composite_objective, design, objectiv
 from excite.trajectories.continuation import evaluate_drive
 from excite.trajectories.excitation import knot_times
 
-HERE = Path(__file__).parent
 ENDS = {"cond": HERE.parent / "R60" / "design", "accuracy": HERE.parent / "R60_accuracy" / "design"}
 
 
@@ -42,15 +45,15 @@ def main() -> None:
         default=[1.0, 1.5, 2.0, 3.0, 5.0],
         help="bounds on the worst parameter's standard deviation [%%]",
     )
-    options = parser.parse_args()
-    (HERE / "drives").mkdir(exist_ok=True)
+    options = studies.parse(parser, __file__)
+    (options.out / "drives").mkdir(exist_ok=True)
     model = prediction.build(machine.load_machine("va12"))
     problem = model.machine.problems["R60"]
     ends = {name: read_design(model, problem, place) for name, place in ENDS.items()}
     points = [score_design(model, problem, name, None, drive, 0.0) for name, drive in ends.items()]
     before = ends["accuracy"]
     for level in sorted(options.sigma_max):
-        path, wall = HERE / "drives" / f"{level:g}.csv", 0.0
+        path, wall = options.out / "drives" / f"{level:g}.csv", 0.0
         if not path.is_file():
             begin = time.monotonic()
             try:
@@ -73,9 +76,9 @@ def main() -> None:
         points.append(score_design(model, problem, "cond", level, before, wall))
         print(points[-1], flush=True)
     points.sort(key=lambda p: float(p["worst_percent"]))
-    summary = {"machine": "va12", "problem": "R60", "designs": points}
-    save(figure(points), HERE / "front.png")
-    with output.new_file(HERE / "summary.json") as place:
+    summary = studies.origin(__file__, 0) | {"machine": "va12", "problem": "R60", "designs": points}
+    save(figure(points), options.out / "front.png")
+    with output.new_file(options.out / "summary.json") as place:
         place.write_text(output.to_json(summary), encoding="utf-8")
 
 

@@ -1,8 +1,7 @@
 """Measure how often 95 % intervals hold: every method, on simulated logs and on real ones.
 
-python results/intervals/study.py [--runs 10] [--out FOLDER] writes summary.json and README.md there (by default into
-results/.intervals, never over the published ones). Real logs are read from --data, by default ../shared/data; without
-them these cases are left out.
+python results/intervals/study.py [--runs 10] [--out FOLDER] writes summary.json and README.md. Real logs are
+read from --data, by default ../shared/data; without them these cases are left out.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
 import sys
 import time
 import warnings
@@ -29,6 +27,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 import numpy as np
 import pandas as pd
+from support import studies
 from support.sticking import TRUTH, sticking_log
 
 from excite.errors import NoEstimateError
@@ -38,7 +37,7 @@ from excite.model import Model, build
 from excite.model.machine import load_machine
 from excite.output import new_file
 from excite.simulation import measure, simulate
-from excite.workflows import identify_from, package_versions
+from excite.workflows import identify_from
 
 METHODS = ("ols", "wls", "iv", "tls", "oe", "joint")
 DRIVE = ROOT / "results" / "R60_accuracy" / "design" / "profile.csv"
@@ -212,16 +211,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
-    parser.add_argument("--out", type=Path, default=ROOT / "results" / ".intervals")
-    asked = parser.parse_args()
+    asked = studies.parse(parser, __file__)
     warnings.simplefilter("ignore")
-    asked.out.mkdir(parents=True, exist_ok=True)
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout
     summary: dict[str, Any] = {
-        "command": f"python results/intervals/study.py --runs {asked.runs} --out results/intervals",
-        "seeds": [0, asked.runs - 1],
-        "commit": commit.strip(),
-        "versions": package_versions(),
+        **studies.origin(__file__, 0),
+        "runs": asked.runs,
         "cases": {},
     }
     for case, (methods, score) in cases(asked.runs, asked.data).items():

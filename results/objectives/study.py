@@ -1,7 +1,7 @@
 """Rank design criteria by how well they predict true errors of identification, over some twenty drives of R60.
 
-python results/objectives/study.py [--runs 12] [--jobs 2] rebuilds summary.json and objectives.png beside this file.
-Drives in `drives/` and runs in `runs/` are not repeated. A drive that two objectives end at counts once.
+python results/objectives/study.py [--runs 12] [--jobs 2] [--out FOLDER] writes summary.json and objectives.png. Drives
+in `drives/` and runs in `runs/` are not repeated. A drive that two objectives end at counts once.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,13 @@ from typing import Any
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parents[1] / "tests"))
+
 import numpy as np
 import scipy.stats
 from matplotlib.figure import Figure
+from support import studies
 
 from excite import output
 from excite.identification import verify
@@ -32,7 +37,6 @@ from excite.smoothing import cramer_rao
 from excite.trajectories import Manoeuvre, baselines, composite_objective, design, objective
 from excite.trajectories.excitation import knot_times
 
-HERE = Path(__file__).parent
 RANDOM = {"multisine": 5, "slow multisine": 3, "random steps": 3, "chirp": 2, "hand-made": 1}
 DESIGNED = ("D", "A", "E", "worst", "weighted-cond")
 STORED = {"cond": HERE.parent / "R60" / "design", "accuracy": HERE.parent / "R60_accuracy" / "design"}
@@ -44,16 +48,16 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=12, help="simulated and identified logs of every drive")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--few", type=int, default=None, help="number of drives, for a trial")
-    options = parser.parse_args()
+    options = studies.parse(parser, __file__)
     for name in ("drives", "runs"):
-        (HERE / name).mkdir(exist_ok=True)
+        (options.out / name).mkdir(exist_ok=True)
     model = prediction.build(machine.load_machine("va12"))
     problem = model.machine.problems["R60"]
     rows: list[dict[str, Any]] = []
     for name, make in list(drives(model, problem).items())[: options.few]:
-        motion = simulate_drive(model, problem, name, make)
+        motion = simulate_drive(model, options.out, name, make)
         values = {c: f(model, motion) for c, f in CRITERIA.items()}
-        error = errors(model, motion, name, options.runs, options.jobs)
+        error = errors(model, motion, options.out, name, options.runs, options.jobs)
         rows.append({"drive": name, "criteria": values, "rms_percent": dict(zip(model.base.names, error, strict=True))})
         print(f"{name}: cond(Phi) {values['cond(Phi)']:.0f}, worst {max(error):.2f} %", flush=True)
     other = [r for k, r in enumerate(rows) if all(r["criteria"] != s["criteria"] for s in rows[:k])]
@@ -66,10 +70,10 @@ def main() -> None:
         }
         for c in CRITERIA
     }
-    summary = {"machine": "va12", "problem": "R60", "runs": options.runs, "rank_correlation": ranks, "drives": rows}
-    save(figure(other, worst, ranks), HERE / "objectives.png")
-    with output.new_file(HERE / "summary.json") as place:
-        place.write_text(output.to_json(summary), encoding="utf-8")
+    found = {"machine": "va12", "problem": "R60", "runs": options.runs, "rank_correlation": ranks, "drives": rows}
+    save(figure(other, worst, ranks), options.out / "objectives.png")
+    with output.new_file(options.out / "summary.json") as place:
+        place.write_text(output.to_json(studies.origin(__file__, 0) | found), encoding="utf-8")
 
 
 # ------------------------------------------------------------------------------------------------ criteria
@@ -150,8 +154,8 @@ def make_design(model: Model, problem: Problem, name: str) -> Manoeuvre:
     return design(model, problem, composite_objective.compose_objective(model, name), starts=0, warm=warm).manoeuvre
 
 
-def simulate_drive(model: Model, problem: Problem, name: str, make: Make) -> Motion:
-    path = HERE / "drives" / f"{name.replace(' ', '-')}.csv"
+def simulate_drive(model: Model, out: Path, name: str, make: Make) -> Motion:
+    path = out / "drives" / f"{name.replace(' ', '-')}.csv"
     if not path.is_file():
         m = make()
         with output.new_file(path) as place:
@@ -161,9 +165,9 @@ def simulate_drive(model: Model, problem: Problem, name: str, make: Make) -> Mot
     return simulate(model, Manoeuvre(rows[:, 0], rows[:, 1:]).sample(float(model.machine.sampling_hz)))
 
 
-def errors(model: Model, motion: Motion, name: str, runs: int, jobs: int) -> list[float]:
+def errors(model: Model, motion: Motion, out: Path, name: str, runs: int, jobs: int) -> list[float]:
     """Root mean square error [%] of every parameter over the runs."""
-    path = HERE / "runs" / f"{name.replace(' ', '-')}-{runs}.json"
+    path = out / "runs" / f"{name.replace(' ', '-')}-{runs}.json"
     if not path.is_file():
         v = verify(model, motion, "joint", "full", runs, seed=1, jobs=jobs)
         with output.new_file(path) as place:

@@ -1,7 +1,7 @@
 """Compare nominal, robust and sequential design on machines with uncertain parameters, driven by a driver model.
 
-python results/robust_sequential/study.py [--machines 100] [--sequential 100] [--identified 6] [--jobs 2] rebuilds
-summary.json, figure.png and README.md beside this file. Finished machines are stored in `runs/`, so an interrupted
+python results/robust_sequential/study.py [--machines 100] [--sequential 100] [--identified 6] [--jobs 2]
+[--out FOLDER] writes summary.json, figure.png and README.md. Finished machines are stored in `runs/`, so an interrupted
 study resumes.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,13 @@ from typing import Any
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parents[1] / "tests"))
+
 import joblib
 import numpy as np
 from matplotlib.figure import Figure
+from support import studies
 
 from excite import output
 from excite.errors import NoEstimateError, SimulationError
@@ -34,7 +39,6 @@ from excite.smoothing import cramer_rao
 from excite.trajectories import Manoeuvre, check_limits, composite_objective, design, objective
 from excite.trajectories.limits import is_free_limit
 
-HERE = Path(__file__).parent
 SECONDS = 30.0  # duration of each of two drives [s]; chosen
 PARAMETER_RANGE = 0.2  # largest relative error of a parameter; chosen
 SCENARIOS = 5  # machines that the robust drive is designed for: nominal and four corners; chosen
@@ -48,13 +52,13 @@ def main() -> None:
     parser.add_argument("--identified", type=int, default=6, help="number of these machines whose logs are identified")
     parser.add_argument("--objective", default="accuracy")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--runs", type=Path, default=HERE / "runs", help="folder of finished machines")
-    options = parser.parse_args()
-    options.runs.mkdir(exist_ok=True)
-    designs = designed(options.objective, options.runs)
+    options = studies.parse(parser, __file__)
+    runs = options.out / "runs"
+    runs.mkdir(exist_ok=True)
+    designs = designed(options.objective, runs)
     work = (
         joblib.delayed(run_machine)(
-            options.runs,
+            runs,
             k,
             designs,
             options.objective,
@@ -69,6 +73,7 @@ def main() -> None:
         print(f"machine {row['machine']}: {len(rows)} of {options.machines} done", flush=True)
     rows.sort(key=lambda r: r["machine"])
     summary = {
+        **studies.origin(__file__, 0),
         "objective": options.objective,
         "drives_s": [SECONDS, SECONDS],
         "spread": PARAMETER_RANGE,
@@ -77,10 +82,10 @@ def main() -> None:
         "table": table(rows),
         "rows": rows,
     }
-    save(figure(rows), HERE / "figure.png")
-    with output.new_file(HERE / "summary.json") as place:
+    save(figure(rows), options.out / "figure.png")
+    with output.new_file(options.out / "summary.json") as place:
         place.write_text(output.to_json(summary), encoding="utf-8")
-    with output.new_file(HERE / "README.md") as place:
+    with output.new_file(options.out / "README.md") as place:
         place.write_text(readme(summary["table"], rows), encoding="utf-8")
 
 
@@ -273,9 +278,9 @@ README = """# Nominal, robust and sequential design under parameter uncertainty
 
 ## Method
 
-`python results/robust_sequential/study.py` draws 100 machines with bodies, friction and contacts up to 20 % off
-(independent, uniform). The driver model follows the designed speed and articulation with delay, limited rate and error.
-All designs get equal time, two drives of 30 s, and `--objective accuracy`:
+`python results/robust_sequential/study.py --out results/robust_sequential` draws 100 machines with bodies, friction and
+contacts up to 20 % off (independent, uniform). The driver model follows the designed speed and articulation with delay,
+limited rate and error. All designs get equal time, two drives of 30 s, and `--objective accuracy`:
 
 - nominal: designed for the values of the machine file, driven twice;
 - robust: designed for five machines, the nominal one and four corners (`--robust`), driven twice;

@@ -1,8 +1,8 @@
 """Fit contact laws to measurements of a wheel on sand, as `excite slip` does, by both definitions of slip.
 
 python results/sand/study.py [--out FOLDER] [--data DATA.csv] writes README.md, summary.json, sand.png and sand_rim.png
-there (by default into results/.sand, never over the published ones), from the single-wheel measurements of Carnegie
-Mellon University (../shared/data/cmu_single_wheel), straight driving only (slip angle 0).
+from the single-wheel measurements of Carnegie Mellon University (../shared/data/cmu_single_wheel), straight driving
+only (slip angle 0).
 """
 
 from __future__ import annotations
@@ -10,19 +10,23 @@ from __future__ import annotations
 # ruff: noqa: E402  (threads are set before numpy loads)
 import argparse
 import os
+import sys
 from pathlib import Path
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parents[1] / "tests"))
+
 import pandas as pd
+from support import studies
 
 import excite
 from excite.output import to_json
 from excite.reports import ShownSlip, save
 from excite.text import format_number, format_uncertain
 
-HERE = Path(__file__).parent
 DATA = HERE.parents[2] / "shared" / "data" / "cmu_single_wheel" / "smooth_wheel.csv"
 COLUMNS = {"speed": "avg_Vx_mm_s", "rim_speed": "avg_Vry_mm_s", "traction": "-avg_Fy_N", "load": "-avg_Fz_N"}
 PAGE = """# A wheel on sand: which slip law is missing
@@ -50,9 +54,9 @@ grows without bound when a wheel locks (that level is left out).
 - **What remains** is {remains} times the repeatability by the larger speed, {remains_rim} times by the rim speed:
   driving flattens at about 1 N, which a linear law on both sides can't follow.
 
-`python results/sand/study.py` uses measurements of a smooth wheel on sand by Carnegie Mellon University
-(`../shared/data/cmu_single_wheel`): straight driving, 9 slip levels, 3 repeats each; `excite slip` does the same with
-any table. Standard deviations allow for errors shared by the repeats of a slip level.
+`python results/sand/study.py --out results/sand` uses measurements of a smooth wheel on sand by Carnegie Mellon
+University (`../shared/data/cmu_single_wheel`): straight driving, 9 slip levels, 3 repeats each; `excite slip` does the
+same with any table. Standard deviations allow for errors shared by the repeats of a slip level.
 """
 
 
@@ -81,11 +85,10 @@ def main(data: Path, out: Path) -> None:
     named = larger.supported[0]
     asymmetry, std = named.parameters["drive_brake_asymmetry"]
     linear = next(law for law in larger.laws if law.name == "linear")
-    out.mkdir(parents=True, exist_ok=True)
     for fit, name in ((larger, "sand"), (rim, "sand_rim")):
         save(fit.plot(), out / f"{name}.png")
     summaries = {per: fit.summary for per, fit in (("larger", larger), ("rim", rim))}
-    (out / "summary.json").write_text(to_json(summaries), encoding="utf-8")
+    (out / "summary.json").write_text(to_json(studies.origin(__file__, 0) | summaries), encoding="utf-8")
     text = PAGE.format(
         larger_verdict=verdict(larger),
         stiffer=format_number(1 + asymmetry, 2),
@@ -106,6 +109,5 @@ def main(data: Path, out: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--out", type=Path, default=HERE.parent / ".sand")
-    given = parser.parse_args()
+    given = studies.parse(parser, __file__)
     main(given.data, given.out)

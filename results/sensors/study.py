@@ -1,25 +1,29 @@
 """Measure what each sensor buys: the accuracy that a drive allows with some sensors left out.
 
-python results/sensors/study.py [--out FOLDER] writes summary.json and table.md in seconds, by default into
-results/.sensors: the published ones stay as they are.
+python results/sensors/study.py [--out FOLDER] writes summary.json and table.md in seconds.
 The drive is results/R60_accuracy, the accuracy the Cramer-Rao bound of the sensors that are left.
 """
 
 from __future__ import annotations
 
+# ruff: noqa: E402  (the folder of shared helpers comes first)
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parents[1] / "tests"))
 
-from excite import __file__ as package, output, smoothing, trajectories, workflows
+import numpy as np
+from support import studies
+
+from excite import __file__ as package, output, smoothing, trajectories
 from excite.model import build
 from excite.model.machine import Sensor
 from excite.text import format_number
 
-HERE = Path(__file__).parent
 DRIVE = Path(package).parents[1] / "results" / "R60_accuracy" / "design"
 LEFT_OUT: dict[str, Sequence[str]] = {
     "all sensors": (),
@@ -38,9 +42,7 @@ COARSER = 8.0  # times fewer counts of every encoder
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=HERE.parent / ".sensors", help="folder that is written")
-    place = parser.parse_args().out
-    place.mkdir(parents=True, exist_ok=True)
+    place = studies.parse(parser, __file__).out
     made = trajectories.read_design(DRIVE)
     machine = made.model.machine
     rows: list[dict[str, Any]] = []
@@ -75,9 +77,7 @@ def main() -> None:
         worst = f"{format_number(row['worst_percent'], 2)} % ({row['worst_parameter']})"
         lines.append(f"| {row['sensors']} | {worst} | {format_number(row['median_percent'], 2)} % | {loses} |")
     (place / "table.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    output.write_summary(
-        place, {"drive": "results/R60_accuracy", "rows": rows, "versions": workflows.package_versions()}
-    )
+    output.write_summary(place, studies.origin(__file__, 0) | {"drive": "results/R60_accuracy", "rows": rows})
 
 
 def _scaled(sensor: Sensor, key: str, factor: float) -> Sensor:
