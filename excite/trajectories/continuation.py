@@ -48,6 +48,8 @@ class ContinuationStage:
 
     Level i has sharpness `sharpness` 2^i and barrier `barrier` / 3^i. It ends when the decrease that a Newton step
     expects is below `patience` / sharpness. elements: collocation elements per interval.
+    push: distance of the first slacks from their bounds, in half ranges; first_barrier: least barrier parameter behind
+    the first multipliers. starts_again: from torques that keep every limit, if a program ends far from its limits.
     """
 
     friction: float
@@ -59,6 +61,9 @@ class ContinuationStage:
     iterations: int
     patience: float
     elements: int = 1
+    push: float = 1e-3
+    first_barrier: float = 0.0
+    starts_again: bool = True
 
     def split_levels(self) -> list[ContinuationStage]:
         """Split the levels into stages, so that surrogates of variances are calibrated before each."""
@@ -77,9 +82,11 @@ STAGES = (
     ContinuationStage(1, 1, 1, 100, 1e-5, 4, 30, 0.1),
 )
 SCREENING_STAGES = 3  # stages that every start goes through; the best third goes on; chosen
-REPAIR_STAGE = ContinuationStage(1, 1, 1, 800, 1e-6, 1, 30, 0.1, elements=3)
+REPAIR_STAGE = ContinuationStage(
+    1, 1, 1, 800, 3e-6, 1, 30, 0.1, elements=3, push=0.05, first_barrier=1e-5, starts_again=False
+)
 REFINE_STAGE = ContinuationStage(1, 1, 1, 800, 1e-6, 1, 30, 0.1)
-MAX_REPAIRS = 3  # repairs of a drive that exceeds a limit, and one more for every machine; chosen
+MAX_REPAIRS = 4  # repairs of a drive that exceeds a limit, and one more for every machine; chosen
 LARGE_EXCESS = 0.05  # share of a limit's range, above which margins grow by a ratio; chosen
 MAX_REFINES = 5  # re-optimisations of an objective with a ceiling; chosen
 MIN_SCORE_GAIN = 2e-3  # gain of the score that justifies another re-optimisation; chosen
@@ -268,18 +275,19 @@ def refine(
 def repair(
     model: Model, problem: Problem, objective: CompositeObjective, state: SearchState, should_stop: Callable[[], bool]
 ) -> SearchState:
-    """Move exceeded limits in and re-optimise, a few times at most.
+    """Re-optimise a drive that exceeds a limit with finer elements, and move exceeded limits in, a few times at most.
 
-    A margin grows by the excess. For a large excess it grows by its ratio, since a range can't shrink below zero; other
-    machines may need much more torque and power for the same motion.
+    Most of an excess is the collocation error of the coarser elements, so the first repair keeps the limits where they
+    are, unless other machines exceed them. Then a margin grows by the excess, for a large excess by its ratio, since a
+    range can't shrink below zero; other machines may need much more torque and power for the same motion.
     """
     margins: dict[str, float] = {}
     state = bring_to_rest(model, problem, objective, state, should_stop)
-    for _ in range(MAX_REPAIRS + len(objective.machines)):
+    for attempt in range(MAX_REPAIRS + len(objective.machines)):
         if state.latest.feasible or should_stop() or state.failure is not None:
             break
         for name, excess in state.latest.violations.items():
-            if excess > 0.3 * TOLERANCE:
+            if excess > 0.3 * TOLERANCE and (attempt > 0 or objective.machines):
                 old, more = margins.get(name, 0.0), min(3 * excess, excess + 0.01)
                 margins[name] = old + more if more < LARGE_EXCESS else 0.5 - (0.5 - old) / (1 + 2 * more)
         state = replace(state, start_pose=state.latest.start) if state.start_pose is not None else state
@@ -421,7 +429,7 @@ def _run_stage(
         return should_stop()
 
     try:
-        solution = SOLVERS[state.solver](StageProgram(tr, task, start, Z, U, levels, fresh), count_and_stop)
+        solution = SOLVERS[state.solver](StageProgram(tr, task, start, Z, U, levels, fresh, stage), count_and_stop)
     except np.linalg.LinAlgError:  # singular information: the machine hardly moves
         return None
     try:
@@ -445,6 +453,7 @@ class StageProgram:
     """Program of a stage: start (n_z,), states Z (K, J, n_z) and torques U (K + 1, n_u) to begin with, scaled.
 
     levels: of sharpness and barrier, in turn. fresh: no stage before has found torques that keep the limits.
+    stage: whose program this is.
     """
 
     tr: Transcription
@@ -454,6 +463,7 @@ class StageProgram:
     U: np.ndarray
     levels: tuple[interior_point.BarrierLevel, ...]
     fresh: bool
+    stage: ContinuationStage
 
 
 @dataclass(frozen=True)
@@ -476,9 +486,11 @@ def _solve_own(program: StageProgram, should_stop: Callable[[], bool]) -> StageS
     tr, task, start, Z, U = program.tr, program.task, program.start, program.Z, program.U
     levels, fresh, barrier = program.levels, program.fresh, program.levels[0].barrier
     if not fresh:
-        point = interior_point.initial_iterate(tr, task, start, Z, U, barrier, 1e-3)
+        first = max(barrier, program.stage.first_barrier)
+        point = interior_point.initial_iterate(tr, task, start, Z, U, first, program.stage.push)
         point, values = interior_point.minimise(tr, task, point, levels, should_stop)
-        fresh = interior_point.infeasibility(values, point) >= MAX_INFEASIBILITY
+        far = interior_point.infeasibility(values, point) >= MAX_INFEASIBILITY
+        fresh = far and program.stage.starts_again
     if fresh:
         near = replace(task, objective=None, goal_weight=1.0, goal=U)
         point = interior_point.initial_iterate(tr, near, start, Z, U, 1e-3, 0.05)
