@@ -4,9 +4,9 @@ A trace of speed and steering is linear between knots some seconds apart, and is
 driver. The search starts from the design for torques, smoothed into phases, and from random phases. Sequential
 quadratic programs improve knots and levels: finite differences of the driven motion give the change of the information
 matrix and of every limit, the objective's slope and convex curvature by that matrix are exact, and a step counts only
-if the driven motion confirms it. Finally times are rounded to half seconds and levels to dial steps, and simulated
-people with slow errors drive the trace: limits that they come near get a margin, limits that they still exceed are
-reported.
+if the driven motion confirms it. Differences and single steps are of motions simulated at a lower rate. Finally times
+are rounded to half seconds and levels to dial steps, and simulated people with slow errors drive the trace: limits that
+they come near get a margin, limits that they still exceed are reported.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import joblib
@@ -39,6 +39,8 @@ POLISHES = 2  # passes by single steps of the dial; chosen
 SHARPNESS = (20.0, 200.0)  # of the smoothed objective in the first and last round; chosen
 ZERO_KNOTS = (0, -2, -1)  # knots with zero levels: the start and the last phase, which stands still
 THINNING = 5  # one of so many samples counts in the search; chosen
+TRIAL_HZ = 50.0  # least rate of the motions whose differences are taken; chosen
+CONFIRMED = 4  # sums of single steps that are simulated at the machine's rate; chosen
 WINDOWS = 12  # parts of the drive: the extreme of each limit in each part is a constraint; chosen
 DIFFERENCE_STEPS = (0.02, 0.01, 0.005)  # of finite differences: [s], [m/s], [rad]; chosen
 STEP_SIZES = (1.0, 0.2, 0.1)  # largest changes in the first round: [s], [m/s], [rad]; chosen
@@ -230,6 +232,7 @@ class PhaseSearch:
 
     duration [s]: of the trace. shortest [s]: shortest phase. fastest [m/s]: largest speed.
     widest (n,) [rad], swing (n,) [rad/s]: largest angle and rate of each steered joint.
+    stride: samples of the machine in one of the search's.
     """
 
     model: Model
@@ -240,6 +243,16 @@ class PhaseSearch:
     fastest: float
     widest: np.ndarray
     swing: np.ndarray
+    stride: int = 1
+
+    @cached_property
+    def coarser(self) -> PhaseSearch:
+        """The same search at a lower rate, TRIAL_HZ or more, for differences between motions."""
+        hz = self.model.machine.sampling_hz
+        stride = max(1, int(float(hz) / TRIAL_HZ))
+        lower = hz.model_copy(update={"value": float(hz) / stride})
+        machine = self.model.machine.model_copy(update={"sampling_hz": lower})
+        return replace(self, model=replace(self.model, machine=machine), stride=stride)
 
     @property
     def most(self) -> int:
@@ -349,20 +362,27 @@ class TraceTrial:
     over: np.ndarray
 
 
-def try_traces(search: PhaseSearch, traces: Sequence[Trace], run: joblib.Parallel) -> list[TraceTrial | None]:
-    """Simulate a steady person on each trace, in parallel; None for a motion that can't be integrated."""
+def try_traces(
+    search: PhaseSearch, traces: Sequence[Trace], run: joblib.Parallel, coarse: bool = False
+) -> list[TraceTrial | None]:
+    """Simulate a steady person on each trace, in parallel; None for a motion that can't be integrated.
+
+    coarse: at the lower rate of `PhaseSearch.coarser`.
+    """
     blob, call = pickle.dumps(search), joblib.delayed(_try_in_worker)
     shares = [list(traces[k :: run.n_jobs]) for k in range(run.n_jobs)]
     found: list[TraceTrial | None] = [None] * len(traces)
-    for k, results in enumerate(run(call(blob, share) for share in shares if share)):
+    for k, results in enumerate(run(call(blob, share, coarse) for share in shares if share)):
         for i, result in enumerate(results):
             at = k + i * run.n_jobs
             found[at] = None if result is None else TraceTrial(traces[at], *result)
     return found
 
 
-def _try_in_worker(blob: bytes, traces: Sequence[Trace]) -> list[tuple[list[np.ndarray], np.ndarray] | None]:
-    search = _load_search(blob)
+def _try_in_worker(
+    blob: bytes, traces: Sequence[Trace], coarse: bool
+) -> list[tuple[list[np.ndarray], np.ndarray] | None]:
+    search = _load_search(blob).coarser if coarse else _load_search(blob)
     results: list[tuple[list[np.ndarray], np.ndarray] | None] = []
     for trace in traces:
         try:
@@ -394,15 +414,16 @@ def _place_in_lane(search: PhaseSearch, motions: Sequence[Motion]) -> list[Motio
 
 def _information(search: PhaseSearch, motion: Motion) -> list[np.ndarray]:
     names = ("t", "q", "nu", "a", "u", "wheels", "memory")
-    thin = replace(motion, **{n: getattr(motion, n)[::THINNING] for n in names})
-    return [THINNING * A for A in trajectories.information_matrices(search.aim, search.model, thin)]
+    step = max(1, THINNING // search.stride)
+    thin = replace(motion, **{n: getattr(motion, n)[::step] for n in names})
+    return [step * search.stride * A for A in trajectories.information_matrices(search.aim, search.model, thin)]
 
 
 def _driver_limits(search: PhaseSearch) -> list[Limit]:
     return [g for g in trajectories.machine_limits(search.model, search.problem) if g.kind not in VALVE_LIMITS]
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def _limits(search: PhaseSearch) -> tuple[ca.Function, np.ndarray, np.ndarray, np.ndarray]:
     """Stack the limits that a driver can break: function of (q, nu, u, du), low, high, range."""
     every = _driver_limits(search)
@@ -485,17 +506,16 @@ def improve_by_program(
 
     x, step = _vector(best.trace), _per_entry(best.trace, DIFFERENCE_STEPS)
     free = np.arange(0 if times else len(best.trace.times) - 2, len(x))
-    near = try_traces(
-        search, [_trace(best.trace, x + step[k] * row) for k, row in enumerate(np.eye(len(x))) if k in free], run
-    )
+    moves = [step[k] * row for k, row in enumerate(np.eye(len(x))) if k in free]
+    base, *near = try_traces(search, [best.trace, *(_trace(best.trace, x + m) for m in moves)], run, coarse=True)
     rows, columns = np.triu_indices(len(search.aim.scale))
     local = trajectories.local_model(search.aim, best.A, rows, columns, sharp)
     dA, dg = np.zeros((len(local.slope), len(free))), np.zeros((best.over.size, len(free)))
     for i, (k, trial) in enumerate(zip(free, near, strict=True)):
-        if trial is not None:
-            change = [(B - A)[rows, columns] for A, B in zip(best.A, trial.A, strict=True)]
+        if trial is not None and base is not None:
+            change = [(B - A)[rows, columns] for A, B in zip(base.A, trial.A, strict=True)]
             dA[:, i] = np.concatenate(change) / step[k]
-            dg[:, i] = (trial.over - best.over).ravel() / step[k]
+            dg[:, i] = (trial.over - base.over).ravel() / step[k]
     C, d = _linear_constraints(search, best.trace)
     size = _per_entry(best.trace, STEP_SIZES)[free]
     slack, by = cp.Variable(len(best.over), nonneg=True), cp.Variable(len(free))
@@ -533,19 +553,22 @@ def improve_by_program(
 
 
 def improve_by_steps(search: PhaseSearch, best: TraceTrial, room: np.ndarray, run: joblib.Parallel) -> TraceTrial:
-    """Return the best of all single steps on the grid and the dial, and of sums of the most useful ones."""
+    """Return the best sum of useful single steps on the grid and the dial."""
     x, step = _vector(best.trace), _per_entry(best.trace, (GRID_S, SPEED_STEP, ANGLE_STEP))
     C, d = _linear_constraints(search, best.trace)
     moves = [sign * step[k] * row for k, row in enumerate(np.eye(len(x))) for sign in (1, -1)]
     moves = [m for m in moves if (C @ (x + m) <= d + 1e-9).all()]
-    before = merit(search, best, room)
-    each = try_traces(search, [_trace(best.trace, x + m) for m in moves], run)
-    ranked = sorted((merit(search, t, room), i) for i, t in enumerate(each) if t is not None)
-    useful = [moves[i] for score, i in ranked if score < before]
+
+    def merits(steps: Sequence[np.ndarray]) -> list[float]:
+        tried = try_traces(search, [_trace(best.trace, x + m) for m in steps], run, coarse=True)
+        return [np.inf if t is None else merit(search, t, room) for t in tried]
+
+    before, *each = merits([np.zeros(len(x)), *moves])
     sums: list[np.ndarray] = []
-    for m in useful:
-        total = m + (sums[-1] if sums else 0)
-        if (C @ (x + total) <= d + 1e-9).all() and (np.abs(total) <= step + 1e-9).all():
+    for k in np.argsort(each):
+        total = moves[k] + (sums[-1] if sums else 0)
+        if each[k] < before and (C @ (x + total) <= d + 1e-9).all() and (np.abs(total) <= step + 1e-9).all():
             sums.append(total)
-    together = try_traces(search, [_trace(best.trace, x + m) for m in sums], run)
-    return min((best, *(t for t in (*each, *together) if t is not None)), key=lambda t: merit(search, t, room))
+    order = np.argsort(merits(sums))[:CONFIRMED]
+    confirmed = try_traces(search, [_trace(best.trace, x + sums[k]) for k in order], run)
+    return min((best, *(t for t in confirmed if t is not None)), key=lambda t: merit(search, t, room))

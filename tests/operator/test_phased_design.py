@@ -162,6 +162,28 @@ def test_one_step_improves_a_poor_drive(straight: Model) -> None:
     assert phased_design.merit(task, replace(best, over=best.over + 1.0), room) > phased_design.merit(task, best, room)
 
 
+def test_differences_at_a_lower_rate_are_those_at_the_machine_s(straight: Model) -> None:
+    """What a faster phase changes in the information matrix and in every limit."""
+    import joblib
+
+    task = task_of(straight, 16.0, 2.0)
+    assert task.coarser.stride * float(task.coarser.model.machine.sampling_hz) == float(straight.machine.sampling_hz)
+    assert float(task.coarser.model.machine.sampling_hz) == phased_design.TRIAL_HZ
+    times = np.array([0.0, 3, 6, 9, 12, 16])
+    one = Trace(times, np.array([0.0, 0.5, -0.4, 0.5, 0, 0]), np.zeros((6, 0)), ())
+    two = replace(one, speed=one.speed * [1, 1.1, 1, 1, 1, 1])
+    run = joblib.Parallel(n_jobs=1)
+    changes = []
+    for coarse in (False, True):
+        first, second = phased_design.try_traces(task, [one, two], run, coarse)
+        assert first is not None
+        assert second is not None
+        changes.append((second.A[0] - first.A[0], second.over - first.over))
+    (exact, limits_exact), (near, limits_near) = changes
+    assert np.linalg.norm(near - exact) < 0.1 * np.linalg.norm(exact)
+    assert np.abs(limits_near - limits_exact).max() < 0.1 * np.abs(limits_exact).max()
+
+
 def test_levels_are_reduced_until_people_keep_the_limits(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing changes for a slow drive; of one that is too long for the lane the speeds fall, not the phases."""
     task = task_of(straight, 16.0, 2.0)
