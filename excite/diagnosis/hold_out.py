@@ -238,15 +238,18 @@ def _likelihood_of_stretches(
     """Return the log-likelihood (stretches, LIKELIHOOD_LEVELS) with the parameters of a fit, NaN where not found.
 
     levels: of process noise, the first of LIKELIHOOD_LEVELS, found as long as the likelihood grows with them. Every
-    reading counts given those before it, by the innovations of a filter along all readings. A model that explains the
-    logs has no process noise.
+    reading counts given those before it, by the innovations of a filter along all readings, linearised where the whole
+    logs lead: what follows from the rest alone is too far off for friction that changes within a small angle. A model
+    that explains the logs has no process noise.
     """
     data = stage.data
     found = np.full((sum(len(own) for own in stretches), len(LIKELIHOOD_LEVELS)), np.nan)
     for k, level in enumerate(levels):
         if level > 0 and rest.process_noise == 0 and stage.is_close:
             break
-        linear = smoothing.linearise_logs(data.space, data.measurements, rest.trajectories, data.starts, rest.X, level)
+        linear = smoothing.linearise_logs(
+            data.space, data.measurements, stage.fit.trajectories, data.starts, rest.X, level
+        )
         if linear is None:
             continue
         likelihood = []
