@@ -181,6 +181,9 @@ def diagnose(
         report(0.15, "fitting effects with inflated sensor noise")
         sharp = selection.choose_with_inflated_noise(before, runner)
         before, chosen = sharp or (fit_with_process_noise(before, runner), chosen)
+    if before.data.sticks and before.exact:
+        report(0.15, "fitting friction near rest")
+        chosen = selection.choose_presliding(before, runner)
     tried: Container[str] = ()
     if not (before.estimated or chosen or deadline.is_over()):
         report(0.15, "fitting effects from initial trajectories")
@@ -349,7 +352,7 @@ def review_effects(before: ExtendedFit, chosen: Sequence[Choice], runner: CallRu
         )
     whole, judged = queue[-1].stage, {x.name: x for x in queue}
     same = judged.keys() == {x.name for x in chosen}
-    worse = whole.fit.cost - found.fit.cost > selection.MIN_LIKELIHOOD_RATIO * found.dispersion
+    worse = whole.deviance - found.deviance > selection.MIN_LIKELIHOOD_RATIO * found.dispersion
     if same or worse or whole.fit.process_noise > found.fit.process_noise:
         judged = judged if same else {x.name: x for x in chosen}
         return [replace(x, rivals=_remaining_rivals(judged[x.name], judged)) for x in chosen]
@@ -373,7 +376,7 @@ def _refit_one_by_one(before: ExtendedFit, chosen: Sequence[Choice], whole: Exte
     found = []
     for x, old, new in zip(chosen, made, made[1:], strict=False):
         alike = old.estimated and old.fit.process_noise == new.fit.process_noise
-        gain = old.fit.cost - new.fit.cost if alike else x.likelihood_ratio
+        gain = old.deviance - new.deviance if alike else x.likelihood_ratio
         found.append(replace(x, stage=new, likelihood_ratio=max(gain, x.likelihood_ratio), process_noise_fit=None))
     return found
 
@@ -405,7 +408,7 @@ def drop_unneeded(before: ExtendedFit, chosen: Sequence[Choice]) -> list[Choice]
         with suppress(NotConvergedError):
             without = _refit_without(x.name, whole)
             if without.fit.process_noise <= whole.fit.process_noise:
-                beside = without.fit.cost - whole.fit.cost
+                beside = without.deviance - whole.deviance
         proven = whole.placed(x.name).effect.inverse or np.isinf(beside)
         if beside < selection.required_likelihood_ratio(x.name, whole, x.n_candidates) or not (
             proven or _predicts_better(without, whole)

@@ -33,6 +33,7 @@ from excite.smoothing import (
     common_sensors,
     encoders_with_offset,
     innovation_statistics,
+    log_variance,
     prepare_logs,
     transfer_trajectory,
 )
@@ -42,6 +43,7 @@ from excite.text import format_number
 MIN_COST_GAIN_OF_CLOSE_FIT = 100.0  # cost by which an unconverged fit must beat a close one to be continued; chosen
 TRACKING_COST_RATIO = 2.5  # cost over its expected value up to which exact dynamics track the logs; chosen
 LOST_COST_RATIO = 10.0  # cost over the number of readings from which a fit is given up after a few passes; chosen
+FRICTION_ERROR = 0.1  # share of friction near rest by which an effect's formula may err there; chosen
 COST_TOLERANCE = 0.02  # share of its expected value by which a right model's cost may be larger; chosen
 IMPOSSIBLE_SIGN_STDS = 3.0  # standard deviations beyond zero from which a parameter's sign is impossible; chosen
 IMPOSSIBLE_SIGN_SHARE = 0.5  # share of the parameter's scale beyond zero, likewise; chosen
@@ -60,7 +62,8 @@ class FitData:
     """Logs prepared for a model.
 
     space: state space of the model. measurements, starts: each log in it, and its initial trajectory. held (n_base,):
-    parameters that stay at the machine file's values, as the logs do not show them.
+    parameters that stay at the machine file's values, as the logs do not show them. friction_near_rest: of each log,
+    the size (N - 1, n_u) [N m] of friction that may have either sign, None if the model's friction holds near rest.
     """
 
     space: StateSpace
@@ -68,6 +71,7 @@ class FitData:
     measurements: tuple[Measurements, ...]
     starts: tuple[Trajectory, ...]
     held: np.ndarray
+    friction_near_rest: tuple[np.ndarray, ...] | None = None
 
     @property
     def noise_inflation(self) -> float:
@@ -77,7 +81,7 @@ class FitData:
     @property
     def sticks(self) -> bool:
         """Tell if friction may have either sign where joints are near rest."""
-        return self.measurements[0].extra_torque_noise is not None
+        return self.friction_near_rest is not None
 
     @property
     def n_readings(self) -> float:
@@ -128,6 +132,14 @@ class ExtendedFit:
     def excess_cost(self) -> float:
         """Cost beyond what noise may cause."""
         return max(0.0, self.fit.cost - (1 + COST_TOLERANCE) * self.expected_cost)
+
+    @cached_property
+    def deviance(self) -> float:
+        """Twice the negative log-likelihood, but for a constant, by which fits to the same logs are compared.
+
+        Where friction is free near rest, the covariance of the innovations depends on the model and counts, too.
+        """
+        return self.fit.cost + (sum(map(log_variance, self.fit.linear)) if self.data.sticks else 0.0)
 
     @property
     def is_close(self) -> bool:
@@ -238,7 +250,7 @@ def fit_machine(
     logs: Sequence[Log],
     filter: Filter,
     runner: CallRunner = run_in_turn,
-    extra_torque_noise: Sequence[np.ndarray] | None = None,
+    friction_near_rest: Sequence[np.ndarray] | None = None,
 ) -> ExtendedFit:
     """Fit a machine's model to logs, with the shapes of its effects free.
 
@@ -246,10 +258,10 @@ def fit_machine(
     as the logs allow: the less it absorbs, the clearer the cause; exact dynamics are tried again from there. If that is
     far from the logs too, sensor noise is inflated. If all fail, `fit_with_process_noise` applies.
 
-    All attempts start at once where there are processes for them. extra_torque_noise: see `Measurements`. Raises
+    All attempts start at once where there are processes for them. friction_near_rest: see `FitData`. Raises
     NotConvergedError.
     """
-    data = prepare_data(machine, logs, filter, extra_torque_noise)
+    data = prepare_data(machine, logs, filter, friction_near_rest)
     calls: list[Callable[[], Any]] = [
         partial(_fit_exact_from_start, data),
         partial(fit_reducing_process_noise, machine, data, identification.PROCESS_NOISE_LEVELS[0]),
@@ -675,18 +687,27 @@ def _build_space(machine: Machine, logs: Sequence[Log]) -> StateSpace:
 
 
 def prepare_data(
-    machine: Machine, logs: Sequence[Log], filter: Filter, extra_torque_noise: Sequence[np.ndarray] | None = None
+    machine: Machine, logs: Sequence[Log], filter: Filter, friction_near_rest: Sequence[np.ndarray] | None = None
 ) -> FitData:
-    """Prepare logs for a machine; extra_torque_noise: see `Measurements`."""
+    """Prepare logs for a machine; friction_near_rest: see `FitData`."""
     space = _build_space(machine, logs)
-    measurements, starts = prepare_logs(space, logs, filter, extra_torque_noise=extra_torque_noise)
+    free = None if friction_near_rest is None else tuple(friction_near_rest)
+    measurements, starts = prepare_logs(space, logs, filter, extra_torque_noise=_free_friction(space.model, free))
     return FitData(
         space,
         tuple(logs),
         measurements,
         starts,
         identification.parameters_at_rest(space.model, logs, filter, slow=False),
+        free,
     )
+
+
+def _free_friction(model: Model, friction_near_rest: Sequence[np.ndarray] | None) -> list[np.ndarray] | None:
+    """Return the friction that stays free near rest: a small share where an effect says what it is at its joint."""
+    known = {k for e in model.effects if e.unsticking for k in e.bodies}
+    free = np.array([FRICTION_ERROR if body.index in known else 1.0 for body in model.machine.actuated])
+    return None if friction_near_rest is None else [size * free for size in friction_near_rest]
 
 
 def adapt_data(machine: Machine, previous: ExtendedFit) -> FitData:
@@ -696,12 +717,21 @@ def adapt_data(machine: Machine, previous: ExtendedFit) -> FitData:
         return before
     space = _build_space(machine, before.logs)
     model = space.model
+    free: Sequence[np.ndarray | None] | None = _free_friction(model, before.friction_near_rest)
     measurements = tuple(
-        replace(r, offset_sensors=encoders_with_offset(space, r.read_at_edges)) for r in before.measurements
+        replace(r, offset_sensors=encoders_with_offset(space, r.read_at_edges), extra_torque_noise=extra)
+        for r, extra in zip(before.measurements, free or [None] * len(before.logs), strict=True)
     )
     starts = tuple(
         transfer_trajectory(space, r, p, before.space, model.nominal)
         for r, p in zip(measurements, before.starts, strict=True)
     )
     held = dict(zip(previous.model.base.names, before.held, strict=True))
-    return FitData(space, before.logs, measurements, starts, np.array([held.get(n, False) for n in model.base.names]))
+    return FitData(
+        space,
+        before.logs,
+        measurements,
+        starts,
+        np.array([held.get(n, False) for n in model.base.names]),
+        before.friction_near_rest,
+    )

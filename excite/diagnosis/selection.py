@@ -83,6 +83,7 @@ TIE_GAIN_SHARE_WITH_NOISE = 0.02  # share of the gain with process noise, which 
 COMPARED_GAIN_SHARE = 0.1  # the same up to which trials are compared without process noise if that is possible; chosen
 
 TRANSITION = "friction_transition"  # has no meaning where friction near rest is free
+PRESLIDING = "presliding"  # what friction near rest is if it is not free
 MIN_MAGNITUDE_STDS = 0.3  # standard deviations from zero below which a positive magnitude fell to zero; chosen
 MAX_SIGNATURE_STEP = 2.0  # factor on a trial magnitude up to which its signature holds; chosen
 MIN_SIGNATURE_STEP = 0.3  # the same downwards; chosen
@@ -161,7 +162,12 @@ def _score_new_effects(stage: ExtendedFit, runner: CallRunner) -> tuple[score_te
     sensors = [s.name for s in stage.data.space.sensors]
     found = score_test.candidates(stage.machine, sensors, _duration(stage.data.logs))
     if stage.data.sticks:
-        found = [x for x in found if x.placed.effect.name != TRANSITION]
+        known_near_rest = {e.where for e in stage.model.effects if e.unsticking}
+        found = [
+            x
+            for x in found
+            if x.placed.effect.name != TRANSITION and not (x.placed.unsticking and x.placed.where in known_near_rest)
+        ]
     wanted = [x for x in found if x.name not in known or _has_harmonics(x.placed.effect)]
     scores = _score_along(stage, score_test.renumber_columns(wanted), runner)
     harmonic: dict[str, float] = {}
@@ -330,7 +336,7 @@ def choose_effect(
     if not trials:
         return None
     score, best = trials[0]
-    gain = stage.fit.cost - best.fit.cost
+    gain = stage.deviance - best.deviance
     level = required_likelihood_ratio(score.candidate.name, best, len(scores))
     explains_all = _explains_rest(best, stage)
     if gain < max(
@@ -363,14 +369,14 @@ def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runne
     unknown = [x for x in unknown if x[0].candidate.name in names]
     if not any(s.candidate.name in names for s, _ in exact):
         exact = []  # none of the best trials has an exact fit: compare all with process noise
-    lowest = trials[0][1].fit.cost
+    lowest = trials[0][1].deviance
     if with_noise and exact and not exact[0][1].is_close:
         # Process noise hid that the best does not explain the logs: try those that were a little worse with it.
         left = [x for x in trials if x[0].candidate.name not in {s.candidate.name for s, _ in compared}]
         others, _ = _trials_without_noise(
-            [x for x in left if x[1].fit.cost - lowest <= (1 - VARIANT_SCORE_SHARE) * gain], runner
+            [x for x in left if x[1].deviance - lowest <= (1 - VARIANT_SCORE_SHARE) * gain], runner
         )
-        exact = sorted([*exact, *others], key=lambda x: x[1].fit.cost)
+        exact = sorted([*exact, *others], key=lambda x: x[1].deviance)
     judged = [*_tied_trials(exact, gain, MIN_GAIN_SHARE if with_noise else MIN_WALD_SHARE), *unknown] if exact else ties
     judged = _without_needless_magnitudes(judged)
     if judged[0][1].is_dead_end:
@@ -378,11 +384,39 @@ def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runne
     score, best = judged[0]
     rivals = tuple(fitted_entry(other, s.candidate.name) for s, other in judged[1:])
     process_noise_fit = with_noise.get(score.candidate.name) if best.exact else None
-    behind = next(x.fit.cost for s, x in trials if s.candidate.name == score.candidate.name) - lowest
+    behind = next(x.deviance for s, x in trials if s.candidate.name == score.candidate.name) - lowest
     gain -= min(behind, (1 - VARIANT_SCORE_SHARE) * gain)  # a tie may be further behind if much is left
     return Choice(
         score.candidate.name, best, gain, dispersion, n_candidates, rivals, score.unabsorbed_share, process_noise_fit
     )
+
+
+def choose_presliding(stage: ExtendedFit, runner: CallRunner) -> list[Choice]:
+    """Choose the joints whose friction near rest builds up over an angle, where it was taken for free.
+
+    It comes before other effects: they are sought in what is left where friction near rest is known.
+    """
+    chosen, scores = list[Choice](), score_effects(stage, runner)
+    wanted = {s.candidate.name: s for s in reversed(scores) if s.candidate.placed.effect.name == PRESLIDING}
+    entries = {name: _start_entry(s) for name, s in wanted.items()}
+    while entries:
+        requests = [(effects.with_effects(stage.machine, entry), stage, 0.0) for entry in entries.values()]
+        fits = zip(entries, refit_all(requests, runner), strict=True)
+        found = {name: x for name, x in fits if x is not None and x.is_close and _is_effective(name, x)}
+        name = min(found, key=lambda name: found[name].deviance, default="")
+        if not name:
+            break
+        best = found[name]
+        gain = stage.deviance - best.deviance
+        if gain < required_likelihood_ratio(name, best, len(scores)) or best.impossible:
+            break
+        chosen.append(Choice(name, best, gain, best.dispersion, len(scores), (), wanted[name].unabsorbed_share))
+        magnitudes = {n: fitted_entry(x, n).amount for n, x in found.items()}
+        entries = {
+            n: e.model_copy(update={"amount": magnitudes.get(n, e.amount)}) for n, e in entries.items() if n != name
+        }
+        stage = best
+    return chosen
 
 
 def choose_with_inflated_noise(stage: ExtendedFit, runner: CallRunner) -> tuple[ExtendedFit, list[Choice]] | None:
@@ -405,10 +439,10 @@ def choose_with_inflated_noise(stage: ExtendedFit, runner: CallRunner) -> tuple[
     if not trials:
         return None
     _, best = trials[0]
-    gain = stage.fit.cost - best.fit.cost
+    gain = stage.deviance - best.deviance
     if gain < max(MIN_LIKELIHOOD_RATIO * best.dispersion, required):
         return None
-    is_comparable = [x for x in trials if stage.fit.cost - x[1].fit.cost >= VARIANT_SCORE_SHARE * gain]
+    is_comparable = [x for x in trials if stage.deviance - x[1].deviance >= VARIANT_SCORE_SHARE * gain]
     tracking: list[_Trial] = []
     for process_noise in (
         (0.0, identification.PROCESS_NOISE_LEVELS[0])
@@ -546,10 +580,10 @@ def _choose_screened(
         without, best = refit_and_drop_noise(stage.machine, best, runner)
         trials = [(score, best), *(x for x in trials[1:] if x[1].fit.process_noise == best.fit.process_noise)]
         if without is not None:
-            stage = stage if comparable and stage.fit.cost < without.fit.cost else without
+            stage = stage if comparable and stage.deviance < without.deviance else without
         # Wald's statistic is comparable, and smaller if the gain is large.
         is_comparable = without is not None or comparable
-        gain = stage.fit.cost - best.fit.cost if is_comparable else wald_statistic(score.candidate.name, best)
+        gain = stage.deviance - best.deviance if is_comparable else wald_statistic(score.candidate.name, best)
         if gain < MIN_LIKELIHOOD_RATIO * best.dispersion:
             return exact_if_close(stage), []
         return stage, [_make_choice(trials, gain, n_candidates, runner)]
@@ -632,14 +666,16 @@ def _fit_candidates(
         (FIRST_BATCH, shortlist[FIRST_BATCH:n_promising]),
         (n_promising, shortlist[n_promising:]),
     ):
-        gained = max((stage.fit.cost - found.fit.cost for _, found in trials), default=0.0)
+        gained = max((stage.deviance - found.deviance for _, found in trials), default=0.0)
         if not batch or (at >= n_promising and gained > MAX_RATIO_OVER_SCORE * batch[0].likelihood_ratio):
             continue
         requests = [
             (effects.with_effects(stage.machine, _start_entry(s)), stage, stage.fit.process_noise) for s in batch
         ]
         report(at)
-        batch_limit = min(cost_limit, stage.fit.cost - CANDIDATE_PROGRESS_SHARE * gained if trials else np.inf)
+        batch_limit = cost_limit
+        if trials and not stage.data.sticks:  # costs are not comparable where only some models free friction near rest
+            batch_limit = min(cost_limit, stage.fit.cost - CANDIDATE_PROGRESS_SHARE * gained)
         for k, (score, found) in enumerate(zip(batch, refit_all(requests, runner, batch_limit), strict=True)):
             report(min(at + k + 1, len(shortlist) - 1))
             if found is None or _fell_to_zero(score.candidate.name, found):
@@ -725,7 +761,7 @@ def _is_effective(name: str, stage: ExtendedFit) -> bool:
 def _best_variants(trials: Sequence[_Trial]) -> list[_Trial]:
     """Return the best variant of each name, best first: least process noise, then least cost."""
     best: dict[str, _Trial] = {}
-    for x in sorted(trials, key=lambda x: (x[1].fit.process_noise, x[1].fit.cost)):
+    for x in sorted(trials, key=lambda x: (x[1].fit.process_noise, x[1].deviance)):
         best.setdefault(x[0].candidate.name, x)
     return list(best.values())
 
@@ -742,7 +778,7 @@ def _tied_trials(trials: Sequence[_Trial], gain: float, share: float | None = No
     if best.exact and not score.candidate.placed.effect.inverse:
         # With process noise it gains less than without.
         margin = max(margin, min(MIN_WALD_SHARE * wald_statistic(score.candidate.name, best), MAX_FORMULA_RATIO))
-    return [x for x in trials if x[1].fit.cost - best.fit.cost < margin]
+    return [x for x in trials if x[1].deviance - best.deviance < margin]
 
 
 def _without_needless_magnitudes(trials: Sequence[_Trial]) -> list[_Trial]:
@@ -750,12 +786,12 @@ def _without_needless_magnitudes(trials: Sequence[_Trial]) -> list[_Trial]:
 
     Friction by bristles that bend is presliding where no Stribeck friction adds to it.
     """
-    costs = {(s.candidate.name, stage.fit.process_noise): stage.fit.cost for s, stage in trials}
+    costs = {(s.candidate.name, stage.fit.process_noise): stage.deviance for s, stage in trials}
     least = MIN_LIKELIHOOD_RATIO * trials[0][1].dispersion
 
     def is_needless(trial: _Trial) -> bool:
-        simpler, fit = trial[0].candidate.placed.simpler, trial[1].fit
-        return simpler is not None and costs.get((simpler, fit.process_noise), np.inf) - fit.cost < least
+        simpler, stage = trial[0].candidate.placed.simpler, trial[1]
+        return simpler is not None and costs.get((simpler, stage.fit.process_noise), np.inf) - stage.deviance < least
 
     return [x for x in trials if not is_needless(x)]
 
@@ -774,4 +810,4 @@ def _trials_without_noise(trials: Sequence[_Trial], runner: CallRunner) -> tuple
     found = [(x, next(anew) if yes else exact) for (x, exact), yes in zip(found, missing, strict=True)]
     found = [(x, None if s is None or _fell_to_zero(x[0].candidate.name, s) else s) for x, s in found]
     exact = [(score, stage) for (score, _), stage in found if stage is not None]
-    return sorted(exact, key=lambda x: x[1].fit.cost), [x for x, stage in found if stage is None]
+    return sorted(exact, key=lambda x: x[1].deviance), [x for x, stage in found if stage is None]

@@ -24,6 +24,7 @@ from .innovations import (
     LinearisedLog as LinearisedLog,
     WhitenedInnovations as WhitenedInnovations,
     innovation_statistics as innovation_statistics,
+    log_variance as log_variance,
     whiten as whiten,
     whiten_signatures as whiten_signatures,
 )

@@ -86,6 +86,12 @@ def innovations(linear: LinearisedLog) -> np.ndarray:
     return normalised
 
 
+def log_variance(linear: LinearisedLog) -> float:
+    """Return the logarithm of the determinant of the covariance of all innovations of a log [SI]."""
+    diagonals = [(step.whitening, step.used) for step in linear.filter]
+    return -2 * sum(float(np.log(np.diagonal(w, axis1=1, axis2=2)[used]).sum()) for w, used in diagonals)
+
+
 def innovation_statistics(linear: LinearisedLog) -> np.ndarray:
     """Compute, for each sensor, the statistics (m, 3) that test whether model and noise explain a log.
 

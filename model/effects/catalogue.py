@@ -202,10 +202,21 @@ _declare(
         "presliding",
         ("joints",),
         "rad",
-        "Coulomb friction builds up over the angle A of motion, as bristles bend: Fs z, A z' = w - abs(w) z",
+        "Coulomb friction builds up over the angle A of motion, as bristles bend: Fs (z + damping z'),"
+        " A z' = w - abs(w) z",
         "torque missing just after every reversal, over the same angle at any speed",
         "Dahl 1968; Canudas de Wit, Olsson, Astrom, Lischinsky, IEEE TAC 40 (1995), (1) to (4) with Fs alone",
         sizes.presliding,
+        {
+            "damping": Shape(
+                "s",
+                0.0,
+                (1.0,),
+                size=sizes.constant(2.5e-3),
+                within=(-0.5, 200.0),
+                meaning="damping of the bristles over their stiffness; 0: none (Dahl)",
+            )
+        },
         grid=(0.25, 1.0),
         positive=True,
         torque=friction.presliding,

@@ -25,7 +25,7 @@ def stribeck(s: SampleView, k: int, p: Values) -> ca.SX:
 
 def presliding(s: SampleView, k: int, p: Values) -> ca.SX:
     """Return the torque by which friction of bristles that bend differs from Fs tanh(w / w_s)."""
-    return s.coulomb[k] * (s.sign(k) - s.z["bent"])
+    return s.coulomb[k] * (s.sign(k) - s.z["bent"] - p["damping"] * presliding_rate(s, k, p))
 
 
 def presliding_rate(s: SampleView, k: int, p: Values) -> ca.SX:

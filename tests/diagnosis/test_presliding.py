@@ -1,7 +1,9 @@
-"""Friction by bristles that bend, on logs of a pendulum that LuGre moves: presliding, not Stribeck friction."""
+"""Friction by bristles that bend, on logs of a pendulum and an arm that LuGre moves: presliding, not Stribeck."""
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,10 @@ import pandas as pd
 import pytest
 
 import excite
+from excite.diagnosis import selection
+from excite.diagnosis.fits import fit_machine, fit_machine_that_sticks
+from excite.diagnosis.parallel import run_in_turn
+from excite.logs import from_table
 from excite.model import Model, build
 from excite.model.machine import Machine, load_machine
 
@@ -69,3 +75,77 @@ def test_bristles_are_told_from_stribeck_friction(breakaway: float, name: str) -
         (finding,) = found["findings"]
         assert not finding["tied_with"]
         assert finding["amount"] == pytest.approx(BENDS, rel=0.3)
+
+
+ARM_BENDS, ARM_DAMPING = 4e-4, 4e-3  # [rad], [s]
+LENGTH, GRAVITY = 0.4, 9.81  # [m], [m/s2]
+MASS, REACH, SPIN = (3.2, 2.1), (0.21, 0.16), (0.055, 0.022)  # [kg], [m], [kg m2] about the centre
+ARM_VISCOUS, ARM_DRY, OFFSET = np.array([1.4, 0.7]), np.array([2.2, 1.1]), np.array([0.4, -0.25])
+ARM_STEPS = 20
+
+
+def arm() -> Model:
+    """The arm of two joints, sampled at 200 Hz."""
+    table = tomllib.loads((Path(__file__).parents[1] / "support" / "two_joints.toml").read_text())
+    table["sampling_hz"]["value"] = 200
+    table["filter"] |= {"cutoff_hz": {"value": 25, "source": "definition"}, "decimation": 4}
+    return build(Machine.model_validate(table))
+
+
+def arm_log(seed: int, seconds: float = 12.0) -> pd.DataFrame:
+    """Simulate the arm under computed torque, semi-implicitly: columns of `arm`.
+
+    Source: Spong, Hutchinson, Vidyasagar, "Robot Modeling and Control", ch. 7 (elbow manipulator); LuGre as above.
+    """
+    rng = np.random.default_rng(seed)
+    dt = 1 / 200 / ARM_STEPS
+    t = np.arange(0, seconds, dt)
+    fade = np.minimum(1, np.minimum(t, seconds - t))
+    wanted = np.empty((2, len(t)))
+    for k, (low, high) in enumerate([(-2.2, -0.2), (-0.3, 1.8)]):
+        wave = np.sin(2 * np.pi * np.outer(t, rng.uniform(0.1, 0.9, 6)) + rng.uniform(0, 2 * np.pi, 6)).sum(axis=1)
+        wanted[k] = (low + high) / 2 + (high - low) / 2 * fade**2 * (3 - 2 * fade) * wave / np.abs(wave).max()
+    speed = np.gradient(wanted, dt, axis=1)
+    acceleration = np.gradient(speed, dt, axis=1)
+    q, v, z = wanted[:, 0].copy(), np.zeros(2), np.zeros(2)
+    (m1, m2), (c1, c2), (i1, i2) = MASS, REACH, SPIN
+    kept = np.empty((len(t), 4))
+    for k in range(len(t)):
+        s, c = np.sin(q[1]), np.cos(q[1])
+        far = m2 * (c2**2 + LENGTH * c2 * c) + i2
+        inertia = np.array(
+            [[m1 * c1**2 + i1 + m2 * (LENGTH**2 + c2**2 + 2 * LENGTH * c2 * c) + i2, far], [far, m2 * c2**2 + i2]]
+        )
+        coupling = m2 * LENGTH * c2 * s * np.array([-v[1] * (2 * v[0] + v[1]), v[0] ** 2])
+        hangs = m2 * c2 * GRAVITY * np.cos(q.sum())
+        weight = np.array([(m1 * c1 + m2 * LENGTH) * GRAVITY * np.cos(q[0]) + hangs, hangs])
+        followed = acceleration[:, k] + 130 * (wanted[:, k] - q) + 9 * (speed[:, k] - v)
+        u = inertia @ followed + coupling + weight + ARM_VISCOUS * speed[:, k]
+        kept[k] = *q, *u
+        bent = (z + dt * v / ARM_BENDS) / (1 + dt * np.abs(v) / ARM_BENDS)
+        friction = ARM_DRY * (bent + ARM_DAMPING * (bent - z) / dt)
+        z = bent
+        v = v + dt * np.linalg.solve(inertia, u + OFFSET - ARM_VISCOUS * v - friction - coupling - weight)
+        q = q + dt * v
+    rows = kept[::ARM_STEPS]
+    step = 2 * np.pi / 65536
+    angle = np.round(rows[:, :2] / step) * step
+    torque = rows[:, 2:] + rng.standard_normal((len(rows), 2)) * (0.1, 0.05)
+    names = {"q1_rad": angle[:, 0], "tau1_Nm": torque[:, 0], "q2_rad": angle[:, 1], "tau2_Nm": torque[:, 1]}
+    return pd.DataFrame({"t_s": np.round(t[::ARM_STEPS], 6), **names})
+
+
+@pytest.mark.slow
+def test_friction_near_rest_is_known_at_each_joint_before_effects_are_sought() -> None:
+    model = arm()
+    logs, filter = [from_table(arm_log(seed=3), model.machine)], model.machine.filter
+    free = fit_machine_that_sticks(fit_machine(model.machine, logs, filter), logs, filter)
+    assert free.data.sticks
+    first, both = selection.choose_presliding(free, run_in_turn)
+    assert {first.name, both.name} == {"presliding@upper_arm", "presliding@forearm"}
+    found = dict(zip(both.stage.model.base.names, both.stage.fit.X, strict=True))
+    for name in (first.name, both.name):
+        assert found[name] == pytest.approx(ARM_BENDS, rel=0.15)
+        assert found[f"{name}.damping"] == pytest.approx(ARM_DAMPING, rel=0.5)
+    assert found["Fs1"] == pytest.approx(ARM_DRY[0], rel=0.03)
+    assert both.stage.fit.cost < 1.05 * both.stage.expected_cost
