@@ -30,6 +30,7 @@ def lacking(day: Day, step: str) -> list[str]:
     return [need.text for need in day.needs(step) if not need.met]
 
 
+@pytest.mark.slow
 def test_failed_log_blocks_identification_until_it_is_mended_and_doubts_until_accepted_in_words(
     log: Path, tmp_path: Path, excite: Excite, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -226,6 +226,7 @@ def test_a_machine_file_is_kept(profile: Path, tmp_path: Path, excite: Excite) -
     assert own.read_text().startswith("extends")
 
 
+@pytest.mark.slow
 def test_a_second_run_replaces_the_first(profile: Path, tmp_path: Path, excite: Excite) -> None:
     excite("simulate", "va12_straight", profile, "--out", tmp_path / "log.csv")
     for _ in range(2):

@@ -46,6 +46,7 @@ from excite.workflows import diagnose_workflow
 FAINT = "torque_gain@rear_roll=0.01", "torque_ripple@rear_roll=20", "stribeck_friction@rear_roll=9"
 
 
+@pytest.mark.slow
 def test_a_log_too_short_to_hide_stretches_has_no_gain(
     straight: Model, straight_motion: Motion, tmp_path: Path, excite: Excite
 ) -> None:

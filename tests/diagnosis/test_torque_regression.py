@@ -80,6 +80,7 @@ def test_what_is_hidden_under_a_slow_error_is_a_correction(emps: Model, effect: 
     assert found.findings[0].magnitude_std < 0.3 * abs(size)
 
 
+@pytest.mark.slow
 def test_what_takes_nearly_all_of_the_misfit_is_the_cause_and_the_rest_is_said(emps: Model) -> None:
     found = diagnosed(emps, rig_log(0, lambda q, v, F: -80 * np.abs(v)))
     assert found.verdict == "named"

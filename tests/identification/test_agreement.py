@@ -40,6 +40,7 @@ def test_logs_of_one_machine_agree(straight: Model, straight_motion: Motion) -> 
     assert all(one.changed == () for one in pairs if one is not None)
 
 
+@pytest.mark.slow
 def test_another_soil_is_named_with_its_values(
     straight: Model, straight_motion: Motion, tmp_path: Path, excite: Excite
 ) -> None:

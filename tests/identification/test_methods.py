@@ -41,6 +41,7 @@ def runs(straight: Model, straight_motion: Motion) -> dict[str, list[Estimate]]:
     return {m: [methods.identify(straight, [one], m) for one in logs] for m in LINEAR}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["iv", "tls"])
 def test_consistent_methods_are_right_and_know_how_right(
     straight: Model, runs: dict[str, list[Estimate]], method: str

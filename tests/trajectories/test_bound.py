@@ -31,6 +31,7 @@ def loose(straight: Model, problem: Problem, drives: list[Motion]) -> Bound:
     return bound(straight, problem, drives[:1], degree=0, rounds=40, population=3000, polished=6, gap=0.05)
 
 
+@pytest.mark.slow
 def test_the_bound_closes_and_lies_below_every_drive(straight: Model, drives: list[Motion], loose: Bound) -> None:
     assert loose.certified > 0.95 * loose.mixture
     assert loose.mixture < min(objective.cond_phi(straight, m) for m in drives)

@@ -77,6 +77,7 @@ def scripted(straight: Model, straight_motion: Motion, monkeypatch: pytest.Monke
     return straight
 
 
+@pytest.mark.slow
 def test_information_adds_and_the_shortest_is_found(scripted: Model, straight_motion: Motion) -> None:
     """With a drive that is only repeated, the number and duration follow from the sum of information matrices."""
     problem = scripted.machine.problems["S40"].lasting(16)

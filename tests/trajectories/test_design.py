@@ -230,6 +230,7 @@ def test_a_limit_exceeded_after_a_repair_is_moved_in(straight: Model, monkeypatc
     assert margins == pytest.approx([1e-4, 1e-4 + 2 * 0.02])  # half ranges
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_the_best_so_far() -> None:
     """A first interrupt once there is a drive within the limits: it ends with a drive, and says it isn't complete."""
     code = (
