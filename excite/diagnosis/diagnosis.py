@@ -1,8 +1,9 @@
 """Diagnose from logs what a model gets wrong.
 
-Forward selection: the model is fitted to the logs, every effect that it lacks is scored (`score_test`), the likeliest
-are fitted, and the best is added to the model (`selection`). This is repeated until the innovations are noise or no
-effect helps. Effects that explain the logs about as well are tied. A misfit that no effect explains, or only a
+Forward selection: the model is fitted to the logs; where it follows them only with free friction near rest, that is
+replaced by presliding at each joint that shows it. Every effect that the model lacks is scored (`score_test`), the
+likeliest are fitted, and the best is added to the model (`selection`). This is repeated until the innovations are noise
+or no effect helps. Effects that explain the logs about as well are tied. A misfit that no effect explains, or only a
 patchwork of MAX_EFFECTS, is unexplained.
 """
 
@@ -183,7 +184,7 @@ def diagnose(
         before, chosen = sharp or (fit_with_process_noise(before, runner), chosen)
     if before.data.sticks and before.exact:
         report(0.15, "fitting friction near rest")
-        chosen = selection.choose_presliding(before, runner)
+        chosen = selection.choose_presliding(before, runner, deadline)
     tried: Container[str] = ()
     if not (before.estimated or chosen or deadline.is_over()):
         report(0.15, "fitting effects from initial trajectories")
@@ -249,7 +250,7 @@ def extend_model(
     MIN_LIKELIHOOD_RATIO, which was not enough.
     """
     chosen, stage, next_ratio = list(first), first[-1].stage if first else before, 0.0
-    while stage.estimated and len(chosen) < MAX_EFFECTS and not stage.is_dead_end:
+    while stage.estimated and _n_beside_presliding(chosen) < MAX_EFFECTS and not stage.is_dead_end:
         turn = len(chosen)
         report(0.15 + 0.2 * turn, "scoring effects")
         scores = selection.score_effects(stage, runner)
@@ -268,6 +269,11 @@ def extend_model(
     return chosen, next_ratio
 
 
+def _n_beside_presliding(chosen: Sequence[Choice]) -> int:
+    """Return the number of effects beside presliding, of which a machine may have one at every joint."""
+    return sum(not x.name.startswith(f"{selection.PRESLIDING}@") for x in chosen)
+
+
 def _cannot_explain(before: ExtendedFit, chosen: Sequence[Choice], scores: Sequence[Score]) -> bool:
     """Tell if no further effects could explain enough, and the last one chosen does not hold by itself."""
     if not (chosen and chosen[-1].stage.exact):
@@ -275,7 +281,7 @@ def _cannot_explain(before: ExtendedFit, chosen: Sequence[Choice], scores: Seque
     stage = chosen[-1].stage
     gained = sum(x.likelihood_ratio for x in chosen)
     most = (
-        (MAX_EFFECTS - len(chosen))
+        (MAX_EFFECTS - _n_beside_presliding(chosen))
         * selection.MAX_RATIO_OVER_SCORE
         * max((s.likelihood_ratio for s in scores), default=0.0)
     )

@@ -39,7 +39,7 @@ from excite.smoothing import (
 )
 from excite.text import format_number
 
-# Cost: twice the negative log-likelihood. A right model's cost is about the number of readings.
+# Cost: sum of squared innovations over their variances. A right model's cost is about the number of readings.
 MIN_COST_GAIN_OF_CLOSE_FIT = 100.0  # cost by which an unconverged fit must beat a close one to be continued; chosen
 TRACKING_COST_RATIO = 2.5  # cost over its expected value up to which exact dynamics track the logs; chosen
 LOST_COST_RATIO = 10.0  # cost over the number of readings from which a fit is given up after a few passes; chosen
@@ -582,7 +582,7 @@ def resume_fit(data: FitData, previous: ExtendedFit, process_noise: float, cost_
                 return without_smoother_levels(found)
             raise
         # Continue an exact fit that came close where the previous one did not, or that is much better than it.
-        was_close = previous.is_close and previous.data.noise_inflation == data.noise_inflation
+        was_close = previous.is_close and previous.data.noise_inflation == data.noise_inflation and not data.sticks
         acceptable = (
             previous.fit.cost - MIN_COST_GAIN_OF_CLOSE_FIT
             if was_close

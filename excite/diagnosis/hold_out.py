@@ -1,7 +1,8 @@
 """Gain of an extended model on data that it was not fitted on.
 
 Stretches of the logs are withheld: their readings are hidden, parameters and states are fitted to the rest, and the
-exact dynamics predict the hidden readings. Both models face the same stretches. Intervals come from a bootstrap over
+exact dynamics predict the hidden readings. For likelihoods the parameters are those of the rest, and a filter along the
+fit to the whole logs is linearised. Both models face the same stretches. Intervals come from a bootstrap over
 stretches (Hesterberg, The American Statistician 69, 2015: expanded percentile interval). The effect was selected on the
 whole logs; its magnitude for this test was not.
 """
@@ -243,13 +244,12 @@ def _likelihood_of_stretches(
     that explains the logs has no process noise.
     """
     data = stage.data
+    along = [replace(p, offset=r.offset) for p, r in zip(stage.fit.trajectories, rest.trajectories, strict=True)]
     found = np.full((sum(len(own) for own in stretches), len(LIKELIHOOD_LEVELS)), np.nan)
     for k, level in enumerate(levels):
         if level > 0 and rest.process_noise == 0 and stage.is_close:
             break
-        linear = smoothing.linearise_logs(
-            data.space, data.measurements, stage.fit.trajectories, data.starts, rest.X, level
-        )
+        linear = smoothing.linearise_logs(data.space, data.measurements, along, data.starts, rest.X, level)
         if linear is None:
             continue
         likelihood = []

@@ -5,7 +5,7 @@ the first effect, or a pair, is chosen with inflated sensor noise (`choose_with_
 trajectories (`choose_from_start`). If nothing explains the logs, candidates with low scores are fitted too
 (`choose_unlikely`).
 
-Likelihood ratio means 2 delta log L, the decrease of the cost.
+Likelihood ratio means 2 delta log L, the decrease of the deviance.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import scipy.stats
 
 from excite import identification
 from excite.diagnosis import score_test
+from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.fits import (
     LOST_COST_RATIO,
     MIN_PROCESS_NOISE,
@@ -391,26 +392,27 @@ def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runne
     )
 
 
-def choose_presliding(stage: ExtendedFit, runner: CallRunner) -> list[Choice]:
+def choose_presliding(stage: ExtendedFit, runner: CallRunner, deadline: Deadline | None = None) -> list[Choice]:
     """Choose the joints whose friction near rest builds up over an angle, where it was taken for free.
 
-    It comes before other effects: they are sought in what is left where friction near rest is known.
+    It comes before other effects: they are sought in what is left where friction near rest is known. deadline: no
+    further joint is begun after it.
     """
     chosen, scores = list[Choice](), score_effects(stage, runner)
     wanted = {s.candidate.name: s for s in reversed(scores) if s.candidate.placed.effect.name == PRESLIDING}
     entries = {name: _start_entry(s) for name, s in wanted.items()}
-    while entries:
+    while entries and not (deadline is not None and deadline.is_over()):
         requests = [(effects.with_effects(stage.machine, entry), stage, 0.0) for entry in entries.values()]
         fits = zip(entries, refit_all(requests, runner), strict=True)
-        found = {name: x for name, x in fits if x is not None and x.is_close and _is_effective(name, x)}
+        found = {n: x for n, x in fits if x is not None and x.is_close and not x.impossible and _is_effective(n, x)}
         name = min(found, key=lambda name: found[name].deviance, default="")
         if not name:
             break
         best = found[name]
         gain = stage.deviance - best.deviance
-        if gain < required_likelihood_ratio(name, best, len(scores)) or best.impossible:
+        if gain < required_likelihood_ratio(name, best, len(scores)):
             break
-        chosen.append(Choice(name, best, gain, best.dispersion, len(scores), (), wanted[name].unabsorbed_share))
+        chosen.append(Choice(name, best, gain, best.dispersion, len(scores), (), unabsorbed_share=1.0))
         magnitudes = {n: fitted_entry(x, n).amount for n, x in found.items()}
         entries = {
             n: e.model_copy(update={"amount": magnitudes.get(n, e.amount)}) for n, e in entries.items() if n != name
@@ -759,7 +761,7 @@ def _is_effective(name: str, stage: ExtendedFit) -> bool:
 
 
 def _best_variants(trials: Sequence[_Trial]) -> list[_Trial]:
-    """Return the best variant of each name, best first: least process noise, then least cost."""
+    """Return the best variant of each name, best first: least process noise, then least deviance."""
     best: dict[str, _Trial] = {}
     for x in sorted(trials, key=lambda x: (x[1].fit.process_noise, x[1].deviance)):
         best.setdefault(x[0].candidate.name, x)

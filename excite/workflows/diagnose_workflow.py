@@ -198,7 +198,10 @@ def _baseline_note(found: Diagnosis | TorqueDiagnosis) -> list[str]:
         tried = [f"tried and not given: {'; '.join(found.rejected)}"] if found.rejected else []
         return ["the torques are explained along the measured motion, by regression", *tried]
     if found.sticks:
-        return ["friction sticks: where a joint is near rest, its friction may have any value up to Fs"]
+        return [
+            "friction sticks: where a joint is near rest, its friction may have any value up to Fs in the model without"
+            " what was found, and up to a tenth of that where presliding was found"
+        ]
     if found.before.estimated:
         return []
     inflation = found.before.data.noise_inflation

@@ -868,7 +868,7 @@ def test_an_amount_that_gains_nothing_clear_names_nothing(gain: float) -> None:
     def trial(name: str, simpler: str | None, cost: float, process_noise: float = 0.0) -> Any:
         candidate = SimpleNamespace(name=name, placed=SimpleNamespace(simpler=simpler))
         fit = SimpleNamespace(cost=cost, process_noise=process_noise)
-        return SimpleNamespace(candidate=candidate), SimpleNamespace(fit=fit, dispersion=1.0)
+        return SimpleNamespace(candidate=candidate), SimpleNamespace(fit=fit, deviance=cost, dispersion=1.0)
 
     bristles = trial("stribeck_friction@load", "presliding@load", 100.0)
     bends = trial("presliding@load", None, 100.0 + gain)
