@@ -19,6 +19,7 @@ from excite.model.effects import CATALOGUE, ContactMotion, SampleView, Soil
 from excite.model.machine import Contact, Quantity
 
 LARGEST_SATURATION = 30.0  # saturation slip over the largest slip, above which the law is linear here; chosen
+MIN_STDS = 2.0  # least traction per slip, in its standard deviations; chosen
 MIN_SHARE = 1e-3  # least traction per slip, as a share of the largest traction; chosen
 RULED_OUT = 0.05  # chance against the best law, below which a law is ruled out; chosen
 DRAWS = 2000  # Bayesian bootstrap; chosen
@@ -107,7 +108,8 @@ def fit_slip_laws(table: SlipTable) -> SlipFit:
     laws = [replace(law, chance=_chance(law.left_out, laws[0].left_out)) for law in laws]
     load = None if table.load is None else float(np.mean(table.load))
     traction = float(np.abs(table.forces["traction"]).max()) if "traction" in table.forces else 0.0
-    if abs(_supported(laws)[0].parameters["Kx"][0]) < MIN_SHARE * traction:
+    stiffness, std = _supported(laws)[0].parameters["Kx"]
+    if abs(stiffness) < max(MIN_SHARE * traction, MIN_STDS * (std or 0.0)):
         raise NotIdentifiableError(
             f"{table.source}: the traction does not grow with slip, so there is no contact law: is it the right column"
             f" (traction=COLUMN)? {'; '.join(n for n in table.notes if n.startswith('columns'))}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -165,15 +166,15 @@ def describe_campaign(s: Summary) -> Description:
 
 def _describe_kept_limits(s: Summary) -> str:
     """Say what holds of the limits of a joint motion between samples and under a position controller."""
-    if s["max_violation"] > 0:
-        return ""
+    kept = " Limits are kept between the samples, too." if s["max_violation"] == 0 else ""
     followed = s.get("followed")
     if followed is None:
-        return " Limits are kept between the samples, too."
-    over = describe_violations(followed, SHOWN_VIOLATION)
-    if not over:
-        return " Limits are kept between the samples, too, and where a position controller follows the motion."
-    return f" Limits are kept between the samples, too; as a position controller follows the motion, it exceeds {over}."
+        return kept
+    if any(x is None or not math.isfinite(x) for x in followed.values()):
+        return f"{kept} In simulation a position controller cannot follow the motion."
+    if over := describe_violations(followed, SHOWN_VIOLATION):
+        return f"{kept} As a position controller follows the motion, it exceeds {over}."
+    return f"{kept} They are kept where a position controller follows the motion as well." if kept else ""
 
 
 def _describe_given_zeros(s: Summary) -> list[str]:

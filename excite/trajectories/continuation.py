@@ -47,9 +47,11 @@ class ContinuationStage:
     """One stage: transitions of friction and slip and the knot spacing are wider by these factors.
 
     Level i has sharpness `sharpness` 2^i and barrier `barrier` / 3^i. It ends when the decrease that a Newton step
-    expects is below `patience` / sharpness. elements: collocation elements per interval.
-    push: distance of the first slacks from their bounds, in half ranges; first_barrier: least barrier parameter behind
-    the first multipliers. starts_again: from torques that keep every limit, if a program ends far from its limits.
+    expects is below `patience` / sharpness.
+
+    elements: collocation elements per interval. Of the own solver alone: push, the distance in half ranges of the first
+    slacks from their bounds; first_barrier, the least barrier parameter that gives the first multipliers; starts_again,
+    whether a program that ends far outside its limits begins anew from torques that keep every limit.
     """
 
     friction: float
@@ -453,7 +455,7 @@ class StageProgram:
     """Program of a stage: start (n_z,), states Z (K, J, n_z) and torques U (K + 1, n_u) to begin with, scaled.
 
     levels: of sharpness and barrier, in turn. fresh: no stage before has found torques that keep the limits.
-    stage: whose program this is.
+    stage: the stage that this program solves.
     """
 
     tr: Transcription

@@ -171,6 +171,7 @@ def design_joint_motion(
             raise KeyboardInterrupt
         raise infeasible_error(composite, best.best.violations, complete)
     chosen = keep_as_followed(model, problem, composite, best.best)
+    states[best.number] = replace(best, best=chosen)
     motion = _as_motion(model, problem, chosen.basis, chosen.coefficients).sample(model)
     return Design(
         composite.name,

@@ -70,7 +70,7 @@ class MachineCheck:
 def check_file(path: Path) -> MachineCheck:
     """Check a machine file. Raises MachineError for a file that can't be read."""
     text, tables, wrong = machine_tables(str(path))
-    read = find_faults(text, tables, wrong)
+    read = find_faults(text, tables, wrong, path)
     faults = list(read.lines)
     if read.machine is None:
         return MachineCheck(tuple(faults), (), (), None, {})

@@ -33,7 +33,7 @@ def chain(path: Path, shipped: Path) -> list[tuple[Path, dict[str, Any]]]:
 
 @dataclass(frozen=True)
 class WrongName:
-    """A table [body.NAME] or [sensor.NAME] of a file for which there is none to change; where: its key."""
+    """A table [body.NAME] or [sensor.NAME] that names no body or sensor of the extended file; where: its key."""
 
     path: Path
     where: tuple[str, str]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import pathlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,17 +36,20 @@ class FileFaults:
     complete: bool
 
 
-def find_faults(text: str, tables: dict[str, Any], wrong: Sequence[WrongName] = ()) -> FileFaults:
+def find_faults(
+    text: str, tables: dict[str, Any], wrong: Sequence[WrongName] = (), path: pathlib.Path | None = None
+) -> FileFaults:
     """Return all faults of a machine file. text: the file itself; tables: its content, with what it extends.
 
-    wrong: names in it of which there is nothing to change, read as probably meant.
+    wrong: names, in it or a file that it extends, of no body or sensor, read as probably meant. path: the file's.
     """
     raw, complete = copy.deepcopy(tables), True
     lines = key_lines(text)
     found: dict[str, None] = {}
     for name in wrong:
-        number = lines.get(name.where)
-        said = f"{'.'.join(name.where)}: {name.message}"
+        own = path is None or name.path == path
+        number = lines.get(name.where) if own else None
+        said = f"{'' if own else f'{name.path}: '}{'.'.join(name.where)}: {name.message}"
         found[said if number is None else f"line {number}: {said}"] = None
     for _ in range(ROUNDS):
         try:

@@ -9,7 +9,8 @@ force gives (output error), in stretches of 5 s:
 - mujoco.sysid: the rig in MJCF with `frictionloss`, the toolbox's optimiser and intervals; a stretch begins with the
   measured position and speed.
 
-All begin 30 % above the truth. A contender whose package is missing is left out.
+Fits of others begin 30 % above the truth, those of this program at the machine file's values. A contender whose package
+is missing is left out.
 """
 
 from __future__ import annotations
