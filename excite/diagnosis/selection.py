@@ -405,6 +405,7 @@ def choose_presliding(stage: ExtendedFit, runner: CallRunner, deadline: Deadline
         requests = [(effects.with_effects(stage.machine, entry), stage, 0.0) for entry in entries.values()]
         fits = zip(entries, refit_all(requests, runner), strict=True)
         found = {n: x for n, x in fits if x is not None and x.is_close and not x.impossible and _is_effective(n, x)}
+        found = {n: x for n, x in found.items() if not _sticks(n, x)}
         name = min(found, key=lambda name: found[name].deviance, default="")
         if not name:
             break
@@ -419,6 +420,15 @@ def choose_presliding(stage: ExtendedFit, runner: CallRunner, deadline: Deadline
         }
         stage = best
     return chosen
+
+
+def _sticks(name: str, stage: ExtendedFit) -> bool:
+    """Tell if presliding ends within a sample even at the rate over which friction turns: the joint just sticks."""
+    placed = stage.placed(name)
+    body = next(b for b in stage.machine.body if b.index == placed.bodies[0])
+    assert body.friction is not None
+    angle = _fitted_values(stage, placed)["A"]
+    return bool(angle < float(body.friction.smoothing) / float(stage.machine.sampling_hz))
 
 
 def choose_with_inflated_noise(stage: ExtendedFit, runner: CallRunner) -> tuple[ExtendedFit, list[Choice]] | None:
