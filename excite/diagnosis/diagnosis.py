@@ -343,6 +343,9 @@ def review_effects(before: ExtendedFit, chosen: Sequence[Choice], runner: CallRu
     queue, found = list(chosen), chosen[-1].stage
     for first in chosen[:-1]:
         rest, whole = queue[1:], queue[-1].stage
+        if whole.data.sticks and whole.placed(first.name).unsticking:
+            queue = [*rest, replace(first, stage=whole, process_noise_fit=None)]  # chosen before all others
+            continue
         try:
             stage = _refit_without(first.name, whole)
         except NotConvergedError:

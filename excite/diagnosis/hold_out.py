@@ -1,8 +1,8 @@
 """Gain of an extended model on data that it was not fitted on.
 
 Stretches of the logs are withheld: their readings are hidden, parameters and states are fitted to the rest, and the
-exact dynamics predict the hidden readings. For likelihoods the parameters are those of the rest, and a filter along the
-fit to the whole logs is linearised. Both models face the same stretches. Intervals come from a bootstrap over
+exact dynamics predict the hidden readings. For likelihoods the parameters are those of the rest.
+Both models face the same stretches. Intervals come from a bootstrap over
 stretches (Hesterberg, The American Statistician 69, 2015: expanded percentile interval). The effect was selected on the
 whole logs; its magnitude for this test was not.
 """
@@ -239,12 +239,14 @@ def _likelihood_of_stretches(
     """Return the log-likelihood (stretches, LIKELIHOOD_LEVELS) with the parameters of a fit, NaN where not found.
 
     levels: of process noise, the first of LIKELIHOOD_LEVELS, found as long as the likelihood grows with them. Every
-    reading counts given those before it, by the innovations of a filter along all readings, linearised where the whole
-    logs lead: what follows from the rest alone is too far off for friction that changes within a small angle. A model
-    that explains the logs has no process noise.
+    reading counts given those before it, by the innovations of a filter along all readings. Friction that builds up
+    over a small angle is linearised where the whole logs lead, as the rest alone leads too far off. A model that
+    explains the logs has no process noise.
     """
     data = stage.data
-    along = [replace(p, offset=r.offset) for p, r in zip(stage.fit.trajectories, rest.trajectories, strict=True)]
+    along: Sequence[smoothing.Trajectory] = rest.trajectories
+    if any(e.unsticking for e in stage.model.effects):
+        along = [replace(p, offset=r.offset) for p, r in zip(stage.fit.trajectories, along, strict=True)]
     found = np.full((sum(len(own) for own in stretches), len(LIKELIHOOD_LEVELS)), np.nan)
     for k, level in enumerate(levels):
         if level > 0 and rest.process_noise == 0 and stage.is_close:

@@ -405,7 +405,6 @@ def choose_presliding(stage: ExtendedFit, runner: CallRunner, deadline: Deadline
         requests = [(effects.with_effects(stage.machine, entry), stage, 0.0) for entry in entries.values()]
         fits = zip(entries, refit_all(requests, runner), strict=True)
         found = {n: x for n, x in fits if x is not None and x.is_close and not x.impossible and _is_effective(n, x)}
-        found = {n: x for n, x in found.items() if not _sticks(n, x)}
         name = min(found, key=lambda name: found[name].deviance, default="")
         if not name:
             break
@@ -420,15 +419,6 @@ def choose_presliding(stage: ExtendedFit, runner: CallRunner, deadline: Deadline
         }
         stage = best
     return chosen
-
-
-def _sticks(name: str, stage: ExtendedFit) -> bool:
-    """Tell if presliding ends within a sample even at the rate over which friction turns: the joint just sticks."""
-    placed = stage.placed(name)
-    body = next(b for b in stage.machine.body if b.index == placed.bodies[0])
-    assert body.friction is not None
-    angle = _fitted_values(stage, placed)["A"]
-    return bool(angle < float(body.friction.smoothing) / float(stage.machine.sampling_hz))
 
 
 def choose_with_inflated_noise(stage: ExtendedFit, runner: CallRunner) -> tuple[ExtendedFit, list[Choice]] | None:
@@ -744,6 +734,8 @@ def _is_plausible(name: str, stage: ExtendedFit) -> bool:
     fitted = replace(placed, values={**placed.values, **_fitted_values(stage, placed)})
     if not effects.shapes_possible(stage.machine, fitted):
         return False
+    if stage.data.sticks and placed.effect.name == PRESLIDING and _sticks(placed, fitted.values["A"], stage):
+        return False
     if fitted.effect.shaking is None:
         return True
     sensors = (s for s in stage.machine.sensors("full") if s.kind == "torque" and s.body == fitted.bodies[0])
@@ -752,6 +744,13 @@ def _is_plausible(name: str, stage: ExtendedFit) -> bool:
         return True
     shaking = [is_shaking(x.values[sensor.name], fitted.shaking(x.t), rate) for x in stage.data.logs]
     return any(shaking) or all(x is None for x in shaking)
+
+
+def _sticks(placed: PlacedEffect, angle: float, stage: ExtendedFit) -> bool:
+    """Tell if friction builds up within a sample even at the rate over which it turns: the joint just sticks."""
+    friction = next(b.friction for b in stage.machine.body if b.index == placed.bodies[0])
+    assert friction is not None
+    return angle < float(friction.smoothing) / float(stage.machine.sampling_hz)
 
 
 def _fell_to_zero(name: str, stage: ExtendedFit) -> bool:
