@@ -52,8 +52,7 @@ def whole(name: str, file: Path, origin: str) -> str:
         "",
     ]
     text, tables, wrong = machine.machine_tables(origin)
-    for one in wrong:
-        raise MachineError(f"{one.path}: {'.'.join(one.where)}: {one.message}")
+    machine.require_right_names(wrong)
     return "\n".join([*lines, *_with_meanings(name, _dumped(tables) if EXTENDS.search(text) else text)]) + "\n"
 
 

@@ -182,7 +182,7 @@ def diagnose(
         report(0.15, "fitting effects with inflated sensor noise")
         sharp = selection.choose_with_inflated_noise(before, runner)
         before, chosen = sharp or (fit_with_process_noise(before, runner), chosen)
-    if before.data.sticks and before.exact:
+    if before.data.sticks:
         report(0.15, "fitting friction near rest")
         chosen = selection.choose_presliding(before, runner, deadline)
     tried: Container[str] = ()

@@ -691,23 +691,28 @@ def prepare_data(
 ) -> FitData:
     """Prepare logs for a machine; friction_near_rest: see `FitData`."""
     space = _build_space(machine, logs)
+    measurements, starts = prepare_logs(space, logs, filter)
     free = None if friction_near_rest is None else tuple(friction_near_rest)
-    measurements, starts = prepare_logs(space, logs, filter, extra_torque_noise=_free_friction(space.model, free))
     return FitData(
         space,
         tuple(logs),
-        measurements,
+        _with_free_friction(measurements, space.model, free),
         starts,
         identification.parameters_at_rest(space.model, logs, filter, slow=False),
         free,
     )
 
 
-def _free_friction(model: Model, friction_near_rest: Sequence[np.ndarray] | None) -> list[np.ndarray] | None:
-    """Return the friction that stays free near rest: a small share where an effect says what it is at its joint."""
+def _with_free_friction(
+    measurements: Sequence[Measurements], model: Model, friction_near_rest: Sequence[np.ndarray] | None
+) -> tuple[Measurements, ...]:
+    """Free the friction near rest; a small share of it where an effect says what it is at its joint."""
+    if friction_near_rest is None:
+        return tuple(measurements)
     known = {k for e in model.effects if e.unsticking for k in e.bodies}
-    free = np.array([FRICTION_ERROR if body.index in known else 1.0 for body in model.machine.actuated])
-    return None if friction_near_rest is None else [size * free for size in friction_near_rest]
+    share = np.array([FRICTION_ERROR if body.index in known else 1.0 for body in model.machine.actuated])
+    sizes = zip(measurements, friction_near_rest, strict=True)
+    return tuple(replace(r, extra_torque_noise=size * share) for r, size in sizes)
 
 
 def adapt_data(machine: Machine, previous: ExtendedFit) -> FitData:
@@ -717,10 +722,10 @@ def adapt_data(machine: Machine, previous: ExtendedFit) -> FitData:
         return before
     space = _build_space(machine, before.logs)
     model = space.model
-    free: Sequence[np.ndarray | None] | None = _free_friction(model, before.friction_near_rest)
-    measurements = tuple(
-        replace(r, offset_sensors=encoders_with_offset(space, r.read_at_edges), extra_torque_noise=extra)
-        for r, extra in zip(before.measurements, free or [None] * len(before.logs), strict=True)
+    measurements = _with_free_friction(
+        [replace(r, offset_sensors=encoders_with_offset(space, r.read_at_edges)) for r in before.measurements],
+        model,
+        before.friction_near_rest,
     )
     starts = tuple(
         transfer_trajectory(space, r, p, before.space, model.nominal)

@@ -1,10 +1,9 @@
 """Gain of an extended model on data that it was not fitted on.
 
 Stretches of the logs are withheld: their readings are hidden, parameters and states are fitted to the rest, and the
-exact dynamics predict the hidden readings. For likelihoods the parameters are those of the rest.
-Both models face the same stretches. Intervals come from a bootstrap over
-stretches (Hesterberg, The American Statistician 69, 2015: expanded percentile interval). The effect was selected on the
-whole logs; its magnitude for this test was not.
+exact dynamics predict the hidden readings. For likelihoods the parameters are those of the rest. Both models face the
+same stretches. Intervals come from a bootstrap over stretches (Hesterberg, The American Statistician 69, 2015: expanded
+percentile interval). The effect was selected on the whole logs; its magnitude for this test was not.
 """
 
 from __future__ import annotations

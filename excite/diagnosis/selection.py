@@ -413,10 +413,8 @@ def choose_presliding(stage: ExtendedFit, runner: CallRunner, deadline: Deadline
         if gain < required_likelihood_ratio(name, best, len(scores)):
             break
         chosen.append(Choice(name, best, gain, best.dispersion, len(scores), (), unabsorbed_share=1.0))
-        magnitudes = {n: fitted_entry(x, n).amount for n, x in found.items()}
-        entries = {
-            n: e.model_copy(update={"amount": magnitudes.get(n, e.amount)}) for n, e in entries.items() if n != name
-        }
+        entries |= {n: entries[n].model_copy(update={"amount": fitted_entry(x, n).amount}) for n, x in found.items()}
+        del entries[name]
         stage = best
     return chosen
 
@@ -486,7 +484,7 @@ def _ratio_with_true_noise(
     without = (
         min(inflation**2 * gain, LOST_COST_RATIO * best.expected_cost - best.fit.cost)
         if plain is None
-        else plain.fit.cost - best.fit.cost
+        else plain.deviance - best.deviance
     )
     return min(wald_statistic(name, best), max(inflation * gain, without))
 
@@ -497,7 +495,7 @@ def _choose_pair(stage: ExtendedFit, first: _Trial, n_candidates: int, runner: C
     The first is the best with inflated noise, and must explain a good part of the excess.
     """
     score, first_fit = first
-    if stage.fit.cost - first_fit.fit.cost < MIN_EXCESS_SHARE_OF_FIRST * stage.excess_cost:
+    if stage.deviance - first_fit.deviance < MIN_EXCESS_SHARE_OF_FIRST * stage.excess_cost:
         return []
     scores, cost_limit = score_effects(first_fit, runner), TRACKING_COST_RATIO * first_fit.expected_cost
     shortlist = _refined_shortlist(first_fit, scores, (), runner)
@@ -510,10 +508,10 @@ def _choose_pair(stage: ExtendedFit, first: _Trial, n_candidates: int, runner: C
     found = [x for x in found if not any(_fell_to_zero(e.candidate.name, x[2]) for e in (score, x[0]))]
     if not found:
         return []
-    second, inflated, best = min(found, key=lambda x: x[2].fit.cost)
+    second, inflated, best = min(found, key=lambda x: x[2].deviance)
     ratio = (
-        _ratio_with_true_noise(score.candidate.name, best, stage.fit.cost - first_fit.fit.cost, stage, None),
-        _ratio_with_true_noise(second.candidate.name, best, first_fit.fit.cost - inflated.fit.cost, stage, None),
+        _ratio_with_true_noise(score.candidate.name, best, stage.deviance - first_fit.deviance, stage, None),
+        _ratio_with_true_noise(second.candidate.name, best, first_fit.deviance - inflated.deviance, stage, None),
     )
     if min(ratio) < MIN_LIKELIHOOD_RATIO * best.dispersion:
         return []
@@ -797,12 +795,14 @@ def _without_needless_magnitudes(trials: Sequence[_Trial]) -> list[_Trial]:
 
     Friction by bristles that bend is presliding where no Stribeck friction adds to it.
     """
-    costs = {(s.candidate.name, stage.fit.process_noise): stage.deviance for s, stage in trials}
+    deviances = {(s.candidate.name, stage.fit.process_noise): stage.deviance for s, stage in trials}
     least = MIN_LIKELIHOOD_RATIO * trials[0][1].dispersion
 
     def is_needless(trial: _Trial) -> bool:
         simpler, stage = trial[0].candidate.placed.simpler, trial[1]
-        return simpler is not None and costs.get((simpler, stage.fit.process_noise), np.inf) - stage.deviance < least
+        return (
+            simpler is not None and deviances.get((simpler, stage.fit.process_noise), np.inf) - stage.deviance < least
+        )
 
     return [x for x in trials if not is_needless(x)]
 

@@ -247,7 +247,7 @@ class PhaseSearch:
 
     @cached_property
     def coarser(self) -> PhaseSearch:
-        """The same search for differences between motions, at TRIAL_HZ or a little more if the machine is faster."""
+        """This search with motions sampled at TRIAL_HZ or a little more, or at the machine's rate if that is lower."""
         hz = self.model.machine.sampling_hz
         stride = max(1, int(float(hz) / TRIAL_HZ))
         lower = hz.model_copy(update={"value": float(hz) / stride})

@@ -289,7 +289,6 @@ def keep_as_followed(
 
     A motion that exceeds limits as planned, or that no reduction helps, stays as it is.
     """
-
     first = _with_followed(model, problem, found)
     for share in DRAWN_BACK_FOLLOWED if first.excess <= ROUNDING < first.followed_excess else ():
         less = score_joint_motion(model, problem, objective, first.basis, share * first.coefficients)

@@ -17,6 +17,7 @@ from .machine import (
     load_machine as load_machine,
     machine_files as machine_files,
     machine_tables as machine_tables,
+    require_right_names as require_right_names,
     shipped_machines as shipped_machines,
 )
 from .meanings import MEANINGS as MEANINGS

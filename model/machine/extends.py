@@ -39,6 +39,9 @@ class WrongName:
     where: tuple[str, str]
     message: str
 
+    def __str__(self) -> str:
+        return f"{'.'.join(self.where)}: {self.message}"
+
 
 def read(path: Path, shipped: Path) -> tuple[dict[str, Any], tuple[WrongName, ...]]:
     """Read a TOML file merged over those that it extends (see `chain`), and its wrong names, read as probably meant.

@@ -49,7 +49,7 @@ def find_faults(
     for name in wrong:
         own = path is None or name.path == path
         number = lines.get(name.where) if own else None
-        said = f"{'' if own else f'{name.path}: '}{'.'.join(name.where)}: {name.message}"
+        said = str(name) if own else f"{name.path}: {name}"
         found[said if number is None else f"line {number}: {said}"] = None
     for _ in range(ROUNDS):
         try:

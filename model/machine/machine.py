@@ -964,12 +964,17 @@ def load_machine(name: str | Path) -> Machine:
         raw, wrong = extends.read(path, MACHINES)
     except ValueError as err:
         raise MachineError(str(err)) from None
-    for one in wrong:
-        raise MachineError(f"{one.path}: {'.'.join(one.where)}: {one.message}")
+    require_right_names(wrong)
     try:
         return Machine.model_validate(raw)
     except ValidationError as err:
         raise MachineError(error_line(path, err, Machine)) from None
+
+
+def require_right_names(wrong: Sequence[extends.WrongName]) -> None:
+    """Raise MachineError for the first wrong name, if there is one."""
+    for one in wrong:
+        raise MachineError(f"{one.path}: {one}")
 
 
 def machine_tables(name: str) -> tuple[str, dict[str, Any], tuple[extends.WrongName, ...]]:

@@ -163,7 +163,7 @@ def test_one_step_improves_a_poor_drive(straight: Model) -> None:
 
 
 def test_differences_at_a_lower_rate_are_those_at_the_machine_s(straight: Model) -> None:
-    """What a faster phase changes in the information matrix and in every limit."""
+    """A faster phase changes the information matrix and every limit alike at both rates."""
     import joblib
 
     task = task_of(straight, 16.0, 2.0)
