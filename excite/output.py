@@ -6,7 +6,10 @@ import glob
 import json
 import os
 import re
+import shlex
 import shutil
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -35,9 +38,35 @@ OWN_NAMES = re.compile(
 )
 
 
-def write_summary(place: Path, summary: Any) -> None:
-    """Write a folder's summary."""
-    (place / SUMMARY).write_text(to_json(summary), encoding="utf-8")
+def write_summary(place: Path, summary: Mapping[str, Any], command: str | None = None) -> None:
+    """Write a folder's summary with the command that made it and the commit of the program, unless it has its own.
+
+    command: how it was made, this process's command line by default.
+    """
+    origin = {"command": command or command_line(), "commit": commit()}
+    (place / SUMMARY).write_text(to_json({**summary, **{k: summary.get(k, v) for k, v in origin.items()}}), "utf-8")
+
+
+def command_line() -> str:
+    """Return this process's command as it is typed in a shell."""
+    name = Path(sys.argv[0]).name
+    return shlex.join(["excite" if name == "__main__.py" else name, *sys.argv[1:]])
+
+
+def commit() -> str | None:
+    """Return the commit of the program's checkout, with "-dirty" if its files differ from it; None outside one."""
+    package = Path(__file__).parent
+    try:
+        if not _git(package, "ls-files", Path(__file__).name):  # installed somewhere below another project
+            return None
+        changed = _git(package, "status", "--porcelain", "--", ".", str((package / "model").resolve()))
+        return _git(package, "rev-parse", "--short", "HEAD") + "-dirty" * bool(changed)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _git(place: Path, *arguments: str) -> str:
+    return subprocess.run(["git", *arguments], capture_output=True, text=True, cwd=place, check=True).stdout.strip()
 
 
 def check_out_folder(out: Path, inputs: Iterable[Path] = (), option: str = "--out") -> None:

@@ -48,7 +48,9 @@ def show(kind: str, summary: Mapping[str, Any]) -> None:
 def finish(summary: dict[str, Any], out: Path, json: bool, describe: Callable[[dict[str, Any]], None]) -> None:
     """End a command: print its summary as JSON, or describe it and name the folder that was written."""
     if json:
-        show_json(summary)
+        from excite import output
+
+        sys.stdout.write((out / output.SUMMARY).read_text(encoding="utf-8"))
         return
     describe(summary)
     say(f"written to {out}/")

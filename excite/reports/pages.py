@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -125,12 +123,12 @@ def write_report(
 ) -> None:
     """Write report.html and summary.json of a folder, after its figures; command, explorable as in `write_page`."""
     write_page(place, kind, summary, command, explorable)
-    output.write_summary(place, summary)
+    output.write_summary(place, summary, command)
 
 
 def provenance(summary: Summary, command: str | None = None) -> dict[str, str]:
     """Return how a result was made: command, machine, settings, seed, time, versions."""
-    rows = {"command": command or shlex.join(["excite", *sys.argv[1:]])}
+    rows = {"command": command or output.command_line()}
     names = ("machine", "problem", "objective", "method", "kit", "runs", "samples", "starts", "design", "estimate")
     for key in (*names, "target", "duration_s", "budget_s", "seed", "wall_s"):
         value = summary.get(key)

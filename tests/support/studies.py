@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from excite import output
 from excite.workflows import package_versions
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -34,12 +34,9 @@ def parse(parser: argparse.ArgumentParser, script: str, argv: Sequence[str] | No
 def origin(script: str, seed: int) -> dict[str, Any]:
     """Return command, seed, package versions and commit of a run of a study."""
     where = Path(script).resolve().relative_to(RESULTS.parent)
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=RESULTS, check=False
-    )
     return {
         "command": " ".join(["python", where.as_posix(), *sys.argv[1:]]),
         "seed": seed,
         "versions": package_versions(),
-        "commit": commit.stdout.strip(),
+        "commit": output.commit(),
     }

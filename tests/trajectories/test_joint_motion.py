@@ -168,7 +168,8 @@ def test_design_keeps_its_limits_where_a_controller_follows_it(arm: Model, probl
     assert max(found.design.followed.values()) <= 1e-6
     assert found.design.cond_phi < 1.1 * 25.29  # that of the planned motion alone
     summary = workflows.design_account(found, "A4", problem, request, 0.0).summary
-    assert "and where a position controller follows the motion" in str(reports.describe("design", summary).remarks)
+    kept = "They are kept where a position controller follows the motion as well."
+    assert kept in str(reports.describe("design", summary).remarks)
     summary["followed"] = {"rate forearm": 0.0024}
     assert "it exceeds rate forearm by 0.24 % of the range" in str(reports.describe("design", summary).remarks)
 
