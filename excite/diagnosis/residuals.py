@@ -176,7 +176,10 @@ def _quantities(
     driven = [b.index for b in machine.actuated]
     planar = machine.planar and machine.body[0].coordinates[0] in model.coordinates
     speed = nu[:, column(machine.body[0].coordinates[0])] if planar else None
-    slips = dict(zip(model.slips, model.kinematics(q.T, nu.T)[1].full(), strict=True)) if model.slips else {}
+    slips: dict[str, np.ndarray] = {}
+    if model.slips:
+        at = model.true_coordinates(q, stage.fit.X)
+        slips = dict(zip(model.slips, model.kinematics(at.T, nu.T)[1].full(), strict=True))
     steered = [b for b in machine.actuated if b.contact is None]
     found: dict[str, tuple[str, dict[str, np.ndarray]]] = {"time": ("s", dict.fromkeys(body_of, t))}
 

@@ -243,7 +243,8 @@ def _fitted_log(space: StateSpace, r: Measurements, p: Trajectory, linear: Linea
             wheels[:, at - 2 * n_q] = p.state[:, k]
     exact = model.read(q.T, nu.T, wheels.T, u.T, z.T, X).full().T
     slopes, white = _input_sensitivities(space, p, u, X), whiten(linear, space.reading_parameters)
-    over = p.ground_inputs if model.map_inputs else passes(model, q, nu, 1 / float(model.machine.sampling_hz))
+    at = model.true_coordinates(q, X)
+    over = p.ground_inputs if model.map_inputs else passes(model, at, nu, 1 / float(model.machine.sampling_hz))
     return FittedLog(space, linear, len(r.offset_sensors), q, nu, a, u, t, exact, model.expand @ X, slopes, white, over)
 
 
