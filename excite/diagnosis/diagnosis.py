@@ -3,8 +3,8 @@
 Forward selection: the model is fitted to the logs; where it follows them only with free friction near rest, that is
 replaced by presliding at each joint that shows it. Every effect that the model lacks is scored (`score_test`), the
 likeliest are fitted, and the best is added to the model (`selection`). This is repeated until the innovations are noise
-or no effect helps. Effects that explain the logs about as well are tied. A misfit that no effect explains, or only a
-patchwork of MAX_EFFECTS, is unexplained.
+or no effect helps. Effects that explain the logs about as well are tied. A misfit that no effect explains is
+unexplained.
 """
 
 from __future__ import annotations
@@ -36,10 +36,8 @@ from excite.model import Model, effects
 from excite.model.machine import EffectEntry, Filter
 from excite.smoothing import NotConvergedError
 
-MAX_EFFECTS = 4  # number of effects; so many kinds without a main cause are a patchwork; chosen
+MAX_EFFECTS = 4  # number of effects beside presliding; chosen
 MIN_EXPLAINED_SHARE = 0.85  # of the excess misfit, for a name; right causes in results/diagnosis explain 0.85 or more
-MIN_GAIN_SHARE_OF_NEXT = 0.1  # share of the next effect's score that an effect with process noise must gain; chosen
-MIN_COST_PER_ANOMALY = 50.0  # cost that an anomaly counts at least; chosen
 FORMULA_STD_FACTOR = 0.5  # of a magnitude, times the root of the share of its gain left to other effects; chosen
 FORMULA_STD_SHARE = 0.05  # of a magnitude, for other formulas; calibrated: covers nine in ten in results/diagnosis
 
@@ -176,7 +174,7 @@ def diagnose(
     """
     report, deadline = progress or (lambda share, what: None), deadline or Deadline()
     report(0.0, "fitting the model")
-    first = before = fit_machine_that_sticks(fit_machine(model.machine, logs, filter, runner), logs, filter, runner)
+    before = fit_machine_that_sticks(fit_machine(model.machine, logs, filter, runner), logs, filter, runner)
     chosen = list[Choice]()
     if before.data.noise_inflation > 1:
         report(0.15, "fitting effects with inflated sensor noise")
@@ -185,33 +183,17 @@ def diagnose(
     if before.data.sticks:
         report(0.15, "fitting friction near rest")
         chosen = selection.choose_presliding(before, runner, deadline)
-    tried: Container[str] = ()
-    if not (before.estimated or chosen or deadline.is_over()):
-        report(0.15, "fitting effects from initial trajectories")
-        before, chosen, tried = selection.choose_from_start(before, runner)
     chosen, next_ratio = extend_model(before, chosen, runner, report, deadline)
     added = chosen
-    chosen, anomalies, nearest = drop_weak_effects(before, chosen, next_ratio)
-    followed = before.exact and before.is_close
-    if not (chosen or followed or deadline.is_over()):  # a fit with inflated sensor noise has process noise, too
-        report(0.85, "fitting less likely effects")
-        old = before if before.data.noise_inflation == 1 else fit_with_process_noise(before, runner)
-        before, anew = selection.choose_unlikely(first, old, tried if old is first else (), runner)
-        if anew or before is not old:
-            anew, next_ratio = extend_model(
-                before, anew, runner, lambda share, what: report(max(share, 0.85), what), deadline
-            )
-            nearest = None if before is not old else nearest
-            added = anew
-        chosen, anomalies, closer = drop_weak_effects(before, anew, next_ratio)
-        nearest = closer or nearest
+    chosen, anomalies, nearest = drop_weak_effects(before, chosen)
+    if not chosen and before.data.noise_inflation > 1:  # what is left is judged with the sensors' own noise
+        before = fit_with_process_noise(before, runner)
+        anomalies = anomaly_lines(before)
     if len(chosen) > 1 and not deadline.is_over():
         report(0.9, "testing each effect given the others")
         chosen, anomalies, nearest = drop_weak_effects(
-            before, drop_unneeded(before, review_effects(before, chosen, runner)), next_ratio
+            before, drop_unneeded(before, review_effects(before, chosen, runner))
         )
-    if (largest := _largest_of_patchwork(chosen, anomalies)) is not None:
-        chosen, anomalies, nearest = [], anomaly_lines(before), largest
     stage = chosen[-1].stage if chosen else before
     found = conclude(before, stage, chosen, anomalies, next_ratio, nearest, runner)
     return found if found.findings else replace(found, dropped=_corrections(before, added, runner))
@@ -230,7 +212,7 @@ def _corrections(
             break
         found.append((_make_finding(x, x.stage, 0.0, k == 0, runner), x.stage))
     total = sum(x.likelihood_ratio for x in added[: len(found)])
-    total += _unexplained_cost(found[-1][1], ()) if found else 0.0
+    total += found[-1][1].excess_cost if found else 0.0
     return tuple(
         (replace(f, share=x.likelihood_ratio / total, kind="correction"), stage)
         for (f, stage), x in zip(found, added, strict=False)
@@ -290,13 +272,12 @@ def _cannot_explain(before: ExtendedFit, chosen: Sequence[Choice], scores: Seque
 
 
 def drop_weak_effects(
-    before: ExtendedFit, chosen: Sequence[Choice], next_ratio: float = 0.0
+    before: ExtendedFit, chosen: Sequence[Choice]
 ) -> tuple[list[Choice], tuple[str, ...], NearestEffect | None]:
     """Drop the last effects as long as they do not explain the misfit or make a parameter impossible.
 
     An effect holds if nothing is left with it, or if it explains MIN_EXPLAINED_SHARE; also with the process noise by
-    which it was judged, unless its gain is small beside next_ratio, the score of the next effect. Return the effects
-    kept, lines about anomalies beside them, and the last effect dropped.
+    which it was judged. Return the effects kept, lines about anomalies beside them, and the last effect dropped.
     """
     kept, nearest = list(chosen), None
     while True:
@@ -305,33 +286,20 @@ def drop_weak_effects(
         impossible = stage.impossible if kept and stage.estimated else ()
         if not kept or (stage.exact and not anomalies and not impossible):
             break
-        explained = _explained_share(kept[-1].likelihood_ratio, stage, anomalies)
+        explained = _explained_share(kept[-1].likelihood_ratio, stage)
         if explained >= MIN_EXPLAINED_SHARE and not impossible:
             break
         process_noise_fit = kept[-1].process_noise_fit
-        faint = kept[-1].likelihood_ratio < MIN_GAIN_SHARE_OF_NEXT * next_ratio
         if (
             process_noise_fit is not None
-            and not (impossible or faint)
-            and _explained_share(
-                kept[-1].likelihood_ratio, process_noise_fit, anomalies_with_noise := anomaly_lines(process_noise_fit)
-            )
-            >= MIN_EXPLAINED_SHARE
+            and not impossible
+            and _explained_share(kept[-1].likelihood_ratio, process_noise_fit) >= MIN_EXPLAINED_SHARE
         ):
             # A nearly right formula leaves a large misfit of exact dynamics; the effect was judged with process noise.
-            kept[-1], anomalies = replace(kept[-1], stage=process_noise_fit), anomalies_with_noise
+            kept[-1], anomalies = replace(kept[-1], stage=process_noise_fit), anomaly_lines(process_noise_fit)
             break
         nearest = NearestEffect(kept.pop().name, explained, impossible)
     return kept, anomalies, nearest
-
-
-def _largest_of_patchwork(chosen: Sequence[Choice], anomalies: Sequence[str]) -> NearestEffect | None:
-    """Return the effect with the largest gain if MAX_EFFECTS kinds lack a main cause; otherwise None."""
-    if len({x.name.split("@")[0] for x in chosen}) < MAX_EFFECTS:
-        return None
-    most, gained = max(chosen, key=lambda x: x.likelihood_ratio), sum(x.likelihood_ratio for x in chosen)
-    share = _explained_share(gained, chosen[-1].stage, anomalies) * most.likelihood_ratio / gained
-    return NearestEffect(most.name, share) if share < selection.MAIN_CAUSE_SHARE else None
 
 
 def review_effects(before: ExtendedFit, chosen: Sequence[Choice], runner: CallRunner = run_in_turn) -> list[Choice]:
@@ -482,15 +450,10 @@ def anomaly_lines(stage: ExtendedFit) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*stage.suspect_sensors, *(line for line, _ in sorted(found, key=lambda x: -x[1]))]))
 
 
-def _explained_share(gained: float, stage: ExtendedFit, anomalies: Sequence[str]) -> float:
+def _explained_share(gained: float, stage: ExtendedFit) -> float:
     """Return the share of the misfit that effects explain by their gain."""
-    next_ratio = _unexplained_cost(stage, anomalies)
-    return gained / (gained + next_ratio) if gained + next_ratio > 0 else 0.0
-
-
-def _unexplained_cost(stage: ExtendedFit, anomalies: Sequence[str]) -> float:
-    """Return the misfit that is left, at least MIN_COST_PER_ANOMALY for each anomaly."""
-    return max(stage.excess_cost, MIN_COST_PER_ANOMALY * len(anomalies))
+    total = gained + stage.excess_cost
+    return gained / total if total > 0 else 0.0
 
 
 def conclude(
@@ -509,8 +472,8 @@ def conclude(
     """
     share = 1.0
     if anomalies or not after.exact:
-        share = _explained_share(sum(x.likelihood_ratio for x in chosen), after, anomalies)
-        next_ratio = max(next_ratio, _unexplained_cost(after, anomalies))
+        share = _explained_share(sum(x.likelihood_ratio for x in chosen), after)
+        next_ratio = max(next_ratio, after.excess_cost)
     findings = tuple(_make_finding(x, after, next_ratio, len(chosen) == 1, runner) for x in chosen)
     gained = sum(x.likelihood_ratio for x in chosen)
     findings = tuple(

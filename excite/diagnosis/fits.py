@@ -102,7 +102,6 @@ class ExtendedFit:
         estimates with inflated sensor noise.
     process_noise_fit: a fit of the same model with more process noise, if there is one: the one that this fit
         continues, or beside inflated sensor noise one that is far from the logs.
-    exact_fit: what is known of the fit without process noise: empty if it was not tried, (None,) if there is none.
     """
 
     machine: Machine
@@ -110,7 +109,6 @@ class ExtendedFit:
     fit: Fit
     estimated: bool = True
     process_noise_fit: ExtendedFit | None = None
-    exact_fit: tuple[Fit | None, ...] = ()
 
     @property
     def model(self) -> Model:
@@ -264,7 +262,7 @@ def fit_machine(
     data = prepare_data(machine, logs, filter, friction_near_rest)
     calls: list[Callable[[], Any]] = [
         partial(_fit_exact_from_start, data),
-        partial(fit_reducing_process_noise, machine, data, identification.PROCESS_NOISE_LEVELS[0]),
+        partial(_fit_reducing_process_noise, machine, data, identification.PROCESS_NOISE_LEVELS[0]),
         *(
             partial(fit_from_start, inflate_sensor_noise(data, times), identification.PROCESS_NOISE_LEVELS[0])
             for times in SENSOR_NOISE_INFLATIONS
@@ -353,9 +351,7 @@ def with_true_sensor_noise(stage: ExtendedFit) -> ExtendedFit:
     if linear is None:
         return stage
     cost = sum(float(x.Z[0, 0]) for x in linear)
-    return replace(
-        stage, data=data, fit=without_smoother_levels(replace(fit, linear=tuple(linear), cost=cost)), exact_fit=()
-    )
+    return replace(stage, data=data, fit=without_smoother_levels(replace(fit, linear=tuple(linear), cost=cost)))
 
 
 def resume_with_true_sensor_noise(
@@ -404,14 +400,9 @@ def _fit_exact_from_start(data: FitData) -> FitPair | None:
     return None if fit is None else (fit, None)
 
 
-def fit_reducing_process_noise(
-    machine: Machine, data: FitData, process_noise: float, max_cost: float = np.inf
-) -> FitPair | None:
-    """Fit from initial trajectories with process noise, and reduce that if the fit is close.
-
-    Return None if the fit costs more than max_cost.
-    """
-    fit = _fit_below_cost(data, process_noise, max_cost)
+def _fit_reducing_process_noise(machine: Machine, data: FitData, process_noise: float) -> FitPair | None:
+    """Fit from initial trajectories with process noise, and reduce that if the fit is close; None if none is found."""
+    fit = fit_from_start(data, process_noise)
     if fit is None:
         return None
     stage = assemble_fit(machine, data, fit)
@@ -450,7 +441,7 @@ def _reduce_noise(stage: ExtendedFit, runner: CallRunner) -> ExtendedFit | None:
         d for d in (less * stage.fit.process_noise for less in PROCESS_NOISE_REDUCTIONS) if d >= MIN_PROCESS_NOISE
     ]
     with closing(runner([partial(_resume_or_none, stage.data, stage, level) for level in smaller])) as fits:
-        return next((replace(stage, fit=fit, exact_fit=()) for fit in fits if fit is not None), None)
+        return next((replace(stage, fit=fit) for fit in fits if fit is not None), None)
 
 
 def refit(machine: Machine, previous: ExtendedFit, process_noise: float) -> ExtendedFit:
@@ -496,23 +487,6 @@ def fit_all_from_start(
     return (None if fit is None else assemble_fit(machine, p, fit) for p, (machine, _, _), fit in answers)
 
 
-def refit_and_drop_noise(
-    machine: Machine, previous: ExtendedFit, runner: CallRunner
-) -> tuple[ExtendedFit | None, ExtendedFit]:
-    """Refit a machine with other effects, and the previous fit without its process noise, side by side.
-
-    Return the refit, None if it fails, and the previous fit, which knows its exact fit if it is close and has noise.
-    """
-    data, drops_noise = adapt_data(machine, previous), previous.is_close and not previous.exact
-    calls = [
-        partial(_resume_or_none, data, previous, previous.fit.process_noise),
-        *([partial(_exact_fit, previous)] if drops_noise else []),
-    ]
-    fit, *exact_fit = runner(calls)
-    other = None if fit is None else assemble_fit(machine, data, fit)
-    return other, replace(previous, exact_fit=tuple(exact_fit)) if drops_noise else previous
-
-
 def _hold_parameter(data: FitData, name: str) -> FitData:
     return replace(data, held=data.held | (np.array(data.space.model.base.names) == name))
 
@@ -520,7 +494,7 @@ def _hold_parameter(data: FitData, name: str) -> FitData:
 def drop_process_noise(found: Sequence[ExtendedFit], runner: CallRunner) -> Iterator[ExtendedFit | None]:
     """Refit without process noise, side by side; None where exact dynamics are far from the logs."""
     for stage, fit in zip(found, runner([partial(_exact_fit, x) for x in found]), strict=True):
-        yield None if fit is None else replace(stage, fit=fit, exact_fit=())
+        yield None if fit is None else replace(stage, fit=fit)
 
 
 def exact_if_close(stage: ExtendedFit) -> ExtendedFit:
@@ -530,8 +504,6 @@ def exact_if_close(stage: ExtendedFit) -> ExtendedFit:
 
 
 def _exact_fit(stage: ExtendedFit) -> Fit | None:
-    if stage.exact_fit:
-        return stage.exact_fit[0]
     cost_limit = LOST_COST_RATIO * stage.data.n_readings
     try:
         fit = resume_fit(stage.data, stage, 0.0, cost_limit)

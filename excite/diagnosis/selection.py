@@ -1,9 +1,7 @@
 """Choose one further effect for a model, with the rivals that explain the logs about as well.
 
 Candidates are scored to first order, the likeliest are fitted, and the best fit is chosen. If no model tracks the logs,
-the first effect, or a pair, is chosen with inflated sensor noise (`choose_with_inflated_noise`) or by fits from initial
-trajectories (`choose_from_start`). If nothing explains the logs, candidates with low scores are fitted too
-(`choose_unlikely`).
+the first effect, or a pair, is chosen with inflated sensor noise (`choose_with_inflated_noise`).
 
 Likelihood ratio means 2 delta log L, the decrease of the deviance.
 """
@@ -12,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import scipy.stats
@@ -26,16 +23,13 @@ from excite.diagnosis.fits import (
     TRACKING_COST_RATIO,
     ExtendedFit,
     drop_process_noise,
-    exact_if_close,
     fit_all_from_start,
     refit,
     refit_all,
-    refit_and_drop_noise,
     resume_with_true_sensor_noise,
 )
 from excite.diagnosis.parallel import CallRunner
 from excite.diagnosis.residual_tests import is_shaking
-from excite.diagnosis.screening import CANDIDATE_PROGRESS_SHARE, fit_screened
 from excite.logs import Log
 from excite.model import effects
 from excite.model.effects import Effect, PlacedEffect
@@ -54,7 +48,7 @@ MAX_CANDIDATES = 5  # number of candidates, beside further variants of the likel
 VARIANT_SCORE_SHARE = 0.7  # share of the best score of its name at which a variant is fitted, too; chosen
 PLAIN_VARIANT_SCORE_SHARE = 0.5  # the same for the variant without signed shapes, which others may mimic; chosen
 RESTART_SCORE_SHARE = 0.9  # share of the best score from which a candidate without a fit is fitted anew; chosen
-MAX_RESTARTS = 12  # candidates that are fitted from initial trajectories if nothing was found; chosen
+CANDIDATE_PROGRESS_SHARE = 0.5  # share of the required gain that is asked of the first passes of a fit; chosen
 FIRST_BATCH = 2  # candidates that are fitted before others are compared with them; chosen
 MAX_RATIO_OVER_SCORE = 2.5  # largest likelihood ratio of a fit over the candidate's score; chosen
 REFINEMENT_REACHES = 1.0, 0.35  # shares of the way to the next trial values, refined in turn; chosen
@@ -64,24 +58,17 @@ INSTANT_ACCURACY_S = 0.5  # [s] to which instants are refined, as fits find them
 # Effects that are worth a place: share of the excess cost that they must explain.
 MIN_EXCESS_SHARE = 0.05, 0.15  # for exact dynamics close to the logs, and otherwise; chosen
 MIN_EXCESS_SHARE_OF_FIRST = 0.3  # of the first effect, or far from the logs: the largest of three; chosen
-MAIN_CAUSE_SHARE = 0.7  # share of the misfit that a main cause explains; chosen
 LARGE_EXCESS_RATIO = 0.1  # excess over expected cost that no error of a formula removes entirely; chosen
 
-# Nature is never exactly the formula. Share of the gain of the effects chosen that a further effect must exceed.
-MIN_GAIN_SHARE = 0.005  # of likelihood ratios; chosen
-MIN_WALD_SHARE = 0.002  # of Wald's statistics; chosen
-MAX_FORMULA_RATIO = 250.0  # likelihood ratio that Wald's statistics can require at most; chosen
-FORMULA_MAGNITUDE_ERROR = 0.03  # relative difference of an effect's formulas: 1 to 6 % in results/diagnosis
-MAX_ABSORBED_FORMULA_SHARE = 0.1  # limit where parameters absorb the effect but not its formula's error; chosen
-MIN_GAIN_SHARE_TIMED = 0.1  # for effects that act at some time only; chosen
-MIN_GAIN_SHARE_WITH_NOISE = 0.25  # if process noise hides how good the formulas are; chosen
-MIN_GAIN_SHARE_MAPPED = 0.02  # beside effects on a map of the ground; two maps of one ground differ by up to 1.3 %
+# Nature is never exactly the formula: what is left of an effect may be another effect's gain.
+FORMULA_ERROR = 0.03  # relative difference of two formulas of one effect: 1 to 6 % in results/diagnosis
+MAX_FORMULA_SHARE = 0.1  # largest share of a gain that this takes, and of one that acts at some time only; chosen
+MIN_GAIN_SHARE_WITH_NOISE = 0.25  # the same if process noise hides how good the formulas are; chosen
 
 # Ties: by how much a rival may be worse.
 TIE_LIKELIHOOD_RATIO = 10.0  # likelihood ratio; chosen
 TIE_EXCESS_SHARE = 0.3  # share of the excess cost that the best effect leaves; chosen
-TIE_GAIN_SHARE_WITH_NOISE = 0.02  # share of the gain with process noise, which absorbs differences; chosen
-COMPARED_GAIN_SHARE = 0.1  # the same up to which trials are compared without process noise if that is possible; chosen
+TIE_GAIN_SHARE = 0.005  # share of the best effect's gain, as nature is never exactly its formula; chosen
 
 TRANSITION = "friction_transition"  # has no meaning where friction near rest is free
 PRESLIDING = "presliding"  # what friction near rest is if it is not free
@@ -140,11 +127,6 @@ def required_likelihood_ratio(name: str, stage: ExtendedFit, n_candidates: int) 
     return max(
         MIN_LIKELIHOOD_RATIO, float(scipy.stats.chi2.isf(MAX_P_VALUE / n_candidates, degrees_of_freedom(name, stage)))
     )
-
-
-def _total_wald_statistic(stage: ExtendedFit) -> float:
-    """Return the sum of Wald's statistics of a model's effects."""
-    return sum(wald_statistic(e.name, stage) for e in stage.model.effects if not e.effect.inverse)
 
 
 def score_effects(stage: ExtendedFit, runner: CallRunner) -> tuple[score_test.Score, ...]:
@@ -363,22 +345,15 @@ def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runne
         trials[0][1].dispersion,
         {s.candidate.name: stage for s, stage in trials if not stage.exact},
     )
-    ties = _tied_trials(trials, gain)
-    compared = _tied_trials(trials, gain, COMPARED_GAIN_SHARE) if with_noise else ties
-    exact, unknown = _trials_without_noise(compared, runner)
+    ties, lowest = _tied_trials(trials, gain), trials[0][1].deviance
+    # Process noise hides how well effects explain the logs: those that are a little worse with it are compared, too.
+    near = [x for x in trials if x[1].deviance - lowest <= (1 - VARIANT_SCORE_SHARE) * gain] if with_noise else ties
+    exact, unknown = _trials_without_noise(near, runner)
     names = {s.candidate.name for s, _ in ties}
     unknown = [x for x in unknown if x[0].candidate.name in names]
     if not any(s.candidate.name in names for s, _ in exact):
         exact = []  # none of the best trials has an exact fit: compare all with process noise
-    lowest = trials[0][1].deviance
-    if with_noise and exact and not exact[0][1].is_close:
-        # Process noise hid that the best does not explain the logs: try those that were a little worse with it.
-        left = [x for x in trials if x[0].candidate.name not in {s.candidate.name for s, _ in compared}]
-        others, _ = _trials_without_noise(
-            [x for x in left if x[1].deviance - lowest <= (1 - VARIANT_SCORE_SHARE) * gain], runner
-        )
-        exact = sorted([*exact, *others], key=lambda x: x[1].deviance)
-    judged = [*_tied_trials(exact, gain, MIN_GAIN_SHARE if with_noise else MIN_WALD_SHARE), *unknown] if exact else ties
+    judged = [*_tied_trials(exact, gain), *unknown] if exact else ties
     judged = _without_needless_magnitudes(judged)
     if judged[0][1].is_dead_end:
         judged = [x for x in judged if x[1].exact and x[1].is_close and not x[1].impossible] or judged
@@ -444,11 +419,7 @@ def choose_with_inflated_noise(stage: ExtendedFit, runner: CallRunner) -> tuple[
         return None
     is_comparable = [x for x in trials if stage.deviance - x[1].deviance >= VARIANT_SCORE_SHARE * gain]
     tracking: list[_Trial] = []
-    for process_noise in (
-        (0.0, identification.PROCESS_NOISE_LEVELS[0])
-        if gain >= MAIN_CAUSE_SHARE * (gain + best.excess_cost)
-        else (0.0,)
-    ):
+    for process_noise in (0.0, identification.PROCESS_NOISE_LEVELS[0]):
         sharp = zip(
             is_comparable,
             resume_with_true_sensor_noise([x for _, x in is_comparable], process_noise, runner),
@@ -521,80 +492,6 @@ def _choose_pair(stage: ExtendedFit, first: _Trial, n_candidates: int, runner: C
     ]
 
 
-def choose_from_start(stage: ExtendedFit, runner: CallRunner) -> tuple[ExtendedFit, list[Choice], frozenset[str]]:
-    """Choose the first effect by fits from initial trajectories, if no model without effects was found.
-
-    With the effect there may be a fit without it after all, since the start was too far off; it is then compared with
-    that. Return the fit without the effect, the choices, and if there are none, the names that were tried.
-    """
-    scores = score_effects(stage, runner)
-    shortlist = _refined_shortlist(stage, scores, (), runner)
-    noise_levels = 0.0, identification.PROCESS_NOISE_LEVELS[0], identification.PROCESS_NOISE_LEVELS[-1]
-    found = _choose_screened(stage, shortlist, noise_levels, len(scores), runner)
-    return (*found, frozenset()) if found else (stage, [], frozenset(s.candidate.name for s in shortlist))
-
-
-def choose_unlikely(
-    scanned: ExtendedFit, stage: ExtendedFit, tried: Container[str], runner: CallRunner
-) -> tuple[ExtendedFit, list[Choice]]:
-    """Choose an effect by exact fits from initial trajectories, whatever its score, if nothing explains the logs.
-
-    Far from any fit the scores say little, and exact dynamics track the logs with the right effect only. scanned: the
-    fit that gives the scores. tried: names that were tried already. Return the fit without the effect, and the choices.
-    """
-    scores = score_effects(scanned, runner)
-    best = {s.candidate.name: s for s in reversed(scores) if s.likelihood_ratio > 0 and s.values["A"] != 0}
-    likeliest = sorted(best.values(), key=lambda s: -s.likelihood_ratio)[:MAX_RESTARTS]
-    likeliest = [s for s in likeliest if s.candidate.name not in tried]
-    return _choose_screened(stage, likeliest, (0.0,), len(scores), runner) or (stage, [])
-
-
-def _choose_screened(
-    stage: ExtendedFit,
-    shortlist: Sequence[score_test.Score],
-    noise_levels: Sequence[float],
-    n_candidates: int,
-    runner: CallRunner,
-) -> tuple[ExtendedFit, list[Choice]] | None:
-    """Choose an effect by fits from initial trajectories, with the first level of process noise that gives one.
-
-    If exact dynamics were fitted without an effect, it must explain MIN_EXCESS_SHARE_OF_FIRST.
-    """
-    machines = [effects.with_effects(stage.machine, _start_entry(s)) for s in shortlist]
-    is_worth_a_fit = (
-        stage.fit.cost - MIN_EXCESS_SHARE_OF_FIRST * stage.excess_cost if stage.estimated and stage.exact else np.inf
-    )
-    for process_noise in noise_levels if shortlist else ():
-        is_large_noise = process_noise > identification.PROCESS_NOISE_LEVELS[0]
-        names = _unique_names(shortlist)[: FIRST_BATCH if is_large_noise else None]
-        started = [(s, m) for s, m in zip(shortlist, machines, strict=True) if s.candidate.name in names]
-        enough = partial(_is_close_and_effective, [s.candidate.name for s, _ in started])
-        found = fit_screened([m for _, m in started], stage, process_noise, runner, is_worth_a_fit, enough)
-        tracking = [(s, x) for (s, _), x in zip(started, found, strict=True) if x is not None and x.tracks_logs]
-        tracking = [(s, x) for s, x in tracking if _is_effective(s.candidate.name, x)]
-        if not tracking:
-            continue
-        trials = _best_variants([x for x in tracking if x[1].is_close] or tracking)
-        score, best = trials[0]
-        comparable = stage.estimated and stage.fit.process_noise == best.fit.process_noise
-        without, best = refit_and_drop_noise(stage.machine, best, runner)
-        trials = [(score, best), *(x for x in trials[1:] if x[1].fit.process_noise == best.fit.process_noise)]
-        if without is not None:
-            stage = stage if comparable and stage.deviance < without.deviance else without
-        # Wald's statistic is comparable, and smaller if the gain is large.
-        is_comparable = without is not None or comparable
-        gain = stage.deviance - best.deviance if is_comparable else wald_statistic(score.candidate.name, best)
-        if gain < MIN_LIKELIHOOD_RATIO * best.dispersion:
-            return exact_if_close(stage), []
-        return stage, [_make_choice(trials, gain, n_candidates, runner)]
-    return None
-
-
-def _is_close_and_effective(names: Sequence[str], k: int, stage: ExtendedFit) -> bool:
-    """Tell if the fit of effect k is close and exact: beside it only close fits count."""
-    return stage.is_close and stage.exact and _is_effective(names[k], stage)
-
-
 def _required_gain(
     stage: ExtendedFit,
     chosen: Sequence[Choice],
@@ -605,23 +502,12 @@ def _required_gain(
 
     share_with_noise: share of their gains that is required if process noise hides errors of their formulas.
     """
-    part = max(
-        MIN_GAIN_SHARE, MIN_GAIN_SHARE_TIMED * candidate.placed.effect.timed, share_with_noise * (not stage.exact)
-    )
-    mapped = {e.name for e in stage.model.effects if e.uses_map}
-    own = (
-        max(
-            min(FORMULA_MAGNITUDE_ERROR**2 / x.unabsorbed_share, MAX_ABSORBED_FORMULA_SHARE),
-            MIN_GAIN_SHARE_MAPPED * (x.name in mapped),
-        )
-        for x in chosen
-    )
-    shape = sum(max(part, share) * x.likelihood_ratio for share, x in zip(own, chosen, strict=True))
+    least = max(MAX_FORMULA_SHARE * candidate.placed.effect.timed, share_with_noise * (not stage.exact))
+    shares = [max(least, min(FORMULA_ERROR**2 / x.unabsorbed_share, MAX_FORMULA_SHARE)) for x in chosen]
+    formulas = sum(share * x.likelihood_ratio for share, x in zip(shares, chosen, strict=True))
     main = not stage.is_close if chosen else _noise_hides_misfit(stage)
     explained = MIN_EXCESS_SHARE_OF_FIRST if main else MIN_EXCESS_SHARE[stage.first_order_is_rough]
-    return max(
-        explained * stage.excess_cost, shape, min(MIN_WALD_SHARE * _total_wald_statistic(stage), MAX_FORMULA_RATIO)
-    )
+    return max(explained * stage.excess_cost, formulas)
 
 
 def _noise_hides_misfit(stage: ExtendedFit) -> bool:
@@ -775,18 +661,13 @@ def _best_variants(trials: Sequence[_Trial]) -> list[_Trial]:
     return list(best.values())
 
 
-def _tied_trials(trials: Sequence[_Trial], gain: float, share: float | None = None) -> list[_Trial]:
+def _tied_trials(trials: Sequence[_Trial], gain: float) -> list[_Trial]:
     """Return the best of sorted trials, and those that explain the logs about as well.
 
-    Differences that errors of the best effect's formula may cause do not count. share: share of the gain that such
-    errors take.
+    Differences that an error of the best effect's formula may cause do not count, nor do those of chance.
     """
-    score, best = trials[0]
-    share = share or (MIN_WALD_SHARE if best.exact else TIE_GAIN_SHARE_WITH_NOISE)
-    margin = max(TIE_LIKELIHOOD_RATIO * best.dispersion, TIE_EXCESS_SHARE * best.excess_cost, share * gain)
-    if best.exact and not score.candidate.placed.effect.inverse:
-        # With process noise it gains less than without.
-        margin = max(margin, min(MIN_WALD_SHARE * wald_statistic(score.candidate.name, best), MAX_FORMULA_RATIO))
+    best = trials[0][1]
+    margin = max(TIE_LIKELIHOOD_RATIO * best.dispersion, TIE_EXCESS_SHARE * best.excess_cost, TIE_GAIN_SHARE * gain)
     return [x for x in trials if x[1].deviance - best.deviance < margin]
 
 
@@ -815,10 +696,9 @@ def _trials_without_noise(trials: Sequence[_Trial], runner: CallRunner) -> tuple
     good = [x for x in trials if x[1].exact or x[1].is_close]
     without = drop_process_noise([s for _, s in good if not s.exact], runner)
     found = [(x, x[1] if x[1].exact else next(without)) for x in good]
-    missing = [exact is None and not stage.exact_fit for (_, stage), exact in found]
-    requests = [(stage.machine, stage, 0.0) for ((_, stage), _), yes in zip(found, missing, strict=True) if yes]
+    requests = [(stage.machine, stage, 0.0) for (_, stage), exact in found if exact is None]
     anew = fit_all_from_start(requests, runner) if requests else iter(())
-    found = [(x, next(anew) if yes else exact) for (x, exact), yes in zip(found, missing, strict=True)]
+    found = [(x, next(anew) if exact is None else exact) for x, exact in found]
     found = [(x, None if s is None or _fell_to_zero(x[0].candidate.name, s) else s) for x, s in found]
     exact = [(score, stage) for (score, _), stage in found if stage is not None]
     return sorted(exact, key=lambda x: x[1].deviance), [x for x, stage in found if stage is None]

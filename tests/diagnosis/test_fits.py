@@ -16,7 +16,7 @@ from support.drives import gentle
 from support.logs import calm, make_log, slope
 
 from excite import identification, smoothing
-from excite.diagnosis import fits as stages, run_forked, screening, selection
+from excite.diagnosis import fits as stages, run_forked, selection
 from excite.diagnosis.parallel import run_in_turn
 from excite.logs import log
 from excite.model import Model, prediction
@@ -34,13 +34,11 @@ def test_what_a_process_found_can_be_sent_back(straight: Model, straight_motion:
     one = make_log(straight, straight_motion, seed=3)
     stage = stages.fit_machine(straight.machine, [one], straight.machine.filter)
     sloped = placing.with_effects(straight.machine, placing.parse_effect("ground_slope=0.001", straight.machine, 10.0))
-    for disturbed in (0.0, 1.0):
-        (found,) = screening.fit_screened([sloped], stage, disturbed, sent)
-        assert found is not None
-        assert found.fit.process_noise < max(disturbed, 0.01)
-        assert (found.process_noise_fit is None) == found.exact
-    (found,) = stages.refit_all([(sloped, stage, 0.0)], sent)
-    assert found is not None
+    for run in (stages.refit_all, stages.fit_all_from_start):
+        for disturbed in (0.0, 1.0):
+            (found,) = run([(sloped, stage, disturbed)], sent)
+            assert found is not None
+            assert found.fit.process_noise == disturbed
 
 
 def test_coarse_sensors_are_no_measure_of_how_near_sharp_ones_come(
@@ -253,49 +251,6 @@ def test_smaller_forces_side_by_side_are_the_smallest_that_do(straight: Model, m
     assert asked == [*wanted, 0.0]
 
 
-def test_a_stage_is_freed_once(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where it was freed beside another fit, that is what it is without its forces."""
-    stage, asked = calm(straight), list[float]()
-    true = stages.resume_fit
-
-    def resume(prepared: Any, of: stages.ExtendedFit, disturbed: float, *given: Any) -> gauss_newton.Fit:
-        asked.append(disturbed)
-        if hopeless and disturbed == 0:
-            raise gauss_newton.NotConvergedError("no fit")
-        return true(prepared, of, disturbed, *given)
-
-    hopeless = False
-    loose = stages.refit(straight.machine, stage, 1.0)
-    monkeypatch.setattr(stages, "resume_fit", resume)
-    (plain,) = stages.drop_process_noise([loose], run_in_turn)
-    assert plain is not None
-    sloped = placing.with_effects(straight.machine, slope(straight))
-    asked.clear()
-    other, known = stages.refit_and_drop_noise(sloped, loose, run_in_turn)
-    assert asked == [1.0, 0.0]
-    assert other is not None
-    assert [e.name for e in other.model.effects] == ["ground_slope@machine"]
-    (again,) = stages.drop_process_noise([known], run_in_turn)
-    assert asked == [1.0, 0.0]
-    assert again is not None
-    assert (again.exact_fit, again.fit.cost) == ((), plain.fit.cost)
-    np.testing.assert_array_equal(again.fit.X, plain.fit.X)
-    # Nor is it asked twice for what can't be had; with other forces it is another fit.
-    hopeless = True
-    _, known = stages.refit_and_drop_noise(sloped, loose, run_in_turn)
-    asked.clear()
-    assert list(stages.drop_process_noise([known], run_in_turn)) == [None]
-    assert asked == []
-    less = stages.fit_with_process_noise(replace(stage, process_noise_fit=known), run_in_turn)
-    assert less.fit.process_noise < known.fit.process_noise
-    assert less.exact_fit == ()
-    assert asked[-1] == 0.0
-    # Nothing is freed that has no forces.
-    asked.clear()
-    _, same = stages.refit_and_drop_noise(sloped, stage, run_in_turn)
-    assert (asked, same) == ([0.0], stage)
-
-
 def test_a_fit_that_is_not_worth_more_passes_is_given_up(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     """As soon as its cost doesn't fall in two passes, from the fourth on; not while it falls, nor where it costs no
     more."""
@@ -362,32 +317,6 @@ def test_steps_that_stay_large_end_a_fit(
             p.space, p.measurements, stage.fit.trajectories, stage.fit.X, p.starts, 0.0, p.held, passes=8
         )
     assert len(seen) == spent
-
-
-@pytest.mark.slow
-def test_what_takes_too_little_of_a_beginning_is_not_fitted_to_the_whole(
-    straight: Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Exact dynamics follow the log without its cause and leave much: of what begins anew only what takes a good part
-    of that from the first quarter, beside what the model without it comes to there, is fitted to all of it."""
-    stuck = prediction.build(
-        placing.with_effects(
-            straight.machine, placing.parse_effect("torque_deadband@rear_roll=150", straight.machine, 40.0)
-        )
-    )
-    one = make_log(stuck, simulate(stuck, gentle(straight, 40.0).u), seed=3, known=straight)
-    stage = stages.fit_machine(straight.machine, [one], straight.machine.filter)
-    assert stage.exact
-    assert stage.excess_cost > 1000
-    lengths, _ = fits(monkeypatch)
-    worth, whole = stage.fit.cost - 0.3 * stage.excess_cost, len(one)
-    for effect, found in (("torque_deadband@rear_roll=100", True), ("torque_offset_drift@front_roll=0.1", False)):
-        lengths.clear()
-        machine = placing.with_effects(straight.machine, placing.parse_effect(effect, straight.machine, 40.0))
-        (made,) = screening.fit_screened([machine], stage, 0.0, run_in_turn, worth, min_beginning_s=5.0)
-        assert (made is not None) == found
-        assert lengths[:2] == [whole // 4] * 2  # without it, and with it
-        assert (max(lengths) == whole) == found
 
 
 def test_what_is_held_is_where_it_is_held_a_pass_later(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -495,116 +424,6 @@ def test_a_step_that_was_cut_short_goes_further_when_it_is_told_again(scales: in
     assert (np.abs(found.X - stage.fit.X - off) < stage.fit.std).all()
 
 
-@pytest.mark.slow
-def test_the_whole_log_is_fitted_where_its_beginning_can_be(
-    sloping: Path, straight: Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A cause that leaves a quarter of a log far off leaves all of it so. A log that is hardly longer is fitted at
-    once, and so is one that is followed without any cause: then none is waited for that costs more than it is worth."""
-    one = log.read_log(sloping, straight.machine)
-    stage = stages.fit_machine(straight.machine, [one], straight.machine.filter)
-    lengths, forces = fits(monkeypatch)
-    right = placing.with_effects(straight.machine, slope(straight))
-    wrong = placing.with_effects(
-        straight.machine, placing.parse_effect("brake_drag@rear_roll=50", straight.machine, 40.0)
-    )
-    (good,) = screening.fit_screened([right], stage, 0.0, run_in_turn)
-    assert good is not None
-    cost, whole = good.fit.cost, len(one)
-    for onset, worth, first, follows in (
-        (5.0, np.inf, whole // 4, True),
-        (15.0, np.inf, 1500, True),
-        (30.0, np.inf, whole, True),
-        (5.0, cost + 1, whole, True),
-        (5.0, cost - 1, whole, False),
-    ):
-        for machines, found in ((right, follows), (wrong, False)):
-            lengths.clear()
-            (made,) = screening.fit_screened([machines], stage, 0.0, run_in_turn, worth, min_beginning_s=onset)
-            assert (made is not None and made.is_close) == found
-            assert lengths[0] == first
-            assert (max(lengths) == whole) == (found or first == whole)
-    # What forces don't bring near isn't either, nor is the whole log fitted where they don't bring its beginning near.
-    for onset, first in ((5.0, whole // 4), (30.0, whole)):
-        for machines, found in ((right, True), (wrong, False)):
-            lengths.clear()
-            forces.clear()
-            (made,) = screening.fit_screened([machines], stage, 1.0, run_in_turn, min_beginning_s=onset)
-            assert (made is not None) == found
-            assert lengths[0] == first
-            assert (max(lengths) == whole) == (found or first == whole)
-            assert forces[0] == 1.0
-
-
-@pytest.mark.slow
-def test_beside_a_cause_only_that_is_fitted_whose_beginning_tells_that_it_comes_as_near(
-    straight: Model, straight_motion: Motion, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What stays off is of no use any more; a rival that comes near as well is still found. Where what came near is no
-    cause all others are fitted."""
-    right = placing.with_effects(straight.machine, placing.parse_effect("ground_slope=0.0015", straight.machine, 40.0))
-    hidden = prediction.build(right)
-    one = make_log(hidden, simulate(hidden, straight_motion.u), seed=7, known=straight)
-    stage = stages.fit_machine(straight.machine, [one], straight.machine.filter)
-    lengths, _ = fits(monkeypatch)
-    wrong = placing.with_effects(
-        straight.machine, placing.parse_effect("torque_gain@front_roll=0.1", straight.machine, 40.0)
-    )
-    for machines, near, enough, tried in (
-        ([right, wrong], [True, False], False, True),
-        ([wrong, right], [False, True], True, True),
-        ([right, wrong, right], [True, False, True], True, False),
-    ):
-        lengths.clear()
-        found: list[bool] = []
-        whole = [0]
-        for made in screening.fit_screened(
-            machines, stage, 0.0, run_in_turn, np.inf, lambda k, x, so=enough: so and x.is_close, min_beginning_s=5.0
-        ):
-            found.append(made is not None and made.is_close)
-            whole.append(lengths.count(len(one)))
-        assert found == near
-        at = machines.index(wrong)
-        assert (whole[at + 1] > whole[at]) == tried
-    running = {x.pid for x in multiprocessing.active_children()}  # of other tests
-    ways = screening.fit_screened(
-        [right, wrong, right], stage, 0.0, run_forked, np.inf, lambda k, x: x.is_close, min_beginning_s=5.0
-    )
-    assert [x is not None for x in ways] == [True, False, True]
-    assert {x.pid for x in multiprocessing.active_children()} <= running
-
-
-def test_only_close_exact_fits_with_a_magnitude_off_zero_are_enough(
-    straight: Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A clean log leads a deadband, which must be positive, to zero; a slope may have either sign."""
-    stage, asked = calm(straight), list[Callable[[int, stages.ExtendedFit], bool]]()
-    scores = {s.candidate.name: s for s in reversed(selection.score_effects(stage, run_in_turn)) if s.values["A"] != 0}
-    names = "torque_deadband@front_roll", "ground_slope@machine"
-    monkeypatch.setattr(
-        selection, "score_effects", lambda *given: tuple(replace(scores[n], likelihood_ratio=100.0) for n in names)
-    )
-    found = list[stages.ExtendedFit]()
-
-    def begin(machines: Any, of: Any, disturbed: float, together: Any, worth: float, enough: Any) -> list[None]:
-        found.extend(stages.refit(m, stage, 0.0) for m in machines)
-        asked.append(enough)
-        return [None for _ in machines]
-
-    monkeypatch.setattr(selection, "fit_screened", begin)
-    selection.choose_unlikely(stage, stage, (), run_in_turn)
-    (enough,) = asked
-    order = [x.model.effects[0].name for x in found]
-    assert sorted(order) == sorted(names)
-    for k, made in enumerate(found):
-        at = made.model.base.names.index(order[k])
-        assert enough(k, made) == (order[k] == "ground_slope@machine")
-        there = replace(made.fit, X=np.where(np.arange(len(made.fit.X)) == at, 9 * made.fit.std[at], made.fit.X))
-        assert enough(k, replace(made, fit=there))
-        assert not enough(k, replace(made, fit=replace(there, process_noise=0.1)))
-        assert not enough(k, replace(made, fit=replace(there, cost=2 * made.expected_cost)))
-
-
 @pytest.mark.parametrize(
     ("forces", "asked", "coarse", "settled", "held"),
     [
@@ -680,99 +499,6 @@ def test_what_was_not_seen_is_judged_again(straight: Model, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize(
-    ("disturbed", "cost", "found", "expected"),
-    [
-        (0.0, 9.9, False, True),
-        (0.0, 10.1, False, False),
-        (0.0, 10.1, True, True),
-        (1.0, 2.19, False, True),
-        (1.0, 2.21, False, False),
-        (1.0, 2.21, True, False),
-        (1.0, None, False, True),
-    ],
-)
-def test_what_the_beginning_of_a_log_may_cost(
-    disturbed: float, cost: float | None, found: bool, expected: bool, straight: Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By exact dynamics ten times its noise, unless a fit is found; with forces no more beside its noise than the whole
-    log may: three tenths of what is four times as much. What can't be integrated may set out."""
-    stage = calm(straight)
-    quarter = len(stage.data.logs[0]) // 4
-    asked = beginnings(stage, monkeypatch, lambda samples, sloped: cost if sloped else None, found)
-    assert sets_out(stage, disturbed, quarter / 100) == expected
-    assert set(asked) == {quarter}
-
-
-@pytest.mark.parametrize(("cost", "before", "passes"), [(9.0, 9.9, 1), (9.0, 10.1, 2), (2.0, 1.0, 2)])
-def test_what_a_few_passes_show_to_do_nothing_goes_no_further(
-    cost: float, before: float, passes: int, straight: Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """That is, nine tenths and more of what the model leaves without it, and more than there may be; what is less than
-    that is given all passes."""
-    stage = calm(straight)
-    quarter = len(stage.data.logs[0]) // 4
-    asked = beginnings(stage, monkeypatch, lambda samples, sloped: cost if sloped else before, False)
-    assert sets_out(stage, 1.0, quarter / 100) == (cost < 2.2)
-    assert asked == [quarter] * passes
-
-
-@pytest.mark.parametrize(("late", "share"), [(0.0, 0.25), (0.3, 0.33), (0.45, 0.5), (0.9, 0.25)])
-def test_a_beginning_tells_where_the_model_as_it_is_stays_far_off(
-    late: float, share: float, straight: Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The shortest such one: what stays off it too is no cause. A quarter, where none is up to a half."""
-    stage = calm(straight)
-    n = len(stage.data.logs[0])
-    asked = beginnings(stage, monkeypatch, lambda samples, sloped: 20.0 if samples > late * n else 5.0, False)
-    assert sets_out(stage, 0.0, n / 400) == (late == 0.9)
-    assert set(asked) == {int(share * n)}
-
-
-def sets_out(stage: stages.ExtendedFit, disturbed: float, onset: float) -> bool:
-    """Tell if a slope is fitted to the whole log, with such process noise, after a beginning of `onset` seconds."""
-    machine, whole = placing.with_effects(stage.machine, slope(stage.model)), list[int]()
-    with pytest.MonkeyPatch.context() as patch:
-        true = smoothing.fit_logs
-
-        def noted(c: Any, records: Any, *given: Any) -> gauss_newton.Fit:
-            whole.append(len(records[0].used))
-            return true(c, records, *given)
-
-        patch.setattr(smoothing, "fit_logs", noted)
-        list(screening.fit_screened([machine], stage, disturbed, run_in_turn, min_beginning_s=onset))
-    assert set(whole) <= {len(stage.data.logs[0])}
-    return bool(whole)
-
-
-def beginnings(
-    stage: stages.ExtendedFit,
-    monkeypatch: pytest.MonkeyPatch,
-    cost: Callable[[int, bool], float | None],
-    found: bool,
-) -> list[int]:
-    """Replace fits to beginnings by scripted ones; return the lengths that are fitted with a slope, in turn.
-
-    cost: by the number of samples, and whether the model has a slope, the cost as a multiple of the noise; None if
-        there is no motion. found: the fits converge.
-    """
-    asked = list[int]()
-    monkeypatch.setattr(stages.FitData, "n_readings", property(lambda p: float(len(p.measurements[0].used))))
-
-    def fit_of(prepared: stages.FitData, *given: Any, **more: Any) -> gauss_newton.Fit:
-        samples, sloped = len(prepared.measurements[0].used), bool(prepared.space.model.effects)
-        if sloped:
-            asked.append(samples)
-        told = cost(samples, sloped)
-        fit = None if told is None else replace(stage.fit, cost=told * prepared.n_readings)
-        if found and fit is not None:
-            return fit
-        raise gauss_newton.NotConvergedError("no fit", fit, 50.0)
-
-    monkeypatch.setattr(screening, "iterate", fit_of)
-    return asked
-
-
-@pytest.mark.parametrize(
     ("slope", "seconds", "forces", "near", "settled"),
     [
         (0.0005, 12.0, 0.0, True, True),
@@ -794,24 +520,6 @@ def test_smaller_forces_are_tried_where_the_model_is_near(
     assert (told.fit.process_noise, told.is_close, told.estimated) == (pytest.approx(forces), near, settled)
     if not settled:
         np.testing.assert_allclose(told.fit.X, straight.nominal, rtol=1e-3)
-
-
-@pytest.mark.slow
-def test_what_begins_anew_beside_exact_dynamics_must_take_a_good_part_of_the_misfit(
-    straight: Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where none could be fitted, or forces had to help, anything that lets the model follow the log will do."""
-    stage, asked = calm(straight), list[float]()
-
-    def begin(machines: Any, of: Any, disturbed: float, together: Any, worth: float, enough: Any) -> list[None]:
-        asked.append(worth)
-        return [None for _ in machines]
-
-    monkeypatch.setattr("excite.diagnosis.selection.fit_screened", begin)
-    far = replace(stage, fit=replace(stage.fit, cost=2 * stage.expected_cost))
-    for of in (far, replace(far, estimated=False), replace(far, fit=replace(far.fit, process_noise=0.1))):
-        assert selection.choose_unlikely(of, of, (), run_in_turn) == (of, [])
-    assert asked == [pytest.approx(2 * stage.expected_cost - 0.3 * 0.98 * stage.expected_cost), np.inf, np.inf]
 
 
 def test_a_fit_that_fails_stands_where_it_was_as_good_as_found(
