@@ -62,13 +62,16 @@ LARGE_EXCESS_RATIO = 0.1  # excess over expected cost that no error of a formula
 
 # Nature is never exactly the formula: what is left of an effect may be another effect's gain.
 FORMULA_ERROR = 0.03  # relative difference of two formulas of one effect: 1 to 6 % in results/diagnosis
+MAX_FORMULA_RATIO = (
+    250.0  # likelihood ratio that a formula's error takes at most if it follows from the magnitude; chosen
+)
 MAX_FORMULA_SHARE = 0.1  # largest share of a gain that this takes, and of one that acts at some time only; chosen
 MIN_GAIN_SHARE_WITH_NOISE = 0.25  # the same if process noise hides how good the formulas are; chosen
 
 # Ties: by how much a rival may be worse.
 TIE_LIKELIHOOD_RATIO = 10.0  # likelihood ratio; chosen
 TIE_EXCESS_SHARE = 0.3  # share of the excess cost that the best effect leaves; chosen
-TIE_GAIN_SHARE = 0.005  # share of the best effect's gain, as nature is never exactly its formula; chosen
+TIE_GAIN_SHARE_WITH_NOISE = 0.02  # share of the gain with process noise, which absorbs differences; chosen
 
 TRANSITION = "friction_transition"  # has no meaning where friction near rest is free
 PRESLIDING = "presliding"  # what friction near rest is if it is not free
@@ -127,6 +130,11 @@ def required_likelihood_ratio(name: str, stage: ExtendedFit, n_candidates: int) 
     return max(
         MIN_LIKELIHOOD_RATIO, float(scipy.stats.chi2.isf(MAX_P_VALUE / n_candidates, degrees_of_freedom(name, stage)))
     )
+
+
+def _formula_ratio(wald: float) -> float:
+    """Return the likelihood ratio that an error of formulas may cause, of effects with a sum of Wald's statistics."""
+    return min(FORMULA_ERROR**2 * wald, MAX_FORMULA_RATIO)
 
 
 def score_effects(stage: ExtendedFit, runner: CallRunner) -> tuple[score_test.Score, ...]:
@@ -507,7 +515,8 @@ def _required_gain(
     formulas = sum(share * x.likelihood_ratio for share, x in zip(shares, chosen, strict=True))
     main = not stage.is_close if chosen else _noise_hides_misfit(stage)
     explained = MIN_EXCESS_SHARE_OF_FIRST if main else MIN_EXCESS_SHARE[stage.first_order_is_rough]
-    return max(explained * stage.excess_cost, formulas)
+    wald = sum(wald_statistic(e.name, stage) for e in stage.model.effects if not e.effect.inverse)
+    return max(explained * stage.excess_cost, formulas, _formula_ratio(wald))
 
 
 def _noise_hides_misfit(stage: ExtendedFit) -> bool:
@@ -666,8 +675,11 @@ def _tied_trials(trials: Sequence[_Trial], gain: float) -> list[_Trial]:
 
     Differences that an error of the best effect's formula may cause do not count, nor do those of chance.
     """
-    best = trials[0][1]
-    margin = max(TIE_LIKELIHOOD_RATIO * best.dispersion, TIE_EXCESS_SHARE * best.excess_cost, TIE_GAIN_SHARE * gain)
+    score, best = trials[0]
+    share = FORMULA_ERROR**2 if best.exact else TIE_GAIN_SHARE_WITH_NOISE
+    margin = max(TIE_LIKELIHOOD_RATIO * best.dispersion, TIE_EXCESS_SHARE * best.excess_cost, share * gain)
+    if best.exact and not score.candidate.placed.effect.inverse:  # with process noise it gains less than without
+        margin = max(margin, _formula_ratio(wald_statistic(score.candidate.name, best)))
     return [x for x in trials if x[1].deviance - best.deviance < margin]
 
 

@@ -927,6 +927,7 @@ def test_what_an_effect_must_gain_to_be_worth_a_place(
     and where the model isn't near the log yet a further one as much. Of what another gained: what its formula is off
     by, the more where parameters absorb the effect but not its error."""
     stage: Any = SimpleNamespace(
+        model=SimpleNamespace(effects=[]),  # no Wald's statistic
         fit=SimpleNamespace(process_noise=forces),
         exact=forces == 0,
         is_close=near,
