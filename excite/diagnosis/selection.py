@@ -62,9 +62,7 @@ LARGE_EXCESS_RATIO = 0.1  # excess over expected cost that no error of a formula
 
 # Nature is never exactly the formula: what is left of an effect may be another effect's gain.
 FORMULA_ERROR = 0.03  # relative difference of two formulas of one effect: 1 to 6 % in results/diagnosis
-MAX_FORMULA_RATIO = (
-    250.0  # likelihood ratio that a formula's error takes at most if it follows from the magnitude; chosen
-)
+MAX_FORMULA_RATIO = 250.0  # largest likelihood ratio that the error of a formula makes; chosen
 MAX_FORMULA_SHARE = 0.1  # largest share of a gain that this takes, and of one that acts at some time only; chosen
 MIN_GAIN_SHARE_WITH_NOISE = 0.25  # the same if process noise hides how good the formulas are; chosen
 
