@@ -30,14 +30,13 @@ from excite.diagnosis.fits import (
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.residual_tests import find_anomalies
 from excite.diagnosis.score_test import Score
-from excite.diagnosis.selection import Choice, ProgressCallback
+from excite.diagnosis.selection import MIN_EXPLAINED_SHARE, Choice, ProgressCallback
 from excite.logs import Log
 from excite.model import Model, effects
 from excite.model.machine import EffectEntry, Filter
 from excite.smoothing import NotConvergedError
 
 MAX_EFFECTS = 4  # number of effects beside presliding; chosen
-MIN_EXPLAINED_SHARE = 0.85  # of the excess misfit, for a name; right causes in results/diagnosis explain 0.85 or more
 FORMULA_STD_FACTOR = 0.5  # of a magnitude, times the root of the share of its gain left to other effects; chosen
 FORMULA_STD_SHARE = 0.05  # of a magnitude, for other formulas; calibrated: covers nine in ten in results/diagnosis
 
@@ -183,6 +182,9 @@ def diagnose(
     if before.data.sticks:
         report(0.15, "fitting friction near rest")
         chosen = selection.choose_presliding(before, runner, deadline)
+    if not (before.estimated or chosen or deadline.is_over()):
+        report(0.15, "fitting effects from initial trajectories")
+        before, chosen = selection.choose_from_start(before, runner)
     chosen, next_ratio = extend_model(before, chosen, runner, report, deadline)
     added = chosen
     chosen, anomalies, nearest = drop_weak_effects(before, chosen)

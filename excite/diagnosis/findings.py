@@ -18,12 +18,12 @@ from excite.diagnosis import hold_out, residuals, separating_run, torque_regress
 from excite.diagnosis.acceptance import reason_against, widen
 from excite.diagnosis.clean_simulation import Remainder, measure_remainder
 from excite.diagnosis.deadline import Deadline
-from excite.diagnosis.diagnosis import MIN_EXPLAINED_SHARE, Diagnosis, Finding, NearestEffect, anomaly_lines, diagnose
+from excite.diagnosis.diagnosis import Diagnosis, Finding, NearestEffect, anomaly_lines, diagnose
 from excite.diagnosis.fits import ExtendedFit, with_true_sensor_noise
 from excite.diagnosis.hold_out import HoldOutErrors, HoldOutGain
 from excite.diagnosis.parallel import CallRunner, run_in_turn
 from excite.diagnosis.residuals import InnovationLevel
-from excite.diagnosis.selection import ProgressCallback
+from excite.diagnosis.selection import MIN_EXPLAINED_SHARE, ProgressCallback
 from excite.diagnosis.torque_regression import TorqueDiagnosis
 from excite.errors import NoEstimateError, NotIdentifiableError
 from excite.identification import Agreement

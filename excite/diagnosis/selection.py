@@ -1,7 +1,8 @@
 """Choose one further effect for a model, with the rivals that explain the logs about as well.
 
 Candidates are scored to first order, the likeliest are fitted, and the best fit is chosen. If no model tracks the logs,
-the first effect, or a pair, is chosen with inflated sensor noise (`choose_with_inflated_noise`).
+the first effect, or a pair, is chosen with inflated sensor noise (`choose_with_inflated_noise`) or by fits from initial
+trajectories (`choose_from_start`).
 
 Likelihood ratio means 2 delta log L, the decrease of the deviance.
 """
@@ -9,6 +10,7 @@ Likelihood ratio means 2 delta log L, the decrease of the deviance.
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +28,7 @@ from excite.diagnosis.fits import (
     fit_all_from_start,
     refit,
     refit_all,
+    resume_with_least_noise,
     resume_with_true_sensor_noise,
 )
 from excite.diagnosis.parallel import CallRunner
@@ -58,6 +61,7 @@ INSTANT_ACCURACY_S = 0.5  # [s] to which instants are refined, as fits find them
 # Effects that are worth a place: share of the excess cost that they must explain.
 MIN_EXCESS_SHARE = 0.05, 0.15  # for exact dynamics close to the logs, and otherwise; chosen
 MIN_EXCESS_SHARE_OF_FIRST = 0.3  # of the first effect, or far from the logs: the largest of three; chosen
+MIN_EXPLAINED_SHARE = 0.85  # of the excess misfit, for a name; right causes in results/diagnosis explain 0.85 or more
 LARGE_EXCESS_RATIO = 0.1  # excess over expected cost that no error of a formula removes entirely; chosen
 
 # Nature is never exactly the formula: what is left of an effect may be another effect's gain.
@@ -425,7 +429,8 @@ def choose_with_inflated_noise(stage: ExtendedFit, runner: CallRunner) -> tuple[
         return None
     is_comparable = [x for x in trials if stage.deviance - x[1].deviance >= VARIANT_SCORE_SHARE * gain]
     tracking: list[_Trial] = []
-    for process_noise in (0.0, identification.PROCESS_NOISE_LEVELS[0]):
+    explains_most = gain >= MIN_EXPLAINED_SHARE * (gain + best.excess_cost)
+    for process_noise in (0.0, identification.PROCESS_NOISE_LEVELS[0])[: 1 + explains_most]:
         sharp = zip(
             is_comparable,
             resume_with_true_sensor_noise([x for _, x in is_comparable], process_noise, runner),
@@ -496,6 +501,36 @@ def _choose_pair(stage: ExtendedFit, first: _Trial, n_candidates: int, runner: C
         Choice(score.candidate.name, first_fit, ratio[0], best.dispersion, n_candidates, (), score.unabsorbed_share),
         _make_choice(_best_variants([(s, x) for s, _, x in found]), ratio[1], len(scores), runner),
     ]
+
+
+def choose_from_start(stage: ExtendedFit, runner: CallRunner) -> tuple[ExtendedFit, list[Choice]]:
+    """Choose the first effect by fits from initial trajectories, if no model without effects was found.
+
+    The first level of process noise counts at which a fit is close; that noise is then reduced. With the effect there
+    may be a fit without it after all, since the start was too far off; it is then compared with that. Return the fit
+    without the effect, and the choice, if any.
+    """
+    scores = score_effects(stage, runner)
+    shortlist = _refined_shortlist(stage, scores, (), runner)
+    trials = list[_Trial]()
+    for process_noise in (0.0, identification.PROCESS_NOISE_LEVELS[0]):
+        requests = [(effects.with_effects(stage.machine, _start_entry(s)), stage, process_noise) for s in shortlist]
+        found = zip(shortlist, fit_all_from_start(requests, runner) if requests else (), strict=True)
+        close = [(s, x) for s, x in found if x is not None and x.is_close]
+        reduced = [(s, x if x.exact else resume_with_least_noise(x, runner)) for s, x in close]
+        trials = _best_variants([(s, x) for s, x in reduced if _is_effective(s.candidate.name, x)])
+        if trials:
+            break
+    if not trials:
+        return stage, []
+    score, best = trials[0]
+    trials = [x for x in trials if x[1].fit.process_noise == best.fit.process_noise]
+    with suppress(NotConvergedError):
+        stage = refit(stage.machine, best, best.fit.process_noise)
+    gain = stage.deviance - best.deviance if stage.estimated else wald_statistic(score.candidate.name, best)
+    if gain < MIN_LIKELIHOOD_RATIO * best.dispersion:
+        return stage, []
+    return stage, [_make_choice(trials, gain, len(scores), runner)]
 
 
 def _required_gain(
