@@ -61,12 +61,15 @@ def commit() -> str | None:
             return None
         changed = _git(package, "status", "--porcelain", "--", ".", str((package / "model").resolve()))
         return _git(package, "rev-parse", "--short", "HEAD") + "-dirty" * bool(changed)
-    except (OSError, subprocess.CalledProcessError):
+    except (OSError, ValueError, subprocess.SubprocessError):  # no git, or one that does not answer
         return None
 
 
 def _git(place: Path, *arguments: str) -> str:
-    return subprocess.run(["git", *arguments], capture_output=True, text=True, cwd=place, check=True).stdout.strip()
+    command = ["git", "--no-optional-locks", *arguments]
+    return subprocess.run(
+        command, stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=place, check=True, timeout=10
+    ).stdout.strip()
 
 
 def check_out_folder(out: Path, inputs: Iterable[Path] = (), option: str = "--out") -> None:

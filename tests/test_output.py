@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -74,6 +78,26 @@ def test_a_former_result_is_told(tmp_path: Path, summary: object, told: str) -> 
     assert output.describe_result(tmp_path) is None
     (tmp_path / output.SUMMARY).write_text("{" if summary is None else json.dumps(summary))
     assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d" + told, output.describe_result(tmp_path) or "")
+
+
+def test_a_summary_says_how_it_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the command line, another command that is given, or its own entries; at the commit of the program."""
+
+    def written(summary: dict[str, Any], *command: str) -> dict[str, Any]:
+        output.write_summary(tmp_path, summary, *command)
+        found: dict[str, Any] = json.loads((tmp_path / "summary.json").read_text())
+        return found
+
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/excite", "design", "my machine.toml"])
+    assert written({"a": 1}) == {"a": 1, "command": "excite design 'my machine.toml'", "commit": output.commit()}
+    assert written({}, "in Python")["command"] == "in Python"
+    assert written({"command": "x", "commit": "y"}) == {"command": "x", "commit": "y"}
+    assert re.fullmatch(r"[0-9a-f]{7,}(-dirty)?", written({})["commit"] or "0000000")
+
+    silent = subprocess.TimeoutExpired("git", 10), subprocess.CalledProcessError(1, "git"), FileNotFoundError("git")
+    for error in silent:
+        monkeypatch.setattr(subprocess, "run", Mock(side_effect=error))
+        assert written({})["commit"] is None
 
 
 def test_json_is_strict() -> None:

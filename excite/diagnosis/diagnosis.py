@@ -37,6 +37,7 @@ from excite.model.machine import EffectEntry, Filter
 from excite.smoothing import NotConvergedError
 
 MAX_EFFECTS = 4  # number of effects beside presliding; chosen
+MIN_COST_PER_ANOMALY = 50.0  # cost that an anomaly counts at least; chosen
 FORMULA_STD_FACTOR = 0.5  # of a magnitude, times the root of the share of its gain left to other effects; chosen
 FORMULA_STD_SHARE = 0.05  # of a magnitude, for other formulas; calibrated: covers nine in ten in results/diagnosis
 
@@ -168,8 +169,8 @@ def diagnose(
     """Diagnose what these logs show that the model lacks.
 
     runner: runs independent calls; the answer does not depend on it. deadline: once the model is fitted, no further
-    effect is begun after it. Raises NotConvergedError if the machine file's
-    parameters give no motion, NotIdentifiableError if a torque is missing.
+    effect is begun after it. Raises NotConvergedError if the machine file's parameters give no motion,
+    NotIdentifiableError if a torque is missing.
     """
     report, deadline = progress or (lambda share, what: None), deadline or Deadline()
     report(0.0, "fitting the model")
@@ -189,6 +190,7 @@ def diagnose(
     added = chosen
     chosen, anomalies, nearest = drop_weak_effects(before, chosen)
     if not chosen and before.data.noise_inflation > 1:  # what is left is judged with the sensors' own noise
+        report(0.85, "fitting the model with the sensors' own noise")
         before = fit_with_process_noise(before, runner)
         anomalies = anomaly_lines(before)
     if len(chosen) > 1 and not deadline.is_over():
@@ -288,17 +290,20 @@ def drop_weak_effects(
         impossible = stage.impossible if kept and stage.estimated else ()
         if not kept or (stage.exact and not anomalies and not impossible):
             break
-        explained = _explained_share(kept[-1].likelihood_ratio, stage)
+        explained = _explained_share(kept[-1].likelihood_ratio, stage, anomalies)
         if explained >= MIN_EXPLAINED_SHARE and not impossible:
             break
         process_noise_fit = kept[-1].process_noise_fit
         if (
             process_noise_fit is not None
             and not impossible
-            and _explained_share(kept[-1].likelihood_ratio, process_noise_fit) >= MIN_EXPLAINED_SHARE
+            and _explained_share(
+                kept[-1].likelihood_ratio, process_noise_fit, anomalies_with_noise := anomaly_lines(process_noise_fit)
+            )
+            >= MIN_EXPLAINED_SHARE
         ):
             # A nearly right formula leaves a large misfit of exact dynamics; the effect was judged with process noise.
-            kept[-1], anomalies = replace(kept[-1], stage=process_noise_fit), anomaly_lines(process_noise_fit)
+            kept[-1], anomalies = replace(kept[-1], stage=process_noise_fit), anomalies_with_noise
             break
         nearest = NearestEffect(kept.pop().name, explained, impossible)
     return kept, anomalies, nearest
@@ -452,10 +457,15 @@ def anomaly_lines(stage: ExtendedFit) -> tuple[str, ...]:
     return tuple(dict.fromkeys([*stage.suspect_sensors, *(line for line, _ in sorted(found, key=lambda x: -x[1]))]))
 
 
-def _explained_share(gained: float, stage: ExtendedFit) -> float:
+def _explained_share(gained: float, stage: ExtendedFit, anomalies: Sequence[str]) -> float:
     """Return the share of the misfit that effects explain by their gain."""
-    total = gained + stage.excess_cost
+    total = gained + _unexplained_cost(stage, anomalies)
     return gained / total if total > 0 else 0.0
+
+
+def _unexplained_cost(stage: ExtendedFit, anomalies: Sequence[str]) -> float:
+    """Return the misfit that is left, at least MIN_COST_PER_ANOMALY for each anomaly."""
+    return max(stage.excess_cost, MIN_COST_PER_ANOMALY * len(anomalies))
 
 
 def conclude(
@@ -474,8 +484,8 @@ def conclude(
     """
     share = 1.0
     if anomalies or not after.exact:
-        share = _explained_share(sum(x.likelihood_ratio for x in chosen), after)
-        next_ratio = max(next_ratio, after.excess_cost)
+        share = _explained_share(sum(x.likelihood_ratio for x in chosen), after, anomalies)
+        next_ratio = max(next_ratio, _unexplained_cost(after, anomalies))
     findings = tuple(_make_finding(x, after, next_ratio, len(chosen) == 1, runner) for x in chosen)
     gained = sum(x.likelihood_ratio for x in chosen)
     findings = tuple(

@@ -284,7 +284,7 @@ def fit_machine(
     return (
         _fit_by_noise_levels(machine, data, identification.PROCESS_NOISE_LEVELS[1:], runner)
         if stage is None
-        else resume_with_least_noise(stage, runner)
+        else _resume_with_least_noise(stage, runner)
     )
 
 
@@ -295,7 +295,7 @@ def fit_with_process_noise(stage: ExtendedFit, runner: CallRunner) -> ExtendedFi
     look. Raises NotConvergedError if these give none either.
     """
     if stage.process_noise_fit is not None:
-        return resume_with_least_noise(stage.process_noise_fit, runner)
+        return _resume_with_least_noise(stage.process_noise_fit, runner)
     return _fit_by_noise_levels(
         stage.machine, inflate_sensor_noise(stage.data, 1.0), identification.PROCESS_NOISE_LEVELS[1:], runner
     )
@@ -415,7 +415,7 @@ def _fit_below_cost(data: FitData, process_noise: float, max_cost: float) -> Fit
     return None if fit is None or fit.cost > max_cost else fit
 
 
-def resume_with_least_noise(stage: ExtendedFit, runner: CallRunner) -> ExtendedFit:
+def _resume_with_least_noise(stage: ExtendedFit, runner: CallRunner) -> ExtendedFit:
     """Continue a fit with the least process noise that gives one, and without any if that is close."""
     if stage.process_noise_fit is not None:
         return exact_if_close(stage)

@@ -28,7 +28,6 @@ from excite.diagnosis.fits import (
     fit_all_from_start,
     refit,
     refit_all,
-    resume_with_least_noise,
     resume_with_true_sensor_noise,
 )
 from excite.diagnosis.parallel import CallRunner
@@ -67,8 +66,11 @@ LARGE_EXCESS_RATIO = 0.1  # excess over expected cost that no error of a formula
 # Nature is never exactly the formula: what is left of an effect may be another effect's gain.
 FORMULA_ERROR = 0.03  # relative difference of two formulas of one effect: 1 to 6 % in results/diagnosis
 MAX_FORMULA_RATIO = 250.0  # largest likelihood ratio that the error of a formula makes; chosen
-MAX_FORMULA_SHARE = 0.1  # largest share of a gain that this takes, and of one that acts at some time only; chosen
-MIN_GAIN_SHARE_WITH_NOISE = 0.25  # the same if process noise hides how good the formulas are; chosen
+MAX_FORMULA_SHARE = (
+    0.1  # largest share of an effect's gain that its formula's error takes; chosen: an effect that acts at
+)
+# some time only must exceed this share of the gains of those chosen, as it follows the error of a formula best
+MIN_GAIN_SHARE_WITH_NOISE = 0.25  # share to exceed where process noise hides how good the formulas are; chosen
 
 # Ties: by how much a rival may be worse.
 TIE_LIKELIHOOD_RATIO = 10.0  # likelihood ratio; chosen
@@ -356,10 +358,11 @@ def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runne
         {s.candidate.name: stage for s, stage in trials if not stage.exact},
     )
     ties, lowest = _tied_trials(trials, gain), trials[0][1].deviance
-    # Process noise hides how well effects explain the logs: those that are a little worse with it are compared, too.
-    near = [x for x in trials if x[1].deviance - lowest <= (1 - VARIANT_SCORE_SHARE) * gain] if with_noise else ties
-    exact, unknown = _trials_without_noise(near, runner)
     names = {s.candidate.name for s, _ in ties}
+    # Process noise hides how well effects explain the logs: those that are a little worse with it are compared, too.
+    margin = (1 - VARIANT_SCORE_SHARE) * gain if with_noise else 0.0
+    near = [x for x in trials if x[0].candidate.name in names or x[1].deviance - lowest <= margin]
+    exact, unknown = _trials_without_noise(near, runner)
     unknown = [x for x in unknown if x[0].candidate.name in names]
     if not any(s.candidate.name in names for s, _ in exact):
         exact = []  # none of the best trials has an exact fit: compare all with process noise
@@ -504,29 +507,22 @@ def _choose_pair(stage: ExtendedFit, first: _Trial, n_candidates: int, runner: C
 
 
 def choose_from_start(stage: ExtendedFit, runner: CallRunner) -> tuple[ExtendedFit, list[Choice]]:
-    """Choose the first effect by fits from initial trajectories, if no model without effects was found.
+    """Choose the first effect by exact fits from initial trajectories, if no model without effects was found.
 
-    The first level of process noise counts at which a fit is close; that noise is then reduced. With the effect there
-    may be a fit without it after all, since the start was too far off; it is then compared with that. Return the fit
-    without the effect, and the choice, if any.
+    With the effect there may be a fit without it after all, since the start was too far off; it is then compared with
+    that. Return the fit without the effect, and the choice, if any.
     """
     scores = score_effects(stage, runner)
     shortlist = _refined_shortlist(stage, scores, (), runner)
-    trials = list[_Trial]()
-    for process_noise in (0.0, identification.PROCESS_NOISE_LEVELS[0]):
-        requests = [(effects.with_effects(stage.machine, _start_entry(s)), stage, process_noise) for s in shortlist]
-        found = zip(shortlist, fit_all_from_start(requests, runner) if requests else (), strict=True)
-        close = [(s, x) for s, x in found if x is not None and x.is_close]
-        reduced = [(s, x if x.exact else resume_with_least_noise(x, runner)) for s, x in close]
-        trials = _best_variants([(s, x) for s, x in reduced if _is_effective(s.candidate.name, x)])
-        if trials:
-            break
+    requests = [(effects.with_effects(stage.machine, _start_entry(s)), stage, 0.0) for s in shortlist]
+    found = zip(shortlist, fit_all_from_start(requests, runner) if requests else (), strict=True)
+    trials = [(s, x) for s, x in found if x is not None and x.is_close and _is_effective(s.candidate.name, x)]
     if not trials:
         return stage, []
+    trials = _best_variants(trials)
     score, best = trials[0]
-    trials = [x for x in trials if x[1].fit.process_noise == best.fit.process_noise]
     with suppress(NotConvergedError):
-        stage = refit(stage.machine, best, best.fit.process_noise)
+        stage = refit(stage.machine, best, 0.0)
     gain = stage.deviance - best.deviance if stage.estimated else wald_statistic(score.candidate.name, best)
     if gain < MIN_LIKELIHOOD_RATIO * best.dispersion:
         return stage, []

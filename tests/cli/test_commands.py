@@ -105,6 +105,8 @@ def test_simulate_then_identify(profile: Path, tmp_path: Path, excite: Excite, s
     assert (code, stderr) == (0, "")
     assert json.loads(stdout)["rows"] == 4001
     code, stdout, _ = excite("identify", "va12_straight", out, "--method", "ols", "--out", tmp_path / "i", "--json")
+    assert stdout == (tmp_path / "i" / "summary.json").read_text()
+    assert json.loads(stdout)["command"].startswith("excite identify va12_straight ")
     assert code == 0
     found = json.loads(stdout)["parameters"]
     assert found["M"]["unit"] == "kg"

@@ -41,6 +41,63 @@ def test_what_a_process_found_can_be_sent_back(straight: Model, straight_motion:
             assert found.fit.process_noise == disturbed
 
 
+@pytest.mark.parametrize(
+    ("close", "without", "chosen"), [(True, True, True), (True, False, True), (False, True, False), (True, None, False)]
+)
+def test_a_first_effect_may_begin_anew(
+    close: bool, without: bool | None, chosen: bool, straight: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the model alone has no fit: by an exact fit that comes near the log, and is better than the one without
+    the effect, if there is one after all. None: that is as good."""
+    stage = replace(calm(straight), estimated=False)
+    machines = list[Any]()
+
+    def begin(requests: Any, runner: Any) -> list[stages.ExtendedFit | None]:
+        made = list[stages.ExtendedFit | None]()
+        for m, of, noise in requests:
+            assert noise == 0
+            machines.append(m)
+            found = stages.refit(m, of, 0.0)
+            made.append(found if close else replace(found, fit=replace(found.fit, cost=9 * found.expected_cost)))
+        return made
+
+    score = next(s for s in selection.score_effects(stage, run_in_turn) if s.candidate.name == "ground_slope@machine")
+    monkeypatch.setattr(selection, "_refined_shortlist", lambda *asked: [score])
+    monkeypatch.setattr(selection, "fit_all_from_start", begin)
+    monkeypatch.setattr(selection, "wald_statistic", lambda name, of: 1e4)
+    true = selection.refit
+
+    def refit(machine: Any, of: stages.ExtendedFit, noise: float) -> stages.ExtendedFit:
+        if without is False:
+            raise gauss_newton.NotConvergedError("no fit")
+        found = true(machine, of, noise)
+        return replace(found, fit=replace(found.fit, cost=of.fit.cost + 5000.0)) if without else found
+
+    monkeypatch.setattr(selection, "refit", refit)
+    before, choices = selection.choose_from_start(stage, run_in_turn)
+    assert [x.name for x in choices] == (["ground_slope@machine"] if chosen else [])
+    assert before.estimated == (close and without is not False)
+    assert len(machines) == 1
+
+
+def test_a_tie_is_a_tie_however_small_the_gain(straight: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With process noise a rival that chance may put first is refitted without it like the best."""
+    stage, trials = calm(straight), []
+    scores = {s.candidate.name: s for s in selection.score_effects(stage, run_in_turn)}
+    for behind, text in ((0.0, "ground_slope=0.009"), (8.0, "rolling_resistance@rear_roll=200")):
+        extended = placing.with_effects(straight.machine, placing.parse_effect(text, straight.machine, 40.0))
+        found = stages.refit(extended, stage, 1.0)
+        fit = replace(found.fit, cost=stage.expected_cost + behind)
+        trials.append((scores[found.model.effects[0].name], replace(found, fit=fit)))
+
+    def freed(found: Sequence[Any], runner: Any) -> Any:
+        return (replace(x, fit=replace(x.fit, process_noise=0.0, cost=x.expected_cost)) for x in found)
+
+    monkeypatch.setattr(selection, "drop_process_noise", freed)
+    choice = selection._make_choice(trials, 25.0, 100, run_in_turn)
+    assert [e.label for e in choice.rivals] == [trials[1][0].candidate.name]
+
+
 def test_coarse_sensors_are_no_measure_of_how_near_sharp_ones_come(
     straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -660,16 +717,3 @@ def test_who_stays_behind_is_given_up(straight: Model, sloping: Path, monkeypatc
     for most, found in ((np.inf, [True, True]), (bar, [True, False])):
         tried = stages.refit_all([(m, stage, stage.fit.process_noise) for m in machines], run_in_turn, most)
         assert [x is not None for x in tried] == found
-
-
-def fits(monkeypatch: pytest.MonkeyPatch) -> tuple[list[int], list[float]]:
-    """Of every fit from now on: how many samples of the first log it is made to, and with which disturbing forces."""
-    iterate, lengths, forces = gauss_newton.fit_logs, list[int](), list[float]()
-
-    def noted(c: Any, records: Any, *asked: Any) -> gauss_newton.Fit:
-        lengths.append(len(records[0].used))
-        forces.append(asked[3])
-        return iterate(c, records, *asked)
-
-    monkeypatch.setattr(smoothing, "fit_logs", noted)
-    return lengths, forces
