@@ -588,7 +588,10 @@ def newton_step(
         offset_deviation = trajectory.offset / offset_scale(space, data) - 0.5
         slope[offsets] += offset_deviation
         cost += float(log.Z[0, 0] + offset_deviation @ offset_deviation)
-    covariance = np.linalg.inv(information)
+    try:
+        covariance = np.linalg.inv(information)
+    except np.linalg.LinAlgError:  # far off, readings may tell nothing of a parameter
+        covariance = np.zeros_like(information)
     if not (np.diag(covariance) > 0).all():
         raise NotConvergedError(
             "joint smoothing: the parameters' covariance is not positive: check the log with `excite log check`"

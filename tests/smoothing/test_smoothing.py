@@ -527,6 +527,14 @@ def test_what_counting_does_to_an_estimate_is_foreseen(straight: Model) -> None:
     assert np.mean(rms / naive) < 0.9  # this motion is kind
 
 
+def test_readings_that_tell_nothing_of_a_parameter_are_no_estimate(straight: Model) -> None:
+    """Far off, an iteration may come to where the information is singular: other starts are then tried."""
+    sensors = tuple(s.name for s in straight.machine.sensor)
+    space, none = build_state_space(straight, sensors), np.zeros(len(straight.nominal))
+    with pytest.raises(gauss_newton.NotConvergedError, match="covariance is not positive"):
+        gauss_newton.newton_step(space, [], [], [], straight.nominal, none, 1.0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["R60", "R60_accuracy"])
 def test_a_design_that_is_played_back_has_intervals_that_hold(va12: Model, name: str) -> None:
