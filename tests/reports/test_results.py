@@ -27,7 +27,7 @@ from excite.reports import Shown, ShownDesign, describe
 from excite.simulation import Motion
 from excite.workflows.design_request import DesignResult
 
-NOT_COMPARED = ("versions", "wall_s")
+NOT_COMPARED = ("versions", "wall_s", "command")
 
 
 @pytest.fixture(scope="module")
