@@ -24,6 +24,7 @@ from excite.diagnosis.fits import (
     MIN_PROCESS_NOISE,
     TRACKING_COST_RATIO,
     ExtendedFit,
+    RefitRequest,
     drop_process_noise,
     fit_all_from_start,
     refit,
@@ -66,10 +67,7 @@ LARGE_EXCESS_RATIO = 0.1  # excess over expected cost that no error of a formula
 # Nature is never exactly the formula: what is left of an effect may be another effect's gain.
 FORMULA_ERROR = 0.03  # relative difference of two formulas of one effect: 1 to 6 % in results/diagnosis
 MAX_FORMULA_RATIO = 250.0  # largest likelihood ratio that the error of a formula makes; chosen
-MAX_FORMULA_SHARE = (
-    0.1  # largest share of an effect's gain that its formula's error takes; chosen: an effect that acts at
-)
-# some time only must exceed this share of the gains of those chosen, as it follows the error of a formula best
+MAX_FORMULA_SHARE = 0.1  # largest share of an effect's gain that the error of its formula takes; chosen
 MIN_GAIN_SHARE_WITH_NOISE = 0.25  # share to exceed where process noise hides how good the formulas are; chosen
 
 # Ties: by how much a rival may be worse.
@@ -199,6 +197,12 @@ def _start_entry(score: score_test.Score) -> EffectEntry:
     return identified_entry(
         e.effect.name, e.where, magnitude, {n: round(v, 12) for n, v in values.items() if n in e.shapes}
     )
+
+
+def _requests(stage: ExtendedFit, scores: Sequence[score_test.Score], process_noise: float) -> list[RefitRequest]:
+    """Return requests to fit a model with each of several candidates."""
+    machines = (effects.with_effects(stage.machine, _start_entry(s)) for s in scores)
+    return [(machine, stage, process_noise) for machine in machines]
 
 
 def fitted_entry(stage: ExtendedFit, name: str) -> EffectEntry:
@@ -514,8 +518,7 @@ def choose_from_start(stage: ExtendedFit, runner: CallRunner) -> tuple[ExtendedF
     """
     scores = score_effects(stage, runner)
     shortlist = _refined_shortlist(stage, scores, (), runner)
-    requests = [(effects.with_effects(stage.machine, _start_entry(s)), stage, 0.0) for s in shortlist]
-    found = zip(shortlist, fit_all_from_start(requests, runner) if requests else (), strict=True)
+    found = zip(shortlist, fit_all_from_start(_requests(stage, shortlist, 0.0), runner), strict=True)
     trials = [(s, x) for s, x in found if x is not None and x.is_close and _is_effective(s.candidate.name, x)]
     if not trials:
         return stage, []
@@ -539,6 +542,7 @@ def _required_gain(
 
     share_with_noise: share of their gains that is required if process noise hides errors of their formulas.
     """
+    # An effect that acts at some time only follows the error of a formula best.
     least = max(MAX_FORMULA_SHARE * candidate.placed.effect.timed, share_with_noise * (not stage.exact))
     shares = [max(least, min(FORMULA_ERROR**2 / x.unabsorbed_share, MAX_FORMULA_SHARE)) for x in chosen]
     formulas = sum(share * x.likelihood_ratio for share, x in zip(shares, chosen, strict=True))
@@ -593,9 +597,7 @@ def _fit_candidates(
         gained = max((stage.deviance - found.deviance for _, found in trials), default=0.0)
         if not batch or (at >= n_promising and gained > MAX_RATIO_OVER_SCORE * batch[0].likelihood_ratio):
             continue
-        requests = [
-            (effects.with_effects(stage.machine, _start_entry(s)), stage, stage.fit.process_noise) for s in batch
-        ]
+        requests = _requests(stage, batch, stage.fit.process_noise)
         report(at)
         batch_limit = cost_limit
         if trials and not stage.data.sticks:  # costs are not comparable where only some models free friction near rest
@@ -629,8 +631,8 @@ def _fit_anew(
     A cause that found no fit would lose to a rival that did.
     """
     first = list({s.candidate.name: s for s in reversed(missing)}.values())
-    requests = [(effects.with_effects(stage.machine, _start_entry(s)), stage, stage.fit.process_noise) for s in first]
-    found = zip(first, fit_all_from_start(requests, runner, cost_limit), strict=True) if first else ()
+    requests = _requests(stage, first, stage.fit.process_noise)
+    found = zip(first, fit_all_from_start(requests, runner, cost_limit), strict=True)
     return [(s, x) for s, x in found if x is not None and _is_effective(s.candidate.name, x)]
 
 
@@ -738,7 +740,7 @@ def _trials_without_noise(trials: Sequence[_Trial], runner: CallRunner) -> tuple
     without = drop_process_noise([s for _, s in good if not s.exact], runner)
     found = [(x, x[1] if x[1].exact else next(without)) for x in good]
     requests = [(stage.machine, stage, 0.0) for (_, stage), exact in found if exact is None]
-    anew = fit_all_from_start(requests, runner) if requests else iter(())
+    anew = fit_all_from_start(requests, runner)
     found = [(x, next(anew) if exact is None else exact) for x, exact in found]
     found = [(x, None if s is None or _fell_to_zero(x[0].candidate.name, s) else s) for x, s in found]
     exact = [(score, stage) for (score, _), stage in found if stage is not None]

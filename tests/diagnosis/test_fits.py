@@ -47,8 +47,8 @@ def test_what_a_process_found_can_be_sent_back(straight: Model, straight_motion:
 def test_a_first_effect_may_begin_anew(
     close: bool, without: bool | None, chosen: bool, straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where the model alone has no fit: by an exact fit that comes near the log, and is better than the one without
-    the effect, if there is one after all. None: that is as good."""
+    """Choose an effect by an exact fit from the start that comes near the log, and is better than the one without the
+    effect if the model has one after all (None: that is as good)."""
     stage = replace(calm(straight), estimated=False)
     machines = list[Any]()
 
