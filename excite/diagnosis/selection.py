@@ -416,8 +416,7 @@ def choose_with_inflated_noise(stage: ExtendedFit, runner: CallRunner) -> tuple[
 
     Inflated noise leaves the misfit that shows the cause, and nearly right models track the logs. The effect must let
     the model track the logs with the true noise; a pair is tried if none does. Return the fit without the effect, and
-    the
-    choices: none if the model needs no effect after all. Return None if nothing tracks the logs.
+    the choices: none if the model needs no effect after all. Return None if nothing tracks the logs.
     """
     begun_without = resume_with_true_sensor_noise([stage], 0.0, runner)
     scores, required = score_effects(stage, runner), MIN_EXCESS_SHARE[1] * stage.excess_cost
