@@ -27,7 +27,7 @@ class SymbolicSample:
     """Symbols of one sample, and the motion of every body in it.
 
     q, nu, a, u, p, wheels: coordinates, velocities, accelerations, torques, standard parameters, measuring wheels.
-    at, rate: coordinates and velocities by name, zero for locked ones. by_name: standard parameters.
+    at, rate, accel: coordinates and their rates by name, zero for locked ones. by_name: standard parameters.
     read: coordinates as the encoders read them: `at` is less by the zeros that are sought.
     frames: motion of each body; gravity (3,) in the root's axes; heading of the root [rad].
     sign: sgn of each joint's rate in its dry friction, by index of the body.
@@ -43,6 +43,7 @@ class SymbolicSample:
     at: dict[str, ca.SX]
     read: dict[str, ca.SX]
     rate: dict[str, ca.SX]
+    accel: dict[str, ca.SX]
     by_name: dict[str, ca.SX]
     frames: dict[int, mechanics.Frame]
     gravity: ca.SX
@@ -64,12 +65,17 @@ class SymbolicSample:
         every = {b.index: ca.SX.sym(f"inertia{b.index}", 10) for b in self.machine.body}
         return ca.jacobian(self.reduced_forces(self.frames, every), ca.vertcat(*every.values()))
 
-    def reduced_forces(self, frames: dict[int, mechanics.Frame], inertia: dict[int, ca.SX]) -> ca.SX:
+    def reduced_forces(
+        self,
+        frames: dict[int, mechanics.Frame],
+        inertia: dict[int, ca.SX],
+        longer: Mapping[int, ca.SX] = mechanics.NONE_LONGER,
+    ) -> ca.SX:
         """Return the generalised forces (n_q,) of the free coordinates q: S^T f of all joints' f, whose angles are S q.
 
-        inertia: (10,) parameters of each body.
+        inertia: (10,) parameters of each body. longer [m]: see `mechanics.body_motions`.
         """
-        rows = mechanics.generalised_forces(self.machine, self.at, frames, inertia)
+        rows = mechanics.generalised_forces(self.machine, self.at, frames, inertia, longer)
         for body in self.machine.body:
             if body.moves_with is not None:
                 rows[self.machine.coordinate(body)] += self.machine.ratio(body) * rows[body.coordinates[0]]
@@ -175,6 +181,7 @@ def symbolic_sample(
         at,
         read,
         rate,
+        accel,
         by_name,
         mechanics.body_motions(machine, at, rate, accel, gravity),
         gravity,
@@ -437,10 +444,14 @@ def _effect_force(s: SymbolicSample, e: ActiveEffect, inertia: Mapping[int, ca.S
             lever = _contact_motion(s, body)[1]
             force += lever[:2, :].T @ ca.vertcat(*effect.push(e.view, k, e.values))
     if effect.gravity is not None:
-        pull = mechanics.rot_z(-s.heading) @ ca.vertcat(*effect.gravity(e.view, e.values), 0)
+        pull = mechanics.rot_z(-s.heading) @ (_level_axes(machine) @ ca.vertcat(*effect.gravity(e.view, e.values)))
         still = {c: ca.SX(0) for c in s.at}
         frames = mechanics.body_motions(machine, s.at, still, still, pull)
         force -= s.reduced_forces(frames, dict(inertia))
+    if effect.link is not None:
+        longer = {k: effect.link(e.values) for k in e.placed.bodies}
+        frames = mechanics.body_motions(machine, s.at, s.rate, s.accel, s.gravity, longer)
+        force += s.reduced_forces(s.frames, dict(inertia)) - s.reduced_forces(frames, dict(inertia), longer)
     if effect.inertia is not None:
         changes = effect.inertia(e.view, e.values)
         by_parameter = effects.payload_change(machine, changes)
@@ -450,6 +461,21 @@ def _effect_force(s: SymbolicSample, e: ActiveEffect, inertia: Mapping[int, ca.S
         if effect.recoil is not None:
             force += e.values[effect.recoil] * _recoil_force(s, e, changes)
     return force
+
+
+def _level_axes(machine: Machine) -> ca.DM:
+    """Return two level axes (3, 2) of the ground: x and y of a machine on a plane, else those across gravity.
+
+    The first one lies in the plane across the first joint, as far as it can.
+    """
+    if machine.planar or not any(machine.gravity):
+        return ca.DM([[1, 0], [0, 1], [0, 0]])
+    down = np.array(machine.gravity) / np.linalg.norm(machine.gravity)
+    first = np.array([0.0, 0.0, 1.0])  # axis of the ground frame
+    first = np.cross(down, first) if abs(down[2]) < 1 / np.sqrt(2) else np.array([1.0, 0.0, 0.0])
+    first -= down * (down @ first)
+    first /= np.linalg.norm(first)
+    return ca.DM(np.column_stack([first, np.cross(down, first)]))
 
 
 def _recoil_force(s: SymbolicSample, e: ActiveEffect, change: Mapping[str, ca.SX]) -> ca.SX:

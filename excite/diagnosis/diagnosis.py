@@ -50,7 +50,7 @@ class Finding:
     the number of candidates. shapes: value, standard deviation, unit. likelihood_ratio: 2 delta log L over the
     dispersion. share: of the excess misfit that it explains. kind: cause if the findings explain the logs, correction
     if something else remains. std_at_shapes: standard deviation of the magnitude if the shapes are those found, which
-    tells if there is such an effect at all.
+    tells if there is such an effect at all. file_value: what the machine file has instead, for an error of the file.
     """
 
     effect: str
@@ -65,6 +65,7 @@ class Finding:
     share: float = 1.0
     kind: str = "cause"
     std_at_shapes: float = 0.0
+    file_value: float | None = None
 
     @property
     def name(self) -> str:
@@ -577,6 +578,7 @@ def _make_finding(
         shapes,
         gain,
         std_at_shapes=at_shapes,
+        file_value=placed.file_value(after.machine),
     )
 
 

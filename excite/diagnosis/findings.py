@@ -30,7 +30,7 @@ from excite.identification import Agreement
 from excite.logs import Log
 from excite.model import Model
 from excite.model.machine import EffectEntry, Filter, Machine, shipped_machines
-from excite.text import format_number, format_uncertain
+from excite.text import format_number, format_rounded, format_uncertain
 
 MACHINE_FILE_DIGITS = 8  # significant digits of magnitudes in a machine file; chosen
 FIRST_ANOMALY_LINES = 3  # lines about anomalies that precede all others; chosen
@@ -345,6 +345,7 @@ def _finding_row(f: Finding, g: HoldOutGain | None) -> dict[str, Any]:
         "amount": f.magnitude,
         "amount_std": f.magnitude_std,
         "unit": f.unit,
+        "file_value": f.file_value,
         "shapes": {n: {"value": value, "std": std, "unit": unit} for n, (value, std, unit) in f.shapes.items()},
         "chi2_gain": f.likelihood_ratio,
         "gain_percent": g.percent if g else None,
@@ -407,8 +408,12 @@ def describe_place(effect: str, where: str) -> str:
 
 
 def format_magnitude(row: Mapping[str, Any]) -> str:
-    """Format a magnitude with its standard deviation, to its significant digits."""
-    return format_uncertain(float(row["amount"]), float(row["amount_std"]), row["unit"])
+    """Format a magnitude with its standard deviation, to its significant digits, and the value that it corrects."""
+    amount, std, file_value = float(row["amount"]), float(row["amount_std"]), row["file_value"]
+    text = format_uncertain(amount, std, row["unit"])
+    if file_value is None:
+        return text
+    return f"{text} ({format_rounded(file_value + amount, std)}, the machine file has {file_value:g} {row['unit']})"
 
 
 def answer_text(a: Assessment) -> str:
@@ -468,6 +473,9 @@ def answer_text(a: Assessment) -> str:
         remark = f" That is {format_share(d.share)} of the misfit; the rest is unexplained, {a.remainder}.{remark}"
     elif d.share < FULL_EXPLANATION_SHARE:
         remark = f" That is {format_share(d.share)} of the misfit; the rest is unexplained.{remark}"
+    elif a.located:
+        left = a.located[0].removeprefix(f"{d.sources[0]}: ") if len(d.sources) == 1 else a.located[0]
+        remark = f" Not all is explained: {left}.{remark}"
     if d.verdict == "tied":
         return f"{logs} {named}: the data cannot tell which.{remark}"
     return f"{logs} {named}: {'; '.join(format_magnitude(r) for r in rows)}.{remark}"

@@ -138,6 +138,9 @@ def hold_out_torques(stage: ExtendedFit) -> HoldOutErrors | None:
     rows = list(model.actuated)
     filtered = (filtered_regression(model, log, machine.filter) for log in stage.data.logs)
     blocks = [(W[rows], Y[rows]) for W, Y in filtered]
+    columns = [model.base.names.index(e.name) for e in model.effects if e.name in model.base.names]
+    if any(not any(W[:, :, k].any() for W, _ in blocks) for k in columns):
+        return None  # a delay or a lag is in no row
     rate = float(machine.sampling_hz) / machine.filter.decimation
     whole = identification.fit_rows(model, blocks)
     level = np.sqrt(sum(((Y - W @ whole) ** 2).sum(axis=1) for W, Y in blocks) / sum(Y.shape[1] for _, Y in blocks))

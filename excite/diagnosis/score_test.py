@@ -445,4 +445,8 @@ def _score(x: Candidate, S: np.ndarray, g: np.ndarray, own: np.ndarray) -> Score
     is_forward = effect.positive or min(effect.grid) < 0
     if is_forward and step[0] <= 0 and len(shown) == 1:
         return 0.0, values, unabsorbed
-    return float(-step[shown] @ g[at]), values, unabsorbed
+    ratio, beyond = float(-step[shown] @ g[at]), abs(values["A"]) / effect.largest
+    if beyond > 1:  # the gain at the largest magnitude that is possible
+        values["A"] /= beyond
+        ratio *= (2 - 1 / beyond) / beyond
+    return ratio, values, unabsorbed

@@ -355,7 +355,7 @@ def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runne
     """Choose the best trial, without process noise if possible, and its ties as rivals.
 
     Trials that tie only with process noise are rivals, too. A trial that makes parameters impossible gives way to one
-    that does not.
+    that does not, and is no rival of it.
     """
     dispersion, with_noise = (
         trials[0][1].dispersion,
@@ -363,10 +363,8 @@ def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runne
     )
     ties, lowest = _tied_trials(trials, gain), trials[0][1].deviance
     names = {s.candidate.name for s, _ in ties}
-    # Process noise hides how well effects explain the logs: those that are a little worse with it are compared, too.
-    margin = (1 - VARIANT_SCORE_SHARE) * gain if with_noise else 0.0
-    near = [x for x in trials if x[0].candidate.name in names or x[1].deviance - lowest <= margin]
-    exact, unknown = _trials_without_noise(near, runner)
+    # Process noise hides how well effects explain the logs: all are compared without it.
+    exact, unknown = _trials_without_noise(trials if with_noise else ties, runner)
     unknown = [x for x in unknown if x[0].candidate.name in names]
     if not any(s.candidate.name in names for s, _ in exact):
         exact = []  # none of the best trials has an exact fit: compare all with process noise
@@ -375,7 +373,8 @@ def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runne
     if judged[0][1].is_dead_end:
         judged = [x for x in judged if x[1].exact and x[1].is_close and not x[1].impossible] or judged
     score, best = judged[0]
-    rivals = tuple(fitted_entry(other, s.candidate.name) for s, other in judged[1:])
+    tied = [x for x in judged[1:] if best.impossible or not x[1].impossible]
+    rivals = tuple(fitted_entry(other, s.candidate.name) for s, other in tied)
     process_noise_fit = with_noise.get(score.candidate.name) if best.exact else None
     behind = next(x.deviance for s, x in trials if s.candidate.name == score.candidate.name) - lowest
     gain -= min(behind, (1 - VARIANT_SCORE_SHARE) * gain)  # a tie may be further behind if much is left
@@ -695,9 +694,16 @@ def _is_effective(name: str, stage: ExtendedFit) -> bool:
 def _best_variants(trials: Sequence[_Trial]) -> list[_Trial]:
     """Return the best variant of each name, best first: least process noise, then least deviance."""
     best: dict[str, _Trial] = {}
-    for x in sorted(trials, key=lambda x: (x[1].fit.process_noise, x[1].deviance)):
+    for x in sorted(trials, key=lambda x: (x[1].fit.process_noise, _information(x))):
         best.setdefault(x[0].candidate.name, x)
     return list(best.values())
+
+
+def _information(trial: _Trial) -> float:
+    """Return the deviance with a price for each parameter of an effect: the information of G. Schwarz (1978)."""
+    score, stage = trial
+    price = np.log(stage.data.n_readings) / stage.data.noise_inflation**2
+    return stage.deviance + price * degrees_of_freedom(score.candidate.name, stage)
 
 
 def _tied_trials(trials: Sequence[_Trial], gain: float) -> list[_Trial]:
@@ -710,7 +716,11 @@ def _tied_trials(trials: Sequence[_Trial], gain: float) -> list[_Trial]:
     margin = max(TIE_LIKELIHOOD_RATIO * best.dispersion, TIE_EXCESS_SHARE * best.excess_cost, share * gain)
     if best.exact and not score.candidate.placed.effect.inverse:  # with process noise it gains less than without
         margin = max(margin, _formula_ratio(wald_statistic(score.candidate.name, best)))
-    return [x for x in trials if x[1].deviance - best.deviance < margin]
+    rough = {x[0].candidate.name: x[0].candidate.placed.effect.formula_error ** 2 * gain for x in trials}
+    least = rough[score.candidate.name]
+    return [
+        x for x in trials if _information(x) - _information(trials[0]) < max(margin, least, rough[x[0].candidate.name])
+    ]
 
 
 def _without_needless_magnitudes(trials: Sequence[_Trial]) -> list[_Trial]:
@@ -743,4 +753,4 @@ def _trials_without_noise(trials: Sequence[_Trial], runner: CallRunner) -> tuple
     found = [(x, next(anew) if exact is None else exact) for x, exact in found]
     found = [(x, None if s is None or _fell_to_zero(x[0].candidate.name, s) else s) for x, s in found]
     exact = [(score, stage) for (score, _), stage in found if stage is not None]
-    return sorted(exact, key=lambda x: x[1].deviance), [x for x, stage in found if stage is None]
+    return sorted(exact, key=_information), [x for x, stage in found if stage is None]

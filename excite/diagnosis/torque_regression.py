@@ -21,7 +21,7 @@ import scipy.stats
 from excite import identification
 from excite.diagnosis.curves import Curve, find_curves
 from excite.diagnosis.deadline import Deadline
-from excite.diagnosis.diagnosis import Finding, NearestEffect, ParameterChange
+from excite.diagnosis.diagnosis import FORMULA_STD_SHARE, Finding, NearestEffect, ParameterChange
 from excite.diagnosis.hold_out import HoldOutErrors, torque_names
 from excite.diagnosis.score_test import Candidate
 from excite.diagnosis.selection import MIN_EXPLAINED_SHARE, ProgressCallback, identified_entry
@@ -161,7 +161,7 @@ def _finding(search: Search, fit: TorqueFit, term: Term, share: float, kind: str
     c, std = fit.coefficient(term)
     relative = fit.shape_stds(term)
     magnitude = scaled_magnitude(placed, c)
-    size = abs(magnitude * std / c)
+    size = float(np.hypot(magnitude * std / c, FORMULA_STD_SHARE * magnitude))
     shapes = {
         n: (placed.values[n], abs(placed.values[n]) * relative.get(n, 0.0), placed.shape_unit(n)) for n in placed.shapes
     }
@@ -172,13 +172,14 @@ def _finding(search: Search, fit: TorqueFit, term: Term, share: float, kind: str
         _rivals(search, fit, term),
         float(min(1.0, len(search.names) * scipy.stats.chi2.sf(term.chi2, k))),
         float(magnitude),
-        float(size),
+        size,
         placed.unit,
         shapes,
         term.chi2,
         share,
         kind,
-        float(size),
+        size,
+        placed.file_value(search.model.machine),
     )
 
 

@@ -77,17 +77,48 @@ def effect_columns(
     for first in range(0, len(placed), BATCH):
         batch = placed[first : first + BATCH]
         functions = signatures(model.machine, standard, batch)
-        n_readings = functions.force.size1_in(6)
         for r, u, own in zip(rows, torques, parts, strict=True):
             z = integrate_memory(functions, r.q, r.nu, u, r.t, p, np.zeros((len(r.t), functions.n_map_inputs)))
-            sample = (r.q.T, r.nu.T, r.a.T, u.T, r.t[None], z.T, np.zeros((n_readings, len(r.t))))
-            force = functions.force(*sample, ca.DM(p)).full().reshape(r.q.shape[1], len(r.t), len(batch))
+            sample = (r.q.T, r.nu.T, r.a.T, u.T, r.t[None], z.T, _readings(model, r), ca.DM(p))
+            force = functions.force(*sample).full().reshape(r.q.shape[1], len(r.t), len(batch))
+            first_row, last = filter.drop[0], len(r.t) - filter.drop[1]
             for c, e in enumerate(batch):
                 if e.effect.channel is not None:
                     force[:, :, c] -= _reading_error(model, e, r.t, u)
-            first_row, last = filter.drop[0], len(r.t) - filter.drop[1]
-            own.append(-decimate(force[:, first_row:last], filter.decimation))
+            columns = -decimate(force[:, first_row:last], filter.decimation)
+            if any(e.effect.reading is not None for e in batch):
+                errors = functions.reading(*sample).full().reshape(-1, len(r.t), len(batch))
+                for c, e in enumerate(batch):
+                    if e.effect.reading is not None:
+                        columns[:, :, c] += _torque_of_angle_error(model, r, errors[:, :, c], X, filter)
+            own.append(columns)
     return [np.concatenate(own, axis=2) for own in parts]
+
+
+def _readings(model: Model, r: TorqueRows) -> np.ndarray:
+    """Return what the sensors read that are not of torque (n_sensors, N), zero for one that the log lacks."""
+    names = [s.name for s in model.machine.sensors("full") if s.kind != "torque"]
+    return np.array([r.log.values.get(name, np.zeros(len(r.t))) for name in names]).reshape(len(names), len(r.t))
+
+
+def _torque_of_angle_error(model: Model, r: TorqueRows, error: np.ndarray, X: np.ndarray, filter: Filter) -> np.ndarray:
+    """Return what the true motion needs more (n_rows, n) than the measured one, to first order.
+
+    error (n_sensors, N): of the sensors that are not of torque. It is filtered as the readings are.
+    """
+    none = np.zeros(len(r.t))
+    sensors = [s for s in model.machine.sensors("full") if s.kind != "torque" and s.name in r.log.values]
+    at = [s.name for s in model.machine.sensors("full") if s.kind != "torque"]
+    values = {s.name: error[at.index(s.name)] for s in sensors}
+    values |= {s.name: none for s in model.machine.sensors("full") if s.kind == "torque"}
+    off = samples(model, Log("", r.t, values), filter)
+    first, last = filter.drop[0], len(r.t) - filter.drop[1]
+    moved = [decimate(x[:, first:last], filter.decimation) for x in (off.q, off.nu, off.a)]
+    motion, p = (r.q[r.at].T, r.nu[r.at].T, r.a[r.at].T), model.expand @ X
+    less, more = (
+        model.predict(*(x + sign * d for x, d in zip(motion, moved, strict=True)), p).full() for sign in (-1, 1)
+    )
+    return np.asarray((less - more) / 2)
 
 
 def needed_torques(model: Model, r: TorqueRows, X: np.ndarray) -> np.ndarray:

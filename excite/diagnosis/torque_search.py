@@ -111,13 +111,29 @@ def scaled_magnitude(e: PlacedEffect, coefficient: float) -> float:
 
 
 def _is_impossible(e: PlacedEffect, coefficient: float) -> bool:
-    """Tell if a coefficient gives an effect a sign that it cannot have."""
-    return bool(coefficient * e.values["A"] < 0) and (e.effect.positive or e.effect.opposes_motion)
+    """Tell if a coefficient gives an effect a sign or a size that it cannot have."""
+    size = coefficient * e.values["A"]
+    has_wrong_sign = size < 0 and (e.effect.positive or e.effect.opposes_motion)
+    return bool(has_wrong_sign or abs(size) > e.effect.largest)
 
 
 def _is_seen_in_torques(e: PlacedEffect) -> bool:
-    """Tell if an effect changes the torques of moving joints: not a sensor's, and not what friction does near rest."""
-    return e.effect.reading is None and e.effect.shaking is None and not e.unsticking
+    """Tell if an effect changes the torques of moving joints, or what they seem to need: not near rest alone."""
+    return e.effect.shaking is None and not e.unsticking
+
+
+def _phase(e: PlacedEffect) -> str | None:
+    """Return the shape that is a phase, None if there is none."""
+    return next((n for n, shape in e.shapes.items() if shape.circular), None)
+
+
+def _in_quadrature(x: Candidate) -> list[Candidate]:
+    """Return a candidate at two phases a quarter of a turn apart, one without a phase as it is."""
+    phase = _phase(x.placed)
+    if phase is None:
+        return [x]
+    both = (replace(x.placed, values={**x.placed.values, phase: at}) for at in (0.0, np.pi / 2))
+    return [Candidate(placed, (0,)) for placed in both]
 
 
 class Search:
@@ -130,7 +146,7 @@ class Search:
         # trial values of the machine at the speeds of the logs, whatever rate its file gives for the friction's turn
         self.machine = identification.with_soft_friction(model, [r.log for r in rows], filter).machine
         found = score_test.candidates(self.machine, [s.name for s in self.machine.sensors("full")], self.duration)
-        self.candidates = [x for x in found if _is_seen_in_torques(x.placed)]
+        self.candidates = [y for x in found if _is_seen_in_torques(x.placed) for y in _in_quadrature(x)]
         self.candidates += self._short_delays()
         self.names = sorted({x.name for x in self.candidates})
         self.columns = self._columns([x.placed for x in self.candidates])
@@ -175,6 +191,19 @@ class Search:
             found.append(Tested(x, c, float(a), log_odds(c, x.placed, n, len(self.names))))
         return sorted(found, key=lambda x: -x.log_odds)
 
+    def turn_phase(self, fit: TorqueFit, x: Tested) -> Tested:
+        """Return a candidate with the phase that explains most, one without a phase as it is."""
+        phase = _phase(x.candidate.placed)
+        if phase is None:
+            return x
+        both = _in_quadrature(x.candidate)
+        C = fit.whiten_all(self._columns([y.placed for y in both]))
+        C -= fit.basis @ (fit.basis.T @ C)
+        sine, cosine = np.linalg.lstsq(C, fit.innovations, rcond=None)[0]
+        values = {**x.candidate.placed.values, phase: float(np.arctan2(cosine, sine))}
+        turned = replace(both[0], placed=replace(both[0].placed, values=values))
+        return self.test(fit, [turned], self._columns([turned.placed]))[0]
+
     def finalists(self, fit: TorqueFit) -> list[Tested]:
         """Return the likeliest candidate of each name, with refined shapes, the likeliest first."""
         taken = {t.name for t in fit.terms}
@@ -182,7 +211,7 @@ class Search:
         for x in self.test(fit, self.candidates, self.columns):
             if x.candidate.name not in taken:
                 best.setdefault(x.candidate.name, x)
-        chosen = [x for x in best.values() if x.log_odds > 0][: SETTINGS.finalists]
+        chosen = [self.turn_phase(fit, x) for x in best.values() if x.log_odds > 0][: SETTINGS.finalists]
         for reach in REACHES:
             near = score_test.refine_candidates([x.score for x in chosen], self.machine, self.duration, reach)
             near = [x for x in near if len(x.columns) == 1]
@@ -251,7 +280,7 @@ def reason_against(before: TorqueFit, after: TorqueFit, term: Term) -> str:
     if not _is_certain(after, term):
         return "its size is uncertain"
     if _is_impossible(term.effect, x):
-        return "its sign is impossible"
+        return "its sign or its size is impossible"
     if not predicts_better(before, after):
         return "it does not predict withheld stretches better"
     if share_of_row(before, after) < SETTINGS.min_share:

@@ -12,6 +12,7 @@ from math import pi
 
 import casadi as ca
 
+from excite.model import mechanics
 from excite.model.effects import friction, ground_map, sizes, soil, torque_map
 from excite.model.effects.effect import Channel, Effect, Memory, SampleView, Shape, Site, Values
 from excite.model.machine import Body
@@ -367,6 +368,7 @@ _declare(
         "a loss of torque that grows with the square of the torque",
         "losses that grow with pressure, Merritt, Hydraulic Control Systems, 1967, ch. 4; sensors, Doebelin, ch. 5",
         sizes.constant(0.05),
+        largest=1.0,
         torque=_square_loss,
     ),
     Effect(
@@ -393,7 +395,7 @@ _declare(
     ),
     Effect(
         "torque_deadband",
-        ("driven_contacts",),
+        ("driven_contacts", "free_drives"),
         "N m",
         "delivered sgn(u) max(abs(u) - A, 0), u measured",
         "a loss of torque with the sign of the torque, also at standstill",
@@ -416,6 +418,7 @@ _declare(
             "lag": Shape("s", 0.1, (0.1,), meaning="time constant of the hose", form=("hose", 1.0)),
         },
         extra_trials=lambda site: [{"hose": 1.0, "lag": x} for x in (0.03, 0.1, 0.3)],
+        largest=1.0,
         torque=_coupled_torque,
         memory={"late": Memory(_hose_rate, 1000.0, per_body=True, form=("hose", 1.0))},
     ),
@@ -428,6 +431,7 @@ _declare(
         "pressure relief valves, Merritt, Hydraulic Control Systems, 1967, ch. 5",
         sizes.constant(0.5),
         {"valve": Shape("N m", 0.6, (0.3, 0.5, 0.7, 0.85), sizes.torque)},
+        largest=1.0,
         torque=_relief_loss,
     ),
     # Periodic in the angle
@@ -461,7 +465,7 @@ _declare(
     ),
     Effect(
         "encoder_eccentricity",
-        ("contacts", "wheels"),
+        ("contacts", "wheels", "free_drives"),
         "rad",
         "the encoder reads A sin(theta + phase) too much, and cos2 cos(2 theta) + sin2 sin(2 theta)",
         "an angle error periodic in the angle itself",
@@ -473,10 +477,10 @@ _declare(
     ),
     Effect(
         "torque_ripple",
-        ("driven_contacts",),
+        ("driven_contacts", "free_drives"),
         "N m",
         "the delivered torque ripples several times per turn: A sin(order theta + phase)",
-        "a torque error periodic in the contact's angle, several times per turn",
+        "a torque error periodic in the joint's angle, several times per turn",
         "piston motors, Ivantysyn, Hydrostatic Pumps and Motors, 2001",
         sizes.share_of(sizes.torque, 0.02),
         {
@@ -611,7 +615,7 @@ _declare(
         ("machine",),
         "rad",
         "gravity along a fixed direction of the ground; `direction` points downhill, from x0 on, or from the"
-        " first heading where no x0 is",
+        " first heading where no x0 is; of an arm, its base stands off level",
         "a force that keeps its direction on the ground while the machine turns and reverses",
         "statics of an inclined plane",
         sizes.constant(0.005),
@@ -725,7 +729,7 @@ _declare(
     # Errors of the machine file
     Effect(
         "contact_radius",
-        ("contacts",),
+        ("contacts", "contact_group"),
         "m",
         "the true radius of the contact is A larger than the machine file's",
         "slip where there is none, with the direction of travel",
@@ -733,6 +737,17 @@ _declare(
         sizes.constant(0.002),
         extra_radius=lambda s, k, p: p["A"],
         file_value=_contact_radius,
+    ),
+    Effect(
+        "link_length",
+        ("links",),
+        "m",
+        "the distance of the joint from the one before it is A larger than in the machine file, along the link",
+        "torques of the joint before that depend on the motion of both",
+        "calibration of a robot's geometry, Mooring, Roth, Driels, Fundamentals of Manipulator Calibration, 1991",
+        sizes.constant(0.005),
+        link=lambda p: p["A"],
+        file_value=mechanics.link_length,
     ),
     Effect(
         "contact_position",
@@ -766,7 +781,7 @@ _declare(
     ),
     Effect(
         "encoder_scale",
-        ("contacts", "articulation"),
+        ("contacts", "articulation", "joints"),
         "-",
         "the encoder reads 1 + A times the angle: its counts per turn, or a gear",
         "slip where there is none, proportional to speed",
@@ -800,13 +815,16 @@ _declare(
         "encoder_delay",
         ("joints",),
         "s",
-        "the angle is read A late: it reads q(t - A), to first order",
+        "the angle is read A late: it reads q(t - A), by Pade's approximant of first order",
         "an angle error proportional to the speed; slip in proportion to the acceleration",
         "Ljung, System Identification, 2nd ed., 10.3",
         sizes.constant(0.02),
+        grid=(1.0, 0.3),
+        formula_error=0.1,
         positive=True,
         angle_only=True,
-        reading=lambda s, exact, k, p: -p["A"] * s.w[k],
+        memory={"late": Memory(lambda s, k, p: s.w[k] - 2 * s.z["late"] / p["A"], 0.1)},
+        reading=lambda s, exact, k, p: -2 * s.z["late"],
     ),
     Effect(
         "yaw_rate_lag",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -205,13 +206,16 @@ class Effect:
     """One entry of the catalogue.
 
     places: joints (with friction), drives (driven joints), contacts, driven_contacts, drive (all driven contacts
-        together, or all contacts for an effect on the soil), articulation (driven joints without contact), wheels
-        (measuring ones), wheel_pair (all measuring ones), yaw_rate, lateral_speed, machine.
+        together, or all contacts for an effect on the soil), contact_group (all contacts), articulation (driven joints
+        without contact), free_drives (those of a machine that touches no ground), links (its joints away from the one
+        before), wheels (measuring ones), wheel_pair (all measuring ones), yaw_rate, lateral_speed, machine. A periodic
+        effect has no place at a sliding joint.
     unit, meaning, signature, source: unit of the magnitude A; formula; symptom in a log; reference.
     typical_magnitude: a typical magnitude [unit] at a site.
     grid: multiples of it to try; several if the signature is not proportional to the magnitude.
     extra_trials: sets of shapes [unit] to try in addition to their grids, with "A" if it is not the typical one.
-    positive: negative magnitudes are never tried.
+    positive: negative magnitudes are never tried. largest: magnitude beyond which there is no such effect.
+    formula_error: relative error of a formula that is known to be rough, 0 for others.
     opposes_motion: a negative fitted magnitude means that something else is the cause.
     inverse: a smaller magnitude is a larger effect.
     timed: the effect depends on time.
@@ -222,7 +226,8 @@ class Effect:
 
     Hooks take the sample, the body they act on and the values A and shapes, and return what the effect adds:
     torque [N m]; extra_radius [m], which all effects see; soil; push: forces [N] along and across a contact;
-    gravity [m/s2] along the ground; inertia: changes of standard parameters of the payload body;
+    gravity [m/s2] along the ground; link [m]: what the link to the joint before is longer;
+    inertia: changes of standard parameters of the payload body;
     reading: error of a sensor; channel: of a torque sensor over time.
     simpler: in the form that never sticks, the effect that it comes to where A is zero.
     recoil: the shape that gives the share of `inertia` due to a load that slides along x and pushes its body back.
@@ -241,6 +246,8 @@ class Effect:
     grid: tuple[float, ...] = (1.0,)
     extra_trials: Callable[[Site], list[dict[str, float]]] = no_trials
     positive: bool = False
+    largest: float = math.inf
+    formula_error: float = 0.0
     opposes_motion: bool = False
     inverse: bool = False
     torque: Callable[[SampleView, int, Values], ca.SX] | None = None
@@ -248,6 +255,7 @@ class Effect:
     soil: Callable[[SampleView, int, Values, Soil], Soil] | None = None
     push: Callable[[SampleView, int, Values], tuple[ca.SX, ca.SX]] | None = None
     gravity: Callable[[SampleView, Values], tuple[ca.SX, ca.SX]] | None = None
+    link: Callable[[Values], ca.SX] | None = None
     inertia: Callable[[SampleView, Values], dict[str, ca.SX]] | None = None
     recoil: str | None = None
     reading: Callable[[SampleView, ca.SX, int, Values], ca.SX] | None = None
@@ -265,7 +273,14 @@ class Effect:
     def sensor_only(self) -> bool:
         """True if only a sensor shows it, no equation of motion."""
         felt = (
-            self.torque or self.extra_radius or self.soil or self.push or self.gravity or self.inertia or self.channel
+            self.torque
+            or self.extra_radius
+            or self.soil
+            or self.push
+            or self.gravity
+            or self.link
+            or self.inertia
+            or self.channel
         )
         return not felt
 
@@ -295,6 +310,11 @@ class PlacedEffect:
 
     def _unit_here(self, unit: str) -> str:
         return OF_STRAIGHT_JOINTS.get(unit, unit) if self.straight else unit
+
+    def file_value(self, machine: Machine) -> float | None:
+        """Return the value of the machine file that the magnitude corrects, None if there is not one alone."""
+        known = self.effect.file_value
+        return known(machine.find(self.bodies[0])) if known is not None and len(self.bodies) == 1 else None
 
     @property
     def name(self) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import casadi as ca
 
 from excite.errors import MachineError
+from excite.model import mechanics
 from excite.model.effects import sizes
 from excite.model.effects.catalogue import CATALOGUE
 from excite.model.effects.effect import DEFAULT_DURATION, Effect, PlacedEffect, Site
@@ -23,9 +24,15 @@ def allowed_places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[in
     driven = list(machine.actuated)
     pulling = [b for b in driven if b.contact is not None]
     together = machine.contacts if effect.soil else pulling
-    each = {"joints": list(machine.rubbing), "drives": driven, "contacts": machine.contacts, "driven_contacts": pulling}
-    if machine.planar:
-        each["articulation"] = [b for b in driven if b.contact is None]
+    each = {
+        "joints": list(machine.rubbing),
+        "drives": driven,
+        "contacts": machine.contacts,
+        "driven_contacts": pulling,
+        "articulation": [b for b in driven if b.contact is None],
+        "free_drives": [] if machine.contacts else driven,
+        "links": [] if machine.contacts else [b for b in machine.body if _has_link(b)],
+    }
     sensors = [s for s in machine.sensors("full") if not (effect.angle_only and s.is_rate)]
     root = machine.body[0].index
     wheels = [s for s in sensors if s.kind == "wheel"]
@@ -35,19 +42,36 @@ def allowed_places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[in
             found |= {b.where: ((b.index,), _angle_sensor(sensors, b)) for b in each[place]}
         elif place == "drive" and len(together) > 1:
             found["drive"] = tuple(b.index for b in together), ()
+        elif place == "contact_group" and len(machine.contacts) > 1:
+            found["contacts"] = tuple(b.index for b in machine.contacts), ()
         elif place == "wheels":
             found |= {s.place or s.name: ((s.body,), (s.name,)) for s in wheels}
         elif place == "wheel_pair" and len(wheels) > 1:
             found["measuring_wheels"] = (wheels[0].body,), tuple(s.name for s in wheels)
         elif place in ("yaw_rate", "lateral_speed"):
             found |= {s.place or place: ((s.body,), (s.name,)) for s in sensors if s.kind == place}
-        elif place == "machine" and machine.planar and (effect.gravity or payload_body(machine) is not None):
+        elif place == "machine" and _has_place(machine, effect):
             found["machine"] = (root,), ()
     if effect.soil or effect.push:
         found = {w: at for w, at in found.items() if all(machine.find(k).contact for k in at[0])}
     if effect.angle_only:
         found = {w: at for w, at in found.items() if at[1]}
+    if any(shape.circular for shape in effect.shapes.values()):  # a phase has no meaning at a sliding joint
+        found = {w: at for w, at in found.items() if not is_straight(machine, at[0])}
     return found
+
+
+def _has_link(body: Body) -> bool:
+    """Tell if a joint is away from the one before it."""
+    moves = body.joint in ("revolute", "prismatic") and body.antecedent != "ground"
+    return moves and mechanics.link_length(body) > 0
+
+
+def _has_place(machine: Machine, effect: Effect) -> bool:
+    """Tell if an effect on the machine as a whole has a place on it."""
+    if machine.planar:
+        return effect.gravity is not None or payload_body(machine) is not None
+    return effect.gravity is not None and any(machine.gravity) and not machine.contacts
 
 
 def _angle_sensor(sensors: Sequence[Sensor], body: Body) -> tuple[str, ...]:

@@ -11,12 +11,14 @@ from .contact import (
 from .rank import independent_columns as independent_columns
 from .tree import (
     INERTIAL as INERTIAL,
+    NONE_LONGER as NONE_LONGER,
     Frame as Frame,
     body_motions as body_motions,
     body_poses as body_poses,
     generalised_forces as generalised_forces,
     inertial_vector as inertial_vector,
     joint_transform as joint_transform,
+    link_length as link_length,
     rot_z as rot_z,
     standard_inertia as standard_inertia,
 )

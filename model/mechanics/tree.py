@@ -23,6 +23,7 @@ from excite.model.machine import Body, Machine
 # standard inertial parameters of a body
 INERTIAL = ("M", "MX", "MY", "MZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
 Z = ca.DM([0, 0, 1])  # axis of every joint in its own frame
+NONE_LONGER: Mapping[int, ca.SX] = {}
 
 
 @dataclass(frozen=True)
@@ -62,27 +63,43 @@ def rot_z(angle: ca.SX | float) -> ca.SX:
     return ca.sparsify(R)
 
 
-def joint_transform(body: Body, q: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
-    """Return rotation (3, 3) and position (3,) [m] of a body's frame in its antecedent's; q: coordinates by name."""
+def link_length(body: Body) -> float:
+    """Return the fixed distance [m] of a joint from the one before it: d along x, and r along z unless it slides."""
+    return math.hypot(float(body.d), 0.0 if body.joint == "prismatic" else float(body.r))
+
+
+def joint_transform(body: Body, q: dict[str, ca.SX], longer: ca.SX | float = 0.0) -> tuple[ca.SX, ca.SX]:
+    """Return rotation (3, 3) and position (3,) [m] of a body's frame in its antecedent's; q: coordinates by name.
+
+    longer [m]: added to the link's length, along it.
+    """
     c = body.coordinates[0] if body.coordinates else ""
     theta = q[c] if body.joint == "revolute" else float(body.theta)
     r = q[c] if body.joint == "prismatic" else float(body.r)
     Rz, Rx, Rt = rot_z(float(body.gamma)), _rot_x(float(body.alpha)), rot_z(theta)
     along = ca.vertcat(float(body.d), 0, 0) + Rx @ (Z * r)
+    if link_length(body) > 0 and not (isinstance(longer, float) and longer == 0):
+        fixed = 0.0 if body.joint == "prismatic" else float(body.r)
+        along += (ca.vertcat(float(body.d), 0, 0) + Rx @ (Z * fixed)) * (longer / link_length(body))
     return Rz @ Rx @ Rt, Rz @ along + Z * float(body.b)
 
 
 def body_motions(
-    machine: Machine, q: dict[str, ca.SX], dq: dict[str, ca.SX], ddq: dict[str, ca.SX], gravity: ca.SX
+    machine: Machine,
+    q: dict[str, ca.SX],
+    dq: dict[str, ca.SX],
+    ddq: dict[str, ca.SX],
+    gravity: ca.SX,
+    longer: Mapping[int, ca.SX] = NONE_LONGER,
 ) -> dict[int, Frame]:
     """Compute the motion of every body by forward recursion.
 
     q, dq, ddq by coordinate name [rad, m and per s, s2]; those of a planar root are velocities and accelerations in
-    its own axes. gravity (3,) [m/s2] in the root's axes.
+    its own axes. gravity (3,) [m/s2] in the root's axes. longer [m]: what bodies' links are longer than in the file.
     """
     frames: dict[int, Frame] = {}
     for body in machine.body:
-        R, P = joint_transform(body, q)
+        R, P = joint_transform(body, q, longer.get(body.index, 0.0))
         zero = ca.SX(3, 1)
         if body.antecedent == "ground":
             above = Frame(ca.SX.eye(3), zero, zero, zero, zero, -gravity)
@@ -119,11 +136,16 @@ def body_motions(
 
 
 def generalised_forces(
-    machine: Machine, q: dict[str, ca.SX], frames: dict[int, Frame], inertial: dict[int, ca.SX]
+    machine: Machine,
+    q: dict[str, ca.SX],
+    frames: dict[int, Frame],
+    inertial: dict[int, ca.SX],
+    longer: Mapping[int, ca.SX] = NONE_LONGER,
 ) -> dict[str, ca.SX]:
     """Compute the generalised force [N or N m] of every coordinate by backward recursion.
 
-    inertial: (10,) parameters of each body in the order of INERTIAL, about its own frame.
+    inertial: (10,) parameters of each body in the order of INERTIAL, about its own frame. longer: as in
+    `body_motions`, which made the frames.
     """
     force: dict[int, ca.SX] = {}
     moment: dict[int, ca.SX] = {}
@@ -146,7 +168,7 @@ def generalised_forces(
         elif body.joint == "prismatic":
             rows[body.coordinates[0]] = F[2]
         if body.antecedent != "ground":
-            R, P = joint_transform(body, q)
+            R, P = joint_transform(body, q, longer.get(body.index, 0.0))
             force[body.antecedent] += R @ F
             moment[body.antecedent] += R @ N + ca.cross(P, R @ F)
     return rows

@@ -656,17 +656,18 @@ def test_further_variants_of_the_likeliest_names_are_tried(straight: Model) -> N
 def test_a_machine_that_can_be_is_preferred(
     impossible: int, forces: float, left: float, chosen: int, straight: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of effects that explain all that a log shows about as well; where more is left, more may come. Not one with which
-    no machine can be either, and that explains less, nor one that only forces let explain as much."""
+    """Of effects that explain all that a log shows about as well, the price of their parameters counted; where more is
+    left, more may come. Not one with which no machine can be either, and that explains less, nor one that only forces
+    let explain as much."""
     stage = calm(straight)
     scores = {s.candidate.name: s for s in selection.score_effects(stage, run_in_turn)}
     tries = []
     for k, text in enumerate(("ground_slope=0.009", "rolling_resistance@rear_roll=200")):
         extended = placing.with_effects(straight.machine, placing.parse_effect(text, straight.machine, 40.0))
         found = fits.refit(extended, stage, 0.0)
-        fit = replace(
-            found.fit, cost=(1 + fits.COST_TOLERANCE) * stage.expected_cost - 1 + left + 3 * k, process_noise=forces * k
-        )
+        price = np.log(stage.data.n_readings) * selection.degrees_of_freedom(found.model.effects[0].name, found)
+        cost = (1 + fits.COST_TOLERANCE) * stage.expected_cost - 1 + left + 3 * k - price
+        fit = replace(found.fit, cost=cost, process_noise=forces * k)
         tries.append((scores[found.model.effects[0].name], replace(found, fit=fit)))
     names = [s.candidate.name for s, _ in tries[:impossible]]
     lines = property(lambda of: ("Fv1 = -1",) if of.model.effects[0].name in names else ())

@@ -19,11 +19,12 @@ from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.torque_regression import TorqueDiagnosis, diagnose_torques
 from excite.errors import NotIdentifiableError
 from excite.identification import identify, needed_sensors
-from excite.logs import prepare
+from excite.logs import Log, prepare
 from excite.model import Model, build
 from excite.model.machine import load_machine
 
 Hidden = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+TWO_JOINTS = Path(__file__).parents[1] / "support" / "two_joints.toml"
 SECONDS, VOLTS_PER_NEWTON = 25.0, 1 / 35.1507
 
 
@@ -100,6 +101,58 @@ def test_a_late_channel_is_no_friction(emps: Model, late: float, seed: int) -> N
     (f,) = diagnosed(emps, log).findings
     assert f.effect == "channel_delay"
     assert f.magnitude == pytest.approx(late, abs=3 * f.magnitude_std)
+
+
+def arm_log(model: Model, misread: Callable[[np.ndarray, np.ndarray], np.ndarray], more: Hidden | None = None) -> Log:
+    """A log of an arm of two joints along given motions.
+
+    misread: what the encoders read (2, N) of the angles and torques. more: further torques (2, N) of q, nu, a.
+    """
+    rng = np.random.default_rng(5)
+    t = np.arange(0, 40, 1 / float(model.machine.sampling_hz))
+    fade = np.clip(np.minimum(t, 40 - t) / 3, 0, 1) ** 2
+    phase = rng.uniform(0, 2 * np.pi, (2, 5))
+    q = np.array([sum(0.9 / k * np.sin(0.7 * k * t + phase[j, k - 1]) for k in range(1, 6)) * fade for j in (0, 1)])
+    nu = np.gradient(q, t, axis=1)
+    a = np.gradient(nu, t, axis=1)
+    u = model.predict(q, nu, a, model.expand @ model.nominal).full()
+    u = u + (0 if more is None else more(q, nu, a))
+    read = misread(q, u) + 1e-5 * rng.standard_normal(q.shape)
+    u = u + 0.02 * rng.standard_normal(u.shape)
+    angles, torques = ([s.name for s in model.machine.sensor if s.kind == kind] for kind in ("angle", "torque"))
+    return Log("made", t, dict(zip([*angles, *torques], [*read, *u], strict=True)))
+
+
+@pytest.mark.parametrize(
+    ("cause", "size", "misread", "more"),
+    [
+        ("encoder_scale@forearm", 0.02, lambda q, u: q * np.array([[1.0], [1.02]]), None),
+        (
+            "encoder_eccentricity@forearm",
+            0.02,
+            lambda q, u: q + np.outer([0, 0.02], np.ones(q.shape[1])) * np.sin(q),
+            None,
+        ),
+        (
+            "torque_ripple@forearm",
+            0.3,
+            lambda q, u: q,
+            lambda q, nu, a: np.array([[0.0], [-0.3]]) * np.sin(7 * q + 0.4),
+        ),
+    ],
+)
+def test_errors_of_encoders_and_ripple_are_found_in_torques(
+    cause: str,
+    size: float,
+    misread: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    more: Hidden | None,
+) -> None:
+    model = build(load_machine(str(TWO_JOINTS)))
+    log = arm_log(model, misread, more)
+    (found,) = diagnose_torques(model, [log], model.machine.filter)[0].findings
+    assert cause in (found.name, *found.tied_with)
+    if found.name == cause:
+        assert found.magnitude == pytest.approx(size, abs=2.5 * found.magnitude_std)
 
 
 def test_rest_hides_nothing(emps: Model) -> None:

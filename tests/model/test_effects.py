@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
 
@@ -17,7 +18,7 @@ from excite.diagnosis.diagnosis import opposite_phase
 from excite.errors import MachineError
 from excite.identification import identify
 from excite.logs import log, passes
-from excite.model import Model, build, signatures
+from excite.model import Model, build, signatures, standard_parameters
 from excite.model.effects import (
     CATALOGUE,
     DEFAULT_DURATION,
@@ -65,6 +66,10 @@ CONTRACT = (  # CONTRACT.md section 4: the names that others rely on, and their 
     ("payload_shift", "kg m"),
 )
 VA12 = machine.load_machine("va12")
+
+
+TWO_JOINTS = str(Path(__file__).parents[1] / "support" / "two_joints.toml")
+OF_ROLLER = {name: e for name, e in CATALOGUE.items() if placing.allowed_places(VA12, e)}
 
 
 def where(effect: Effect) -> str:
@@ -121,6 +126,73 @@ def test_both_measuring_wheels_further_out_turn_further_apart(va12: Model) -> No
     np.testing.assert_allclose(change[sensors.index("thetal")], -0.01 * turned / 0.33)
     np.testing.assert_allclose(change[sensors.index("thetar")], 0.01 * turned / 0.33)
     assert np.count_nonzero(change.any(axis=1)) == 2
+
+
+def moved(model: Model) -> list[np.ndarray]:
+    """Coordinates, rates and accelerations (n_q, 50) of a lively motion."""
+    rng = np.random.default_rng(0)
+    return [size * rng.standard_normal((len(model.coordinates), 50)) for size in (1.0, 1.5, 4.0)]
+
+
+def torques(model: Model, motion: list[np.ndarray]) -> np.ndarray:
+    """Torques (n_q, 50) that a motion needs with all parameters of the machine file, the effect's included."""
+    beside = () if model.plain else (np.zeros((len(model.inputs), 50)), np.zeros((len(model.memory), 50)))
+    known = {n: value for n, (value, _) in standard_parameters(model.machine).items()}
+    known |= {e.name: e.values["A"] for e in model.effects}
+    return np.asarray(model.predict(*motion, [known[n] for n in model.base.standard], *beside).full())
+
+
+@pytest.mark.parametrize("known", [TWO_JOINTS, "ur10"], ids=["two_joints", "ur10"])
+def test_a_longer_link_is_that_of_another_machine_file(known: str) -> None:
+    """The torques of a file with that length, whose inertia about the joints is the same."""
+    one = machine.load_machine(known)
+    links = placing.allowed_places(one, CATALOGUE["link_length"])
+    assert links
+    for place, ((index,), _) in links.items():
+        body = one.find(index)
+        factor = 1 + 0.02 / np.hypot(float(body.d), float(body.r))
+        stretched = {n: Quantity(value=factor * float(getattr(body, n)), source="assumed") for n in ("d", "r")}
+        longer = body.model_copy(update=stretched)
+        other = one.model_copy(update={"body": tuple(longer if b.index == index else b for b in one.body)})
+        with_effect = build(placing.with_effects(one, shaped(f"link_length@{place}=0.02", {}, one)))
+        motion = moved(with_effect)
+        expected, plain = (torques(build(m), motion) for m in (other, one))
+        assert np.abs(expected - plain).max() > 1e-4 * np.abs(plain).max()
+        assert np.abs(torques(with_effect, motion) - expected).max() < 1e-9 * np.abs(expected).max()
+
+
+def test_contacts_that_are_all_larger_roll_like_each_larger_one(va12: Model) -> None:
+    together = build(placing.with_effects(VA12, shaped("contact_radius@contacts=0.003", {})))
+    rolls = [shaped(f"contact_radius@{roll}=0.003", {}) for roll in ("front_roll", "rear_roll")]
+    apart = build(placing.with_effects(VA12, *rolls))
+    motion = moved(va12)
+    assert np.abs(torques(together, motion) - torques(va12, motion)).max() > 1
+    np.testing.assert_allclose(torques(together, motion), torques(apart, motion), rtol=1e-9)
+
+
+def test_an_arm_off_level_feels_gravity_turned() -> None:
+    one = machine.load_machine(TWO_JOINTS)
+    tilted = one.model_copy(update={"gravity": (9.81 * 0.01, -9.81, 0.0)})
+    model = build(placing.with_effects(one, shaped("ground_slope@machine=0.01", {}, one)))
+    motion = moved(model)
+    expected, plain = (torques(build(m), motion) for m in (tilted, one))
+    found = torques(model, motion)
+    other = build(placing.with_effects(one, shaped("ground_slope@machine=0.01", {"direction": np.pi}, one)))
+    assert min(np.abs(t - expected).max() for t in (found, torques(other, motion))) < 1e-9 * np.abs(plain).max()
+    assert np.abs(expected - plain).max() > 1e-3 * np.abs(plain).max()
+
+
+def test_effects_have_places_at_every_joint_where_they_make_sense(emps: Model) -> None:
+    arm = machine.load_machine("ur10")
+    joints = {b.where for b in arm.actuated}
+    for name in ("encoder_scale", "encoder_eccentricity", "encoder_delay", "torque_ripple", "torque_deadband"):
+        assert set(placing.allowed_places(arm, CATALOGUE[name])) == joints, name
+    for name in ("articulation_backlash", "articulation_compliance"):
+        assert set(placing.allowed_places(arm, CATALOGUE[name])) == joints, name
+        assert placing.allowed_places(emps.machine, CATALOGUE[name])
+    for name in ("encoder_eccentricity", "torque_ripple"):  # a slide has no turns
+        assert not placing.allowed_places(emps.machine, CATALOGUE[name])
+    assert "link_length" not in OF_ROLLER
 
 
 def test_a_torque_map_is_a_table_between_its_nodes(va12: Model) -> None:
@@ -329,7 +401,7 @@ def forms(effect: Effect) -> list[dict[str, float]]:
     return list(found.values())
 
 
-@pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
+@pytest.mark.parametrize("effect", OF_ROLLER.values(), ids=list(OF_ROLLER))
 def test_what_an_effect_predicts_is_what_it_does(effect: Effect) -> None:
     """Forward dynamics put into the prediction give the torques that the sensors read, and the regressor is the exact
     slope of the prediction, by differences."""
@@ -390,7 +462,7 @@ def test_an_effect_has_the_parameters_and_the_memory_of_its_form(effect: Effect,
     assert bool(model.map_inputs) == has(effect.map_form)
 
 
-@pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
+@pytest.mark.parametrize("effect", OF_ROLLER.values(), ids=list(OF_ROLLER))
 def test_an_effect_of_no_size_changes_nothing(effect: Effect, va12: Model) -> None:
     """A motion of a few seconds, and what all sensors read of it: as without; with a typical amount it differs."""
     t = np.arange(400) / 100
@@ -416,7 +488,7 @@ WITHIN = {"vibration_on": {"begin": 1.0, "length": 2.0, "shake": 0.0}, "brake_dr
 FAR = ("payload_shift", "articulation_stop_spring", "relief_valve")
 
 
-@pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
+@pytest.mark.parametrize("effect", OF_ROLLER.values(), ids=list(OF_ROLLER))
 def test_a_signature_is_what_the_extended_model_has_more(effect: Effect, va12: Model) -> None:
     """The force of a signature is the difference of the two balances, and so is its reading."""
     for shapes in forms(effect):
