@@ -1,5 +1,6 @@
 """A name must pay: on withheld data, beside slow unknown forces, with a possible sign; errors of the file are named."""
 
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,9 @@ import pytest
 
 import excite
 from excite.diagnosis import fits, hold_out, selection, slow_forces
-from excite.logs import examine, from_table
-from excite.model import build, effects
-from excite.model.machine import load_machine
+from excite.logs import Log, examine, from_table
+from excite.model import build, effects, standard_parameters
+from excite.model.machine import Machine, load_machine
 
 R60 = Path(__file__).parents[2] / "results" / "R60_accuracy" / "design" / "profile.csv"
 
@@ -67,6 +68,15 @@ def file_with(tmp_path: Path, text: str) -> Path:
             0.001,
             marks=pytest.mark.slow,
         ),
+        pytest.param(
+            "".join(
+                f'[body.{roll}.contact]\nradius = {{ value = {radius}, source = "measured" }}\n'
+                for roll, radius in (("front_roll", 0.652), ("rear_roll", 0.652))
+            ),
+            "contact_radius@contacts",
+            0.002,
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_a_wrong_length_in_the_machine_file_is_named(tmp_path: Path, wrong: str, name: str, amount: float) -> None:
@@ -79,6 +89,57 @@ def test_a_wrong_length_in_the_machine_file_is_named(tmp_path: Path, wrong: str,
     assert not any("rolling_resistance" in x for x in (f.name, *f.tied_with))
     if f.name == name:
         assert abs(f.magnitude - amount) < 2 * f.magnitude_std < 0.2 * abs(amount)
+
+
+def arm(**changes: float) -> Machine:
+    """An arm of two joints, sampled at 250 Hz; changes: of the forearm's distance d and of gravity across."""
+    text = (Path(__file__).parents[1] / "support" / "two_joints.toml").read_text()
+    table = tomllib.loads(text.replace("sampling_hz = { value = 50", "sampling_hz = { value = 250"))
+    table["filter"] |= {"cutoff_hz": {"value": 40, "source": "definition"}, "decimation": 5, "drop": [20, 20]}
+    for body in table["body"]:
+        body["friction"]["smoothing"]["value"] = 0.05
+    table["body"][1]["d"]["value"] += changes.get("longer", 0.0)
+    table["gravity"] = [9.81 * changes.get("tilt", 0.0), -9.81, 0.0]
+    return Machine.model_validate(table)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("true", "scale", "name", "amount"),
+    [
+        (arm(longer=0.02), 1.0, "link_length@forearm", 0.02),
+        (arm(tilt=0.03), 1.0, "ground_slope@machine", 0.03),
+        (arm(), 1.02, "encoder_scale@forearm", 0.02),
+    ],
+    ids=["length", "level", "encoder"],
+)
+def test_a_wrong_file_of_an_arm_is_named(true: Machine, scale: float, name: str, amount: float) -> None:
+    """Torques from the true machine's inverse dynamics along given motions."""
+    rng = np.random.default_rng(5)
+    known, model = build(arm()), build(true)
+    t = np.arange(0, 30, 1 / 2500)
+    x = np.clip(np.minimum(t, 30 - t) / 3, 0, 1)
+    fade = 6 * x**5 - 15 * x**4 + 10 * x**3
+    phase = rng.uniform(0, 2 * np.pi, (2, 5))
+    q = np.array([sum(0.9 / k * np.sin(0.8 * k * t + phase[j, k - 1]) for k in range(1, 6)) * fade for j in (0, 1)])
+    nu = np.gradient(q, t, axis=1)
+    a = np.gradient(nu, t, axis=1)
+    t, q, nu, a = t[::10], q[:, ::10], nu[:, ::10], a[:, ::10]
+    standard = {n: value for n, (value, _) in standard_parameters(true).items()}
+    u = model.predict(q, nu, a, [standard[n] for n in model.base.standard]).full()
+    noise = [float(s.noise) for s in true.sensor if s.kind == "torque"]
+    u += np.array(noise)[:, None] * rng.standard_normal(u.shape)
+    q = q * np.array([[1.0], [scale]])
+    step = 2 * np.pi / 65536
+    angles, torques = ([s.name for s in true.sensor if s.kind == kind] for kind in ("angle", "torque"))
+    log = Log("made", t, dict(zip([*angles, *torques], [*(step * np.round(q / step)), *u], strict=True)))
+    d = excite.diagnose(known, log).diagnosis
+    assert d.verdict in ("named", "tied")
+    (f,) = d.findings
+    assert name in (f.name, *f.tied_with)
+    if f.name == name:
+        assert f.magnitude == pytest.approx(amount, abs=2.5 * f.magnitude_std)
+        assert f.magnitude_std < 0.15 * abs(amount)
 
 
 def test_slow_forces_leave_a_true_effect_its_significance_and_take_that_of_a_false_one() -> None:

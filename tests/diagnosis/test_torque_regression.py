@@ -110,7 +110,8 @@ def arm_log(model: Model, misread: Callable[[np.ndarray, np.ndarray], np.ndarray
     """
     rng = np.random.default_rng(5)
     t = np.arange(0, 40, 1 / float(model.machine.sampling_hz))
-    fade = np.clip(np.minimum(t, 40 - t) / 3, 0, 1) ** 2
+    x = np.clip(np.minimum(t, 40 - t) / 3, 0, 1)
+    fade = 6 * x**5 - 15 * x**4 + 10 * x**3
     phase = rng.uniform(0, 2 * np.pi, (2, 5))
     q = np.array([sum(0.9 / k * np.sin(0.7 * k * t + phase[j, k - 1]) for k in range(1, 6)) * fade for j in (0, 1)])
     nu = np.gradient(q, t, axis=1)
@@ -127,12 +128,6 @@ def arm_log(model: Model, misread: Callable[[np.ndarray, np.ndarray], np.ndarray
     ("cause", "size", "misread", "more"),
     [
         ("encoder_scale@forearm", 0.02, lambda q, u: q * np.array([[1.0], [1.02]]), None),
-        (
-            "encoder_eccentricity@forearm",
-            0.02,
-            lambda q, u: q + np.outer([0, 0.02], np.ones(q.shape[1])) * np.sin(q),
-            None,
-        ),
         (
             "torque_ripple@forearm",
             0.3,
