@@ -118,7 +118,11 @@ def diagnose(
     ] = False,
     budget: Annotated[
         float | None,
-        typer.Option("--budget", help="begin nothing new after this many seconds: the best answer so far"),
+        typer.Option(
+            "--budget",
+            help="begin nothing new after this many seconds: the best answer so far",
+            callback=options.positive,
+        ),
     ] = None,
     false_alarms: Annotated[
         int,
