@@ -274,7 +274,8 @@ def slip(
 
     table: a file, or a DataFrame. columns: role -> column, "-NAME" for the opposite sign, where names are not
     recognised; roles are keys of `excite.logs.SLIP_ROLES`. units: role -> unit where headers say none.
-    per: what slips are divided by, "rim" as in machine files or the "larger" of rim and forward speed.
+    per: what the laws divide slip by, "rim" as in machine files or the "larger" of rim and forward speed; the laws
+    depend on it. A column of slips is taken as divided by the larger speed, and converted.
     radius [m]: of the wheel, for a rate of turn. soil: constants whose law (18) is compared with the table.
     machine, where: for which `contact.toml` of `save` is written, a table to paste by default.
     Raises LogError for an unusable table, UsageError for an unknown `per` or contact, NotIdentifiableError for too few

@@ -33,7 +33,7 @@ REQUEST_KEYS = (
 )  # entries of a summary that say how a result was made
 # names of the files that the program writes into a result folder
 OWN_NAMES = re.compile(
-    r"summary\.json|machine\.(json|toml)|(profile|phases|covariance|prediction)\.csv|README\.md"
+    r"summary\.json|machine\.(json|toml)|contact\.toml|(profile|phases|covariance|prediction)\.csv|README\.md"
     r"|[a-z0-9-]+\.(png|svg|pdf|html|md)|design|verify|next|drives|runs\.parquet|study\.json|machines"
 )
 

@@ -50,16 +50,17 @@ def result_folder(
 ) -> Iterator[tuple[Path, dict[str, Any]]]:
     """Give a command a folder to write into and an empty summary, and describe the summary at the end.
 
-    Before the work the folder is checked, and the result that it will replace is named.
+    The folder is checked before the work; the result that it will replace is named once the input was accepted.
     """
     from excite import output
 
     output.check_out_folder(out, inputs)
     before = output.describe_result(out)
+    line = None
     if before is not None and not json:
-        terminal.say(f"{out}/ will be replaced, it holds the result of {before}; to keep it, give another --out")
+        line = f"{out}/ will be replaced, it holds the result of {before}; to keep it, give another --out"
     summary: dict[str, Any] = {}
-    with output.new_folder(out) as place:
+    with output.new_folder(out) as place, terminal.announcing(line):
         yield place, summary
     terminal.finish(summary, out, json, describe)
 

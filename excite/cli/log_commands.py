@@ -118,7 +118,11 @@ def diagnose(
     ] = False,
     budget: Annotated[
         float | None,
-        typer.Option("--budget", help="begin nothing new after this many seconds: the best answer so far"),
+        typer.Option(
+            "--budget",
+            help="begin nothing new after this many seconds: the best answer so far",
+            callback=options.positive,
+        ),
     ] = None,
     false_alarms: Annotated[
         int,
@@ -164,7 +168,8 @@ def slip(
         typer.Option(
             "--column",
             help="ROLE=NAME, or ROLE=-NAME for the opposite sign, of a column that is not recognised (repeatable);"
-            " roles: slip, speed, rim_speed, spin, angle, load, traction, side, level",
+            " roles: slip (taken as divided by the larger of rim and forward speed), speed, rim_speed, spin, angle,"
+            " load, traction, side, level",
         ),
     ] = None,
     unit: Annotated[
@@ -174,7 +179,9 @@ def slip(
     per: Annotated[
         str,
         typer.Option(
-            "--per", help="what slips are divided by: `rim` speed as in machine files, or the `larger` of both speeds"
+            "--per",
+            help="what the laws divide slip by: `rim` speed as in machine files, or the `larger` of both speeds; the"
+            " table's slips are converted, and braking slips grow by it, so the law that is found depends on it",
         ),
     ] = "rim",
     radius: Annotated[float | None, typer.Option("--radius", help="of the wheel [m], for a rate of turn")] = None,

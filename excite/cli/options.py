@@ -182,9 +182,22 @@ AfterOption = Annotated[
         " what it left uncertain (repeatable)",
     ),
 ]
+
+
+def positive(param: typer.CallbackParam, value: float | None) -> float | None:
+    """Return the value of an option. Raises UsageError unless it is positive and finite."""
+    if value is not None:
+        workflows.require_positive(param.opts[0], value, "s")
+    return value
+
+
 BudgetOption = Annotated[
     float | None,
-    typer.Option("--budget", help="seconds of searching after which the best so far is given; no limit by default"),
+    typer.Option(
+        "--budget",
+        help="seconds of searching after which the best so far is given; no limit by default",
+        callback=positive,
+    ),
 ]
 RunsOption = Annotated[
     int, typer.Option("--runs", min=1, help="number of simulated test days, each with sensor noise of its own")

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -67,8 +68,33 @@ Advance = Callable[[int, int, float | str | None], None]  # done, total, best sc
 
 
 @contextmanager
+def announcing(line: str | None) -> Iterator[None]:
+    """Say a line when the work of the block begins, which is when its input was accepted: at its first `bar`.
+
+    Work without a bar has the line said at its end, none if it fails.
+    """
+    before = _announced.set(line)
+    try:
+        yield
+        _say_announced()
+    finally:
+        _announced.reset(before)
+
+
+def _say_announced() -> None:
+    line = _announced.get()
+    if line is not None:
+        _announced.set(None)
+        say(line)
+
+
+_announced: ContextVar[str | None] = ContextVar("line to say when the work begins", default=None)
+
+
+@contextmanager
 def bar(label: str) -> Iterator[Advance]:
     """Show a progress bar on stderr; lines of JSON if `PROGRESS_VARIABLE` asks for them, nothing without a terminal."""
+    _say_announced()
     if os.environ.get(workflows.PROGRESS_VARIABLE) == "json":
 
         def write(done: int, total: int, note: float | str | None) -> None:

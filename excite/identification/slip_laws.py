@@ -92,8 +92,8 @@ def fit_slip_laws(table: SlipTable) -> SlipFit:
     A law's score is that of its errors on settings left out, as normal ones of unknown size; its chance against the
     best law is the mean over a Bayesian bootstrap of the settings (pseudo-BMA+: Yao et al., Bayesian Analysis 13,
     2018). Laws of a chance above 0.05 are supported, without those that add effects to another such law.
-    Raises NotIdentifiableError if there are fewer settings than parameters of the linear law, or if the best law has no
-    traction that grows with slip.
+    Raises NotIdentifiableError if there are fewer settings than parameters of the linear law, or if in the simplest
+    supported law a force does not grow with its slip.
     """
     sided = "side" in table.forces and float(np.ptp(table.Vy / table.norm)) > BOTH_WAYS
     levels = int(table.level.max()) + 1
@@ -106,15 +106,26 @@ def fit_slip_laws(table: SlipTable) -> SlipFit:
         raise NotIdentifiableError(f"{table.source}: {levels} settings are too few for any law")
     laws.sort(key=lambda law: law.rms_left_out)
     laws = [replace(law, chance=_chance(law.left_out, laws[0].left_out)) for law in laws]
+    _require_stiffness(table, _supported(laws)[0])
     load = None if table.load is None else float(np.mean(table.load))
-    traction = float(np.abs(table.forces["traction"]).max()) if "traction" in table.forces else 0.0
-    stiffness, std = _supported(laws)[0].parameters["Kx"]
-    if abs(stiffness) < max(MIN_SHARE * traction, MIN_STDS * (std or 0.0)):
-        raise NotIdentifiableError(
-            f"{table.source}: the traction does not grow with slip, so there is no contact law: is it the right column"
-            f" (traction=COLUMN)? {'; '.join(n for n in table.notes if n.startswith('columns'))}"
-        )
     return SlipFit(table, tuple(laws), _supported(laws), _repeatability(table), load)
+
+
+def _require_stiffness(table: SlipTable, law: SlipLaw) -> None:
+    """Raise NotIdentifiableError if a force of a law does not grow with its slip."""
+    for name, role, slip in (("Kx", "traction", "slip"), ("Ky", "side", "the lateral motion")):
+        if name not in law.parameters:
+            continue
+        largest = float(np.abs(table.forces[role]).max())
+        stiffness, std = law.parameters[name]
+        if largest > 0 and abs(stiffness) >= max(MIN_SHARE * largest, MIN_STDS * (std or 0.0)):
+            continue
+        force = "traction" if role == "traction" else "side force"
+        raise NotIdentifiableError(
+            f"{table.source}: the {force} {'does not grow with ' + slip if largest > 0 else 'is 0 in every row'}, so"
+            f" there is no contact law: is it the right column ({role}=COLUMN)?"
+            f" {'; '.join(n for n in table.notes if n.startswith('columns'))}"
+        )
 
 
 def soil_law(table: SlipTable, soil: mechanics.SoilConstants) -> SlipLaw:

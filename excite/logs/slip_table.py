@@ -6,13 +6,14 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
-from excite.logs.files.common import UNITS_SAID, UNITS_UNKNOWN
+from excite.logs.files.common import UNCLEAR, UNITS_SAID, UNITS_UNKNOWN
 from excite.logs.tables import read_table
 from excite.model.machine import UNITS
 from excite.text import count
@@ -77,12 +78,17 @@ SLIP_ROLES = {
 RATIOS = {"-": 1.0, "%": 0.01, "percent": 0.01, "pct": 0.01}
 AVERAGED = re.compile(r"^(avg|mean|average)_")
 SPREAD = re.compile(r"(^|_)(std|sd|stdev|slope|offset|min|max)(_|$)")
-SAME_SLIP = 0.02  # slips closer than this, one to the next, are of one setting; chosen
-SAME_ANGLE = math.radians(2)  # [rad] the same of slip angles; chosen
+ROUNDING = 1e-9  # slips, slip angles and shares of the mean load that differ by less are equal; rounding of numbers
+MIN_REPEATED = 0.9  # share of rows that recur exactly, from which settings are the values as they are; chosen
+MIN_GAP_RATIO = 4.0  # gap between settings over the largest gap within one, where repeats are nearly equal; chosen
+SAME_ANGLE = math.radians(2)  # [rad] slip angles closer than this, one to the next, are of one setting; chosen
 SAME_LOAD = 0.1  # the same of loads, of their mean; chosen
+SWEEP_SETTINGS = 50  # slips that differ, above which the wheel went through them continuously; chosen
 SWEEP_LEVELS = 12  # stretches of slip that a continuous sweep is divided into; chosen
+MIN_SLIP_RANGE = 0.02  # range of slip, below which the sign of a force is not judged; chosen
 MIN_RIM_SHARE = 0.05  # rim speed over forward speed, below which slip divided by the rim speed says nothing; chosen
 SLIP_PER = ("rim", "larger")  # speeds that slips may be divided by
+PER_NAMES = {"rim": "rim speed", "larger": "larger speed"}
 
 
 @dataclass(frozen=True)
@@ -133,7 +139,8 @@ def read_slip_table(
 
     columns: role (a key of SLIP_ROLES) -> name of its column, "-NAME" for one of opposite sign; the others are
         recognised by name. units: role -> unit; the others come from the headers, SI where these say nothing.
-    per: see `SlipTable`. radius [m]: of the wheel, for a rate of turn.
+    A column of slips is taken as divided by the larger of rim and forward speed.
+    per: what `SlipTable.slip` is divided by, see there. radius [m]: of the wheel, for a rate of turn.
     Raises LogError: what is missing or impossible, and what to do.
     """
     name = "the table" if isinstance(source, pd.DataFrame) else str(source)
@@ -142,10 +149,10 @@ def read_slip_table(
     for role in (*chosen, *units):
         if role not in SLIP_ROLES:
             raise LogError(f"{name}: {role} is no role of a column, allowed: {', '.join(SLIP_ROLES)}")
-    every = {role: _Column.find(name, table, role, chosen, units) for role in SLIP_ROLES}
+    speeds = {role: _Column.find(name, table, role, chosen, units) for role in ("speed", "rim_speed")}
+    used = [role for role in SLIP_ROLES if role != "slip" or None in speeds.values()]
+    every = {role: speeds.get(role) or _Column.find(name, table, role, chosen, units) for role in used}
     found = {role: column for role, column in every.items() if column is not None}
-    if {"speed", "rim_speed"} <= found.keys():
-        found.pop("slip", None)
     read = [f"{role.replace('_', ' ')} from {c.name} [{c.unit}]{c.remark}" for role, c in found.items()]
     notes = [f"columns: {'; '.join(read)}"]
     values = {role: c.values for role, c in found.items()}
@@ -154,12 +161,16 @@ def read_slip_table(
     kept = np.all([np.isfinite(v) for v in values.values()], axis=0)
     if not kept.all():
         notes.append(f"{count(int((~kept).sum()), 'row')} with missing values left out")
+    if not kept.any():
+        raise LogError(
+            f"{name}: no row has numbers in all of these columns: {', '.join(c.name for c in found.values())}"
+        )
     values = {role: v[kept] for role, v in values.items()}
     if "spin" in values and "rim_speed" not in values:
         if radius is None:
             raise LogError(f"{name}: column {found['spin'].name} is a rate of turn, give the wheel's radius as well")
         values["rim_speed"] = radius * values["spin"]
-    Vx, Vy, rim = _speeds(name, table, values, notes)
+    Vx, Vy, rim = _speeds(name, table, values, per, notes)
     level = _levels(rim, Vx, Vy, values)
     made = SlipTable(
         name, Vx, Vy, rim, values.get("load"), {k: values[k] for k in ("traction", "side") if k in values}, level, per
@@ -192,7 +203,7 @@ def _require_usable(t: SlipTable) -> SlipTable:
     pairs = (("traction", t.slip, straight, 1), ("side", t.Vy / t.norm, np.full(len(t.slip), True), -1))
     for role, slip, at, sign in pairs:
         force = t.forces.get(role)
-        if force is None or np.ptp(slip[at]) < SAME_SLIP or np.ptp(force[at]) == 0:
+        if force is None or np.ptp(slip[at]) < MIN_SLIP_RANGE or np.ptp(force[at]) == 0:
             continue
         if sign * np.corrcoef(slip[at], force[at])[0, 1] < -0.5:
             way = "grow with slip" if sign > 0 else "be against the lateral motion"
@@ -234,13 +245,30 @@ class _Column:
                 return None
             name, sign = best[0], 1.0
         unit = (units.get(role) or said.get(name) or _split(name)[1] or "").strip("[]() ")
-        values = sign * pd.to_numeric(table[name], errors="coerce").to_numpy(float)
+        values = sign * _numbers(source, table, name)
         return cls(
             name,
             values * _size(source, role, name, unit, values),
             unit or SLIP_ROLES[role].unit,
             "" if sign > 0 else ", sign turned",
         )
+
+
+def _numbers(source: str, table: pd.DataFrame, name: str) -> np.ndarray:
+    """Return the numbers of a column (N,), NaN where a cell is empty. Raises LogError for a cell that is no number."""
+    if unclear := table.attrs.get(UNCLEAR, {}).get(name):
+        raise LogError(f"{source}: {unclear}")
+    column = table[name]
+    values = pd.to_numeric(column, errors="coerce").to_numpy(float)
+    wrong = np.isnan(values) & ~column.isna().to_numpy() & (column.astype(str).str.strip() != "").to_numpy()
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        more = f"; {count(int(wrong.sum()), 'such cell')} in this column" if wrong.sum() > 1 else ""
+        raise LogError(
+            f"{source}: row {k + 1}, column {name}: is {str(column.iloc[k])[:30]!r}, not a number{more}; correct or"
+            " empty the cell, or choose another column (--column)"
+        )
+    return values
 
 
 def _size(source: str, role: str, name: str, unit: str, values: np.ndarray) -> float:
@@ -285,7 +313,7 @@ def _missing(source: str, table: pd.DataFrame, role: str) -> str:
 
 
 def _speeds(
-    source: str, table: pd.DataFrame, values: Mapping[str, np.ndarray], notes: list[str]
+    source: str, table: pd.DataFrame, values: Mapping[str, np.ndarray], per: str, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return velocity along and across the wheel and speed of its rim [m/s] of every row. Raises LogError."""
     angle = values.get("angle", np.zeros(len(values["traction"])))
@@ -295,6 +323,12 @@ def _speeds(
     if "slip" not in values:
         raise LogError(_missing(source, table, "slip") + "; or give speed and rim_speed")
     s = values["slip"]
+    if (s < 0).any():
+        notes.append(
+            "slip from the table is taken as divided by the larger of rim and forward speed; if its braking slips were"
+            f" divided by the rim speed, give both speeds. The laws divide it by the {PER_NAMES[per]}, which their"
+            " parameters depend on"
+        )
     if (s < -1).any() or (s > 1).any():
         raise LogError(
             f"{source}: slip: must be from -1 to 1 (got {s.min():g} to {s.max():g}); give speed and rim_speed"
@@ -313,16 +347,50 @@ def _speeds(
 
 def _levels(rim: np.ndarray, Vx: np.ndarray, Vy: np.ndarray, values: Mapping[str, np.ndarray]) -> np.ndarray:
     """Number the settings: by a column of levels, or rows whose slip, slip angle and load agree."""
+    angle = np.arctan2(Vy, np.maximum(np.abs(Vx), 1e-12))
     if "level" in values:
-        keys = [values["level"]]
+        return _distinct(values["level"], _chained(angle, SAME_ANGLE))
+    speed = np.hypot(Vx, Vy)
+    slip = (rim - speed) / np.maximum(np.maximum(np.abs(rim), speed), 1e-12)
+    load = values.get("load", np.ones(len(slip)))
+    load = load / np.mean(load)
+    by_slip, by_load, by_angle = _spaced(slip), _chained(load, SAME_LOAD), _chained(angle, SAME_ANGLE)
+    if not 4 <= by_slip.max() + 1 <= SWEEP_SETTINGS:
+        by_slip = np.digitize(slip, np.quantile(slip, np.linspace(0, 1, SWEEP_LEVELS + 1)[1:-1]))
     else:
-        speed = np.hypot(Vx, Vy)
-        slip = (rim - speed) / np.maximum(np.maximum(np.abs(rim), speed), 1e-12)
-        load = values.get("load", np.ones(len(slip)))
-        keys = [_chained(slip, SAME_SLIP), _chained(load / np.mean(load), SAME_LOAD)]
-        if keys[0].max() < 3:  # a sweep
-            keys[0] = np.digitize(slip, np.quantile(slip, np.linspace(0, 1, SWEEP_LEVELS + 1)[1:-1]))
-    keys.append(_chained(np.arctan2(Vy, np.maximum(np.abs(Vx), 1e-12)), SAME_ANGLE))
+        exact = _distinct(*(_chained(x, ROUNDING) for x in (slip, load, angle)))
+        if _repeated(exact) >= MIN_REPEATED:
+            return exact
+    return _distinct(by_slip, by_load, by_angle)
+
+
+def _spaced(x: np.ndarray) -> np.ndarray:
+    """Number the settings of a value by its spacing.
+
+    Repeats are equal, or nearly equal: then the gaps within settings are far smaller than those between them. Without
+    such a break in the sizes of the gaps every value is a setting.
+    """
+    best, ratio = _chained(x, ROUNDING), MIN_GAP_RATIO
+    if _repeated(best) >= MIN_REPEATED:
+        return best
+    gaps = np.sort(np.diff(np.sort(x)))
+    gaps = gaps[gaps > ROUNDING]
+    for small, large in pairwise(gaps):
+        if large < ratio * small:
+            continue
+        group = _chained(x, small)
+        if group.max() + 1 >= 4 and _repeated(group) >= 0.5:
+            best, ratio = group, large / small
+    return best
+
+
+def _repeated(group: np.ndarray) -> float:
+    """Return the share of rows whose group has other rows, too."""
+    return float(np.mean(np.bincount(group)[group] > 1)) if len(group) else 0.0
+
+
+def _distinct(*keys: np.ndarray) -> np.ndarray:
+    """Number the rows by the combinations of keys that occur."""
     return np.unique(np.column_stack(keys), axis=0, return_inverse=True)[1].ravel()
 
 

@@ -66,6 +66,10 @@ class Panel:
     y_ticks: Mapping[float, str] = field(default_factory=dict)
 
     @property
+    def empty(self) -> bool:
+        return not self.curves and not self.outlines and self.image is None
+
+    @property
     def over_time(self) -> bool:
         return self.x_label.startswith("time")
 
@@ -79,10 +83,15 @@ class Explorable:
 
 
 def explorable(figure: Figure) -> Explorable:
-    """Return what the axes of a figure show that are over time (their label says so) or have the gid EXPLORE."""
-    shown = [ax for ax in figure.axes if ax.get_gid() == EXPLORE or _over_time(ax)]
-    left = [ax for ax in figure.axes if ax not in shown and ax.get_label() != "<colorbar>"]
-    return Explorable(tuple(_panel(ax) for ax in shown), not left)
+    """Return what the axes of a figure show that are over time (their label says so) or have the gid EXPLORE.
+
+    Axes that are hidden or hold no curve, band or image give no panel.
+    """
+    axes = [ax for ax in figure.axes if ax.get_visible()]
+    panels = {ax: _panel(ax) for ax in axes if ax.get_gid() == EXPLORE or _over_time(ax)}
+    shown = {ax: panel for ax, panel in panels.items() if not panel.empty}
+    left = [ax for ax in axes if ax not in shown and ax.get_label() != "<colorbar>"]
+    return Explorable(tuple(shown.values()), not left)
 
 
 def _x_label(ax: Axes) -> str:

@@ -142,9 +142,9 @@ def require_objective(name: str, machine: Machine, of: Path | None = None) -> No
 
 
 def require_positive(option: str, value: float | None, unit: str) -> None:
-    """Raise UsageError for a number that is given and not positive."""
-    if value is not None and not value > 0:
-        raise UsageError(f"{option}: must be > 0 {unit} (got {value:g})")
+    """Raise UsageError for a number that is given and not positive and finite."""
+    if value is not None and not 0 < value < float("inf"):
+        raise UsageError(f"{option}: must be > 0 {unit} and finite (got {value:g})")
 
 
 def machine_stem(machine: str) -> str:

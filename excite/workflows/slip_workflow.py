@@ -35,6 +35,8 @@ def slip(
 
     table: None for the contact of a soil alone. Raises LogError, UsageError, NotIdentifiableError.
     """
+    _require_contact(machine, where)
+    requests.require_positive("--radius", radius, "m")
     if table is None:
         if soil is None:
             raise UsageError("TABLE: give a table of a single-wheel test, or a soil's constants (--cohesion and so on)")
@@ -84,6 +86,19 @@ def soil_account(soil: SoilConstants, machine: str | None, where: str | None) ->
     rows = {"Kx": {"value": soil.stiffness}, "Ky": {"value": soil.stiffness}}
     frame = partial(reports.rows_frame, {**rows, "saturation_slip": {"value": soil.saturation_slip}}, "parameter")
     return Account("slip", summary, {}, frame, (partial(_write, text),))
+
+
+def _require_contact(machine: str | None, where: str | None) -> None:
+    """Raise UsageError for a machine without contacts, or a contact that it does not have."""
+    if machine is None:
+        if where is not None:
+            raise UsageError(f"--where: {where} is a contact of a machine, give --machine as well")
+        return
+    places = tuple(b.where for b in load_machine(machine).contacts)
+    if not places:
+        raise UsageError(f"--machine: {machine} has no contact with the ground that a law could be written for")
+    if where is not None:
+        requests.require_known("--where", where, places)
 
 
 def _write(text: str, place: Path) -> None:
@@ -136,6 +151,7 @@ def _lines(
     std: Mapping[str, float] | None = None,
 ) -> str:
     """Write a contact as TOML: a machine that extends `machine`, or a table to paste into a machine file."""
+    _require_contact(machine, where)
 
     def quantity(value: float, name: str = "") -> str:
         spread = (std or {}).get(name)
@@ -162,12 +178,10 @@ def _lines(
             "[body.contact]",
             *keys,
         ]
-        places = [where or "WHERE"]
+        places = ["WHERE"]
     else:
         base: Machine = load_machine(machine)
         contacts = {b.where: b for b in base.contacts}
-        if where is not None:
-            requests.require_known("--where", where, tuple(contacts))
         places = [where] if where is not None else list(contacts)
         lines += [f'extends = "{base.name if not machine.endswith(".toml") else Path(machine).name}"']
         lines += [f'name = "{base.name}_on_this_soil"']

@@ -113,7 +113,8 @@ def _line(where: Path, message: str, raw: dict[str, Any], lines: dict[Path, int]
     number = line_of(lines, where) or line_of(lines, called)
     listed = called[:1] in (("body",), ("sensor",)) and len(called) > 1
     owner = f"{'sensor ' if called[0] == 'sensor' else ''}{called[1]}" if listed else ""
-    key = ".".join(map(str, called[2:] if listed else called))
+    steps = called[2:] if listed else called
+    key = "".join(f"[{s}]" if isinstance(s, int) else f".{s}" for s in steps).lstrip(".")
     text = ": ".join(part for part in (owner, key, message) if part)
     return " ".join((text if number is None else f"line {number}: {text}").split())
 
@@ -130,14 +131,15 @@ def _meant(one: ErrorDetails) -> str | None:
 def _mend(raw: dict[str, Any], one: ErrorDetails, where: Path) -> bool:
     """Put a fault right as it was probably meant. Return False if that can't be guessed."""
     *way, key = one["loc"] or where or ("",)
+    nothing = object()
     parent = _at(raw, way)
     kind, meant = one["type"], _meant(one) if one["type"] in ("extra_forbidden", "literal_error") else None
     if kind == "missing" and key == "source" and isinstance(parent, dict):
         parent["source"] = "assumed"
         return True
-    if not isinstance(parent, dict | list) or (isinstance(parent, dict) and key not in parent):
+    value = _at(raw, (*way, key), nothing)
+    if not isinstance(parent, dict | list) or value is nothing:
         return False
-    value = parent[key]  # type: ignore[index]
     if kind == "extra_forbidden" and isinstance(parent, dict):
         del parent[str(key)]
         if meant is not None:
@@ -156,10 +158,11 @@ def _mend(raw: dict[str, Any], one: ErrorDetails, where: Path) -> bool:
     return kind == "value_error" and where == ("problem",) and raw.pop("problem", None) is not None
 
 
-def _at(raw: Any, way: Sequence[int | str]) -> Any:
+def _at(raw: Any, way: Sequence[int | str], nothing: object = None) -> Any:
+    """Return what stands at a place of nested tables and lists, `nothing` where the place does not exist."""
     for step in way:
         try:
             raw = raw[step]
         except (KeyError, IndexError, TypeError):
-            return None
+            return nothing
     return raw

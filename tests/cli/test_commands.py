@@ -154,7 +154,11 @@ def test_simulated_joints_stick_on_request(profile: Path, tmp_path: Path, excite
         (["design", "va12", "--duration", "nan"], ["--duration", "nan"]),
         (["design", "va12", "--starts", "0"], ["--starts"]),
         (["design", "va12", "--starts", "many"], ["--starts", "integer"]),
-        (["design", "va12", "--budget", "0"], ["--budget"]),
+        *(
+            ([*command, "--budget", value], ["--budget: must be > 0 s", value])
+            for command in (["design", "va12"], ["run", "va12"], ["compare", "va12"], ["diagnose", "va12", "PROFILE"])
+            for value in ("0", "-1", "nan", "inf")
+        ),
         (["design", "emps"], ["emps", "problem"]),
         (["design", "va12", "--speed", "3"], ["--speed"]),
         (["verify", "nowhere"], ["nowhere", "excite design"]),

@@ -95,6 +95,41 @@ def test_side_forces_and_slip_angles() -> None:
     assert law.parameters["Ky"][0] == pytest.approx(-3e4, rel=0.02)
 
 
+SETTINGS = np.arange(-7, 8) / 50  # 0.02 apart
+
+
+@pytest.mark.parametrize(
+    ("slips", "settings"),
+    [
+        (np.repeat(SETTINGS, 3), 15),
+        (np.repeat(SETTINGS, 3) + np.tile([0, 3e-4, -5e-4], 15), 15),
+        (np.repeat([0.01, 0.02, 0.03, 0.2, 0.4, 0.6], 3), 6),
+        (SETTINGS, 15),
+        (np.repeat(10 * SETTINGS[4:], 3) / 2 + np.random.default_rng(0).normal(0, 4e-3, 33), 11),
+        (np.linspace(-0.2, 0.3, 400), 12),  # a sweep
+    ],
+)
+def test_repeats_are_known_by_the_spacing_of_settings(slips: np.ndarray, settings: int) -> None:
+    table = read_slip_table(pd.DataFrame({"slip": slips, "Fx [N]": 3e4 * slips}))
+    assert table.level.max() + 1 == settings
+    assert (np.diff(table.level[np.argsort(table.slip)]) >= 0).all()
+
+
+def test_repeats_of_a_speed_differ_by_their_noise() -> None:
+    noise = 20 * np.random.default_rng(0).standard_normal(45)
+    slips = np.repeat(SETTINGS, 3)
+    forces = pd.DataFrame({"rim_speed": 0.5, "speed": 0.5 - 0.5 * slips, "Fx [N]": 3e4 * slips + noise})
+    assert interface.slip(forces).repeatability["traction"] == pytest.approx(20, rel=0.3)
+
+
+@pytest.mark.parametrize("role", ["traction", "side"])
+def test_forces_of_zero_are_no_contact_law(role: str) -> None:
+    slips, angles = (x.ravel() for x in np.meshgrid([0.02, 0.06, 0.1, 0.15], [0.0, 4.0, 8.0]))
+    table = pd.DataFrame({"slip": slips, "angle [deg]": angles, "traction": 1e4 * slips, "side": -300 * angles})
+    with pytest.raises(NotIdentifiableError, match=r"is 0 in every row.*right column \(" + role):
+        interface.slip(table.assign(**{role: 0.0}))
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -106,6 +141,18 @@ def test_side_forces_and_slip_angles() -> None:
 def test_tables_that_are_refused(change: dict[str, str], words: str) -> None:
     with pytest.raises(LogError, match=words):
         read_slip_table(wheel(100 * SLIPS).rename(columns=change))
+
+
+def test_words_in_a_column_are_refused_unless_it_is_not_needed() -> None:
+    table = wheel(100 * SLIPS)
+    table["slip [%]"] = table["slip [%]"].astype(object)
+    table.loc[4, "slip [%]"] = "low"
+    with pytest.raises(LogError, match=r"row 5, column slip \[%\]: is 'low', not a number; correct"):
+        read_slip_table(table)
+    known = read_slip_table(table.assign(speed=1 - SLIPS, rim_speed=1.0))
+    assert known.slip == pytest.approx(SLIPS)
+    with pytest.raises(LogError, match="no row has numbers in all of these columns: slip"):
+        read_slip_table(wheel(100 * SLIPS).assign(**{"slip [%]": np.nan}))
 
 
 def test_a_force_of_the_wrong_sign_is_refused_and_turned() -> None:
@@ -131,6 +178,42 @@ def test_the_contact_is_accepted_by_a_machine(tmp_path: Path, excite: Excite) ->
     assert float(kept.Kx) == pytest.approx(-1.2e5, rel=0.1)
     code, _, said = excite("slip", tmp_path / "wheel.csv", "--column", "side=Fq", "--out", tmp_path / "no")
     assert (code, "no column Fq for side" in said, said.count("\n")) == (2, True, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--machine", "emps"), "emps has no contact"),
+        (("--where", "front_roll"), "give --machine as well"),
+        (("--machine", "va12", "--where", "roof"), "--where: roof"),
+        (("--radius", "nan"), "--radius: must be > 0 m"),
+        (("--radius", "-1"), "--radius: must be > 0 m"),
+    ],
+)
+def test_options_that_are_refused(options: tuple[str, ...], words: str, tmp_path: Path, excite: Excite) -> None:
+    wheel(100 * SLIPS).to_csv(tmp_path / "wheel.csv", index=False)
+    code, _, said = excite("slip", tmp_path / "wheel.csv", *options, "--out", tmp_path / "out")
+    assert (code, words in said, said.count("\n")) == (2, True, 1), said
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_earlier_result_is_replaced_but_only_by_a_new_one(tmp_path: Path, excite: Excite) -> None:
+    wheel(100 * SLIPS).to_csv(tmp_path / "wheel.csv", index=False)
+    wheel(0 * SLIPS, noise=0).to_csv(tmp_path / "zero.csv", index=False)
+    out = tmp_path / "out"
+    assert excite("slip", tmp_path / "wheel.csv", "--out", out)[0] == 0
+    code, shown, _ = excite("slip", tmp_path / "zero.csv", "--out", out)
+    assert (code, shown, (out / "contact.toml").is_file()) == (1, "", True)
+    code, shown, said = excite("slip", tmp_path / "wheel.csv", "--out", out)
+    assert (code, said, shown.count("will be replaced")) == (0, "", 1)
+
+
+def test_the_result_says_what_slips_were_divided_by(excite: Excite) -> None:
+    notes = " ".join(read_slip_table(wheel(100 * SLIPS), per="larger").notes)
+    assert "divided by the larger of rim and forward speed" in notes
+    assert "The laws divide it by the larger speed" in notes
+    _, shown, _ = excite("slip", "--help")
+    assert "taken as divided by the larger" in " ".join(shown.split())
 
 
 def test_stiffness_of_a_soil() -> None:

@@ -248,6 +248,22 @@ def test_charts_keep_every_peak_and_gap() -> None:
     assert charts.thin_out([first], 60_000).tolist() == list(range(60_000))
 
 
+def test_axes_without_anything_to_show_give_no_panel(caplog: pytest.LogCaptureFixture) -> None:
+    """Hidden axes that fill up a figure, and axes with no more than a word, which stays in the picture."""
+    figure = Figure()
+    first, hidden, wordy = figure.subplots(3, 1, sharex=True)
+    first.plot([0, 1], [2, 3])
+    hidden.set_visible(False)
+    wordy.set_xlabel("time [s]")
+    shown = charts.explorable(figure)
+    assert (len(shown.panels), shown.whole) == (1, False)
+    wordy.set_visible(False)
+    shown = charts.explorable(figure)
+    assert (len(shown.panels), shown.whole) == (1, True)
+    charts.documents({"log.png": shown.panels})
+    assert "MISSING_RENDERERS" not in caplog.text
+
+
 def test_a_report_zooms_sorts_and_copies(browser: Any, va12: Model, va12_motion: Motion, tmp_path: Path) -> None:
     """In a browser: linked charts with values under the pointer, sortable tables, and no network; on paper pictures."""
     problem = va12.machine.problems[str(va12.machine.problem)]

@@ -96,6 +96,13 @@ WRONG = {
     "lane too small": ([("problems.T30.lane_m", [1.0, 1.0])], "problems.T30.lane_m: lane_points 2.4 m apart"),
     "no torque measured": ([("sensor.5", None)], "sensor: none of kind torque on joint 1 (front_axle)"),
     "rolls the wrong way": ([("body.1.alpha.value", "pi/2")], "front_axle: contact: must turn about y"),
+    "one length of a lane": ([("problems.T30.lane_m", [60.0])], "problems.T30.lane_m[1]: is missing"),
+    "a lane without lengths": ([("problems.T30.lane_m", [])], "problems.T30.lane_m[0]: is missing"),
+    "gravity on a plane": ([("gravity", [0.0, 0.0])], "gravity[2]: is missing"),
+    "a place of one coordinate": (
+        [("body.0.inertia.com.value", [0.2])],
+        "front_frame: inertia.com.value[2]: is missing",
+    ),
     "two wheels in one place, no gyro": (
         [("sensor.4.lateral.value", 1.1), ("sensor.8", None)],
         "two measuring wheels apart",
