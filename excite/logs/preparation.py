@@ -119,7 +119,8 @@ def read_stretches(
     stretches, said = place_rows(accepted.table, machine, needs, name, rate)
     used = {line.partition(" row only")[0] for line in said}  # of held channels the note says how they are used
     doubts = [line for line in accepted.doubts if line.partition(" row only")[0] not in used]
-    doubtful = [replace(stretch, doubts=accepted.grave) for stretch in stretches]
+    grave = tuple(line for line in accepted.grave if line.partition(" row only")[0] not in used)
+    doubtful = [replace(stretch, doubts=grave) for stretch in stretches]
     return doubtful, [*notes, *accepted.notes, *said, *doubts]
 
 

@@ -25,7 +25,11 @@ from excite.text import format_number
 
 T = TypeVar("T")
 
-GRAVE = ("clocks", "slow")  # checks whose doubts, as those of units, make an estimate doubtful
+GRAVE = (
+    "clocks",
+    "slow",
+    "counts",
+)  # checks whose doubts, as those of units and held positions, make an estimate doubtful
 NO_UNIT = ("-", "1", "n/a", "na", "none", "raw")  # written where a unit would be; compared without case
 PREFIXES = "numkMG"  # of units: nano to giga
 CLOSE = 0.05  # of a unit's size, when a wrong rate of sampling is taken for time in that unit
@@ -73,7 +77,12 @@ def accept(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sou
     differ, unheard = unit_doubts(table, machine)
     units = [f"{source}: {line}" for line in differ]
     notes = (*notes, *(f"{source}: {line}" for line in unheard))
-    grave = [f"{source}: {f.text}" for f in seen if f.kind == "doubt" and f.check in GRAVE]
+    positions = {s.name for s in machine.sensors("full") if s.kind in ("angle", "wheel")}
+    grave = [
+        f"{source}: {f.text}"
+        for f in seen
+        if f.kind == "doubt" and (f.check in GRAVE or (f.check == "held" and f.sensor in positions))
+    ]
     return Accepted(clean, (*notes, *bridged), (*units, *doubtful), (*units, *grave))
 
 

@@ -138,7 +138,11 @@ def identify_account(
         "unused_sensors": list(identification.unused_sensors(model, estimate.method, read)),
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
-        "notes": [*said, *requests.acceptance_notes(accepted), *ready.notes, *estimate.notes, *more_notes],
+        "notes": list(
+            dict.fromkeys(
+                [*said, *requests.acceptance_notes(accepted), *ready.notes, *estimate.notes, *more_notes],
+            )
+        ),
         "accepted": accepted,
         "agreement": None if found.agreement is None else identification.summarise_agreement(found.agreement),
         "validation": [_check(model, one, read, estimate, chosen) for one in unfitted],
