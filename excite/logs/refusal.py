@@ -149,7 +149,7 @@ def wrong_time_unit(t: np.ndarray, machine: Machine) -> str:
         return (
             f"column {machine.time_column}: {len(t)} rows span {format_number(span, 4)} s only, at {rate:g} Hz"
             f" at least {format_number(least / rate, 3)} s are needed: is it in another unit, such as min, h or day?"
-            f" then write time_unit for it in {own_file(machine)}"
+            " Give the time of each row in seconds"
         )
     return ""
 

@@ -43,7 +43,7 @@ SENSOR_PLACE_KEYS = {
 Index = Annotated[int, Field(strict=True, ge=0, le=99)]
 
 # Checks of a log that a sensor can be left out of (`checks_off`), with what each looks for.
-TimeUnit = Literal["s", "ms", "us", "ns", "min", "h", "day"]
+TimeUnit = Literal["s", "ms", "us", "ns", "min", "day"]
 TIME_UNITS = get_args(TimeUnit)
 LOG_CHECKS = {
     "jumps": "a position that goes further in one row than the joint can: an encoder that was reset, counts that wrap",

@@ -53,7 +53,6 @@ UNITS: dict[str, tuple[str, float]] = {
     "us": ("time", 1e-6),
     "ns": ("time", 1e-9),
     "min": ("time", 60.0),
-    "h": ("time", 3600.0),
     "day": ("time", 86400.0),
 }
 
