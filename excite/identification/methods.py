@@ -92,6 +92,8 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     if METHODS[method].optimistic and model.slips and not estimate.doubt:
         doubt = f"slips from real encoders are noisy, and the intervals of {method} are too narrow then: use joint"
         estimate = replace(estimate, doubt=doubt)
+    if (starts := _unknown_starts(model)) and not estimate.doubt:
+        estimate = replace(estimate, doubt=starts)
     estimate = assess(model, repaired, estimate, filter)
     if estimate.share_outside_law is None:
         estimate = replace(estimate, share_outside_law=_share_outside_law(model, repaired, filter, estimate))
@@ -99,6 +101,25 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     unused = unused_sensors(model, method, repaired)
     said = [f"{method} does not use {', '.join(unused)}"] if unused else []
     return add_notes(estimate, *ratios, *said, *(note for e in examined for note in e.notes), *doubts)
+
+
+def _unknown_starts(model: Model) -> str:
+    """Say which joints are measured as a speed only while the equations depend on their position, "" if none."""
+    machine = model.machine
+    angles = [s for s in machine.sensors("full") if s.kind == "angle"]
+    placed = {machine.coordinate(machine.find(s.body)) for s in angles if not s.is_rate}
+    rates = {machine.coordinate(machine.find(s.body)): s for s in angles if s.is_rate}
+    lines = []
+    for coordinate, sensor in rates.items():
+        if coordinate in placed or coordinate not in model.active_coordinates:
+            continue
+        body = machine.find(sensor.body)
+        where, what = body.where.replace("_", " "), "angle" if body.joint == "revolute" else "position"
+        lines.append(
+            f"the start {what} of joint {body.index} ({where}) is unknown and taken as 0: column {sensor.column} is a"
+            f" speed, and the equations depend on the {what}; measure it, or begin every log where it is 0"
+        )
+    return "; ".join(lines)
 
 
 def _share_outside_law(model: Model, logs: Sequence[Log], filter: Filter, estimate: Estimate) -> float | None:

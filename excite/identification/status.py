@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -22,6 +23,15 @@ MIN_TESTED_SHARE = 1e-6  # of a known value's variance that the logs must leave 
 CONTRADICTION_LEVEL = 1e-3  # of that test; chosen
 INERTIAL_INITIALS = "MXYZI"  # of the names of inertial parameters
 NEVER_NEGATIVE = ("M", "XX", "YY", "ZZ")  # standard inertial parameters that no body has below zero
+NEAR_FACTOR = 0.1  # relative deviation from a factor between units; chosen
+MIN_NOMINAL_SHARE = 1e-3  # of the largest nominal value in a unit, below which one is nearly zero; chosen
+# Factor between two units, number of values that must be off by it, and what to ask. Chance alone leaves a value of a
+# roughly written machine file at one of the small factors, hardly two of them.
+UNIT_FACTORS = (
+    (1000.0, 1, "is a column in mm, or in kN, where the machine file says otherwise? check the unit of every sensor"),
+    (180 / math.pi, 2, "is an angle in degrees where the machine file says radians, or the reverse?"),
+    (30 / math.pi, 2, "is a speed in rpm where the machine file says rad/s, or the reverse?"),
+)
 CAUSES = "the sign of a torque or angle column, a unit, or a radius in the machine file"
 
 
@@ -57,6 +67,7 @@ def assess(model: Model, logs: Sequence[Log], estimate: Estimate, filter: Filter
         or together
         or _contradiction(model, estimate)
         or "; ".join(dict.fromkeys(d for one in logs for d in one.doubts))
+        or _unit_suspicion(model, estimate)
     )
     if clear and not doubt:
         doubt = f"values that no machine has: check {CAUSES}"
@@ -90,6 +101,29 @@ def _contradiction(model: Model, estimate: Estimate) -> str:
         f"the log contradicts what the machine file calls known, above all {worst} (p-value {format_p_value(p_value)}):"
         " check that value, or the sensors and lengths that it depends on"
     )
+
+
+def _unit_suspicion(model: Model, estimate: Estimate) -> str:
+    """Say which values are off the machine file's by the factor between two units, "" if none is.
+
+    Values that the file gives as zero, or nearly so among those in the same unit, and offsets say nothing of units.
+    """
+    nominal, names = np.abs(model.nominal), np.array(model.base.names)
+    units = np.array(model.base.units)
+    largest = np.array([nominal[units == unit].max() for unit in units])
+    comparable = np.isfinite(estimate.value) & (nominal > MIN_NOMINAL_SHARE * largest) & (nominal >= model.scale)
+    comparable &= np.abs(model.offsets).sum(axis=0) == 0
+    comparable &= ~np.isin(names, [n for e in model.effects for n in e.parameters])
+    clear = comparable & (np.abs(estimate.value - model.nominal) > CLEAR_STDS * estimate.std)
+    ratio = np.divide(estimate.value, model.nominal, out=np.ones_like(nominal), where=clear)
+    for factor, least, question in UNIT_FACTORS:
+        for one in (factor, 1 / factor):
+            off = names[clear & (np.abs(ratio / one - 1) < NEAR_FACTOR)]
+            if len(off) >= least:
+                times = f"{format_number(factor, 3)} times {'above' if one > 1 else 'below'}"
+                verb = "is" if len(off) == 1 else "are"
+                return f"{', '.join(off.tolist())} {verb} about {times} the machine file's value: {question}"
+    return ""
 
 
 def add_consistent(model: Model, estimate: Estimate) -> Estimate:

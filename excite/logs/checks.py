@@ -16,8 +16,9 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs import clocks, log
+from excite.logs.filtered import derivative, lowpass, too_slow
 from excite.logs.log import Log
-from excite.logs.plausibility import RATES, against, as_speed, is_speed, own_file, rated_speed, unchanging
+from excite.logs.plausibility import RATES, against, as_speed, is_speed, own_file, rated_speed, step_of, unchanging
 from excite.logs.resampling import BRIDGED_STEPS, held_every
 from excite.logs.times import date_and_time, has_time, seconds
 from excite.model.machine import TURN, Machine, Sensor
@@ -50,6 +51,9 @@ MANY = 0.005  # share of a channel's samples that may be repaired; chosen
 FEW = 20  # readings that do not say how fast a channel is; chosen
 SLOWER = 1.5  # times the step of the fastest channel, from which one is slower; chosen
 CUTOFFS = 10.0  # times the filter's cutoff at which a channel follows what the filter passes; chosen
+ROUNDED_FINE = 2.0  # times the machine file's noise that rounding may add; chosen
+DECIMATION_PASS = 0.4  # of the rate after decimation, up to which its filter passes
+COARSE_SHARE = 0.02  # of an acceleration's mean square that may be due to rounding; chosen
 FILTERED = (
     "angle",
     "torque",
@@ -342,6 +346,40 @@ def held(record: Record) -> Iterator[Finding]:
         yield Finding("held", "doubt", c.sensor.name, text)
 
 
+def coarse(record: Record) -> Iterator[Finding]:
+    """Find positions and speeds rounded so coarsely that it spoils their acceleration.
+
+    Rounding to steps adds white noise of step / sqrt(12). Differentiated d times up to the frequency f that the filter
+    and its decimation pass, it has the deviation step / sqrt(12) (2 pi f)^d sqrt(2 f / ((2 d + 1) rate)). Its share of
+    the acceleration's mean square is missing in masses by least squares.
+    """
+    given = record.machine.filter
+    for c in record.of("counts"):
+        rate = 1 / usual_step(c.t)
+        cutoff = min(float(given.cutoff_hz), DECIMATION_PASS * rate / given.decimation)
+        passed = given.model_copy(update={"cutoff_hz": given.cutoff_hz.model_copy(update={"value": cutoff})})
+        if c.sensor.kind not in ("angle", "wheel") or c.sensor.resolution is not None or too_slow(rate, passed):
+            continue
+        step, known = step_of(c.x), max(float(c.sensor.noise or 0.0), float(c.sensor.step or 0.0) / np.sqrt(12))
+        if step / np.sqrt(12) <= ROUNDED_FINE * known or len(c.x) < log.SHORTEST:
+            continue
+        order = 1 if c.sensor.is_rate else 2
+        smooth = lowpass(c.x, rate, passed)
+        for _ in range(order):
+            smooth = derivative(smooth, rate)
+        own = step / np.sqrt(12) * (2 * np.pi * cutoff) ** order * np.sqrt(2 * cutoff / ((2 * order + 1) * rate))
+        total = float(np.mean(smooth**2))
+        share = own**2 / total if total > 0 else 0.0
+        if share > COARSE_SHARE:
+            text = (
+                f"{c.name}: is rounded to steps of {format_number(step, 3)} {record.machine.si_unit(c.sensor)}, whose"
+                f" noise makes about {format_number(100 * min(share, 1.0), 1)} % of its acceleration's mean square, and"
+                f" masses too small: record it finer, or write a lower cutoff_hz under [filter] in"
+                f" {own_file(record.machine)}"
+            )
+            yield Finding("counts", "doubt", c.sensor.name, text)
+
+
 def slow(record: Record) -> Iterator[Finding]:
     """Find channels that are recorded slower than others, and too slow for the filter's cutoff."""
     steps = {c.sensor.name: _own_step(c) for c in record.channels.values() if len(c.x) >= FEW}
@@ -584,6 +622,7 @@ CHECKS: tuple[Callable[[Record], Iterator[Finding]], ...] = (
     spikes,
     dropouts,
     held,
+    coarse,
     slow,
     disagreeing_clocks,
     opposed,

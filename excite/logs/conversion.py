@@ -11,7 +11,7 @@ from excite.logs.log import Log
 from excite.logs.preparation import prepare
 from excite.logs.repair import examine
 from excite.model import Model
-from excite.model.machine import UNITS, Machine, Sensor
+from excite.model.machine import Machine, Sensor
 
 SLOW_SHARE = 0.7  # of its rows that a channel was read in, below which it is a slower one, blank in the others; chosen
 
@@ -33,7 +33,7 @@ def convert(model: Model, path: str | Path, si: bool = False) -> tuple[list[pd.D
 
 def table_from(machine: Machine, log: Log, si: bool = False) -> pd.DataFrame:
     """Build the table of a log; columns as in `convert`."""
-    columns = {"t_s": log.t} if si else {machine.time_column: log.t / UNITS[machine.time_unit][1]}
+    columns = {"t_s": log.t} if si else machine.clocks(log.t)
     for sensor in machine.sensors("full"):
         if sensor.name not in log.values:
             continue

@@ -257,14 +257,21 @@ def lowpass(x: np.ndarray, rate: float, filter: Filter) -> np.ndarray:
 
     Raises LogError for a sampling rate that is too low for the filter.
     """
-    cutoff = float(filter.cutoff_hz)
-    if cutoff >= rate / 2:
-        raise LogError(
-            f"the log is sampled at {rate:g} Hz, and the filter's cutoff_hz = {cutoff:g} needs more than {2 * cutoff:g}"
-            " Hz: write a lower cutoff_hz under [filter] in the machine file"
-        )
-    b, a = scipy.signal.butter(filter.order, cutoff / (rate / 2))
+    if line := too_slow(rate, filter):
+        raise LogError(line)
+    b, a = scipy.signal.butter(filter.order, float(filter.cutoff_hz) / (rate / 2))
     return np.asarray(scipy.signal.filtfilt(b, a, x, padlen=3 * filter.order))
+
+
+def too_slow(rate: float, filter: Filter) -> str:
+    """Return a line for a rate [Hz] of a log that is too low for the filter, "" otherwise."""
+    cutoff = float(filter.cutoff_hz)
+    if cutoff < rate / 2:
+        return ""
+    return (
+        f"the log is sampled at {rate:g} Hz, and the filter's cutoff_hz = {cutoff:g} needs more than {2 * cutoff:g}"
+        " Hz: write a lower cutoff_hz under [filter] in the machine file"
+    )
 
 
 def derivative(x: np.ndarray, rate: float) -> np.ndarray:

@@ -9,6 +9,7 @@ import pandas as pd
 
 from excite.logs import log
 from excite.logs.checks import Record, findings, record_of
+from excite.logs.filtered import too_slow
 from excite.logs.log import Log
 from excite.logs.plausibility import doubts
 from excite.logs.preparation import as_log, at_rate_of, on_one_clock, place_rows
@@ -121,6 +122,7 @@ def inspect(table: pd.DataFrame, machine: Machine | None, source: str = "log") -
         accused = {f.sensor for f in seen if f.kind == "fault"}
         bad = {c for s in machine.sensors("full") for c in s.columns if s.name in accused}
         used = _as_used(table, record, machine, {*bad, *unread}, faults, remarks)
+        faults += [line for own, _, _ in used if (line := too_slow(float(own.sampling_hz), own.filter))]
         for with_rate, one, _ in () if faults else used:
             doubtful += doubts(with_rate, one.values, one.interpolated)
     unknown = [c.name for c in columns if not c.what and c.name not in log.columns_known(machine)]

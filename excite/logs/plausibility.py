@@ -33,6 +33,7 @@ CLEARER = 0.8  # times what is left of the torques otherwise: beyond doubt a spe
 FAST, SLOWLY = 0.95, 0.7  # correlation with another one's speed, of a speed and of what is none
 SEVERAL = 50  # steps that counts are judged by
 STILL = 1e-6  # of a count: no step
+STEP_ROUNDING = 1e-9  # of the largest reading: smaller steps are rounding of the numbers; chosen
 OFF, MOSTLY = 0.1, 0.9  # of a count, and share of the steps, by which steps are whole ones
 ONE = 0.03  # by which the smallest step may differ from one count, as numbers in a file are rounded
 SHARE = 0.1  # of the highest speed: below, dry friction fades
@@ -410,6 +411,16 @@ def _counts(sensor: Sensor, machine: Machine, values: np.ndarray) -> str:
         f"column {sensor.column}: does not move in whole counts of {turn:g} per turn: is it exact, filtered, rounded or"
         " resampled? deviations are stated for counts as they come"
     )
+
+
+def step_of(values: np.ndarray) -> float:
+    """Return the step [SI] in whole numbers of which readings (N,) move, 0 if there is none."""
+    steps = np.abs(np.diff(values))
+    steps = steps[steps > STEP_ROUNDING * float(np.abs(values).max(initial=0.0))]
+    if len(steps) < SEVERAL:
+        return 0.0
+    least = float(np.quantile(steps, 0.01))
+    return least if _whole(steps / least, OFF) else 0.0
 
 
 def _whole(steps: np.ndarray, off: float) -> bool:

@@ -119,7 +119,8 @@ def read_stretches(
     stretches, said = place_rows(accepted.table, machine, needs, name, rate)
     used = {line.partition(" row only")[0] for line in said}  # of held channels the note says how they are used
     doubts = [line for line in accepted.doubts if line.partition(" row only")[0] not in used]
-    doubtful = [replace(stretch, doubts=accepted.grave) for stretch in stretches]
+    grave = tuple(line for line in accepted.grave if line.partition(" row only")[0] not in used)
+    doubtful = [replace(stretch, doubts=grave) for stretch in stretches]
     return doubtful, [*notes, *accepted.notes, *said, *doubts]
 
 
@@ -197,7 +198,7 @@ def merge_own_times(tables: Sequence[pd.DataFrame], machine: Machine, sources: S
     parts = dict[tuple[int, str, str, float], list[str]]()
     for sensor in machine.sensor:
         k = next((k for k, table in enumerate(tables) if set(sensor.columns) <= set(table.columns)), None)
-        clock = None if k is None else _clock(tables[k], machine, sensor, used)
+        clock = None if k is None else _clock(tables[k], machine, sensor, used, sources[k])
         if k is None or clock is None:
             continue
         unit = sensor.time_unit or _unit_in_file(tables[k], clock) or machine.time_unit
@@ -262,8 +263,13 @@ def _refuse_other_scale(spans: dict[str, float]) -> None:
             )
 
 
-def _clock(table: pd.DataFrame, machine: Machine, sensor: Sensor, used: set[str]) -> str | None:
-    """Find the time column of a sensor in its table."""
+def _clock(table: pd.DataFrame, machine: Machine, sensor: Sensor, used: set[str], source: str) -> str | None:
+    """Find the time column of a sensor in its table. Raises LogError where one is named that is not there."""
+    if sensor.time_column is not None and sensor.time_column not in table.columns:
+        raise LogError(
+            f"{source}: no column {sensor.time_column}, which the machine file names as time_column of sensor"
+            f" {sensor.name} (column {sensor.column}): name the column of its times, or take time_column out"
+        )
     for name in (sensor.time_column, machine.time_column):
         if name is not None and name in table.columns:
             return name
@@ -283,7 +289,7 @@ def _joined(sources: Sequence[Source], machine: Machine) -> list[Source]:
     files = [s for s in sources if not isinstance(s, Log)]
     if len(files) < 2:
         return list(sources)
-    needed = {c for s in machine.sensor if s.kind in NEEDED for c in s.columns}
+    needed = {c for s in machine.sensors("full") if s.kind in NEEDED for c in s.columns}
     tables = [s if isinstance(s, pd.DataFrame) else log.table_of(s, machine) for s in files]
     own = [needed & set(table.columns) for table in tables]
     whole = any(columns == needed for columns in own)

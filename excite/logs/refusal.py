@@ -13,19 +13,23 @@ import pandas as pd
 
 from excite.errors import LogError
 from excite.logs import log
-from excite.logs.checks import Finding, findings, record_of, refuse
+from excite.logs.checks import WRONG_RATE, Finding, findings, record_of, refuse
 from excite.logs.files.common import UNITS_UNKNOWN
 from excite.logs.files.layout import known_unit
 from excite.logs.plausibility import own_file
 from excite.logs.repair import mended
 from excite.logs.tables import COMMENTS
 from excite.logs.times import has_time, seconds
-from excite.model.machine import UNITS, Machine
+from excite.model.machine import TIME_UNITS, UNITS, Machine
 from excite.text import format_number
 
 T = TypeVar("T")
 
-GRAVE = ("clocks", "slow")  # checks whose doubts, as those of units, make an estimate doubtful
+GRAVE = (
+    "clocks",
+    "slow",
+    "counts",
+)  # checks whose doubts, as those of units and held positions, make an estimate doubtful
 NO_UNIT = ("-", "1", "n/a", "na", "none", "raw")  # written where a unit would be; compared without case
 PREFIXES = "numkMG"  # of units: nano to giga
 CLOSE = 0.05  # of a unit's size, when a wrong rate of sampling is taken for time in that unit
@@ -73,7 +77,12 @@ def accept(table: pd.DataFrame, machine: Machine, needs: Sequence[str] = (), sou
     differ, unheard = unit_doubts(table, machine)
     units = [f"{source}: {line}" for line in differ]
     notes = (*notes, *(f"{source}: {line}" for line in unheard))
-    grave = [f"{source}: {f.text}" for f in seen if f.kind == "doubt" and f.check in GRAVE]
+    positions = {s.name for s in machine.sensors("full") if s.kind in ("angle", "wheel")}
+    grave = [
+        f"{source}: {f.text}"
+        for f in seen
+        if f.kind == "doubt" and (f.check in GRAVE or (f.check == "held" and f.sensor in positions))
+    ]
     return Accepted(clean, (*notes, *bridged), (*units, *doubtful), (*units, *grave))
 
 
@@ -121,7 +130,7 @@ def wrong_time_unit(t: np.ndarray, machine: Machine) -> str:
     typical, rate = float(np.median(np.diff(t))) if len(t) > 1 else 0.0, float(machine.sampling_hz)
     if typical <= 0:
         return ""
-    for unit in ("s", "ms", "us", "ns", "min", "day"):
+    for unit in TIME_UNITS:
         ratio = UNITS[unit][1] / UNITS[machine.time_unit][1]
         if unit != machine.time_unit and abs(typical * rate * ratio - 1) <= CLOSE:
             line = f'time_unit = "{unit}"'
@@ -129,6 +138,19 @@ def wrong_time_unit(t: np.ndarray, machine: Machine) -> str:
                 f"column {machine.time_column}: sampled at {format_number(1 / typical, 4)} Hz, the machine file says"
                 f" {rate:g} Hz: is it in {unit}? then write {line} in {own_file(machine)}"
             )
+    if typical * rate > WRONG_RATE and 1 / typical <= 2 * float(machine.filter.cutoff_hz):
+        return (
+            f"column {machine.time_column}: rows are {format_number(typical, 4)} s apart"
+            f" ({format_number(1 / typical, 4)} Hz), the machine file has {rate:g} Hz: is it a row number, or in"
+            " another unit? Give the time of each row in seconds"
+        )
+    least, span = log.fewest_rows(machine), float(np.ptp(t))
+    if typical * rate < 1 / WRONG_RATE and span * rate < least <= len(t):
+        return (
+            f"column {machine.time_column}: {len(t)} rows span {format_number(span, 4)} s only, at {rate:g} Hz"
+            f" at least {format_number(least / rate, 3)} s are needed: is it in another unit, such as min, h or day?"
+            " Give the time of each row in seconds"
+        )
     return ""
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from excite.errors import LogError
-from excite.logs.clocks import goes_on, period_of, unrounded
+from excite.logs.clocks import ROUNDED, goes_on, period_of, unrounded
 from excite.logs.times import DAY_S
 from excite.text import count, format_number
 
@@ -78,7 +78,7 @@ def order_rows(
             )
             notes.append(f"{source}: {which}, the copies are left out")
     runs = _split(rows, t, column, source, notes)
-    runs = [_even_ticks(run, column, source, notes) for run in runs]
+    runs = [_even_ticks(run, column, nominal_step, source, notes) for run in runs]
     return [_unrounded(run, known, nominal_step, source, notes) for run in runs], notes
 
 
@@ -110,8 +110,12 @@ def _split(rows: np.ndarray, t: np.ndarray, column: str, source: str, notes: lis
     )
 
 
-def _even_ticks(run: Run, column: str, source: str, notes: list[str]) -> Run:
-    """A run whose times increase strictly: rows that share a tick of a coarse clock are spread evenly along it."""
+def _even_ticks(run: Run, column: str, nominal_step: float, source: str, notes: list[str]) -> Run:
+    """A run whose times increase strictly: rows that share a tick of a coarse clock are spread evenly along it.
+
+    The first and the last tick hold part of their rows only, so the step is that from the first row of the second tick
+    to the first row of the last one, or nominal_step [s] if the ticks allow it.
+    """
     t = run.t
     shared = int((np.diff(t) == 0).sum())
     if not shared:
@@ -128,11 +132,24 @@ def _even_ticks(run: Run, column: str, source: str, notes: list[str]) -> Run:
             f" {count(shared, 'row shares its', 'rows share their')} time with the row before, and rows are not even"
             " along the clock: log a finer time"
         )
+    begin = np.flatnonzero(np.diff(t) > 0) + 1
+    allowed = _ticks_allow(t, begin, tick, nominal_step)
+    if allowed:
+        slope = nominal_step
+    elif len(begin) > 1:
+        slope = float(np.polyfit(begin, t[begin], 1)[0])
+    said = ", as in the machine file, which the ticks allow" if allowed else ""
     notes.append(
         f"{source}: {count(shared, 'row shares its', 'rows share their')} time with the row before: the clock ticks"
-        f" every {format_number(tick, 3)} s, the rows are taken to be {format_number(slope, 4)} s apart"
+        f" every {format_number(tick, 3)} s, the rows are taken to be {format_number(slope, 4)} s apart{said}"
     )
-    return Run(run.rows, start + slope * k)
+    return Run(run.rows, float(np.mean(t - slope * k)) + slope * k)
+
+
+def _ticks_allow(t: np.ndarray, begin: np.ndarray, tick: float, step: float) -> bool:
+    """Tell if rows `step` [s] apart explain times t (N,) [s] in ticks, which begin in rows (M,) within a step each."""
+    off = t - step * np.arange(len(t))
+    return step > 0 and bool(np.ptp(off) <= tick + step and np.ptp(off[begin]) <= ROUNDED * step)
 
 
 def _unrounded(run: Run, positions: np.ndarray, nominal_step: float, source: str, notes: list[str]) -> Run:

@@ -228,6 +228,11 @@ def _judge_estimate(s: Summary, worst_percent: float | None, impossible: Sequenc
     return f"valid, the 95 % intervals hold; every parameter is known to {format_percent(worst_percent)} or better."
 
 
+def validated_log(check: Mapping[str, Any]) -> str:
+    """Name a log for validation, and say if it was fitted itself."""
+    return f"{check['log']}, which was {'fitted itself and validates nothing' if check.get('fitted') else 'not fitted'}"
+
+
 def _describe_validation(check: Mapping[str, Any]) -> str:
     """Compare a log's prediction error with what noise and the parameters' uncertainty make of it."""
     errors = ", ".join(
@@ -235,7 +240,7 @@ def _describe_validation(check: Mapping[str, Any]) -> str:
         f" {check['parameters_percent'][n]:.1f} %)"
         for n, v in check["torque_error_percent"].items()
     )
-    text = f"On {check['log']}, which was not fitted, the torque errors are {errors}"
+    text = f"On {validated_log(check)}, the torque errors are {errors}"
     if not check["outside"]:
         return f"{text}: the rest is within noise and the parameters' uncertainty."
     return f"{text}: more than these explain in {_worst_seconds(check['outside'])}."

@@ -10,6 +10,7 @@ from excite.reports import charts
 from excite.reports.charts import Explorable
 from excite.reports.description import Summary
 from excite.reports.descriptions import describe
+from excite.reports.estimate_descriptions import validated_log
 from excite.reports.html import Picture, report_page
 from excite.text import format_number
 
@@ -153,7 +154,7 @@ def _caption(name: str, summary: Summary) -> str:
     kind, _, number = name.removesuffix(".png").partition("-")
     k = int(number or 1) - 1
     if kind == "validation":
-        return FIT_CAPTION.format(f"{summary['validation'][k]['log']}, which was not fitted")
+        return FIT_CAPTION.format(validated_log(summary["validation"][k]))
     if kind in CAPTIONS_BY_LOG:
         return CAPTIONS_BY_LOG[kind].format(summary["logs"][k])
     return FIT_CAPTION.format(summary["logs"][k]) if kind == "fit" else name

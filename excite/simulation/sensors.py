@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from excite.model import Model, machine
-from excite.model.machine import UNITS, Sensor
+from excite.model.machine import Sensor
 from excite.simulation.integrator import Motion
 
 KITS = ("paper", "full")
@@ -30,7 +30,7 @@ def measure(
         raise ValueError(f"kit: {kit} is unknown, allowed: {', '.join(KITS)}")
     exact = exact_readings(model, motion, X)
     rng = np.random.default_rng([seed, SENSOR_STREAM])
-    columns = {model.machine.time_column: motion.t / UNITS[model.machine.time_unit][1]}
+    columns = model.machine.clocks(motion.t)
     for sensor in model.machine.sensors(kit):
         read = exact[sensor.name]
         if sensor.loop is not None:

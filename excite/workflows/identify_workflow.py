@@ -12,9 +12,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from excite import identification, reports
-from excite.errors import NoEstimateError, NotIdentifiableError, SimulationError
+from excite.errors import LogError, NoEstimateError, NotIdentifiableError, SimulationError
 from excite.identification import FILTERS, Agreement, Estimate, describe_late_channels
-from excite.logs import Log, Prepared, examine, prepare
+from excite.logs import Log, Prepared, examine, moves, prepare
 from excite.model import Model, parameter_descriptions
 from excite.model.machine import Filter
 from excite.reports import Account
@@ -95,6 +95,9 @@ def identify(
     )
     examined = [examine(model.machine, one) for one in others.logs] if others else []
     unfitted = [e.log for e in examined]
+    for one in unfitted:
+        if not moves(model.machine, one):
+            raise LogError(f"{one.source}: nothing moves in it, so it validates nothing: give a log of motion")
     more_notes = [*(others.notes if others else ()), *(line for e in examined for line in (*e.notes, *e.doubts))]
     with bar("identifying"):
         found = identify_from(model, ready.logs, method, filtering)
@@ -135,10 +138,14 @@ def identify_account(
         "unused_sensors": list(identification.unused_sensors(model, estimate.method, read)),
         "unidentifiable": list(estimate.unidentifiable),
         "reasons": dict(estimate.unidentifiable),
-        "notes": [*said, *requests.acceptance_notes(accepted), *ready.notes, *estimate.notes, *more_notes],
+        "notes": list(
+            dict.fromkeys(
+                [*said, *requests.acceptance_notes(accepted), *ready.notes, *estimate.notes, *more_notes],
+            )
+        ),
         "accepted": accepted,
         "agreement": None if found.agreement is None else identification.summarise_agreement(found.agreement),
-        "validation": [_check(model, one, estimate, chosen) for one in unfitted],
+        "validation": [_check(model, one, read, estimate, chosen) for one in unfitted],
         "versions": requests.package_versions(),
     }
     if unloaded is not None:
@@ -204,11 +211,19 @@ def _parameters(estimate: Estimate) -> dict[str, dict[str, Any]]:
     return rows
 
 
-def _check(model: Model, one: Log, estimate: Estimate, chosen: Filter) -> dict[str, Any]:
-    """Predict a log that was not fitted: errors of torques, and of signals by direct simulation."""
+def _is_same(one: Log, other: Log) -> bool:
+    """Tell if two logs have the same readings."""
+    return one.values.keys() == other.values.keys() and all(
+        np.array_equal(x, other.values[name]) for name, x in one.values.items()
+    )
+
+
+def _check(model: Model, one: Log, read: Sequence[Log], estimate: Estimate, chosen: Filter) -> dict[str, Any]:
+    """Predict a log for validation: errors of torques, and of signals by direct simulation. read: logs fitted."""
     torques = identification.validate_torques(model, one, estimate, chosen)
     shown: dict[str, Any] = {
         "log": one.source,
+        "fitted": any(_is_same(one, other) for other in read),
         "torque_error_percent": dict(zip(torques.names, torques.percent, strict=True)),
         "outside": [
             {"signal": name, "from_s": begin, "to_s": end, "ratio": ratio}

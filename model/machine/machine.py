@@ -713,6 +713,15 @@ class Machine(FileRecord):
         """Bodies with a contact."""
         return tuple(b for b in self.body if b.contact)
 
+    def clocks(self, t: np.ndarray) -> dict[str, np.ndarray]:
+        """Return times t (N,) [s] by column, as the log's clock and those of its loggers write them."""
+        columns = {self.time_column: t / units.UNITS[self.time_unit][1]}
+        for s in self.sensors("full"):
+            if s.time_column is not None:
+                own = (t - s.time_offset) / units.UNITS[s.time_unit or self.time_unit][1]
+                columns.setdefault(s.time_column, own)
+        return columns
+
     def sensors(self, kit: str) -> tuple[Sensor, ...]:
         """Return the sensors of a kit, without those of locked coordinates."""
         return tuple(s for s in self.sensor if kit in s.kits and self._visible(s))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from support.commands import Excite
@@ -12,7 +13,7 @@ from support.commands import Excite
 from excite.identification import identify, needed_sensors
 from excite.logs import Log, prepare
 from excite.model import Model
-from excite.simulation import Motion, measure
+from excite.simulation import Motion, measure, simulate
 
 
 @pytest.fixture(scope="module")
@@ -71,3 +72,14 @@ def _deviations(model: Model, tables: list[pd.DataFrame]) -> object:
     ready = prepare(model, tables, needed_sensors(model, "joint"))
     logs: list[Log] = ready.logs
     return identify(ready.model, logs, "joint").std
+
+
+def test_a_value_a_thousand_times_off_leaves_doubt_about_a_unit(emps: Model) -> None:
+    """A position in mm that the machine file calls m leaves the mass a thousandth of the file's."""
+    t = np.arange(4001) / 1000
+    force = 60 * np.sin(2 * np.pi * 1.1 * t) + 40 * np.sin(2 * np.pi * 2.7 * t)
+    table = measure(emps, simulate(emps, force[:, None]), seed=1)
+    for factor, status in ((1.0, "valid"), (1000.0, "doubtful")):
+        ready = prepare(emps, [table.assign(qm=factor * table["qm"])], needed_sensors(emps, "wls"))
+        estimate = identify(ready.model, ready.logs, "wls")
+        assert (estimate.status, "1000 times below the machine file's value" in estimate.doubt) == (status, factor > 1)

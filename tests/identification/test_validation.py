@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
+from support.commands import Excite
 from support.drives import drive
 from support.files import study
 from support.logs import make_log
@@ -16,7 +17,7 @@ from excite.identification import Estimate, compare_torques, identify, methods, 
 from excite.logs import Log, log
 from excite.model import Model, build
 from excite.model.effects import placing
-from excite.simulation import Motion, simulate
+from excite.simulation import Motion, measure, simulate
 
 
 @pytest.fixture(scope="module")
@@ -130,3 +131,26 @@ def test_band_of_smoothed_torques_is_what_other_parameters_predict(straight: Mod
     expected = np.abs(high.predicted - low.predicted) / 2
     error = np.linalg.norm(found.parameters - expected, axis=1) / np.linalg.norm(expected, axis=1)
     assert (error < 0.05).all(), error
+
+
+def test_a_log_that_validates_nothing_is_said(
+    straight: Model, straight_motion: Motion, tmp_path: Path, excite: Excite
+) -> None:
+    """A copy of the log that was fitted is named as such; a rest and row numbers as times are refused."""
+    table = measure(straight, straight_motion, seed=1)
+    rest = table.assign(**{c: 0.0 for c in table.columns if c.endswith("_rad")})
+    logs = {"fitted": table, "copy": table, "rest": rest, "rows": table.assign(t_s=range(len(table)))}
+    for name, one in logs.items():
+        one.to_csv(tmp_path / f"{name}.csv", index=False)
+
+    def validate(name: str) -> tuple[int, str]:
+        files = (tmp_path / "fitted.csv", "--validate", tmp_path / f"{name}.csv")
+        code, out, err = excite("identify", "va12_straight", *files, "--method", "wls", "--out", tmp_path / "out")
+        return code, " ".join((out + err).split())
+
+    code, said = validate("copy")
+    assert code == 0
+    assert "copy.csv, which was fitted itself and validates nothing, the torque errors" in said
+    for name, words in (("rest", "rest.csv: nothing moves in it"), ("rows", "is it a row number")):
+        code, said = validate(name)
+        assert (code, words in said) == (2, True), said

@@ -324,3 +324,16 @@ def test_samples_of_a_group_whose_clock_begins_anew_are_not_mixed(tmp_path: Path
         LogError, match=r"log\.mf4: the times of a go back by 5 s after sample 5: its clock begins anew"
     ):
         merged(tmp_path / "log.mf4", [(np.arange(10) % 5 * 1.25, {"a": np.arange(10.0)}), other])
+
+
+@pytest.mark.parametrize("first", [0, 300], ids=["whole", "part of a tick"])
+@pytest.mark.parametrize("rate", [1000.0, 970.0])
+def test_rows_of_a_clock_in_whole_seconds_are_as_far_apart_as_its_ticks_say(
+    emps: Model, table: pd.DataFrame, first: int, rate: float
+) -> None:
+    """The first and the last tick hold part of their rows; the machine file's rate counts if the ticks allow it."""
+    one = sampled(table, rate).iloc[first:]
+    ready = prepare(emps, [one.assign(t=np.floor(one["t"]))], NEEDS)
+    own = float(ready.model.machine.sampling_hz)
+    assert own == rate if rate == 1000 else abs(own / rate - 1) < 1 / (3 * rate)
+    assert any("which the ticks allow" in note for note in ready.notes) == (rate == 1000)

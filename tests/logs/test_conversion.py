@@ -12,8 +12,9 @@ from support.commands import Excite
 from support.files import SHARED
 
 from excite import identify
+from excite.errors import LogError
 from excite.logs import prepare
-from excite.model import Model
+from excite.model import Model, build
 from excite.simulation import Motion, measure
 
 RACK = SHARED / "rack_and_pinion"
@@ -100,3 +101,25 @@ def test_a_pendulum_is_as_its_builders_describe_it_and_little_else_is_known() ->
         value, std = told[name]
         assert abs(value - true) < 2 * std < 0.4 * true
     assert any("poorly identified" in note for note in found.notes)
+
+
+def test_two_loggers_need_no_sensor_of_a_locked_joint(straight: Model, straight_motion: Motion) -> None:
+    table = measure(straight, straight_motion, seed=2)
+    torques = ["u1_Nm", "u4_Nm"]
+    ready = prepare(straight, [table.drop(columns=torques), table[["t_s", *torques]]], ("theta1", "theta4", "u1", "u4"))
+    (one,) = ready.logs
+    assert {"theta1", "u1"} <= one.values.keys()
+
+
+def test_a_clock_that_is_not_there_is_named(straight: Model, straight_motion: Motion) -> None:
+    """A simulated log has the clocks of all loggers, so one without is of another machine file."""
+    own = tuple(
+        s.model_copy(update={"time_column": "t_drive", "time_offset": 0.5}) if s.name == "u1" else s
+        for s in straight.machine.sensor
+    )
+    model = build(straight.machine.model_copy(update={"sensor": own}))
+    table = measure(model, straight_motion, seed=2)
+    (one,) = prepare(model, [table]).logs
+    assert len(one) == len(table)
+    with pytest.raises(LogError, match="no column t_drive, which the machine file names as time_column of sensor u1 "):
+        prepare(model, [table.drop(columns="t_drive")])

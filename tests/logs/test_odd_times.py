@@ -23,10 +23,38 @@ def identify(excite: Excite, tmp_path: Path, table: pd.DataFrame, machine: str |
     return code, err
 
 
+def said_by_log_check(excite: Excite, tmp_path: Path) -> str:
+    code, out, err = excite("log", "check", tmp_path / "log.csv", "--machine", "emps", "--out", tmp_path / "out")
+    assert code == 1
+    return " ".join((out + err).split())
+
+
 def test_rate_too_low_for_the_filter_is_said(excite: Excite, tmp_path: Path) -> None:
     code, err = identify(excite, tmp_path, rig_log()[::10])
     assert code == 2
-    assert "sampled at 100 Hz, and the filter's cutoff_hz = 100 needs more than 200 Hz" in " ".join(err.split())
+    words = "sampled at 100 Hz, and the filter's cutoff_hz = 100 needs more than 200 Hz"
+    assert words in " ".join(err.split())
+    assert words in said_by_log_check(excite, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("per_second", "words"),
+    [
+        (
+            1000 / 1.7,
+            "rows are 0.5882 s apart (1.7 Hz), the machine file has 1000 Hz: is it a row number",
+        ),
+        (1 / 3600, "3000 rows span 0.0008331 s only"),
+        (1 / 604800, "3000 rows span 4.959e-06 s only"),
+    ],
+    ids=["row number", "hours", "weeks"],
+)
+def test_numbers_that_are_no_seconds_are_said(excite: Excite, tmp_path: Path, per_second: float, words: str) -> None:
+    table = rig_log()
+    code, err = identify(excite, tmp_path, table.assign(t=table["t"] * per_second))
+    assert code == 2
+    assert words in " ".join(err.split())
+    assert words in said_by_log_check(excite, tmp_path)
 
 
 def test_first_time_that_is_blank_is_named(excite: Excite, tmp_path: Path) -> None:

@@ -16,12 +16,12 @@ from support.logs import make_log
 
 from excite import diagnosis, workflows
 from excite.errors import NoEstimateError
-from excite.identification import methods
-from excite.logs import Log, log, plausibility
+from excite.identification import identify, methods
+from excite.logs import Log, log, plausibility, prepare
 from excite.model import Model, prediction
 from excite.model.effects import placing
 from excite.model.machine import machine
-from excite.simulation import Motion, follow, sensors, simulate
+from excite.simulation import Motion, follow, measure, sensors, simulate
 from excite.smoothing import NotConvergedError
 
 T = np.arange(4001) / 100
@@ -237,3 +237,28 @@ def test_a_dead_channel_is_named_where_no_estimate_is_found(va12: Model, va12_mo
     dead = Log("dead", one.t, one.values | {name: np.full(len(one), one.values[name][0])})
     with pytest.raises(NoEstimateError, match=rf"{name}_\w+: never changes \(.*is the sensor connected"):
         methods.identify(va12, [dead], "joint")
+
+
+def test_a_position_that_is_rounded_coarsely_is_a_doubt(emps: Model) -> None:
+    """Its noise makes the mass too small; a noise in the machine file as large says that it is known."""
+    t = np.arange(6001) / 1000
+    force = 60 * np.sin(2 * np.pi * 1.1 * t) + 40 * np.sin(2 * np.pi * 2.7 * t)
+    table = measure(emps, simulate(emps, force[:, None]), seed=1)
+    for step, status in ((1e-6, "valid"), (5e-4, "doubtful")):
+        ready = prepare(emps, [table.assign(qm=step * np.round(table["qm"] / step))], ("q1", "u1"))
+        estimate = identify(ready.model, ready.logs, "wls")
+        assert estimate.status == status
+        assert (f"column qm: is rounded to steps of {step:g} m" in estimate.doubt) == (status == "doubtful")
+
+
+def test_a_counted_angle_that_is_held_is_a_doubt_said_once(
+    straight: Model, straight_motion: Motion, tmp_path: Path, excite: Excite
+) -> None:
+    table = measure(straight, straight_motion, seed=1)
+    held = table["theta1_rad"].to_numpy()[np.arange(len(table)) // 2 * 2]
+    table.assign(theta1_rad=held).to_csv(tmp_path / "log.csv", index=False)
+    code, _, _ = excite("identify", "va12_straight", tmp_path / "log.csv", "--method", "wls", "--out", tmp_path / "out")
+    assert code == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["status"] == "doubtful"
+    assert sum("changes in every second row only" in note for note in summary["notes"]) == 1
