@@ -117,6 +117,7 @@ def diagnose_torques(
     before = TorqueFit(model, rows, solution.kept, lowest, [])
     search = Search(model, rows, filter, identification.fit_rows(model, blocks, solution))
     after, reasons = search.extend(before, report, deadline)
+    after = _largest_first(before, after)
     between = [before.with_terms(after.terms[:k]) for k in range(1, len(after.terms))]
     stages = [before, *between, after] if after.terms else [before]
     withheld = [stage.hold_out(before)[1] for stage in stages]
@@ -147,6 +148,13 @@ def _require_rows(model: Model, rows: Sequence[TorqueRows]) -> None:
                 f"{rows[0].log.source}: {count} filtered rows with {body.where} in motion are too few to explain its"
                 f" torque (at least {MIN_ROWS}): record a longer log, or reduce the filter's decimation"
             )
+
+
+def _largest_first(before: TorqueFit, after: TorqueFit) -> TorqueFit:
+    """Order the effects by what each takes alone."""
+    if len(after.terms) < 2:
+        return after
+    return after.with_terms(sorted(after.terms, key=lambda term: _excess(before.with_terms([term]))))
 
 
 def _excess(fit: TorqueFit) -> float:

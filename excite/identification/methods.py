@@ -12,6 +12,7 @@ import numpy as np
 from excite.errors import MachineError, NoEstimateError, NotIdentifiableError
 from excite.identification import bias
 from excite.identification.bias import Estimator
+from excite.identification.encoder_errors import correct_angles, is_encoder_error
 from excite.identification.estimate import Estimate, add_notes, held_note
 from excite.identification.identifiability import add_advice
 from excite.identification.instrumental_variables import iv
@@ -66,6 +67,8 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     _require_method_for_effects(model, method)
     examined = [examine(model.machine, log) for log in logs]
     repaired, filter = [e.log for e in examined], filter or model.machine.filter
+    if METHODS[method].effects == "linear":
+        repaired = [correct_angles(model, log, filter) for log in repaired]
     if not any(v.any() for log in repaired for v in log.values.values()):
         raise NotIdentifiableError(f"{repaired[0].source}: every signal is zero: is the log empty of measurements?")
     angles = [s for s in model.machine.sensors("full") if s.kind == "angle"]
@@ -89,6 +92,8 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
                 f"{repaired[0].source}: the equations of {method} are singular along this log: check the sign and unit"
                 " of every column, and that the machine moves"
             ) from None
+    if METHODS[method].effects == "linear":
+        estimate = _with_known_encoder_errors(model, estimate)
     if METHODS[method].optimistic and model.slips and not estimate.doubt:
         doubt = f"slips from real encoders are noisy, and the intervals of {method} are too narrow then: use joint"
         estimate = replace(estimate, doubt=doubt)
@@ -101,6 +106,15 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     unused = unused_sensors(model, method, repaired)
     said = [f"{method} does not use {', '.join(unused)}"] if unused else []
     return add_notes(estimate, *ratios, *said, *(note for e in examined for note in e.notes), *doubts)
+
+
+def _with_known_encoder_errors(model: Model, estimate: Estimate) -> Estimate:
+    """Say of encoders' errors that they are the machine file's."""
+    names = {e.name for e in model.effects if is_encoder_error(model, e)} & estimate.unidentifiable.keys()
+    reason = (
+        f"{estimate.method} takes the machine file's value, by which the readings are corrected; joint estimates it"
+    )
+    return replace(estimate, unidentifiable={**estimate.unidentifiable, **dict.fromkeys(names, reason)})
 
 
 def _unknown_starts(model: Model) -> str:
@@ -179,7 +193,7 @@ def require_sensors(model: Model, method: str = "joint") -> None:
 
 
 def _require_method_for_effects(model: Model, method: str) -> None:
-    """Raise MachineError if a method cannot estimate the machine's effects."""
+    """Raise MachineError if a method cannot estimate the machine's effects; errors of encoders are corrected."""
     supported = METHODS[method].effects
     if model.plain or supported == "any":
         return
@@ -187,7 +201,7 @@ def _require_method_for_effects(model: Model, method: str) -> None:
     if supported == "none":
         raise MachineError(f"{machine}: effect: method {method} doesn't know effects, use {others}")
     for e in model.effects:
-        if e.name in model.nonlinear or e.effect.sensor_only:
+        if e.name in model.nonlinear or (e.effect.sensor_only and not is_encoder_error(model, e)):
             raise MachineError(
                 f"{machine}: effect {e.name}: least squares cannot find it, as the equations of motion are not linear"
                 " in its magnitude: use joint"
