@@ -69,11 +69,13 @@ VA12 = machine.load_machine("va12")
 
 
 TWO_JOINTS = str(Path(__file__).parents[1] / "support" / "two_joints.toml")
-OF_ROLLER = {name: e for name, e in CATALOGUE.items() if placing.allowed_places(VA12, e)}
 
 
 def where(effect: Effect) -> str:
-    return next(iter(placing.allowed_places(VA12, effect)))
+    places = placing.allowed_places(VA12, effect)
+    if not places:
+        pytest.skip(f"{effect.name} has no place on a roller; it has tests of its own")
+    return next(iter(places))
 
 
 def typical(effect: Effect) -> float:
@@ -192,7 +194,7 @@ def test_effects_have_places_at_every_joint_where_they_make_sense(emps: Model) -
         assert placing.allowed_places(emps.machine, CATALOGUE[name])
     for name in ("encoder_eccentricity", "torque_ripple"):  # a slide has no turns
         assert not placing.allowed_places(emps.machine, CATALOGUE[name])
-    assert "link_length" not in OF_ROLLER
+    assert not placing.allowed_places(VA12, CATALOGUE["link_length"])
 
 
 def test_a_torque_map_is_a_table_between_its_nodes(va12: Model) -> None:
@@ -401,7 +403,7 @@ def forms(effect: Effect) -> list[dict[str, float]]:
     return list(found.values())
 
 
-@pytest.mark.parametrize("effect", OF_ROLLER.values(), ids=list(OF_ROLLER))
+@pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
 def test_what_an_effect_predicts_is_what_it_does(effect: Effect) -> None:
     """Forward dynamics put into the prediction give the torques that the sensors read, and the regressor is the exact
     slope of the prediction, by differences."""
@@ -462,7 +464,7 @@ def test_an_effect_has_the_parameters_and_the_memory_of_its_form(effect: Effect,
     assert bool(model.map_inputs) == has(effect.map_form)
 
 
-@pytest.mark.parametrize("effect", OF_ROLLER.values(), ids=list(OF_ROLLER))
+@pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
 def test_an_effect_of_no_size_changes_nothing(effect: Effect, va12: Model) -> None:
     """A motion of a few seconds, and what all sensors read of it: as without; with a typical amount it differs."""
     t = np.arange(400) / 100
@@ -488,7 +490,7 @@ WITHIN = {"vibration_on": {"begin": 1.0, "length": 2.0, "shake": 0.0}, "brake_dr
 FAR = ("payload_shift", "articulation_stop_spring", "relief_valve")
 
 
-@pytest.mark.parametrize("effect", OF_ROLLER.values(), ids=list(OF_ROLLER))
+@pytest.mark.parametrize("effect", CATALOGUE.values(), ids=list(CATALOGUE))
 def test_a_signature_is_what_the_extended_model_has_more(effect: Effect, va12: Model) -> None:
     """The force of a signature is the difference of the two balances, and so is its reading."""
     for shapes in forms(effect):
