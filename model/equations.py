@@ -466,16 +466,15 @@ def _effect_force(s: SymbolicSample, e: ActiveEffect, inertia: Mapping[int, ca.S
 def _level_axes(machine: Machine) -> ca.DM:
     """Return two level axes (3, 2) of the ground: x and y of a machine on a plane, else those across gravity.
 
-    The first one lies in the plane across the first joint, as far as it can.
+    The first one is x of the ground as far as that is level, y where x is upright.
     """
     if machine.planar or not any(machine.gravity):
         return ca.DM([[1, 0], [0, 1], [0, 0]])
     down = np.array(machine.gravity) / np.linalg.norm(machine.gravity)
-    first = np.array([0.0, 0.0, 1.0])  # axis of the ground frame
-    first = np.cross(down, first) if abs(down[2]) < 1 / np.sqrt(2) else np.array([1.0, 0.0, 0.0])
-    first -= down * (down @ first)
+    first = np.eye(3)[int(abs(down[0]) > abs(down[1]) and abs(down[0]) > abs(down[2]))]
+    first = first - down * (down @ first)
     first /= np.linalg.norm(first)
-    return ca.DM(np.column_stack([first, np.cross(down, first)]))
+    return ca.DM(np.column_stack([first, np.cross(first, down)]))
 
 
 def _recoil_force(s: SymbolicSample, e: ActiveEffect, change: Mapping[str, ca.SX]) -> ca.SX:

@@ -413,7 +413,7 @@ def format_magnitude(row: Mapping[str, Any]) -> str:
     text = format_uncertain(amount, std, row["unit"])
     if file_value is None:
         return text
-    return f"{text} ({format_rounded(file_value + amount, std)}, the machine file has {file_value:g} {row['unit']})"
+    return f"{text} ({format_rounded(file_value + amount, std)}, by the machine file {file_value:g} {row['unit']})"
 
 
 def answer_text(a: Assessment) -> str:

@@ -357,11 +357,9 @@ def _make_choice(trials: Sequence[_Trial], gain: float, n_candidates: int, runne
     Trials that tie only with process noise are rivals, too. A trial that makes parameters impossible gives way to one
     that does not, and is no rival of it.
     """
-    dispersion, with_noise = (
-        trials[0][1].dispersion,
-        {s.candidate.name: stage for s, stage in trials if not stage.exact},
-    )
-    ties, lowest = _tied_trials(trials, gain), trials[0][1].deviance
+    dispersion = trials[0][1].dispersion
+    with_noise = {s.candidate.name: stage for s, stage in trials if not stage.exact}
+    ties, lowest = _tied_trials(trials, gain), min(x.deviance for _, x in trials)
     names = {s.candidate.name for s, _ in ties}
     # Process noise hides how well effects explain the logs: all are compared without it.
     exact, unknown = _trials_without_noise(trials if with_noise else ties, runner)
@@ -544,6 +542,8 @@ def _required_gain(
     least = max(MAX_FORMULA_SHARE * candidate.placed.effect.timed, share_with_noise * (not stage.exact))
     shares = [max(least, min(FORMULA_ERROR**2 / x.unabsorbed_share, MAX_FORMULA_SHARE)) for x in chosen]
     formulas = sum(share * x.likelihood_ratio for share, x in zip(shares, chosen, strict=True))
+    rough = ((x.likelihood_ratio, x.stage.placed(x.name).effect.formula_error) for x in chosen)
+    formulas = max(formulas, sum(min(error**2 * ratio, MAX_FORMULA_RATIO) for ratio, error in rough))
     main = not stage.is_close if chosen else _noise_hides_misfit(stage)
     explained = MIN_EXCESS_SHARE_OF_FIRST if main else MIN_EXCESS_SHARE[stage.first_order_is_rough]
     wald = sum(wald_statistic(e.name, stage) for e in stage.model.effects if not e.effect.inverse)
@@ -692,7 +692,7 @@ def _is_effective(name: str, stage: ExtendedFit) -> bool:
 
 
 def _best_variants(trials: Sequence[_Trial]) -> list[_Trial]:
-    """Return the best variant of each name, best first: least process noise, then least deviance."""
+    """Return the best variant of each name, best first: least process noise, then least information."""
     best: dict[str, _Trial] = {}
     for x in sorted(trials, key=lambda x: (x[1].fit.process_noise, _information(x))):
         best.setdefault(x[0].candidate.name, x)
@@ -716,11 +716,13 @@ def _tied_trials(trials: Sequence[_Trial], gain: float) -> list[_Trial]:
     margin = max(TIE_LIKELIHOOD_RATIO * best.dispersion, TIE_EXCESS_SHARE * best.excess_cost, share * gain)
     if best.exact and not score.candidate.placed.effect.inverse:  # with process noise it gains less than without
         margin = max(margin, _formula_ratio(wald_statistic(score.candidate.name, best)))
-    rough = {x[0].candidate.name: x[0].candidate.placed.effect.formula_error ** 2 * gain for x in trials}
-    least = rough[score.candidate.name]
-    return [
-        x for x in trials if _information(x) - _information(trials[0]) < max(margin, least, rough[x[0].candidate.name])
-    ]
+    lowest = _information(trials[0])
+
+    def ties(trial: _Trial) -> bool:
+        rough = max(x.candidate.placed.effect.formula_error for x in (score, trial[0]))
+        return _information(trial) - lowest < max(margin, rough**2 * gain)
+
+    return [x for x in trials if ties(x)]
 
 
 def _without_needless_magnitudes(trials: Sequence[_Trial]) -> list[_Trial]:

@@ -186,7 +186,7 @@ class TorqueFit:
         robust = bread @ meat @ bread
         grow = np.sqrt(np.maximum(np.diag(robust) / np.maximum(np.diag(white), 1e-300), 1.0))
         scale = np.outer(size, size)
-        return np.divide(white * np.outer(grow, grow), scale, out=np.zeros_like(scale), where=scale > 0)
+        return np.divide(white * np.outer(grow, grow), scale, out=np.full_like(scale, np.inf), where=scale > 0)
 
     def columns_of(self, term: Term) -> slice:
         """Columns of a term in the design."""
@@ -200,7 +200,7 @@ class TorqueFit:
         return float(self.x[k]), float(np.hypot(np.sqrt(self.covariance[k, k]), self.x[k] - self.whitened_x[k]))
 
     def shape_stds(self, term: Term) -> dict[str, float]:
-        """Standard deviations of a term's free shapes, relative to their values; 0 for one that shows nowhere."""
+        """Standard deviations of a term's free shapes, relative to their values; inf for one that shows nowhere."""
         k = self.terms.index(term)
         first = self.design[0].shape[2] + sum(len(t.free) for t in self.terms[:k])
         return {n: float(np.sqrt(self.covariance[first + i, first + i])) for i, n in enumerate(term.free)}

@@ -97,20 +97,17 @@ def effect_columns(
 
 def _readings(model: Model, r: TorqueRows) -> np.ndarray:
     """Return what the sensors read that are not of torque (n_sensors, N), zero for one that the log lacks."""
-    names = [s.name for s in model.machine.sensors("full") if s.kind != "torque"]
-    return np.array([r.log.values.get(name, np.zeros(len(r.t))) for name in names]).reshape(len(names), len(r.t))
+    read = [r.log.values.get(name, np.zeros(len(r.t))) for name in model.reading_names]
+    return np.array(read).reshape(len(read), len(r.t))
 
 
 def _torque_of_angle_error(model: Model, r: TorqueRows, error: np.ndarray, X: np.ndarray, filter: Filter) -> np.ndarray:
-    """Return what the true motion needs more (n_rows, n) than the measured one, to first order.
+    """Return the torques [N m, N] that the true motion needs more (n_rows, n) than the measured one, to first order.
 
     error (n_sensors, N): of the sensors that are not of torque. It is filtered as the readings are.
     """
-    none = np.zeros(len(r.t))
-    sensors = [s for s in model.machine.sensors("full") if s.kind != "torque" and s.name in r.log.values]
-    at = [s.name for s in model.machine.sensors("full") if s.kind != "torque"]
-    values = {s.name: error[at.index(s.name)] for s in sensors}
-    values |= {s.name: none for s in model.machine.sensors("full") if s.kind == "torque"}
+    off_by = dict(zip(model.reading_names, error, strict=True))
+    values = {name: off_by.get(name, np.zeros(len(r.t))) for name in r.log.values}  # none in torques
     off = samples(model, Log("", r.t, values), filter)
     first, last = filter.drop[0], len(r.t) - filter.drop[1]
     moved = [decimate(x[:, first:last], filter.decimation) for x in (off.q, off.nu, off.a)]

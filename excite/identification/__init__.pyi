@@ -31,6 +31,7 @@ from .linear_methods import (
 from .methods import (
     METHODS as METHODS,
     add_bias as add_bias,
+    corrected_logs as corrected_logs,
     identify as identify,
     needed_sensors as needed_sensors,
     recommend_method as recommend_method,

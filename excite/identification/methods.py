@@ -67,8 +67,7 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     _require_method_for_effects(model, method)
     examined = [examine(model.machine, log) for log in logs]
     repaired, filter = [e.log for e in examined], filter or model.machine.filter
-    if METHODS[method].effects == "linear":
-        repaired = [correct_angles(model, log, filter) for log in repaired]
+    repaired = corrected_logs(model, repaired, method, filter)
     if not any(v.any() for log in repaired for v in log.values.values()):
         raise NotIdentifiableError(f"{repaired[0].source}: every signal is zero: is the log empty of measurements?")
     angles = [s for s in model.machine.sensors("full") if s.kind == "angle"]
@@ -97,8 +96,8 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     if METHODS[method].optimistic and model.slips and not estimate.doubt:
         doubt = f"slips from real encoders are noisy, and the intervals of {method} are too narrow then: use joint"
         estimate = replace(estimate, doubt=doubt)
-    if (starts := _unknown_starts(model)) and not estimate.doubt:
-        estimate = replace(estimate, doubt=starts)
+    if starts := _unknown_starts(model):
+        estimate = add_notes(estimate, starts) if estimate.doubt else replace(estimate, doubt=starts)
     estimate = assess(model, repaired, estimate, filter)
     if estimate.share_outside_law is None:
         estimate = replace(estimate, share_outside_law=_share_outside_law(model, repaired, filter, estimate))
@@ -108,9 +107,15 @@ def identify(model: Model, logs: Sequence[Log], method: str = "ols", filter: Fil
     return add_notes(estimate, *ratios, *said, *(note for e in examined for note in e.notes), *doubts)
 
 
+def corrected_logs(model: Model, logs: Sequence[Log], method: str, filter: Filter) -> list[Log]:
+    """Return the logs as a method takes them: without the encoder errors of the machine file, unless it knows these."""
+    return [correct_angles(model, log, filter) for log in logs] if METHODS[method].effects == "linear" else list(logs)
+
+
 def _with_known_encoder_errors(model: Model, estimate: Estimate) -> Estimate:
     """Say of encoders' errors that they are the machine file's."""
-    names = {e.name for e in model.effects if is_encoder_error(model, e)} & estimate.unidentifiable.keys()
+    own = (n for e in model.effects if is_encoder_error(model, e) for n in e.parameters)
+    names = set(own) & estimate.unidentifiable.keys()
     reason = (
         f"{estimate.method} takes the machine file's value, by which the readings are corrected; joint estimates it"
     )
@@ -131,7 +136,7 @@ def _unknown_starts(model: Model) -> str:
         where, what = body.where.replace("_", " "), "angle" if body.joint == "revolute" else "position"
         lines.append(
             f"the start {what} of joint {body.index} ({where}) is unknown and taken as 0: column {sensor.column} is a"
-            f" speed, and the equations depend on the {what}; measure it, or begin every log where it is 0"
+            f" speed, and the equations depend on the {what}; measure it, or be sure that logs begin at 0"
         )
     return "; ".join(lines)
 

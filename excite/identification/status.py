@@ -23,14 +23,18 @@ MIN_TESTED_SHARE = 1e-6  # of a known value's variance that the logs must leave 
 CONTRADICTION_LEVEL = 1e-3  # of that test; chosen
 INERTIAL_INITIALS = "MXYZI"  # of the names of inertial parameters
 NEVER_NEGATIVE = ("M", "XX", "YY", "ZZ")  # standard inertial parameters that no body has below zero
-NEAR_FACTOR = 0.1  # relative deviation from a factor between units; chosen
 MIN_NOMINAL_SHARE = 1e-3  # of the largest nominal value in a unit, below which one is nearly zero; chosen
-# Factor between two units, number of values that must be off by it, and what to ask. Chance alone leaves a value of a
-# roughly written machine file at one of the small factors, hardly two of them.
+# Factor between two units, number of values that must be off by it, relative deviation from it, and what to ask. Chance
+# alone leaves a value of a roughly written machine file at one of the small factors, hardly two of them; chosen.
 UNIT_FACTORS = (
-    (1000.0, 1, "is a column in mm, or in kN, where the machine file says otherwise? check the unit of every sensor"),
-    (180 / math.pi, 2, "is an angle in degrees where the machine file says radians, or the reverse?"),
-    (30 / math.pi, 2, "is a speed in rpm where the machine file says rad/s, or the reverse?"),
+    (
+        1000.0,
+        1,
+        0.1,
+        "is a column in mm, or in kN, where the machine file says otherwise? check the sensors' units",
+    ),
+    (180 / math.pi, 2, 0.1, "is an angle in degrees where the machine file says radians, or the reverse?"),
+    (30 / math.pi, 2, 0.03, "is a speed in rpm where the machine file says rad/s, or the reverse?"),
 )
 CAUSES = "the sign of a torque or angle column, a unit, or a radius in the machine file"
 
@@ -116,9 +120,10 @@ def _unit_suspicion(model: Model, estimate: Estimate) -> str:
     comparable &= ~np.isin(names, [n for e in model.effects for n in e.parameters])
     clear = comparable & (np.abs(estimate.value - model.nominal) > CLEAR_STDS * estimate.std)
     ratio = np.divide(estimate.value, model.nominal, out=np.ones_like(nominal), where=clear)
-    for factor, least, question in UNIT_FACTORS:
+    turns = any(b.joint == "revolute" for b in model.machine.body)
+    for factor, least, tolerance, question in UNIT_FACTORS if turns else UNIT_FACTORS[:1]:
         for one in (factor, 1 / factor):
-            off = names[clear & (np.abs(ratio / one - 1) < NEAR_FACTOR)]
+            off = names[clear & (np.abs(ratio / one - 1) < tolerance)]
             if len(off) >= least:
                 times = f"{format_number(factor, 3)} times {'above' if one > 1 else 'below'}"
                 verb = "is" if len(off) == 1 else "are"

@@ -196,7 +196,7 @@ def merge_own_times(tables: Sequence[pd.DataFrame], machine: Machine, sources: S
     """
     used = {c for s in machine.sensor for c in s.columns}
     parts = dict[tuple[int, str, str, float], list[str]]()
-    for sensor in machine.sensor:
+    for sensor in machine.sensors("full"):
         k = next((k for k, table in enumerate(tables) if set(sensor.columns) <= set(table.columns)), None)
         clock = None if k is None else _clock(tables[k], machine, sensor, used, sources[k])
         if k is None or clock is None:

@@ -63,6 +63,7 @@ def identify_from(model: Model, logs: Sequence[Log], method: str, filtering: str
     first = (reason,) if reason else ()
     notes = (*first, *estimate.notes, *identification.far_from_nominal(model, estimate), *late)
     estimate = identification.add_consistent(model, replace(estimate, notes=notes))
+    used = identification.corrected_logs(model, used, method, chosen)
     return IdentifyResult(estimate, used, chosen, agreement)
 
 
@@ -101,6 +102,7 @@ def identify(
     more_notes = [*(others.notes if others else ()), *(line for e in examined for line in (*e.notes, *e.doubts))]
     with bar("identifying"):
         found = identify_from(model, ready.logs, method, filtering)
+    unfitted = identification.corrected_logs(model, unfitted, method, found.filter)
     return identify_account(as_in_file, ready, found, unfitted, more_notes, before, accepted).write(place)
 
 

@@ -219,6 +219,7 @@ _declare(
             )
         },
         grid=(0.25, 1.0),
+        formula_error=0.15,  # bristle models differ by that much
         positive=True,
         torque=friction.presliding,
         unsticking=True,
@@ -615,7 +616,8 @@ _declare(
         ("machine",),
         "rad",
         "gravity along a fixed direction of the ground; `direction` points downhill, from x0 on, or from the"
-        " first heading where no x0 is; of an arm, its base stands off level",
+        " first heading where no x0 is; of an arm, its base stands off level, downhill from x of the ground on (y where"
+        " x is upright)",
         "a force that keeps its direction on the ground while the machine turns and reverses",
         "statics of an inclined plane",
         sizes.constant(0.005),

@@ -57,7 +57,7 @@ def allowed_places(machine: Machine, effect: Effect) -> dict[str, tuple[tuple[in
     if effect.angle_only:
         found = {w: at for w, at in found.items() if at[1]}
     if any(shape.circular for shape in effect.shapes.values()):  # a phase has no meaning at a sliding joint
-        found = {w: at for w, at in found.items() if not is_straight(machine, at[0])}
+        found = {w: at for w, at in found.items() if w == "machine" or not is_straight(machine, at[0])}
     return found
 
 
@@ -71,7 +71,8 @@ def _has_place(machine: Machine, effect: Effect) -> bool:
     """Tell if an effect on the machine as a whole has a place on it."""
     if machine.planar:
         return effect.gravity is not None or payload_body(machine) is not None
-    return effect.gravity is not None and any(machine.gravity) and not machine.contacts
+    turns = any(b.joint == "revolute" for b in machine.body)  # along a slide, gravity is an offset
+    return effect.gravity is not None and any(machine.gravity) and not machine.contacts and turns
 
 
 def _angle_sensor(sensors: Sequence[Sensor], body: Body) -> tuple[str, ...]:
