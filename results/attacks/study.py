@@ -175,8 +175,8 @@ rebuilds this page; program version {s["program"]}. All cases are in [summary.js
 """
 
 
-def report(rows: Sequence[Row], planned: int, program: str, out: Path, command: str) -> None:
-    s = summary(rows, planned, program)
+def report(rows: Sequence[Row], planned: int, program: str, out: Path, command: str, first: int) -> None:
+    s = studies.origin(__file__, first) | summary(rows, planned, program)
     (out / "summary.json").write_text(json.dumps(s, indent=1, default=float) + "\n")
     (out / "README.md").write_text(readme(s, command))
 
@@ -208,7 +208,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     options = f"--per-attack {given.per_attack} --first {given.first} --out results/attacks"
     if set(given.only) != set(KINDS):
         options += f" --only {' '.join(given.only)}"
-    report(rows, len(wanted), program, given.out, f"python results/attacks/study.py {options}")
+    report(rows, len(wanted), program, given.out, f"python results/attacks/study.py {options}", given.first)
     print(f"{given.out / 'summary.json'}: {summary(rows, len(wanted), program)['all']}")
 
 

@@ -309,7 +309,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         shown = ("key", "visibility", "amount", "manoeuvre", "duration_s", "kit", "outcome", "named", "error", "wall_s")
         print(pd.DataFrame(rows).reindex(columns=shown).to_string(index=False))
         return
-    s = summary(rows)
+    s = studies.origin(__file__, 0) | summary(rows)
     flat = pd.DataFrame(rows).drop(columns=["findings", "located"], errors="ignore")
     for column in ("hidden", "amount"):
         flat[column] = [" ".join(map(str, values)) for values in flat[column]]

@@ -353,7 +353,7 @@ def gyro_lag(t: Trial, size: float, draw: Draw) -> Key:
     late = s.state()
     s.rates[late] = (s.qd[2] - late) / (0.4 * size)
     s.read["yaw_rate_rad_s"] = late
-    return Key()
+    return Key((("yaw_rate_lag@yaw_rate",),))
 
 
 def double_stribeck(t: Trial, size: float, draw: Draw) -> Key:
