@@ -202,7 +202,8 @@ class Search:
         sine, cosine = np.linalg.lstsq(C, fit.innovations, rcond=None)[0]
         values = {**x.candidate.placed.values, phase: float(np.arctan2(cosine, sine))}
         turned = replace(both[0], placed=replace(both[0].placed, values=values))
-        return self.test(fit, [turned], self._columns([turned.placed]))[0]
+        (other,) = self.test(fit, [turned], self._columns([turned.placed]))
+        return other if other.chi2 > x.chi2 else x
 
     def finalists(self, fit: TorqueFit) -> list[Tested]:
         """Return the likeliest candidate of each name, with refined shapes, the likeliest first."""

@@ -353,7 +353,7 @@ def _levels(rim: np.ndarray, Vx: np.ndarray, Vy: np.ndarray, values: Mapping[str
     speed = np.hypot(Vx, Vy)
     slip = (rim - speed) / np.maximum(np.maximum(np.abs(rim), speed), 1e-12)
     load = values.get("load", np.ones(len(slip)))
-    load = load / np.mean(load)
+    load = load / (np.abs(load).mean() or 1.0)
     by_slip, by_load, by_angle = _spaced(slip), _chained(load, SAME_LOAD), _chained(angle, SAME_ANGLE)
     if not 4 <= by_slip.max() + 1 <= SWEEP_SETTINGS:
         by_slip = np.digitize(slip, np.quantile(slip, np.linspace(0, 1, SWEEP_LEVELS + 1)[1:-1]))
