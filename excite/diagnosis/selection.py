@@ -62,10 +62,10 @@ INSTANT_ACCURACY_S = 0.5  # [s] to which instants are refined, as fits find them
 MIN_EXCESS_SHARE = 0.05, 0.15  # for exact dynamics close to the logs, and otherwise; chosen
 MIN_EXCESS_SHARE_OF_FIRST = 0.3  # of the first effect, or far from the logs: the largest of three; chosen
 MIN_EXPLAINED_SHARE = 0.85  # of the excess misfit, for a name; right causes in results/diagnosis explain 0.85 or more
-LARGE_EXCESS_RATIO = 0.1  # excess over expected cost that no error of a formula removes entirely; chosen
+LARGE_EXCESS_RATIO = 0.01  # excess over expected cost that no error of a formula removes entirely; chosen
 
 # Nature is never exactly the formula: what is left of an effect may be another effect's gain.
-FORMULA_ERROR = 0.06  # largest relative difference of two formulas of one effect: 1 to 6 % in results/diagnosis
+FORMULA_ERROR = 0.03  # relative difference of two formulas of one effect: 1 to 6 % in results/diagnosis
 MAX_FORMULA_RATIO = 250.0  # largest likelihood ratio that the error of a formula makes; chosen
 MAX_FORMULA_SHARE = 0.1  # largest share of an effect's gain that the error of its formula takes; chosen
 MIN_GAIN_SHARE_WITH_NOISE = 0.25  # share to exceed where process noise hides how good the formulas are; chosen

@@ -570,6 +570,7 @@ _declare(
         sizes.constant(0.05),
         {"moment": Shape("-", 1.0, (0.0, 1.0))},
         grid=(0.2, 1.0, 4.0),
+        formula_error=0.1,  # the length depends on load and slip
         positive=True,
         soil=soil.relaxed,
         memory={
@@ -836,6 +837,7 @@ _declare(
         "a difference between gyro and measuring wheels proportional to the yaw acceleration",
         "Titterton, Weston, Strapdown Inertial Navigation Technology, 2nd ed., 2004, ch. 4: bandwidth of gyros",
         sizes.constant(0.03),
+        formula_error=0.1,  # a dead time is much the same
         positive=True,
         memory={"felt": Memory(lambda s, k, p: (s.yaw_rate[k] - s.z["felt"]) / p["A"], 1.0)},
         reading=lambda s, exact, k, p: s.z["felt"] - exact,
