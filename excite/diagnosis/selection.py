@@ -542,7 +542,7 @@ def _required_gain(
     least = max(MAX_FORMULA_SHARE * candidate.placed.effect.timed, share_with_noise * (not stage.exact))
     shares = [max(least, min(FORMULA_ERROR**2 / x.unabsorbed_share, MAX_FORMULA_SHARE)) for x in chosen]
     formulas = sum(share * x.likelihood_ratio for share, x in zip(shares, chosen, strict=True))
-    rough = ((x.likelihood_ratio, x.stage.placed(x.name).effect.formula_error) for x in chosen)
+    rough = ((x.likelihood_ratio, effects.CATALOGUE[x.name.split("@")[0]].formula_error) for x in chosen)
     formulas = max(formulas, sum(min(error**2 * ratio, MAX_FORMULA_RATIO) for ratio, error in rough))
     main = not stage.is_close if chosen else _noise_hides_misfit(stage)
     explained = MIN_EXCESS_SHARE_OF_FIRST if main else MIN_EXCESS_SHARE[stage.first_order_is_rough]

@@ -935,8 +935,24 @@ def test_what_an_effect_must_gain_to_be_worth_a_place(
         first_order_is_rough=forces > 0 or not near,
         excess_cost=1e4,
     )
-    chosen: Any = [SimpleNamespace(likelihood_ratio=gained, unabsorbed_share=unabsorbed)] if gained else []
+    known = SimpleNamespace(name="torque_gain@rear_roll", likelihood_ratio=gained, unabsorbed_share=unabsorbed)
+    chosen: Any = [known] if gained else []
     candidate: Any = SimpleNamespace(placed=SimpleNamespace(effect=SimpleNamespace(timed=timed)))
+    assert selection._required_gain(stage, chosen, candidate, 0.0) == pytest.approx(least)
+
+
+@pytest.mark.parametrize(("gained", "least"), [(3000.0, 0.15**2 * 3000), (1e5, 250.0)])
+def test_beside_a_rough_formula_an_effect_must_gain_more_than_its_error(gained: float, least: float) -> None:
+    stage: Any = SimpleNamespace(
+        model=SimpleNamespace(effects=[]),
+        fit=SimpleNamespace(process_noise=0.0),
+        exact=True,
+        is_close=True,
+        first_order_is_rough=False,
+        excess_cost=0.0,
+    )
+    chosen: Any = [SimpleNamespace(name="presliding@carriage", likelihood_ratio=gained, unabsorbed_share=1.0)]
+    candidate: Any = SimpleNamespace(placed=SimpleNamespace(effect=SimpleNamespace(timed=False)))
     assert selection._required_gain(stage, chosen, candidate, 0.0) == pytest.approx(least)
 
 
