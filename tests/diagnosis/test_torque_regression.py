@@ -285,8 +285,12 @@ def test_a_deadline_ends_the_search_with_the_best_so_far(emps: Model) -> None:
 
 @pytest.mark.slow
 def test_a_budget_gives_the_best_answer_so_far_and_says_so(tmp_path: Path) -> None:
-    """What regression finds in a second comes first; to follow the motion takes half a minute more."""
+    """What regression finds comes first; following the motion takes longer, on a quick machine not by much."""
     rig_log(0, HIDDEN["asymmetric_viscous"][0]).to_csv(tmp_path / "log.csv", index=False)
-    summary = run_command("emps", tmp_path / "log.csv", tmp_path / "diagnosis", "--budget", "10")
-    assert [f["effect"] for f in summary["findings"]] == ["asymmetric_viscous"]  # type: ignore[attr-defined]
-    assert any("best answer so far" in note for note in summary["notes"])  # type: ignore[attr-defined]
+    for budget in ("10", "6", "4"):
+        summary = run_command("emps", tmp_path / "log.csv", tmp_path / "diagnosis", "--budget", budget)
+        assert [f["effect"] for f in summary["findings"]] == ["asymmetric_viscous"]  # type: ignore[attr-defined]
+        if any("best answer so far" in note for note in summary["notes"]):  # type: ignore[attr-defined]
+            break
+    else:
+        pytest.fail("no budget ended the search")
