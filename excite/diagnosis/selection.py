@@ -20,6 +20,7 @@ from excite import identification
 from excite.diagnosis import score_test
 from excite.diagnosis.deadline import Deadline
 from excite.diagnosis.fits import (
+    IMPOSSIBLE_SIGN_STDS,
     LOST_COST_RATIO,
     MIN_PROCESS_NOISE,
     TRACKING_COST_RATIO,
@@ -648,13 +649,15 @@ def _likeliest_not_found(
 
 
 def _is_plausible(name: str, stage: ExtendedFit) -> bool:
-    """Tell if an effect's fitted shapes are possible.
+    """Tell if an effect's fitted magnitude and shapes are possible.
 
     If it shakes a torque sensor, one of the logs must show that, or none can.
     """
     placed = stage.placed(name)
     fitted = replace(placed, values={**placed.values, **_fitted_values(stage, placed)})
-    if not effects.shapes_possible(stage.machine, fitted):
+    k = stage.model.base.names.index(name)
+    beyond = abs(float(stage.fit.X[k])) - fitted.effect.largest
+    if not effects.shapes_possible(stage.machine, fitted) or beyond > IMPOSSIBLE_SIGN_STDS * stage.fit.std[k]:
         return False
     if stage.data.sticks and placed.effect.name == PRESLIDING and _sticks(placed, fitted.values["A"], stage):
         return False

@@ -790,6 +790,7 @@ _declare(
         "slip where there is none, proportional to speed",
         "counts per turn of the encoder's data sheet",
         sizes.constant(0.001),
+        largest=0.05,  # more is another sensor, not its data sheet
         reading=lambda s, exact, k, p: p["A"] * exact,
     ),
     Effect(
