@@ -67,6 +67,9 @@ def fail(message: str, code: int) -> NoReturn:
 Advance = Callable[[int, int, float | str | None], None]  # done, total, best score so far or what is being done
 
 
+_announced: ContextVar[str | None] = ContextVar("announced", default=None)  # said when the work begins
+
+
 @contextmanager
 def announcing(line: str | None) -> Iterator[None]:
     """Say a line when the work of the block begins, which is when its input was accepted: at its first `bar`.
@@ -86,9 +89,6 @@ def _say_announced() -> None:
     if line is not None:
         _announced.set(None)
         say(line)
-
-
-_announced: ContextVar[str | None] = ContextVar("line to say when the work begins", default=None)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.drives import arm_motion
 
 import excite
 from excite.diagnosis import fits, hold_out, selection, slow_forces
@@ -118,13 +119,8 @@ def test_a_wrong_file_of_an_arm_is_named(true: Machine, scale: float, name: str,
     rng = np.random.default_rng(5)
     known, model = build(arm()), build(true)
     t = np.arange(0, 30, 1 / 2500)
-    x = np.clip(np.minimum(t, 30 - t) / 3, 0, 1)
-    fade = 6 * x**5 - 15 * x**4 + 10 * x**3
-    phase = rng.uniform(0, 2 * np.pi, (2, 5))
-    q = np.array([sum(0.9 / k * np.sin(0.8 * k * t + phase[j, k - 1]) for k in range(1, 6)) * fade for j in (0, 1)])
-    nu = np.gradient(q, t, axis=1)
-    a = np.gradient(nu, t, axis=1)
-    t, q, nu, a = t[::10], q[:, ::10], nu[:, ::10], a[:, ::10]
+    q, nu, a = (x[:, ::10] for x in arm_motion(t, 0.8))
+    t = t[::10]
     standard = {n: value for n, (value, _) in standard_parameters(true).items()}
     u = model.predict(q, nu, a, [standard[n] for n in model.base.standard]).full()
     noise = [float(s.noise) for s in true.sensor if s.kind == "torque"]

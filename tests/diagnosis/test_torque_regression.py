@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.signal
+from support.drives import arm_motion
 from support.files import SHARED
 
 from excite.diagnosis import machine_file
@@ -110,12 +111,7 @@ def arm_log(model: Model, misread: Callable[[np.ndarray, np.ndarray], np.ndarray
     """
     rng = np.random.default_rng(5)
     t = np.arange(0, 40, 1 / float(model.machine.sampling_hz))
-    x = np.clip(np.minimum(t, 40 - t) / 3, 0, 1)
-    fade = 6 * x**5 - 15 * x**4 + 10 * x**3
-    phase = rng.uniform(0, 2 * np.pi, (2, 5))
-    q = np.array([sum(0.9 / k * np.sin(0.7 * k * t + phase[j, k - 1]) for k in range(1, 6)) * fade for j in (0, 1)])
-    nu = np.gradient(q, t, axis=1)
-    a = np.gradient(nu, t, axis=1)
+    q, nu, a = arm_motion(t, 0.7)
     u = model.predict(q, nu, a, model.expand @ model.nominal).full()
     u = u + (0 if more is None else more(q, nu, a))
     read = misread(q, u) + 1e-5 * rng.standard_normal(q.shape)
@@ -285,7 +281,7 @@ def test_a_deadline_ends_the_search_with_the_best_so_far(emps: Model) -> None:
 
 @pytest.mark.slow
 def test_a_budget_gives_the_best_answer_so_far_and_says_so(tmp_path: Path) -> None:
-    """What regression finds comes first; following the motion takes longer, on a quick machine not by much."""
+    """Give what regression finds, which comes first; to follow the motion takes longer, on a quick machine not much."""
     rig_log(0, HIDDEN["asymmetric_viscous"][0]).to_csv(tmp_path / "log.csv", index=False)
     for budget in ("10", "6", "4"):
         summary = run_command("emps", tmp_path / "log.csv", tmp_path / "diagnosis", "--budget", budget)

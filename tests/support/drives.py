@@ -37,6 +37,19 @@ def held_straight() -> np.ndarray:
     return np.column_stack([np.interp(t, knots["t_s"], knots[name]) for name in ("u1_Nm", "u4_Nm")])
 
 
+def arm_motion(t: np.ndarray, pace: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Angles, rates and accelerations (2, N) [rad, s] of two joints from rest to rest at times t (N,) [s].
+
+    pace [rad/s]: of the slowest of five sines.
+    """
+    phase = np.random.default_rng(5).uniform(0, 2 * np.pi, (2, 5))
+    x = np.clip(np.minimum(t, t[-1] - t) / 3, 0, 1)
+    fade = 6 * x**5 - 15 * x**4 + 10 * x**3
+    q = np.array([sum(0.9 / k * np.sin(pace * k * t + phase[j, k - 1]) for k in range(1, 6)) * fade for j in (0, 1)])
+    nu = np.gradient(q, t, axis=1)
+    return q, nu, np.gradient(nu, t, axis=1)
+
+
 def gentle(model: Model, seconds: float) -> Motion:
     """Little torque for a short time."""
     t = np.arange(0, seconds + 0.01, 0.01)
